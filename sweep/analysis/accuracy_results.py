@@ -1,7 +1,7 @@
-"""Results of `sweep accuracy`: time and error of the settings of accuracy, in tables and a figure.
+"""Results of `sweep accuracy`: time and error of accuracy settings, in tables and a figure.
 
-The thesis's way is the method of [T], the thesis that :mod:`sweep.model` names; docs/accuracy.md
-describes it.
+A setting is a choice of tolerance, effects, beamlets or draws. The thesis's way is the method of
+[T], the thesis that :mod:`sweep.model` names; docs/accuracy.md describes it.
 """
 
 from __future__ import annotations
@@ -26,10 +26,13 @@ from sweep.storage.store_format import OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
 
 TABULATED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-"""Errors for each of which a table shows the fastest setting that is as accurate."""
+"""Errors for which a table shows the fastest setting whose error is no larger."""
 
 NEGLIGIBLE_ERROR = 1e-9
-"""Error below which settings count as equally accurate, because the reference has such errors."""
+"""Error below which two settings count as equally accurate.
+
+The reference, to which they are compared, has errors of this size itself.
+"""
 
 AS_WRITTEN_KIND, ADAPTIVE_KIND, THESIS_KIND, REFERENCE_KIND = (
     "as written",
@@ -37,11 +40,18 @@ AS_WRITTEN_KIND, ADAPTIVE_KIND, THESIS_KIND, REFERENCE_KIND = (
     "thesis",
     "reference",
 )
-"""Kinds of settings: the spec as written, adaptive, the thesis's way, and the reference."""
+"""Kinds of accuracy settings: the spec as written, adaptive, the thesis's method, the reference.
+
+Adaptive settings simulate an effect only where a tolerance requires it. The reference is the most
+accurate setting.
+"""
 CLOSED_FORM_KIND, IMPROVED_THESIS_KIND = "closed form", "thesis improved"
-"""Kinds of settings: the thesis's effects in closed form, and the thesis's way, improved."""
+"""Kinds of accuracy settings: closed forms with the thesis's effects, and its improved method."""
 BEAMLETS_KIND, LINE_PATTERN_KIND = "beamlets", "in a line"
-"""Kinds of settings with a fixed number of beamlets, in a lattice or in a line."""
+"""Kinds of accuracy settings with a fixed number of beamlets, in a lattice or in a line.
+
+Beamlets are the rays that sample the cross-section of a beam.
+"""
 MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
     "means of draws",
     "draws counted",
@@ -61,19 +71,25 @@ FIXED_KINDS = (
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
 )
-"""Kinds of settings that are the same at every point of a study."""
+"""Kinds of settings with the same effects, beamlets and draws at every point of a study."""
 
 REQUIRED_SPEEDUP_OVER_FIXED, REQUIRED_SPEEDUP_OVER_THESIS = 1 / 1.1, 5.0
-"""Required time of the best fixed setting, and of the thesis's way, over that of adaptive ones."""
+"""Least ratio of computing times that adaptive settings must reach at equal accuracy.
+
+The ratios are those of the best fixed setting, and of the thesis's method, to the adaptive setting.
+"""
 
 THESIS_BEAMLETS = 109
 """Number of beamlets that the thesis simulates."""
 
 MEDIAN_ROUNDS_MIN = 3
-"""Least number of rounds of measurement from which speed-ups are medians over the rounds."""
+"""Least number of rounds of measurement for speed-ups to be medians over the rounds.
+
+With fewer rounds they are ratios of the fastest rounds.
+"""
 
 RANDOM_ERROR_QUANTILE = 0.95
-"""Fraction of the points whose errors are no larger than the error of a setting with draws.
+"""Quantile over the points, 0..1, that is taken as the error of a setting with random draws.
 
 Without draws the error of a setting is the largest one.
 """
@@ -81,31 +97,38 @@ Without draws the error of a setting is the largest one.
 
 @dataclass(frozen=True)
 class MeasuredSetting:
-    """Measured times and errors of one accuracy setting, relative to the reference setting."""
+    """Measured computing times and errors of one accuracy setting.
+
+    Errors are differences from the results of the reference, the most accurate setting.
+    """
 
     name: str
     """Name of the setting."""
     kind: str
-    """Kind of the setting, one of those above."""
+    """Kind of the setting, one of the constants of this module that end in `_KIND`."""
     tolerance: float
     """Tolerance of an adaptive setting."""
     seconds_by_round: np.ndarray
-    """Time per point in each round of measurement (rounds,) [s]."""
+    """Computing time per point of the study in each round of measurement (rounds,) [s]."""
     planning_seconds: float
-    """Time per point for planning, in the fastest round [s]."""
+    """Part of the time per point that choosing effects takes, in the fastest round [s]."""
     pd_error: np.ndarray
-    """Largest error of pd at each point (points,)."""
+    """Largest error of a probability of detection at each point (points,)."""
     log10_pfa_error: float
-    """Largest error of log10 pfa at any point; nan if there is none."""
+    """Largest error of log10 of a false-alarm probability at any point; nan if there is none."""
     magnitude_error: float
-    """Largest relative error of |X| at any point; nan if there is none."""
+    """Largest relative error of the magnitude |X| of a bin at any point; nan if there is none."""
     leakage_error: float
-    """Largest error of a leakage probability at any point; nan if there is none.
+    """Largest error, over all points, of the probability of a false peak by window sidelobes.
 
-    The tolerance does not limit it, because it jumps where a bin reaches the threshold.
+    It is nan if there is none. The tolerance does not limit it, because it jumps where a bin
+    reaches the threshold.
     """
     error_quantile: float
-    """Quantile of pd's errors over the points that counts as `largest_error`; 1 without draws."""
+    """Quantile of the errors of pd over the points that is taken as `largest_error`, 0..1.
+
+    It is 1, the largest error, without draws.
+    """
 
     @property
     def fastest_round_seconds(self) -> float:
@@ -125,7 +148,10 @@ class MeasuredSetting:
 
     @property
     def covers_leakage_error(self) -> bool:
-        """False for a closed form whose missing leakage is larger than its other errors."""
+        """True unless the setting is a closed form whose missing leakage exceeds its other errors.
+
+        Leakage is the probability of false peaks by window sidelobes.
+        """
         return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
             self.largest_error, NEGLIGIBLE_ERROR
         )
@@ -189,7 +215,7 @@ def drop_reference_setting(settings: Iterable[MeasuredSetting]) -> list[Measured
 
 
 def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
-    """Return the settings for which no other is both faster and more accurate, fastest first."""
+    """Return the settings than which no other is both faster and more accurate, fastest first."""
     front_settings: list[MeasuredSetting] = []
     for setting in sorted(settings, key=lambda s: (s.fastest_round_seconds, s.largest_error)):
         if not front_settings or max(setting.largest_error, NEGLIGIBLE_ERROR) < max(
@@ -209,7 +235,7 @@ def fastest_setting_within_error(
 
 
 class SettingComparison(NamedTuple):
-    """Adaptive setting and another setting of comparable error."""
+    """Adaptive setting (effects as needed) and another setting of comparable error."""
 
     adaptive: MeasuredSetting
     """Adaptive setting."""
@@ -273,14 +299,17 @@ SETTING_TABLE_COLUMNS = (
     "setting", "us a point", "planning", "median", "90 %", "largest", "log10 pfa",
     "magnitude", "leakage", "front",
 )  # fmt: skip
-"""Columns of the table of settings: times, quantiles of pd's error, largest other errors, front."""
+"""Columns of the table of settings: times, quantiles of pd's error, and other largest errors.
+
+The last column marks settings that no other setting beats in both time and error.
+"""
 
 
 SHORT_SETTING_TABLE_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
 """Columns of the shorter table of settings in the terminal."""
 
 CHEAPEST_SETTING_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
-"""Columns of the table of the fastest setting for each tolerance."""
+"""Column names of the table that lists the fastest setting for each tolerance."""
 
 STORING_SECONDS_ATTRIBUTE = "storing_seconds"
 """Name of the attribute with the time that storing the study takes [s].
@@ -423,7 +452,7 @@ def _fixed_sentences(comparisons: Sequence[SettingComparison], attributes: dict)
 def _slowdown_text(
     worst_comparison: SettingComparison, comparisons: Sequence[SettingComparison], attributes: dict
 ) -> str:
-    """Return a text on the time that adaptive settings lose where fixed settings are faster.
+    """Return a text on how much slower adaptive settings are where a fixed setting is faster.
 
     `worst_comparison` is the comparison with the smallest speed-up among `comparisons`.
     """
@@ -561,10 +590,13 @@ NUMBERED_KINDS = (
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
 )
-"""Kinds whose settings have names that begin with a number of beamlets or draws."""
+"""Kinds of accuracy settings whose names begin with a number of beamlets or draws."""
 
 CONNECTED_KINDS = (ADAPTIVE_KIND, *NUMBERED_KINDS)
-"""Kinds whose settings differ only in tolerance or number; a line connects their marks."""
+"""Kinds of accuracy settings that differ only in tolerance or number.
+
+A line connects their marks.
+"""
 
 MARK_BY_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
@@ -580,7 +612,7 @@ MARK_BY_KIND = {
     IMPROVED_THESIS_KIND: ("p", canvas.LINE_COLOURS[4], "the thesis's way, improved"),
     AS_WRITTEN_KIND: ("*", canvas.LINE_COLOURS[6], "as written"),
 }
-"""Marker, colour and legend text of each kind of setting."""
+"""Marker, colour and legend text of each kind of accuracy setting in the figure."""
 
 
 def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> Sheet:
@@ -626,7 +658,7 @@ def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]
 def _draw_setting_mark(
     axes: Axes, setting: MeasuredSetting, marker: str, colour: str, label: str
 ) -> None:
-    """Draw a setting: a mark at its largest error, and quantiles of pd's errors below it.
+    """Draw a setting as a mark at its largest error, with smaller quantiles of pd's error below it.
 
     A bar reaches down to the 90 % quantile, and a dot marks the median.
     """

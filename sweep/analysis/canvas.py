@@ -152,10 +152,10 @@ def save_sheet(finished_sheet: Sheet, file_path: Path, *, source: str = "") -> P
 
 
 LINES_PER_SHARED_PANEL_MAX = 4
-"""Largest number of lines that share a panel; if there are more, each line has a panel."""
+"""Largest number of lines that share a panel. If there are more, each line has its own panel."""
 
 MARKED_POINTS_MAX = 40
-"""Largest number of points of a line at which every point has a marker."""
+"""Largest number of points of a line for every point to have a marker."""
 
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Markers of the points of lines, by style index."""

@@ -63,11 +63,11 @@ class ChartLine:
     name: str = ""
     """Name in the legend."""
     style_index: int = 0
-    """Number that selects colour, dash and marker."""
+    """Number that selects the line's colour, dash and marker from the common lists."""
     low: np.ndarray | None = None
-    """Lower ends of a band about the line (n,)."""
+    """Lower end of a band about the line at each position (n,), such as a confidence interval."""
     high: np.ndarray | None = None
-    """Upper ends of a band about the line (n,)."""
+    """Upper end of a band about the line at each position (n,), such as a confidence interval."""
     style: str = "line"
     """Style of the line.
 
@@ -75,9 +75,9 @@ class ChartLine:
     line) or ``area`` (stacked on the areas before it).
     """
     points_per_value: int = 1
-    """Number of points of the study whose mean each value is."""
+    """Number of points of the study whose mean each value of the line is."""
     hover_texts: Sequence[str] = ()
-    """Texts that a page shows when the reader points at a value."""
+    """Texts that a page shows when the reader points at a value of the line, one per value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +85,9 @@ class HeatMap:
     """Map of values over two coordinates, shown by colours."""
 
     x: np.ndarray
-    """Positions of the columns along the horizontal axis."""
+    """Positions of the columns of cells along the horizontal axis."""
     y: np.ndarray
-    """Positions of the rows along the vertical axis."""
+    """Positions of the rows of cells along the vertical axis."""
     values: np.ndarray
     """Values (rows, columns); nan where missing."""
     contour_levels: Sequence[float] = ()
@@ -103,17 +103,24 @@ class ColourScale:
     high: float
     """Highest value of the scale."""
     is_log: bool
-    """True if the scale is logarithmic."""
+    """True if colours depend on the logarithm of the value."""
     label: str
     """Label of the scale, with units."""
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Panel of a chart: lines or a heat map over two axes, for one choice of each facet."""
+    """Panel of a chart: lines or a heat map over two axes.
+
+    It belongs to one choice of each facet, a property by which panels differ, such as the part of
+    the study.
+    """
 
     facet_choices: Mapping[str, str]
-    """Choice of each facet at which a page shows the panel, by the facet's name."""
+    """Choice of each facet at which a page shows the panel, by the facet's name.
+
+    A facet is a property by which panels differ, such as the part of the study.
+    """
     x: ChartAxis
     """Horizontal axis."""
     y: ChartAxis
@@ -125,7 +132,10 @@ class Panel:
 
     @property
     def title(self) -> str:
-        """Title of the panel: its choices of facets, separated by commas."""
+        """Title of the panel: its choices of facets, with commas.
+
+        A facet is a property by which panels differ, such as the part of the study.
+        """
         return ", ".join(filter(None, self.facet_choices.values()))
 
 
@@ -142,7 +152,11 @@ class Chart:
     panels: Sequence[Panel]
     """Panels in order."""
     facet_labels: Mapping[str, str] = field(default_factory=dict)
-    """Labels of the controls by which the reader of a page selects a panel, by facet."""
+    """Labels of the controls with which a reader selects a panel.
+
+    There is one control for each facet, a property by which panels differ, such as the part of the
+    study.
+    """
     colour_scale: ColourScale | None = None
     """Colour scale of all heat maps; None for charts of lines."""
     panels_per_row: Sequence[int] = ()
@@ -154,7 +168,7 @@ class ChartSizeLimits:
     """Limits of the size of a chart."""
 
     parts_max: int
-    """Largest number of parts of the study, each of which has a panel."""
+    """Largest number of parts of the study that are shown. Each part has a panel."""
     columns_max: int
     """Largest number of columns of a row of heat maps."""
     rows_max: int
@@ -168,16 +182,22 @@ class ChartSizeLimits:
 SHEET_SIZE_LIMITS = ChartSizeLimits(
     parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_per_row=2
 )
-"""Limits of charts on sheets. A heat map has no more cells than pixels, so that no cell is lost."""
+"""Limits of charts on sheets (matplotlib figures).
+
+A heat map has no more cells than pixels, so that no cell is lost.
+"""
 
 LINES_PER_PANEL_MAX = 8
 """Largest number of lines in a panel; further lines are omitted."""
 
 REDUCED_LINE_INTERVALS = 500
-"""Number of values to which a line is reduced, if it has more than twice as many points."""
+"""Number of values to which a long line is reduced.
+
+Lines with at most twice as many points are kept.
+"""
 
 _LOG_SCALE_DECADES_MIN = 3
-"""Decades between the median and the largest value above which a colour scale is logarithmic."""
+"""Number of decades between median and largest value, above which a colour scale is logarithmic."""
 
 _LARGEST_IS_WORST_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
 """Prefixes of the names of variables whose largest value is the worst one."""

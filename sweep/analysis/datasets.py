@@ -37,7 +37,7 @@ from sweep.storage.store_format import (
 from sweep.storage.verified_store import open_verified_store
 
 DRAW_BATCH_DIM = "batch"
-"""Name of the dimension of batches of draws in a store."""
+"""Name of the array dimension in a store along which draws are counted in batches."""
 
 READ_CHUNK_VALUES_MAX = 2**20
 """Largest number of array values in a Dask chunk.
@@ -50,7 +50,7 @@ READ_SHOTS_MAX = 8192
 """Largest number of shots that are read at once, unless a stored chunk has more."""
 
 MISSING_COUNT = -1
-"""Stored value of a count that is not computed yet."""
+"""Value that stands in a store for a count that is not computed yet."""
 
 GRID_KIND, SCENE_KIND, ACCURACY_KIND = "grid", "scene", "accuracy"
 """Kinds of stores."""

@@ -11,7 +11,7 @@ import numpy as np
 from sweep.messages import counted as counted
 
 KILOMETRE_DISPLAY_MIN = 1000.0
-"""Median of distances [m] above which they are shown in km."""
+"""Median of the distances on an axis above which they are shown in km [m]."""
 
 _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW": "µW", "m s-1": "m/s"}
 """Symbols of units in labels, by the units' names in stores, if they differ."""
@@ -33,7 +33,7 @@ _SI_PREFIX_BY_EXPONENT = {
 """SI prefixes by exponent of ten."""
 
 _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
-"""Units that take an SI prefix."""
+"""Units that may be written with an SI prefix, such as mm."""
 
 
 def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str]:
@@ -114,7 +114,7 @@ def describe_value_extent(values: np.ndarray) -> str:
 
 
 def source_note(attributes: Mapping[Any, Any], counted_unit: str) -> str:
-    """Return a text that names the study of a picture, the model version and missing progress.
+    """Return a text that names a picture's study, the model version, and what is not computed yet.
 
     `attributes` are those of the store. `counted_unit` is the unit of progress: ``points`` or
     ``blocks``.

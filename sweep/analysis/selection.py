@@ -27,7 +27,7 @@ CELL_MEAN, CELL_LOWEST, CELL_HIGHEST = "mean", "lowest", "highest"
 """Names of the statistics of the points in a cell of a figure."""
 
 SUMMED_VALUES_MAX = 2**20
-"""Largest number of values in a partial sum."""
+"""Largest number of values that one partial sum adds up. The partial sums are then added."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SortedCoordinate:
     dim: str
     """Dimension of the dataset along which the coordinate lies."""
     indices: np.ndarray
-    """Index along the dimension of each value."""
+    """Index of each value along the dimension of the dataset."""
     values: np.ndarray
     """Values of the coordinate, without duplicates."""
 
@@ -318,10 +318,13 @@ PUBLISHED_CUTS = (
     (GRAZING_ANGLE_PATH, "85 deg"),
     (RANGE_PATH, "3500 m"),
 )
-"""Cuts of the published figures: path and value of the fixed parameter."""
+"""Cuts of the published figures through range and grazing angle.
+
+Each has the dotted path and the value of the parameter that is fixed.
+"""
 
 AVERAGED_RANGE_MIN = "5 m"
-"""Smallest range of the points that means of false alarms include.
+"""Smallest range of points over which false alarms are averaged [m].
 
 At shorter ranges the shot noise of the echo matters ([T] 4.2).
 """
@@ -329,10 +332,10 @@ At shorter ranges the shot noise of the echo matters ([T] 4.2).
 
 @dataclass(frozen=True)
 class StudyCut:
-    """Cut through a study, along which one coordinate is fixed and the other varies."""
+    """Part of a study along which one of range and grazing angle is fixed and the other varies."""
 
     name: str
-    """Name of the cut: the fixed value, or 'all' for the complete study."""
+    """Name of the cut: the value of the fixed coordinate, or 'all' for the complete study."""
     fixed_name: str
     """Name of the fixed coordinate; empty for the complete study."""
     fixed_value: object
@@ -403,9 +406,10 @@ def study_cuts(spec: GridSpec) -> list[StudyCut]:
 
 
 def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
-    """Divide a zipped axis into runs along which range or grazing angle is constant.
+    """Divide a zipped axis, along which range and grazing angle vary together, into runs.
 
-    The result is the constant parameter and its value for each run, in order.
+    Along a run one of them is constant. The result is this parameter and its value for each run, in
+    order.
     """
     axis_parameters = [m for m in axis.parameters if m.path in (RANGE_PATH, GRAZING_ANGLE_PATH)]
     runs: list[tuple[AxisParameter, object]] = []
@@ -448,7 +452,7 @@ def select_beyond_range(
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of the finite values of points; nan if there are none."""
+    """Statistics of the finite values of a variable; nan if there are no finite values."""
 
     n_finite: int
     """Number of finite values."""

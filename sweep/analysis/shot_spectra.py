@@ -52,26 +52,26 @@ class BinGroup:
 
 @dataclass(frozen=True)
 class SegmentSpectrum:
-    """Spectrum of a segment of n bins, with its detections."""
+    """Spectrum of one segment (chirp) of a shot, with n bins, and its detections."""
 
     name: str
     """Display name of the segment."""
     slope: float
-    """Slope of the frequency over the chirp rate: 1 for the up-chirp, 0 for constant frequency."""
+    """Frequency slope over the chirp rate: 1 for the up-chirp, 0 for constant frequency."""
     bins: np.ndarray
     """Numbers of the bins (n,), rising; a complex record has negative ones too."""
     frequency: np.ndarray
     """Frequencies of the bins (n,) [Hz]."""
     signal_magnitude: np.ndarray
-    """Magnitudes |X| of the signal without noise (n,) [V]."""
+    """Magnitude |X| of the signal without noise in each bin (n,) [V]."""
     magnitude: np.ndarray
-    """Magnitudes |X| with noise, if noise was drawn (n,) [V]."""
+    """Magnitude |X| of each bin with noise, if noise was drawn (n,) [V]."""
     beat_frequency: float
     """Beat frequency, before it is folded at the Nyquist frequency [Hz]."""
     carrier_frequency: float
     """Carrier frequency of the segment [Hz]."""
     bin_groups: tuple[BinGroup, ...]
-    """Groups of bins above the threshold: the detections."""
+    """Groups of adjacent bins above the threshold. Each group is one detection."""
     snr: float
     """Signal-to-noise ratio of the signal's strongest bin."""
     pd: float
@@ -85,16 +85,16 @@ class SegmentSpectrum:
 
 @dataclass(frozen=True)
 class SimulatedShot:
-    """Simulated shot: parameters, prepared shot, spectra, and reported range and velocity."""
+    """One simulated shot: parameters, spectra with detections, reported range and velocity."""
 
     label: str
     """Label of the shot in figures and tables."""
     parameters: ParameterValues
     """Parameters of the shot."""
     prepared_shot: shot_model.Shots
-    """Prepared shot, as an array of one shot."""
+    """All that the shot's spectra depend on (lines, noise, threshold), as arrays of one shot."""
     outputs: dict[str, float]
-    """Outputs of the model, by variable name."""
+    """Results of the model for the shot, by the name of the output variable."""
     segments: tuple[SegmentSpectrum, ...]
     """Spectra of the segments that the shot has."""
     reported_range: float
@@ -104,17 +104,17 @@ class SimulatedShot:
 
     @property
     def noise_sigma(self) -> float:
-        """Standard deviation of the noise in a bin, per quadrature [V]."""
+        """Standard deviation of the real part, or of the imaginary part, of a bin's noise [V]."""
         return float(self.prepared_shot.bin_noise_sigma[0])
 
     @property
     def threshold(self) -> float:
-        """Detection threshold on |X| [V]."""
+        """Detection threshold on the magnitude |X| of a bin [V]."""
         return float(self.prepared_shot.threshold[0])
 
     @property
     def noise_rms(self) -> float:
-        """Root mean square of |X| in a bin of noise [V]."""
+        """Root mean square of the magnitude |X| of a bin that holds noise alone [V]."""
         return float(np.sqrt(2)) * self.noise_sigma
 
     def magnitude_to_dbv(self, magnitude: np.ndarray | float) -> np.ndarray:
@@ -165,7 +165,7 @@ def simulate_prepared_shot(
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """Simulate one prepared shot of a grid or a scene.
+    """Simulate one shot of a grid or a scene, given all that its spectra depend on.
 
     Parameters and result are those of :func:`simulate_shot`.
     """
@@ -286,7 +286,7 @@ def draw_noise_spectrum(
 
 
 def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, ...]:
-    """Return the groups of adjacent bins whose magnitudes reach the threshold."""
+    """Return the groups of adjacent bins whose magnitudes are at or above the threshold."""
     bins_above = np.flatnonzero(magnitude >= threshold)
     runs = (
         np.split(bins_above, np.flatnonzero(np.diff(bins_above) > 1) + 1) if bins_above.size else []
@@ -319,8 +319,9 @@ def range_or_velocity_at(
 
     Notes
     -----
-    The unfolded frequency is f, the carrier f_c, and the Doppler ratio beta = 2 v / c. The slope of
-    the segment is s times the chirp rate S. Then
+    The unfolded frequency is f, the carrier f_c, and the Doppler ratio beta = 2 v / c, with the
+    radial velocity v and the speed of light c. The slope of the segment is s times the chirp rate
+    S. The range R, or the velocity v, is
 
         R = c (f_c beta - f) / (2 s S (1 + beta)) for a chirp, v = c f / (2 f_c) for s = 0.
     """
@@ -347,16 +348,21 @@ SPECTRUM_COLOUR, THRESHOLD_COLOUR, NOISE_COLOUR, DETECTION_COLOUR = (
     "black",
 )
 LEVEL_AXIS_MARGIN_BELOW_DB, LEVEL_AXIS_MARGIN_ABOVE_DB = 25.0, 12.0
-"""Margins of the level axis below the noise and above the strongest bin or the threshold [dB]."""
+"""Margins of the vertical axis of a spectrum [dB].
+
+The first is below the noise, the second above the strongest bin or the threshold.
+"""
 
 PEAK_VIEW_HALF_WIDTH_MIN_BINS = 12
-"""Least half-width of the close-up of a peak [bins]."""
+"""Least distance from a peak to the edges of its close-up [bins]."""
 
 DETECTION_VIEW_MARGIN_MIN_BINS = 8
-"""Least margin of a close-up around its outermost detections [bins]."""
+"""Least distance from the outermost detections in a close-up of a peak to its edges [bins]."""
 
 NEARBY_DETECTION_BAND_FRACTION_MAX = 0.05
-"""Largest distance of a detection from the peak in a close-up, as a fraction of the band.
+"""Largest distance from a peak at which a detection is shown in the peak's close-up.
+
+It is a fraction of the width of the spectrum.
 """
 
 
@@ -407,7 +413,7 @@ def draw_spectra_sheet(
 
 
 def _level_axis_limits_db(shots: Sequence[SimulatedShot]) -> tuple[float, float]:
-    """Return the limits of a level axis that shows the noise and the peaks of all shots [dBV]."""
+    """Return the limits of a vertical axis that shows noise and peaks of all shots [dBV]."""
     low = (
         min(float(shot.magnitude_to_dbv(shot.noise_rms)) for shot in shots)
         - LEVEL_AXIS_MARGIN_BELOW_DB
@@ -644,7 +650,7 @@ def _false_alarm_table(shot: SimulatedShot) -> PageTable:
 
 
 DRAWN_AXIS_VALUES_MAX = 3
-"""Largest number of values of a study's only axis at which a report shows a shot each."""
+"""Largest number of values of a study's only axis for which a report shows one shot per value."""
 
 _REPORTED_PARAMETER_PATHS = (
     "target.range",

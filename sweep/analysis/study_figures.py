@@ -69,7 +69,7 @@ from sweep.spec.figure_sections import (
 from sweep.storage.locations import Location, derived_files_dir, parse_location
 
 SURFACE_AXIS_VALUES_MIN = 8
-"""Least number of values of an axis that a default figure shows as a side of a surface."""
+"""Least number of values of an axis for a default figure to be a surface over this axis."""
 
 DEFAULT_FIGURE_VARIABLES = ("pd_shot", "pd_doppler")
 """Variables of the default figures of a grid."""

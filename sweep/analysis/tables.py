@@ -396,12 +396,12 @@ _FALSE_ALARM_COLUMNS = {
     "closed form": ("closed_form", ".6e"), "noise only": ("noise_only", ".6e"),
     "study's mean": ("study_mean", ".6e"), "excess of mean": ("study_variance_excess", ".1e%"),
 }  # fmt: skip
-"""Columns of the table of false alarms: the record key of each, and its number format."""
+"""Record key and number format of each column of the table of false alarms, by column name."""
 _PRINTED_COLUMNS = {
     "printed": ("printed", ".3e"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".4f%"),
 }  # fmt: skip
-"""Further columns of the table of false alarms, if there are published values."""
+"""Record key and number format of the columns for published values in the table of false alarms."""
 _LEAKAGE_COLUMNS = {
     "setting": ("setting", ""), "cut": ("cut", ""),
     "up: mean": ("p_leakage_up_mean", ".3e"), "up: median": ("p_leakage_up_median", ".3e"),
@@ -409,14 +409,17 @@ _LEAKAGE_COLUMNS = {
     "shot: mean": ("shot_with_leakage_mean", ".3e"),
     "shot: median": ("shot_with_leakage_median", ".3e"),
 }  # fmt: skip
-"""Columns of the table of leakage: the record key of each, and its number format."""
+"""Record key and number format of each column of the table of leakage, by column name.
+
+Leakage is a false alarm by the window's sidelobes.
+"""
 _THRESHOLD_COLUMNS = {
     "setting": ("setting", ""), "closed form": ("closed_form", ".6e"),
     "noise only": ("noise_only", ".6e"), "study's mean": ("study_mean", ".6e"),
     "printed": ("printed", ".3g"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".3f%"),
 }  # fmt: skip
-"""Columns of the table of thresholds: the record key of each, and its number format."""
+"""Record key and number format of each column of the table of thresholds, by column name."""
 
 
 def false_alarm_page(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 EXIT_DAMAGED, EXIT_DIFFERENT = 1, 4
 """Exit codes of verify for a damaged store, and of compare for different results."""
 
-#: Largest number of damaged objects that are listed for a store.
+#: Largest number of damaged objects of a store that the output of verify lists.
 LISTED_DAMAGED_OBJECTS_MAX = 20
 
 

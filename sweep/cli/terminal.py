@@ -36,16 +36,19 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.study_plan import EffectRow, EffectsTable, StudyPlan
 
 ASK_ABOVE_POINTS, ASK_ABOVE_BYTES, ASK_ABOVE_CPU_SECONDS = 10**9, 10**12, 30 * 86400.0
-"""Points, bytes and time on one core [s] above which a run asks before it starts."""
+"""Size of a study above which a run asks for confirmation before it starts.
+
+It is the number of points, the size of the results [bytes], and the time on one core [s].
+"""
 
 MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
-"""Product of points and draws above which a run estimates its time before it starts."""
+"""Number of points times draws of a study above which a run first estimates its time."""
 
 SENTENCE_COLUMN_WIDTH_MIN, COLUMN_GAP, UNBROKEN_CELL_WIDTH_MAX = 14, 3, 36
-"""Widths in a table [characters].
+"""Widths in a printed table [characters].
 
 The first is the least width of a column of sentences, the second the gap between columns. Cells
-below the third width are never broken in a row that is printed as a list.
+narrower than the third are never broken if a row is printed as a list.
 """
 
 
@@ -400,7 +403,7 @@ def _print_grid_summary(store: Location) -> None:
 
 
 def _sampled_share_text(block_share: float) -> str:
-    """Return a note that a table covers only a part of the blocks; '' if it covers all."""
+    """Return a note that a table covers only a part of the store's blocks; '' if it covers all."""
     return f", by {100 * block_share:.2g} % of the blocks" if block_share < 1 else ""
 
 
@@ -672,7 +675,10 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
 
 
 def print_effects(table: EffectsTable) -> None:
-    """Print where effects are simulated, and their cost; warn of effects that are forced off."""
+    """Print where each effect is simulated, and its cost in time.
+
+    Warn of effects that are forced off.
+    """
     active_rows = [row for row in table.rows if row.change_bound > 0 or row.simulated_fraction > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
     print_table("Effects", headings, [_effect_row_cells(row) for row in active_rows], "called for")
@@ -777,7 +783,7 @@ def study_effects_table(
 
 
 def print_effects_warnings(table: EffectsTable) -> None:
-    """Warn of effects that are forced off although they matter."""
+    """Warn of switched-off effects that change results by more than the tolerance."""
     for warning in table.warnings():
         echo_wrapped(f"warning: {warning}", err=True)
 

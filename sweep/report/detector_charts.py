@@ -50,22 +50,28 @@ CHART_PARTS_MAX = 6
 """Largest number of parts of a study among which the reader of a chart can choose."""
 
 NOISE_BUDGET_POINTS = 24
-"""Number of points along a coordinate, or of shots along a flight, in a chart of noise sources."""
+"""Number of points at which a chart of noise sources is computed.
+
+They are points along a coordinate of a grid, or shots along a flight.
+"""
 
 ROC_POINT_PDS = (0.999, 0.9, 0.5, 0.1, 0.01)
-"""Probabilities of detection by which points are chosen for ROC curves.
+"""Probabilities of detection for which points are chosen, whose ROC curves are drawn.
 
-The point with the closest pd to each value is chosen.
+The point whose pd is closest to each of these is chosen.
 """
 
 ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
 """Probabilities of a false alarm in a bin at which ROC curves are computed."""
 
 ROC_DRAWS = 400
-"""Number of draws for the ROC curve of a point with random effects."""
+"""Number of draws with which the ROC curve of a point with random effects is simulated."""
 
 PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
-"""Name of the variable for false alarms in both chirps by noise or leakage."""
+"""Name of the variable for false alarms in both chirps, by noise or by leakage.
+
+Leakage is signal in the window's sidelobes.
+"""
 
 _LABEL_BY_ALARM = {
     "pfa_bin": "noise, one bin",
@@ -84,7 +90,7 @@ _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
 
 @dataclass(frozen=True)
 class GridProfile:
-    """Points of one part of a study along its main coordinate, or its only point."""
+    """Points of one part of a study along the coordinate that charts show, or the only point."""
 
     label: str
     """Name of the part."""
@@ -101,7 +107,7 @@ class GridProfile:
         return CoordinateAxis.from_points(self.points, self.coordinate_name)
 
     def evenly_spread_indices(self, n_max: int) -> np.ndarray:
-        """Return at most ``n_max`` evenly spread indices along the profile."""
+        """Return at most ``n_max`` evenly spread indices of points along the profile."""
         if self.coordinate is None:
             return np.zeros(1, int)
         size = self.coordinate.values.size
@@ -181,9 +187,9 @@ _PFA_FUNCTION_BY_ALARM = {
     "in a bin": lambda bin_probability, bins: bin_probability,
     "in both chirps": lambda p, bins: noise_false_alarms.segment_pfa(p, bins) ** 2,
 }
-"""Functions that convert the false-alarm probability of a bin, by the kind of false alarm.
+"""Functions that give the probability of each kind of false alarm, by the name of the kind.
 
-Their arguments are this probability and the number of independent bins.
+Their arguments are the false-alarm probability of one bin, and the number of independent bins.
 """
 
 
@@ -250,9 +256,9 @@ def _roc_indices(profile: GridProfile) -> np.ndarray:
 def noise_budget_of_grid(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart:
-    """Return the chart of the shares of noise sources at the ADC, along each profile of a grid.
+    """Return the chart of the noise at the ADC, along each part (profile) of a grid.
 
-    `n_omitted` is the number of omitted profiles.
+    It shows the share of each noise source. `n_omitted` is the number of omitted profiles.
     """
     panels = []
     for profile in profiles:
@@ -337,9 +343,10 @@ def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart
 def false_alarm_chart(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart | None:
-    """Return the chart of false alarms by noise and leakage, along each profile of a grid.
+    """Return the chart of false alarms by noise and by leakage, along each part of a grid.
 
-    It is None for a grid with a single point. `n_omitted` is the number of omitted profiles.
+    Leakage is signal in the window's sidelobes. The result is None for a grid with a single point.
+    `n_omitted` is the number of omitted parts (profiles).
     """
     if profiles[0].coordinate is None:
         return None
@@ -393,16 +400,19 @@ def false_alarm_chart(
 
 
 REPORTED_PD_LEVEL = 0.9
-"""Level of pd by which a report states the maximum range and counts points."""
+"""Probability of detection that a report requires within the maximum range.
+
+The report also counts the points that reach it.
+"""
 
 UNBROKEN_LABEL = "kept all the way"
-"""Label of the maximum range up to which pd never falls below the level."""
+"""Label of the maximum range up to which pd is never below the chosen level."""
 
 LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
 """Variables of :func:`.detection_limits.limit` with the two kinds of maximum range, by label."""
 
 INTERVAL_END_LABELS = {"low": "lower end", "high": "upper end"}
-"""Column names for the ends of the interval of the maximum range."""
+"""Column names for the lower and the upper end of the confidence interval of the maximum range."""
 
 MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {REPORTED_PD_LEVEL:g}"
 """Heading of the chart or table of the maximum range."""

@@ -71,7 +71,7 @@ PAGE_CLOUDS_MAX = 8
 """Largest number of clouds on a page: scanners times positions along the study's axes."""
 
 TERRAIN_SIDE_NODES_MAX = 90
-"""Largest number of terrain nodes along a side of the drawn terrain."""
+"""Largest number of nodes of the drawn terrain along each of its sides."""
 
 TERRAIN_LOWERING_FRACTION = 0.012
 """Depth by which the drawn terrain is lowered, as a fraction of its horizontal size.
@@ -83,9 +83,10 @@ CAMERA_FIELD_OF_VIEW = math.radians(45)
 """Vertical field of view of plotly's camera [rad]."""
 
 VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
-"""Fraction of the field of view that the points' box fills, and least width-to-height ratio.
+"""Framing of the points of a cloud in plotly's view.
 
-The rest of the field of view is for labels. The ratio is that of a plot on a phone.
+The first is the fraction of the field of view that the points' box fills; the rest is for labels.
+The second is the least width-to-height ratio of the plot, that of a phone.
 """
 
 CAMERA_POSITION_BY_VIEW = {
@@ -328,9 +329,10 @@ def _hidden_axis_layout(view: str) -> dict[str, bool]:
 
 
 def _largest_fitting_side(side_ratios: np.ndarray) -> float:
-    """Return the largest length of a box's longest side at which the box fits into every view.
+    """Return the largest size at which the box around the points fits into every view.
 
-    `side_ratios` (3,) are the sides relative to the longest one. The length is in plotly's units.
+    The size is the length of the longest side, in plotly's units. `side_ratios` (3,) are the sides
+    relative to the longest one.
     """
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * side_ratios
     eye_positions = [
@@ -361,9 +363,9 @@ def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
 
 
 def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> dict[str, Any]:
-    """Return the changes of plotly's layout that frame the true points of all clouds.
+    """Return the changes of plotly's layout that make the true points of all clouds fill the view.
 
-    With ``with_path`` the flight paths are framed too. All axes have the same scale.
+    With ``with_path`` the flight paths are in the view too. All axes have the same scale.
     """
     axis_ranges: dict[str, Any] = {}
     lengths = {}
@@ -475,7 +477,7 @@ def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) ->
 
 
 QuantityLines = tuple[str, ChartAxis, list[ChartLine]]
-"""Label of a quantity, its vertical axis, and its lines over time."""
+"""Label of a quantity of shots or points, its vertical axis, and its lines over time."""
 
 
 def _time_panels(

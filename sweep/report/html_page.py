@@ -44,7 +44,7 @@ PLOTLY_DASH_STYLES = (
 """Dash styles of lines in plotly's notation. Lines then differ not only by colour."""
 
 _COLOUR_MAP_SPANS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
-"""Part of the colour map, 0..1, that contrasts with a light and with a dark page."""
+"""Parts of the colour map, within 0..1, that contrast with a light page and with a dark page."""
 
 _GROUND_COLOURS = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
 """Colours of the darkest and the brightest terrain, on a light and on a dark page."""
@@ -67,7 +67,7 @@ class PlotControl:
     options: Sequence[str]
     """Options in order."""
     relayout: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Changes of plotly's layout that an option makes, by option."""
+    """Changes of plotly's layout that the choice of an option makes, by option."""
 
     @property
     def initial_option_index(self) -> int:
@@ -149,9 +149,10 @@ def make_interactive_plot(chart: Chart) -> InteractivePlot:
 
 
 def _make_control(panels: Sequence[Panel], name: str, label: str) -> PlotControl:
-    """Return the control by which the reader chooses among the panels of a facet.
+    """Return the control by which the reader chooses a panel of a chart.
 
-    If the panels differ in their vertical axes, the options change that axis.
+    It changes one facet, a property by which panels differ. If the panels differ in their vertical
+    axes, the options change that axis.
     """
     axes_by_option: dict[str, set[ChartAxis]] = {}
     for panel in panels:
@@ -280,7 +281,7 @@ def _mask_nonpositive(line: ChartLine) -> ChartLine:
 def _band_trace(
     line: ChartLine, x: np.ndarray, low: np.ndarray, high: np.ndarray, meta: dict[str, Any]
 ) -> go.Scatter:
-    """Return plotly's trace of the area between the lower and upper ends of a line's band."""
+    """Return plotly's trace of the band about a line, the area between its lower and upper ends."""
     finite_indices = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     reversed_indices = finite_indices[::-1]
     return go.Scatter(

@@ -60,7 +60,7 @@ PAGE_SIZE_LIMITS = ChartSizeLimits(
     cells_max=400_000,
     maps_per_row=1,
 )
-"""Limits of charts on a page.
+"""Limits of the charts on a page: parts, rows, columns and cells.
 
 The limit of cells applies to all heat maps of the page together, which keeps it to a few megabytes.
 """
@@ -504,9 +504,9 @@ def _format_values(values: np.ndarray, units: str) -> str:
 
 
 def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> HtmlTable:
-    """Return a table of the effects: the share of points that simulate each, and their extent.
+    """Return a table of the effects: the share of points at which each is simulated, and where.
 
-    `flag_arrays` are the flags of simulated effects, `modes` the modes that the spec states.
+    `flag_arrays` hold the effects simulated at each point, `modes` the modes that the spec states.
     """
     lazy_counts = []
     for k in range(len(EFFECTS)):
@@ -558,7 +558,7 @@ def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str])
 
 
 def _describe_effect_extent(presence: xr.DataArray) -> str:
-    """Return a text with the extent of the points along a dimension that simulate an effect.
+    """Return a text that says where along a dimension points simulate an effect.
 
     `presence` is a mask along the dimension. The text is empty if all points or none do.
     """

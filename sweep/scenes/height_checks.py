@@ -10,7 +10,10 @@ from sweep.messages import counted
 from sweep.scenes.scene_files import SceneError
 
 PLAUSIBLE_HEIGHT_MAX = 1e6
-"""Largest magnitude of a plausible height [unit of the file]."""
+"""Largest magnitude that a height in a file may have [unit of the file].
+
+Larger values must be declared as missing.
+"""
 
 _CUSTOMARY_NO_DATA_VALUES = (
     -32768.0,
@@ -23,30 +26,32 @@ _CUSTOMARY_NO_DATA_VALUES = (
     9999.0,
     99999.0,
 )
-"""Values that files customarily use for missing heights."""
+"""Values by which files customarily mark missing heights."""
 
 _CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN = 0.1
-"""Gap from a customary no-data value to the nearest height, above which it is suspicious.
+"""Distance of a customary no-data value from the nearest height, above which a warning is given.
 
-The gap is relative to the span of all other heights.
+It is relative to the difference between the largest and the smallest of all other heights.
 """
 
 _REPEATED_EXTREME_RELATIVE_GAP_MIN = 1.0
-"""Gap between an extreme value of several cells and the nearest height, above which the value is
-suspicious. The gap is relative to the span of all other heights.
+"""Distance of the smallest or largest value from the next height, above which a warning is given.
+
+Several cells have this value. The distance is relative to the difference between the largest and
+the smallest of all other heights.
 """
 
 _REPEATED_EXTREME_CELLS_MIN = 4
-"""Number of cells with exactly the same extreme value from which on the value is suspicious."""
+"""Least number of cells that share the smallest or largest value for a warning about it."""
 
 _SUSPICIOUS_VALUES_MAX = 3
-"""Maximum number of suspicious values that are reported for a file."""
+"""Maximum number of suspicious heights of a file about which warnings are given."""
 
 _CLIFF_SEARCH_STRIP_ROWS = 256
 """Number of grid rows that the search for cliffs reads at a time."""
 
 CLIFF_SLOPE_MIN = 20.0
-"""Slope between neighbouring cells above which a step counts as a cliff: height over distance."""
+"""Height difference over distance of neighbouring cells, above which a step counts as a cliff."""
 
 CLIFF_HEIGHT_MIN = 100.0
 """Height difference of neighbouring cells above which a step counts as a cliff [m]."""

@@ -20,16 +20,19 @@ from sweep.scenes.scene_files import SceneError
 from sweep.units import QuantityError, read_unit
 
 MAP_SCALE_ERROR_MAX = 1e-3
-"""Largest relative error of a map's scale that needs no warning."""
+"""Largest relative error of distances on a map, compared with the ground, without a warning."""
 
 STATED_SCALE_ERROR_MAX = 5e-2
-"""Largest relative error of a scale that the user states; a larger one counts as a mistake."""
+"""Largest relative error of a map scale (metres per unit) that a user states.
+
+A scale with a larger error counts as a mistake.
+"""
 
 DEGREE_CELL_SIZE_MAX = 0.1
 """Largest cell size of a raster whose coordinates may be degrees [unit of the coordinates].
 
-It applies to rasters without a reference system, within 360 degrees of longitude and 90 of
-latitude.
+It is used for rasters without a reference system, whose coordinates are within 360 degrees of
+longitude and 90 of latitude.
 """
 
 MapBounds = tuple[float, float, float, float]
@@ -47,7 +50,7 @@ _METRES_BY_HEIGHT_UNIT = (
 
 
 class MetresPerUnit(NamedTuple):
-    """Length on the ground of one unit of a map's coordinates [m]."""
+    """Length on the ground of one unit of a map's coordinates [m], eastwards and northwards."""
 
     east: float
     """Metres on the ground per unit of the map's coordinates eastwards."""
@@ -78,7 +81,10 @@ class MapFrame:
     """Warnings about the map's scale, as sentences."""
 
     def is_same_map(self, other: MapFrame) -> bool:
-        """Return True if two maps have the same horizontal reference system, or one states none."""
+        """Return True if this and another map have the same horizontal reference system.
+
+        The result is also True if one of the maps states none.
+        """
         if not (self.wkt and other.wkt) or self.wkt == other.wkt:
             return True
         horizontal_crs, other_horizontal_crs = (
@@ -104,7 +110,7 @@ class MapFrame:
 
 
 def metric_projection_wkt_of_crs(wkt: str) -> str:
-    """Return a coordinate reference system as WKT if it is a map projection in metres, else ''.
+    """Return a reference system as WKT if it is a map projection in metres, else ''.
 
     `wkt` is the reference system. Its vertical part is removed if heights are not in metres.
     """
@@ -335,9 +341,9 @@ def _checked_map_frame(
 
 
 def _largest_scale_error(factors: MetresPerUnit, scales: np.ndarray) -> float:
-    """Return the largest relative error of a map's scale against scales measured on the ground.
+    """Return the largest relative difference between a map's scale and its scale on the ground.
 
-    `scales` (n, 2) are metres per unit eastwards and northwards at n points.
+    `scales` (n, 2) are metres on the ground per unit eastwards and northwards at n points.
     """
     return float(np.abs(np.array(factors) / scales - 1).max())
 

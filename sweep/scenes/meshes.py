@@ -26,17 +26,20 @@ IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
 """Quaternion (w, x, y, z) of no rotation."""
 
 _RELATIVE_AREA_ROUNDING = 1e-12
-"""Largest length that rounding gives to the normal of a face without area.
+"""Largest length of a triangle's normal that rounding alone can give to a triangle without area.
 
 The normal is the cross product of two edges. The length is relative to the product of the edges'
 lengths.
 """
 
 _Y_UP_FORMATS = {".glb", ".gltf"}
-"""Formats with a vertical y axis by their specification. All others are taken to have z up."""
+"""Suffixes of mesh formats whose specification has a vertical y axis.
+
+All other formats are taken to have a vertical z axis.
+"""
 
 _TRIANGLES_ONLY_FORMATS = {".stl", *_Y_UP_FORMATS}
-"""Formats that hold triangles only."""
+"""Suffixes of mesh formats that hold no polygons but triangles."""
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".off", ".gltf", ".glb")
 """Suffixes of the mesh formats that can be read, without archives.
@@ -54,7 +57,7 @@ MESH_FACES_MAX = 100_000_000
 """Maximum number of triangles of a mesh file."""
 
 _MEMORY_PER_FILE_BYTE = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
-"""Upper bound of the memory for reading and preparing a mesh, per byte of its file, by suffix."""
+"""Upper bound of the memory needed to read a mesh, in bytes per byte of its file, by suffix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +179,7 @@ _REPAIR_TEXT_BY_COUNT = {
     "n_merged_vertices": "{} coincident vertices merged",
     "n_unreferenced_vertices": "{} unused vertices dropped",
 }
-"""Templates of the texts about repairs, by field of `MeshCleaningReport`."""
+"""Texts about repairs of a mesh, with a place for the number, by field of `MeshCleaningReport`."""
 
 
 @dataclass(frozen=True)
@@ -465,7 +468,7 @@ _STL_HEADER_STRUCT = struct.Struct("<80sI")
 _STL_TRIANGLE_BYTES = 50
 """Bytes per triangle of a binary STL."""
 _STL_PROBE_BYTES = 1000
-"""Number of first bytes of an STL file that show whether it is text or binary."""
+"""Number of bytes at the start of an STL file by which text and binary files are told apart."""
 
 
 def _check_stl(path: Path) -> None:
@@ -537,7 +540,7 @@ def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
 
 
 def _metres_per_unit(path: Path, unit: str | None) -> float:
-    """Return how many metres a unit of length has; 1 if no unit is given."""
+    """Return the length of a unit [m]; 1 if no unit is given."""
     if unit is None:
         return 1.0
     try:

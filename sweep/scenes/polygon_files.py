@@ -12,7 +12,7 @@ import numpy as np
 from sweep.scenes.polygons import Polygons
 
 _PLY_INDEX_PROPERTIES = ("vertex_indices", "vertex_index")
-"""Names of the PLY property with the vertex indices of a face."""
+"""Names that PLY files use for the list of vertex indices of a face."""
 
 
 def read_polygon_file(path: Path) -> Polygons:

@@ -15,19 +15,29 @@ from typing import NamedTuple
 import numpy as np
 
 NON_PLANARITY_REPORTED_MIN = 1e-3
-"""Departure of a polygon from its mean plane that is reported [square root of its area]."""
+"""Distance of a polygon's corner from its mean plane that is reported.
+
+It is relative to the square root of the polygon's area.
+"""
 
 NON_PLANARITY_MAX = 0.25
-"""Departure of a polygon from its mean plane above which it is refused [square root of its area].
+"""Distance of a polygon's corner from its mean plane above which the polygon is refused.
 
-The surface of such a polygon is not determined by its corners.
+It is relative to the square root of the polygon's area. The corners of such a polygon do not
+determine its surface.
 """
 
 _RELATIVE_AREA_ROUNDING = 1e-12
-"""Largest area that rounding gives to a polygon without area, over the square of its extent."""
+"""Largest area that rounding alone can give to a polygon without area.
+
+It is relative to the square of the polygon's extent.
+"""
 
 _AREA_SUM_TOLERANCE = 1e-9
-"""Largest relative difference by rounding between a polygon's area and the sum of its triangles."""
+"""Largest relative difference between a polygon's area and the sum of its triangles' areas.
+
+Larger differences do not come from rounding, and the polygon is refused.
+"""
 
 
 class PolygonError(ValueError):
@@ -179,7 +189,7 @@ class _FlatPolygons(NamedTuple):
     area: np.ndarray
     """Areas (m,) of the polygons."""
     non_planarity: np.ndarray
-    """Largest departures (m,) of corners from the mean plane, over the square root of the area."""
+    """Largest distance (m,) of a corner from the mean plane, over the square root of the area."""
     is_convex: np.ndarray
     """Mask (m,) of the strictly convex polygons."""
     is_empty: np.ndarray
@@ -293,7 +303,7 @@ def _triangulate_by_earcut(
 
 
 _EDGE_POINT_PAIRS_MAX = 1 << 22
-"""Maximum number of pairs of an edge and a point in one batch of winding numbers."""
+"""Maximum number of pairs of an edge and a point for which winding numbers are computed at once."""
 
 
 def _polygon_winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:

@@ -28,10 +28,10 @@ from sweep.scenes.scene_files import SceneError, require_file, require_memory
 from sweep.scenes.terrain import AreaBounds, Terrain
 
 GRID_CELLS_MAX = 50_000_000
-"""Maximum number of heights of a terrain, which make 100 million triangles."""
+"""Maximum number of heights of a terrain. Each makes about two triangles."""
 
 RASTER_FILE_CELLS_MAX = 1_000_000_000
-"""Maximum number of heights in a raster file, all of which are read for the file's digest."""
+"""Maximum number of heights in a raster file. All of them are read to compute the file's digest."""
 
 TRIANGULATION_BYTES_PER_CELL = 220
 """Upper bound of the memory per height for building triangles and their ray-casting tree [bytes].
@@ -40,7 +40,7 @@ It was measured.
 """
 
 _READ_STRIP_CELLS = 1 << 22
-"""Number of heights that are read from a file at a time."""
+"""Number of heights that are read from a raster file at once."""
 
 _GDAL_OFFLINE_OPTIONS = {
     "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none",
@@ -60,7 +60,10 @@ _GDAL_DRIVERS = (
 """GDAL drivers of the raster formats that can be read: local files without references to others."""
 
 _IMAGE_FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
-"""Formats of grey images that can be read; readers of other formats may run programs."""
+"""Formats of grey images that can be read.
+
+Readers of other formats may run programs.
+"""
 
 _VRT_BYTES_MAX = 1 << 26
 """Maximum size of a virtual raster's file [bytes]."""
@@ -237,9 +240,9 @@ def open_raster(path: Path) -> Iterator[Any]:
 
 
 def _require_block_memory(path: Path, raster: Any) -> None:
-    """Raise `SceneError` if a block of a raster does not fit into the free memory.
+    """Raise `SceneError` if a block of a raster file does not fit into the free memory.
 
-    A block is the part of a file that is decompressed at a time.
+    A block is the part of a file that is decompressed at once.
     """
     for (rows, columns), dtype in zip(raster.block_shapes, raster.dtypes, strict=True):
         bytes_needed = 2 * rows * columns * np.dtype(dtype).itemsize

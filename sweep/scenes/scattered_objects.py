@@ -49,17 +49,18 @@ class MinimumOfPowerLaws:
 
 
 LUNAR_CRATER_EQUILIBRIUM_LAW = (10**-1.1, 2.0)
-"""Coefficient and exponent of the size-frequency law of old craters on the Moon, per m^2.
+"""Coefficient and exponent of the number of old craters on the Moon per m^2 above a diameter.
 
-In equilibrium new craters destroy as many old ones. Trask gives ``N = 10**10.9 D**-2`` per 10^6
-km^2, with D in metres: Ranger VIII and IX, part II, JPL Technical Report 32-800 (1966).
+In equilibrium new craters destroy as many old ones. Trask gives the number per 10^6 km^2 as
+``10**10.9 D**-2``, with the diameter D in metres: Ranger VIII and IX, part II, JPL Technical Report
+32-800 (1966).
 """
 
 CRATER_PRODUCTION_EXPONENT = 2.8
-"""Exponent of the size-frequency law of young craters of 1 to 100 m.
+"""Exponent by which the number of young craters of 1 to 100 m falls with their diameter.
 
-Young craters have not yet worn each other down. Moore, Boyce and Hahn, The Moon and the
-Planets 23, 231 (1980): "near 2.8".
+Young craters have not yet worn each other down. Moore, Boyce and Hahn, The Moon and the Planets 23,
+231 (1980): "near 2.8".
 """
 
 
@@ -96,8 +97,8 @@ class MartianRockLaw:
     -----
     The fraction of the ground under rocks of at least diameter D (in metres) is
     ``F(D) = k exp(-q D)`` with ``q = 1.79 + 0.152/k`` [1]_. A rock covers ``pi D^2 / 4``, so that
-    the number per area is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The fraction k under
-    rocks of any size is 0.02 to 0.2 at the landing sites.
+    the number per area is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``, with the exponential
+    integral E1. The fraction k under rocks of any size is 0.02 to 0.2 at the landing sites.
 
     References
     ----------
@@ -105,11 +106,14 @@ class MartianRockLaw:
     """
 
     area_fraction: float
-    """Fraction k of the ground under rocks of any size."""
+    """Fraction of the ground that rocks of all sizes cover."""
 
     @property
     def decay_rate(self) -> float:
-        """Decay rate q of the covered area with the diameter [1/m]."""
+        """Rate at which the covered fraction falls with the smallest diameter counted [1/m].
+
+        The fraction is proportional to the exponential of minus this rate times the diameter.
+        """
         return 1.79 + 0.152 / self.area_fraction
 
     def cumulative_number_density(self, diameter: np.ndarray) -> np.ndarray:
@@ -215,9 +219,9 @@ def draw_positions_and_diameters(
 
 
 EJECTA_CUTOFF_CRATER_RADII = 4.0
-"""Distance from the crater's centre at which its ejecta are cut off [crater radii].
+"""Distance from the crater's centre beyond which the model has no ejecta [crater radii].
 
-The ejecta are 1/64 as high there as at the rim.
+At this distance the ejecta are 1/64 as high as at the rim.
 """
 
 
@@ -537,7 +541,8 @@ class MeanTreeDimensions:
     -----
     Leaves have random positions and the spherical distribution of leaf angles: every direction of a
     leaf's normal is equally likely. The probability of a gap along a ray is therefore Beer's law
-    ``exp(-G * density * path)`` with ``G = 1/2`` [1]_ [2]_.
+    ``exp(-G * density * path)``. The density is that of leaf area per volume, and ``G = 1/2`` is
+    the mean area of a leaf across the ray over its own area [1]_ [2]_.
 
     References
     ----------
@@ -562,7 +567,7 @@ class MeanTreeDimensions:
     variation: float = 0.25
     """Largest relative deviation of a tree's size from the mean size.
 
-    Sizes are uniformly distributed up to this deviation.
+    Sizes are uniformly distributed up to this deviation on both sides.
     """
 
     def __post_init__(self) -> None:
@@ -582,7 +587,7 @@ class MeanTreeDimensions:
 
 
 LEAF_SURFACE, TRUNK_SURFACE = 0, 1
-"""Surface numbers of the leaves and trunks of trees."""
+"""Numbers of the surfaces of trees: of leaves and of trunks."""
 
 
 def draw_tree_clump(

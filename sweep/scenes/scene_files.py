@@ -170,7 +170,7 @@ _EXAMPLE_WAYPOINT_HEADER = "time [s], x [m], y [m], z [m], heading [deg], pitch 
 
 
 NumberedRow = tuple[int, list[str]]
-"""Line number and cells of a row of a CSV file."""
+"""Line number and texts of the cells of a row of a CSV file."""
 
 
 class WaypointTable(NamedTuple):
@@ -313,7 +313,7 @@ def read_csv_columns(
 
 
 _MISTAKES_SHOWN_MAX = 10
-"""Maximum number of mistakes in a file that an error lists; it states the number of the others."""
+"""Maximum number of mistakes in a file that an error message lists. The others are only counted."""
 
 
 def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
@@ -344,7 +344,7 @@ def _exact_times(rows: Sequence[NumberedRow], factors: Mapping[str, float]) -> l
 
 
 _DECIMAL_TIME_DIGITS = 60
-"""Number of significant digits of times in decimal arithmetic."""
+"""Number of significant digits with which times of a table are computed."""
 
 
 def _time_order_error(

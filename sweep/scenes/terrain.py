@@ -22,10 +22,13 @@ from sweep.scenes.map_frames import MapFrame
 from sweep.scenes.meshes import Facets
 
 _NEGATIVE_VARIANCE_FRACTION_MAX = 1e-6
-"""Largest negative part of a power spectrum that rounding may cause, over the total variance."""
+"""Largest sum of negative values in a power spectrum of relief, relative to the total variance.
+
+Rounding may cause it. A larger sum means that the covariance is not valid.
+"""
 
 _COVARIANCE_BATCH_NODES = 1 << 20
-"""Number of grid nodes whose covariance is computed at a time."""
+"""Number of grid nodes at which the covariance of random relief is computed at once."""
 
 AreaBounds = tuple[float, float, float, float]
 """Smallest x, smallest y, largest x and largest y of an area in world coordinates [m]."""
@@ -365,9 +368,9 @@ def draw_fractal_relief(
 
 
 def _stein_covariance(alpha: float):  # type: ignore[no-untyped-def]  # returns a function with the constants
-    """Return the covariance of Stein's method for fractal relief with the Hurst exponent alpha / 2.
+    """Return the covariance of Stein's method for fractal relief.
 
-    Distances are in units of the grid's diagonal.
+    `alpha` is twice the Hurst exponent. Distances are in units of the grid's diagonal.
 
     Returns
     -------

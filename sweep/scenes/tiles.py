@@ -23,10 +23,10 @@ import numpy as np
 from sweep.scenes.terrain import Terrain
 
 _ALIGNMENT_TOLERANCE_CELLS = 1e-3
-"""Offset of two grids from a whole number of cells up to which they count as one grid [cells]."""
+"""Largest deviation from whole cells of the offset of two grids that count as one [cells]."""
 
 _ADJACENT_GAP_MAX_CELLS = 2.0
-"""Gap up to which two grids count as adjacent [cells of the coarser grid]."""
+"""Largest gap between two grids that count as adjacent [cells of the coarser grid]."""
 
 
 def extend_tiles_to_neighbours(

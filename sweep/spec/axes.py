@@ -1,7 +1,7 @@
-"""Axes of a study: the parameters that vary and their values.
+"""Axes of a study: the parameters that vary, and their values.
 
 `read_axes` reads the ``axes`` section of a spec. A plain axis varies one parameter; a zipped axis
-varies several parameters together. The grid of a study is the product of its axes.
+varies several parameters together. The grid of a study has every combination of values of its axes.
 """
 
 from __future__ import annotations
@@ -39,10 +39,16 @@ from sweep.spec.sections import (
 from sweep.units import QuantityError, Unit
 
 RESERVED_DIMENSIONS = ("batch", "draw", "point", "spec", "study_id")
-"""Names of dimensions that a store may have in addition to its axes."""
+"""Names of dimensions that a store may have in addition to the axes.
+
+No axis may have such a name.
+"""
 
 _STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
-"""Pattern of the name of the coordinate that marks which points of a dataset a study has."""
+"""Pattern of coordinate names that no axis may have.
+
+A coordinate with such a name marks the study from which a dataset's points come.
+"""
 
 _AXIS_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 """Pattern of the name of a zipped axis."""
@@ -54,7 +60,7 @@ _AXIS_NAME_REMEDY = "take a word such as 'cut'"
 
 @dataclass(frozen=True, eq=False)
 class AxisParameter:
-    """One parameter that varies along an axis, with its values."""
+    """One parameter that varies along an axis, with its values along the axis."""
 
     path: str
     """Dotted path of the parameter, such as ``target.range``."""
@@ -71,7 +77,7 @@ class AxisParameter:
 
 @dataclass(frozen=True)
 class Axis:
-    """One dimension of a study's grid."""
+    """One dimension of a study's grid, along which one parameter or several vary."""
 
     name: str
     """Name of the dimension in the store."""
@@ -90,7 +96,7 @@ class Axis:
 
 
 def axis_identity(axis: Axis) -> dict[str, Any]:
-    """Return an axis as data for the study's identity.
+    """Return the content of an axis that counts for the study's identity (equality of two studies).
 
     An axis of at most 64 values is listed value by value. A longer axis is given by the number of
     its values, the first and last value, and a digest of all values.
@@ -114,7 +120,7 @@ def axis_identity(axis: Axis) -> dict[str, Any]:
 
 
 def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
-    """Return one parameter along an axis as data for the study's identity."""
+    """Return the content of one parameter along an axis that counts for the study's identity."""
     n_values, has_words = len(parameter.values), isinstance(parameter.values, tuple)
     if n_values <= _VALUES_LISTED_IN_IDENTITY_MAX:
         return {
@@ -210,9 +216,10 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
-    """Return path and values, as written, of each parameter of an axis.
+    """Return the dotted path and the written values of each parameter of an axis.
 
-    A zipped axis has one such pair for each parameter of each piece.
+    A zipped axis consists of pieces, parts one after the other. It has one pair for each parameter
+    of each piece.
     """
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
         return [(key, raw_axis)]
@@ -295,7 +302,7 @@ def _axis_path_problem_and_remedy(path: str) -> tuple[str, str]:
 
 
 def _make_axis_parameter(path: str, pieces: list[AxisPiece], location: Location) -> AxisParameter:
-    """Concatenate pieces of values into one parameter along an axis."""
+    """Join pieces of values, the parts of an axis, into one parameter along the axis."""
     name = parameter_short_name(path)
     n_values = _number_of_values(pieces)
     if n_values > AXIS_VALUES_MAX:
@@ -334,7 +341,10 @@ def _check_duplicates(parameter: AxisParameter, location: Location) -> None:
 
 
 def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
-    """Read a zipped axis; every piece must set the same parameters."""
+    """Read a zipped axis, along which several parameters vary together.
+
+    It is written in pieces, one after the other. Every piece must set the same parameters.
+    """
     findings = Findings(
         Finding((*location, str(other)), "is no part of a zipped axis", "write {zip: [...]}")
         for other in raw_axis
@@ -408,7 +418,7 @@ def _read_zipped_piece(raw_piece: object, location: Location) -> dict[str, list[
 
 
 def _number_of_values(pieces: list[AxisPiece]) -> int:
-    """Return the total number of values in a list of pieces."""
+    """Return the total number of values in a list of pieces, the parts of an axis."""
     return sum(len(piece.si_values) for piece in pieces)
 
 
@@ -416,7 +426,7 @@ def _number_of_values(pieces: list[AxisPiece]) -> int:
 
 
 def _name_coordinates(axes: list[Axis]) -> list[Axis]:
-    """Return the axes with each coordinate named by the shortest unambiguous tail of its path."""
+    """Return the axes with a name for each coordinate: the shortest unambiguous end of its path."""
     paths = [parameter.path for axis in axes for parameter in axis.parameters]
     named_axes = []
     for axis in axes:
@@ -430,9 +440,9 @@ def _name_coordinates(axes: list[Axis]) -> list[Axis]:
 
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
-    """Return the shortest tail of a dotted path that identifies a parameter, joined by underscores.
+    """Return the shortest last part of a dotted path that identifies a parameter, with underscores.
 
-    No other path ends with this tail, and no variable of a store has this name.
+    No other path ends with this part, and no variable of a store has this name.
     """
     keys, *other_keys = (
         parameter_path.removesuffix(".kind").split(".")
@@ -495,9 +505,9 @@ _GENERATOR_FORMS = {
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
-"""Generators of values by keyword, with the form in which each is written."""
+"""Generators of values along an axis, by keyword, with an example of how each is written."""
 _NUMPY_ALIASES = {"linspace": "linear", "geomspace": "log", "logspace": "log", "arange": "step"}
-"""Keyword of the generator that corresponds to a function of NumPy, by the function's name."""
+"""Keyword of the generator that does what a function of NumPy does, by the function's name."""
 _NUMBER_OF_VALUES_RULE = NumericRule(
     description="", example="10", at_least="2", at_most=str(AXIS_VALUES_MAX), is_integer=True
 )
@@ -508,17 +518,17 @@ _NUMBER_OF_VALUES_RULE = NumericRule(
 
 @dataclass(frozen=True)
 class Progression:
-    """Exact arithmetic progression ``start + increment * i`` for ``i = 0 .. number - 1``."""
+    """Arithmetic progression ``start + increment * i``, i = 0 to number - 1, in exact numbers."""
 
     start: Fraction
     """First value."""
     increment: Fraction = Fraction(0)
-    """Difference of consecutive values."""
+    """Difference between a value and the one before it."""
     number: int = 1
     """Number of values."""
 
     def apply_affine_transform(self, factor: Fraction, offset: Fraction) -> Progression:
-        """Return the progression of ``factor * value + offset``."""
+        """Return the progression whose values are ``factor * value + offset``."""
         return Progression(self.start * factor + offset, self.increment * factor, self.number)
 
     def values(self) -> np.ndarray:
@@ -596,14 +606,14 @@ def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
 
 @dataclass(frozen=True)
 class AxisPiece:
-    """Values of one piece of an axis: a single value or a generator."""
+    """One part of the values along an axis: a single value, or the values of a generator."""
 
     si_values: np.ndarray
-    """Values (n,) in SI units, or words."""
+    """Values (n,) in SI units; words for parameters that take words."""
     unit: Unit
     """Unit in which the values were written; ``Unit("")`` for words."""
     progression: Progression | None = None
-    """Exact values in `unit`; None if they are not an arithmetic progression."""
+    """Exact values in `unit`, if they are an arithmetic progression; else None."""
 
     def to_unit(self, unit: Unit) -> np.ndarray:
         """Return the values (n,) in a unit."""
@@ -783,9 +793,9 @@ def _read_bounds(
 
 
 def _step_progression(bounds: list[Fraction], location: Location) -> Progression:
-    """Return the progression of a step generator, whose bounds are first, last and step.
+    """Return the values of a step generator, whose bounds are first value, last value and step.
 
-    It includes the last value if a whole number of steps leads to it.
+    The last value is included if a whole number of steps leads to it.
     """
     first, last, step = bounds
     if step == 0:
@@ -826,7 +836,8 @@ def _geometric_values(
 ) -> AxisPiece:
     """Return `number` values with a constant ratio, from the first to the second bound.
 
-    The ratio is constant in SI units, so that the unit of the bounds does not matter.
+    The ratio is constant in SI units, so that the unit in which the bounds are written does not
+    matter.
     """
     if unit.is_logarithmic:
         remedy = f"write {_GENERATOR_FORMS['linear']}"

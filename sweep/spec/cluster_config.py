@@ -29,7 +29,7 @@ from sweep.units import QuantityError
 LOOPBACK_ADDRESS = "127.0.0.1"
 """Address at which a service accepts connections from its own machine alone."""
 NO_DASHBOARD, DASHBOARD_PORT = "none", 8787
-"""Value for no dashboard, and the usual port of Dask's dashboard."""
+"""Value of the dashboard's port that means no dashboard, and the usual port of Dask's dashboard."""
 _WORKER_COUNT_RULE = NumericRule(
     description="Workers", example="8", at_least="1", at_most="100000", is_integer=True
 )
@@ -87,9 +87,9 @@ _SINGLE_LINE_RULE_ARGUMENTS = {
     "pattern": r"[^\n\r\0]{1,2000}",
     "remedy": "write one line",
 }
-"""Arguments of `TextRule` for a text of one line."""
+"""Keyword arguments of `TextRule` for a text that must be a single line."""
 _LIST_TEXTS_MAX = 100_000
-"""Maximum number of texts in a list."""
+"""Maximum number of texts in a list of a cluster's configuration."""
 _MEMORY_FIELD_ARGUMENTS = ("byte", "4 GB", "64 MB", "100 TB")
 """Arguments of `declare.quantity_field` for an amount of memory: unit, example, and bounds."""
 
@@ -428,7 +428,7 @@ def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
 def _scheduler_findings(scheduler: SchedulerConfig, *, is_remote: bool) -> Iterator[Finding]:
     """Yield mistakes in the address of the scheduler.
 
-    `is_remote` is True for workers on other machines, which need an address.
+    `is_remote` is True if workers are on other machines. The scheduler then needs an address.
     """
     if scheduler.host and scheduler.interface:
         yield Finding(("scheduler",), "has both a host and an interface", "keep one of them")

@@ -16,9 +16,9 @@ from sweep.spec.sections import MODEL_BY_SECTION
 from sweep.units import read_unit
 
 LISTED_VALUES_MAX = 8
-"""Maximum number of values that a list shows in full."""
+"""Largest number of values of a field that a line of differences lists in full."""
 SHOWN_CHARACTERS_MAX = 200
-"""Maximum number of characters of a text that are shown."""
+"""Largest number of characters of a text that a line of differences shows."""
 SCENE_SECTION_MODELS: spec_fields.ModelClasses = (
     Scene,
     Platform,
@@ -73,7 +73,10 @@ def describe_differences(a: Any, b: Any) -> list[str]:
 
 
 def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of an identity by dotted path; all values of an axis are one entry."""
+    """Return the entries of a study's identity by dotted path. All values of an axis are one entry.
+
+    The identity is the content by which two studies are the same or not.
+    """
     leaves: dict[str, Any] = dict(identity.get("parameters", {}))
     for key, value in identity.items():
         if key == "axes":

@@ -33,9 +33,9 @@ from sweep.spec.rules import (
 )
 
 AUTO, ON, OFF = EFFECT_MODES
-"""Modes of an effect: simulated if the tolerance requires it, always, or never."""
+"""Modes of an effect: simulated only where the tolerance requires it, always, or never."""
 ModelClasses = tuple[type[BaseModel], ...]
-"""Pydantic models, one of which validates a value."""
+"""Pydantic models (sections of a spec) as one of which a value is validated."""
 KeyPath = tuple[str, ...]
 """Keys that lead to a value in a spec: the names of the sections around it and of its field."""
 SectionT = TypeVar("SectionT", bound=BaseModel)
@@ -62,7 +62,7 @@ _SIGNED_QUANTITY_MAX = {
     "rad/s": "1e6 deg/s",
     "": "1e12",
 }
-"""Default bound on the magnitude of a signed quantity, by the quantity's SI unit."""
+"""Largest magnitude of a quantity of either sign, unless its field has bounds, by SI unit."""
 
 
 def field_with_rule(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
@@ -388,7 +388,7 @@ def yaml_name(name: str, field: Any) -> str:
 
 
 def fields_by_name(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the fields of a model by their names in a spec."""
+    """Return the fields of a model (section) by the names that they have in a spec."""
     return {yaml_name(name, field): field for name, field in model.model_fields.items()}
 
 
@@ -577,7 +577,7 @@ def set_if_absent(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
 
 
 def to_canonical(value: Any) -> Any:
-    """Return the canonical form of data, in which equal data has equal JSON text.
+    """Return data in a form in which equal data has equal JSON text.
 
     Floats without a fraction below 2**53 become integers, keys are sorted, and tuples become lists.
     """
@@ -591,7 +591,10 @@ def to_canonical(value: Any) -> Any:
 
 
 def identity_digest(identity: Mapping[str, Any]) -> str:
-    """Return the hash of an identity: BLAKE2b of its canonical JSON, 32 hexadecimal digits."""
+    """Return the hash of a study's identity, the content by which studies are the same or not.
+
+    It is BLAKE2b of the canonical JSON text, 32 hexadecimal digits.
+    """
     text = json.dumps(
         to_canonical(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
     )
@@ -610,8 +613,10 @@ class SpecFiles:
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Digest of each file's content, by the file's path as written in the spec."""
     time_origin: Decimal = Decimal(0)
-    """Time of the flight's start in the tables of waypoints [s]: the first time in the platform's
-    table."""
+    """Time in the tables of waypoints at which the flight begins [s].
+
+    It is the first time in the platform's table.
+    """
 
     def resolve(self, raw_path: str, digest_of: Callable[[Path], str] = file_digest) -> Path:
         """Return the path of a file, with ``~`` as the user's home folder.

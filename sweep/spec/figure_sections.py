@@ -22,11 +22,11 @@ from sweep.spec.sections import SPECTRA_METHOD, parameter_rules
 from sweep.units import QuantityError, read_number
 
 CoordinateSelection = str | int | float | tuple[str | int | float, ...]
-"""One value or several values of a coordinate, as written."""
+"""One value, or several values, of a coordinate, as written in a spec."""
 PublishedNumbers = tuple[Any, ...]
-"""Numbers as published, in nested tuples."""
+"""Numbers from a publication for comparison, in nested tuples of SI values."""
 CropLimits = tuple[float, ...]
-"""Lower and upper limit of a scene's coordinate [m], or of time [s]."""
+"""Lower and upper limit of a scene's coordinate [m], or of time [s], that a figure shows."""
 
 
 def _read_coordinate_selection(raw_value: object) -> dict[str, CoordinateSelection]:
@@ -115,7 +115,10 @@ class FigureBase(SpecSection):
     """Base of all figures and tables."""
 
     FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ("kind",)
-    """Names of the fields whose values make up the file name; other entries are used literally."""
+    """Names of the fields whose values make up the file name.
+
+    Entries that name no field are used as they are.
+    """
 
     name: str = declare.text_field(
         "Stem of the picture's file name",
@@ -127,7 +130,7 @@ class FigureBase(SpecSection):
 
     @property
     def file_stem(self) -> str:
-        """Stem of the picture's file name: `name`, else the values of `FILE_NAME_PARTS`."""
+        """File name of the picture without suffix: `name`, or the values of `FILE_NAME_PARTS`."""
         words = [
             getattr(self, name_part, name_part) for name_part in (*self.FILE_NAME_PARTS, "kind")
         ]
@@ -233,10 +236,13 @@ FIGURE_QUANTITIES = (
     *(name for name, output in _FIGURE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
-"""Quantities of shots and of points that a figure can show."""
+"""Names of the quantities of shots and of points that a scene's figure can show."""
 
 SEVERAL_SURFACES_KEYWORD = "several_surfaces"
-"""Keyword for the first shot whose footprint has several surfaces, in place of a shot's number."""
+"""Word that may replace a shot's number in a figure.
+
+It selects the first shot whose footprint has several surfaces.
+"""
 _VIEW_DIRECTION_RULE = ChoiceRule(
     description="Direction from which the cloud is seen",
     options=("oblique", "above", "side", "front"),
@@ -390,10 +396,10 @@ SceneFigure = Annotated[
 # Checks of figures
 
 _COORDINATE_FIELDS = ("x", "y", "by", "rows", "columns")
-"""Fields of a grid's figure that hold the name of a coordinate."""
+"""Fields of a grid's figure whose value is the name of a coordinate."""
 
 NAVIGATION_SHOTS_MIN = 3
-"""Minimum number of shots per cycle for a navigation solution."""
+"""Minimum number of shots in a measurement cycle from which a velocity can be computed."""
 
 
 def grid_figure_findings(
@@ -546,7 +552,10 @@ def _figure_variable_findings(
 
 
 def _spectra_variable_findings(figure: Any, location: Location) -> Iterator[Finding]:
-    """Yield a finding if a figure shows a closed form: studies of whole spectra store none."""
+    """Yield a finding if a figure shows a closed-form result that the study does not store.
+
+    Studies that draw whole spectra store no such results.
+    """
     stored_variables = (
         outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
     )
@@ -595,7 +604,10 @@ def _figure_scanner_findings(
 
 
 def _allows_navigation(raw_scanner: object) -> bool:
-    """Return True if a scanner has enough shots per cycle for navigation, or can't be read."""
+    """Return True if a scanner has enough shots per cycle to compute a velocity.
+
+    The result is also True if the scanner can't be read.
+    """
     scanner = validate_or_none(AnyScanner, raw_scanner)
     try:
         return scanner is None or shots_per_cycle(scanner.build_pattern()) >= NAVIGATION_SHOTS_MIN

@@ -21,7 +21,7 @@ from sweep.spec.rules import JsonObject, ListRule, Rule, read_element
 from sweep.units import QuantityError
 
 Vector = tuple[float, ...]
-"""Components of a vector in SI units."""
+"""Components of a vector along x, y and z, in SI units."""
 TimeSpan = tuple[float, float]
 """Start and stop of a time interval [s]."""
 
@@ -284,7 +284,7 @@ class Platform(RigidMotion):
     )  # fmt: skip
 
     def read_time_origin(self, files: SpecFiles) -> Decimal:
-        """Return the time of the flight's start in the tables of waypoints [s], exactly.
+        """Return the exact time in the tables of waypoints at which the flight begins [s].
 
         This is the first time of the path's table, or 0 if the path is not given by a table.
         """
@@ -326,19 +326,19 @@ class Platform(RigidMotion):
 # Scan patterns
 
 BEAMS_MAX = 10_000
-"""Maximum number of beams of a scanner, and of directions along each side of a raster."""
+"""Maximum number of beams of a scanner; also of directions along each side of a raster scan."""
 STEERING_ANGLES_RULE = ListRule(
     description="Angles of a beam towards forward and towards the left",
     element_rule=declare.quantity_rule("Angle from nadir", "rad", "22.5 deg", "-89 deg", "89 deg"),
     length_min=2,
     length_max=2,
 )
-"""Rule of a beam given by two steering angles [rad]."""
+"""Rule of a beam's direction that is given by two steering angles [rad]."""
 _DIRECTION_VECTOR_RULE = ListRule(
     description="Direction of a beam in the body frame",
     element_rule=declare.quantity_rule("Component", "", "-1", "-1e9", "1e9"),
 )
-"""Rule of a beam given by the three components of its direction in the body frame."""
+"""Rule of a beam's direction that is given by three components in the body frame."""
 
 
 class BeamDirectionsRule(Rule):
@@ -373,7 +373,7 @@ def beam_rule(beam: object) -> ListRule:
 
 
 _NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
-"""Smallest and largest angle between a beam and nadir."""
+"""Smallest and largest angle between a beam and the downward vertical (nadir), with units."""
 _CYCLE_RATE_FIELD = declare.frequency_field("Measurement cycles a second")
 _INTERVAL_FIELD_ZERO_BY_DEFAULT = declare.duration_field(
     "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0

@@ -56,16 +56,22 @@ FULL_SCALE_PATH = "instrument.processing.full_scale"
 DETECTION_PATH = "instrument.processing.detection"
 BINS_COUNTED_PATH = "instrument.processing.bins_counted"
 LINE_WIDTH_PATH, LINE_SHAPE_PATH = "instrument.laser.line_width", "instrument.laser.line_shape"
-"""Paths of the width and the shape of the laser's line."""
+"""Dotted paths of the parameters for width and shape of the laser's spectral line."""
 ROUGHNESS_PATH = "target.roughness"
 TRAINING_PATH, GUARD_PATH, RANK_PATH = (
     DETECTOR_PREFIX + name for name in ("training", "guard", "rank")
 )
-"""Paths of the cells of a CFAR detector."""
+"""Dotted paths of the parameters of CFAR detectors: training cells, guard cells and rank.
+
+Such a detector compares a bin with the noise in neighbouring bins, its training cells.
+"""
 
 _WINDOW_TRIAL_SAMPLES_MAX = 16
-"""Maximum number of samples of a trial window. `WindowFunctionRule` tests names with as many
-samples, and a window that exists with so many exists with more."""
+"""Maximum number of samples at which a window function is tried.
+
+`WindowFunctionRule` tests names with as many samples. A window that exists with so many samples
+exists with more.
+"""
 _SPECTRUM_BINS_MIN = 8
 """Minimum number of bins of a spectrum for detectors that examine the whole spectrum."""
 
@@ -75,14 +81,16 @@ ValueCondition = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class GridValues:
-    """Parameter values of a study's grid, as far as they can be read from the spec.
+    """Values of the parameters over a study's grid, as far as they can be read from the spec.
 
     Axes vary independently of each other; the parameters of one axis vary together.
     """
 
     values: Mapping[str, Any]
-    """SI values of the parameters by dotted path; for a parameter on an axis the value of its
-    field, which `axes` overrides."""
+    """SI values of the parameters by dotted path.
+
+    For a parameter on an axis it is the value of its field, which `axes` overrides.
+    """
     axes: tuple[Axis, ...] = ()
     """Axes of the study."""
     effect_modes: Mapping[str, str] = field(default_factory=dict)
@@ -241,9 +249,12 @@ ECHO_TIME_PATHS = (
     SAMPLE_RATE_PATH,
     FFT_SIZE_PATH,
 )
-"""Parameters that determine when a record ends and when its echo arrives."""
+"""Dotted paths of the parameters that determine when a record ends and when its echo arrives."""
 _ECHO_TIME_POINTS_MAX = 10**7
-"""Maximum number of points of the grid of `ECHO_TIME_PATHS`; a larger grid is not checked."""
+"""Maximum number of combinations of `ECHO_TIME_PATHS` values at which echo times are checked.
+
+Grids with more combinations are not checked.
+"""
 
 
 def _echo_time_findings(grid: GridValues) -> Iterator[Finding]:
@@ -280,7 +291,7 @@ def _echo_time_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 class _EchoLateness(NamedTuple):
-    """Smallest times over a grid from the ends of chirp and record to the echo's arrival [s].
+    """Smallest times, over a grid, from the end of chirp or record to the echo's arrival [s].
 
     Negative values mean that the echo arrives before the end.
     """
@@ -288,8 +299,10 @@ class _EchoLateness(NamedTuple):
     after_chirp_end: float
     """Time from the end of the chirp to the echo's arrival [s]."""
     after_record_end: float
-    """Time from the end of the record to the echo's arrival [s]; from the end of the chirp if the
-    effect `overlap` is off."""
+    """Time from the end of the record to the echo's arrival [s].
+
+    If the effect `overlap` is off, it is the time from the end of the chirp.
+    """
 
 
 def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
@@ -384,7 +397,11 @@ def _window_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _responsivity_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if the responsivity exceeds one electron per photon, q lambda / (h c)."""
+    """Yield a finding if the detector's responsivity exceeds one electron per photon.
+
+    That limit is q lambda / (h c) [A/W], with the elementary charge q, wavelength lambda, Planck's
+    constant h and the speed of light c.
+    """
     responsivity_per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
     least_margin = _least_weighted_sum(
         grid, {beam.WAVELENGTH_PATH: responsivity_per_metre, RESPONSIVITY_PATH: -1.0}
@@ -422,7 +439,7 @@ _SINGLE_MODE_CONDITIONS = {
     beam.COUPLING_PATH: _condition_equal_to(beam.SINGLE_MODE),
     beam.ARCHITECTURE_PATH: _condition_different_from("direct"),
 }
-"""Conditions of a coherent receiver that couples a single mode."""
+"""Conditions on parameters under which a coherent receiver couples to a single spatial mode."""
 
 
 def _beam_findings(grid: GridValues) -> Iterator[Finding]:
@@ -442,13 +459,11 @@ def _beam_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for beams whose width the aperture or the paraxial limit excludes.
+    """Yield a finding for beams that are narrower or wider than possible.
 
-    Notes
-    -----
-    The narrowest full divergence of an aperture of diameter D is 4 M^2 lambda / (pi D). A waist may
-    be at most the radius of the aperture, and must be so wide that the beam spreads by at most 90
-    deg.
+    Notes ----- The narrowest full divergence of an aperture of diameter D is 4 M^2 lambda / (pi D),
+    with the beam quality M^2 and the wavelength lambda. A waist may be at most the radius of the
+    aperture, and must be so wide that the beam spreads by at most 90 deg.
     """
     remedy = "or set instrument.telescope.coupling: aperture, where all light mixes"
     if narrowest := _narrowest_impossible_beam(grid, _SINGLE_MODE_CONDITIONS):
@@ -502,7 +517,8 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
     Returns
     -------
     str
-        Sentence with the beam's divergence and the limit 4 M^2 lambda / (pi D).
+        Sentence with the beam's divergence and the limit 4 M^2 lambda / (pi D), for beam quality
+        M^2, wavelength lambda and aperture diameter D.
     """
     for conditions in (
         {beam.COUPLING_PATH: _condition_equal_to(beam.APERTURE)},
@@ -544,7 +560,7 @@ def _narrowest_impossible_beam(
 
 
 def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: float) -> float:
-    """Convert the waist [m] of a beam to its divergence [rad], or vice versa by the same law."""
+    """Convert a beam's waist radius [m] to its full divergence [rad], or the reverse."""
     return float(
         beam.divergence_from_waist(
             waist_or_divergence, parameters[beam.WAVELENGTH_PATH], parameters[beam.QUALITY_PATH]
@@ -555,13 +571,19 @@ def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: f
 def _argmax_of_product(
     grid: GridValues, powers: Mapping[str, float], conditions: Mapping[str, ValueCondition]
 ) -> dict[str, float]:
-    """Return the parameters that maximise a product of powers; empty if no point qualifies."""
+    """Return the parameters at which a product of powers of them is largest.
+
+    The result is empty if no point of the grid meets the conditions.
+    """
     terms = {path: partial(_exponent_times_log, -power) for path, power in powers.items()}
     return grid.argmin_of_sum(terms, conditions)
 
 
 def _exponent_times_log(power: float, values: np.ndarray) -> np.ndarray:
-    """Return ``power * log(values)``; infinite where a value is 0."""
+    """Return ``power * log(values)``, a term in the logarithm of a product of powers.
+
+    It is infinite where a value is 0.
+    """
     with np.errstate(divide="ignore"):
         return np.asarray(power * np.log(values))
 
@@ -569,7 +591,10 @@ def _exponent_times_log(power: float, values: np.ndarray) -> np.ndarray:
 # Looks
 
 VOTING_LOOKS_MAX = 64
-"""Maximum number of looks of a shot whose detections are combined by votes."""
+"""Maximum number of looks of a shot whose detections are combined by votes.
+
+A look is one record of each segment (chirp).
+"""
 
 
 def _exceeds_one(number: np.ndarray) -> np.ndarray:
@@ -578,7 +603,7 @@ def _exceeds_one(number: np.ndarray) -> np.ndarray:
 
 
 def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in settings of several looks.
+    """Yield mistakes in the settings of several looks, the repeated records of each segment.
 
     The settings contradict each other, or their detection probability is unknown.
     """
@@ -657,7 +682,10 @@ def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
-    """Yield a finding if draws of noise are requested with a leak line or several looks."""
+    """Yield a finding if noise is to be drawn together with leaked light or several looks.
+
+    Looks are repeated records of each segment.
+    """
     if method != "probabilities" and grid.any_point_meets(
         {circulator_leak.LEAK_LENGTH_PATH: _is_positive}
     ):
@@ -677,10 +705,10 @@ def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
 
 
 def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the search band.
+    """Yield mistakes in the search band, the ranges and velocities in which echoes are searched.
 
-    Its four ends must all be given, or none. Each upper end must exceed the lower one. A band must
-    not be combined with false alarms that are counted in all bins.
+    Its four limits must all be given, or none. Each upper limit must exceed the lower one. A band
+    must not be combined with false alarms that are counted in all bins.
     """
     missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.parameter_values(path).size]
     if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
@@ -819,11 +847,11 @@ EFFECT_PARAMETER_REQUIREMENTS = (
         "set it to 1 au or so",
     ),
 )
-"""Requirements of the parameters of effects on other parameters."""
+"""What parameters of effects require of other parameters: the values that exclude each other."""
 
 
 def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for each effect that is on although its parent effect is off."""
+    """Yield a finding for each effect that is on although an effect that it depends on is off."""
     outer_of_effect = {effect.name: effect.parent for effect in EFFECTS}
     for name, outer in outer_of_effect.items():
         while outer and grid.effect_modes.get(name) == ON:
@@ -964,7 +992,7 @@ def _mode_finding(effect: str, problem: str, remedy: str) -> Finding:
 
 
 def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parameter]]:
-    """Yield each random effect that is not off, with each of its parameters that enables it."""
+    """Yield each random effect that is not off, with each parameter whose value enables it."""
     for effect in EFFECTS:
         if effect.is_random and grid.effect_modes.get(effect.name, OFF) != OFF:
             for parameter in effect.parameters:
@@ -1012,7 +1040,10 @@ def spectrum_method_findings(draws: Draws | SceneDraws, grid: GridValues) -> Ite
 
 
 def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
-    """Return paths of detector and estimator parameters on axes or away from their defaults."""
+    """Return the paths of those detector and estimator parameters that the spec sets.
+
+    They are on axes, or their values differ from the defaults.
+    """
     paths_on_axes = [
         parameter.path
         for axis in grid.axes
@@ -1029,7 +1060,11 @@ def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
 
 
 def _cfar_window_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for odd or too wide CFAR windows, and for ranks beyond the window."""
+    """Yield mistakes in the cells of CFAR detectors, which compare a bin with neighbouring bins.
+
+    The number of training cells is odd, the cells exceed the spectrum, or the rank exceeds the
+    cells.
+    """
     training, guard, rank = (
         grid.parameter_values(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)
     )

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 GRID_STEPS_PER_SIDE_MAX = 7000
 """Maximum number of grid steps along one side of a square."""
 _RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
-"""Uses of random numbers; the index of a use selects its random stream."""
+"""What random numbers are used for. The index of a use selects its stream of random numbers."""
 
 Vector = tuple[float, ...]
-"""Components of a vector in SI units."""
+"""Components of a vector along x, y and z, in SI units."""
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:
@@ -59,7 +59,10 @@ class Material(SpecSection):
 
 
 OPTICAL_FIELDS = tuple(Material.model_fields)
-"""Names of the optical fields of a surface, which do not change where rays hit it."""
+"""Names of the optical fields of a surface, such as its reflectance.
+
+They do not change where rays hit.
+"""
 
 
 class Relief(SpecSection):
@@ -371,7 +374,7 @@ class ImageGround(PlacedGround):
 
 
 def _nodes_per_side(side: float, step: float) -> int:
-    """Return the number of nodes in steps of `step` [m] along a grid of at least `side` [m]."""
+    """Return the number of nodes, `step` [m] apart, of a grid side that is at least `side` [m]."""
     return math.ceil(side / step * (1 - 1e-12)) + 1
 
 

@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
 PFA_SHOT_WARNING_ABOVE = 0.01
-"""False-alarm probability of a shot above which the user is warned."""
+"""Probability that noise raises a false alarm in a shot, above which the user is warned."""
 
 SAMPLED_SETTINGS_MAX = 400
-"""Approximate maximum number of combinations of threshold, FFT size and detector that are
-computed."""
+"""Approximate largest number of settings for which false alarms are computed.
+
+A setting is a combination of threshold, FFT size and detector.
+"""
 
 
 def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]:

@@ -37,16 +37,19 @@ Location = tuple[str | int, ...]
 """Keys and list indices that lead to a value in a spec."""
 
 MISSING = object()
-"""Sentinel for a value that the spec does not contain."""
+"""Value that stands for one that the spec does not contain."""
 _SHOWN_VALUE_CHARACTERS_MAX = 60
-"""Maximum number of characters of a value that are shown."""
+"""Maximum number of characters of a wrong value that an error message shows."""
 _PARTIAL_NAME_CHARACTERS_MIN, _SUGGESTIONS_MAX = 4, 3
-"""Minimum length of a part of a name for which longer names are suggested, and their maximum
-number."""
+"""Limits of suggestions for a misspelt name.
+
+The first is the least length of a text that suggests longer names which contain it [characters].
+The second is the largest number of such names.
+"""
 _OFF_WORDS = {"no", "n", "false", "none", "never", "null", "disable", "disabled", "0", "off"}
-"""Words that users write for ``off``."""
+"""Words that users write in place of ``off``, such as no."""
 _ON_WORDS = {"yes", "y", "true", "always", "enable", "enabled", "1", "on"}
-"""Words that users write for ``on``."""
+"""Words that users write in place of ``on``, such as yes."""
 
 
 @dataclass(frozen=True, order=True)
@@ -196,10 +199,10 @@ def suggest_similar_name(name: str, known_names: Iterable[str], *, fallback: str
 # Rules
 
 RULE_ERROR_TYPE = "broken_rule"
-"""Type of pydantic errors that are raised by rules."""
+"""Type by which pydantic errors that rules raise are told from all others."""
 
 JsonObject = dict[str, Any]
-"""JSON object."""
+"""Mapping with text keys, as in JSON."""
 
 
 def rule_error(problem: str, suggestion: str) -> PydanticCustomError:
@@ -289,8 +292,8 @@ _BOUND_KINDS = {
 }
 """Kinds of bounds of a number, by the names of `NumericRule`'s fields.
 
-Each has its words in messages, a comparison that is True outside the bound, and its JSON Schema
-keyword.
+Each has its words in messages, a comparison that is True for values outside the bound, and its
+keyword in a JSON Schema.
 """
 
 
@@ -299,8 +302,10 @@ class NumericRule(Rule):
     """Rule of a number within bounds; bounds are written as users write values."""
 
     si_unit: str = ""
-    """SI unit after reading; ``"dB"`` for a power ratio written in decibels; empty for a pure
-    number."""
+    """SI unit after reading; empty for a pure number.
+
+    It is ``"dB"`` for a power ratio written in decibels.
+    """
     example: str = ""
     """A valid value as a user would write it."""
     above: str | None = None
@@ -587,7 +592,7 @@ class FilePathRule(Rule):
     """Rule of a file's path, relative to the file that names it."""
 
     compute_digest: Callable[[Path], str] = file_digest
-    """Function that returns the digest of all that is read from the file."""
+    """Function that computes the digest of everything that is read from the file."""
 
     def read(self, raw_value: object) -> str:
         """Return the path as written, after a check that it may be the path of a file."""
@@ -614,7 +619,7 @@ class ListRule(Rule):
     element_noun: str = "values"
     """Noun for the values in messages."""
     increasing: bool = False
-    """True if each value must exceed the previous one."""
+    """True if each value must be larger than the one before it."""
     distinct: bool = False
     """True if no value may occur twice."""
 
@@ -682,7 +687,7 @@ _CHIRP_TIME_RULE = NumericRule(
     at_least="-1e6 s",
     at_most="1e6 s",
 )
-"""Rule of a time in a table of the sweep's frequency error."""
+"""Rule of a time [s] in the up-chirp, in a table of the sweep's frequency error."""
 _FREQUENCY_ERROR_RULE = NumericRule(
     description="Frequency error",
     si_unit="Hz",
@@ -690,9 +695,9 @@ _FREQUENCY_ERROR_RULE = NumericRule(
     at_least="-1e15 Hz",
     at_most="1e15 Hz",
 )
-"""Rule of a frequency error in a table of the sweep's frequency error."""
+"""Rule of a frequency error [Hz] in a table of the chirp's frequency error over time."""
 ERROR_TABLE_ROWS_MAX = 4096
-"""Maximum number of rows of a table of the sweep's frequency error."""
+"""Maximum number of rows of a table of the chirp's frequency error over time."""
 
 
 class FrequencyErrorTableRule(Rule):
@@ -742,8 +747,10 @@ class FrequencyErrorTableRule(Rule):
 
 
 COSINE_SUM_WINDOWS = tuple(COSINE_SUM_COEFFICIENTS)
-"""Windows that are computed without scipy, which is slow to import. All others are made by
-scipy."""
+"""Names of windows that are sums of cosines and are computed without scipy, which imports slowly.
+
+All other windows are made by scipy.
+"""
 SCIPY_WINDOWS = (
     "barthann", "bartlett", "bohman", "chebwin", "cosine", "dpss", "exponential", "gaussian",
     "general_gaussian", "general_hamming", "kaiser", "lanczos", "parzen", "taylor", "triang",

@@ -38,7 +38,7 @@ from sweep.spec.sections import default_value
 from sweep.units import QuantityError, read_unit
 
 SHOTS_PER_SCANNER_MAX = 10**9
-"""Maximum number of shots of a scanner: arrays of this length are allocated."""
+"""Maximum number of shots of a scanner in a flight. Arrays of this length must fit into memory."""
 
 RESERVED_SCANNER_NAMES = ("scene_map",)
 """Names of groups in a store that are not scanners."""
@@ -405,7 +405,7 @@ _BEAM_WIDTH_PATHS = (
     beam.OSCILLATOR_WAIST_PATH,
     beam.COUPLING_PATH,
 )
-"""Parameters of the beam from which its width follows."""
+"""Dotted paths of the parameters from which the width of the beam follows."""
 _BEAMLET_POSITION_PATHS = (
     PATTERN_PATH,
     "footprint.phases",
@@ -414,19 +414,22 @@ _BEAMLET_POSITION_PATHS = (
     beam.WAIST_PATH,
     beam.FOCUS_PATH,
 )
-"""Parameters that determine the positions of beamlets."""
+"""Dotted paths of the parameters that determine where beamlets (rays of a beam) hit."""
 _MOVES_BEAMLETS_REFUSAL = (
     "moves the beamlets, and a study casts its rays once",
     _OTHER_STUDY_REMEDY,
 )
-"""Problem and remedy of an axis over a parameter that moves beamlets."""
+"""Problem and remedy to state for an axis over a parameter that moves beamlets (rays of a beam)."""
 _AXIS_REFUSALS = {
     "footprint.speckle": ("", ""),  # moves no beamlet, unlike other fields of footprint
     "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
     **dict.fromkeys((*_BEAM_WIDTH_PATHS, "footprint."), _MOVES_BEAMLETS_REFUSAL),
     "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY),
 }
-"""Problem and remedy of axes by prefix of the parameter's path; the first match applies."""
+"""Problem and remedy to state for parameters that no axis may set, by prefix of their path.
+
+The first matching prefix applies.
+"""
 
 
 def axis_refusal(path: str) -> tuple[str, str]:
@@ -455,7 +458,7 @@ def axis_refusal(path: str) -> tuple[str, str]:
 def variation_findings(
     parameters: Mapping[str, Any], path: str, values: Iterable[Any], location: Location
 ) -> list[Finding]:
-    """Return the mistakes in letting one parameter of a scene take several values.
+    """Return the reasons why one parameter of a scene may not take several values.
 
     Parameters
     ----------
@@ -488,9 +491,9 @@ def variation_findings(
 
 
 def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for each axis that a single set of rays can't serve.
+    """Yield a finding for each axis that would change where rays hit, as rays are cast only once.
 
-    Also yield one for a beamlet pattern that only suits a plane, and for an axis whose name the
+    Also yield one for a pattern of beamlets that only suits a plane, and for an axis whose name the
     store uses.
     """
     parameters = {path: default_value(path) for path in _BEAMLET_POSITION_PATHS} | dict(grid.values)

@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 
 
 Vector = tuple[float, ...]
-"""Components of a vector in SI units."""
+"""Components of a vector along x, y and z, in SI units."""
 
 WORLD_ORIGIN = "world"
-"""Name of the origin of a scene that keeps the coordinates of its objects."""
+"""Word for a scene's origin that leaves the coordinates of objects as they are."""
 
 
 class SolidObject(Material, ABC):
@@ -500,13 +500,13 @@ class BuiltScene(NamedTuple):
     """Scene as bodies at which rays can be cast, in the scene's frame."""
 
     caster: RayCaster
-    """Ray caster of the bodies.
+    """Object that finds where rays hit the bodies.
 
     All objects at rest form the first body, if there are any. Each moving object is a body of its
     own.
     """
     surfaces: tuple[SurfaceMaterial, ...]
-    """Materials of the surfaces by surface number."""
+    """Materials of the surfaces, in the order of the surface numbers."""
     body_motions: tuple[MovingBody | None, ...]
     """Motion of each body of the ray caster; None for the body at rest."""
     mesh_reports: tuple[str, ...]

@@ -18,7 +18,7 @@ JSON_SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """URI of the JSON Schema dialect that the schema uses."""
 
 _INSTRUMENT_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
-"""Names of the models of an instrument's sections."""
+"""Names of the pydantic models of the sections of an instrument."""
 
 
 def json_schema() -> JsonObject:
@@ -129,7 +129,7 @@ def _values_schema(path: str, rule: Rule) -> JsonObject:
 
 
 def _generator_schemas(value_schema: JsonObject) -> Iterator[JsonObject]:
-    """Yield the schemas of the generators linear, log and step."""
+    """Yield the JSON schemas of the generators of values: linear, log and step."""
     number_schema = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
     for form in ("linear", "log"):
         bounds_schema = _list_schema(value_schema, 2, maxItems=2)

@@ -31,15 +31,15 @@ from sweep.spec.rules import (
 )
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
-"""Detection architectures of the receiver."""
+"""Names of the receiver architectures: how the echo is detected."""
 _POWER_BOUNDS = ("1e-18 W", "1e9 W")
-"""Lower and upper bound of an optical power."""
+"""Lower and upper bound of an optical power, with units."""
 _FREQUENCY_BOUNDS = ("1 mHz", "1e15 Hz")
-"""Lower and upper bound of a frequency or bandwidth."""
+"""Lower and upper bound of a frequency or bandwidth, with units."""
 _RESISTANCE_BOUNDS = ("1 uohm", "1e12 ohm")
-"""Lower and upper bound of a resistance."""
+"""Lower and upper bound of a resistance, with units."""
 _WAIST_EXAMPLE_AND_BOUNDS = ("5 mm", "100 nm", "1 km")
-"""Example, lower and upper bound of the radius of a beam."""
+"""Example, lower bound and upper bound of the waist radius of a beam, with units."""
 
 
 @add_effect_parameters("instrument.laser")
@@ -460,7 +460,10 @@ class Effects(SpecSection):
 
 
 def _tolerance_share_field(description: str) -> Any:
-    """Declare a field for a part of the tolerance that is automatic or set by the user."""
+    """Declare a field for the part of the tolerance that one source of error may use.
+
+    By default the part is chosen automatically.
+    """
     description += "; auto: as accuracy.tolerance needs"
     return declare.number_field(description, "1e-6", "0", "1", default=AUTOMATIC, keyword="auto")
 
@@ -493,7 +496,7 @@ class Accuracy(SpecSection):
 
 
 SPECTRA_METHOD = "spectra"
-"""Method of draws that are whole spectra."""
+"""Method of draws in which whole spectra are drawn, including noise in every bin."""
 
 
 class Draws(SpecSection):
@@ -537,7 +540,7 @@ class Draws(SpecSection):
 
     @property
     def is_adaptive(self) -> bool:
-        """True if each point is drawn until its accuracy is met."""
+        """True if each point is drawn until its statistical error is within the tolerance."""
         return self.limit > 0
 
 
@@ -581,7 +584,7 @@ MODEL_BY_SECTION: dict[str, type[BaseModel]] = {
     "footprint": Footprint,
     "accuracy": Accuracy,
 }
-"""Models of the sections whose fields an axis may vary, by the section's name."""
+"""Pydantic models of the sections whose fields an axis may vary, by the name of the section."""
 
 
 AXES_REMEDY = (

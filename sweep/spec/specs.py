@@ -107,18 +107,20 @@ if TYPE_CHECKING:
 GRID_POINTS_MAX = 10**15
 """Maximum number of points of a grid."""
 WARNED_LINE_DRIFT_BINS_MIN = 2.0
-"""Smallest drift of a speckled line within a record that raises a warning [bins]. From this drift
-on the stated standard errors are too small."""
+"""Smallest drift of a line within a record, due to acceleration, that gives a warning [bins].
+
+The line is in developed speckle. From this drift on the stated standard errors are too small.
+"""
 
 _N_ACCELERATION_SAMPLES = 1000
-"""Number of instants of a flight at which its acceleration is evaluated."""
+"""Number of times in a flight at which the acceleration of the platform is evaluated."""
 
 FILE_DIGESTS_KEY = "files"
-"""Key of a stored spec that holds the digest of each file by the file's path."""
+"""Key in the JSON of a stored spec under which the digests of files are held, by path."""
 _SECTIONS_WITHOUT_DEFAULTS = ("question", "execution", "axes", "figures")
-"""Sections whose defaults the complete spec of `to_yaml_mapping` leaves out."""
+"""Sections to which `to_yaml_mapping` adds no defaults for fields that the spec does not state."""
 _AXES_RULE = CustomRule(description="What varies", reader=lambda axes: axes)
-"""Rule of the field `axes`: `read_axes` has read the axes before pydantic validates the spec."""
+"""Rule of the field `axes`, which is read by `read_axes` before pydantic validates the spec."""
 
 
 class BaseSpec(SpecSection):
@@ -147,8 +149,10 @@ class BaseSpec(SpecSection):
     _file_digests: dict[str, str] = PrivateAttr(default_factory=dict)
     """Digest of each file's content, by the file's path as written in the spec."""
     _instrument_floor: InstrumentErrorFloor | None = PrivateAttr(default=None)
-    """Fields of the error floor that come from the instrument; None if the spec states all of
-    them."""
+    """Fields of the section error_floor that come from the instrument.
+
+    None if the spec states all of them.
+    """
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], *, base: Path | str = ".") -> Self:
@@ -511,7 +515,7 @@ def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
 STRONGEST_PEAK_CONDITION: dict[str, ValueCondition] = {
     waveform.PEAKS_PATH: lambda peaks: peaks == waveform.STRONGEST_PEAK
 }
-"""Condition on points at which each segment reports its strongest peak alone."""
+"""Condition on parameters under which each segment reports only its strongest peak."""
 
 
 def _strongest_peak_findings(grid: GridValues) -> Iterator[Finding]:
@@ -599,7 +603,7 @@ class GridSpec(BaseSpec):
 
     @property
     def reports_strongest_peak(self) -> bool:
-        """True if segments report their strongest peak alone at any point."""
+        """True if, at any point, segments report only their strongest peak."""
         return GridValues(self.parameters(), self.axes).any_point_meets(STRONGEST_PEAK_CONDITION)
 
     def identity(self) -> dict[str, Any]:
@@ -820,8 +824,9 @@ class SceneSpec(BaseSpec):
 
         Notes
         -----
-        Acceleration a changes the Doppler frequency 2 v / lambda by 2 a T / lambda within a record
-        of duration T. A bin is 1 / T wide, so that the drift is 2 a T^2 / lambda bins. The result
+        At the radial velocity v and wavelength lambda the Doppler frequency is 2 v / lambda. An
+        acceleration a changes it by 2 a T / lambda within a record of duration T. A bin is 1 / T
+        wide, so that the drift is 2 a T^2 / lambda bins. The result
         is 0 below `WARNED_LINE_DRIFT_BINS_MIN`, and for ground without developed speckle.
         """
         p = self.parameters()

@@ -33,7 +33,7 @@ _JOURNAL_FILE_NAME_PATTERN = re.compile(
 """Pattern of the names of the files that sweep writes into a journal."""
 
 _DRAFT_FILE_NAME_PATTERN = re.compile(r".+\.[0-9a-f]{32}\.partial")
-"""Pattern of the names of files that were not written completely."""
+"""Pattern of the names of drafts: files whose writing was interrupted or is under way."""
 
 
 def is_ignorable_file(name: str) -> bool:
@@ -49,7 +49,7 @@ def is_ignorable_file(name: str) -> bool:
 
 
 def is_draft_file(name: str) -> bool:
-    """Tell from its name whether a file is a draft that sweep did not finish writing."""
+    """Return True if a file's name shows that sweep has not finished writing the file (a draft)."""
     return bool(_DRAFT_FILE_NAME_PATTERN.fullmatch(name))
 
 
@@ -62,7 +62,7 @@ def list_foreign_files(store: Path) -> list[str]:
 
 
 def _read_node_names(store: Path) -> set[str]:
-    """Return the names of a store's arrays and groups, as far as its documents can be read."""
+    """Return the names of a store's arrays and groups, as far as its metadata can be read."""
     node_names: set[str] = set()
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         root_metadata = parse_json(read_file_below_root(store, "zarr.json", METADATA_BYTES_MAX))
@@ -80,7 +80,7 @@ def _read_node_names(store: Path) -> set[str]:
 
 
 def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
-    """Yield the names of the groups that contain the nodes."""
+    """Yield the names of all groups that contain one of the given arrays or groups."""
     for node in node_names:
         while node := node.rpartition("/")[0]:
             yield node

@@ -52,10 +52,10 @@ DRAFT_SUFFIX = ".partial"
 #: Attribute that marks a packed copy of a store: its files are shards of many chunks.
 PACKED_ATTRIBUTE = "packed"
 
-#: Concurrent requests to an object store. A request takes milliseconds, mostly waiting.
+#: Number of requests to an object store at a time. A request takes milliseconds, mostly waiting.
 CONCURRENT_REQUESTS_MAX = 16
 
-#: Retries after HTTP status 500 and above, timeouts and lost connections.
+#: How often a request is repeated after HTTP status 500 and above, timeouts and lost connections.
 RETRY_CONFIG = {
     "max_retries": 8,
     "retry_timeout": timedelta(seconds=90),
@@ -66,7 +66,7 @@ RETRY_CONFIG = {
     },
 }
 
-#: Retries at the first contact, when a wrong address is likelier than a transient fault.
+#: How often the first request is repeated. A wrong address is then likelier than a transient fault.
 FIRST_CONTACT_RETRY_CONFIG = {
     **RETRY_CONFIG,
     "max_retries": 3,
@@ -76,7 +76,7 @@ FIRST_CONTACT_RETRY_CONFIG = {
 CLIENT_OPTIONS = {"timeout": "30s", "connect_timeout": "5s"}
 
 ObjectVersion = Any
-"""Tag (ETag or version) by which an object store identifies one version of an object."""
+"""Tag (ETag or version) by which an object store tells versions of one object apart."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -111,7 +111,7 @@ class ObjectPath:
         )
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """Return the path with further parts appended to its key."""
+        """Return the path whose key is this key with further parts appended."""
         return self / "/".join(others)
 
     @property
@@ -479,7 +479,7 @@ def file_sizes_below(location: Location) -> dict[str, int]:
 
 
 def derived_files_dir(location: Location) -> Path:
-    """Return the folder for files derived from a store.
+    """Return the folder for files made from a store, such as figures.
 
     It is the folder of a store on disk, and the current folder for one in an object store.
     """
@@ -534,28 +534,31 @@ def _write_new_file(file_path: str, content: bytes, durable: bool) -> None:
 #: Suffix of the hidden name of a store that will replace another once it is complete.
 STAGING_SUFFIX = ".next"
 
-#: Age at which a draft of another host counts as abandoned [s].
+#: Age above which a draft (unfinished file) of another host counts as abandoned [s].
 ABANDONED_DRAFT_AGE_SECONDS = 86400.0
 
-#: Largest lag of a file server's clock that is tolerated [s].
+#: Largest time by which a file server's clock may be behind this machine's [s].
 CLOCK_SKEW_SECONDS_MAX = 60.0
 
 _LEFTOVER_NAME_PATTERN = re.compile(
     r"\.(?P<name>.+)\.(?P<state>creating|packing|replaced|removing)-"
     r"(?:(?P<host>.+)-)?(?P<pid>\d+)(?:\.(?P<start>\d+))?-[0-9a-f]{8}"
 )
-"""Hidden names that dead processes leave; earlier versions wrote no host, or no start id."""
+"""Pattern of the hidden names of files that interrupted processes leave.
 
-#: Start id of a process that exists, but is hidden from other users.
+Earlier versions of sweep wrote no host, or no start time of the process, into such names.
+"""
+
+#: Start time that stands for a process that exists, but is hidden from other users.
 HIDDEN_PROCESS_START_ID = -1
 
 
 PID_MAX = 2**31 - 1
-"""Largest process id that an operating system assigns."""
+"""Largest process number that an operating system assigns."""
 
 
 def process_start_id(pid: int) -> int:
-    """Return the start time of a process, which distinguishes it from others with the same id.
+    """Return the start time of a process, which tells it from others with the same number.
 
     The unit is clock ticks since the machine was booted on Linux, and 0.01 s since the epoch on
     other systems. Changes of the clock do not alter it. Return 0 if no such process runs, and
@@ -599,17 +602,20 @@ def resolve_links(location: Location) -> Location:
 
 
 def eyepoint_store_location(store: Location, geometry_id: str) -> Location:
-    """Return the path of a geometry's eyepoint store, in a folder next to the study's store."""
+    """Return the path of the store with a flight's shot geometry (eyepoints).
+
+    It is in a folder next to the store of the study.
+    """
     return resolve_links(store).parent / "eyepoints" / f"{geometry_id}.zarr"
 
 
 def staging_path_for(path: Path) -> Path:
-    """Return the path at which the replacement of a store is built until it is complete."""
+    """Return the path at which a new store is built before it replaces the store at a path."""
     return path.with_name(f".{path.name}{STAGING_SUFFIX}")
 
 
 def final_path_for(path: Path) -> Path:
-    """Return the final path of a store: its own, or that of the store that it will replace."""
+    """Return the path that a complete store has: its own, or that of the store it replaces."""
     staging_match = re.fullmatch(rf"\.(.+){re.escape(STAGING_SUFFIX)}", path.name)
     return path.with_name(staging_match[1]) if staging_match else path
 
@@ -707,10 +713,10 @@ def recover_interrupted_replace(location: Location) -> None:
 
 
 def store_fingerprint(location: Location) -> tuple[int, ...] | None:
-    """Return a fingerprint of the store at a location; no other store ever has the same.
+    """Return numbers that identify the store at a location; no other store ever has the same.
 
-    It consists of device, inode, size and times of the store's root document. Return None in an
-    object store, or if the document can't be opened.
+    They are device, inode, size and times of the store's root document. Return None in an object
+    store, or if the document can't be opened.
     """
     if not isinstance(location, Path):
         return None
@@ -813,7 +819,10 @@ def remedy_for_write_error(error: OSError, place: object, otherwise: str) -> str
 
 
 def _has_no_free_inodes(path: Path) -> bool:
-    """Tell whether the disk of a path, which need not exist, has no free inodes."""
+    """Return True if the disk of a path has no free inodes, so that no file can be created.
+
+    The path need not exist.
+    """
     while not path.exists() and path != path.parent:
         path = path.parent
     with suppress(OSError):

@@ -51,7 +51,7 @@ def compressed_bytes_max(raw_bytes: int) -> int:
 
 
 class ArrayFileLayout(NamedTuple):
-    """Numbers of values and chunks in each file of an array."""
+    """Numbers of values per chunk, and of chunks per file, of an array."""
 
     values_per_chunk: int  # number of values in a chunk
     bytes_per_value: int  # size of a value [bytes]; 0 for strings
@@ -96,7 +96,10 @@ class ArrayFileLayout(NamedTuple):
             self.check_chunk_decoded_size(chunk, path_in_messages)
 
     def _iter_chunks(self, content: bytes) -> Iterator[bytes]:
-        """Yield each chunk in a file; of a numeric chunk in a shard only the header."""
+        """Yield each chunk in a file of an array.
+
+        Of a numeric chunk in a shard (a file of many chunks) only the header is read.
+        """
         if not self.chunks_per_shard:
             yield content
             return

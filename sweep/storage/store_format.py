@@ -67,7 +67,7 @@ from sweep.storage.size_checks import (
 #: Manifest: journal file with the digest of each object that a store has before any results.
 MANIFEST_FILE = "template.jsonl"
 
-#: Version of the layout of stores.
+#: Version of the layout of stores: of their groups, arrays, attributes and journal.
 LAYOUT_VERSION = 5
 
 #: Level of the zstd compression of every array chunk.
@@ -85,15 +85,15 @@ _ATTRIBUTES_BY_STORE_KIND = {
     "eyepoints": ("geometry", "shots_a_cycle"),
     "accuracy": ("title", "spec", "coordinates"),
 }
-"""Required attributes of each kind of store, in addition to the common ones."""
+"""Names of the attributes that each kind of store must have, in addition to the common ones."""
 
 _COMMON_ATTRIBUTES = ("study_id", "model_version", "software")
-"""Required attributes of every store."""
+"""Names of the attributes that every store must have."""
 
 _STUDY_ID_PATTERN = re.compile(r"[0-9a-f]{32}")
 
 _NON_STRING_ATTRIBUTE_TYPES = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
-"""Types of the attributes that are not text."""
+"""Types of those attributes of a store that are not text, by name."""
 
 _ARRAY_ATTRIBUTE_TYPES = {
     "units": str, "long_name": str, "comment": str, "standard_name": str, "path": str,
@@ -126,7 +126,7 @@ _SHARD_INDEX_CONFIGURATION = {
     "index_codecs": [_LITTLE_ENDIAN_CODEC, _CHECKSUM_CODEC],
     "index_location": "end",
 }
-"""Configuration of the index of a shard."""
+"""Zarr configuration of the index of a shard, the list of the chunks in a file."""
 
 
 class StoreError(EscapedTextError):
@@ -341,7 +341,7 @@ def read_study_id(path: Location) -> str:
 
 
 def repair_hint(path: Location) -> str:
-    """Return a hint how to restore the objects of a store's manifest; '' without a manifest."""
+    """Return advice on how to restore damaged objects in a store's manifest; '' if it has none."""
     if not (path / JOURNAL_DIR / MANIFEST_FILE).exists():
         return ""
     if read_manifest_attributes(path):
@@ -382,9 +382,9 @@ def _check_node_metadata(node_name: str, node: dict[str, Any]) -> None:
 
 
 def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, Any]:
-    """Return the metadata that this program would write for an array of this shape and type.
+    """Return the metadata that sweep itself would write for an array of this shape and type.
 
-    The parts that may differ between arrays are taken from ``node``. Raise ValueError if they are
+    Parts that may differ between arrays are taken from ``node``. ValueError is raised if they are
     invalid.
     """
     data_type, attributes, fill_value = node["data_type"], node["attributes"], node["fill_value"]
@@ -562,11 +562,11 @@ _LOG_LINE_END = b'"}\n'
 _RECEIPT_HEAD_PATTERN = re.compile(
     rb'\{"block":(\d{1,18}),"(?:points":(\d{1,18})(?:,"bytes":(\d{1,18}))?|withdrawn")'
 )
-"""Pattern of the start of a receipt: block, then points and bytes, or `withdrawn`."""
+"""Pattern of the first fields of a receipt: the block, then points and bytes, or `withdrawn`."""
 
 _RECEIPT_TIME_PATTERN = re.compile(rb'"time":(\d{1,10}(?:\.\d{1,20})?)$')
 _RECEIPT_WORKER_PATTERN = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
-"""Pattern of host and process id of the worker in a receipt."""
+"""Pattern of the fields in a receipt that name the worker: host and process number."""
 
 
 def encode_record(record: dict[str, Any]) -> bytes:
@@ -678,14 +678,17 @@ class FileLog:
         return True
 
     def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
-        """Rewrite the log without the lines for which ``is_sound`` is false."""
+        """Write the log again, without the lines for which ``is_sound`` is false."""
         if self._path.is_dir() or not all(map(is_sound, iter_raw_lines(self._path))):
             lines = iter_raw_lines(self._path)
             atomic_write(self._path, b"".join(line for line in lines if is_sound(line)))
 
 
 class ObjectLog:
-    """Append-only log in an object store: objects under a key, numbered in order of writing."""
+    """Append-only log in an object store: a series of objects under one key.
+
+    They are numbered in the order of writing.
+    """
 
     def __init__(self, path: ObjectPath) -> None:
         self._path = path
@@ -838,7 +841,7 @@ def _iter_file_lines(log: BinaryIO) -> Iterator[bytes]:
 
 @dataclass
 class ReceiptTotals:
-    """Totals of a log of receipts: committed blocks, times and recent throughput."""
+    """Totals of the receipts in a store's log: committed blocks, computing times, recent points."""
 
     #: Number of points of each committed block, 0 for other blocks; (blocks,) int64.
     points_by_block: np.ndarray
@@ -856,9 +859,10 @@ class ReceiptTotals:
 
 
 def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf) -> ReceiptTotals:
-    """Return the totals of a store's receipts; damaged lines are ignored.
+    """Return the totals of the receipts in a store's log; damaged lines are ignored.
 
-    ``since``: time from which recent points and their workers are counted [s since the epoch].
+    ``since`` is the time from which recent points and their workers are counted [s since the
+    epoch].
     """
     totals = ReceiptTotals(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
     for line in iter_raw_lines(store / JOURNAL_DIR / RECEIPTS_FILE):

@@ -44,7 +44,7 @@ CHUNK_NAME_PATTERN = re.compile(r"(.+)/c((?:/\d+)*)")
 #: Dimensions along which the shots of a flight are divided into blocks; they vary fastest.
 CYCLE_DIM, SHOT_DIM = "cycle", "shot"
 
-#: Time that abandoned reads have to be cancelled when the program ends [s].
+#: Time in which reads that nobody waits for are cancelled when the program ends [s].
 PENDING_READS_TIMEOUT_SECONDS = 5.0
 
 _CHECKSUM_BYTES = 4
@@ -57,7 +57,7 @@ class DamagedChunkError(ValueError):
 
 
 def describe_chunk_damage(content: bytes) -> str:
-    """Return the damage of a chunk in words, '' if its CRC32C at the end matches."""
+    """Return what is wrong with a chunk, in words; '' if the CRC32C checksum at its end matches."""
     if not content:
         return "is empty"
     checksum = google_crc32c.value(content[:-_CHECKSUM_BYTES]).to_bytes(_CHECKSUM_BYTES, "little")
@@ -65,7 +65,10 @@ def describe_chunk_damage(content: bytes) -> str:
 
 
 def describe_shard_damage(content: bytes, n_chunks: int) -> str:
-    """Return the damage of a shard in words, '' if the checksums of its index and chunks match."""
+    """Return what is wrong with a shard (a file of many chunks), in words; '' if it is undamaged.
+
+    The checksums of its index and of its chunks are checked.
+    """
     index_bytes = n_chunks * _SHARD_INDEX_ENTRY_BYTES + _CHECKSUM_BYTES
     if damage := describe_chunk_damage(content[-index_bytes:]):
         return damage
@@ -77,10 +80,11 @@ def describe_shard_damage(content: bytes, n_chunks: int) -> str:
 
 
 class ChunkBlockMap:
-    """Map from the chunks of a store to the blocks that write them, from its root document.
+    """Map from the chunks of a store's arrays to the blocks that write them.
 
-    The chunks of the outputs of a group form a grid, and each block has one position in it. An
-    array that lacks a dimension of this grid is written by the blocks at position 0 along it.
+    It follows from the root document. The chunks of the outputs of a group form a grid, and each
+    block has one position in it. An array that lacks a dimension of this grid is written by the
+    blocks at position 0 along it.
     """
 
     def __init__(self, location: Location) -> None:
@@ -100,7 +104,7 @@ class ChunkBlockMap:
             self.n_blocks += math.prod(chunks_by_dim.values())
 
     def _block_grid_shape(self, group: str) -> dict[str, int]:
-        """Return the number of chunks along each divided dimension of a group's outputs."""
+        """Return the number of chunks of a group's outputs along each dimension cut into blocks."""
         chunks_by_dim: dict[str, int] = {}
         for name, node in self._arrays.items():
             if name.rpartition("/")[0] != group or self._is_in_template(name, node):
@@ -138,7 +142,7 @@ class ChunkBlockMap:
         return first_block + index
 
     def chunks_per_shard(self, chunk_name: str) -> int:
-        """Return the capacity of a chunk's shard file [chunks]; 0 if the file is a single chunk."""
+        """Return how many chunks a chunk's file (shard) may hold; 0 if it is a single chunk."""
         name_match = CHUNK_NAME_PATTERN.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         if node is None or node["codecs"][0]["name"] != "sharding_indexed":
@@ -159,7 +163,10 @@ def _chunk_counts_by_dim(node: dict[str, Any]) -> dict[str, int]:
 
 
 def _block_dim_names(node: dict[str, Any]) -> list[str]:
-    """Return the dimension names of an array, with `cycle` for `shot`: blocks divide both alike."""
+    """Return the dimension names of an array, with `cycle` in place of `shot`.
+
+    Blocks divide both dimensions in the same way.
+    """
     return [CYCLE_DIM if dim == SHOT_DIM else dim for dim in node.get("dimension_names", ())]
 
 
@@ -273,7 +280,10 @@ class VerifiedStore(WrapperStore[Any]):
 
 
 _loops_with_failed_reads: set[asyncio.AbstractEventLoop] = set()
-"""Event loops of Zarr in which a read has failed; other reads may still be pending there."""
+"""Event loops of Zarr in which a read has failed.
+
+Other reads may still be pending in these loops when Python exits.
+"""
 
 
 @atexit.register

@@ -1,4 +1,4 @@
-"""Run, resume and extend a study: all its stages, from the options to the complete store."""
+"""Run, resume and extend studies: the stages from a spec and options to a complete store."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ EYEPOINT_LOCK_POLL_SECONDS = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome(SessionOutcome):
-    """Result of a run."""
+    """Result of a run: what was computed, and why results are missing, if any are."""
 
     rays_by_scanner: Mapping[str, int] = field(
         default_factory=dict
@@ -100,7 +100,7 @@ class Outcome(SessionOutcome):
     def from_session_outcome(
         cls, outcome: SessionOutcome, rays_by_scanner: Mapping[str, int] | None = None
     ) -> Outcome:
-        """Return the outcome of a run: that of its last session, and the rays cast before it."""
+        """Return the outcome of a run from that of its last session and the rays cast before it."""
         return cls(**vars(outcome), rays_by_scanner=rays_by_scanner or {})
 
 
@@ -199,7 +199,7 @@ def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any
 
 
 def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions) -> Outcome:
-    """Resume the store at a path without links, as :func:`resume`."""
+    """Resume the store at a path that contains no symbolic links, as :func:`resume` does."""
     final_path = final_path_for(final_path) if isinstance(final_path, Path) else final_path
     working_path = find_pending_replacement(final_path) or final_path
     attributes, study = _read_resumable_study(working_path)
@@ -300,21 +300,27 @@ def extend(
 
 
 def _make_backend(run_options: RunOptions, spec: AnySpec) -> ComputeBackend:
-    """Return the compute backend of a study; SpecError if one point exceeds its memory."""
+    """Return the backend (threads, workers or cluster) that computes a study.
+
+    SpecError is raised if one point needs more memory than the backend has.
+    """
     backend = ComputeBackend(run_options, SpecWorkload(spec))
     refuse_too_large_point(spec, backend.memory)
     return backend
 
 
 def _check_memory(study: GridStudy | FlightStudy, backend: ComputeBackend) -> None:
-    """Raise a SpecError if a study exceeds the backend's memory, now or once it is connected."""
+    """Raise a SpecError if a study needs more memory than the backend has.
+
+    If the backend is not connected yet, the check is made once it is.
+    """
     backend.check_memory = partial(refuse_too_large_study, study)
     with show_activity("building the scene", backend.progress):
         refuse_too_large_study(study, backend.memory)
 
 
 def _check_spec_type(spec: object) -> None:
-    """Raise a TypeError if an argument is no study, for example the path of its file."""
+    """Raise a TypeError if an argument is no spec, for example the path of a spec's file."""
     if isinstance(spec, GridSpec | SceneSpec):
         return
     if isinstance(spec, str | os.PathLike):
@@ -327,7 +333,10 @@ def _check_spec_type(spec: object) -> None:
 def _read_resumable_study(
     store_path: Location,
 ) -> tuple[dict[str, object], GridStudy | FlightStudy]:
-    """Return the attributes of a store, and its study; StoreError if it can't be resumed."""
+    """Return a store's attributes and the study in it.
+
+    StoreError is raised if it can't be resumed.
+    """
     attributes, study = study_loading.read_study(store_path)
     if isinstance(study, EyepointStudy):
         raise StoreError(
@@ -344,7 +353,10 @@ def _read_resumable_study(
 def _refuse_altered_store(
     store_path: Location, attributes: dict[str, Any], study: GridStudy | FlightStudy
 ) -> None:
-    """Raise a StoreError if a store has other versions, or if its template is damaged."""
+    """Raise a StoreError if a store can't be continued by this software.
+
+    It was begun with other versions, or its objects older than any result are damaged.
+    """
     refuse_other_versions(store_path, attributes, study.model_version, reader="this machine")
     if study.id != attributes["study_id"]:
         raise StoreError(
@@ -356,7 +368,7 @@ def _refuse_altered_store(
 
 
 def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy) -> None:
-    """Raise a StoreError if something is at a path, or is being prepared for it."""
+    """Raise a StoreError if a path is occupied, or if a store is being prepared for it."""
     staging_path, remedy = (
         find_pending_replacement(store_path),
         f"{suggested_call('resume', store_path)} goes on with it",
@@ -389,8 +401,8 @@ def _compute_into_path(
 ) -> Outcome:
     """Compute a study into a store at ``final_path``.
 
-    If a store at that path is to be replaced, the new store is built at a staging path. It replaces
-    the old one when it is complete.
+    If a store at that path is to be replaced, the new store is built at a temporary path, the
+    staging path. It replaces the old store when it is complete.
     """
     recover_interrupted_replace(final_path)
     working_path, recipe, durable = final_path, _spec_folder_entry(spec), backend.options.durable
@@ -469,7 +481,10 @@ def _compute_into_path(
 
 
 def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
-    """Move the complete staged store to its final path, which the caller has locked."""
+    """Move a complete store from its staging path to its final path.
+
+    The caller holds the lock there.
+    """
     staging_path = staging_path_for(final_path)
     with raise_as_store_error(f"{staging_path} can't take the place of {final_path}"):
         if durable:
@@ -481,7 +496,7 @@ def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
 
 
 def _eyepoint_stores_exist(store_path: Location, study: GridStudy | FlightStudy) -> bool:
-    """Return True if the eyepoint stores of all scanners exist, complete or not."""
+    """Return True if every scanner's store of shot geometry (eyepoints) exists, complete or not."""
     return isinstance(study, FlightStudy) and all(
         eyepoint_store_location(store_path, eyepoints.id).exists()
         for eyepoints in study.eyepoint_studies()
@@ -489,12 +504,15 @@ def _eyepoint_stores_exist(store_path: Location, study: GridStudy | FlightStudy)
 
 
 def _spec_folder_entry(spec: AnySpec) -> dict[str, str]:
-    """Return the entry of a recipe with the folder of a flight's files; empty for a grid."""
+    """Return the entry of a store's recipe that names the folder of a flight's files.
+
+    It is empty for a grid. The recipe is the part of the journal about how the store is made.
+    """
     return {"base": str(spec.base.absolute())} if isinstance(spec, SceneSpec) else {}
 
 
 def _check_user_functions(spec: AnySpec) -> None:
-    """Import and test the functions that a study names, if any; CodeError if one fails."""
+    """Import and test the user's functions that a study names. CodeError is raised if one fails."""
     if any(iter_user_functions(spec)):
         from sweep.tasks.studies.user_functions import check_user_functions  # the model's kernels
 
@@ -504,7 +522,7 @@ def _check_user_functions(spec: AnySpec) -> None:
 def _warn_of_changed_user_code(
     store_path: Location, spec: AnySpec, say: Callable[[str], None]
 ) -> None:
-    """Print a message for each user module whose file has changed since a store was begun.
+    """Print a message for each user module whose file has changed since the store was begun.
 
     If the store extends another one, the file is compared with that at the start of the other one.
     """
@@ -541,9 +559,10 @@ def _compute_missing_blocks(
     backend: ComputeBackend,
     prepare: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    """Lock a store and compute its missing blocks, after the missing eyepoints of a flight.
+    """Lock a store and compute its missing blocks.
 
-    `prepare` creates the store if needed. It is called before the store is locked.
+    In a flight the missing geometry of shots (eyepoints) is computed first. `prepare` creates the
+    store if needed. It is called before the store is locked.
     """
     backend.max_workers = study.n_blocks
     backend.check_memory = partial(refuse_too_large_study, study)
@@ -575,7 +594,10 @@ def _compute_missing_blocks(
 
 
 def _is_flight_complete(store_path: Location, study: FlightStudy) -> bool:
-    """Return True if all blocks of a flight, and of its existing eyepoint stores, are committed."""
+    """Return True if all blocks of a flight are stored, and all of its existing eyepoint stores.
+
+    An eyepoint store holds the geometry of the shots, as rays have found it.
+    """
     return bool(
         blocks_with_receipt(store_path, study).all() and committed_blocks(store_path, study).all()
     ) and all(
@@ -588,7 +610,7 @@ def _is_flight_complete(store_path: Location, study: FlightStudy) -> bool:
 def _cast_missing_eyepoints(
     study: FlightStudy, backend: ComputeBackend
 ) -> tuple[dict[str, int], str]:
-    """Cast the missing eyepoints of a study.
+    """Cast the rays of shots whose geometry (eyepoints) is not stored yet.
 
     Return the number of rays by scanner, and the reason for stopping early, or ''.
     """
@@ -629,7 +651,7 @@ def _cast_missing_eyepoints(
 
 
 def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: EyepointStudy) -> bool:
-    """Return True if an eyepoint store exists with all of its blocks."""
+    """Return True if a store of shot geometry (eyepoints) exists with all of its blocks."""
     if can_create_store(eyepoint_store_path):
         return False
     attributes = read_attributes(eyepoint_store_path)
@@ -650,9 +672,10 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
 def _acquire_eyepoint_lock(
     eyepoint_store_path: Location, eyepoints: EyepointStudy, backend: ComputeBackend
 ) -> StoreLock | None:
-    """Lock an eyepoint store once no other run holds its lock; create the store if needed.
+    """Wait until no other run holds the lock of an eyepoint store, and lock it.
 
-    Return None if the run is interrupted meanwhile.
+    The store, which holds the geometry of shots, is created if needed. Return None if the run is
+    interrupted meanwhile.
     """
     has_announced_wait = False
     while not backend.interrupts.is_stopping:

@@ -1,4 +1,4 @@
-"""Start of a worker: ignore signals meant for the client, protect output, import the model."""
+"""Set-up of a starting worker: ignore the client's signals, protect output, import the model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sweep.tasks.engine.text_streams import PatientStream, make_dask_logs_patien
 
 
 def dask_setup(worker: Any) -> None:
-    """Set up a starting worker; called by Dask."""
+    """Set up a starting worker. Dask calls this function in the worker's process."""
     # A terminal sends Ctrl-C to all processes of its group, but workers finish their blocks.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)

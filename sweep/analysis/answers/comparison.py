@@ -25,10 +25,10 @@ from sweep.model.outputs import GRID_OUTPUTS, PD_OUTPUTS, SHOT_STATISTIC_VARIABL
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 PD_ROUNDING_MAX = 1e-12
-"""Largest difference between probabilities that rounding on another processor explains."""
+"""Largest difference of a probability of detection that rounding on another processor explains."""
 
 _MATCHED_SIGNIFICANT_DIGITS = 12
-"""Number of significant digits in which the coordinates of matching points agree."""
+"""Number of significant digits to which coordinates must agree if two points are to match."""
 
 GRID_WITH_FLIGHT_MESSAGE = (
     "a grid of points and a flight have nothing to match: compare two of a kind"
@@ -113,7 +113,11 @@ def study_title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
 
 
 def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """Return the bound on the error of a probability: half-width of draws, effects and beamlets."""
+    """Return an upper bound of the error of a probability of detection.
+
+    It is the sum of the half-width by random draws and the errors by skipped effects and few
+    beamlets.
+    """
     error_bounds = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
              if n in dataset]  # fmt: skip
     return sum(
@@ -525,7 +529,7 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
 
 
 PLOTTED_DIFFERENCE_MIN = 1e-16
-"""Smallest difference of pd on the plot's axis; smaller ones are drawn at the left edge."""
+"""Smallest difference of pd on the axis of the figure. Smaller ones are drawn at its left edge."""
 
 
 def save_difference_figure(
@@ -578,7 +582,11 @@ def pd_difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Cha
 def _exceedance_lines(
     differences: xr.Dataset, name: str, scanner: str, style_index: int
 ) -> list[ChartLine]:
-    """Return two lines: the share of points above each difference, and above each allowed one."""
+    """Return two lines over the difference of pd.
+
+    They are the shares of points whose difference is larger, and whose allowed difference is
+    larger.
+    """
     is_finite = np.isfinite(differences[name].values)
     lines = []
     for values, label_suffix, style in (

@@ -19,7 +19,7 @@ from sweep.spec.sections import parameter_rules
 from sweep.units import QuantityError, read_number, read_quantity
 
 RELATIVE_VALUE_TOLERANCE = 1e-9
-"""Largest relative difference at which a value counts as a value of the grid."""
+"""Largest relative difference at which a wanted value counts as a coordinate's value."""
 
 STUDY_ID_NAME = "study_id"
 """Name of the coordinate and of the attribute that hold the id of the study."""
@@ -30,7 +30,7 @@ JOIN_REMEDY = (
 """Advice in error messages on how to join the stores of several studies."""
 
 _STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
-"""Pattern of the name of a study's marker coordinate."""
+"""Pattern of the name of a coordinate that marks the study from which a dataset comes."""
 
 JOINED_SPECS_ATTRIBUTE = "specs"
 """Name of the attribute of a join of studies with their specs and variable names.

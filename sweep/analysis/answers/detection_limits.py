@@ -1,9 +1,10 @@
 """Limits along an axis at which pd falls below a level: maximum range, minimum grazing angle.
 
-Between two grid points the position is interpolated in the normal deviate z, defined by pd =
-Phi(z). The Marcum function Q_1(a, b) is close to Phi(a - b). Therefore z follows the signal's
-amplitude and is almost linear, while pd bends from 1 to 0. Near pd = 1 the probability of a miss, 1
-- pd, supplies the digits.
+Between two grid points the limit is interpolated in the normal deviate z of pd. It is defined by
+pd = Phi(z), with the normal distribution function Phi. A steady signal gives pd = Q_1(a, b), the
+Marcum function of signal a and threshold b over the noise, which is close to Phi(a - b). Therefore
+z follows the signal's amplitude and is almost linear, while pd bends from 1 to 0. Near pd = 1 the
+probability of a miss, 1 - pd, supplies the digits.
 """
 
 from __future__ import annotations
@@ -21,22 +22,25 @@ from sweep.analysis.answers.probability import (
 )
 
 LIMIT_FOUND, LEVEL_NEVER_REACHED, LEVEL_NEVER_LOST, LIMIT_NOT_COMPUTED = range(4)
-"""Flags of the outcomes of a search for a limit."""
+"""Flags of the outcome of a search for the coordinate at which pd falls below a level."""
 LIMIT_REASON_MEANINGS = "found never_reached never_lost not_computed"
-"""Names of these flags, separated by spaces, for the CF attribute `flag_meanings`."""
+"""Names of the outcomes of a limit search, for the CF attribute `flag_meanings`."""
 
 _PD_PLUS_MISS_ERROR_MAX = 1e-6
-"""Largest deviation from 1 of pd plus the probability of a miss, by rounding and averaging."""
+"""Largest deviation from 1, by rounding and averaging, of pd plus the probability of a miss."""
 
 _NORMAL_DEVIATE_MAX = 38.0
-"""Largest magnitude of a normal deviate, used for a pd of 0 or 1.
+"""Largest magnitude of a normal deviate, which stands for a pd of 0 or 1.
 
-It corresponds to a probability near the smallest positive float.
+The normal deviate of pd is the argument at which the normal distribution function equals pd. This
+one corresponds to a probability near the smallest positive float.
 """
 
 
 def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
-    """Return the normal deviate z of a probability of detection, pd = Phi(z).
+    """Return the normal deviate z of a probability of detection pd.
+
+    It is defined by pd = Phi(z), with the normal distribution function Phi.
 
     Parameters
     ----------
@@ -123,8 +127,8 @@ def limit(
 
     Notes
     -----
-    Between the last value at the level and the next value below it, the normal deviate z, defined
-    by pd = Phi(z), is interpolated linearly.
+    Between the last value at the level and the next value below it, the normal deviate z of pd is
+    interpolated linearly. It is defined by pd = Phi(z), with the normal distribution function Phi.
     """
     level = parse_pd_level(pd)
     coord = find_coordinate(dataset, along)
@@ -248,7 +252,7 @@ def _limits_along_dimension(
 def _smallest_chosen_step(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
     """Return the smallest of the chosen steps along a dimension; infinity if none is chosen.
 
-    A step is a position along the dimension: 0, 1, 2, and fractions between.
+    A step is an index along the dimension, which may lie between two integers.
     """
     return xr.where(is_chosen, steps, np.inf).min(dim, skipna=False)
 

@@ -30,7 +30,7 @@ from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
 
 _SEGMENT_NAMES = ("up", "doppler", "down")
-"""Names of the segments of a shot, as parts of variable names."""
+"""Names of the segments (chirps) of a shot, as they occur in names of variables."""
 _INSTRUMENT_PATH_PREFIX = "instrument."
 """Beginning of the dotted paths of all instrument parameters."""
 _PATH_BY_PARAMETER = {
@@ -43,10 +43,10 @@ _PATH_BY_PARAMETER = {
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
-"""Dotted paths of the instrument parameters on which the bounds depend, without `instrument.`."""
+"""Dotted paths, without `instrument.`, of the parameters on which Cramer-Rao bounds depend."""
 
 _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
-"""Names of the effects that are drawn at random."""
+"""Names of the effects that are simulated by random draws."""
 
 _GROUPING_PARAMETERS = (
     "architecture",
@@ -57,7 +57,7 @@ _GROUPING_PARAMETERS = (
     "delay",
     "sample_rate",
 )
-"""Parameters by which points are grouped; the bounds of a group are computed together."""
+"""Parameters that are equal at points whose Cramer-Rao bounds are computed together."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -405,9 +405,10 @@ def window_tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def main_lobe_spline(window_name: str, length: int) -> CubicSpline:
-    """Return a spline of a window's main lobe, |W(delta)| / W(0), accurate to 1e-8.
+    """Return a spline of a window's main lobe, relative to its peak, accurate to 1e-8.
 
-    The offset delta from the peak is 0 to 1/2, in bins of sample rate over window length.
+    The main lobe is the magnitude of the window's Fourier transform near its peak. The argument is
+    the distance from the peak, 0 to 1/2, in bins of sample rate over window length.
     """
     taper, bin_offsets = get_window(window_name, length), np.linspace(0.0, 0.5, 33)
     return CubicSpline(bin_offsets, np.abs(direct_transform(taper, bin_offsets)) / taper.sum)

@@ -32,7 +32,7 @@ from sweep.model.threshold import THRESHOLD_PATHS, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec
 
 SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
-"""Names with a probability of detection each: the segments of a shot, and the shot."""
+"""Names of what has a probability of detection: each segment (chirp), and the whole shot."""
 
 
 def segment_variable_name(quantity: str, segment: str) -> str:
@@ -308,12 +308,12 @@ def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
 # tolerance.
 
 ROC_POINTS_MAX = 20_000
-"""Largest number of points for which :func:`roc` computes curves."""
+"""Largest number of points of a study for which :func:`roc` computes curves."""
 ROC_SIMULATED_POINTS_MAX = 200
-"""Largest number of points that :func:`roc` simulates again."""
+"""Largest number of points that :func:`roc` simulates again, for want of a closed form of pd."""
 
 PD_MATCH_TOLERANCE = 1e-9
-"""Largest difference from the stored pd at which the closed form of pd counts as exact."""
+"""Largest difference of the closed form of pd from the stored pd at which it counts as exact."""
 
 CURVE_TNR_VARIABLE = "curve_tnr"
 """Name of the variable with the threshold-to-noise ratio along a ROC curve.
@@ -322,7 +322,7 @@ It is not `tnr`, which may be a coordinate of the study.
 """
 
 ROC_RANDOM_KEY_DOMAIN = "sweep.analysis.roc"
-"""Text that separates the random numbers of ROC curves from all other random numbers."""
+"""Text from which the random numbers of ROC curves follow, so that they differ from all others."""
 
 _RANDOM_EFFECTS_MASK = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
 """Bit mask of the random effects in the variable `effects`."""
@@ -333,7 +333,7 @@ _SEGMENTS_THAT_MUST_DETECT = {
     "down": ("down",),
     "shot": ("up", "down"),
 }
-"""Segments that must all exceed the threshold for a detection, by segment or shot."""
+"""Segments (chirps) that must all exceed the threshold for a detection, by segment or shot."""
 
 
 def roc(

@@ -34,13 +34,13 @@ from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
 RELATIVE_VALUE_TOLERANCE = 1e-9
-"""Largest relative difference at which a value counts as a value of an axis."""
+"""Largest relative difference at which a coordinate's value counts as a value of a study's axis."""
 
 
 def compute_answer_per_study(
     dataset: xr.Dataset, answer: Callable[[xr.Dataset], Any], *, require_axes: bool
 ) -> Any:
-    """Compute an answer from a dataset of one study, or for each design of a join.
+    """Compute an answer from a dataset of one study, or for each study of a joined dataset.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset
 
 
 def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Raise ValueError if a dataset lacks the coordinate of one of its study's axes."""
+    """Raise ValueError if a dataset lacks the coordinate of any axis of its study."""
     for axis_parameter in _axis_parameters(spec):
         if parameter_coordinate(dataset, axis_parameter.path) is None:
             raise ValueError(
@@ -185,7 +185,7 @@ def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSp
 
 
 def _study_value_mask(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
-    """Return a mask of a coordinate's values that are among the study's values of the parameter."""
+    """Return a mask of those values of a coordinate that the study has for its parameter."""
     path = coord.attrs["path"]
     axis_values = [
         np.asarray(axis_parameter.values)
@@ -256,7 +256,10 @@ def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
 
 
 def _restrict_to_design(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
-    """Return the dataset of one design of a join without points and variables of other designs."""
+    """Return the data of one of several joined studies, without those of the others.
+
+    Points and variables that only the others have are dropped.
+    """
     design_record = json.loads(dataset.attrs[JOINED_SPECS_ATTRIBUTE])[
         str(dataset[STUDY_ID_NAME].item())
     ]
@@ -308,7 +311,7 @@ def join_designs(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
 
 
 _SUMMED_ATTRIBUTES = ("points", "points_committed", "blocks", "blocks_committed")
-"""Attributes of datasets that a join sums over its designs."""
+"""Attributes of datasets that are summed when studies are joined."""
 
 
 def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
@@ -441,4 +444,7 @@ def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence
 
 
 _FILL_VALUE_BY_DTYPE_KIND = {"i": -1, "u": 0, "b": False}
-"""Values for the points that a design lacks, by NumPy's kind of data type; nan for other kinds."""
+"""Values for points that one of the joined studies lacks, by NumPy's kind of data type.
+
+For other kinds the value is nan.
+"""

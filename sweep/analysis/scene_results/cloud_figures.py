@@ -42,7 +42,10 @@ The azimuth is measured from north towards east.
 """
 
 DRAWN_GROUND_SLOPE_MAX = 1.5
-"""Slope above which the ground is not drawn, as walls and edges of crowns would hide points."""
+"""Slope of the ground (rise over run) above which it is not drawn.
+
+Walls and the edges of tree crowns would hide points.
+"""
 
 
 @dataclass(frozen=True)
@@ -115,13 +118,13 @@ DROPOUT_COLOUR, PATH_COLOUR, GROUND_COLOUR = "#C1121F", "#1A1A1A", "0.86"
 """Colours of shots without a point, of the flight path, and of the ground seen from the side."""
 
 OBLIQUE_WIDTH_MAX_INCHES, OBLIQUE_HEIGHT_MAX_INCHES = 7.6, 6.4
-"""Largest width and height of the projected box around the points [inches]."""
+"""Largest width and height, on an oblique picture, of the box around the points [inches]."""
 
 OBLIQUE_MARGINS_INCHES = (0.55, 0.75, 0.85, 0.1)
 """Margins of an oblique picture for ticks and labels: left, below, right and above [inches]."""
 
 _TRIAL_SHEET_SIDE_INCHES = 10.0
-"""Side of the square sheet on which the projection of the box is measured [inches]."""
+"""Side of a square trial figure on which the projection of the points' box is measured [inches]."""
 
 
 class ObliqueView:

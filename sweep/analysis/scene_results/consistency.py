@@ -19,22 +19,25 @@ from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.storage.locations import Location
 
 ERROR_RATIO_MAX = 2.0
-"""Largest ratio of errors to standard errors that counts as consistent."""
+"""Largest ratio of actual errors to stated standard errors that counts as consistent."""
 
 _JUDGED_ERRORS_MIN = 20
-"""Least number of errors for a judgement of their size."""
+"""Least number of errors from which their size is judged."""
 
 _SAMPLED_SHOTS_MAX, _SAMPLED_DRAWS_MAX, _SAMPLED_VALUES_PER_AXIS_MAX = 1 << 15, 16, 6
-"""Largest numbers of shots, of draws, and of values per axis that are read for the comparison."""
+"""Largest numbers of shots, of draws, and of values per axis whose errors are read."""
 
 _SAMPLED_FLIGHT_INTERVALS = 16
-"""Number of evenly spaced intervals of a long flight that are read."""
+"""Number of evenly spaced parts of a long flight whose errors are read."""
 
 _COMPARED_QUANTILES = 0.6827, 0.9545
-"""Fractions at which quantiles of the errors are compared with those of a normal distribution."""
+"""Fractions (probabilities) at which quantiles of actual errors are compared with normal ones."""
 
 _SCALAR_NORMAL_QUANTILES, _VECTOR_NORMAL_QUANTILES = (1.0, 2.0), (1.8780, 2.8328)
-"""Quantiles of the length of a normal error, in standard errors: of a number, and of a 3-vector."""
+"""Quantiles at 68.27 % and 95.45 % of the length of a normal error, in standard errors.
+
+The first pair is for a number, the second for a vector of three components.
+"""
 
 
 _LIKELY_CAUSE_BY_QUANTITY = {
@@ -172,7 +175,7 @@ def _iter_flight_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
 
 
 _VELOCITY_QUANTITY = "velocity"
-"""Name of the velocity vector of navigation, as a quantity."""
+"""Name in messages of the velocity vector that navigation computes."""
 _VARIABLE_BY_QUANTITY = {"range": "range", "radial velocity": "radial_velocity"}
 """Stored variables of the quantities of a point, by the quantity's name in messages."""
 

@@ -30,7 +30,7 @@ from sweep.spec.scene_sections import Interface
 from sweep.storage.locations import Location, write_path_atomically
 
 MEASURED_QUANTITIES = ("range", "radial_velocity")
-"""Quantities that a unit reports."""
+"""Names of the quantities that a lidar unit reports."""
 
 REPORT_COLUMNS = {
     "time": ("s", "time stamp: time of the measurement plus the latency"),
@@ -56,10 +56,10 @@ _TRUTH_VARIABLE_BY_COLUMN = {
     "true_range": "beam_range",
     "true_radial_velocity": "beam_radial_velocity",
 }
-"""Stored variables with the truth along the beam, by column of the reports."""
+"""Stored variables with the true values along the beam, by column of the reports."""
 
 _PERIOD_END_TOLERANCE_FRACTION = 1e-6
-"""Time before the end of a period from which a shot counts to the next period [periods].
+"""Time before the end of a report's period from which a shot counts to the next period [periods].
 
 It allows for rounding errors of times.
 """

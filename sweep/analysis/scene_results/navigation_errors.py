@@ -21,26 +21,32 @@ VELOCITY_QUANTITY, ALTITUDE_QUANTITY = "velocity", "altitude"
 """Names of the quantities that navigation solves for."""
 
 SOLUTIONS_PER_READ = 65_536
-"""Approximate number of solutions that are read at once."""
+"""Approximate number of navigation solutions that are read from a store at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorTally:
-    """Error statistics of solutions with m components, by altitude bin.
+    """Error statistics of navigation solutions, by altitude bin. A solution has m components.
 
     The sum of two tallies is the tally of all their solutions.
     """
 
     n_attempts: np.ndarray
-    """Number of attempts at a solution (bins,)."""
+    """Number of attempts to compute a navigation solution, in each altitude bin (bins,)."""
     n_solutions: np.ndarray
-    """Number of attempts that gave a solution (bins,)."""
+    """Number of attempts that gave a navigation solution, in each altitude bin (bins,)."""
     mean_error: np.ndarray
-    """Mean error of the solutions (bins, m)."""
+    """Mean error of the solutions in each altitude bin, by component (bins, m)."""
     squared_deviation: np.ndarray
-    """Sum of the squared deviations of errors from their mean (bins, m)."""
+    """Sum of squared deviations of errors from their mean, by altitude bin (bins, m).
+
+    The second dimension is the component of the solution.
+    """
     mean_stated_variance: np.ndarray
-    """Mean of the variances that the solutions state (bins, m)."""
+    """Mean variance that solutions state for themselves, by altitude bin (bins, m).
+
+    The second dimension is the component of the solution.
+    """
 
     def __add__(self, other: ErrorTally) -> ErrorTally:
         """Return the tally of both, by the method of Chan, Golub and LeVeque (1983).
@@ -102,7 +108,7 @@ class ErrorCurve:
     altitude_edges: np.ndarray
     """Edges of the altitude bins (bins + 1,) [m]."""
     tally: ErrorTally
-    """Error statistics in each bin."""
+    """Error statistics in each altitude bin."""
 
     @property
     def label(self) -> str:
@@ -303,14 +309,14 @@ def _quotient_or_nan(total: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 AVAILABILITY, BIAS, RMSE = "availability", "bias", "rmse"
-"""Names of the statistics of navigation errors."""
+"""Names of the statistics: share of attempts that gave a solution, mean error, and RMS error."""
 COMPONENT_NAMES_BY_QUANTITY = {VELOCITY_QUANTITY: ("x", "y", "z"), ALTITUDE_QUANTITY: ("",)}
 """Names of the components of each quantity; altitude has a single one without a name."""
 
 UNIT_BY_QUANTITY = {VELOCITY_QUANTITY: "m/s", ALTITUDE_QUANTITY: "m"}
 """Units of the errors of each quantity."""
 VECTOR_LENGTH_LABEL = "vector"
-"""Label of the error of the whole vector, which is listed after the components x, y and z."""
+"""Label of the error of a whole vector, which follows the components x, y and z."""
 
 ComponentStatistic = tuple[str, int]
 """Name of a statistic, and index of a component; an index after the last stands for the vector."""

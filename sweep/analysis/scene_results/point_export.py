@@ -53,7 +53,7 @@ UNIT_BY_COLUMN = {
     for n in POINT_COLUMNS
     if n in QUANTITY_BY_NAME and QUANTITY_BY_NAME[n].units != "1"
 }
-"""Units of the columns that have a unit."""
+"""Units of those columns of points that have a unit."""
 UNIT_BY_COLUMN["scan_angle"] = "deg"
 
 REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING_SIGN_NOTE)
@@ -193,10 +193,13 @@ def write_csv(table: PointTable, file_path: Path, remarks: Remarks) -> int:
 
 
 LAS_COORDINATE_STEP_MIN = 1e-4
-"""Least quantisation step of coordinates in a LAS file [m]; a large cloud needs a larger step."""
+"""Least step in which coordinates are stored in a LAS file [m].
+
+A large cloud needs a larger step.
+"""
 
 LAS_COORDINATE_STEPS_MAX = 2.0**31 - 1
-"""Largest distance of a coordinate from the file's offset in a LAS file [quantisation steps]."""
+"""Largest distance of a coordinate from the offset of a LAS file, in steps of coordinates."""
 LAS_RETURN_NUMBER_MAX = 15
 """Largest return number in a LAS file."""
 
@@ -204,10 +207,10 @@ _LAS_STANDARD_COLUMNS = {"x", "y", "z", "time", "return_number", "number_of_retu
 """Columns with a field in LAS point format 6. All other columns become extra bytes."""
 
 _LAS_SCAN_ANGLE_STEP_DEG = 0.006
-"""Quantisation step of scan angles in a LAS file [deg]."""
+"""Step in which scan angles are stored in a LAS file [deg]."""
 
 _STORED_RETURN_NUMBER_FIELD = "stored_return"
-"""Name of the extra field with the stored return number, from 1."""
+"""Name of the extra field of a LAS point with the number of the return in the store, from 1."""
 
 _LAS_BEAM_NUMBER_MAX = 255
 """Largest beam number that the user data of a LAS point can hold."""

@@ -41,9 +41,9 @@ MISSING_POINT_COLOUR = "0.6"
 """Colour of points whose value is not known, or whose category has no colour of its own."""
 
 OUTLIER_MARGIN_FRACTION = 0.25
-"""Distance beyond the 0.5 % or 99.5 % quantile from which values do not extend a colour scale.
+"""Distance beyond the 0.5 % or 99.5 % quantile above which a value does not extend a colour scale.
 
-It is a fraction of the span between both quantiles.
+It is a fraction of the difference between both quantiles.
 """
 
 
@@ -111,9 +111,9 @@ def false_point_legend_marker() -> Line2D:
 def choose_colours(
     quantity: str, values: np.ndarray, *, is_trusted: np.ndarray, surfaces: Sequence[str]
 ) -> ContinuousColourScale | CategoryColours:
-    """Return the colours for the values of a quantity: continuous, or by category.
+    """Return the colours for the values of a quantity: a continuous scale, or one per category.
 
-    ``is_trusted`` is a mask of the values that determine the ends of a continuous scale, and
+    ``is_trusted`` is a mask of the values that determine the ends of a continuous scale.
     ``surfaces`` are the names of the surfaces.
     """
     if quantity in CATEGORICAL_QUANTITIES:
@@ -147,7 +147,7 @@ def _colour_scale_ends(values: np.ndarray) -> tuple[float, float]:
 def _continuous_colour_scale(
     quantity: str, values: np.ndarray, is_trusted: np.ndarray
 ) -> ContinuousColourScale:
-    """Return a continuous colour scale that spans the trusted values, without outliers."""
+    """Return a colour scale that spans the values of trusted points, without far outliers."""
     finite_values = values[np.isfinite(values)]
     trusted_values = values[is_trusted & np.isfinite(values)]
     trusted_values = trusted_values if trusted_values.size else finite_values
@@ -250,7 +250,7 @@ TICK_SPACING_MIN_X_INCHES, TICK_SPACING_MIN_Y_INCHES = 0.42, 0.25
 """Least spacing of legible ticks on horizontal and vertical axes [inches]."""
 
 OFFSET_LABEL_COORDINATE_MIN = 1e5
-"""Magnitude of coordinates [m] above which an axis shows differences from a round number."""
+"""Magnitude of coordinates above which axis labels are differences from a round number [m]."""
 
 
 def marker_area(positions: np.ndarray, width: float, height: float) -> float:

@@ -80,7 +80,7 @@ LOG_QUANTITIES = ("pfa_up", "pfa_down")
 """Quantities that are shown on a logarithmic scale: probabilities of false alarms."""
 
 POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Bits of a point's flags by the kind of point that they stand for.
+"""Bits of a point's flags that say of which kind the point is, by the name of the kind.
 
 Each point has exactly one of these bits.
 """
@@ -163,7 +163,7 @@ ValueLimits = tuple[float, ...]
 """Lowest and highest value of a quantity."""
 
 UNLIMITED_VALUES: ValueLimits = (-np.inf, np.inf)
-"""Limits that every finite value keeps."""
+"""Limits that exclude no finite value."""
 
 
 def within_limits_mask(
@@ -188,7 +188,10 @@ class Recording:
     dataset: xr.Dataset
     """Arrays of the scanner at this position."""
     flags_chunk_folder: Location | None = None
-    """Folder with the chunks of the array `flags` at this position; None for a packed store."""
+    """Folder with the stored chunks of the array `flags` for this scanner and position.
+
+    Chunks in it show which shots are computed. It is None for a packed store.
+    """
 
     @property
     def n_shots(self) -> int:
@@ -350,8 +353,8 @@ class Recording:
 def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
     """Return the number of the first shot that has true points on two surfaces in a draw.
 
-    If there is none, the result is the first shot whose spectrum without noise has two groups of
-    bins above the threshold, or None.
+    If there is none, it is the first shot whose spectrum without noise has two groups of adjacent
+    bins above the threshold. If there is none either, the result is None.
     """
     fallback_shot = None
     for shot_slice in recording.iter_shot_slices():
@@ -385,7 +388,7 @@ def select_rows_within(
 
 
 class ThinnedRows:
-    """Rows appended part by part, of which every n-th is kept to stay below a largest number.
+    """Rows collected part by part. If they are too many, only every n-th row is kept.
 
     The step n is a power of two.
     """
@@ -426,7 +429,7 @@ class AxisPosition:
     label: str
     """Coordinates of the position, as text."""
     open_axes: tuple[str, ...]
-    """Names of the axes along which the request admits several values."""
+    """Names of the axes along which the request leaves several values to choose from."""
 
     def open_recording(self, tree: xr.DataTree, scanner: str) -> Recording:
         """Return the recording of a scanner at this position."""
@@ -550,22 +553,22 @@ CLOUD_POINTS_MAX, CLOUD_DROPOUTS_MAX, CLOUD_PATH_POINTS_MAX = 120_000, 20_000, 2
 """Largest numbers of points, shots without a point, and path positions in a picture."""
 
 BOX_MARGIN_FRACTION = 0.04
-"""Margin around the points of a picture, as a fraction of the longest side of their box."""
+"""Margin around the points of a picture, relative to the longest side of their box."""
 
 CoordinateBox = dict[str, tuple[float, float]]
-"""Lowest and highest value of x, y and z [m]."""
+"""Lowest and highest value of each of x, y and z [m], the bounds of a picture."""
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points of a picture, with the flight path and dropouts (shots without a point)."""
+    """Points of a picture, with the flight path and dropouts (shots that gave no point)."""
 
     points: ColumnArrays
     """Columns of the points: x, y, z, flags, and the requested quantities."""
     path: ColumnArrays
     """Columns x, y and z of the flight path [m]; empty if it was not requested."""
     thinned_points: ThinnedRows
-    """Points before the box was applied, with the number of all points."""
+    """Points before those outside the box were left out, with the number of all points."""
     thinned_dropouts: ThinnedRows
     """Positions of the dropouts, with the number of all dropouts."""
     n_outside: int

@@ -1,1 +1,1 @@
-"""Cost of accuracy in time: a ladder of settings, tried on a sample of a study's points."""
+"""Cost of accuracy: error and computing time of different accuracy settings, on sampled points."""

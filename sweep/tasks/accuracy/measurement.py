@@ -1,4 +1,7 @@
-"""Measurement of the cost of accuracy: settings tried in rounds on a sample, stored with errors."""
+"""Measurement of the cost of accuracy: error and computing time of each setting on sampled points.
+
+The results are stored in a store of their own.
+"""
 
 from __future__ import annotations
 
@@ -54,37 +57,60 @@ from sweep.tasks.studies.output_layouts import cf_attributes
 from sweep.tasks.studies.study_loading import ACCURACY_STORE_KIND, make_study
 
 DEFAULT_SAMPLE_POINTS, DEFAULT_TIME_LIMIT_SECONDS = 200, 60.0
-"""Default number of points of a sample, and default time limit of the trials [s]."""
+"""Defaults of `measure_accuracy`: number of sampled points, and time limit of the measurement [s].
+"""
 
 ROUNDS_MAX = 27
-"""Largest number of rounds, for studies whose points take little time and vary most in it."""
+"""Largest number of rounds.
+
+In each round every setting is timed once on every part of the sample.
+"""
 
 TRIAL_TIME_FRACTION = 0.003
-"""Fraction of the time limit per trial, large enough for a negligible overhead of calls."""
+"""Aimed duration of one trial of a setting, as a fraction of the measurement's time limit."""
 
 TIMED_SEQUENCE_TIME_FACTOR = 2
-"""Time of a sequence of points that is timed, as a multiple of the time of a trial."""
+"""Aimed time of the points that are timed for a setting, as a multiple of a trial's aimed duration.
+"""
 
 FIRST_TIMED_SEQUENCE_DIVISOR = 8
-"""Divisor of the length of the first sequences, which show what settings are slow."""
+"""Factor by which the first timed sequence of points is shorter than the longest one.
+
+The first sequences only show which settings are slow.
+"""
 
 FIRST_ROUND_TIME_FRACTION, TIME_DOMAIN_TIME_FRACTION = 0.6, 0.8
-"""Fractions of the time limit at which the first round, and the time-domain comparison, end."""
+"""Fractions of the time limit by which two stages are to end.
+
+The first is for the first round of trials, the second for the comparison with the time domain.
+"""
 
 TIME_DOMAIN_POINTS_MIN, TIME_DOMAIN_POINTS_MAX = 3, 500
-"""Least number of points in the time domain, whatever their time, and largest number."""
+"""Least and largest number of points that are also simulated in the time domain.
+
+The least number is simulated even if the time limit is exceeded.
+"""
 
 TIME_DOMAIN_BEAMLET_COUNT = 109
-"""Number of beamlets in the time domain if accuracy sets it; each beamlet needs a record."""
+"""Number of beamlets (rays of a beam) in the time-domain simulation.
+
+It is used if the spec's accuracy sets their number. Few are used because each needs a record.
+"""
 
 REPEATED_TRIAL_SECONDS_MAX = 1.0
-"""Time of a trial [s] above which it is made only once."""
+"""Duration of a setting's trial [s] above which the setting is tried in the first round only."""
 
 FIXED_EFFECTS_TOLERANCES = (1e-1, 1e-3, 1e-6)
-"""Tolerances whose effects are tried as fixed sets, the same at every point."""
+"""Tolerances from which settings with fixed effects are made.
+
+Such a setting simulates at every point each effect that the tolerance needs at any point.
+"""
 
 STORING_TIME_REPEATS = 3
-"""Number of trials of each part of storing; the first may import and open modules and files."""
+"""Number of times that each step of storing is timed.
+
+The first time may be longer, because modules are imported and files opened.
+"""
 
 
 def measure_accuracy(
@@ -155,7 +181,7 @@ def measure_accuracy(
 
 
 def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
-    """Raise a StoreError if something at a path may not be replaced."""
+    """Raise a StoreError if the path holds something that may not be overwritten."""
     if can_create_store(store_path):
         return
     if store_format.read_attributes(store_path)["kind"] != ACCURACY_STORE_KIND:
@@ -169,7 +195,7 @@ def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
 
 
 def measure_storing_seconds(study: BlockStudy) -> float:
-    """Return the processor time of creating a study's store and writing its blocks [s]."""
+    """Return the processor time [s] that creating a study's store and writing its blocks takes."""
     block = study.n_blocks // 2
     results = {
         name: np.zeros(
@@ -195,13 +221,14 @@ def measure_storing_seconds(study: BlockStudy) -> float:
 
 
 class NothingMeasured(Exception):
-    """Raised if the measurement is interrupted before any point is complete."""
+    """Exception raised if the measurement is interrupted before any point has all its results."""
 
 
 class AccuracyMeasurement:
-    """Measurement of all settings on a sample, in turn, so that drifts affect all settings alike.
+    """Measurement of the error and computing time of accuracy settings on a sample of points.
 
-    Each round has a different order of settings, as a short trial takes longer after a long one.
+    All settings are tried in turn, so that drifts of the machine's speed affect all alike. Each
+    round has a different order of settings, because a short trial takes longer after a long one.
     All rounds together take about `time_limit` [s].
     """
 
@@ -224,7 +251,10 @@ class AccuracyMeasurement:
         self._order_generator = np.random.default_rng(0)
 
     def run(self) -> AccuracyTemplate:
-        """Run all rounds that the time allows; `NothingMeasured` if no point is complete."""
+        """Run as many rounds as the time limit allows. Return the content of the store.
+
+        NothingMeasured is raised if the run is interrupted before any point is complete.
+        """
         n_settings = len(self._settings)
         self._progress.say(
             f"trying {n_settings} settings on {self._sample.size:,} {self._sample.points_noun}"
@@ -239,7 +269,7 @@ class AccuracyMeasurement:
             self._progress.end()
 
     def _run_rounds(self, parts: list[np.ndarray], n_rounds: int) -> AccuracyTemplate:
-        """Run the rounds, and compare with the time domain after the first one.
+        """Run all rounds of trials, with the time-domain comparison after the first one.
 
         Return the content of the store.
         """
@@ -280,7 +310,11 @@ class AccuracyMeasurement:
         )
 
     def _points_per_part(self) -> int:
-        """Return the number of points of a part of the sample; the time allows two parts."""
+        """Return the number of points in each part of the sample.
+
+        All settings are tried on one part before the next part begins. Parts are so small that the
+        time limit suffices for at least two.
+        """
         setting_numbers, first_part = (
             range(len(self._settings)),
             self._sample.split_into_parts(1)[0],
@@ -301,7 +335,10 @@ class AccuracyMeasurement:
         return max(1, min(self._sample.size // parts_min, int(points_that_fit / (parts_min + 1))))
 
     def _plan_rounds(self, parts: list[np.ndarray]) -> int:
-        """Return the number of rounds that the time allows; set the points to time per setting."""
+        """Return the number of rounds that the time limit allows.
+
+        Also set, for each setting, how many points are timed per trial.
+        """
         n_points, trial_seconds = 1, TRIAL_TIME_FRACTION * self._time_limit
         while (
             self._time_trial(0, parts[0]) < trial_seconds / 2
@@ -334,11 +371,11 @@ class AccuracyMeasurement:
 
     @property
     def _elapsed_seconds(self) -> float:
-        """Time since the start of the trials [s]."""
+        """Wall time since the start of the trials [s]."""
         return time.monotonic() - self._start
 
     def _time_trial(self, setting_number: int, part: np.ndarray) -> float:
-        """Try a setting on a part of the sample. Return the wall time [s]."""
+        """Compute a part of the sample with one setting. Return the wall time that it took [s]."""
         start = time.monotonic()
         if self._interrupts.is_stopping:
             raise NothingMeasured
@@ -347,7 +384,10 @@ class AccuracyMeasurement:
         return time.monotonic() - start
 
     def _try_setting(self, setting_number: int, part: np.ndarray) -> Trial:
-        """Try a setting on a part of the sample, timed on as many points as are planned."""
+        """Compute a part of the sample with one setting. Return the trial with results and times.
+
+        The processor time is measured on the number of points planned for this setting.
+        """
         return self._sample.try_setting(
             self._settings[setting_number], part, int(self._n_timed_points[setting_number])
         )
@@ -359,9 +399,9 @@ class AccuracyMeasurement:
         time_fraction: float,
         first_round: list[list[Trial]] | None = None,
     ) -> list[list[Trial]]:
-        """Try every setting on each part that time allows; slow settings only in the first round.
+        """Try every setting on each part of the sample, as far as the time allows.
 
-        Return the trials by part and setting.
+        Slow settings are tried in the first round only. Return the trials by part and setting.
         """
         trials_by_part: list[list[Trial]] = []
         for part in parts:
@@ -385,10 +425,11 @@ class AccuracyMeasurement:
     def _compare_with_time_domain(
         self, sample_rows: np.ndarray
     ) -> tuple[dict[int, np.ndarray], int]:
-        """Compare the reference with the time domain at some points, as time allows.
+        """Compare the most accurate setting, the reference, with time-domain records.
 
-        Return the differences of each point, by :func:`result_differences`, and the number of
-        beamlets of both, 0 if it is that of the reference.
+        The records are made at some of the points, as time allows. Return the differences at each
+        point, by :func:`result_differences`, and the number of beamlets of both. That number is 0
+        if it is the reference's own.
         """
         reference_setting, beamlets_field = self._setting_ladder.reference, "footprint.beamlets"
         differences: dict[int, np.ndarray] = {}
@@ -420,7 +461,10 @@ class AccuracyMeasurement:
 def add_settings_with_fixed_effects(
     setting_ladder: SettingLadder, sample: StudySample, tolerances: Iterable[float] = ()
 ) -> SettingLadder:
-    """Return the ladder with settings that fix the effects of each tolerance at every point."""
+    """Return all settings, with added ones that simulate the same effects at every point.
+
+    There is one added set of effects for each tolerance in `FIXED_EFFECTS_TOLERANCES`.
+    """
     if not any(setting.kind == ALL_EFFECTS_KIND for setting in setting_ladder.settings):
         return setting_ladder  # settings of draws have no such variants
     setting_by_tolerance = {
@@ -444,19 +488,22 @@ ERROR_ARRAY_LONG_NAMES = {
     "leakage_error": "error of a probability of leakage, of the two chirps",
     "standard_error": "standard error that the setting itself tells, where it draws",
 }
-"""Arrays by setting and point, and their long names.
+"""Long names of the arrays of errors in the store, which have one value per setting and point.
 
 The first four are in the order of :func:`result_differences`.
 """
 
 N_PROMISED_ERRORS = 3
-"""Number of arrays in `ERROR_ARRAY_LONG_NAMES`, from the first on, that a tolerance bounds."""
+"""Number of arrays of errors that the tolerance bounds: the first ones of `ERROR_ARRAY_LONG_NAMES`.
+"""
 
 
 def result_differences(results: SampleResults, reference: SampleResults) -> tuple[np.ndarray, ...]:
-    """Return the largest differences (n,) of pd, log10 pfa, magnitudes and leakage.
+    """Return the largest differences, (n,) each, between two results at n points.
 
-    Magnitudes are relative to the second results, or to sigma if they are below it.
+    These are the differences of pd, log10 pfa, magnitudes of bins, and probability of leakage
+    peaks. Differences of magnitudes are relative to the second results, or to the noise's standard
+    deviation if the magnitudes are below it.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log10_pfa_difference = np.abs(results.log10_pfa - reference.log10_pfa)
@@ -479,14 +526,20 @@ def result_differences(results: SampleResults, reference: SampleResults) -> tupl
 
 
 def _probability_differences(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return differences of probabilities; nan counts as 0 unless both are nan."""
+    """Return the absolute differences of two arrays of probabilities.
+
+    A single nan counts as a probability of 0. The difference is nan where both are nan.
+    """
     is_known = np.isfinite(first) | np.isfinite(second)
     return np.where(is_known, np.abs(np.nan_to_num(first) - np.nan_to_num(second)), np.nan)
 
 
 @dataclass
 class AccuracyTemplate:
-    """Content of a store of accuracy: errors by setting and point, times by setting and round."""
+    """Content of a store of `sweep accuracy`: errors and times of all settings.
+
+    Errors are stored by setting and point, times by setting and round.
+    """
 
     sample: StudySample
     setting_ladder: SettingLadder
@@ -494,23 +547,23 @@ class AccuracyTemplate:
     trials_by_round: list[list[Trial]]  # trials of all these points, by round and setting
     n_timed_points: np.ndarray  # (settings,): number of points that are timed together
     time_domain_differences: dict[int, np.ndarray]
-    """Differences of the reference from the time domain, by index in the sample."""
+    """Differences of the reference from the time domain, by the point's number in the sample."""
     time_domain_beamlets: int  # number of beamlets of both; 0 if that of the reference
     stop_reason: str  # reason why the sample is incomplete, or ''
     storing_seconds: float = math.nan  # processor time of storing the study [s]
 
     @property
     def model_version(self) -> str:
-        """Version of the model that was measured."""
+        """Version of the simulation model with which the accuracy was measured."""
         return VERSION
 
     @property
     def id(self) -> str:
-        """Id of the study."""
+        """Identifier (hash) of the study whose accuracy was measured."""
         return self.sample.spec.id
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return the spec, the reference of the errors, and totals of the measurement."""
+        """Return the root attributes: spec, reference setting, and totals of the measurement."""
         spec, settings_and_trials = (
             self.sample.spec,
             zip(self.setting_ladder.settings, self.trials_by_round[0], strict=True),
@@ -549,11 +602,11 @@ class AccuracyTemplate:
         }
 
     def group_attributes(self) -> dict[str, dict[str, Any]]:
-        """Return no groups."""
+        """Return an empty mapping, as the store has no groups of arrays below its root."""
         return {}
 
     def array_layouts(self) -> list[ArrayLayout]:
-        """Return coordinates, errors and times."""
+        """Return the layouts of all arrays of the store: coordinates, errors and times."""
         settings, results = (
             self.setting_ladder.settings,
             [trial.results for trial in self.trials_by_round[0]],
@@ -638,6 +691,9 @@ class AccuracyTemplate:
 
 
 def tolerance_of_setting(setting: AccuracySetting) -> float:
-    """Return the tolerance of an adaptive setting; nan of other settings."""
+    """Return the tolerance that a setting states.
+
+    The result is nan for the reference and for settings without a tolerance.
+    """
     value = setting.overrides.get("accuracy.tolerance", np.nan)
     return float(value) if setting.kind != REFERENCE_KIND else np.nan

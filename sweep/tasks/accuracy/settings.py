@@ -1,4 +1,7 @@
-"""Accuracy settings of a study that are compared, as overrides of its spec."""
+"""Accuracy settings that are compared for a study.
+
+Each overrides some fields of the study's spec.
+"""
 
 from __future__ import annotations
 
@@ -31,44 +34,62 @@ MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
     "draws counted",
     "draws in noise",
 )
-"""Kinds of accuracy settings, by how a point is computed."""
+"""Kinds of settings with random draws, by how pd of a point follows from the draws."""
 
 TRIED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
 TRIED_BEAMLET_COUNTS = (1, 7, 19, 37, 61, 109, 223, 1015, 4009)
-"""Numbers of beamlets that a study might fix: complete shells of a hexagonal lattice."""
+"""Numbers of beamlets in a hexagonal lattice that are tried as fixed numbers.
+
+Each number fills complete shells of the lattice.
+"""
 
 TRIED_LINE_BEAMLET_COUNTS = (3, 9, 33, 163, 1234)
-"""Numbers of beamlets in a line along the slope that a study over a plane might fix."""
+"""Numbers of beamlets along one line that are tried as fixed numbers.
+
+The line follows the slope of the target, which must be a plane.
+"""
 
 FIXED_EFFECTS_LINE_BEAMLET_COUNT = 163
-"""Number of beamlets in a line with fixed effects: enough for the widest footprints."""
+"""Number of beamlets along a line in settings with fixed effects; enough for the widest footprints.
+"""
 
 THESIS_BEAMLET_COUNT = 109
-"""Number of beamlets in [T 3.3.1]."""
+"""Number of beamlets per beam that the thesis uses [T 3.3.1]."""
 
 REFERENCE_RAYS_PER_SHOT, REFERENCE_RAYS_TOLERANCE = 8017, 3e-7
-"""Rays per shot of a flight's reference, and error by rays above which a shot gets more."""
+"""Settings of rays for the reference of a flight, the most accurate setting.
+
+The first is the number of rays per shot. The second is the largest error of a shot's results by the
+finite number of rays; a shot with a larger error gets more rays.
+"""
 
 FIXED_RAYS_PER_SHOT_MAX = 223
-"""Largest fixed number of rays that is tried; more cost as much as everything else together."""
+"""Largest fixed number of rays per shot that is tried.
+
+Larger numbers would take as much time as all other trials together.
+"""
 
 FIXED_RAYS_PER_SHOT_MIN, RAYS_TIMES_TOLERANCE = 19, 0.1
-"""Numbers of rays with fixed effects: the least, and the product of rays and tolerance.
+"""Constants for the number of rays per shot in settings with fixed effects.
 
-With this product one shot in a thousand over open ground exceeds the tolerance.
+That number is the second constant over the tolerance, but at least the first, rounded up to a tried
+number. About one shot in a thousand over open ground then exceeds the tolerance.
 """
 
 REFERENCE_TOLERANCE = 1e-9
-"""Tolerance of the reference for lines, leakage and, over a plane, the number of beamlets."""
+"""Tolerance of the most accurate setting, to which all others are compared.
+
+It limits the errors by lines and leakage and, over a plane, by the number of beamlets.
+"""
 
 TRIED_DRAW_COUNTS = (10, 100, 1000)
 
 REFERENCE_DRAWS_FACTOR = 10
-"""Number of draws of the reference over that of the longest setting."""
+"""Number of draws of the reference, as a multiple of the largest number of draws that is tried."""
 
 TRIED_DRAW_TOLERANCES = (1e-1, 3e-2, 1e-2)
-"""Tolerances of pd that end the draws of a point."""
+"""Tried tolerances of pd: a point is drawn until the statistical error of its pd is below it."""
 
 _TOLERANCE_FIELD, _DRAWS_FIELD, _DRAWS_LIMIT_FIELD = (
     "accuracy.tolerance",
@@ -87,8 +108,8 @@ class AccuracySetting:
 
     ``thesis_grid_options`` are options of
     :func:`sweep.model.spectrum.oversampled_grid.find_peaks_on_grid`, if this function finds the
-    peaks. ``rays_error_max`` is the largest error by rays of a flight's shot before it gets more
-    rays; 0 if the spec sets it.
+    peaks. ``rays_error_max`` is the largest error of a flight's shot by its finite number of rays;
+    a shot with a larger error gets more rays. 0 means that the spec sets it.
     """
 
     name: str
@@ -99,15 +120,16 @@ class AccuracySetting:
 
     @property
     def has_line_effects_only(self) -> bool:
-        """True if only effects are simulated that the thesis's method can simulate.
+        """True if the setting simulates only effects that the thesis's method can simulate.
 
-        These move or scale a line as a whole, without changes within a record.
+        Such effects move or scale a spectral line as a whole. They do not change it within a
+        record.
         """
         return self.kind in (CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND)
 
     @property
     def plans_effects(self) -> bool:
-        """True if effects are planned, and the time of planning counts."""
+        """True if the setting chooses effects point by point. The time of choosing then counts."""
         return not self.has_line_effects_only and self.kind not in (
             FIXED_EFFECTS_KIND,
             ALL_EFFECTS_KIND,
@@ -116,17 +138,23 @@ class AccuracySetting:
 
     @property
     def counts_detections(self) -> bool:
-        """True if pd is the fraction of detected draws, not the mean of their probabilities."""
+        """True if pd is the fraction of draws with a detection, not the mean of the draws' pd."""
         return self.kind in (COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND)
 
     def apply_to(self, spec: AnySpec) -> AnySpec:
-        """Return the spec with the overrides; SpecError if the result is invalid."""
+        """Return the spec with the setting's values.
+
+        SpecError is raised if the result is invalid.
+        """
         return apply_changes(spec, self.overrides) if self.overrides else spec
 
 
 @dataclass(frozen=True)
 class SettingLadder:
-    """Settings, the reference last, and notes on them."""
+    """All settings that are compared, with notes.
+
+    The last one is the most accurate, the reference.
+    """
 
     settings: tuple[AccuracySetting, ...]
     reference_text: str  # description of the reference
@@ -134,12 +162,12 @@ class SettingLadder:
 
     @property
     def reference(self) -> AccuracySetting:
-        """Setting to which the results of all others are compared."""
+        """Most accurate setting, to whose results the results of all others are compared."""
         return self.settings[-1]
 
 
 def build_setting_ladder(spec: AnySpec) -> SettingLadder:
-    """Return the settings of a study, without those with fixed effects."""
+    """Return the accuracy settings to compare for a study, without those that fix the effects."""
     if isinstance(spec, GridSpec) and spec.draws.has_draws:
         return _build_draw_setting_ladder(spec)
     notes: list[str] = []
@@ -199,10 +227,10 @@ def add_fixed_effect_settings(
     effects_by_tolerance: Mapping[float, frozenset[str]],
     tolerances: Iterable[float] = (),
 ) -> SettingLadder:
-    """Add settings with fixed effects: at every point those that a tolerance needs at any point.
+    """Add settings that simulate the same effects at every point.
 
-    ``tolerances`` of lines and leakage are tried with each set of effects; by default the
-    tolerances of the sets.
+    Each set of effects holds those that one tolerance needs at any point. Each set is tried with
+    all ``tolerances`` for lines and leakage; by default with the tolerance of the set alone.
     """
     tolerance_by_effects: dict[frozenset[str], float] = {}
     for tolerance, effect_names in effects_by_tolerance.items():
@@ -237,7 +265,10 @@ def add_fixed_effect_settings(
 
 
 def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
-    """Return overrides of the number of beamlets for fixed effects; empty if the scene sets it."""
+    """Return the field values that set the number of beamlets in settings with fixed effects.
+
+    The result is empty if the scene sets the number of beamlets.
+    """
     if _fixed_beamlets_reason(spec):
         return {}
     if not isinstance(spec, SceneSpec):
@@ -255,7 +286,7 @@ def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
 
 
 def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
-    """Return settings with fixed numbers of beamlets: in a lattice, and in a line over a plane."""
+    """Return settings with fixed numbers of beamlets, in a lattice or, over a plane, on a line."""
     for n_beamlets in TRIED_BEAMLET_COUNTS:
         if not is_flight or n_beamlets <= FIXED_RAYS_PER_SHOT_MAX:
             yield AccuracySetting(
@@ -271,7 +302,7 @@ def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
 
 
 def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterator[AccuracySetting]:
-    """Yield settings of the thesis's method, its improvements, and the same in closed form."""
+    """Yield settings of the thesis's method, of improvements to it, and closed-form equivalents."""
     yield AccuracySetting(name="closed form, as thesis", kind=CLOSED_FORM_KIND, overrides=overrides)
     variants: list[tuple[str, str, int, dict[str, Any]]] = [
         *((THESIS_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),
@@ -302,7 +333,10 @@ def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterato
 
 
 def _build_draw_setting_ladder(spec: GridSpec) -> SettingLadder:
-    """Return settings of draws, with a long run of other draws as the reference."""
+    """Return settings for a study with random draws.
+
+    The reference is a setting with many more draws, made with other random numbers.
+    """
     reference_draws = REFERENCE_DRAWS_FACTOR * TRIED_DRAW_COUNTS[-1]
     notes = ["errors are differences from a long run with other draws, so they are random too"]
     as_written_overrides: dict[str, Any] = {}
@@ -359,11 +393,11 @@ def _build_draw_setting_ladder(spec: GridSpec) -> SettingLadder:
 
 
 def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
-    """Return overrides that enable all effects.
+    """Return the field values that enable all effects.
 
     An effect whose absence is a rule of the scene, such as segment motion, stays off if the spec
-    disables it. Random effects are enabled only if probabilities are means over
-    draws, which they are not in a flight.
+    disables it. Random effects are enabled only if probabilities are means over draws, which they
+    are not in a flight.
     """
     has_draws, modes = isinstance(spec, GridSpec) and spec.draws.has_draws, spec.effect_modes()
     return {
@@ -375,12 +409,12 @@ def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
 
 
 def _is_on_axis(spec: AnySpec, path: str) -> bool:
-    """Return True if an axis of the spec varies a parameter."""
+    """Return True if an axis of the spec varies the parameter at a dotted path."""
     return any(member.path == path for axis in spec.axes for member in axis.parameters)
 
 
 def _fixed_beamlets_reason(spec: AnySpec) -> str:
-    """Return the reason why the scene, not accuracy, sets the number of beamlets; or ''."""
+    """Return why the scene, not the accuracy, sets the number of beamlets; '' if it does not."""
     if spec.parameters()["footprint.phases"] == "coherent":
         return "with coherent phases it is part of the scene, as the thesis has it"
     if spec.instrument.receiver.architecture == "direct":

@@ -1,8 +1,8 @@
-"""Sample of a study's points on which accuracy settings are tried.
+"""Sample of a study's points, on which accuracy settings are tried.
 
-Points of a grid are spread over all axes. Shots of a flight come in complete tiles, as effects are
-planned by tile. Points are computed as in a run, or by the thesis's method
-(:mod:`sweep.model.spectrum.oversampled_grid`).
+Points of a grid are spread over all axes. Shots of a flight come in complete tiles of consecutive
+shots, because effects are planned tile by tile. Points are computed as in a run, or by the thesis's
+method (:mod:`sweep.model.spectrum.oversampled_grid`).
 """
 
 from __future__ import annotations
@@ -45,48 +45,52 @@ from sweep.tasks.studies.parameter_grid import (
 )
 
 PeakFinder = Callable[[Shots], np.ndarray]
-"""Function that returns the largest bins of each segment's spectrum.
+"""Function that finds the largest bins in the spectrum of each segment (chirp) of some shots.
 
-The result is that of :func:`sweep.model.evaluation.evaluate_segments`.
+It returns what :func:`sweep.model.evaluation.evaluate_segments` returns.
 """
 
 PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
-"""Values of points and their attributes, by name of the coordinate."""
+"""Coordinates that identify sampled points: by name, the values at the points, and the attributes.
+"""
 
 
 def _effect_flags_of_names(effect_names: Collection[str]) -> np.uint32:
-    """Return the flags of the named effects."""
+    """Return an integer in which the bit of each named effect is set."""
     return np.uint32(sum(1 << EFFECT_NAMES.index(effect_name) for effect_name in effect_names))
 
 
 THESIS_EFFECT_FLAGS = _effect_flags_of_names(
     [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
 )
-"""Flags of the effects that the thesis's method can simulate: those that move or scale lines."""
+"""Effects that the thesis's method can simulate, one bit each.
+
+They move or scale a spectral line as a whole.
+"""
 
 TIME_DOMAIN_EFFECT_FLAGS = ~_effect_flags_of_names(
     ["acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"]
     + [effect.name for effect in EFFECTS if effect.is_random]
 )
-"""Flags of the effects that the time-domain records contain."""
+"""Effects that simulated time-domain records contain, one bit each."""
 
 TIMED_SEQUENCES_PER_PART, TIMED_POINTS_MAX = 12, 8192
-"""Numbers of sequences of points that are timed per part of a grid's sample, and of their points.
-
-The second number is the largest.
-"""
+"""Limits of timing in a grid: timed sequences per part of the sample, and points per sequence."""
 
 AXIS_POINTS_PER_SCANNER = 2
-"""Number of points of the axes at which each scanner of a flight is sampled."""
+"""Number of points of a flight's axes at which shots of each scanner are sampled."""
 
 RESERVED_COORDINATE_NAMES = ("number", "kind", "tolerance")
-"""Names of coordinates of the store; parameters of these names have their complete path instead."""
+"""Names that the store uses for its own coordinates.
+
+The coordinate of a parameter with such a name is called by the parameter's full dotted path.
+"""
 
 AS_WRITTEN_SETTING = AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
 
 
 class SampleResults(NamedTuple):
-    """Results of a setting at n points; nan where it has none."""
+    """Results that one accuracy setting gives at n points; nan where it gives no result."""
 
     pd: np.ndarray  # (n, 4): probability of detection in up, Doppler, down segment, and shot
     log10_pfa: np.ndarray  # (n, 2): log10 of the probability of false alarm of segment and shot
@@ -95,13 +99,14 @@ class SampleResults(NamedTuple):
     standard_error: np.ndarray  # (n,): largest standard error of pd, if it is a mean over draws
     noise_sigma: np.ndarray  # (n,): noise of a bin per quadrature, in the unit of magnitudes
     n_beamlets: np.ndarray
-    """Number of beamlets (n,); in a flight the number of rays cast."""
+    """Number of beamlets that sample the beam at each point (n,); in a flight, of rays cast."""
 
 
 def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
-    """Return the sample results of some points from the model's outputs.
+    """Return the results of some points from the model's outputs.
 
-    With ``n_draws`` the outputs are counts of so many draws, otherwise probabilities.
+    If ``n_draws`` is given, the outputs are numbers of draws with a detection, out of that many
+    draws. Otherwise they are probabilities.
     """
     segments_and_shot = (*SEGMENT_NAMES, "shot")
 
@@ -129,7 +134,7 @@ def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
 
 
 def nan_results(n_points: int) -> SampleResults:
-    """Return results of nan for `n` points."""
+    """Return results of `n` points that are all nan."""
     shapes = (
         (n_points, 4),
         (n_points, 2),
@@ -143,16 +148,16 @@ def nan_results(n_points: int) -> SampleResults:
 
 
 class Trial(NamedTuple):
-    """Trial of a setting on some points."""
+    """Results and computing time of one accuracy setting on some points."""
 
     results: SampleResults
     seconds_per_point: float
-    """Processor time per point [s], with planning; other processes of the machine do not count."""
+    """Processor time per point of this process [s], including the time to plan its effects."""
     planning_seconds_per_point: float  # processor time of planning per point [s]
 
 
 def merge_trials(trials: Sequence[Trial]) -> Trial:
-    """Merge the trials of a setting on several parts of a sample."""
+    """Merge the trials of one setting on several parts of a sample into one."""
     weights = np.array([trial.results.noise_sigma.size for trial in trials], float)
     weights /= weights.sum()
     return Trial(
@@ -163,7 +168,7 @@ def merge_trials(trials: Sequence[Trial]) -> Trial:
 
 
 class StudySample(ABC):
-    """Sample of a study's points."""
+    """Base of the samples of a study's points. Accuracy settings are tried on these points."""
 
     points_noun = "points"
     spec: AnySpec
@@ -174,23 +179,29 @@ class StudySample(ABC):
 
     @property
     def size(self) -> int:
-        """Number of points of the sample."""
+        """Number of points in the sample."""
         return self.point_indices.size
 
     @abstractmethod
     def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
-        """Divide the sample into parts of about `points_per_part` points. Return their rows."""
+        """Divide the sample into parts of about `points_per_part` points.
+
+        Return the indices of each part's points in the sample.
+        """
 
     @abstractmethod
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute a part of the sample; time it on `n_timed_points` points, or on a larger part."""
+        """Compute a part of the sample with one setting, and time it.
+
+        `n_timed_points` is the number of points that are timed. It may exceed the size of the part.
+        """
 
     @abstractmethod
     def point_coordinates(self) -> PointCoordinates:
-        """Return the coordinates that identify the points of the sample."""
+        """Return the coordinates that identify the points of the sample in the store."""
 
     def simulated_effects(self, setting: AccuracySetting) -> frozenset[str]:
-        """Return the effects that a setting simulates anywhere in the sample."""
+        """Return the names of the effects that a setting simulates at any point of the sample."""
         parts = (self.point_indices[part] for part in self.split_into_parts(self.size))
         effect_flags = [
             np.bitwise_or.reduce(self._plan_effect_flags(setting, indices)[0]) for indices in parts
@@ -200,7 +211,10 @@ class StudySample(ABC):
     def compare_with_time_domain(
         self, setting: AccuracySetting, sample_row: int
     ) -> tuple[SampleResults, SampleResults]:
-        """Compute a point in the time domain, and by the setting with the effects of both."""
+        """Compute one point from time-domain records and by the model. Return both results.
+
+        Only effects that the setting plans and that records contain are simulated.
+        """
         point_index = self.point_indices[[sample_row]]
         effect_flags = self._plan_effect_flags(setting, point_index)[0] & TIME_DOMAIN_EFFECT_FLAGS
         # Records contain range walk, whatever effects are named.
@@ -216,13 +230,19 @@ class StudySample(ABC):
         return time_domain, simulated
 
     def clear_caches(self) -> None:  # noqa: B027
-        """Drop results that the trials of one part share; their time counts for each trial."""
+        """Drop results that several trials of one part share.
+
+        The time to compute them counts in each of these trials.
+        """
 
     @abstractmethod
     def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Return the effect flags of points (n,), and the time of planning per point [s]."""
+        """Return the effects planned at each point (n,), one bit each.
+
+        Return also the time of planning per point [s].
+        """
 
     @abstractmethod
     def _iter_outputs(
@@ -232,17 +252,20 @@ class StudySample(ABC):
         effect_flags: np.ndarray,
         find_peaks: PeakFinder | None,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Yield indices of points, and their outputs; ``find_peaks`` replaces the peak search."""
+        """Yield indices of some points and the model's outputs there, until all points are done.
+
+        ``find_peaks`` replaces the model's search for peaks.
+        """
 
     @cached_property
     def _thesis_effect_flags(self) -> np.uint32:
-        """Flags of the study's effects that the thesis's method can simulate."""
+        """Effects of the study that the thesis's method can simulate, one bit each."""
         return (
             _effect_flags_of_names(self.simulated_effects(AS_WRITTEN_SETTING)) & THESIS_EFFECT_FLAGS
         )
 
     def _run_setting(self, setting: AccuracySetting, point_indices: np.ndarray) -> Trial:
-        """Plan and compute points; return the trial."""
+        """Plan and compute some points with one setting. Return results and times."""
         effect_flags, planning_seconds = self._plan_effect_flags(setting, point_indices)
         find_peaks = (
             partial(find_peaks_on_grid, **setting.thesis_grid_options)
@@ -261,7 +284,7 @@ class StudySample(ABC):
         n_points: int,
         outputs_by_rows: Iterable[tuple[np.ndarray, Results]],
     ) -> SampleResults:
-        """Return the results of all points from the outputs of groups of points."""
+        """Return the results of all points, joined from outputs that cover some points each."""
         n_counted_draws = (
             int(self.study_with_setting(setting).spec.draws.number)
             if setting.counts_detections
@@ -277,9 +300,10 @@ class StudySample(ABC):
 
 
 def halton_sample(shape: tuple[int, ...], n_points: int) -> np.ndarray:
-    """Return indices of points, in C order, spread evenly over a grid by Halton's sequence.
+    """Return indices of grid points that Halton's sequence spreads evenly over the grid.
 
-    Any first part of the sample is spread evenly too, so that a part represents all.
+    The indices count in C order. The first points of the sample are spread evenly by themselves, so
+    a first part represents all.
     """
     n_grid_points = math.prod(shape)
     if not shape or n_grid_points <= 1:
@@ -297,7 +321,7 @@ def halton_sample(shape: tuple[int, ...], n_points: int) -> np.ndarray:
 def axis_coordinates(
     axes: tuple[Axis, ...], axis_indices: tuple[np.ndarray, ...]
 ) -> PointCoordinates:
-    """Return the coordinates of points from their indices along each axis."""
+    """Return the coordinates of points, given their indices along each axis."""
     coordinates: PointCoordinates = {}
     for axis, indices in zip(axes, axis_indices, strict=True):
         for member in axis.parameters:
@@ -314,8 +338,8 @@ def axis_coordinates(
 class GridSample(StudySample):
     """Sample of the points of a grid: spread evenly, or given by their indices.
 
-    Points are timed together with those that the block computes next, which share intermediate
-    results.
+    Each point is timed together with the points that a run computes next in the same block, because
+    they share intermediate results.
     """
 
     def __init__(
@@ -332,11 +356,11 @@ class GridSample(StudySample):
         self.timed_points_max = min(TIMED_POINTS_MAX, self._block_points)
 
     def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
-        """Divide the sample into parts, each spread as evenly as all of it."""
+        """Divide the sample into parts, each of which is spread evenly over the grid."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points_per_part)))
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute the part alone; the time is that of more points of the same blocks."""
+        """Compute a part with one setting. Measure the time on more points of the same blocks."""
         point_indices = self.point_indices[part]
         trial = self._run_setting(setting, point_indices)
         if n_timed_points == 1:
@@ -355,7 +379,7 @@ class GridSample(StudySample):
         )
 
     def point_coordinates(self) -> PointCoordinates:
-        """Return the index of each point in C order, and its values along each axis."""
+        """Return the index of each sampled point in C order, and its values along each axis."""
         axis_indices = (
             np.unravel_index(self.point_indices, self._grid.shape) if self._grid.shape else ()
         )
@@ -403,7 +427,10 @@ class GridSample(StudySample):
     def _points_computed_next(
         self, setting: AccuracySetting, point_index: int, n_points: int
     ) -> np.ndarray:
-        """Return a point and those that its block computes next, cyclically."""
+        """Return a point and those that follow it in its block.
+
+        After the block's last point its first one follows.
+        """
         grid = self.study_with_setting(setting).grid
         (block,), (local_index,) = (
             array.tolist() for array in grid.locate_points(np.array([point_index]))
@@ -414,10 +441,11 @@ class GridSample(StudySample):
 
 
 class FlightSample(StudySample):
-    """Sample of the shots of a flight: complete tiles, as effects are planned by tile.
+    """Sample of the shots of a flight, in complete tiles (runs of consecutive shots).
 
-    The time includes rays, plans, spectra and probabilities. Draws, points and navigation take the
-    same time whatever the accuracy. `point_indices` are indices in the sample.
+    Tiles are complete because effects are planned tile by tile. The time includes rays, plans,
+    spectra and probabilities. Draws, points and navigation take the same time whatever the
+    accuracy. `point_indices` are indices of shots within the sample.
     """
 
     points_noun = "shots"
@@ -440,7 +468,10 @@ class FlightSample(StudySample):
         )
 
     def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
-        """Divide the sample into complete tiles of one scanner at a point of the axes, in turn."""
+        """Divide the sample into parts of complete tiles.
+
+        Each part has shots of one scanner at one point of the axes. Scanners and points take turns.
+        """
         tiles_per_part, parts_by_block = max(1, round(points_per_part / SHOTS_PER_TILE)), []
         for rows in (
             np.flatnonzero(self._part_of_row == block_number)
@@ -460,7 +491,10 @@ class FlightSample(StudySample):
         ]
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute the part, timed with neighbouring tiles up to `n_timed_points` shots."""
+        """Compute a part with one setting.
+
+        If the part has fewer than `n_timed_points` shots, neighbouring tiles are timed with it.
+        """
         point_indices = self.extend_to_complete_tiles(part, n_timed_points)
         trial = self._run_setting(setting, point_indices)
         rows_of_part = np.searchsorted(point_indices, part)
@@ -473,7 +507,7 @@ class FlightSample(StudySample):
         )
 
     def point_coordinates(self) -> PointCoordinates:
-        """Return scanner and number of each shot, and its values along each axis."""
+        """Return, for each sampled shot, its scanner, its number and the values along each axis."""
         axis_indices = np.reshape(
             [flight_block.axis_indices for flight_block in self._flight_blocks],
             (len(self._flight_blocks), -1),
@@ -485,13 +519,13 @@ class FlightSample(StudySample):
         } | axis_coordinates(self.spec.axes, tuple(axis_indices[self._part_of_row].T))
 
     def clear_caches(self) -> None:
-        """Drop the rays that settings of the same geometry share."""
+        """Drop the cast rays that settings with the same geometry share."""
         self._cast_eyepoints.clear()
 
     def extend_to_complete_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
-        """Return the rows of the complete tiles of some points, and of tiles that follow.
+        """Return the sample indices of all shots in the tiles of some shots, and in the next tiles.
 
-        Tiles are added until those from the first one on have at least `n_shots` shots.
+        Tiles are added until the shots from the first tile on are at least `n_shots`.
         """
         rows_of_block = np.flatnonzero(self._part_of_row == self._part_of_row[point_indices[0]])
         return rows_of_block[
@@ -503,7 +537,7 @@ class FlightSample(StudySample):
         ]
 
     def flight_block_and_shots(self, point_indices: np.ndarray) -> tuple[FlightBlock, np.ndarray]:
-        """Return scanner and point of the axes of a part of the sample, and its shot numbers."""
+        """Return the scanner and axis point of a part of the sample, and its shot numbers."""
         return self._flight_blocks[self._part_of_row[point_indices[0]]], self._shot_numbers[
             point_indices
         ]
@@ -558,7 +592,7 @@ class FlightSample(StudySample):
         )
 
     def _sample_shots(self, n_points: int) -> Iterator[tuple[FlightBlock, np.ndarray]]:
-        """Yield scanners at points of the axes, and shot numbers spread over the flight."""
+        """Yield scanners at points of the axes, with shot numbers spread evenly over the flight."""
         study = self.study_with_setting(AS_WRITTEN_SETTING)
         for scanner, scanner_grid in study.scanner_grids.items():
             axis_points = halton_sample(scanner_grid.axes_shape, AXIS_POINTS_PER_SCANNER)
@@ -577,7 +611,7 @@ class FlightSample(StudySample):
                 yield scanner_grid.first_flight_block(tuple(map(int, axis_indices))), shot_numbers
 
     def _make_study(self, setting: AccuracySetting) -> FlightStudy:
-        """Return the study of the flight with a setting."""
+        """Return the flight study that an accuracy setting gives."""
         spec: Any = setting.apply_to(self.spec)
         # all studies share a scene, as building it can take seconds
         study = FlightStudy(spec, Path("nowhere.zarr"), build_world(self.spec))
@@ -588,7 +622,10 @@ class FlightSample(StudySample):
     def _cast_shots(
         self, setting: AccuracySetting, flight_block: FlightBlock, shot_numbers: np.ndarray
     ) -> tuple[Eyepoints, float]:
-        """Return the eyepoints of shots, cached by geometry, and the time of casting them [s]."""
+        """Return the geometry of shots found by rays, and the time of casting these rays [s].
+
+        The geometry is cached for settings that share it.
+        """
         eyepoint_study = self.study_with_setting(setting).get_eyepoint_study(flight_block.scanner)
         cache_key = eyepoint_study.id, shot_numbers.tobytes()
         if cache_key not in self._cast_eyepoints:
@@ -601,10 +638,10 @@ class FlightSample(StudySample):
 
 
 def rows_of_complete_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
-    """Return the rows of the complete tiles of some rows, and of tiles that follow, cyclically.
+    """Return the rows of all shots in the tiles of some rows, and in the tiles that follow.
 
-    ``tile_of_row`` (n,) is the rising number of each row's tile. Tiles are added until those from
-    the first one on have at least `n_shots` shots.
+    After the last tile the first follows. ``tile_of_row`` (n,) is the rising number of each row's
+    tile. Tiles are added until those from the first one on have at least `n_shots` shots.
     """
     tiles, counts = np.unique(tile_of_row, return_counts=True)
     own_tiles = np.unique(tile_of_row[rows])
@@ -622,7 +659,10 @@ def _simulate_shot_statistics(
     shot_numbers: np.ndarray,
     effect_flags: np.ndarray,
 ) -> Results:
-    """Return statistics of shots from the peaks that ``find_peaks`` finds; nan without a hit."""
+    """Return statistics of shots computed from the peaks that ``find_peaks`` finds.
+
+    They are nan for shots without a hit.
+    """
     hitting_shots, n_rays = eyepoints.has_target.nonzero()[0], eyepoints.weight.size
     shot_parameters, ground = parameters_and_ground_of_eyepoints(
         eyepoints.select(hitting_shots), study.parameters_at(flight_block), study.surfaces

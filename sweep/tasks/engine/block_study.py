@@ -1,7 +1,7 @@
-"""Interface between the engine and the studies that it computes.
+"""Interface between the engine, which schedules and stores, and the studies that it computes.
 
 The engine knows a study as :class:`BlockStudy`: arrays, blocks of points, and a method that
-computes one block. :class:`Workload` says what the study asks of the machines. The study alone
+computes one block. :class:`Workload` says what the study needs from the machines. Only the study
 knows what a point is, and how it is computed.
 """
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class PartialResults(NamedTuple):
-    """Results of some points of a block."""
+    """Results of some of a block's points, with the indices of these points."""
 
     local_indices: np.ndarray  # (m,) int64: indices of the points in C order over the block
     results: Results  # arrays (m, ...) by name
@@ -34,14 +34,20 @@ NO_RESULTS = PartialResults(np.zeros(0, np.int64), {})
 
 
 class EarlierResults(NamedTuple):
-    """Results of a block from earlier tasks or another store: finished and unfinished points."""
+    """Results of a block that exist already, from earlier tasks or from another store.
+
+    Finished points are not computed again; unfinished points are continued.
+    """
 
     finished: PartialResults = NO_RESULTS  # points that need not be computed
     unfinished: PartialResults = NO_RESULTS  # points that are computed in part, to be continued
 
 
 def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
-    """Concatenate results of several parts of a block, by the names of the first part's arrays."""
+    """Join the results of several parts of a block.
+
+    The first part gives the names of the arrays.
+    """
     if not parts:
         return NO_RESULTS
     names = parts[0].results
@@ -53,22 +59,24 @@ def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
 
 @dataclass
 class Deadline:
-    """Time at which a task stops work on a block; calling the object tells if it has passed."""
+    """Time at which a task stops work on a block.
+
+    Calling the object tells whether it has passed.
+    """
 
     end_time: float = float("inf")  # time by `time.monotonic` [s]
     has_passed: bool = False  # True if any call so far was after the deadline
 
     def __call__(self) -> bool:
-        """Return True after the deadline."""
+        """Return True if the time is at or after the deadline."""
         self.has_passed = self.has_passed or time.monotonic() >= self.end_time
         return self.has_passed
 
 
 class UnfinishedBlock(Exception):
-    """Raised by a block that stops at its deadline, with the results so far.
+    """Exception raised by a block that stops at its deadline. It holds the results so far.
 
-    `n_points` is the number of points that the results amount to; a point that is computed in part
-    counts in part.
+    `n_points` is the number of points done. A point that is computed in part counts as a fraction.
     """
 
     def __init__(self, results: EarlierResults, n_points: float) -> None:
@@ -77,25 +85,28 @@ class UnfinishedBlock(Exception):
 
 
 class StoreTemplate(Protocol):
-    """Content of a new store: its identity, attributes, groups and arrays."""
+    """Content of a new store before any result: its identity, attributes, groups and arrays."""
 
     @property
     def id(self) -> str:
-        """Hash of all that the results depend on."""
+        """Hash of everything that the results depend on."""
 
     @property
     def model_version(self) -> str:
-        """Version of the model that computes the results; stores of another one are refused."""
+        """Version of the model that computes the results. Stores of other versions are refused."""
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return the attributes of the store's root except versions; the same on every machine."""
+        """Return the root attributes of the store, without software versions.
+
+        They are equal on all machines.
+        """
 
     def group_attributes(self) -> dict[str, dict[str, Any]]:
         """Return the attributes of each group by its path; empty if all arrays are in the root."""
         return {}
 
     def array_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of all arrays of the store."""
+        """Return the layouts (names, shapes, chunks) of all arrays of the store."""
 
 
 class BlockStudy(StoreTemplate, ABC):
@@ -115,32 +126,35 @@ class BlockStudy(StoreTemplate, ABC):
     """
 
     points_noun = "points"
-    """Noun for the points in messages, in the plural."""
+    """Noun for the points in messages, in the plural, such as ``shots``."""
 
     @property
     @abstractmethod
     def grids(self) -> Sequence[BlockGrid]:
-        """Grid of blocks of each group of the store."""
+        """Grids that cut the study's points into blocks, one grid for each group of the store."""
 
     @abstractmethod
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the arrays whose values are known when the store is made."""
+        """Return the arrays whose values are known when the store is made, such as coordinates."""
 
     @abstractmethod
     def output_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of the arrays that blocks write."""
+        """Return the layouts (names, shapes, chunks) of the arrays of results that blocks write."""
 
     @abstractmethod
     def evaluate(self, block: int) -> Results:
-        """Compute a block. Return one array per chunk that it writes, by the name of the array."""
+        """Compute one block.
+
+        Return one array of results for each chunk that it writes, by array name.
+        """
 
     @abstractmethod
     def compile_kernels(self) -> None:
-        """Compile all that `evaluate` compiles, so that workers find it in the cache on disk."""
+        """Compile all kernels that `evaluate` needs. Workers load them from the cache on disk."""
 
     @property
     def has_checkpoints(self) -> bool:
-        """True if the engine may stop a block at a deadline, and continue it in another task."""
+        """True if a block may be stopped at a deadline and continued in another task."""
         return False
 
     def evaluate_until(
@@ -154,21 +168,24 @@ class BlockStudy(StoreTemplate, ABC):
         raise NotImplementedError
 
     def pop_reused_point_count(self, block: int) -> int:
-        """Return the number of points of a computed block that another store had; forget it."""
+        """Return how many points of a computed block were taken from another store.
+
+        The count is then deleted, so it can be asked for once.
+        """
         return 0
 
     def array_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of all arrays of the store."""
+        """Return the layouts of all arrays of the store: constant ones, and those of results."""
         return [*self.constant_arrays(), *self.output_layout_by_name.values()]
 
     @cached_property
     def output_layout_by_name(self) -> dict[str, ArrayLayout]:
-        """Layouts of the arrays that blocks write, by name."""
+        """Layouts of the arrays of results that blocks write, by the name of the array."""
         return {layout.name: layout for layout in self.output_layouts()}
 
     @property
     def n_chunks(self) -> int:
-        """Number of chunks of all blocks."""
+        """Number of chunks that all blocks write, over all arrays."""
         return sum(layout.n_chunks for layout in self.output_layout_by_name.values())
 
     @property
@@ -180,7 +197,7 @@ class BlockStudy(StoreTemplate, ABC):
 
     @property
     def block_nbytes_max(self) -> int:
-        """Size of the results of the largest block before compression [bytes]."""
+        """Size of the results of the largest block, before compression [bytes]."""
         nbytes_by_group = dict.fromkeys(self._first_block_and_grid_by_group, 0)
         for layout in self.output_layout_by_name.values():
             nbytes_by_group[layout.group_path] += layout.nbytes_of_part(layout.chunks)
@@ -188,18 +205,18 @@ class BlockStudy(StoreTemplate, ABC):
 
     @property
     def n_points(self) -> int:
-        """Number of points of all blocks."""
+        """Total number of points in all blocks."""
         return sum(grid.n_points for grid in self.grids)
 
     @property
     def n_blocks(self) -> int:
-        """Number of blocks."""
+        """Number of blocks in all grids."""
         return sum(grid.n_blocks for grid in self.grids)
 
     def locate_in_grid(self, block: int) -> tuple[BlockGrid, int]:
-        """Return the grid that contains a block, and the number of the block there.
+        """Return the grid that contains a block, and the number of the block within that grid.
 
-        IndexError if there is no such block.
+        IndexError is raised if there is no such block.
         """
         block_in_grid = block
         for grid in self.grids:
@@ -210,7 +227,7 @@ class BlockStudy(StoreTemplate, ABC):
 
     @cached_property
     def _first_block_and_grid_by_group(self) -> dict[str, tuple[int, BlockGrid]]:
-        """Number of the first block of each group, and the grid of the group."""
+        """Number of the first block of each group of the store, and the group's grid."""
         last_blocks = np.cumsum([grid.n_blocks for grid in self.grids]).tolist()
         return {
             block_grid.group: (end - block_grid.n_blocks, block_grid)
@@ -218,7 +235,7 @@ class BlockStudy(StoreTemplate, ABC):
         }
 
     def first_block_of_group(self, group: str) -> int:
-        """Return the number of the first block of a group."""
+        """Return the number, within the study, of the first block of a group of the store."""
         return self._first_block_and_grid_by_group[group][0]
 
     def count_block_points(self, block: int) -> int:
@@ -227,7 +244,7 @@ class BlockStudy(StoreTemplate, ABC):
         return grid.count_block_points(block_in_grid)
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Count the points in the blocks that a mask (blocks,) of bool marks."""
+        """Return the total number of points in the blocks that a mask (blocks,) of bool marks."""
         parts = np.split(is_included, np.cumsum([grid.n_blocks for grid in self.grids])[:-1])
         return sum(
             grid.count_points_in_blocks(part) for grid, part in zip(self.grids, parts, strict=True)
@@ -235,9 +252,9 @@ class BlockStudy(StoreTemplate, ABC):
 
     @cached_property
     def _grid_dim_indices_by_array(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
-        """Index of the grid dimension that each dimension of an array follows.
+        """Index of the grid dimension that each dimension of an array is cut along.
 
-        The keys are group and name of the array.
+        The outer keys are groups of the store, the inner keys names of arrays.
         """
         grid_dims: dict[str, dict[str, tuple[int | None, ...]]] = {
             group: {} for group in self._first_block_and_grid_by_group
@@ -249,10 +266,11 @@ class BlockStudy(StoreTemplate, ABC):
         return grid_dims
 
     def chunk_positions(self, block: int) -> dict[str, tuple[int, ...]]:
-        """Return the position of the chunk that a block writes, by the name of the array.
+        """Return the position, in an array's grid of chunks, of the chunk that a block writes.
 
-        An array that lacks a dimension of the grid is written by the first block along it, and
-        missing for the others.
+        The result has one entry per array, by name. An array that lacks a dimension of the block
+        grid is written by the first block along that dimension. The result of the other blocks
+        lacks this array.
         """
         grid, block_in_grid = self.locate_in_grid(block)
         position = grid.block_position(block_in_grid)
@@ -266,14 +284,14 @@ class BlockStudy(StoreTemplate, ABC):
         }
 
     def chunk_regions(self, block: int) -> dict[str, tuple[slice, ...]]:
-        """Return the slices that a block writes, by the name of the array."""
+        """Return the slices of each array that a block writes, by the name of the array."""
         return {
             name: self.output_layout_by_name[name].chunk_region(position)
             for name, position in self.chunk_positions(block).items()
         }
 
     def chunk_owner_blocks(self) -> dict[str, np.ndarray]:
-        """Return the block that writes each chunk, by the name of the array.
+        """Return the number of the block that writes each chunk, by the name of the array.
 
         Each value has the shape of the array's grid of chunks.
         """
@@ -285,12 +303,12 @@ class BlockStudy(StoreTemplate, ABC):
 
 
 BlockEvaluator = Callable[[Any, int], Results]
-"""Function of a study and the number of a block that replaces `BlockStudy.evaluate`."""
+"""Function of a study and a block's number that computes the block in place of the study."""
 
 StudyReader = Callable[["Location"], tuple[dict[str, Any], BlockStudy]]
-"""Function that returns the attributes of a store and its study; StoreError if it can't be read.
+"""Function that returns a store's attributes and the study in it, or raises a StoreError.
 
-It must be a function of a module, because it is sent to workers by name.
+It must be defined at the top level of a module, because it is sent to workers by name.
 """
 
 
@@ -299,12 +317,12 @@ class Workload(Protocol):
 
     @property
     def execution(self) -> Execution:
-        """Workers, threads and scheduler that the spec asks for."""
+        """Number of workers, threads and scheduler that the spec asks for."""
 
     @property
     def user_module_names(self) -> tuple[str, ...]:
-        """Names of the user's Python modules whose functions the blocks call."""
+        """Names of the user's Python modules that are called while blocks are computed."""
 
     @property
     def read_study(self) -> StudyReader:
-        """Function with which a worker opens the study of a store."""
+        """Function with which a worker reads the study from its store."""

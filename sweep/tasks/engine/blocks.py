@@ -24,16 +24,20 @@ from typing import Any
 import numpy as np
 
 Results = dict[str, np.ndarray]
-"""Arrays of results by the name of the output variable."""
+"""Arrays of results, by the name of the output variable."""
 
-#: Fill value of an array by the kind of its dtype; the integers that are stored are not negative.
+#: Fill value of arrays by the kind of their data type (NumPy code). Stored integers are not
+#: negative.
 FILL_VALUE_BY_DTYPE_KIND = {"f": float("nan"), "i": -1, "u": 0}
 
 
 def chunk_slices(
     position: tuple[int, ...], chunks: tuple[int, ...], shape: tuple[int, ...]
 ) -> tuple[slice, ...]:
-    """Return the slices of the chunk at a position in the grid of chunks, cut at the edge."""
+    """Return the slices of an array that one chunk covers, cut at the edge of the array.
+
+    The chunk is given by its position in the grid of chunks.
+    """
     return tuple(
         slice(index * chunk, min((index + 1) * chunk, size))
         for index, chunk, size in zip(position, chunks, shape, strict=True)
@@ -42,9 +46,10 @@ def chunk_slices(
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayLayout:
-    """Layout of one array of a store, and its values if they are known before blocks are computed.
+    """Layout of one array of a store: name, dimensions, shape, chunks and attributes.
 
-    `name` is the path inside the store. `values` is None for arrays that blocks write.
+    `name` is the path inside the store. `values` is None for arrays that blocks write; other values
+    are known before any block is computed.
     """
 
     name: str
@@ -66,7 +71,7 @@ class ArrayLayout:
         *,
         fill_value: float | None = None,
     ) -> ArrayLayout:
-        """Return the layout of an array with known values, in a single chunk."""
+        """Return the layout of an array whose values are known. The array is one chunk."""
         is_text = values.dtype.kind in "UOT"
         return cls(
             name=name,
@@ -81,7 +86,7 @@ class ArrayLayout:
 
     @property
     def group_path(self) -> str:
-        """Path of the group that contains the array; '' for the root."""
+        """Path of the store's group that contains the array; '' for the root."""
         return self.name.rpartition("/")[0]
 
     @property
@@ -92,24 +97,27 @@ class ArrayLayout:
         )
 
     def nbytes_of_part(self, shape: tuple[int, ...]) -> int:
-        """Return the size of a part of the array with this shape, before compression [bytes]."""
+        """Return the size [bytes] of a part of the array with a given shape, before compression."""
         return math.prod(shape) * np.dtype(self.dtype).itemsize
 
     def chunk_region(self, position: tuple[int, ...]) -> tuple[slice, ...]:
-        """Return the slices of the chunk at a position in the grid of chunks."""
+        """Return the slices of the array that one chunk covers.
+
+        `position` is the index of the chunk along each dimension of the grid of chunks.
+        """
         return chunk_slices(position, self.chunks, self.shape)
 
 
 CF_CONVENTIONS = "CF-1.11"
-"""Version of the CF metadata conventions that the store's attributes follow."""
+"""Version of the Climate and Forecast (CF) metadata conventions that all stores follow."""
 
 
 class BlockGrid:
     """Grid of points, cut into blocks along named dimensions; the last dimension varies fastest.
 
-    A block, and a point, is numbered in C order. ``fine_dim`` names a dimension that divides every
-    step of the last one into ``fine_steps``. Arrays are in the ``group`` of the store, or in its
-    root if that is empty.
+    Blocks and points are numbered in C order. ``fine_dim`` names a further dimension: each step of
+    the last one has ``fine_steps`` of its steps. Arrays are in the ``group`` of the store, or in
+    its root if that is empty.
     """
 
     def __init__(
@@ -135,23 +143,29 @@ class BlockGrid:
         return math.prod(self.shape) * self.fine_steps
 
     def block_position(self, block: int) -> tuple[int, ...]:
-        """Return the position of a block in the grid of blocks; IndexError if there is none."""
+        """Return the index of a block along each dimension of the grid of blocks.
+
+        IndexError is raised if there is no such block.
+        """
         if not 0 <= block < self.n_blocks:
             raise IndexError(f"block {block} of {self.n_blocks}")
         return tuple(map(int, np.unravel_index(block, self.blocks_per_dim)))
 
     def block_at(self, block_position: tuple[int, ...]) -> int:
-        """Return the number of the block at a position in the grid of blocks."""
+        """Return the number of the block that has given indices in the grid of blocks."""
         return (
             int(np.ravel_multi_index(block_position, self.blocks_per_dim)) if block_position else 0
         )
 
     def block_slices(self, block: int) -> tuple[slice, ...]:
-        """Return the slices of a block along each dimension, cut at the edge of the grid."""
+        """Return the slices of grid steps that a block covers along each dimension.
+
+        Blocks at the edge are cut there.
+        """
         return chunk_slices(self.block_position(block), self.block_shape, self.shape)
 
     def actual_block_shape(self, block: int) -> tuple[int, ...]:
-        """Return the number of grid steps of a block along each dimension, less at the edge."""
+        """Return how many grid steps a block covers along each dimension; fewer at the edge."""
         return tuple(
             block_slice.stop - block_slice.start for block_slice in self.block_slices(block)
         )
@@ -161,16 +175,16 @@ class BlockGrid:
         return math.prod(self.actual_block_shape(block)) * self.fine_steps
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Count the points in the blocks that a mask (blocks,) of bool marks."""
+        """Return the total number of points in the blocks that a mask (blocks,) of bool marks."""
         counts = np.asarray(is_included, bool).reshape(self.blocks_per_dim)
         for size, chunk in zip(self.shape[::-1], self.block_shape[::-1], strict=True):
             counts = counts @ np.minimum(chunk, size - np.arange(0, size, chunk))
         return int(counts) * self.fine_steps
 
     def locate_points(self, grid_indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the block of each point, and the index of the point in its block, in C order.
+        """Return the block of each point, and the index of the point in that block, in C order.
 
-        `grid_indices` (n,) are indices in C order over the whole grid.
+        `grid_indices` (n,) are indices of the points, in C order over the whole grid.
         """
         blocks, local_indices = np.zeros((2, grid_indices.size), np.int64)
         index = np.unravel_index(grid_indices, self.shape) if self.shape else ()
@@ -183,9 +197,10 @@ class BlockGrid:
         return blocks, local_indices
 
     def grid_indices(self, block: int, local_indices: np.ndarray) -> np.ndarray:
-        """Return the indices, in C order over the whole grid, of some points of a block.
+        """Return the indices of some points of a block, in C order over the whole grid.
 
-        `local_indices` (m,) are indices in C order over the block. Inverse of `locate_points`.
+        `local_indices` (m,) are their indices in C order over the block. Inverse of
+        `locate_points`.
         """
         if not self.shape:
             return np.zeros(local_indices.size, np.int64)
@@ -204,9 +219,9 @@ class BlockGrid:
         sizes: Mapping[str, int],
         attributes: Mapping[str, Any],
     ) -> ArrayLayout:
-        """Return the layout of an array that is cut along the dimensions that follow the grid.
+        """Return the layout of an array of results, cut into chunks as the grid is cut into blocks.
 
-        `sizes` has the sizes of all other dimensions in `dims`.
+        `sizes` has the sizes of those dimensions in `dims` that are not dimensions of the grid.
         """
         array_sizes = dict(sizes) | dict(zip(self.dims, self.shape, strict=True))
         chunk_sizes = dict(sizes) | dict(zip(self.dims, self.block_shape, strict=True))
@@ -227,16 +242,16 @@ class BlockGrid:
         )
 
     def grid_dim_indices(self, layout: ArrayLayout) -> tuple[int | None, ...]:
-        """Return the index of the grid dimension that each dimension of an array follows.
+        """Return the index of the grid dimension along which each dimension of an array is cut.
 
-        None for dimensions that follow none.
+        The index is None for dimensions that are not cut along the grid.
         """
         grid_dim_of: dict[str, int] = {self.fine_dim: len(self.dims) - 1} if self.fine_dim else {}
         grid_dim_of |= {dim: position for position, dim in enumerate(self.dims)}
         return tuple(grid_dim_of.get(dim) for dim in layout.dims)
 
     def chunk_owner_blocks(self, layout: ArrayLayout) -> np.ndarray:
-        """Return the block that writes each chunk of an array.
+        """Return the number of the block that writes each chunk of an array.
 
         The result has the shape of the array's grid of chunks.
         """
@@ -252,6 +267,6 @@ class BlockGrid:
         )
 
 
-#: Largest number of blocks of a study: a run keeps some 30 bytes per block in memory, and a block
-#: is stored in one file per array.
+#: Largest number of blocks of a study. A run keeps some 30 bytes per block in memory, and a block
+#: is one file per array in the store.
 BLOCKS_PER_STUDY_MAX = 2 * 10**7

@@ -1,4 +1,4 @@
-"""Connections to a cluster: one that runs already, or workers that are started and ended here."""
+"""Connections to a Dask cluster: a running one, or workers that the session starts and ends."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from sweep.tasks.engine.text_streams import make_dask_logs_patient
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-#: Time in which a scheduler must respond [s].
+#: Time in which a Dask scheduler must respond to a new client [s].
 CONNECT_TIMEOUT_SECONDS = 15.0
 
 
 class ClusterConnection(NamedTuple):
-    """Connection to a cluster."""
+    """Connection to a Dask cluster: its client, and what the session may do with its workers."""
 
     client: Client
     expected_worker_threads: int  # largest number of worker threads; 0 if unknown
@@ -41,7 +41,7 @@ class ClusterConnection(NamedTuple):
 
 
 def cpu_count() -> int:
-    """Return the number of cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     from dask.system import CPU_COUNT
 
     return int(CPU_COUNT)
@@ -51,10 +51,10 @@ def cpu_count() -> int:
 def connect_cluster(
     cluster: AnyClusterConfig, *, max_workers: int, processes: bool, say: Callable[[str], None]
 ) -> Iterator[ClusterConnection]:
-    """Connect a client to a cluster; a cluster that is started here ends with the context.
+    """Connect a client to a cluster. A cluster that this function starts ends with the context.
 
-    At most `max_workers` workers are started, as further ones would be idle. ClusterError if no
-    scheduler responds or no worker starts.
+    At most `max_workers` workers are started, as further ones would be idle. ClusterError is raised
+    if no scheduler responds or no worker starts.
     """
     from distributed import Client
 
@@ -94,15 +94,16 @@ def connect_cluster(
 
 
 def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:
-    """Return the bounds of the number of workers, limited to `max_workers`."""
+    """Return the least and the largest number of workers, both limited to `max_workers`."""
     requested = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
     return WorkerBounds(*(min(n_workers, max(1, max_workers)) for n_workers in requested))
 
 
 def _connect_client(address: str, cluster: AnyClusterConfig) -> Client:
-    """Connect a client that is not Dask's default one; ClusterError if no scheduler responds.
+    """Connect a client that does not become Dask's default client.
 
-    A client that fails to connect would remain the default.
+    A client that fails to connect would remain the default. ClusterError is raised if no scheduler
+    responds.
     """
     from distributed import Client
 
@@ -132,7 +133,7 @@ def _connect_client(address: str, cluster: AnyClusterConfig) -> Client:
 
 
 async def _check_scheduler(address: str, security: Security | None) -> None:
-    """Ask a scheduler for its identity; an exception if none responds in time."""
+    """Ask a scheduler for its identity. An exception is raised if it does not respond in time."""
     from distributed import Security, rpc
 
     connection_args = (security or Security()).get_connection_args("client")
@@ -148,7 +149,10 @@ def _start_workers(
     bounds: WorkerBounds,
     processes: bool,
 ) -> Any:
-    """Start the workers of a cluster that ends with this process; ClusterError if that fails."""
+    """Start the workers of a cluster that ends with this process.
+
+    ClusterError is raised on failure.
+    """
     import dask
 
     try:
@@ -171,7 +175,7 @@ def _start_workers(
 def _keep_workers_in_bounds(
     dask_cluster: Any, cluster: AnyClusterConfig, bounds: WorkerBounds
 ) -> None:
-    """Adapt the number of workers to the work within bounds, and replace batch jobs that end."""
+    """Adapt the number of workers to the work, between its bounds. Replace batch jobs that end."""
     if isinstance(cluster, BatchClusterConfig):
         from sweep.tasks.engine.deploy import jobqueue
 
@@ -186,7 +190,7 @@ def _keep_workers_in_bounds(
 
 
 def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
-    """Return the number of workers, and where they run, as text."""
+    """Return how many workers there are and where they run, as text for a message."""
     count_text = (
         f"{bounds.least} to {bounds.most}" if bounds.least < bounds.most else f"{bounds.most}"
     )
@@ -206,7 +210,7 @@ def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
 def write_performance_report(
     client: Client, report_path: Path, say: Callable[[str], None]
 ) -> Iterator[None]:
-    """Write Dask's report of the context's computations; a failure is only reported."""
+    """Write Dask's report of the computations in the context. A failure only prints a message."""
     from distributed import performance_report
 
     report = performance_report(filename=str(report_path))

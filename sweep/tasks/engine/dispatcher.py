@@ -1,4 +1,4 @@
-"""Dispatch of blocks as Dask tasks, of which a bounded number is in flight.
+"""Dispatch of blocks to workers as Dask tasks. Only a limited number of tasks is sent at a time.
 
 A task writes its blocks itself and returns receipts, which the client fetches and releases at once.
 No result stays on a worker, so none is lost if the worker dies.
@@ -37,32 +37,35 @@ if TYPE_CHECKING:
     from dask.typing import Key
     from distributed import Client, Future
 
-#: Intended time of a task [s]: long compared with its overhead of 3-9 ms, short compared with a
-#: study.
+#: Intended duration of a task [s]. It is long compared with a task's overhead of 3-9 ms, and short
+#: compared with a study.
 TARGET_TASK_SECONDS = 2.0
 BLOCKS_PER_TASK_MAX = 1000
 
-#: Largest rate of tasks [1/s], a third of what a scheduler can handle. With more than 200 worker
-#: threads tasks are longer to keep to it.
+#: Largest number of tasks per second, a third of what a scheduler can handle [1/s]. With more than
+#: 200 worker threads tasks are made longer to stay below it.
 TASKS_PER_SECOND_MAX = 100.0
 
-#: Age at which the count of worker threads is updated [s].
+#: Interval at which the worker threads of a cluster are counted again [s].
 WORKER_THREADS_REFRESH_SECONDS = 2.0
 
-#: Time without a response after which a worker is silent [s]; longer if its blocks take long.
+#: Time without a result after which a worker counts as silent [s]. It is longer if blocks take
+#: long.
 WORKER_SILENCE_SECONDS = 30.0
 
-#: Largest time after which files that a worker has written are visible here [s]: NFS of Linux
-#: caches folders for as long.
+#: Largest time until files that a worker has written are visible to this process [s]. NFS clients
+#: on Linux cache folders for as long.
 FILE_VISIBILITY_SECONDS_MAX = 60.0
 
-#: Time without a response after which a stall is reported [s]; longer if tasks take longer.
+#: Time without any result after which a message says that the run stalls [s]. It is longer if tasks
+#: take long.
 STALL_REPORT_SECONDS = 60.0
 
-#: Largest delay of the first response that is not a stall, as workers compile the model [s].
+#: Time for the first result of a run before a message says that it stalls [s]. Workers compile the
+#: model before it.
 COMPILATION_SECONDS_MAX = 600.0
 
-#: Multiple of the expected time of a task after which a stall is reported.
+#: Time without any result after which a stall is reported, as a multiple of a task's expected time.
 STALL_TASK_DURATION_FACTOR = 5.0
 
 #: Largest numbers of tasks and of workers that a summary of the state lists.
@@ -77,13 +80,13 @@ _logger = logging.getLogger("sweep.scheduler")
 
 @dataclass
 class ThroughputEstimator:
-    """Estimator of the number of blocks per task, from the times of the blocks so far."""
+    """Estimator of a suitable number of blocks per task, from the times of blocks so far."""
 
     n_blocks: int = 0
     work_seconds: float = 0.0
 
     def add_task_result(self, task_result: TaskResult) -> None:
-        """Add the times of a task's receipts."""
+        """Add the computing times of the blocks that a task has finished."""
         self.n_blocks += len(task_result.receipts)
         self.work_seconds += sum(receipt.seconds for receipt in task_result.receipts)
 
@@ -101,7 +104,7 @@ class ThroughputEstimator:
 
 @dataclass
 class WorkerThreadCount:
-    """Number of worker threads of a cluster, updated every few seconds."""
+    """Counter of the worker threads of a cluster, updated every few seconds."""
 
     client: Client
     expected_worker_threads: int = 0
@@ -110,7 +113,7 @@ class WorkerThreadCount:
     counted_at: float = -1e9
 
     def current_count(self) -> int:
-        """Return the number of worker threads, at least 1."""
+        """Return the number of worker threads of the cluster, at least 1."""
         if time.monotonic() - self.counted_at > WORKER_THREADS_REFRESH_SECONDS:
             self.threads_by_worker = dict(self.client.nthreads())
             self.n_worker_threads = max(
@@ -122,7 +125,10 @@ class WorkerThreadCount:
 
 @dataclass(eq=False)
 class _InFlightTask:
-    """Blocks that are sent to a worker, and to further workers if that one is silent."""
+    """Task that was sent to a worker and has not ended.
+
+    It may be sent to others if that one is silent.
+    """
 
     blocks: list[int]
     futures_by_key: dict[Key, Future] = field(default_factory=dict)
@@ -133,9 +139,9 @@ class TaskDispatcher:
     """Sender of a study's blocks to the workers of a cluster.
 
     A worker that can't open the store, can't write to it, or writes to another one is excluded, and
-    its blocks go to the others. Blocks of a silent worker are also sent to others once these are
+    its blocks go to other workers. Blocks of a silent worker are also sent to others once these are
     idle; the first result counts. ``verify_receipt`` tells whether the block of a receipt is in the
-    store as seen from here: by its size, or by its digest for the first block of each worker.
+    store as this process sees it: by its size, or by its digest for the first block of each worker.
     """
 
     def __init__(
@@ -177,9 +183,9 @@ class TaskDispatcher:
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
         """Yield results of tasks as they arrive; an empty result after each `IDLE_POLL_SECONDS`.
 
-        Once `is_stopping` returns True no more tasks are sent. The iteration ends when those in
-        flight end, or at once if there is no worker. SchedulerLostError if the scheduler is gone;
-        StoreError or OSError if no worker can write to the store.
+        Once `is_stopping` returns True no more tasks are sent. The iteration ends when all sent
+        tasks have ended, or at once if there is no worker. SchedulerLostError is raised if the
+        scheduler is gone; StoreError or OSError if no worker can write to the store.
         """
         try:
             while True:
@@ -202,7 +208,7 @@ class TaskDispatcher:
             self._superseded.clear()
 
     def state_summary(self) -> str:
-        """Describe the blocks, tasks and workers of the run, one to a line."""
+        """Return the state of blocks, tasks and workers of the run as text of several lines."""
         now = time.monotonic()
         tasks = set(self._in_flight.values())
         lines = [
@@ -235,7 +241,10 @@ class TaskDispatcher:
         return "\n".join(lines)
 
     def _report_stall(self) -> None:
-        """Report that no result arrives, at increasing intervals, and log the state of the run."""
+        """Print a message and log the state of the run if no result arrives for long.
+
+        The intervals between messages increase.
+        """
         if (
             not self._in_flight or not self._usable_workers()
         ):  # the session reports a lack of workers
@@ -267,11 +276,11 @@ class TaskDispatcher:
 
     @property
     def _all_workers_excluded(self) -> bool:
-        """True if all workers so far are excluded, and further ones may still connect."""
+        """True if all workers known so far are excluded, but further workers may still connect."""
         return bool(self._excluded_workers) and not self._usable_workers()
 
     def _submit_tasks(self, *, may_submit: bool) -> None:
-        """Submit tasks until twice as many are in flight as there are worker threads."""
+        """Submit tasks until there are twice as many unfinished tasks as worker threads."""
         n_worker_threads = self._slots.current_count()
         if time.monotonic() - self._duplicated_at > WORKER_THREADS_REFRESH_SECONDS:
             self._duplicated_at = time.monotonic()
@@ -293,7 +302,7 @@ class TaskDispatcher:
             self._submit_task(_InFlightTask(blocks), **self._placement_kwargs(blocks[0]))
 
     def _is_failed_block_in_flight(self) -> bool:
-        """Return True if a block that failed before is in flight.
+        """Return True if a block that failed before is being computed.
 
         Two such blocks at once could each be blamed for the error of the other.
         """
@@ -301,7 +310,7 @@ class TaskDispatcher:
         return bool(failed) and any(task.blocks[0] in failed for task in self._in_flight.values())
 
     def _placement_kwargs(self, block: int) -> dict[str, Any]:
-        """Return arguments of `Client.submit` that keep a block off the worker where it failed."""
+        """Return arguments of `Client.submit` that keep a block from the worker where it failed."""
         failing_worker = self._failing_worker.get(block)
         others = [worker for worker in self._usable_workers() if worker != failing_worker]
         if failing_worker and others:
@@ -309,7 +318,7 @@ class TaskDispatcher:
         return {"workers": self._usable_workers()} if self._excluded_workers else {}
 
     def _submit_task(self, task: _InFlightTask, **placement: Any) -> None:
-        """Submit a task, with further arguments of `Client.submit`."""
+        """Submit a task to Dask, with further arguments of `Client.submit`."""
         first_block = task.blocks[0]
         key = task_key(
             self._settings,
@@ -327,7 +336,7 @@ class TaskDispatcher:
         future.add_done_callback(self._finished_futures.put)
 
     def _duplicate_stragglers(self) -> None:
-        """Send the tasks of silent workers to idle workers as well."""
+        """Send tasks of workers that have been silent for long to idle workers as well."""
         now = time.monotonic()
         overdue = [
             task
@@ -373,13 +382,16 @@ class TaskDispatcher:
             self._submit_task(task, workers=idle_workers)
 
     def _seconds_until_resend(self, task: _InFlightTask) -> float:
-        """Return the time after which a task may be sent again [s]; it doubles each time."""
+        """Return the time after which a task may be sent to a further worker [s].
+
+        It doubles each time that the task is sent.
+        """
         return max(WORKER_SILENCE_SECONDS, 5 * self._expected_task_seconds(task)) * 2.0 ** (
             len(task.futures_by_key) - 1
         )
 
     def _expected_task_seconds(self, task: _InFlightTask) -> float:
-        """Return the expected time of a task, from the blocks so far [s]."""
+        """Return the expected duration of a task, from the computing times of blocks so far [s]."""
         throughput = self._throughput
         return (
             len(task.blocks) * throughput.work_seconds / throughput.n_blocks
@@ -403,7 +415,10 @@ class TaskDispatcher:
         return task_result
 
     def _finish_task(self, future: Future) -> TaskResult:
-        """Return the result of a task that has ended, and update the state of the run by it."""
+        """Return the result of a task that has ended.
+
+        Update the state of blocks and workers by it.
+        """
         task = self._in_flight[future.key]
         for key in task.futures_by_key:
             del self._in_flight[key]
@@ -439,14 +454,15 @@ class TaskDispatcher:
         return task_result
 
     def _requeue_blocks(self, blocks: list[int]) -> None:
-        """Put blocks back into the queue that are unfinished, or whose task was lost."""
+        """Put blocks that are unfinished, or whose task was lost, back into the queue."""
         self._block_queue.requeue(blocks)
         self._resend_counts.update(blocks)
 
     def _verify_receipts(self, task_result: TaskResult) -> None:
-        """Keep only receipts whose blocks are visible in the store; check the others again later.
+        """Keep only receipts of blocks that this process sees in the store.
 
-        A block that does not appear in time is sent again, and its worker is excluded.
+        The others are checked again later. A block that does not appear in time is sent again, and
+        its worker is excluded.
         """
         now = time.monotonic()
         pending = [
@@ -468,7 +484,7 @@ class TaskDispatcher:
                 self._exclude_worker(worker, receipt.host, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
 
     def _exclude_worker(self, worker: str, host: str, error: Exception) -> None:
-        """Send no more tasks to a worker. Raise the error if no other worker is left.
+        """Send no more tasks to a worker. Its error is raised if no other worker is left.
 
         Workers that may still connect count as left.
         """
@@ -487,7 +503,7 @@ class TaskDispatcher:
         self._say(f"worker {worker} on {host} is left out: {error}")
 
     def _check_connection(self) -> None:
-        """Raise a SchedulerLostError if the client is not connected."""
+        """Raise a SchedulerLostError if the client is not connected to the scheduler."""
         if self._client.status != "running":
             raise SchedulerLostError(f"the client is {self._client.status}")
 
@@ -512,7 +528,10 @@ def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
 
 
 def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
-    """Return the result of a task that raised or killed its workers: a failure of every block."""
+    """Return the result of a task that raised an error or killed its workers.
+
+    It holds a failure of every block of the task.
+    """
     from distributed.scheduler import KilledWorker
 
     failures = [make_failure(block, error) for block in blocks]
@@ -529,7 +548,10 @@ def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
 def task_key(
     settings: TaskSettings, blocks: list[int], is_retry: bool, resend_count: int = 0
 ) -> str:
-    """Return the Dask key of a task: equal for the same blocks of the same store in any process."""
+    """Return the key that identifies a task for Dask.
+
+    It is equal for the same blocks of the same store in any process.
+    """
     identity = repr(
         (settings.store_path, settings.study_id, blocks, is_retry, resend_count)
     ).encode()

@@ -22,28 +22,28 @@ from typing import Any
 from sweep.messages import EXIT_INCOMPLETE, STORE_PLACEHOLDER, is_run_as_command, suggested_call
 from sweep.tasks.engine.progress import Progress
 
-#: Signals that end a run after its running blocks; a second one ends it at once.
+#: Signals that end a run once its running blocks are written. A second such signal ends it at once.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 #: Signal of a closed terminal, which may arrive several times; None on systems without it.
 HANGUP_SIGNAL = getattr(signal, "SIGHUP", None)
 
-#: Time in which the main thread must handle a signal [s].
+#: Time in which the main thread must handle a signal before the watcher thread reacts [s].
 SIGNAL_HANDLING_SECONDS_MAX = 2.0
 
 #: Time after SIGTERM in which running blocks must end [s]; batch systems mostly kill after 30 s.
 SIGTERM_GRACE_SECONDS = 15.0
 
-#: Interval at which the watcher checks whether a signal was handled [s].
+#: Interval at which the watcher thread checks whether a signal was handled [s].
 SIGNAL_POLL_SECONDS = 0.1
 
-#: Time limit of the last message of a process, for example to a stopped terminal [s].
+#: Time limit for writing a process's last message, for example to a stopped terminal [s].
 EXIT_MESSAGE_SECONDS_MAX = 1.0
 
 #: Largest number of signals that are read at once, one byte each.
 _SIGNAL_BYTES_MAX = 4096
 
-#: Byte that wakes the watcher and is no signal.
+#: Byte that wakes the watcher thread and stands for no signal.
 _WAKE_BYTE = b"\0"
 
 
@@ -99,7 +99,7 @@ class InterruptHandler:
             self._watcher = None
 
     def announce_stop(self) -> None:
-        """Print, once, that the run stops when running blocks are written."""
+        """Print once that the run stops when the blocks being computed are written."""
         with self._announce_lock:
             if not self._is_announced:
                 self._is_announced = True
@@ -124,7 +124,10 @@ class InterruptHandler:
     # Methods of the watcher thread
 
     def _start_watcher(self) -> None:
-        """Start the watcher thread, unless an event loop of the caller already receives signals."""
+        """Start the thread that watches for signals.
+
+        It is not started if an event loop of the caller already receives signals.
+        """
         receiver, sender = socket.socketpair()
         receiver.setblocking(False)
         sender.setblocking(False)
@@ -165,12 +168,15 @@ class InterruptHandler:
                 self.announce_stop()
 
     def _seconds_to_deadline(self) -> float | None:
-        """Return the time to the deadline [s]; None if there is none."""
+        """Return the time until running blocks are stopped [s]; None if no deadline is set."""
         deadline = self._deadline
         return None if deadline is None else max(deadline - time.monotonic(), 0.0)
 
     def _unhandled_signals(self, receiver: socket.socket) -> list[int]:
-        """Return arrived signals that the main thread has not handled; discard wake-up bytes."""
+        """Return signals that have arrived but that the main thread has not handled yet.
+
+        Bytes by which Python announces signals to the watcher thread are discarded.
+        """
         try:
             signal_bytes = receiver.recv(_SIGNAL_BYTES_MAX, socket.MSG_PEEK)
             unhandled = [
@@ -185,7 +191,10 @@ class InterruptHandler:
         return unhandled
 
     def _is_handled_in_time(self, receiver: socket.socket, n_signals: int) -> bool:
-        """Wait up to `SIGNAL_HANDLING_SECONDS_MAX`. Return True once a signal is handled."""
+        """Wait up to `SIGNAL_HANDLING_SECONDS_MAX`.
+
+        Return True once the main thread handles a signal.
+        """
         deadline = time.monotonic() + SIGNAL_HANDLING_SECONDS_MAX
         while time.monotonic() < deadline:
             if (
@@ -196,7 +205,10 @@ class InterruptHandler:
         return False
 
     def _react_to_stalled_signals(self, unhandled: list[int], *, is_repeated: bool) -> None:
-        """React to signals that compiled code holds up: print a message, or end the process."""
+        """React to signals that can't be handled while compiled code runs.
+
+        Print a message, or end the process.
+        """
         if set(unhandled) == {HANGUP_SIGNAL}:
             return
         is_asked_again = self.is_stopping or is_repeated
@@ -210,7 +222,7 @@ class InterruptHandler:
             self.announce_stop()
 
     def _exit_process(self, exit_code: int) -> None:
-        """Print a last message and end the process from the watcher thread; never returns."""
+        """Print a last message and end the process from the watcher thread. This never returns."""
 
         def print_last_words() -> None:
             self._listener.end()

@@ -77,13 +77,13 @@ LOG_FILE_NAMES = (RECEIPTS_FILE, FAILURE_LOG_FILE, SESSION_LOG_FILE)
 
 RECIPE_FILE = "recipe.json"
 
-#: Recipe key of the path of the store that this one extends, and takes results from.
+#: Key, in a store's recipe, of the path of the store that this one extends and takes results from.
 EXTENDED_STORE_KEY = "extends"
 
-#: Recipe key of the digests of the user's modules at the start of the first run.
+#: Key, in a store's recipe, of the digests of the user's modules at the start of the first run.
 USER_MODULE_DIGESTS_KEY = "code"
 
-#: Recipe key of the id of the study whose store this one will replace; '' without one.
+#: Key, in a store's recipe, of the id of the study whose store this one will replace; '' if none.
 REPLACED_STUDY_ID_KEY = "replaces"
 
 #: Number of folders on disk that are listed at once; listing on a file server is mostly waiting.
@@ -92,7 +92,7 @@ LISTING_THREADS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Receipt:
-    """Record of a block that a worker has written."""
+    """Record of a stored block: number, points, size, digest, times, and process that wrote it."""
 
     block: int
     points: int
@@ -108,7 +108,7 @@ class Receipt:
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """Record of a block's error, and of the process in which it occurred."""
+    """Record of a block that raised an error: the error, and the process in which it occurred."""
 
     block: int
     error: str
@@ -118,9 +118,10 @@ class Failure:
 
 
 class Journal:
-    """Writer of a store's logs. Opening removes damaged and incomplete lines.
+    """Writer of a store's logs. Damaged and incomplete lines are removed when it is opened.
 
-    The caller holds the store's lock. If `durable`, a receipt is on the disk once it is committed.
+    The caller holds the store's lock. If `durable`, a receipt is on the disk once it is committed,
+    and not only in the cache of the operating system.
     """
 
     def __init__(self, store_path: Location, *, durable: bool = False) -> None:
@@ -132,7 +133,7 @@ class Journal:
             log.remove_damaged_lines(lambda line: verified_line_body(line) is not None)
 
     def commit(self, *receipts: Receipt) -> None:
-        """Append receipts, which marks their blocks as done.
+        """Append receipts to the log, which marks their blocks as done.
 
         In an object store they are done after the next `flush`.
         """
@@ -142,7 +143,7 @@ class Journal:
         )
 
     def withdraw_receipt(self, block: int, reason: str) -> None:
-        """Withdraw the receipt of a block, so that the block is computed again."""
+        """Add a line that cancels a block's receipt, so that the block is computed again."""
         self._append(
             RECEIPTS_FILE, {"block": block, "withdrawn": reason, "time": round(time.time(), 3)}
         )
@@ -153,7 +154,10 @@ class Journal:
         return all(is_flushed)
 
     def record_failure(self, failure: Failure) -> None:
-        """Append the error of a block that is permanently failed."""
+        """Append the error of a block that failed for good.
+
+        Later runs skip it unless told to retry.
+        """
         self._append(FAILURE_LOG_FILE, asdict(failure))
 
     def record_run_event(self, event: str, **details: Any) -> None:
@@ -163,7 +167,7 @@ class Journal:
         self.flush(force=True)
 
     def _append(self, log_name: str, *records: dict[str, Any]) -> None:
-        """Append lines, all or none; OSError if they can't be written."""
+        """Append lines to a log, all or none. OSError is raised if they can't be written."""
         if records:
             self._logs[log_name].append(b"".join(map(encode_record, records)))
 
@@ -185,7 +189,10 @@ def blocks_with_receipt(store_path: Location, study: BlockStudy) -> np.ndarray:
 
 
 def committed_blocks(store_path: Location, study: BlockStudy) -> np.ndarray:
-    """Return a mask (blocks,) of done blocks: with a receipt, and all chunks in the store."""
+    """Return a mask (blocks,) of the blocks that are done.
+
+    A block is done if it has a receipt and all of its chunks are in the store.
+    """
     return find_complete_blocks(store_path, study, blocks_with_receipt(store_path, study))
 
 
@@ -209,12 +216,15 @@ def last_run_start_time(store_path: Location) -> float:
 
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
-    """Replace the recipe of a store atomically; ``facts`` are its entries."""
+    """Replace a store's recipe in one step.
+
+    ``facts`` are its entries: folder of files, extended store.
+    """
     atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_record(facts))
 
 
 def read_recipe(store_path: Location) -> dict[str, Any]:
-    """Return the recipe; empty if it is missing or damaged."""
+    """Return a store's recipe, the facts about how it is made; empty if missing or damaged."""
     records = [
         record for _, record in iter_lines_and_records(store_path / JOURNAL_DIR / RECIPE_FILE)
     ]
@@ -222,7 +232,7 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
 
 
 def remove_predecessors_from_recipe(store_path: Path) -> None:
-    """Remove the entries of the extended and the replaced store from the recipe of a store."""
+    """Remove, from a store's recipe, the entries that name the store it extends or replaces."""
     facts = read_recipe(store_path)
     for name in (EXTENDED_STORE_KEY, REPLACED_STUDY_ID_KEY):
         facts.pop(name, None)
@@ -243,9 +253,9 @@ def refuse_damaged_recipe(store_path: Location) -> None:
 
 
 class ChunkScan:
-    """Concurrent search for missing chunks of candidate blocks; begins on construction.
+    """Search, in threads, for missing chunks of blocks. It begins on construction.
 
-    `candidates` is a mask (blocks,) of bool.
+    `candidates` is a mask (blocks,) of bool of the blocks whose chunks are searched.
     """
 
     def __init__(self, store_path: Location, study: BlockStudy, candidates: np.ndarray) -> None:
@@ -269,13 +279,13 @@ class ChunkScan:
         ]
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for the scan, for at most `timeout` [s]. Return True if it has ended."""
+        """Wait until the search ends, for at most `timeout` [s]. Return True if it has ended."""
         return not wait(self._array_scans, timeout).not_done
 
     def complete_blocks(self) -> np.ndarray:
-        """Return a mask (blocks,) of candidates without a missing chunk in arrays scanned so far.
+        """Return a mask (blocks,) of candidates that lack no chunk in the arrays searched so far.
 
-        OSError if the store can't be read.
+        OSError is raised if the store can't be read.
         """
         is_complete = self._candidates.copy()
         for scan in self._array_scans:
@@ -284,7 +294,7 @@ class ChunkScan:
         return is_complete
 
     def stop(self) -> None:
-        """Stop the scan."""
+        """End the search for missing chunks early."""
         self._is_stopped = True
         self._executor.shutdown(wait=False)
 
@@ -292,7 +302,7 @@ class ChunkScan:
 def find_complete_blocks(
     store_path: Location, study: BlockStudy, candidates: np.ndarray
 ) -> np.ndarray:
-    """Return a mask (blocks,) of the candidates of which every chunk exists and is not empty."""
+    """Return a mask (blocks,) of the candidate blocks whose chunks all exist and are not empty."""
     scan = ChunkScan(store_path, study, candidates)
     try:
         scan.wait()
@@ -323,7 +333,7 @@ def _is_nonempty_file(status: os.stat_result) -> bool:
 def _iter_chunk_keys(
     folder: ObjectPath, shape: tuple[int, ...]
 ) -> Iterator[tuple[tuple[int, ...], int]]:
-    """Yield position and size [bytes] of the chunks of an array in an object store."""
+    """Yield the position and the size [bytes] of each chunk of an array in an object store."""
     if not shape:
         yield (), max(0, folder.size())
         return
@@ -338,9 +348,10 @@ def _iter_chunk_keys(
 def _mark_existing_chunks(
     folder_or_name: Path | str, is_present: np.ndarray, parent_descriptor: int | None = None
 ) -> None:
-    """Mark the existing chunks below a folder in `is_present`, in the shape of the grid of chunks.
+    """Set `is_present` to True for each chunk that exists below a folder.
 
-    `parent_descriptor` is an open folder in which a folder is given by name.
+    `is_present` has the shape of the array's grid of chunks. `parent_descriptor` is an open folder
+    that contains the folder.
     """
     try:
         # links are not followed: their targets are no part of the store
@@ -363,12 +374,12 @@ def _mark_existing_chunks(
         os.close(descriptor)
 
 
-#: Prefix of the names of checkpoints; the number of the block follows.
+#: Prefix of the file names of checkpoints (saved parts of blocks). The number of the block follows.
 CHECKPOINT_FILE_PREFIX = "begun-"
 
 
 class Checkpoint(NamedTuple):
-    """Saved part of a block that is not complete."""
+    """Saved results of a block that is not complete, with the time and the points done so far."""
 
     results: EarlierResults = EarlierResults()
     points: float = 0.0  # number of points done; a point that is computed in part counts in part
@@ -378,7 +389,10 @@ class Checkpoint(NamedTuple):
 def write_checkpoint(
     store_path: Location, study_id: str, block: int, checkpoint: Checkpoint
 ) -> None:
-    """Save a checkpoint, unless one with as many points exists; OSError if it can't be written."""
+    """Save a block's checkpoint, unless a saved one has as many points done.
+
+    OSError is raised if it can't be written.
+    """
     if read_checkpoint(store_path, study_id, block).points >= checkpoint.points:
         return  # written by another worker, which was believed to be lost
     buffer = io.BytesIO()
@@ -445,7 +459,7 @@ def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def read_checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
-    """Return the number of points done in the checkpoint of each unfinished block."""
+    """Return the number of points done in the checkpoint of each block that has one."""
     block_names = [
         file.name.removeprefix(CHECKPOINT_FILE_PREFIX)
         for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_FILE_PREFIX}*")
@@ -481,7 +495,7 @@ def _checkpoint_arrays(results: EarlierResults) -> dict[str, Any]:
 
 
 def _content_digest(content: bytes) -> str:
-    """Return the digest of a checkpoint's content."""
+    """Return the digest of a checkpoint's content, by which damage is found."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
@@ -490,7 +504,8 @@ LOCK_FILE = "lock"
 #: Largest number of attempts to acquire a lock in an object store against other processes.
 LOCK_ATTEMPTS_MAX = 5
 
-#: Time between heartbeats [s], and age beyond which a holder on another host may be dead [s].
+#: Two times of the heartbeats by which a lock's holder shows that it runs [s]. The first is the
+#: time between heartbeats. The second is the age above which a holder on another host may be dead.
 HEARTBEAT_INTERVAL_SECONDS = 10.0
 HEARTBEAT_AGE_SECONDS_MAX = 120.0
 
@@ -514,15 +529,21 @@ HARD_LINK_UNSUPPORTED_ERRNOS = {
 }
 
 _released_tokens: set[str] = set()
-"""Tokens of locks that this process has released; an unreachable store may still hold them."""
+"""Tokens (unique texts) of the locks that this process has released.
+
+A store that could not be reached may still hold them.
+"""
 
 _issued_warnings: set[str] = set()
-"""Kinds of lock warnings that this process has given; a study may have many locks."""
+"""Kinds of lock warnings that this process has given, so that each is given once.
+
+A study may have many locks.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LockHolder:
-    """Process that holds a lock."""
+    """Process that holds a store's lock: its host, process number, start time and token."""
 
     host: str = "unknown"
     pid: int = 0
@@ -532,7 +553,7 @@ class LockHolder:
 
     @classmethod
     def of_this_process(cls) -> LockHolder:
-        """Return this process as a holder, with a new token."""
+        """Return this process as a lock holder, with a new token (a unique text)."""
         pid = os.getpid()
         return cls(
             host=socket.gethostname(),
@@ -550,7 +571,10 @@ class LockHolder:
 
 @cache
 def _machine_id() -> str:
-    """Return the boot and the namespace within which process numbers are unique; '' if unknown."""
+    """Return a text that identifies the machine's boot and the process's namespace; '' if unknown.
+
+    Process numbers are unique within both.
+    """
     try:
         boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         return f"{boot_id} {os.readlink('/proc/self/ns/pid')}"
@@ -580,14 +604,20 @@ def _parse_lock_holder(holder_json: str) -> LockHolder:
 
 
 def is_holder_alive(store_path: Location, holder: LockHolder) -> bool:
-    """Return True if a holder runs: by its process on this machine, by its heartbeat elsewhere."""
+    """Return True if the process that holds a lock still runs.
+
+    A process on this machine is looked up. One on another machine is judged by its last heartbeat.
+    """
     if (is_running := _is_running_here(holder)) is not None:
         return is_running
     return heartbeat_age(store_path) < HEARTBEAT_AGE_SECONDS_MAX
 
 
 def _is_running_here(holder: LockHolder) -> bool | None:
-    """Return whether a holder of this machine runs; None if it is elsewhere or can't be seen."""
+    """Return whether a lock's holder, a process of this machine, still runs.
+
+    None if it is on another machine, or can't be seen from here.
+    """
     if not (holder.is_on_this_machine and holder.start):
         return None
     current_start = process_start_id(holder.pid)
@@ -595,7 +625,10 @@ def _is_running_here(holder: LockHolder) -> bool | None:
 
 
 def heartbeat_age(store_path: Location) -> float:
-    """Return the age of a lock's last heartbeat by the file system's clock [s]; inf without one."""
+    """Return the time since a lock was last updated by its holder [s]; inf if it never was.
+
+    It is measured by the clock of the file system.
+    """
     lock_path = store_path / JOURNAL_DIR / LOCK_FILE
     probe = lock_path.with_name(f"clock-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     file_system_time: float | None = None
@@ -626,7 +659,7 @@ def _modification_time(path: Location) -> float | None:
 
 
 class _FileLock:
-    """Lock as a file on disk."""
+    """Lock of a store on disk: a file that names the process that holds it."""
 
     def __init__(self, lock_path: Path) -> None:
         self._lock_path = lock_path
@@ -652,10 +685,10 @@ class _FileLock:
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
-        """Acquire the lock for a holder, after removing that of a dead one.
+        """Acquire the lock for a holder. The lock of a dead holder is removed first.
 
         `check_holder` raises if the present holder lives. On file systems with flock no other
-        process acquires the lock meanwhile. BusyError if another process was quicker.
+        process acquires the lock meanwhile. BusyError is raised if another process was quicker.
         """
         self._lock_path.parent.mkdir(exist_ok=True)
         with self._acquisition_guard(say):  # one process at a time checks and acquires
@@ -680,7 +713,7 @@ class _FileLock:
 
     @contextmanager
     def _acquisition_guard(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Exclude other processes that acquire the lock, if the file system has flock."""
+        """Keep other processes from acquiring the lock meanwhile, if the file system has flock."""
         guard_path = self._lock_path.with_name("lock.guard")
         open_flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         guard_descriptor = os.open(guard_path, open_flags, 0o666)
@@ -745,7 +778,7 @@ class _FileLock:
             raise
 
     def send_heartbeat(self) -> None:
-        """Update the heartbeat of the lock."""
+        """Update the lock file's time, which shows that the holder still runs."""
         os.utime(self._lock_path)
 
     def release(self) -> None:
@@ -771,7 +804,10 @@ def _warn_once(say: Callable[[str], None], kind: str, warning: str) -> None:
 
 
 class _ObjectLock:
-    """Lock as an object, changed by conditional puts: its holder, and a count of heartbeats."""
+    """Lock of a store in an object store: an object with its holder and a count of heartbeats.
+
+    It is written only if no other process has changed it.
+    """
 
     def __init__(self, lock_path: ObjectPath) -> None:
         self._lock_path = lock_path
@@ -823,7 +859,7 @@ class _ObjectLock:
         raise ObjectStoreError(11, "others are quicker to lock it: try again", str(self._lock_path))
 
     def send_heartbeat(self) -> None:
-        """Update the heartbeat of the lock."""
+        """Raise the count of heartbeats in the lock, which shows that the holder still runs."""
         self._replace_content(f"{self._holder_json}\n{self._n_heartbeats + 1}\n")
         self._n_heartbeats += 1
 
@@ -854,9 +890,10 @@ def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
 
 
 def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
-    """Wait until the heartbeat of a holder on another machine is too old, or a new one arrives.
+    """Wait until the last heartbeat of a lock's holder is too old, or a new one arrives.
 
-    A job that is restarted on another node soon after it was killed thus need not be refused.
+    The holder is on another machine. A job that is restarted on another node soon after it was
+    killed thus need not be refused.
     """
     other_holder, heartbeat_version = (
         read_lock_holder(store_path),
@@ -880,7 +917,10 @@ def _sends_no_heartbeat(
     watch_seconds: float,
     say: Callable[[str], None],
 ) -> bool:
-    """Watch a lock for some time by this process's clock. Return True if it did not change."""
+    """Watch a lock for some time by this process's clock.
+
+    Return True if its holder did not update it.
+    """
     holder_text = f"process {other_holder.pid} on {escape_to_one_line(other_holder.host)}"
     say(
         f"waiting up to {watch_seconds:.0f} s to see whether {holder_text}, "
@@ -898,10 +938,10 @@ def _sends_no_heartbeat(
 
 
 class StoreLock:
-    """Lock of a store, acquired on construction and kept alive until released.
+    """Lock of a store. It is acquired on construction and updated regularly until it is released.
 
-    BusyError if a living driver holds it, StoreError if the store can't be written. ``say`` gets
-    messages for the user; by default they are warnings.
+    BusyError is raised if a living process holds the lock, StoreError if the store can't be
+    written. ``say`` gets messages for the user; by default they are warnings.
     """
 
     def __init__(self, store_path: Location, say: Callable[[str], None] = warnings.warn) -> None:
@@ -919,9 +959,10 @@ class StoreLock:
         self._heartbeat_thread.start()
 
     def _watch_other_holder(self, say: Callable[[str], None]) -> object:
-        """Watch the heartbeat of a holder on another machine. Return its lock's state if silent.
+        """Watch the heartbeat of a lock's holder on another machine.
 
-        None if there is no such holder; BusyError if it lives.
+        Return the state of the lock if no heartbeat arrives, None if there is no such holder.
+        BusyError is raised if the holder lives.
         """
         other_holder, heartbeat_version = (
             read_lock_holder(self._store_path),
@@ -956,7 +997,7 @@ class StoreLock:
             raise self._make_busy_error(other_holder)
 
     def _make_busy_error(self, other_holder: LockHolder) -> BusyError:
-        """Return the error of a lock that another process holds."""
+        """Return the error to raise if another process holds the lock."""
         holder_text = (
             f"process {escape_to_one_line(other_holder.pid)} on "
             f"{escape_to_one_line(other_holder.host)}"

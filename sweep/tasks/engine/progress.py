@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 #: Time between lines of progress without a terminal [s].
 PROGRESS_LINE_INTERVAL_SECONDS = 30.0
 
-#: Rate at which a bar is drawn [Hz]; each time takes some ms of the driver.
+#: Number of times per second that a progress bar is drawn [Hz]. Each time takes some ms.
 BAR_REFRESH_RATE_HZ = 4.0
 
-#: Width of a terminal from which a bar shows workers and bytes too [columns].
+#: Width of a terminal from which a progress bar shows workers and bytes too [columns].
 WIDE_TERMINAL_COLUMNS_MIN = 100
 
-#: Time before an activity is shown [s]; most activities are over by then.
+#: Duration of an activity before a message about it is shown [s]. Most activities are shorter.
 ACTIVITY_SHOWN_AFTER_SECONDS = 2.0
 
 _logger = logging.getLogger("sweep")
 
 
 class TaskError(EscapedTextError):
-    """Error of a study that can't be run as requested; the message has reason and remedy."""
+    """Error of a study that can't be run as requested. The message states reason and remedy."""
 
 
 class BusyError(StoreError):
@@ -42,20 +42,23 @@ class BusyError(StoreError):
 
 
 class ClusterError(TaskError):
-    """Error of a scheduler or of workers that are not available."""
+    """Error of a Dask scheduler or of workers that are not available."""
 
 
 class CodeError(TaskError):
-    """Error of a user's function that is not allowed, can't be imported, or fails."""
+    """Error of a user's Python function: it is not allowed, can't be imported, or fails."""
 
 
 class SchedulerLostError(Exception):
-    """Error of a scheduler that is gone with tasks in flight; committed blocks are safe."""
+    """Error raised if the Dask scheduler disappears during a run. Committed blocks are safe."""
 
 
 @contextmanager
 def raise_as_store_error(problem: str) -> Iterator[None]:
-    """Raise errors of the disk or of an object store as a StoreError that begins with `problem`."""
+    """Turn errors of the disk or of an object store into a StoreError.
+
+    Its message begins with `problem`.
+    """
     try:
         yield
     except RefusedFileError as error:
@@ -65,29 +68,32 @@ def raise_as_store_error(problem: str) -> Iterator[None]:
 
 
 class Progress:
-    """Listener to the progress of a run. The methods of this class do nothing."""
+    """Base of listeners to the progress of a run. Its methods do nothing."""
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
-        """Begin a run of `points` points, `done` of which exist already, some in part.
+        """Start to show a run of `points` points.
 
-        `unit` names the points, in the plural.
+        `done` points exist already, some of them in part. `unit` names the points, in the plural.
         """
 
     def advance(self, *, points: float, failed: int) -> None:
-        """Add newly computed points and failed blocks; both are 0 if only time has passed."""
+        """Add points that were computed and blocks that failed since the last call.
+
+        Both are 0 if only time has passed.
+        """
 
     def update_workers(self, *, workers: int, stored: int) -> None:
-        """Update the number of workers and the size stored [bytes]; called before `advance`."""
+        """Set the number of workers and the size stored so far [bytes]. Called before `advance`."""
 
     def say(self, text: str) -> None:
-        """Show a message."""
+        """Show a message to the user."""
 
     def end(self) -> None:
         """End the run."""
 
 
 def make_progress(progress: bool | Progress) -> Progress:
-    """Return a progress listener: the given one, none, or a display on standard error."""
+    """Return a progress listener: the given one, a silent one, or a display on standard error."""
     if progress is True:
         return ProgressBar() if is_terminal(sys.stderr) else ProgressLines()
     if progress is False:
@@ -96,7 +102,7 @@ def make_progress(progress: bool | Progress) -> Progress:
 
 
 class _GuardedListener(Progress):
-    """Wrapper of a user's listener, which is no longer called after its first error."""
+    """Wrapper of a user's progress listener, which is not called again after its first error."""
 
     def __init__(self, listener: Progress) -> None:
         self._listener, self._has_failed = listener, False
@@ -132,7 +138,10 @@ class _GuardedListener(Progress):
 
 @contextmanager
 def show_activity(activity: str, progress: Progress | None = None) -> Iterator[None]:
-    """Show an activity, or the compilation of kernels, if it takes longer than two seconds."""
+    """Show a text about the work in the context if it takes longer than two seconds.
+
+    If kernels are being compiled, the text says so.
+    """
     from numba.core.event import install_recorder
 
     listener, start_time, is_over = (
@@ -172,7 +181,7 @@ def show_activity(activity: str, progress: Progress | None = None) -> Iterator[N
 
 
 class _CountingProgress(Progress):
-    """Listener that adds up points and failures."""
+    """Base of progress listeners that add up computed points and failed blocks."""
 
     def __init__(self) -> None:
         self._n_points = self._n_failed = 0
@@ -196,7 +205,7 @@ class _CountingProgress(Progress):
         self._show_state()
 
     def _show_state(self, *, is_start: bool = False) -> None:
-        """Show the present state."""
+        """Show the present numbers of points, workers, bytes and failures."""
 
     def update_workers(self, *, workers: int, stored: int) -> None:
         from rich.filesize import decimal
@@ -206,14 +215,14 @@ class _CountingProgress(Progress):
 
     @property
     def _points_per_second(self) -> float:
-        """Points per second of this run."""
+        """Points computed per second since this run began."""
         return (self._points_done - self._points_before) / max(
             time.monotonic() - self._start_time, 1e-9
         )
 
     @property
     def _column_texts(self) -> dict[str, Any]:
-        """Texts of the present state, by the names of the columns of a bar."""
+        """Texts of the present state, by the names of the columns of a progress bar."""
         return {
             "done": point_count_text(self._points_done),
             "rate": f"{point_count_text(self._points_per_second)} {self._points_noun}/s"
@@ -225,7 +234,7 @@ class _CountingProgress(Progress):
 
 
 class ProgressLines(_CountingProgress):
-    """Listener that prints one line at the start, every 30 s and at the end, for logs."""
+    """Progress listener that prints one line at the start, every 30 s and at the end, for logs."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -259,7 +268,7 @@ class ProgressLines(_CountingProgress):
 
 
 class ProgressBar(_CountingProgress):
-    """Bar with points, rate, time left, workers, bytes and failures, on standard error."""
+    """Progress bar on standard error with points, points per second, time left and failures."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -313,7 +322,8 @@ class ProgressBar(_CountingProgress):
 def point_count_text(points: float) -> str:
     """Return a number of points as text: `4,500`, or two digits if below 10, as `0.31`.
 
-    Numbers below 10 are not whole if part of a point is done, or for a rate.
+    Numbers below 10 need not be whole: a point may be done in part, or the number may be per
+    second.
     """
     if points >= 10 or abs(points - round(points)) < 1e-6:
         return f"{points:,.0f}"

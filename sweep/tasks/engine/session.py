@@ -1,4 +1,7 @@
-"""One run over the missing blocks of a store: options, compute backend, commits and outcome."""
+"""One session of a run: options, compute backend, committing of blocks, and outcome.
+
+A session computes the missing blocks of one store.
+"""
 
 from __future__ import annotations
 
@@ -83,17 +86,17 @@ if TYPE_CHECKING:
 #: Value of the option `scheduler` that selects serial computation in this process.
 SERIAL_SCHEDULER_OPTION = "none"
 
-#: Number of failed blocks, without any success, after which a run stops.
+#: Number of failed blocks, while no block has succeeded, after which a run stops.
 MAX_INITIAL_FAILURES = 20
 
-#: Time for which a run waits for the scan of existing chunks [s]. After that it trusts the log, and
-#: the scan goes on during the run.
+#: Time for which a run waits for the search for missing chunks [s]. Afterwards it trusts the log of
+#: receipts, and the search goes on during the run.
 CHUNK_SCAN_TIMEOUT_SECONDS = 2.0
 
-#: Time without a worker after which a warning is given [s].
+#: Time without any connected worker after which a warning is given [s].
 NO_WORKER_WARNING_SECONDS = 20.0
 
-#: Fields of receipts that a run adds up.
+#: Fields of the receipts of blocks that a session sums.
 SUMMED_RECEIPT_FIELDS = ("points", "reused_points", "bytes", "seconds", "write_seconds")
 
 _logger = logging.getLogger("sweep.session")
@@ -193,12 +196,12 @@ class RunOptions:
         return cls(**options)
 
     def resolve_cluster(self, workload: Workload) -> AnyClusterConfig | None:
-        """Return the cluster of the options, or of the spec's `execution`.
+        """Return the cluster that the options name, or else the spec's `execution`.
 
         None if blocks are computed in this process.
 
-        ClusterError if both a scheduler and a cluster are named, or a number of workers for a
-        scheduler that runs already.
+        ClusterError is raised if both a scheduler and a cluster are named, or a number of workers
+        for a scheduler that runs already.
         """
         if self.cluster is not None:
             if self.scheduler is not None:
@@ -238,7 +241,7 @@ class RunOptions:
         )
 
     def _with_dashboard(self, cluster: AnyClusterConfig) -> AnyClusterConfig:
-        """Enable the dashboard of a cluster that is started here, if one is asked for."""
+        """Return a cluster's configuration with Dask's dashboard enabled, if it is asked for."""
         if not self.dashboard:
             return cluster
         if isinstance(cluster, ExistingSchedulerConfig | KubernetesClusterConfig):
@@ -265,7 +268,7 @@ class RunOptions:
         return not needs_workers and execution == Execution()
 
     def _first_option_of_workers(self) -> str:
-        """Return the name of an option that only workers can serve; '' if none is set."""
+        """Return the name of the first set option that only worker processes can serve, or ''."""
         is_set = {
             "workers": self.workers is not None,
             "client": self.client is not None,
@@ -279,7 +282,10 @@ class RunOptions:
         return next((name for name, value in is_set.items() if value), "")
 
     def n_threads(self, workload: Workload) -> int:
-        """Return the number of threads of this process that compute blocks; 1 for a plain loop."""
+        """Return the number of threads of this process that compute blocks.
+
+        1 means a plain loop over the blocks.
+        """
         scheduler = self.scheduler or (self.workers is None and workload.execution.scheduler)
         if scheduler == SERIAL_SCHEDULER_OPTION:
             return 1
@@ -298,9 +304,9 @@ def _is_scheduler_address(address: object) -> bool:
 
 
 def _with_worker_count(cluster: AnyClusterConfig, n_workers: int | None) -> AnyClusterConfig:
-    """Set the number of workers of a cluster, if one is given.
+    """Return a cluster's configuration with a given number of workers, if one is given.
 
-    ClusterError if the workers belong to a scheduler that runs already.
+    ClusterError is raised if the workers belong to a scheduler that runs already.
     """
     if n_workers is None:
         return cluster
@@ -312,7 +318,10 @@ def _with_worker_count(cluster: AnyClusterConfig, n_workers: int | None) -> AnyC
 
 
 class ComputeBackend(ExitStack):
-    """Context manager for the workers, or the process, that compute consecutive studies."""
+    """Context manager of the workers, or the threads of this process, that compute studies.
+
+    Several studies are computed one after the other.
+    """
 
     def __init__(self, options: RunOptions, workload: Workload) -> None:
         super().__init__()
@@ -323,9 +332,15 @@ class ComputeBackend(ExitStack):
             process_memory() if self.is_in_process else worker_memory(options.client, self._cluster)
         )
         self.bytes_per_thread = 0.0
-        """Memory that a thread of this process takes for its block [bytes]; set by the caller."""
+        """Memory that a thread of this process needs to compute a block [bytes].
+
+        The caller sets it.
+        """
         self.check_memory: Callable[[WorkerMemory], None] = lambda memory: None
-        """Raises a SpecError if the study exceeds the memory of a worker; set by the caller."""
+        """Function that raises a SpecError if a study needs more memory than a worker has.
+
+        The caller sets it.
+        """
         self.max_workers = 1  # number of blocks of the study, as further workers would be idle
         self._connection: ClusterConnection | None = None
 
@@ -396,7 +411,8 @@ class ComputeBackend(ExitStack):
     ) -> Iterator[TaskResult]:
         """Compute the blocks of a queue. Yield the results of tasks as they arrive.
 
-        `verify_receipt` tells whether the block of a receipt is in the store as seen from here.
+        `verify_receipt` tells whether the block of a receipt is in the store as this process sees
+        it.
         """
         options = self.options
         settings = TaskSettings(
@@ -435,14 +451,14 @@ class ComputeBackend(ExitStack):
         return dispatcher.iter_results(lambda: self.interrupts.is_stopping)
 
     def restart_workers(self) -> None:
-        """Restart lost workers of this machine."""
+        """Start new workers on this machine in place of lost ones."""
         if self._connection is not None:
             self._connection.restart_workers()
 
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOutcome:
-    """Result of one session."""
+    """Result of one session: numbers of blocks and points, size, and why it stopped."""
 
     store: Location
     points_noun: str  # name of the points, in the plural
@@ -488,7 +504,10 @@ def _block_count_text(count: int) -> str:
 
 
 class NoWorkerMonitor:
-    """Source of warnings about a cluster without workers, at intervals that double."""
+    """Monitor that warns if a cluster has no workers for long.
+
+    Intervals between warnings double.
+    """
 
     def __init__(self) -> None:
         self._last_seen, self._has_had_workers, self._warn_after = (
@@ -498,7 +517,7 @@ class NoWorkerMonitor:
         )
 
     def warning_text(self, n_workers: int, *, has_receipts: bool = False) -> str:
-        """Return a warning if there has been no worker for long, else ''.
+        """Return a warning if the cluster has had no worker for long, else ''.
 
         `has_receipts` means that a worker has returned a result since the last call.
         """
@@ -520,7 +539,7 @@ class NoWorkerMonitor:
 
 
 class Session:
-    """One run over the missing blocks of a store, whose lock this process holds."""
+    """Computation of the missing blocks of a store. This process holds the store's lock."""
 
     def __init__(
         self, store_path: Location, study: BlockStudy, backend: ComputeBackend, lock: StoreLock
@@ -544,7 +563,7 @@ class Session:
     def run(self, *, prior_stop_reason: str = "") -> SessionOutcome:
         """Compute all missing blocks, and return the outcome.
 
-        `prior_stop_reason` is the reason why an earlier stage of the study is incomplete; if it is
+        `prior_stop_reason` is the reason why an earlier stage of the study is incomplete. If it is
         not empty, no block is computed.
         """
         start_time = time.monotonic()
@@ -624,7 +643,7 @@ class Session:
         return ""
 
     def _finish_chunk_scan(self, chunk_scan: ChunkScan, is_done: np.ndarray) -> str:
-        """Wait for the scan of existing chunks, and compute the blocks that lack any.
+        """Wait until the search for missing chunks ends, and compute the blocks that lack any.
 
         Return the reason for stopping early, or ''.
         """
@@ -637,9 +656,10 @@ class Session:
         return self._compute_blocks(is_settled, is_settled & is_done)
 
     def _compute_blocks(self, is_settled: np.ndarray, is_done: np.ndarray) -> str:
-        """Compute all unsettled blocks. Return the reason for stopping early, or ''.
+        """Compute all blocks that are not settled. Return the reason for stopping early, or ''.
 
-        `is_settled` and `is_done` are masks (blocks,) of bool.
+        `is_settled` and `is_done` are masks (blocks,) of bool. Settled blocks are done, or failed
+        for good.
         """
         if is_settled.all():
             return ""
@@ -719,7 +739,7 @@ class Session:
         return "interrupted" if self._interrupts.is_stopping else ""
 
     def _commit_task_result(self, task_result: TaskResult, block_queue: BlockQueue) -> None:
-        """Append receipts and failures to the journal, and report the progress."""
+        """Append a task's receipts and failures to the journal, and report the progress."""
         points_before, failures_before = self._points_so_far(), len(self._permanent_failures)
         self._journal.commit(*task_result.receipts)
         self._unflushed_receipts += task_result.receipts
@@ -741,7 +761,10 @@ class Session:
         )
 
     def _flush_receipts(self, *, force: bool = False) -> None:
-        """Write pending receipts, and add those that are written to the totals."""
+        """Write receipts that are not written yet.
+
+        Add written ones to the totals of the session.
+        """
         if not self._journal.flush(force=force):
             return
         if self._unflushed_receipts:
@@ -760,7 +783,7 @@ class Session:
 
 
 def store_write_error_text(store_path: Location, error: OSError) -> str:
-    """Return the reason why a store can't be written, and the remedy."""
+    """Return the reason why a store can't be written, and the remedy, as text of a message."""
     if isinstance(error, ObjectStoreError):
         return f"the store can't be written: {error.strerror}"
     if not _store_exists(store_path):

@@ -84,13 +84,13 @@ ROOT_DOCUMENT_FILE = "zarr.json"
 
 MANIFEST_PATH = f"{JOURNAL_DIR}/{MANIFEST_FILE}"
 
-#: Object that marks a store in an object store as incompletely created or removed.
+#: Name of the object that marks a store in an object store as created or removed only in part.
 UNFINISHED_MARKER_FILE = "partial"
 
 #: Largest number of foreign files that an error message names.
 FOREIGN_FILES_IN_MESSAGE_MAX = 5
 
-#: Compression of the chunks, and their checksum.
+#: Codecs that compress a chunk and add its checksum.
 CHUNK_CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 
 _ZSTD_ENCODER = Zstd(level=ZSTD_LEVEL)
@@ -106,11 +106,12 @@ def create_store(
     recipe: Mapping[str, Any] | None = None,
     durable: bool = False,
 ) -> Location:
-    """Create a store without results: metadata and arrays with known values.
+    """Create a store that holds metadata and arrays with known values, but no results.
 
     On disk the store is built in the same folder and renamed, so that an interrupted creation
     leaves nothing that looks like a store. For an object store it is built on this machine and
-    uploaded, its root last. StoreError if something is at the path, or the path is not writable.
+    uploaded, its root last. StoreError is raised if something is at the path, or the path is not
+    writable.
     """
     store_path = parse_location(store_path)
     try:
@@ -145,14 +146,14 @@ def create_store(
 def _build_store(
     store_path: Path, template: StoreTemplate, recipe: Mapping[str, Any] | None
 ) -> None:
-    """Create a store without results on disk, with its recipe."""
+    """Create a store without results on disk, with its recipe (the facts about how it is made)."""
     build_template(store_path, template, template_attributes(template))
     if recipe:
         write_recipe(store_path, **recipe)
 
 
 def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
-    """Copy a store on disk to a path in an object store, its root last."""
+    """Copy a store on disk to a path in an object store. The root metadata is copied last."""
     names = file_sizes_below(local_path).keys() - {ROOT_DOCUMENT_FILE}
     with reserve_object_location(store_path):
         map_concurrently(
@@ -190,7 +191,10 @@ def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
 
 
 def remove_store(store_path: Location) -> None:
-    """Remove a store in one step; in an object store its root first, which makes it invalid."""
+    """Remove a store in one step.
+
+    In an object store its root metadata goes first, which makes it invalid.
+    """
     if isinstance(store_path, Path):
         remove_atomically(store_path)
         return
@@ -210,9 +214,10 @@ def build_template(
     *,
     shard_shape_of: Callable[[ArrayLayout], tuple[int, ...] | None] = lambda layout: None,
 ) -> None:
-    """Create a store without results on disk.
+    """Create the template on disk: a store without results.
 
-    A file holds one chunk, or a shard of the shape that `shard_shape_of` returns for an array.
+    `shard_shape_of` returns, for an array, the shape of the shard that a file holds. Without it a
+    file holds one chunk.
     """
     group = zarr.create_group(
         SingleWriterLocalStore(store_path), zarr_format=3, attributes=attributes
@@ -244,7 +249,7 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
 def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
-    """Write the manifest of a store: its root attributes, and digests of objects by name."""
+    """Write the manifest: root attributes, and digests of all objects older than any result."""
     records = [encode_record({"attributes": attributes, "objects": len(digests)})]
     records += [
         encode_record({"object": name, "digest": object_digest})
@@ -314,7 +319,7 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
 
 
 class StoredBlock(NamedTuple):
-    """Digest and size of a block as stored."""
+    """Digest and size [bytes] of a block as it is stored."""
 
     digest: str  # digest of the bytes and their paths, by `contents_digest`
     n_bytes: int  # size as stored
@@ -372,7 +377,7 @@ def chunk_names_of_block(study: BlockStudy, block: int) -> list[str]:
 
 
 def make_chunk_size_limit(study: BlockStudy) -> Callable[[str], int]:
-    """Return a function from the path of a chunk inside the store to its largest size [bytes]."""
+    """Return a function that gives the largest valid size of a chunk [bytes] from its path."""
 
     def size_limit(chunk_path: str) -> int:
         layout = study.output_layout_by_name[array_name_of_chunk(chunk_path)]
@@ -397,9 +402,10 @@ def chunk_name(array_name: str, position: tuple[int, ...]) -> str:
 
 
 def sync_to_disk(store_path: Location) -> None:
-    """Write the cache of the store's file system to disk; OSError if the disk fails.
+    """Write the operating system's cache of the store's file system to disk.
 
-    One call syncs the whole file system, which costs as much as syncing a few files.
+    OSError is raised if the disk fails. One call syncs the whole file system, which costs as much
+    as syncing a few files.
     """
     if not isinstance(store_path, Path):
         return
@@ -415,7 +421,7 @@ def sync_to_disk(store_path: Location) -> None:
 
 
 def remove_draft_files(store_path: Location) -> None:
-    """Remove incomplete files of writers that were killed."""
+    """Remove unfinished files that killed processes have left in a store."""
     if isinstance(store_path, Path):
         partial_files = (
             candidate
@@ -447,7 +453,7 @@ def refuse_links(store_path: Location) -> None:
 def _exclude_foreign_files(
     store_path: Path, entries: Iterable[os.DirEntry[str]]
 ) -> list[os.DirEntry[str]]:
-    """Return the entries below a store that are not foreign files."""
+    """Return those entries below a store that sweep has made."""
     entries = list(entries)
     if not entries:
         return []  # without a search for foreign files, which walks through the store
@@ -462,7 +468,7 @@ def _exclude_foreign_files(
 
 
 class Damage(NamedTuple):
-    """Object of a store that differs from what was written."""
+    """Object of a store that differs from what was written, with a text about the difference."""
 
     object_name: str  # path inside the store; with the line number in a log
     description: str  # description of the damage
@@ -471,7 +477,10 @@ class Damage(NamedTuple):
 
 
 def read_manifest_digests(store_path: Location) -> dict[str, str]:
-    """Return the digests of the template's objects by name; skip damaged lines of the manifest."""
+    """Return the digests in a store's manifest, by the name of the object.
+
+    Damaged lines are skipped.
+    """
     return {
         record["object"]: record["digest"]
         for record in iter_records(store_path / MANIFEST_PATH)
@@ -480,7 +489,10 @@ def read_manifest_digests(store_path: Location) -> dict[str, str]:
 
 
 def find_template_damages(store_path: Location) -> list[Damage]:
-    """Return the damaged objects of the template, and the damaged lines of the manifest."""
+    """Return the damaged objects of the template, and the damaged lines of the manifest.
+
+    The template is everything that the store contained before any result.
+    """
     records = [record for _, record in iter_lines_and_records(store_path / MANIFEST_PATH)]
     if not records:
         return [Damage(MANIFEST_PATH, "is missing or empty", repaired_by="repair")]
@@ -502,7 +514,7 @@ def find_template_damages(store_path: Location) -> list[Damage]:
 def describe_template_object_damage(
     store_path: Location, object_name: str, expected_digest: str
 ) -> str:
-    """Return the damage of an object of the template with a known digest; '' if it has none."""
+    """Return the damage of an object whose digest the manifest states; '' if it is undamaged."""
     return damage_or_read_error(
         lambda: (
             ""
@@ -513,7 +525,10 @@ def describe_template_object_damage(
 
 
 def refuse_damaged_template(store_path: Location) -> None:
-    """Raise a StoreError if the template is damaged, as new results might not fit it."""
+    """Raise a StoreError if objects older than any result are damaged.
+
+    New results might not fit such a store.
+    """
     refuse_links(store_path)
     if problems := find_template_damages(store_path):
         problem_lines = "\n".join(
@@ -567,9 +582,9 @@ def damage_or_read_error(read_damage: Callable[[], str]) -> str:
 def is_block_visible(
     store_path: Location, study: BlockStudy, receipt: Receipt, check_digest: bool
 ) -> bool:
-    """Return True if a block that a worker has written is in the store as seen from here.
+    """Return True if a block that a worker has written is in the store as this process sees it.
 
-    Its chunks are compared by size with the receipt, or by digest if `check_digest`.
+    The size of its chunks is compared with the receipt, or their digest if `check_digest`.
     """
     chunk_paths = chunk_names_of_block(study, receipt.block)
     try:
@@ -588,7 +603,7 @@ def is_block_visible(
     return (store_path / chunk_paths[-1]).size() > 0
 
 
-#: Distributions whose version can change a result or its stored bytes.
+#: Python packages whose version can change a result, or the bytes in which it is stored.
 VERSIONED_DISTRIBUTIONS = ("numba", "numpy", "scipy", "sweep", "zarr")
 
 
@@ -600,7 +615,10 @@ def current_software_versions() -> dict[str, str]:
 
 @cache
 def processor_description() -> str:
-    """Return machine, processor and vector instructions, by which NumPy and LLVM select code."""
+    """Return machine, processor and vector instructions as text.
+
+    NumPy and LLVM choose machine code by them, so the last bits of results may depend on them.
+    """
     import llvmlite.binding
     import numpy as np
 

@@ -19,7 +19,7 @@ from typing import Any
 #: Descriptors of standard input, output and error.
 STANDARD_DESCRIPTORS = (0, 1, 2)
 
-#: Time for which a write waits for a reader that has stopped [s].
+#: Time for which a flush waits for a reader that has stopped [s].
 READER_PATIENCE_SECONDS = 0.3
 
 #: Time without any text after which the writer thread ends [s].
@@ -33,7 +33,10 @@ DASK_LOGGERS = ("distributed", "tornado", "bokeh")
 
 
 class ForgivingStream(io.TextIOBase):
-    """Text stream around another one, which may be None; silent after the first error."""
+    """Text stream that passes text on to another one, and drops it silently after the first error.
+
+    The other stream may be None.
+    """
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -49,7 +52,10 @@ class ForgivingStream(io.TextIOBase):
         return is_terminal(self._stream)
 
     def fileno(self) -> int:
-        """Return the descriptor of the inner stream; UnsupportedOperation if it has none."""
+        """Return the file descriptor of the inner stream.
+
+        UnsupportedOperation is raised if it has none.
+        """
         try:
             return int(self._stream.fileno())
         except (AttributeError, OSError, ValueError, TypeError):
@@ -90,7 +96,7 @@ class ForgivingStream(io.TextIOBase):
                 self._go_silent(error)
 
     def finish_writing(self) -> None:
-        """Flush for the last time, so that no later flush can fail."""
+        """Write out all text for the last time, so that no later flush can fail."""
         self.flush()
         try:
             if self._stream is not None:
@@ -126,7 +132,7 @@ class PatientStream(ForgivingStream):
         self._handover_lock = threading.Lock()
 
     def write(self, text: str) -> int:
-        """Hand a text to the writer thread, or drop it."""
+        """Pass a text to the writer thread, or drop it if too many texts wait."""
         try:
             self.fileno()
         except io.UnsupportedOperation:
@@ -160,7 +166,7 @@ class PatientStream(ForgivingStream):
             self._is_reader_stopped = self._waiting_texts.unfinished_tasks > 0
 
     def _write_waiting_texts(self) -> None:
-        """Write texts as they arrive.
+        """Write the waiting texts to the stream's descriptor as they arrive.
 
         Buffers of the stream are avoided, as the main thread needs their locks to exit.
         """
@@ -236,7 +242,10 @@ def silence_failing_output() -> Iterator[None]:
 
 
 def _open_standard_descriptors() -> None:
-    """Open closed standard descriptors, so that no new file gets their numbers and their output."""
+    """Open those of the descriptors 0 to 2 that are closed.
+
+    New files would otherwise get their numbers, and with them the program's output.
+    """
     for descriptor in STANDARD_DESCRIPTORS:
         try:
             os.fstat(descriptor)

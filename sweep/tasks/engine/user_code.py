@@ -59,7 +59,7 @@ def allowed_modules() -> set[str]:
 
 
 def module_digests(modules: Iterable[str]) -> dict[str, str]:
-    """Return the digest of each module's file, as imported here; '' for one without a file."""
+    """Return the digest of each module's file as imported here; '' for a module without a file."""
     return {name: _module_file_digest(import_module(name)) for name in modules}
 
 
@@ -71,9 +71,10 @@ def _module_file_digest(module: ModuleType) -> str:
 
 @lru_cache(maxsize=64)
 def allow_identical_module(module: str, digest: str) -> None:
-    """Allow a module in this worker, as in the run's driver; CodeError if its file differs.
+    """Allow a module in this worker if its file equals that of the process that started the run.
 
-    It is checked once per process: an imported module does not change with its file.
+    CodeError is raised if the file differs. It is checked once per process: an imported module does
+    not change with its file.
     """
     allow_modules([module])
     imported = import_user_module(module)
@@ -107,7 +108,7 @@ def import_user_module(name: str) -> ModuleType:
 
 
 def _import_error_place_text(error: BaseException) -> str:
-    """Return file and line at which the import of a module failed; '' if unknown."""
+    """Return the file and line at which the import of a module failed, as text; '' if unknown."""
     if isinstance(error, SyntaxError):
         return f" ({error.filename}:{error.lineno})"
     frames = traceback.extract_tb(error.__traceback__)

@@ -34,23 +34,23 @@ from sweep.tasks.engine.progress import CodeError, StoreError
 
 ReturnValue = TypeVar("ReturnValue")
 
-#: Errors of the storage: every further block would raise them too.
+#: Errors of the storage that every further block would raise too, so that a run stops.
 STORAGE_ERRNOS = {
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
     errno.ECONNREFUSED, errno.ETIMEDOUT, errno.ENXIO,
 }  # fmt: skip
 
-#: Time after which the results of an unfinished block are saved, and the block is put back for
-#: another task [s]. As much is lost if a worker dies, and Ctrl-C waits for as long.
+#: Time after which an unfinished block is saved and left to another task [s]. So much work is lost
+#: if a worker dies, and Ctrl-C waits for as long.
 CHECKPOINT_INTERVAL_SECONDS = 10.0
 
-#: Time in which a thread must return from compiled code after its time limit [s].
+#: Time after a block's time limit in which its thread must return from compiled code [s].
 INTERRUPT_GRACE_SECONDS = 10.0
 
-#: Interval of checks of the scheduler, the lock and the clock while no result arrives [s].
+#: Interval at which scheduler, lock and clock are checked while no result arrives [s].
 IDLE_POLL_SECONDS = 0.5
 
-#: Number of studies that a worker keeps open.
+#: Largest number of studies whose stores a worker keeps open.
 OPEN_STUDIES_MAX = 4
 
 
@@ -59,15 +59,18 @@ RESULTS_NOT_VISIBLE_MESSAGE = (
 )
 
 ReceiptVerifier = Callable[[Receipt, bool], bool]
-"""Function that returns True if the block of a receipt is in the store as seen from here.
+"""Function that returns True if a receipt's block is in the store as this process sees it.
 
-Its second argument tells whether to compare digests, and not only sizes.
+The first argument is the receipt. The second tells whether to compare digests, and not only sizes.
 """
 
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """Settings that all tasks of a run share; sent with each task, therefore small."""
+    """Settings that all tasks of a run share.
+
+    They are sent with each task and are therefore small.
+    """
 
     store_path: str
     study_id: str
@@ -82,7 +85,7 @@ class TaskSettings:
 
 @dataclass
 class TaskResult:
-    """Result of one task: receipts, failures, and the points of unfinished blocks."""
+    """Result of one task: receipts of stored blocks, failures, and points of unfinished blocks."""
 
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
@@ -101,7 +104,10 @@ _open_writer_lock = threading.Lock()
 def get_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
-    """Return the writer of a store, opened once per process; StoreError for another study."""
+    """Return the writer of a store's blocks, which is opened once per process.
+
+    StoreError is raised if the store holds another study.
+    """
     with _open_writer_lock:
         return _cached_block_writer(store_path, study_id, read_study)
 
@@ -138,14 +144,18 @@ def _refuse_replaced_store(store_path: str, study_id: str) -> None:
 
 @lru_cache(maxsize=OPEN_STUDIES_MAX)
 def _stored_study_id(store_path: str, store_stamp: tuple[int, ...] | None) -> str:
-    """Return the id of the study in a store; the stamp is part of the key of the cache."""
+    """Return the id of the study in a store.
+
+    The result is cached. `store_stamp`, which identifies the store's files, is part of the key.
+    """
     return str(read_attributes(parse_location(store_path))["study_id"])
 
 
 def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
-    """Evaluate and write blocks; an error of one block does not stop the others.
+    """Compute and write blocks. An error of one block does not stop the others.
 
-    A block that takes long is computed in part, and saved for the next task.
+    A block that takes long is computed in part and saved as a checkpoint, from which the next task
+    continues.
     """
     task_result = TaskResult(worker_address=worker_address(), host=socket.gethostname())
     try:
@@ -163,7 +173,10 @@ def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
 
 
 def _allow_user_code(settings: TaskSettings) -> None:
-    """Allow the user's modules that the driver allows; CodeError if a file differs here."""
+    """Allow this worker to import the user's modules that the run allows.
+
+    CodeError is raised if a module's file differs here.
+    """
     for module, digest in settings.user_module_digests:
         user_code.allow_identical_module(module, digest)
 
@@ -197,7 +210,10 @@ def _run_blocks(
 def _compute_block(
     writer: study_store.BlockWriter, block: int, settings: TaskSettings, deadline: Deadline
 ) -> Receipt | float:
-    """Compute one block. Return its receipt, or the number of points done at the deadline."""
+    """Compute and write one block.
+
+    Return its receipt, or the number of points done at the deadline.
+    """
     stored_study, store_path, checkpoint = writer.study, writer.store_path, Checkpoint()
     started_at = time.perf_counter()
     evaluate: Callable[[], Results]
@@ -239,7 +255,7 @@ def _compute_block(
 
 
 def make_failure(block: int, error: BaseException) -> Failure:
-    """Return a record of a block's error in this process."""
+    """Return a record of an error that a block raised in this process."""
     traceback_lines = traceback.format_exception(type(error), error, error.__traceback__)
     return Failure(
         block=block,
@@ -255,16 +271,17 @@ class BlockTimeoutError(Exception):
 
 
 class _TimeoutInterruption(SystemExit):
-    """Raised in another thread to end it; not caught by `except Exception`."""
+    """Exception raised in another thread to end it. `except Exception` does not catch it."""
 
 
 def run_with_timeout(
     function: Callable[[], ReturnValue], timeout: float | None, seconds_spent: float = 0.0
 ) -> ReturnValue:
-    """Call a function; BlockTimeoutError if it exceeds `timeout` less `seconds_spent` [s].
+    """Call a function in a thread and return its result.
 
-    The function runs in a thread, where Python code is interrupted. A worker process ends itself if
-    the thread is still in compiled code `INTERRUPT_GRACE_SECONDS` later; any other process waits.
+    BlockTimeoutError is raised if it takes longer than `timeout` less `seconds_spent` [s]. Python
+    code is then interrupted. A worker process ends itself if the thread is still in compiled code
+    `INTERRUPT_GRACE_SECONDS` later; any other process waits.
     """
     if timeout is None:
         return function()
@@ -320,10 +337,10 @@ def worker_address() -> str:
 
 
 class BlockQueue:
-    """Queue of the blocks that are not done.
+    """Queue of the blocks that remain to be computed.
 
-    `is_done` is a mask (blocks,) of bool. A block that failed is returned once more, in a task by
-    itself.
+    `is_done` is a mask (blocks,) of bool. A block that failed is tried once more, in a task of its
+    own.
     """
 
     def __init__(self, is_done: np.ndarray) -> None:
@@ -334,9 +351,10 @@ class BlockQueue:
         self.failed: set[int] = set()
 
     def take_blocks(self, count: int, *, include_failed: bool = True) -> list[int]:
-        """Take up to `count` blocks for one task; a block that failed before is taken alone.
+        """Remove up to `count` blocks from the queue, for one task.
 
-        If not `include_failed`, blocks that failed before stay in the queue.
+        A block that failed before is taken alone. If not `include_failed`, such blocks stay in the
+        queue.
         """
         if self._failed_once and include_failed:
             return [self._failed_once.popleft()]
@@ -355,7 +373,7 @@ class BlockQueue:
         return True
 
     def requeue(self, blocks: list[int]) -> None:
-        """Put blocks back that are unfinished, or whose task was lost.
+        """Put blocks back into the queue that are unfinished, or whose task was lost.
 
         A block that failed before is still taken alone.
         """
@@ -364,7 +382,7 @@ class BlockQueue:
 
 
 def _iter_false_indices(mask: np.ndarray, step: int = 1 << 16) -> Iterator[int]:
-    """Yield the indices of False elements, found in steps of `step` elements."""
+    """Yield the indices of False elements of a mask, searched in steps of `step` elements."""
     for start in range(0, mask.size, step):
         yield from (start + np.flatnonzero(~mask[start : start + step])).tolist()
 
@@ -375,9 +393,9 @@ def run_serial(
     is_stopping: Callable[[], bool],
     verify_receipt: ReceiptVerifier,
 ) -> Iterator[TaskResult]:
-    """Yield the results of blocks that are computed in this process, one after the other.
+    """Compute blocks in this process one after the other. Yield the result of each.
 
-    Reference implementation: every backend must write the same bytes.
+    Every other way to compute must write the same bytes as this reference.
     """
     while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
         yield _accept_result(
@@ -461,9 +479,9 @@ def _accept_result(
     block_queue: BlockQueue,
     verify_receipt: ReceiptVerifier,
 ) -> TaskResult:
-    """Return the result of a task of this process, once its blocks are found in the store.
+    """Return the result of a task of this process, after a check that its blocks are in the store.
 
-    Failures replace the receipts of blocks that are not there. Unfinished blocks go back to the
+    Failures replace the receipts of blocks that are missing there. Unfinished blocks go back to the
     queue. The error that prevents any block from being computed is raised.
     """
     if task_result.worker_error is not None:

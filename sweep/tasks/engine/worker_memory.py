@@ -1,4 +1,4 @@
-"""Memory that is available to the processes that compute blocks."""
+"""Memory that is available to the processes that compute blocks of a study."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ class WorkerMemory:
     """Memory available to a process that computes blocks."""
 
     find_bytes_max: Callable[[], float]
-    """Function that returns the largest memory which the process may use [bytes]."""
+    """Function that returns the largest memory that the process may use [bytes]."""
     process_name: str
     """Name of the process in messages, as the subject of a sentence: `this machine`."""
     workers_sharing: int = 1
-    """Number of workers that share this machine's memory; 1 if each has a limit."""
+    """Number of workers that share the machine's memory; 1 if each worker has its own limit."""
 
     @cached_property
     def bytes_max(self) -> float:
-        """Largest memory that the process may use [bytes]; inf if unknown."""
+        """Largest memory that the process may use [bytes]; inf if it is unknown."""
         return self.find_bytes_max()
 
     def suffices_for(self, bytes_needed: float) -> bool:
-        """Return True if the process may use so much memory [bytes]."""
+        """Return True if the process may use the given amount of memory [bytes]."""
         return bytes_needed < SMALL_BYTES or bytes_needed <= self.bytes_max
 
 
@@ -54,7 +54,7 @@ def process_memory() -> WorkerMemory:
 
 
 def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
-    """Return the memory of the smallest worker of a client, or of a cluster to be started."""
+    """Return the memory of the smallest worker of a cluster that runs, or is to be started."""
     if client is not None:
         return WorkerMemory(lambda: _smallest_worker_memory_limit(client), "a worker of the client")
     if isinstance(cluster, LocalClusterConfig):

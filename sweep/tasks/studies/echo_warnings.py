@@ -35,27 +35,33 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.grid_study import GridStudy
 
 ECHO_LOSS_WARNING_DB = 3.0
-"""Loss of an echo's power above which a warning is given [dB]."""
+"""Loss of an echo's power above which a warning is given [dB].
+
+Power is lost if the echo arrives after its record has begun.
+"""
 
 PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MAX = 0.125, 0.3
-"""Limits beyond which a random walk of phase changes pd by more than 0.02.
+"""Limits above which the laser's random walk of phase changes pd by more than 0.02.
 
-The first is the delay over the duration of the record. The second is the variance of the laser's
-phase over the delay, or over the record if that is shorter [rad^2].
+The first is the echo's delay over the duration of the record. The second is the variance of the
+laser's phase over the delay, or over the record if that is shorter [rad^2].
 """
 
 ECHO_POINTS_SAMPLED_MAX = 200_000
-"""Largest number of points, of the grid of parameters in `ECHO_PARAMETERS`, that are checked."""
+"""Largest number of points of a grid whose echoes are checked.
+
+Points differ in `ECHO_PARAMETERS`.
+"""
 
 SAMPLED_TILES_PER_SCANNER = 16
-"""Number of tiles of each scanner's shots that are checked."""
+"""Number of tiles (runs of consecutive shots) of each scanner whose echoes are checked."""
 
 EDGE_SPREAD_BINS_MIN, EDGE_DISTANCE_BINS, EDGE_DISTANCE_DEVIATIONS = 0.2, 4.0, 3.0
-"""Limits for an echo across DC or Nyquist.
+"""Limits by which an echo is taken to spread across an edge of the spectrum: DC or Nyquist.
 
-The first is the standard deviation of a footprint's lines [bins of fs/L] above which an echo, if
-any bin may detect it, is not a single line. The others are the distances from DC or Nyquist, in
-bins and in standard deviations, within which such an echo lies across.
+The first is the standard deviation of a footprint's line frequencies [bins] above which an echo is
+not a single line, if any bin may detect it. The others are distances from the edge, in bins and in
+standard deviations, below which such an echo spreads across it.
 """
 
 ECHO_PARAMETERS = (
@@ -89,50 +95,50 @@ ECHO_PARAMETERS = (
     beam.FOCUS_PATH,
     beam.COUPLING_PATH,
 )
-"""Parameters that determine when echoes arrive, and how they are read."""
+"""Dotted paths of the parameters that determine when echoes arrive and how beats are used."""
 
 
 PHASE_ESTIMATOR_LOSS_MAX = 0.03
-"""Largest fraction of the window's sum without echo at which phase estimators are valid.
+"""Largest part of a record without echo at which frequency estimators that use phases are valid.
 
-Their errors are then below some 0.02 bin. Half a record without an echo causes errors of up to 0.6
-bin.
+It is a fraction of the window's sum. Errors are then below some 0.02 bin. With half a record
+without an echo they reach 0.6 bin.
 """
 
 PHASE_ESTIMATORS = ("jacobsen", "candan")
-"""Estimators that interpret the phases of neighbouring bins as those of a complete record."""
+"""Frequency estimators that assume the phases of neighbouring bins of a complete record."""
 
 
 class EchoDiagnosis(NamedTuple):
-    """Arrival and reading of the echoes of n points."""
+    """Arrival of the echoes of n points, and whether their beats give a false range or velocity."""
 
     range: np.ndarray
-    """Range (n,) [m]."""
+    """Range of the target (n,) [m]."""
     window_fraction_lost: np.ndarray
-    """Fraction (n,) of the window's sum before the echo arrives, 0..1; 1 if it never arrives."""
+    """Fraction (n,) of the window's sum that precedes the echo, 0..1; 1 if no echo arrives."""
     is_misread: np.ndarray
-    """True (n,) if the beats are read as another range or velocity."""
+    """True (n,) where the measured beats would be interpreted as another range or velocity."""
     has_phase_walk: np.ndarray
-    """True (n,) if the laser's phase varies more than the model of detection allows."""
+    """True (n,) where the laser's phase noise exceeds the limits of the model of detection."""
     is_range_velocity_exchanged: np.ndarray
-    """True (n,) if up and down beat alone are read with range and velocity exchanged.
+    """True (n,) where up and down beat alone give range and velocity exchanged.
 
-    The other assumption for two beats would read them correctly.
+    The other assumption for two beats would give them correctly.
     """
     is_exchanged_by_other_assumption: np.ndarray
-    """True (n,) if the other assumption for two beats exchanges range and velocity.
+    """True (n,) where the other assumption for two beats would exchange range and velocity.
 
-    Points at which the present assumption does so too are not marked.
+    Points at which the present assumption exchanges them too are not marked.
     """
     crosses_spectrum_edge: np.ndarray
-    """True (n,) if an echo in developed speckle spreads over bins across DC or Nyquist.
+    """True (n,) where an echo in developed speckle spreads across DC or Nyquist.
 
     Only echoes that any bin may detect are marked.
     """
 
 
 class FootprintDeviations(NamedTuple):
-    """Standard deviations of range and radial velocity over the beams of n footprints."""
+    """Standard deviations of range and radial velocity over the illuminated spots of n points."""
 
     range: np.ndarray
     """Standard deviation of the range (n,) [m]."""
@@ -167,16 +173,17 @@ class FootprintDeviations(NamedTuple):
         return cls(*(np.where(has_one_surface, v, 0.0) for v in deviations))
 
     def select(self, points: np.ndarray) -> FootprintDeviations:
-        """Return the footprints with these indices."""
+        """Return the deviations of the footprints with given indices."""
         return FootprintDeviations(self.range[points], self.radial_velocity[points])
 
 
 def diagnose_echoes(
     parameters: Mapping[str, Any], footprint: FootprintDeviations | None = None
 ) -> EchoDiagnosis:
-    """Determine when the echoes of points arrive, and how their beats are read.
+    """Find out when the echoes of points arrive, and which range and velocity their beats give.
 
-    ``footprint`` has the deviations of the footprints; by default those on a plane.
+    ``footprint`` has the deviations of range and velocity over the footprints; by default those of
+    footprints on a plane.
     """
     relevant = {
         path: parameter for path, parameter in parameters.items() if path in ECHO_PARAMETERS
@@ -239,7 +246,10 @@ def _crosses_spectrum_edge(
     velocity: np.ndarray,
     footprint: FootprintDeviations | None,
 ) -> np.ndarray:
-    """Return :attr:`EchoDiagnosis.crosses_spectrum_edge`, (n,)."""
+    """Return where echoes in developed speckle spread across DC or Nyquist, (n,) of bool.
+
+    The result is :attr:`EchoDiagnosis.crosses_spectrum_edge`.
+    """
     is_speckled = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
     is_speckled &= str(p[RECEIVER_PREFIX + "architecture"]) != "direct"
     if (
@@ -276,9 +286,9 @@ def _crosses_spectrum_edge(
 def _is_misread(
     p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, assumption: str | None = None
 ) -> np.ndarray:
-    """Return True (n,) if the beats of a target, as a spectrum shows them, give another target.
+    """Return True (n,) where the beats that spectra show give another target than the true one.
 
-    All three beats are read, or with an ``assumption`` up and down beat alone.
+    All three beats are used; with an ``assumption`` only up and down beat.
     """
     budget = LinkBudget(p)
     settings, record, slopes = budget.waveform, budget.record, waveform.chirp_slopes(p)
@@ -334,7 +344,7 @@ def _is_misread(
 
 
 def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
-    """Yield warnings about echoes that a study misses, records in part, or misreads."""
+    """Yield warnings about echoes that a study misses, records in part, or interprets wrongly."""
     is_flight = isinstance(study, FlightStudy)
     diagnosis = _diagnose_flight(study) if isinstance(study, FlightStudy) else _diagnose_grid(study)
     if not diagnosis.range.size:
@@ -432,7 +442,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
 
 
 def _used_phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
-    """Return the phase estimators that a study uses."""
+    """Return the frequency estimators of a study that use the phases of neighbouring bins."""
     path = f"{ESTIMATOR_PREFIX}kind"
     values = [
         member.values
@@ -445,7 +455,7 @@ def _used_phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
 
 
 def _reads_two_beats(study: GridStudy | FlightStudy) -> bool:
-    """Return True if range and velocity are always or sometimes read from two beats alone."""
+    """Return True if range and velocity are computed, always or at times, from only two beats."""
     spec = study.spec
     p = PARAMETER_DEFAULTS | dict(spec.parameters())
     has_no_doppler = "doppler" not in waveform.existing_segments(
@@ -464,7 +474,7 @@ def _iter_exchange_warnings(
     is_absent: np.ndarray,
     points_noun: str,
 ) -> Iterator[str]:
-    """Yield a warning about the points at which the assumption for two beats is wrong.
+    """Yield a warning about points where the assumption for two beats exchanges range and velocity.
 
     No warning is given if the target is fast at some points and far at others, and assumed to be
     fast.
@@ -513,7 +523,7 @@ def _fraction_text(mask: np.ndarray) -> str:
 
 
 def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
-    """Return the ranges of the marked points as text: 'from x on' if all beyond are marked.
+    """Return the ranges of marked points as text: 'from x on' if all larger ranges are marked.
 
     Points that are ``is_absent`` are ignored.
     """

@@ -17,7 +17,7 @@ CHUNK_READ_ERRORS = (OSError, ValueError, RuntimeError)
 
 
 class ExtendableStudy(BlockStudy):
-    """Study that may be extended, and may extend another.
+    """Base of studies that may be extended to a larger study, or may extend a smaller one.
 
     `find_reuse_source` returns the results of a smaller study, or None.
     """
@@ -35,14 +35,14 @@ class ExtendableStudy(BlockStudy):
 
     @property
     def id(self) -> str:
-        """Hash of the spec's identity."""
+        """Hash of everything in the spec that results depend on."""
         return str(self.spec.id)
 
     @abstractmethod
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return a mask (points,), or one bool for all, of points that depend on the tolerance.
+        """Return which points of a block are computed more accurately if the tolerance is smaller.
 
-        A tighter tolerance computes these points of the block more closely.
+        The result is a mask (points,), or one bool for all points.
         """
 
     def first_draw_block(self, block: int) -> int:

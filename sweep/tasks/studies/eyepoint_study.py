@@ -1,4 +1,4 @@
-"""Study of the eyepoints of a flight: what every shot through one scanner hits.
+"""Study of a flight's geometry: what every shot through one scanner hits (its eyepoint).
 
 Only this module casts rays. The path of the store is a hash of its content, so that every study of
 the same geometry finds it. Shots that need more rays are cast again during the simulation
@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec
     from sweep.spec.scene_sections import BuiltScene
 
-#: Largest numbers of shots and beamlets of a block, which contains complete cycles.
+#: Largest numbers of shots and of beamlets (rays) in a block of complete measurement cycles.
 SHOTS_PER_BLOCK_MAX = 4096
 BEAMLETS_PER_BLOCK_MAX = 1 << 20
 
-#: Number of beamlets above which rays are cut into several blocks, for all cores of a machine: they
-#: take some half a second.
+#: Number of beamlets (rays) above which they are cut into several blocks, so that all cores have
+#: work. So many take some half a second.
 DEFAULT_BLOCK_BEAMLETS_MIN = 1 << 17
 
-#: Largest number of beamlets that are cast at once, which bounds memory if cycles are long.
+#: Largest number of beamlets (rays) that are cast at once. It limits memory if cycles are long.
 RAYS_PER_CAST_MAX = 1 << 18
 
 #: Number of nodes of a scene's map along the longer side, and least number along the shorter side.
@@ -54,10 +54,10 @@ MAP_NODES_MIN = 16
 FLIGHT_SAMPLE_POINTS = 512
 MAP_MARGIN_FRACTION = 0.08
 
-#: Height of the viewpoint of the map above the scene and the flight [m].
+#: Height above scene and flight from which rays are cast down to map the ground [m].
 MAP_VIEWPOINT_CLEARANCE = 1.0
 
-#: Largest distance from the ground of a platform that stands on it [m].
+#: Largest height above ground at which a platform counts as standing on it [m].
 GROUND_CONTACT_DISTANCE_MAX = 1e-6
 
 #: Sizes of the model's dimensions of vectors and matrices.
@@ -65,7 +65,7 @@ VECTOR_DIM_SIZES = {"xyz": 3, "xyz_again": 3}
 
 
 class EyepointStudy(BlockStudy):
-    """Study of the eyepoints of a flight's shots through one scanner.
+    """Study of the eyepoints (geometry found by rays) of a flight's shots through one scanner.
 
     `n_beamlets` and `world` are by default those of the spec.
     """
@@ -99,12 +99,12 @@ class EyepointStudy(BlockStudy):
 
     @property
     def grids(self) -> tuple[BlockGrid]:
-        """Grid of the cycles, in a tuple."""
+        """Grid of the measurement cycles, in a tuple of one."""
         return (self._grid,)
 
     @cached_property
     def id(self) -> str:
-        """Hash of the geometry."""
+        """Hash of everything that the geometry depends on."""
         return self.spec.geometry_id(self.scanner)
 
     @property
@@ -113,11 +113,11 @@ class EyepointStudy(BlockStudy):
         return self.count_rays(self.n_points)
 
     def count_rays(self, n_shots: int) -> int:
-        """Return the number of rays of `n_shots` shots in complete cycles."""
+        """Return the number of rays of `n_shots` shots, which make complete measurement cycles."""
         return n_shots * self.n_beamlets + n_shots // self.shots_per_cycle
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return the geometry from which the id is hashed."""
+        """Return the description of the geometry, from which the study's id is hashed."""
         return {
             "kind": "eyepoints",
             "geometry": json.dumps(self.spec.geometry_identity(self.scanner), sort_keys=True),
@@ -125,7 +125,7 @@ class EyepointStudy(BlockStudy):
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the weights of the beamlets."""
+        """Return the power fractions of the beamlets, the only array known in advance."""
         weight_attributes = cf_attributes(
             BEAMLET_WEIGHT_VARIABLE.units, BEAMLET_WEIGHT_VARIABLE.long_name
         )
@@ -147,7 +147,7 @@ class EyepointStudy(BlockStudy):
         return place_beamlets(self.n_beamlets, self.spec.beamlet_pattern)[1]
 
     def output_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of the arrays of shots, beamlets and cycles."""
+        """Return the layouts of the arrays by shot, by beamlet and by measurement cycle."""
         sizes = VECTOR_DIM_SIZES | {"beamlet": self.n_beamlets}
         return [
             make_output_layout(self._grid, name, output, output.dims, sizes)
@@ -155,23 +155,26 @@ class EyepointStudy(BlockStudy):
         ]
 
     def evaluate(self, block: int) -> Results:
-        """Cast the eyepoints of a block."""
+        """Cast the rays of a block. Return the geometry of its shots and cycles."""
         (cycles,) = self._grid.block_slices(block)
         return self.cast_cycles(
             np.arange(cycles.start * self.shots_per_cycle, cycles.stop * self.shots_per_cycle)
         )
 
     def compile_kernels(self) -> None:
-        """Compile the ray caster, by the first cycle."""
+        """Compile the ray caster, by casting the first measurement cycle."""
         self.cast_cycles(np.arange(self.shots_per_cycle))
 
     def cast_cycles(self, shot_numbers: np.ndarray) -> Results:
-        """Cast the shots (n,) of complete cycles. Return the arrays of shots and of cycles."""
+        """Cast the shots (n,) of complete measurement cycles.
+
+        Return the arrays by shot and by cycle.
+        """
         shot_arrays = self.cast_shots(shot_numbers)
         return shot_arrays | self._cycle_arrays(shot_arrays)
 
     def cast_shots(self, shot_numbers: np.ndarray) -> Results:
-        """Cast any shots, given by numbers (n,). Return their arrays by name."""
+        """Cast the shots with given numbers (n,). Return their arrays by name."""
         from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 
         shots_per_cast = max(1, RAYS_PER_CAST_MAX // self.n_beamlets)
@@ -184,7 +187,10 @@ class EyepointStudy(BlockStudy):
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def shot_numbers_of_sampled_tiles(self, n_tiles: int) -> np.ndarray:
-        """Return the numbers of all shots of up to `n_tiles` tiles spread over the flight."""
+        """Return the numbers of all shots in up to `n_tiles` tiles spread over the flight.
+
+        A tile is a run of consecutive shots whose effects are planned together.
+        """
         last_tile = (self.n_points - 1) // SHOTS_PER_TILE
         first_shots = (
             np.unique(np.linspace(0, last_tile, n_tiles).astype(np.int64)) * SHOTS_PER_TILE
@@ -193,7 +199,10 @@ class EyepointStudy(BlockStudy):
         return np.asarray(shot_numbers[shot_numbers < self.n_points])
 
     def shot_numbers_of_sampled_cycles(self, n_tiles: int) -> np.ndarray:
-        """Return the numbers of all shots of cycles that overlap `n_tiles` tiles of the flight."""
+        """Return the numbers of all shots in cycles that overlap `n_tiles` tiles of the flight.
+
+        A tile is a run of consecutive shots whose effects are planned together.
+        """
         cycle_numbers = np.unique(
             self.shot_numbers_of_sampled_tiles(n_tiles) // self.shots_per_cycle
         )
@@ -262,9 +271,9 @@ def build_world(spec: SceneSpec) -> BuiltScene:
 def height_above_surface(
     world: BuiltScene, position: np.ndarray, time: float | np.ndarray
 ) -> np.ndarray:
-    """Return the height of positions (n, 3) above the surface below them at times (n,) [m].
+    """Return the height of positions (n, 3) above the surface straight below them [m].
 
-    inf if nothing is below a position.
+    `times` (n,) are in s. The result is inf if nothing is below a position.
     """
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(
@@ -295,7 +304,10 @@ def below_surface_warning(spec: SceneSpec) -> str:
 
 
 def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
-    """Return the pose of each body at a time, or at one time per ray; None for bodies at rest."""
+    """Return position and attitude of each body of the scene; None for bodies at rest.
+
+    They are those at one time, or at one time per ray.
+    """
     from sweep.model.geometry.ray_casting import Pose
 
     states = [
@@ -336,7 +348,10 @@ def refine_rays(
 
 
 def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
-    """Return the arrays of a map of heights around a flight and its hits, at its start."""
+    """Return the arrays of a map of the scene's heights at the start of the flight.
+
+    It covers the flight path and what the beams hit.
+    """
     world = build_world(spec)
     positions = np.concatenate([_sampled_positions(spec, world, name) for name in spec.scanners])
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
@@ -370,7 +385,7 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
 
 
 def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.ndarray:
-    """Return positions of the platform, and of hits of its beams, (n, 3)."""
+    """Return sampled positions of the platform, and of points that its beams hit, (n, 3) [m]."""
     from sweep.model.geometry.quaternion import rotate
 
     n_shots = spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)
@@ -389,7 +404,7 @@ def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.n
 
 
 def _map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coordinates x and y of nodes of square cells that cover a rectangle."""
+    """Return the x and y coordinates of the nodes of square cells that cover a rectangle [m]."""
     step = float((high - low).max()) / (MAP_NODES_MAX - 1)
     count = np.maximum(np.ceil((high - low) / step).astype(int) + 1, MAP_NODES_MIN)
     centre = (low + high) / 2

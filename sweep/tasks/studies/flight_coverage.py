@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
 SAMPLED_RAYS_PER_SCANNER = 1 << 17
-"""Number of rays per scanner, spread over the flight, that sample its hits."""
+"""Number of rays per scanner, spread over the flight, that sample what the scanner hits."""
 
 MISSED_SHOTS_FRACTION_MAX = 0.01
 """Fraction of a scanner's shots without a hit above which a warning is given."""
 
 _N_SAMPLED_TIMES = 65
-"""Number of times at which the positions of the platform and of moving objects are sampled."""
+"""Number of times in a flight at which platform and moving objects are located."""
 
 
 class ScannerHits(NamedTuple):
-    """Hits of a sample of one scanner's shots."""
+    """Numbers of hits and misses among sampled shots of one scanner."""
 
     name: str
     n_shots: int
@@ -37,7 +37,7 @@ class ScannerHits(NamedTuple):
     partial_hit_fraction: float
     """Fraction of the shots with some beamlets that hit something, and others that do not."""
     beams_without_hits: tuple[int, ...]
-    """Numbers of the beams of which no shot hits anything."""
+    """Numbers of those beams of which no sampled shot hits anything."""
 
     def hits_text(self) -> str:
         """Return the hits as a sentence."""
@@ -53,23 +53,23 @@ class ScannerHits(NamedTuple):
 
 
 class FlightCoverage(NamedTuple):
-    """Hits of a flight by scanner, and the extents of path and scene."""
+    """Sampled hits of each scanner of a flight, and the bounding boxes of path and scene."""
 
     scanner_hits: tuple[ScannerHits, ...]
     path_bounding_box: np.ndarray
-    """Least and largest coordinates of the platform, (2, 3) [m]."""
+    """Smallest and largest coordinates of the platform along its path, (2, 3) [m]."""
     scene_bounding_box: np.ndarray
-    """Least and largest coordinates of the scene, (2, 3) [m]."""
+    """Smallest and largest coordinates of the scene's bodies, (2, 3) [m]."""
 
     def extents_text(self) -> str:
-        """Return the extents of path and scene as text."""
+        """Return the ranges of coordinates of path and scene, as text of a message."""
         return (
             f"the path spans {_box_text(self.path_bounding_box)}, "
             f"and the scene {_box_text(self.scene_bounding_box)}"
         )
 
     def warnings(self) -> Iterator[str]:
-        """Yield a warning for each scanner with too many shots that hit nothing.
+        """Yield a warning for each scanner of which too many shots hit nothing.
 
         The limit is `MISSED_SHOTS_FRACTION_MAX`.
         """
@@ -84,7 +84,7 @@ class FlightCoverage(NamedTuple):
 
 @lru_cache(maxsize=1)
 def sample_coverage(spec: SceneSpec) -> FlightCoverage:
-    """Cast a sample of the shots of each scanner; the last result is cached."""
+    """Cast sampled shots of each scanner. Return their hits; the last result is cached."""
     world, flight = build_world(spec), spec.build_flight()
     times = np.linspace(flight.start, flight.stop, _N_SAMPLED_TIMES)
     positions = flight.state(times).position
@@ -95,7 +95,7 @@ def sample_coverage(spec: SceneSpec) -> FlightCoverage:
 
 
 def refuse_flight_without_hits(spec: SceneSpec) -> None:
-    """Raise a SceneError, with the reason, if no beam of the sample hits anything."""
+    """Raise a SceneError, which states the reason, if none of the sampled beams hits anything."""
     flight_coverage = sample_coverage(spec)
     if any(scanner.hit_fraction for scanner in flight_coverage.scanner_hits):
         return

@@ -1,4 +1,7 @@
-"""Study of a flight's point clouds: radiometry, draws and navigation on existing eyepoints."""
+"""Study of a flight's point clouds, computed from the known geometry of its shots.
+
+Radiometry, random draws and navigation are computed; rays have been cast before.
+"""
 
 from __future__ import annotations
 
@@ -65,13 +68,17 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
     CloudSimulator = Callable[[tuple[str, ...], Eyepoints, np.ndarray, np.ndarray], Results]
-    """Function of effect names, eyepoints, shot numbers and effect flags that returns results."""
+    """Function that simulates the points of some shots.
 
-#: Domain of the keys of draws. The key of a shot is its number, so the draws of a flight are the
-#: same at every point of the axes and for every instrument.
+    Its arguments are effect names, eyepoints (geometry of the shots), shot numbers and effect
+    flags.
+    """
+
+#: Text from which, with the seed, the random numbers of a flight's draws follow. The key of a shot
+#: is its number, so the draws are the same at every point of the axes and for every instrument.
 FLIGHT_KEY_DOMAIN = "sweep.flight"
 
-#: Smallest number of shots of a cycle for a velocity vector.
+#: Smallest number of shots in a measurement cycle from which a velocity vector is computed.
 NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
 
 #: Outputs of the geometry of shots and cycles, which do not depend on the axes.
@@ -80,7 +87,7 @@ GEOMETRY_OUTPUTS = SHOT_VARIABLES | CYCLE_VARIABLES
 
 @cache
 def flag_array_attributes() -> dict[str, dict[str, Any]]:
-    """Return the CF attributes of arrays of flags and of categories, by the name of the array."""
+    """Return CF convention attributes of arrays of flags and of categories, by array name."""
     from sweep.model.pointcloud.navigation import (
         STATUS_EXCLUDED,
         STATUS_SOLVED,
@@ -104,7 +111,7 @@ def flag_array_attributes() -> dict[str, dict[str, Any]]:
 
 
 class FlightBlock(NamedTuple):
-    """Block of a flight: cycles and draws of a scanner at one point of the axes."""
+    """Block of a flight: measurement cycles and draws of one scanner at one point of the axes."""
 
     scanner: str
     axis_indices: tuple[int, ...]
@@ -113,7 +120,10 @@ class FlightBlock(NamedTuple):
 
 
 class ScannerGrid(ParameterGrid, BlockGrid):
-    """Grid of the blocks of one scanner: axes, draws and cycles, the last fastest."""
+    """Grid of the blocks of one scanner.
+
+    Its dimensions are axes, draws and cycles, the last fastest.
+    """
 
     def __init__(self, spec: SceneSpec, scanner: str) -> None:
         ParameterGrid.__init__(self, spec)
@@ -154,17 +164,20 @@ class ScannerGrid(ParameterGrid, BlockGrid):
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Return the values along each dimension, by parameter path, or as `draw` and `cycle`."""
+        """Return the values along each dimension of the grid.
+
+        They are given by parameter path along axes, and by the names `draw` and `cycle`.
+        """
         draw_values = {"draw": np.arange(self.n_draws)}
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
 
     @property
     def has_navigation_solution(self) -> bool:
-        """True if a cycle has enough shots for a velocity vector."""
+        """True if a measurement cycle has enough shots to compute a velocity vector."""
         return self.shots_per_cycle >= NAVIGATION_SHOTS_PER_CYCLE_MIN
 
     def flight_block(self, block_in_grid: int) -> FlightBlock:
-        """Return the block of this scanner with a number."""
+        """Return the block of this scanner with a given number, as axis point, draws and cycles."""
         *axis_ranges, draws, cycles = (
             range(block_slice.start, block_slice.stop)
             for block_slice in self.block_slices(block_in_grid)
@@ -174,11 +187,11 @@ class ScannerGrid(ParameterGrid, BlockGrid):
         )
 
     def first_flight_block(self, axis_indices: tuple[int, ...]) -> FlightBlock:
-        """Return the first block at a point of the axes."""
+        """Return the block with the first draws and cycles at a point of the axes."""
         return self.flight_block(self.block_at((*axis_indices, 0, 0)))
 
 
-#: Largest number of shots of a scanner, times draws and points of the axes.
+#: Largest product of a scanner's shots, draws and points of the axes.
 DRAWN_SHOTS_MAX = 10**10
 
 
@@ -195,7 +208,7 @@ def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
 
 
 class ReusedCloud(NamedTuple):
-    """Results of a flight's block that a smaller study has."""
+    """Results of a flight's block that are taken from the store of a smaller study."""
 
     is_reused: np.ndarray  # (shots, draws) bool
     results: Results  # (shots or cycles, draws, ...) by name; (shots, ...) without draws
@@ -217,11 +230,14 @@ class FlightStudy(ExtendableStudy):
 
     @property
     def grids(self) -> list[ScannerGrid]:
-        """Grid of blocks of each scanner."""
+        """Grids of blocks, one for each scanner."""
         return list(self.scanner_grids.values())
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True if a tighter tolerance computes shots more closely, other than by effects."""
+        """Return True if a smaller tolerance changes shots by more than the choice of effects.
+
+        The number of rays, or of the steps of computation, may depend on it too.
+        """
         return bool(
             self.spec.is_ray_number_set_by_tolerance
             or has_numerics_set_by_tolerance(self.spec.parameters())
@@ -377,7 +393,10 @@ class FlightStudy(ExtendableStudy):
     def plan_effects(
         self, flight_block: FlightBlock, eyepoints: Eyepoints, tile_numbers: np.ndarray
     ) -> ShotEffectPlan | None:
-        """Plan the effects of shots by the rising numbers of their tiles, (n,)."""
+        """Choose the effects of shots, given the rising numbers (n,) of their tiles.
+
+        A tile is a run of consecutive shots whose effects are chosen together.
+        """
         return plan_shot_effects(
             eyepoints,
             tile_numbers,
@@ -397,7 +416,7 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         reused: ReusedCloud | None = None,
     ) -> Results:
-        """Simulate radiometry, draws and navigation of shots in complete cycles.
+        """Simulate radiometry, draws and navigation of shots that make complete measurement cycles.
 
         Results that are ``reused`` are not simulated again.
         """
@@ -428,7 +447,7 @@ class FlightStudy(ExtendableStudy):
         return results
 
     def _empty_cloud(self, scanner_grid: ScannerGrid, n_shots: int, n_draws: int) -> ReusedCloud:
-        """Return arrays of fill values for the results of shots."""
+        """Return the arrays of results of shots, filled with their fill values."""
         outputs = (
             SHOT_STATISTIC_VARIABLES
             | POINT_VARIABLES
@@ -450,7 +469,7 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         simulate_cloud: CloudSimulator,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Yield rows and results of shots in groups that are simulated together.
+        """Yield indices and results of shots, in groups that are simulated together.
 
         Shots that need more rays are cast and simulated again.
         """
@@ -477,7 +496,7 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         effect_flags: np.ndarray,
     ) -> Results:
-        """Return the points of shots, by their eyepoints, numbers and effect flags."""
+        """Return the points of shots, given their geometry (eyepoints), numbers and effects."""
         from sweep.model.pointcloud.error_floor import apply_error_floor
         from sweep.model.pointcloud.point_cloud import simulate_cloud
         from sweep.model.sampling.philox import point_keys
@@ -543,7 +562,7 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         draw_slice: slice,
     ) -> Results:
-        """Return the navigation of complete cycles from the points of their shots in some draws."""
+        """Return velocity and altitude of complete measurement cycles, for some draws."""
         from sweep.model.pointcloud.navigation import solve_navigation
 
         row_index = slice(None) if rows.size == len(results["flags"]) else rows
@@ -564,7 +583,7 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _read_reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
-        """Return the results of a block from the smaller study, for shots with equal effects."""
+        """Return a block's results in the smaller study, for shots with the same effects."""
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
             self.reuse_source,
@@ -626,7 +645,7 @@ class FlightStudy(ExtendableStudy):
         return reused
 
     def parameters_at(self, flight_block: FlightBlock) -> Mapping[str, Any]:
-        """Return the SI values of all parameters at a block's point of the axes."""
+        """Return the SI values of all parameters at a block's point of the axes, by dotted path."""
         scanner_grid = self.scanner_grids[flight_block.scanner]
         return scanner_grid.fixed_parameters | {
             path: axis_values[index].item()
@@ -638,7 +657,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
-        """Errors of the instrument that do not decrease with the strength of the echo."""
+        """Standard deviations of instrument errors that do not decrease with a stronger echo."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
         stated = self.spec.error_floor
@@ -649,7 +668,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def motion_priors(self) -> MotionPriors:
-        """Standard deviations of motion that the instrument does not measure, from the spec."""
+        """Standard deviations, from the spec, of motion that the instrument does not measure."""
         from sweep.model.pointcloud.ego_motion import MotionPriors
 
         stated = self.spec.navigation
@@ -657,12 +676,12 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
-        """Surface materials, in the order of their numbers."""
+        """Materials of the scene's surfaces, in the order of the surface numbers."""
         return tuple(self.spec.surfaces())
 
     @cached_property
     def ray_error_budget(self) -> ErrorBudget | None:
-        """Accuracy that sets the number of rays of each shot; None if the number is given."""
+        """Accuracy from which each shot's number of rays follows; None if the number is given."""
         return (
             ErrorBudget.from_parameters(self.spec.parameters())
             if self.spec.is_ray_number_set_by_tolerance
@@ -670,7 +689,10 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
-        """Open the eyepoint store of a scanner. Return its arrays by name, and beamlet weights."""
+        """Open a scanner's store of shot geometry (eyepoints).
+
+        Return its arrays by name, and the power fractions of the beamlets.
+        """
         group = open_verified_group(
             eyepoint_store_location(self.store_path, self.spec.geometry_id(scanner))
         )
@@ -682,7 +704,7 @@ class FlightStudy(ExtendableStudy):
     def _read_eyepoint_arrays(
         self, scanner: str, names: Mapping[str, Any], index_range: range
     ) -> Results:
-        """Read arrays of a scanner's eyepoints for some shots or cycles."""
+        """Read arrays of a scanner's shot geometry (eyepoints) for some shots or cycles."""
         arrays = self._get_eyepoint_arrays(scanner)
         return {
             name: np.asarray(arrays[name][index_range.start : index_range.stop]) for name in names
@@ -691,7 +713,7 @@ class FlightStudy(ExtendableStudy):
     def _read_shots_and_eyepoints(
         self, scanner: str, shot_range: range
     ) -> tuple[Results, Eyepoints]:
-        """Read the arrays of some shots. Return them, and the eyepoints."""
+        """Read the stored geometry of some shots. Return it as arrays and as `Eyepoints`."""
         from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
         shot_arrays = self._read_eyepoint_arrays(scanner, SHOT_VARIABLES, shot_range)
@@ -706,7 +728,7 @@ class FlightStudy(ExtendableStudy):
 
 
 def _iter_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
-    """Yield groups of rows that lack the same draws, and a slice of these draws."""
+    """Yield groups of shots that lack the same draws, by index, and a slice of these draws."""
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):
         rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)
@@ -718,20 +740,23 @@ def _iter_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, sl
 def _insert_results(
     results: Results, rows: np.ndarray, draw_index: slice | np.ndarray, part_results: Results
 ) -> None:
-    """Insert the results of some rows and draws into the arrays of all."""
+    """Copy the results of some shots and draws into the arrays of all of them."""
     for name, values in part_results.items():
         results[name][rows if name in SHOT_STATISTIC_VARIABLES else (rows, draw_index)] = values
 
 
 class ShotEffectPlan(NamedTuple):
-    """Plan of the effects of a flight's shots."""
+    """Effects chosen for each shot of a flight."""
 
     hitting_shots: np.ndarray  # (m,) indices of the shots that hit something
     tile_index: np.ndarray  # (m,) index of the tile of each such shot in the plan
     tile_plan: EffectPlan  # plan of the tiles
 
     def selected_effects(self, n_shots: int) -> SelectedEffects:
-        """Return the effects simulated at `n_shots` shots; none at shots that hit nothing."""
+        """Return the effects simulated at each of `n_shots` shots.
+
+        Shots without a hit have none.
+        """
         selected = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
         selected.effect_flags[self.hitting_shots] = pack_effect_flags(self.tile_plan.is_kept)[
             self.tile_index
@@ -750,9 +775,10 @@ def plan_shot_effects(
     rotating: bool,
     rays_by_tolerance: bool = False,
 ) -> ShotEffectPlan | None:
-    """Plan the effects of a flight's shots at one point of the axes; None if no shot hits anything.
+    """Choose the effects of a flight's shots at one point of the axes.
 
-    ``tile_of_shot`` (n,) is the rising number of the tile of each shot.
+    ``tile_of_shot`` (n,) is the rising number of each shot's tile, a run of shots with common
+    effects. The result is None if no shot hits anything.
     """
     from sweep.model.effects.planning import plan_effects
     from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
@@ -780,7 +806,10 @@ def plan_shot_effects(
 
 
 def _find_tile_runs(tile_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges of runs of equal tiles, at least one run, and the run of each element."""
+    """Return the edges of runs of equal tile numbers, and the run to which each element belongs.
+
+    There is at least one run.
+    """
     starts_new_run = np.diff(tile_numbers) != 0
     run_edges = np.concatenate([[0], np.flatnonzero(starts_new_run) + 1, [tile_numbers.size]])
     return run_edges, np.concatenate([[0], np.cumsum(starts_new_run)])

@@ -73,7 +73,7 @@ if TYPE_CHECKING:
 
 
 def canonical_point_rows(parameters: Mapping[str, ParameterValue], n_points: int) -> np.ndarray:
-    """Return rows of float64 (n_points, parameters) that identify points by their values alone.
+    """Return rows of float64 (n_points, parameters) that identify points by their parameters alone.
 
     A row holds every parameter, in the order of the sorted paths. Strings are represented by 62
     bits of their hash.
@@ -85,7 +85,7 @@ def canonical_point_rows(parameters: Mapping[str, ParameterValue], n_points: int
 
 
 def _value_bits(value: ParameterValue) -> np.ndarray:
-    """Return values as uint64: bits of their float64, or hashes of strings."""
+    """Return values as uint64, for comparison: bits of their float64, or hashes of strings."""
     array = np.asarray(value)
     if array.dtype.kind == "U":
         names, inverse = np.unique(array, return_inverse=True)
@@ -96,23 +96,23 @@ def _value_bits(value: ParameterValue) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _text_hash(word: str) -> int:
-    """Return 62 bits of the hash of a string."""
+    """Return the first 62 bits of a string's hash, as an integer."""
     # 62 bits: as a float64 with the upper two bits clear the hash is never nan
     digest = hashlib.blake2b(word.encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 2
 
 
-#: Names of the arrays of simulated effects, and of the error bound of the omitted ones.
+#: Names of the arrays with the simulated effects, and with the error bound of the omitted ones.
 EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY = "effects", "effects_error"
 
-#: Largest number of points of a tile: small enough for similar points, large enough for cheap
-#: planning.
+#: Largest number of points of a tile, a box of points whose effects are chosen together. It is
+#: small enough for similar points, and large enough for cheap planning.
 POINTS_PER_TILE_MAX = 1024
 
-#: Number of points that are planned at once, and number per tile in the preview of tiles.
+#: Number of points whose effects are planned at once, and number per tile in a first, rough plan.
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
 
-#: Numeric parameters that are constant within a tile: sizes of records, and accuracy.
+#: Numeric parameters whose values must be equal in a tile: sizes of records, and accuracy.
 PARAMETERS_CONSTANT_IN_TILE = (
     "instrument.processing.fft_size",
     "instrument.processing.sample_rate",
@@ -126,7 +126,7 @@ PARAMETERS_CONSTANT_IN_TILE = (
 
 
 class SelectedEffects(NamedTuple):
-    """Effects that are simulated at n points."""
+    """Effects that are simulated at each of n points, one bit per effect."""
 
     effect_flags: np.ndarray  # (n,) uint32: bit k for the k-th effect of the catalogue
     error_bound: np.ndarray  # (n,): bound of the change by all omitted effects together
@@ -136,7 +136,7 @@ class SelectedEffects(NamedTuple):
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
     def iter_equal_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
-        """Yield indices (m,) of points with the same effects, and the names of these effects."""
+        """Yield indices (m,) of points with the same simulated effects, and the names of these."""
         for group_flags in np.unique(self.effect_flags):
             yield (
                 np.flatnonzero(self.effect_flags == group_flags),
@@ -144,10 +144,10 @@ class SelectedEffects(NamedTuple):
             )
 
     def iter_joint_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
-        """Yield groups of points that are computed together.
+        """Yield groups of points that are computed together though their effects may differ.
 
-        A group has the indices (m,) of its points, the names of all their effects, and their flags
-        (m,).
+        A group has the indices (m,) of its points, the names of all their effects, and one flag per
+        effect and point (m,).
         """
         separating_flags = self.effect_flags & SEPARATE_BATCHES_MASK
         for shared_flags in np.unique(separating_flags):
@@ -157,7 +157,7 @@ class SelectedEffects(NamedTuple):
 
 
 class TileGroup(NamedTuple):
-    """Tiles that share the values of all strings and sizes."""
+    """Tiles (boxes of neighbouring points) that share the values of all strings and sizes."""
 
     group_number: int  # number of the group in the grid
     requested_indices: np.ndarray  # (m,): indices of the tiles in the request
@@ -169,7 +169,10 @@ class TileGroup(NamedTuple):
 
 
 class TileGrid(BlockGrid):
-    """Tiles of a grid; the points of a tile share the values of all strings and sizes."""
+    """Tiles of a grid: boxes of neighbouring points whose effects are chosen together.
+
+    The points of a tile share the values of all strings and sizes.
+    """
 
     def __init__(self, grid: ParameterBlockGrid) -> None:
         self.grid = grid
@@ -179,7 +182,7 @@ class TileGrid(BlockGrid):
         super().__init__(grid.dims, grid.shape, fit_tile_shape(grid.shape, self._is_constant_axis))
 
     def tiles_of_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tiles (m,) that overlap a block, and the index of the tile of each point."""
+        """Return the tiles (m,) that overlap a block, and for each point the index of its tile."""
         tile_indices = [
             np.arange(block_slice.start, block_slice.stop) // tile_length
             for block_slice, tile_length in zip(
@@ -216,7 +219,10 @@ class TileGrid(BlockGrid):
             yield TileGroup(int(group_code), members, parameters)
 
     def _is_constant_in_tile(self, axis: int) -> bool:
-        """Return True if the values of an axis must not vary within a tile."""
+        """Return True if an axis must have a single value within a tile.
+
+        It then varies a string or a size, such as the FFT size.
+        """
         return any(
             values.dtype.kind in "UO"
             or path in PARAMETERS_CONSTANT_IN_TILE
@@ -227,7 +233,10 @@ class TileGrid(BlockGrid):
     def _values_along_axis(
         self, axis: int, tile_index_along: np.ndarray, stride: int
     ) -> dict[str, ParameterValue]:
-        """Return the values of an axis in tiles, by path, shaped to broadcast with other axes."""
+        """Return the values along an axis, cut into tiles, by parameter path.
+
+        Their shape broadcasts with that of the values along other axes.
+        """
         members = self.grid.values_by_axis[axis]
         if self._is_constant_axis[axis]:
             tile_index = int(tile_index_along[0])
@@ -253,7 +262,10 @@ class TileGrid(BlockGrid):
 
 
 def fit_tile_shape(sizes: tuple[int, ...], is_constant: tuple[bool, ...]) -> tuple[int, ...]:
-    """Return the number of points of a tile along each axis: about equal, but 1 if constant."""
+    """Return the number of points of a tile along each axis.
+
+    The numbers are about equal, but 1 along axes that must be constant within a tile.
+    """
     shape, points_left = [1] * len(sizes), POINTS_PER_TILE_MAX
     divisible_axes = sorted(
         (axis for axis in range(len(sizes)) if not is_constant[axis]), key=lambda k: sizes[k]
@@ -267,7 +279,10 @@ def fit_tile_shape(sizes: tuple[int, ...], is_constant: tuple[bool, ...]) -> tup
 
 
 class EffectPlanner:
-    """Planner of the effects of a grid's tiles; each tile is planned once."""
+    """Planner that chooses the effects to simulate in each tile (box of neighbouring points).
+
+    Each tile is planned once.
+    """
 
     def __init__(self, spec: GridSpec, grid: ParameterBlockGrid) -> None:
         self._effect_modes, self.tiles = spec.effect_modes(), TileGrid(grid)
@@ -312,7 +327,10 @@ class EffectPlanner:
     def absent_effect_flags(
         self, parameters: Mapping[str, ParameterValue], n_points: int
     ) -> np.ndarray:
-        """Return the flags (n,) of effects that are absent at each point, whatever its tile has."""
+        """Return the effects that are absent at each point (n,), one bit each.
+
+        They stay absent there even if they are chosen for the point's tile.
+        """
         inactive_bits = np.zeros(n_points, np.uint32)
         for bit, effect in enumerate(EFFECT_CATALOGUE):
             is_inactive = effect.is_absent(PARAMETER_DEFAULTS | dict(parameters))
@@ -355,7 +373,7 @@ class EffectPlanner:
             remaining = np.concatenate(unsettled) if unsettled else remaining[:0]
 
     def _plan_group(self, tile_group: TileGroup) -> EffectPlan:
-        """Return the plan of tiles that share strings and sizes."""
+        """Return the choice of effects for tiles that share the values of all strings and sizes."""
         from sweep.model.effects.planning import plan_effects
 
         parameters, n_tiles = tile_group.parameters, len(tile_group.requested_indices)
@@ -379,7 +397,10 @@ BATCH_DIM = "batch"
 
 
 def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
-    """Return the output variables of blocks by sorted name; their dimensions omit the axes."""
+    """Return the output variables that blocks write, by name in sorted order.
+
+    Their dimensions do not include the study's axes.
+    """
     error_output = replace(
         EFFECT_VARIABLES[EFFECTS_ERROR_ARRAY],
         comment="sum over the effects left out of what each may change: of pd in all three "
@@ -405,7 +426,7 @@ def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
 
 
 class GridStudy(ExtendableStudy):
-    """Study over a grid of parameters."""
+    """Study over a grid of parameters, of which each point is computed on its own."""
 
     def __init__(self, spec: GridSpec) -> None:
         super().__init__(spec)
@@ -414,11 +435,14 @@ class GridStudy(ExtendableStudy):
 
     @property
     def grids(self) -> tuple[ParameterBlockGrid]:
-        """Grid of the study's points, in a tuple."""
+        """Grid of the study's points, in a tuple of one."""
         return (self.grid,)
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return a mask (points,), or one bool for all, of points that depend on the tolerance."""
+        """Return which points of a block are computed more accurately if the tolerance is smaller.
+
+        The result is a mask (points,), or one bool for all points.
+        """
         return has_numerics_set_by_tolerance(self.grid.parameters_of_block(block))
 
     def store_attributes(self) -> dict[str, Any]:
@@ -438,7 +462,7 @@ class GridStudy(ExtendableStudy):
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the coordinates of the axes, and the sizes of batches of draws."""
+        """Return the arrays known in advance: axis coordinates, and sizes of batches of draws."""
         arrays = axis_coordinate_layouts(self.spec.axes)
         if draws_per_batch := batch_sizes(self.spec):
             batch_attributes = cf_attributes("1", "draws in the batch")
@@ -480,10 +504,10 @@ class GridStudy(ExtendableStudy):
         checkpoint_results: EarlierResults = EarlierResults(),  # noqa: B008
         deadline: Deadline | None = None,
     ) -> Results:
-        """Compute a block; fill values at points that the model does not support.
+        """Compute a block. Points that the model does not support get fill values.
 
-        Points in `checkpoint_results` are not computed again, or continued. `UnfinishedBlock` at
-        the deadline.
+        Points in `checkpoint_results` are not computed again, or continued. `UnfinishedBlock` is
+        raised at the deadline.
         """
         selected_effects = self.effect_planner.select_for_block(block)
         reused = self._read_reused_results(block, selected_effects)
@@ -524,11 +548,11 @@ class GridStudy(ExtendableStudy):
     def evaluate_until(
         self, block: int, checkpoint_results: EarlierResults, deadline: Deadline
     ) -> Results:
-        """Compute a block from a checkpoint on; `UnfinishedBlock` at the deadline."""
+        """Compute a block from a checkpoint on. `UnfinishedBlock` is raised at the deadline."""
         return self.evaluate(block, checkpoint_results, deadline)
 
     def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
-        """Return the results that the smaller study has of a block: final ones, or first draws."""
+        """Return the results of a block in the smaller study: final results, or first draws."""
         if (reuse_source := self.reuse_source) is None:
             return EarlierResults()
         parts = []
@@ -599,7 +623,7 @@ class GridStudy(ExtendableStudy):
 
 
 def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
-    """Return the layouts of the values along axes, in the units of the spec."""
+    """Return the layouts of the coordinate arrays of axes, with values in the units of the spec."""
     return [
         ArrayLayout.from_values(
             member.coordinate,
@@ -625,7 +649,8 @@ NON_PHYSICAL_PARAMETER_PREFIXES = (
     "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS_PATH
 )  # fmt: skip
 
-#: Domain of the keys of draws, which makes their random streams differ from any others of the seed.
+#: Text from which, with the seed, the random numbers of a grid's draws follow. They differ from all
+#: other random numbers of the same seed.
 GRID_KEY_DOMAIN = "sweep.draws"
 
 
@@ -641,8 +666,8 @@ def iter_block_results(
     """Yield the results of a block's points that are not done, in groups with the same effects.
 
     Points in ``reused``, from another study, or in ``checkpoint_results``, from an earlier task,
-    are not computed again. `UnfinishedBlock` at the deadline; a later call continues to the same
-    bits.
+    are not computed again. `UnfinishedBlock` is raised at the deadline; a later call continues to
+    the same bits.
     """
     parameters, order = grid.parameters_of_block(block), grid.geometry_order(block)
     order = order[
@@ -732,7 +757,7 @@ def select_parameters(
 
 
 def _points_per_call(spec: GridSpec) -> int:
-    """Return the number of points per call of the model."""
+    """Return how many points one call of the model computes at once."""
     return max(1, min(POINTS_PER_CALL_MAX, COUNTS_PER_CALL_MAX // max(1, len(batch_sizes(spec)))))
 
 
@@ -819,13 +844,13 @@ def _simulate_draws(
 
 
 def zero_running_sums(spec: GridSpec, n_points: int) -> Results:
-    """Return running sums of zeros (n_points, sums), if the study stores running sums."""
+    """Return sums of zero (n_points, sums) to which draws are added, if the study stores sums."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
     return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:
-    """Return the spec with at most `draws_max` draws."""
+    """Return a copy of the spec in which no point has more than `draws_max` draws."""
     draw_counts = {
         "number": min(spec.draws.number, draws_max),
         "limit": min(spec.draws.limit, draws_max),

@@ -21,15 +21,15 @@ FFT_SIZE_PARAMETER = "instrument.processing.fft_size"
 
 PEAK_BYTES_PER_FFT_POINT = 250
 PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA = 300
-"""Peak memory of a point per point of its FFT [bytes], measured at 2^20 and 2^22.
+"""Peak memory of one grid point, per sample of its FFT [bytes], if whole spectra are drawn.
 
-`PEAK_BYTES_PER_FFT_POINT` is for closed-form results, `PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA` for
-draws of whole spectra.
+`PEAK_BYTES_PER_FFT_POINT` is the same for closed-form results. Both were measured with FFTs of 2^20
+and 2^22 samples.
 """
 
 
 def fft_size_max(spec: GridSpec | SceneSpec) -> int:
-    """Return the largest number of points of the FFT in a study."""
+    """Return the largest FFT size (number of samples) in a study."""
     sizes = [
         member.values
         for axis in spec.axes
@@ -40,7 +40,7 @@ def fft_size_max(spec: GridSpec | SceneSpec) -> int:
 
 
 def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
-    """Return the peak memory of one point, or shot [bytes]."""
+    """Return the peak memory that the computation of one grid point, or one shot, needs [bytes]."""
     draws_spectra = getattr(spec.draws, "draws_whole_spectra", False)
     return fft_size_max(spec) * (
         PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA if draws_spectra else PEAK_BYTES_PER_FFT_POINT
@@ -48,12 +48,12 @@ def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
 
 
 def block_bytes_max(study: GridStudy | FlightStudy) -> int:
-    """Return the peak memory of a thread that computes and writes one block [bytes]."""
+    """Return the peak memory that a thread needs to compute and write one block [bytes]."""
     return point_memory_bytes(study.spec) + 2 * study.block_nbytes_max
 
 
 def scene_memory_bytes(spec: SceneSpec) -> int:
-    """Return the size of a scene's triangles and search trees, copied into each process [bytes]."""
+    """Return the size of a scene's triangles and search trees [bytes]. Each process has a copy."""
     from sweep.tasks.studies.eyepoint_study import build_world
 
     return build_world(spec).caster.nbytes
@@ -106,7 +106,7 @@ def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> N
 
 
 def _available_memory_phrase(worker_memory: WorkerMemory) -> str:
-    """Return the available memory as a clause of a message."""
+    """Return the available memory as part of a sentence."""
     return f"and {worker_memory.process_name} has {_gigabytes_text(worker_memory.bytes_max)}"
 
 

@@ -21,11 +21,14 @@ CF_STANDARD_NAMES = {
     "sun_elevation": "solar_elevation_angle",
     "wavelength": "radiation_wavelength",
 }
-"""Standard names of arrays and coordinates that are in the CF standard name table (version 90)."""
+"""Standard names of the Climate and Forecast (CF) conventions, for arrays and coordinates.
+
+They are from version 90 of the table of standard names.
+"""
 
 
 def cf_attributes(units: str, long_name: str, comment: str = "", name: str = "") -> dict[str, Any]:
-    """Return the CF attributes of the array or coordinate `name`; empty ones are omitted."""
+    """Return the attributes of an array or coordinate by the CF conventions, without empty ones."""
     attributes = {"units": units, "long_name": long_name}
     optional = {"comment": comment, "standard_name": CF_STANDARD_NAMES.get(name, "")}
     return attributes | {key: value for key, value in optional.items() if value}

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 ParameterValue = float | int | str | np.ndarray
 
-#: Parameters that change the positions of the lines of beamlets. Any other parameter only scales
-#: the lines or changes how they are evaluated, which is cheap once the positions are known.
+#: Parameters that change the frequencies of spectral lines. Any other parameter only scales lines
+#: or changes how they are evaluated, which is cheap once their frequencies are known.
 GEOMETRIC_PARAMETERS = (
     "target.range",
     "target.grazing_angle",
@@ -35,7 +35,7 @@ TOLERANCE_PARAMETER = "accuracy.tolerance"
 SHOTS_PER_TILE = 256
 
 #: Largest time of a block by :func:`worst_cpu_seconds_per_point` [s], which is lost if a worker
-#: dies. It also bounds the counts of draws, one per point and batch, to some 100 MB.
+#: dies. It also limits the counts of draws, one per point and batch, to some 100 MB.
 BLOCK_CPU_SECONDS_MAX = 60.0
 
 #: Default size of a block [points], and number of blocks above which blocks grow instead. A block
@@ -50,7 +50,7 @@ DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
 
 
 def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
-    """Return an upper estimate of the time of one draw of any point or shot on one core [s].
+    """Return an upper estimate of the time of one draw of a point or shot on one core [s].
 
     The constants were measured on one machine and rounded up, as the content of a block must not
     depend on the machine.
@@ -77,7 +77,7 @@ def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
 
 
 def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
-    """Return the estimated time of a block on one core [s] by default, for that of its study."""
+    """Return the default computing time of a block on one core [s], given that of the study."""
     return max(study_cpu_seconds / DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_CPU_SECONDS_MIN)
 
 
@@ -117,9 +117,9 @@ def fit_block_shape(
 ) -> tuple[int, ...]:
     """Return the number of points of a block along each axis.
 
-    `is_geometric` tells whether an axis changes the geometry. The block first takes whole
-    radiometric axes, then geometric ones, beginning with the last axis. It thus holds every
-    radiometric variation of its geometries.
+    `is_geometric` tells whether an axis changes the geometry of beam and target; other axes are
+    radiometric. A block first takes whole radiometric axes, then geometric ones, beginning with the
+    last axis. It thus holds every radiometric variation of its geometries.
     """
     order = sorted(range(len(sizes)), key=lambda k: (is_geometric[k], -k))
     shape, points_left = [1] * len(sizes), block_points
@@ -137,7 +137,10 @@ def default_block_points(n_points: int, cpu_seconds_per_point: float) -> int:
 
 
 def block_points_limit(spec: GridSpec, n_points: int) -> int:
-    """Return the largest number of points of a block: as specified, or less if points take long."""
+    """Return the largest number of points of a block.
+
+    It is as specified, or less if points take long.
+    """
     cpu_seconds_per_point = worst_cpu_seconds_per_point(spec)
     requested_points = spec.storage.block_points or default_block_points(
         n_points, cpu_seconds_per_point
@@ -146,7 +149,7 @@ def block_points_limit(spec: GridSpec, n_points: int) -> int:
 
 
 class ParameterGrid:
-    """Parameters of a study: fixed values, and values along the axes."""
+    """Parameters of a study's points: fixed values, and values along the axes of the grid."""
 
     def __init__(self, spec: GridSpec | SceneSpec) -> None:
         self.fixed_parameters: dict[str, float | int | str] = dict(spec.parameters())
@@ -155,15 +158,15 @@ class ParameterGrid:
             {member.path: np.asarray(member.values) for member in axis.parameters}
             for axis in spec.axes
         ]
-        """Values along each axis, by the paths of the parameters that they set."""
+        """Values along each axis, one dict per axis, by the dotted paths of the parameters."""
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Return the values along each dimension of the grid, by the paths of their parameters."""
+        """Return the values along each dimension of the grid, by dotted paths of the parameters."""
         return self.values_by_axis
 
 
 class ParameterBlockGrid(ParameterGrid, BlockGrid):
-    """Points of a grid study with their parameters, cut into blocks."""
+    """Points of a grid study, cut into blocks, with the parameters of each point."""
 
     def __init__(self, spec: GridSpec) -> None:
         ParameterGrid.__init__(self, spec)
@@ -206,10 +209,10 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
         return parameters
 
     def geometry_order(self, block: int) -> np.ndarray:
-        """Return the permutation (n,) of a block's points that makes equal geometries adjacent.
+        """Return an order (n,) of a block's points that puts points with equal geometry together.
 
-        Radiometric axes vary fastest, and velocities slowest, as the change of a line within a
-        record depends on velocity.
+        Radiometric axes vary fastest, and velocities slowest, as the change of a spectral line
+        within a record depends on velocity.
         """
         local_indices = np.arange(self.count_block_points(block)).reshape(
             self.actual_block_shape(block)

@@ -1,4 +1,4 @@
-"""Export of the spectra of a shot, draw by draw: with noise, the noise level, and the truth."""
+"""Export of drawn spectra of a shot, with noise, noise level, and the true quantities."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _spectra_dataset(
     signals_by_draw: list[list[Any]],
     draw_numbers: np.ndarray,
 ) -> xr.Dataset:
-    """Return spectra, signals and true quantities as a Dataset."""
+    """Return drawn spectra, noise-free signals and true quantities as an xarray Dataset."""
     import xarray as xr
 
     bin_width = float(shots.sample_rate[0]) / shots.fft_size

@@ -1,6 +1,6 @@
-"""Summaries of stores: blocks done, detection, echoes of a flight, errors and tolerance.
+"""Summaries of stores: stored blocks, detection, hits of a flight, errors against the tolerance.
 
-StoreError if there is no store of sweep at a path, or one of another kind.
+StoreError is raised if there is no store of sweep at a path, or one of another kind.
 """
 
 from __future__ import annotations
@@ -52,7 +52,10 @@ AXIS_POINTS_LISTED_MAX = 12
 
 @dataclass(frozen=True)
 class DetectionRow:
-    """Detection in one part of a grid; points that are not computed, NaN, are omitted."""
+    """Mean detection results in one part of a grid.
+
+    Points that are not computed (NaN) do not count.
+    """
 
     label: str
     n_points: int
@@ -62,7 +65,7 @@ class DetectionRow:
 
     @classmethod
     def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
-        """Return the row of n points; arrays of the Doppler segment may be missing."""
+        """Return the row for n points. Arrays of the Doppler segment may be missing."""
         is_computed = ~np.isnan(pd_shot)
         pd_shot, pd_doppler = (
             pd_shot[is_computed],
@@ -134,7 +137,7 @@ def count_unsupported_points(
 
 
 def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) -> str:
-    """Return the reason why the model does not support a point of a block."""
+    """Return the reason why the model does not support one point of a block, as text."""
     ((_, effects),) = (
         study.effect_planner.select_for_block(block).subset(local_index).iter_equal_groups()
     )
@@ -149,7 +152,10 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
 def _sample_blocks(
     store: Location, study: BlockStudy, done_blocks: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
-    """Return a reproducible random sample of the blocks that are done, and its fraction."""
+    """Return a random sample of the stored blocks, and the fraction of them that it holds.
+
+    Equal calls give equal samples.
+    """
     done_blocks = (
         np.flatnonzero(blocks_with_receipt(store, study)) if done_blocks is None else done_blocks
     )
@@ -164,7 +170,7 @@ def _sample_blocks(
 
 
 def _axis_range_label(axis: Axis, start: int, end: int) -> str:
-    """Return the values of a part of an axis as text.
+    """Return the range of values that a part of an axis covers, as text.
 
     Indices stand for the values if the axis sets several parameters.
     """
@@ -182,7 +188,7 @@ def _format_value(value: object) -> str:
 def iter_block_values(
     store: Location, study: BlockStudy, array_names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
-    """Yield the slices that each block wrote in arrays of equal chunks, and their values."""
+    """Yield the slices and values that each stored block wrote in arrays with equal chunks."""
     group = open_verified_group(store)
     arrays: list[Any] = [group[array_name] for array_name in array_names]
     for block in blocks:
@@ -192,7 +198,10 @@ def iter_block_values(
 
 @dataclass
 class ScannerRow:
-    """Echoes of a scanner at one point of the axes, in the committed blocks."""
+    """Numbers of true and false points of one scanner at one point of the axes.
+
+    Only stored blocks count.
+    """
 
     label: str
     n_shots: int = 0  # number of shots times draws
@@ -204,7 +213,7 @@ class ScannerRow:
 
     @property
     def mean_pd(self) -> float:
-        """Mean probability of detection of shots that hit something; nan if none does."""
+        """Mean probability of detection of the shots that hit something; nan if no shot does."""
         all_pd = np.concatenate([*self.pd_of_shots, np.empty(0)])
         return float(all_pd.mean()) if all_pd.size else float("nan")
 
@@ -270,7 +279,10 @@ def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list
 
 @dataclass
 class AccuracyRow:
-    """Error of a probability of detection, or of the results that depend on a scanner's rays."""
+    """Statistical error of a probability of detection, or error by the finite number of rays.
+
+    It is compared with the tolerance at each point.
+    """
 
     name: str
     """Name of the probability or of the scanner; empty for the beamlets of a grid."""
@@ -292,7 +304,7 @@ class AccuracyRow:
 
     @property
     def excess(self) -> float:
-        """Excess of the error over the tolerance at the worst point; 0 if it is met."""
+        """Excess of the error over the tolerance at the worst point; 0 if no point exceeds it."""
         return max(0.0, self.worst_error - self.tolerance_at_worst_point)
 
     @property
@@ -321,7 +333,7 @@ class AccuracyRow:
         samples: np.ndarray,
         start_index: tuple[int, ...],
     ) -> None:
-        """Add points, the first of which is at ``start_index`` of the array."""
+        """Add the errors of points, the first of which is at ``start_index`` of the array."""
         is_known = np.isfinite(errors)
         samples = np.where(is_known, np.nan_to_num(samples), 0)
         excess = np.where(is_known, errors - tolerances, -np.inf)
@@ -344,9 +356,9 @@ class AccuracyRow:
 def accuracy_rows_of_draws(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row for each probability with a promised accuracy.
+    """Return a row of errors for each probability whose accuracy the tolerance promises.
 
-    Empty without draws or results.
+    The result is empty without draws or results.
     """
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
@@ -365,7 +377,10 @@ def accuracy_rows_of_draws(
 def accuracy_rows_of_rays(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row for each scanner; for a grid one row if the most beamlets are too few."""
+    """Return a row of errors by the finite number of rays for each scanner.
+
+    A grid has one row, and only if the largest number of beamlets does not suffice.
+    """
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
     if isinstance(study, GridStudy):
@@ -405,7 +420,10 @@ def _accuracy_rows(
     samples_array: str,
     tolerance: np.ndarray,
 ) -> list[AccuracyRow]:
-    """Return a row for each array of errors; ``samples_array`` has numbers of draws or rays."""
+    """Return a row for each array of errors.
+
+    ``samples_array`` holds the numbers of draws or rays.
+    """
     (blocks, block_fraction), axes = _sample_blocks(store_path, study, done_blocks), study.spec.axes
     rows = [AccuracyRow(name, block_fraction=block_fraction) for name in error_arrays]
     tolerance = np.broadcast_to(tolerance, study.output_layout_by_name[samples_array].shape)
@@ -424,7 +442,7 @@ def _accuracy_rows(
 
 
 def _tolerance_over_grid(study: GridStudy) -> np.ndarray:
-    """Return tolerances that broadcast over the grid."""
+    """Return the tolerance at each point, in a shape that broadcasts over the grid."""
     for n_trailing_axes, values in enumerate(reversed(study.grid.values_by_axis)):
         if TOLERANCE_PARAMETER in values:
             return values[TOLERANCE_PARAMETER].reshape(-1, *(1,) * n_trailing_axes)
@@ -433,7 +451,7 @@ def _tolerance_over_grid(study: GridStudy) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """State of a store: points and blocks done, failures, lock, and rate of the last run."""
+    """State of a store: points and blocks done, failures, lock, and speed of the last run."""
 
     store: Location
     title: str
@@ -461,7 +479,10 @@ class Status:
 
     @property
     def seconds_left(self) -> float:
-        """Estimated time left at the rate of the last run [s]; inf if the rate is 0."""
+        """Estimated time to compute the missing points [s], at the speed of the last run.
+
+        The result is inf if that speed is 0.
+        """
         return (
             (self.points - self.points_done) / self.points_per_second
             if self.points_per_second

@@ -69,14 +69,14 @@ from sweep.tasks.studies.study_loading import AnyStudy
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
-#: Number of blocks that are read at once, and number of threads that read them.
+#: Number of blocks that are read for checking at once, and number of threads that read them.
 BLOCKS_PER_READ_BATCH = 256
 READER_THREADS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerificationReport:
-    """Result of the verification of a store."""
+    """Result of checking a store: undamaged blocks, damaged objects, and foreign files."""
 
     store: Location
     blocks: int
@@ -88,7 +88,7 @@ class VerificationReport:
 
     @property
     def is_undamaged(self) -> bool:
-        """True if nothing is damaged."""
+        """True if no object of the store is damaged."""
         return not self.damages
 
     @property
@@ -245,7 +245,7 @@ def _foreign_object_names(store_path: Location) -> list[str]:
 
 
 def _iter_surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Damage]:
-    """Yield chunks outside the arrays of a store, except drafts of killed writers."""
+    """Yield chunk files outside the bounds of their arrays, except drafts of killed writers."""
     manifest = study_store.read_manifest_digests(store_path)
     chunk_grid_shapes = (
         {name: owner_blocks.shape for name, owner_blocks in study.chunk_owner_blocks().items()}
@@ -297,7 +297,7 @@ def _iter_block_damages(
 def _find_block_damages(
     store_path: Location, study: BlockStudy, block: int, expected_digest: bytes
 ) -> list[Damage]:
-    """Return the damages of a block's chunks, whose digest is in its receipt."""
+    """Return the damages of a block's chunks, found by the digest in the block's receipt."""
     chunk_paths, bytes_max = (
         study_store.chunk_names_of_block(study, block),
         study_store.make_chunk_size_limit(study),
@@ -374,7 +374,8 @@ def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
 def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
     """Restore damaged objects of the template, each in one step. Return their names.
 
-    The caller holds the store's lock. StoreError if this machine can't make the same objects.
+    The template is all that is older than any result. The caller holds the store's lock. StoreError
+    is raised if this machine can't make the same objects.
     """
     study_store.refuse_links(store_path)
     try:
@@ -415,7 +416,7 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
 
 
 def _refuse_unreproducible(store_path: Location, template_path: Path) -> None:
-    """Raise a StoreError if new objects differ from the digests in the manifest.
+    """Raise a StoreError if newly made objects differ from the digests in the manifest.
 
     Only undamaged lines of the manifest count.
     """
@@ -452,7 +453,8 @@ def _refuse_unproven_study(
             )
 
 
-#: Largest size of a shard of complete chunks before compression [bytes]; each thread holds one.
+#: Largest size of a shard (file of several chunks) before compression [bytes]. Each thread holds
+#: one.
 SHARD_BYTES_MAX = 64 << 20
 
 
@@ -509,7 +511,7 @@ def pack_store(
 def _write_packed_store(
     store_path: Location, output: Location, study: BlockStudy, progress: Progress
 ) -> None:
-    """Write a packed copy, its root document last."""
+    """Write a copy of a store in few large files (shards), its root metadata last."""
     attributes = {**study_loading.read_study(store_path)[0], PACKED_ATTRIBUTE: True}
     with tempfile.TemporaryDirectory() as directory:
         template = Path(directory) / "template"
@@ -545,7 +547,7 @@ def _write_packed_store(
 
 
 def _pack_array(source: Any, output: Location) -> None:
-    """Copy an array shard by shard, and compare each shard as read back."""
+    """Copy an array shard by shard (file by file). Compare each shard after reading it back."""
     target = zarr.open_array(to_zarr_store(output), mode="r+")
     target = target.with_config({"write_empty_chunks": True})  # else chunks of fill values are lost
     dims = tuple(map(str, range(target.ndim)))
@@ -561,7 +563,10 @@ def _pack_array(source: Any, output: Location) -> None:
 def _copy_region(
     source: zarr.Array[Any], target: zarr.Array[Any], region: tuple[slice, ...]
 ) -> None:
-    """Copy a region of an array, and compare it as read back; OSError if it differs."""
+    """Copy a region of an array, and compare it after reading it back.
+
+    OSError is raised if it differs.
+    """
     values = np.asarray(source[region or ...])
     target[region or ...] = values
     read_back = np.asarray(target[region or ...])
@@ -570,7 +575,10 @@ def _copy_region(
 
 
 def shard_shape_of_array(layout: ArrayLayout) -> tuple[int, ...] | None:
-    """Return the shape of a shard of complete chunks, filled along the last axis first; or None."""
+    """Return the shape of a shard, a file of whole chunks; None if the array gets none.
+
+    A shard is filled along the last axis first.
+    """
     if layout.values is not None:
         return None
     chunks_left = SHARD_BYTES_MAX // max(1, layout.nbytes_of_part(layout.chunks))

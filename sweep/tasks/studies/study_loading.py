@@ -165,7 +165,7 @@ CACHED_BLOCKS_MAX = 2
 
 
 class SharedPoints(NamedTuple):
-    """Points of a block that a block of the older store contains."""
+    """Points that a block of this study and a block of the older store have in common."""
 
     source_block: int  # block of the older store
     local_indices: np.ndarray  # (m,) int64: indices in C order over the new block
@@ -173,7 +173,7 @@ class SharedPoints(NamedTuple):
 
 
 class ReuseSource:
-    """Results in the store of a smaller study that a larger one reuses."""
+    """Results in the store of a smaller study that a larger study takes over."""
 
     def __init__(
         self,
@@ -236,7 +236,7 @@ class ReuseSource:
                 )
 
     def _match_points_of_group(self, group: str) -> PointMatching:
-        """Return the matching of points between the grids of a group in both studies."""
+        """Return which points of a group's grid are also in the grid of the other study."""
         source_grid, target_grid = (
             next(grid for grid in study.grids if grid.group == group)
             for study in (self.source_study, self._target_study)
@@ -275,7 +275,7 @@ class ReuseSource:
         return open_verified_group(self._source_path)
 
     def reuse_remark(self) -> str:
-        """Return a remark on results that can't be reused as they are; '' if all can."""
+        """Return a remark if some of the stored results can't be reused as they are; else ''."""
         if not (self.has_final_results or self.has_first_draws):
             return "whole spectra are drawn anew"
         remarks = ["points that are there are drawn further"] if self.has_first_draws else []
@@ -355,7 +355,10 @@ def have_equal_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
 
 
 def continues_draws(source_spec: GridSpec, target_spec: GridSpec) -> bool:
-    """Return True if the draws of a study are the first draws of another, without spectra."""
+    """Return True if the draws of one study are the first draws of the other.
+
+    Studies that draw whole spectra are excluded.
+    """
     draw_counts = {"number": target_spec.draws.number, "limit": target_spec.draws.limit}
     is_looser = (_fixed_tolerance(source_spec) or 1.0) < (_fixed_tolerance(target_spec) or 0.0)
     return (
@@ -423,7 +426,7 @@ def refuse_not_larger_study(
 
 
 def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]:
-    """Return the reasons why a study is not larger than another of its kind, one per field."""
+    """Return the reasons why a study is not larger than another of its kind, one for each field."""
     return [
         *_iter_disallowed_changes(source_spec, target_spec),
         *_iter_lost_axis_values(source_spec, target_spec),
@@ -508,19 +511,19 @@ def _lost_values_text(grid: ParameterGrid, path: str, indices: np.ndarray) -> st
 
 
 class AxisLookup(NamedTuple):
-    """Indices, along an axis of one study, of the values of parameters of another."""
+    """Positions of parameter values of one study along an axis of another study."""
 
     paths: tuple[str, ...]
     axis: int | None  # axis of the other study; None if the parameters are fixed there
     index_along_axis: np.ndarray
-    """int64 index along the axis, -1 if it lacks the values.
+    """Index of each value along the other study's axis, int64; -1 if that axis lacks the value.
 
     The shape is that of this study's grid, with length 1 along axes without any of the parameters.
     """
 
 
 class PointMatching:
-    """Matching of the points of two studies by their parameters.
+    """Mapping from the points of one study to the points of another with equal parameters.
 
     Axes may be longer, in another order, new, or zipped differently. Parameters in ``ignored`` may
     differ.
@@ -540,7 +543,7 @@ class PointMatching:
     def match_slices(self, grid_slices: tuple[slice, ...]) -> np.ndarray:
         """Return the indices of points in the other grid, in C order, for slices of this grid.
 
-        -1 for points that the other grid lacks.
+        -1 stands for points that the other grid lacks.
         """
         grid_indices = np.zeros((1,) * len(grid_slices), np.int64)
         is_missing = np.zeros((1,) * len(grid_slices), bool)

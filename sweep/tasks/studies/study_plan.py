@@ -1,4 +1,4 @@
-"""Plan of a study before it runs: points, blocks, bytes, time, memory and effects."""
+"""Plan of a study before it runs: numbers of points and blocks, size, time, memory and effects."""
 
 from __future__ import annotations
 
@@ -45,27 +45,27 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
     from sweep.tasks.engine.blocks import Results
 
-#: Time limit of measuring the time per point [s], and number of blocks that are measured.
+#: Limits of measuring the time per point: duration of the measurement [s], and number of blocks.
 POINT_TIMING_SECONDS = 1.0
 TIMED_BLOCKS_MAX = 16
 
 #: Approximate time limit of measuring one scanner [s].
 SCANNER_TIMING_SECONDS = 0.5
 
-#: Largest number of draws of a point that are measured.
+#: Largest number of draws of a point whose time is measured.
 TIMED_DRAWS_MAX = 1000
 
-#: Largest number of draws of whole spectra that are measured.
+#: Largest number of draws of whole spectra whose time is measured.
 TIMED_SPECTRA_MAX = 10
 
-#: Time of worker processes to start, and of a worker or thread to write a chunk [s].
+#: Estimated times for a plan [s]: of starting worker processes, and of writing one chunk.
 WORKER_START_SECONDS = 3.0
 CHUNK_WRITE_SECONDS = 2e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScannerPlan:
-    """Plan of one scanner of a flight."""
+    """Plan of one scanner of a flight: numbers of shots and rays, and computing times."""
 
     name: str
     n_cycles: int
@@ -97,7 +97,7 @@ class StudyPlan:
 
     @property
     def cpu_seconds(self) -> float:
-        """Estimated time of the study on one core [s]."""
+        """Estimated computing time of the whole study on one core [s]."""
         return self.n_points * self.seconds_per_point
 
 
@@ -218,7 +218,7 @@ def _choose_timed_blocks(study: GridStudy) -> list[int]:
 
 
 class TimedRound(NamedTuple):
-    """Time of one round of measurement."""
+    """Number of points in one round of time measurement, and the time that they took."""
 
     n_points: int
     seconds_by_part: tuple[float, ...]  # time of each part of the work [s]
@@ -258,7 +258,10 @@ def _sampled_indices_of_block(study: GridStudy, block: int, n_geometries: int) -
 
 
 def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
-    """Return the number of points computed, and the estimated time of their omitted draws [s]."""
+    """Compute points to measure their time.
+
+    Return the number of points, and the estimated time of draws that were left out [s].
+    """
     spec, extrapolated_seconds = study.spec, 0.0
     local_indices = _sampled_indices_of_block(study, block, n_geometries)
     parameters = study.grid.parameters_of_block(block)
@@ -274,7 +277,7 @@ def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tu
 
 
 class PointTimes(NamedTuple):
-    """Processor time of some points."""
+    """Processor time that some points took, and an estimate for draws that were left out."""
 
     measured_seconds: float  # measured time [s]
     extrapolated_seconds: float
@@ -377,13 +380,13 @@ EFFECT_COST_ROUNDS_MAX, EFFECT_COST_ROUNDS_MIN = 5, 3
 #: about twice the error of the median.
 EFFECT_COST_SPREAD_MAX = 0.1
 
-#: Sufficient time of a round of measuring an effect's cost [s].
+#: Duration of a round of measuring an effect's cost after which no more work is added [s].
 EFFECT_COST_ROUND_SECONDS = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class EffectRow:
-    """Simulation, largest change and cost of one effect in a study."""
+    """Row of a table of effects: where one effect is simulated, what it changes, and its cost."""
 
     name: str
     mode: str
@@ -396,7 +399,7 @@ class EffectRow:
 
 @dataclass(frozen=True, kw_only=True)
 class EffectsTable:
-    """Table of all effects of a study."""
+    """Table of all effects of a study: where each is simulated, what it changes, and its cost."""
 
     rows: tuple[EffectRow, ...]
     tolerance: float
@@ -404,7 +407,7 @@ class EffectsTable:
     tile_fraction: float  # fraction of the tiles that were planned
 
     def warnings(self) -> Iterator[str]:
-        """Yield warnings about disabled effects that exceed the tolerance."""
+        """Yield a warning for each disabled effect that changes results beyond the tolerance."""
         for row in self.rows:
             if row.mode == "off" and row.change_bound > self.tolerance:
                 yield (
@@ -537,7 +540,7 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
 
 
 class _TileEffects(NamedTuple):
-    """Effects of m tiles."""
+    """Simulated and omitted effects of m tiles (boxes of points, or runs of shots)."""
 
     n_simulated: np.ndarray  # (effects, m): number of points at which an effect is simulated
     change_bounds: np.ndarray  # (effects, m): bound of the change by an effect
@@ -553,7 +556,7 @@ def _make_effects_table(
     effect_cost: Callable[[str, np.ndarray], float],
     tile_fraction: float,
 ) -> EffectsTable:
-    """Return the table of effects from the effects of the tiles."""
+    """Return the table of effects, given the simulated and omitted effects of each tile."""
     effect_modes = spec.effect_modes()
     rows = tuple(
         EffectRow(
@@ -578,13 +581,16 @@ def _make_effects_table(
 
 
 def _time_range_text(times: np.ndarray) -> str:
-    """Return a range of times as text."""
+    """Return the first and the last of some times in a flight as text."""
     first, last = times.min(), times.max()
     return f"time {first:.4g} s" if first == last else f"time {first:.4g}..{last:.4g} s"
 
 
 def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarray) -> str:
-    """Return the smallest box of the grid that contains the tiles, in the user's units."""
+    """Return the smallest box of the grid that contains given tiles, in the user's units.
+
+    A tile is a box of neighbouring points whose effects are chosen together.
+    """
     slices = [effect_planner.tiles.block_slices(tile) for tile in tiles.tolist()]
     words = []
     for k, axis in enumerate(spec.axes):
@@ -605,7 +611,7 @@ def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarra
 
 
 class _PointSample(NamedTuple):
-    """Points of a tile, with all effects of its plan."""
+    """Points of a tile (box of neighbouring points) to be timed, with all effects chosen for it."""
 
     parameters: Mapping[str, ParameterValue]
     n_points: int
@@ -650,13 +656,13 @@ def _seconds_of_points(
 
 
 Stopwatch = Callable[[], float]
-"""Function that does some work once and returns its time [s]."""
+"""Function that does some work once and returns the time that it took [s]."""
 
 
 def _grid_effect_cost(
     spec: GridSpec, sample_tile: Callable[[int], _PointSample], tiles: np.ndarray, effect_name: str
 ) -> float:
-    """Return the fraction of the time of points that an effect takes."""
+    """Return the fraction of the computing time of grid points that an effect takes."""
 
     def stopwatches_of_tile(tile: int) -> tuple[Stopwatch, Stopwatch]:
         parameters, n_points, effect_names = sample_tile(tile)
@@ -710,7 +716,7 @@ def reproducible_time_fraction(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]
 
 
 class _ShotSample(NamedTuple):
-    """Arguments of :meth:`FlightStudy.simulate_shots`, for complete cycles of a scanner."""
+    """Arguments of :meth:`FlightStudy.simulate_shots` for some cycles of a scanner, to be timed."""
 
     flight_block: FlightBlock
     shot_arrays: Results
@@ -733,7 +739,10 @@ class _ShotSample(NamedTuple):
 
 
 def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
-    """Sample cycles spread over the flight of each scanner, at the ends of the axes."""
+    """Sample measurement cycles spread over the flight of each scanner.
+
+    They are taken at the first and at the last point of all axes.
+    """
     axis_corners = {
         tuple(end_factor * (int(axis.size) - 1) for axis in study.spec.axes)
         for end_factor in (0, 1)
@@ -760,7 +769,7 @@ def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
 def _flight_effect_cost(
     study: FlightStudy, shot_samples: Sequence[_ShotSample], effect_name: str
 ) -> float:
-    """Return the fraction of the time of shots that an effect takes."""
+    """Return the fraction of the computing time of shots that an effect takes."""
     no_flags, effect_flag = np.uint32(0), np.uint32(1 << EFFECT_NAMES.index(effect_name))
 
     def stopwatches_of_sample(sample: _ShotSample) -> tuple[Stopwatch, Stopwatch]:
@@ -796,7 +805,7 @@ def _flight_effect_cost(
 
 
 def _select_evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
-    """Return at most `n_max` items, evenly spaced from the first to the last."""
+    """Return at most `n_max` of the items, evenly spaced from the first to the last."""
     positions = np.linspace(0, len(sequence) - 1, min(n_max, len(sequence))).astype(int)
     return [sequence[k] for k in positions]
 
@@ -819,7 +828,10 @@ def _seconds_of_cycles(
 def _tile_grid_indices(
     effect_planner: EffectPlanner, tile: int, n_max: int | None = None
 ) -> np.ndarray:
-    """Return the indices of a tile's points, or of `n_max` of them, in C order over the grid."""
+    """Return the indices of a tile's points, or of `n_max` of them, in C order over the grid.
+
+    A tile is a box of neighbouring points whose effects are chosen together.
+    """
     tile_size = effect_planner.tiles.count_block_points(tile)
     local_indices = np.unique(np.linspace(0, tile_size - 1, n_max or tile_size).astype(np.int64))
     return effect_planner.tiles.grid_indices(tile, local_indices)

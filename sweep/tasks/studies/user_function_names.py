@@ -7,11 +7,17 @@ SPECTRUM_METHOD_PARAMETERS = {
     "detector": "instrument.processing.detector.kind",
     "estimator": "instrument.processing.estimator.kind",
 }
-"""Parameters that name the detector and the estimator of whole spectra: built-in or the user's."""
+"""Dotted paths of the parameters that name the detector and the estimator for whole spectra.
+
+Each names a built-in method or a function of the user's.
+"""
 
 
 def iter_user_functions(spec: Any) -> Iterator[tuple[str, str]]:
-    """Yield role and name of each function of the user's that a spec names."""
+    """Yield, for each function of the user's that a spec names, its role and its name.
+
+    The role is detector or estimator.
+    """
     draws = getattr(spec, "draws", None)
     if not getattr(draws, "draws_whole_spectra", False):
         return

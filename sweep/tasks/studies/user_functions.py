@@ -37,9 +37,9 @@ def check_user_functions(spec: GridSpec | SceneSpec) -> None:
 
 
 def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
-    """Return the built-in detectors and estimators, and the user's that the parameters name.
+    """Return the detectors and estimators that parameters may name: built-in ones and the user's.
 
-    CodeError if a function of the user's is not allowed, or can't be imported.
+    CodeError is raised if a function of the user's is not allowed, or can't be imported.
     """
     from sweep.model.sampling.noisy_spectra import SpectrumMethods
 
@@ -59,7 +59,7 @@ def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
 
 @lru_cache(maxsize=64)
 def load_checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
-    """Return a user's function with read-only arguments and checked results."""
+    """Return a user's function with a wrapper that checks results. Its arguments are read-only."""
     function = _import_user_function(name)
     definition = f"{name}{_definition_text(function)}"
 
@@ -151,9 +151,9 @@ def _check_returned_array(
 
 
 def _test_user_function(role: str, name: str) -> None:
-    """Test a function on three spectra of a tone at bin 40.25 of 128 in weak noise.
+    """Call a function on three test spectra: a tone at bin 40.25 of 128 in weak noise.
 
-    CodeError if it fails.
+    CodeError is raised if the call fails or its result is invalid.
     """
     n_samples, generator = 256, np.random.default_rng(1)
     setting = SpectrumSettings(

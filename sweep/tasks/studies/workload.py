@@ -1,4 +1,4 @@
-"""Requirements of a spec on the machines: workers, and the user's modules."""
+"""Requirements of a spec's study on machines: workers, and the user's Python modules."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class SpecWorkload:
 
     @property
     def execution(self) -> Execution:
-        """Section `execution` of the spec."""
+        """Section `execution` of the spec: workers, threads and scheduler."""
         return self.spec.execution
 
     @property
@@ -28,5 +28,5 @@ class SpecWorkload:
 
     @property
     def read_study(self) -> StudyReader:
-        """Function that reads the study of a store."""
+        """Function with which a worker reads the study from its store."""
         return study_loading.read_study

@@ -51,12 +51,12 @@ RESUBMIT_PAUSE_SECONDS = 15.0
 
 
 class _JobWithStatus:
-    """Job that reports if the batch system rejects it."""
+    """Batch job that reports an error if the batch system rejects it."""
 
     status: Status
 
     async def start(self) -> None:
-        """Submit the job."""
+        """Submit the job to the batch system, and record whether it is rejected."""
         try:
             await super().start()  # type: ignore[misc]
         except BaseException:
@@ -65,7 +65,7 @@ class _JobWithStatus:
 
 
 class _ResubmittingCluster:
-    """Cluster that forgets rejected jobs, so that others are submitted later."""
+    """Cluster of batch jobs that forgets rejected ones, so that others are submitted later."""
 
     worker_spec: dict[str, Any]
     workers: dict[str, Any]
@@ -100,9 +100,9 @@ class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
 
 
 def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
-    """Start a cluster, and submit jobs for its least number of workers.
+    """Start a cluster, and submit as many jobs as its least number of workers needs.
 
-    RuntimeError if the batch system rejects them.
+    RuntimeError is raised if the batch system rejects the jobs.
     """
     cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
     dask_cluster = cluster_class(**jobqueue_options(cluster))
@@ -134,12 +134,12 @@ async def _submit_jobs(dask_cluster: Any, n_jobs: int) -> None:
 
 
 def count_jobs(cluster: BatchClusterConfig, n_workers: int) -> int:
-    """Return the number of jobs that hold `n_workers` workers."""
+    """Return the number of batch jobs that are needed for `n_workers` workers."""
     return -(-n_workers // cluster.job.workers)
 
 
 def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
-    """Return the arguments of dask-jobqueue's clusters."""
+    """Return the keyword arguments for the cluster classes of dask-jobqueue."""
     worker, job = cluster.worker, cluster.job
     lifetime, stagger = worker_lifetime(job.walltime)
     required: dict[str, Any] = {
@@ -170,16 +170,16 @@ def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
 
 
 def worker_lifetime(walltime: float) -> tuple[float, float]:
-    """Return the mean time after which a worker leaves its job, and its spread to each side [s].
+    """Return the mean time after which a worker leaves its job, and the largest deviation [s].
 
-    The last worker leaves when 5 % of the walltime is left, at least a minute, but at most a
-    quarter of a very short walltime.
+    Workers leave at different times. The last one leaves when 5 % of the job's time limit is left,
+    at least a minute, but at most a quarter of a very short limit.
     """
     reserve = max(0.05 * walltime, min(60.0, walltime / 4))
     return walltime - 1.5 * reserve, reserve / 2
 
 
 def walltime_text(seconds: float) -> str:
-    """Return a time as hours, minutes and seconds, as batch systems write it."""
+    """Return a duration as hours, minutes and seconds, the form that batch systems read."""
     whole_seconds = int(seconds)
     return f"{whole_seconds // 3600:02d}:{whole_seconds // 60 % 60:02d}:{whole_seconds % 60:02d}"

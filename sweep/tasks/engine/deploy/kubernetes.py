@@ -19,16 +19,19 @@ SCHEDULER_PORT = 8786
 #: Time in which the scheduler's pod must be ready [s]; an image may have to be fetched first.
 POD_READY_SECONDS_MAX = 600.0
 
-#: Folder of certificates in the pods.
+#: Folder in which pods find the TLS certificates.
 CERTIFICATE_FOLDER = "/etc/sweep-tls"
 
-#: HTTP routes of the scheduler that the operator reads the state of workers from.
+#: HTTP routes of the scheduler from which the Dask operator reads the state of workers.
 SCHEDULER_HTTP_ROUTES = ["distributed.http.scheduler.api", "distributed.http.health"]
 
 
 @contextmanager
 def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> Iterator[str]:
-    """Create a cluster for the context. Yield its scheduler's address; ClusterError on failure."""
+    """Create a Dask cluster in Kubernetes for the context. Yield the address of its scheduler.
+
+    ClusterError is raised on failure.
+    """
     try:
         from httpx import HTTPError
         from kr8s import APITimeoutError, NotFoundError, ServerError
@@ -63,13 +66,13 @@ def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> It
 
 
 def _delete_resource(kubernetes_object: Any) -> None:
-    """Delete a resource of Kubernetes; errors are ignored."""
+    """Delete a Kubernetes resource; errors are ignored."""
     with suppress(Exception):  # removed, or out of reach: the results are stored anyway
         kubernetes_object.delete()
 
 
 def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> Any:
-    """Return the scheduler's service, once its pod is ready."""
+    """Wait until the pod of the scheduler is ready. Return the scheduler's service."""
     from kr8s import NotFoundError
 
     deadline = time.monotonic() + POD_READY_SECONDS_MAX
@@ -84,7 +87,10 @@ def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> A
 
 @contextmanager
 def _open_service_address(service: Any, cluster: KubernetesClusterConfig) -> Iterator[str]:
-    """Yield the address of a service: its own inside the cluster, a forwarded port outside."""
+    """Yield an address at which a service can be reached.
+
+    Inside the cluster it is the service's own, outside it is a port that is forwarded to it.
+    """
     if _is_resolvable_host(scheduler_host(cluster)):
         yield f"{connection_protocol(cluster)}://{scheduler_host(cluster)}:{SCHEDULER_PORT}"
         return
@@ -100,7 +106,7 @@ def _open_service_address(service: Any, cluster: KubernetesClusterConfig) -> Ite
 
 
 def _is_resolvable_host(name: str) -> bool:
-    """Return True if the name of a host can be resolved."""
+    """Return True if the host name can be resolved to an address."""
     try:
         socket.getaddrinfo(name, SCHEDULER_PORT)
     except OSError:
@@ -109,19 +115,22 @@ def _is_resolvable_host(name: str) -> bool:
 
 
 def connection_protocol(cluster: KubernetesClusterConfig) -> str:
-    """Return the protocol between scheduler, workers and client."""
+    """Return the protocol of connections between scheduler, workers and client: TLS or TCP."""
     return "tls" if cluster.security else "tcp"
 
 
 def scheduler_host(cluster: KubernetesClusterConfig) -> str:
-    """Return the name of the scheduler inside the Kubernetes cluster."""
+    """Return the host name of the scheduler inside the Kubernetes cluster."""
     return f"{cluster.name}-scheduler.{cluster.namespace}.svc.cluster.local"
 
 
 def autoscaler_resource(
     cluster: KubernetesClusterConfig, bounds: WorkerBounds
 ) -> dict[str, Any] | None:
-    """Return the resource that adapts the number of workers within bounds; None if it is fixed."""
+    """Return the Kubernetes resource that adapts the number of workers to the work.
+
+    None if the number of workers is fixed.
+    """
     if bounds.least == bounds.most:
         return None
     return {
@@ -133,7 +142,7 @@ def autoscaler_resource(
 
 
 def cluster_resource(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> dict[str, Any]:
-    """Return the cluster as a Kubernetes resource."""
+    """Return the Kubernetes resource that describes the Dask cluster."""
     try:
         from dask_kubernetes.operator import make_cluster_spec
     except ImportError as error:
@@ -180,7 +189,7 @@ def _configure_pod(
     variables: dict[str, str],
     cluster: KubernetesClusterConfig,
 ) -> None:
-    """Set command, environment and volumes of a pod's only container."""
+    """Set the command, environment and volumes of the only container of a pod."""
     (container,) = pod["containers"]
     container["args"] = ["dask", *arguments, *_tls_arguments(cluster)]
     container["env"] = [{"name": name, "value": value} for name, value in variables.items()]
@@ -198,7 +207,7 @@ def _configure_pod(
 
 
 def _tls_arguments(cluster: KubernetesClusterConfig) -> list[str]:
-    """Return the command-line arguments of TLS; empty without certificates."""
+    """Return the command-line arguments that enable TLS; empty if there are no certificates."""
     if not cluster.security:
         return []
     name_by_option = {"ca-file": "ca", "cert": "certificate", "key": "key"}

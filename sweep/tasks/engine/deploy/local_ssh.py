@@ -1,4 +1,4 @@
-"""Workers on this machine and on machines reached by SSH, and settings of all clusters."""
+"""Workers on this machine and on machines reached by SSH, and settings that all clusters share."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from distributed import Security
 
 
-#: Module that a worker runs on start.
+#: Name of the Python module that a worker runs when it starts.
 PRELOAD_MODULE = "sweep.tasks.preload"
 
-#: Environment variables that limit libraries with threads of their own to one per worker slot.
+#: Environment variables that limit the threads of numerical libraries to one per worker thread.
 SINGLE_THREAD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -36,8 +36,8 @@ SINGLE_THREAD_VARIABLES = {
     "NUMBA_NUM_THREADS": "1",
 }
 
-#: Environment variable that removes the working directory from Python's search path: a file
-#: `socket.py` there would be run by every worker.
+#: Environment variable that removes the working directory from Python's search path. Otherwise
+#: every worker would run a file `socket.py` in that directory.
 SAFE_PATH_VARIABLE = "PYTHONSAFEPATH"
 
 #: Settings of Dask that reduce its self-monitoring, and disable the pause near the memory limit. By
@@ -63,7 +63,11 @@ ADAPTIVE_TARGET_DURATION = "1s"
 
 
 def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of workers: thread limits, safe path, and the user's."""
+    """Return the environment variables of workers.
+
+    They limit threads, restrict the import path to safe folders, and include the user's own
+    variables.
+    """
     dask_variables = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
         for name, setting in DASK_CONFIG.items()
@@ -72,9 +76,9 @@ def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
 
 
 def make_security(cluster: ClusterConfig) -> Security | None:
-    """Return the TLS security of client, scheduler and workers; None without certificates.
+    """Return the TLS security of client, scheduler and workers; None if there are no certificates.
 
-    Client, scheduler and workers then refuse connections without a certificate.
+    With TLS they refuse connections without a certificate.
     """
     from distributed import Security
 
@@ -95,7 +99,7 @@ def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
 
 
 def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
-    """Return Dask's options for the addresses of a scheduler in this process and its dashboard."""
+    """Return Dask's options for a scheduler in this process: its addresses and its dashboard."""
     options: dict[str, Any] = {
         "port": scheduler.port,
         "dashboard": shows_dashboard(scheduler),
@@ -107,12 +111,12 @@ def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
 
 
 def shows_dashboard(scheduler: SchedulerConfig) -> bool:
-    """Return True if a dashboard is asked for."""
+    """Return True if the configuration asks for Dask's dashboard."""
     return scheduler.dashboard != NO_DASHBOARD
 
 
 def dashboard_address(scheduler: SchedulerConfig) -> str:
-    """Return the address of a scheduler's HTTP server, on the loopback interface.
+    """Return the address of a scheduler's HTTP server, on this machine's loopback interface.
 
     The port is the requested one; any free port if that is taken, or if no dashboard is asked for.
     """
@@ -127,7 +131,7 @@ def dashboard_address(scheduler: SchedulerConfig) -> str:
 
 WORKER_MEMORY_BYTES_MIN = 1 << 30
 
-#: Time after which a worker without a heartbeat is ended and restarted.
+#: Time without a sign of life from a worker after which it is ended and restarted.
 WORKER_TTL = "2 minutes"
 
 
@@ -156,7 +160,7 @@ def isolate_spawned_workers() -> Iterator[None]:
 def start_local_cluster(
     cluster: LocalClusterConfig, bounds: WorkerBounds, *, processes: bool
 ) -> Any:
-    """Start workers on this machine; OSError, RuntimeError or ImportError if they can't start."""
+    """Start workers on this machine. OSError, RuntimeError or ImportError is raised on failure."""
     import dask
     from distributed import LocalCluster, Security
 
@@ -197,7 +201,10 @@ def start_local_cluster(
 
 
 def _make_worker_class_without_pages() -> type:
-    """Return a class of thread workers whose HTTP server, which Dask requires, has no page."""
+    """Return a class of workers in threads that serves no web page.
+
+    Dask requires an HTTP server of each worker.
+    """
     from distributed import Worker
 
     class WorkerWithoutPages(Worker):
@@ -208,7 +215,7 @@ def _make_worker_class_without_pages() -> type:
 
 
 def dashboard_link(dask_cluster: Any) -> str:
-    """Return the URL of the dashboard of a cluster that was started here."""
+    """Return the URL of the dashboard of a cluster that this process started."""
     from distributed.utils import format_dashboard_link
 
     return str(
@@ -219,9 +226,9 @@ def dashboard_link(dask_cluster: Any) -> str:
 
 
 def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> int:
-    """Return the memory at which Dask restarts a worker [bytes].
+    """Return the memory use at which Dask restarts a worker [bytes].
 
-    By default it is an equal share of 90 % of the machine's memory.
+    By default it is the worker's equal share of 90 % of the machine's memory.
     """
     from distributed.system import MEMORY_LIMIT
 
@@ -234,7 +241,10 @@ def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> in
 
 
 def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
-    """Start workers on all machines; OSError or RuntimeError if one can't be reached."""
+    """Start workers on all machines by SSH.
+
+    OSError or RuntimeError is raised if one can't be reached.
+    """
     import asyncssh
     from distributed import Scheduler, SpecCluster
 
@@ -255,9 +265,9 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Return Dask's specification of the workers on each machine, by its name.
+    """Return Dask's specification of the workers on each machine, by the machine's name.
 
-    The workers are distributed evenly.
+    The workers are distributed evenly over the machines.
     """
     from distributed.deploy.ssh import Worker
 
@@ -281,7 +291,7 @@ def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dic
 
 
 def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
-    """Return the arguments of `asyncssh.connect`."""
+    """Return the keyword arguments of `asyncssh.connect` for one machine."""
     options = {
         "username": cluster.user,
         "client_keys": cluster.identity and [cluster.resolve_path(cluster.identity)],
@@ -291,7 +301,10 @@ def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 
 
 def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
-    """Return the arguments of the nannies on the machines, all of them representable in JSON."""
+    """Return the arguments of the nannies, the processes that start and watch workers.
+
+    All of them can be written as JSON.
+    """
     security = security_settings(cluster)
     return {
         "nthreads": cluster.worker.threads,
@@ -304,7 +317,7 @@ def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 
 
 class Certificates(NamedTuple):
-    """Files of a cluster's self-signed certificate."""
+    """Paths of the files of a cluster's self-signed TLS certificate."""
 
     ca: Path
     certificate: Path
@@ -312,9 +325,9 @@ class Certificates(NamedTuple):
 
 
 def make_certificates(directory: Path) -> Certificates:
-    """Create a certificate for Dask, valid for a year, that only its owner can read.
+    """Create a TLS certificate for Dask, valid for a year, in files that only their owner can read.
 
-    ClusterError if that is not possible.
+    ClusterError is raised if that fails.
     """
     from distributed import Security
 
