@@ -126,7 +126,7 @@ class BlockStudy(StoreTemplate, ABC):
     """
 
     points_noun = "points"
-    """Noun for the points in messages, in the plural, such as ``shots``."""
+    """Noun for the points in messages, in the plural."""
 
     @property
     @abstractmethod
