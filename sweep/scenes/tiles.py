@@ -23,7 +23,8 @@ import numpy as np
 from sweep.scenes.terrain import Terrain
 
 _ALIGNMENT_TOLERANCE_CELLS = 1e-3
-"""Largest deviation from whole cells of the offset of two grids that count as one [cells]."""
+"""Two grids count as parts of one if their offset is a whole number of cells within this tolerance
+[cells]."""
 
 _ADJACENT_GAP_MAX_CELLS = 2.0
 """Largest gap between two grids that count as adjacent [cells of the coarser grid]."""

@@ -567,7 +567,7 @@ def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
 
 
 def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
-    """Diagnose the echoes of shots spread over a flight, at the ends of its axes."""
+    """Diagnose late and folded echoes of sampled shots of a flight, at the ends of its axes."""
     from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
     from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 

@@ -62,7 +62,7 @@ class FlightCoverage(NamedTuple):
     """Smallest and largest coordinates of the scene's bodies, (2, 3) [m]."""
 
     def extents_text(self) -> str:
-        """Return the ranges of coordinates of path and scene, as text of a message."""
+        """Return a text with the ranges of coordinates that the path and the scene span."""
         return (
             f"the path spans {_box_text(self.path_bounding_box)}, "
             f"and the scene {_box_text(self.scene_bounding_box)}"
