@@ -932,9 +932,8 @@ class Shots:
         from sweep.model.detection.pseudo_variance import signal_pseudo_variance
 
         shape = (len(self.waveform_segments), self.size)
-        line_deviation_bins = np.ascontiguousarray(
-            np.broadcast_to(self.speckle.line_deviation_bins, shape), float
-        )
+        # A writable copy: kernels would be compiled anew for an array that can't be written.
+        line_deviation_bins = np.array(np.broadcast_to(self.speckle.line_deviation_bins, shape))
         # Without images, bins near DC and Nyquist hold half of the echo, and their values are not
         # real.
         if (
