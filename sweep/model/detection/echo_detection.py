@@ -1036,7 +1036,8 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     largest = 0.0
     for i in range(magnitude.size):
         largest = max(largest, magnitude[i] if is_echo[i] else 0.0)
-    pd, miss, stretch_begin, i, n_stretches = 0.0, 1.0, 0, 0, 0
+    pd, miss, n_stretches = 0.0, 1.0, 0
+    stretch_begin, i = np.int64(0), np.int64(0)  # numba would compile anew for literals 0
     while i < magnitude.size:
         echo_begin, has_strong_bin = i, False
         while i < magnitude.size and is_echo[i]:

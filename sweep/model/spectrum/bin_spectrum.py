@@ -324,7 +324,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
     )
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
     """Add the lines' spectrum to ``field``, only in bins that the line-shape table contains.
 
@@ -625,7 +625,7 @@ def add_line_by_record_ends(
         field.im[shift + i] += c * (u_im - v_im) + s * (u_re + v_re)
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, tangents, field):
     """Compute the lines' spectrum F in ``n_bins`` bins into ``field.re`` and ``field.im``.
 
@@ -928,7 +928,7 @@ def distance_below_level_with_images(level, weight_sum, seen, envelope, layout):
     return distance_below_level(level, weight_sum, envelope) + 1.0
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def detect_in_span(
     bundle,
     negligible_magnitude,

@@ -174,7 +174,7 @@ class NearEndCorrection(NamedTuple):
     """False if bins of the echo are too close to the near end to compute the correction."""
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def detect_with_leakage(
     bundle,
     negligible_magnitude,
@@ -762,7 +762,7 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
     )
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _leakage_of_span_and_beyond(
     detected,
     bundle,
@@ -945,7 +945,7 @@ def _end_correction_factor(offset):
     return factors[offset - 1] if offset > 0 else -factors[-offset]
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _fill_far_powers(
     n_points, centre_bin, bundle, log_accuracy, shape, layout, tangents, workspace
 ):

@@ -663,15 +663,28 @@ def select_segment(shapes, segment):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
+def _copy_values(source, target):
+    """Copy an array (n,) into another one.
+
+    An assignment to ``target[:]`` would compile the text of its error message into each kernel.
+    """
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def copy_line_shape(shapes, from_segment, to_segment):
     """Copy the line shape of one segment to another segment in ``shapes``."""
     source, target = select_segment(shapes, from_segment), select_segment(shapes, to_segment)
-    target.table_re[:], target.table_im[:] = source.table_re, source.table_im
-    target.envelope.magnitude[:] = source.envelope.magnitude
-    target.envelope.square_integral[:] = source.envelope.square_integral
-    target.ends.start_re[:], target.ends.start_im[:] = source.ends.start_re, source.ends.start_im
-    target.ends.end_re[:], target.ends.end_im[:] = source.ends.end_re, source.ends.end_im
+    _copy_values(source.table_re, target.table_re)
+    _copy_values(source.table_im, target.table_im)
+    _copy_values(source.envelope.magnitude, target.envelope.magnitude)
+    _copy_values(source.envelope.square_integral, target.envelope.square_integral)
+    _copy_values(source.ends.start_re, target.ends.start_re)
+    _copy_values(source.ends.start_im, target.ends.start_im)
+    _copy_values(source.ends.end_re, target.ends.end_re)
+    _copy_values(source.ends.end_im, target.ends.end_im)
 
 
 def chebyshev_nodes(n_nodes: int) -> np.ndarray:
@@ -928,7 +941,7 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
                 modes.re[s, i, j], modes.im[s, i, j] = coefficients_re[j], coefficients_im[j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def build_line_shape(segment, shape_index, previous_index, modes, tables, shape):
     """Compute one segment's line shape, the spectrum of a line of amplitude 1.
 
@@ -972,10 +985,11 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
     ):
         return
     if layout.holds_all_bins:
-        shape.table_re[:] = tables.full_table_re[segment]
-        shape.table_im[:] = tables.full_table_im[segment]
-        shape.envelope.magnitude[:] = tables.full_envelope.magnitude[segment]
-        shape.envelope.square_integral[:] = tables.full_envelope.square_integral[segment]
+        envelope = tables.full_envelope
+        _copy_values(tables.full_table_re[segment], shape.table_re)
+        _copy_values(tables.full_table_im[segment], shape.table_im)
+        _copy_values(envelope.magnitude[segment], shape.envelope.magnitude)
+        _copy_values(envelope.square_integral[segment], shape.envelope.square_integral)
         return
     even_re, even_im, odd_re, odd_im = 0.0, 0.0, 0.0, 0.0  # T_j is 1 at the end, +-1 at the start
     n_values, ends = mode_transforms.shape[1], shape.ends
@@ -1050,7 +1064,7 @@ def first_segment_of_same_shape(segment, shape_index, modes, echo_lengths, segme
     return -1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def build_late_line_shape(segment, shape_index, modes, tables, shape):
     """Compute the line shape of an echo that arrives after its record has begun.
 
@@ -1135,7 +1149,7 @@ def build_late_line_shape(segment, shape_index, modes, tables, shape):
         value_position = u * _LATE_VALUES_PER_BIN + middle
         cell = math.floor(value_position)
         kernel_coordinate = 2.0 * (value_position - cell) - 1.0
-        kernel_weights[:] = KERNEL_BASIS[KERNEL_DEGREE]
+        _copy_values(KERNEL_BASIS[KERNEL_DEGREE], kernel_weights)
         for d in range(KERNEL_DEGREE - 1, -1, -1):
             for j in range(KERNEL_CELLS + ZERO_WEIGHT_CELLS):
                 kernel_weights[j] = kernel_weights[j] * kernel_coordinate + KERNEL_BASIS[d, j]

@@ -869,7 +869,7 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
     )
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _copy_lines(lines, n_lines, shifts):
     """Copy lines to several shifted frequencies; return the number of all copies.
 
@@ -893,7 +893,7 @@ def _copy_lines(lines, n_lines, shifts):
     return n_lines * shifts.offset.size
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _prepare_lines(
     beat,
     segment,
@@ -998,7 +998,7 @@ def _prepare_lines(
     )
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _store_span(start, n_bins, span, magnitudes, is_exempt):
     """Append a span to the spans of earlier points at index ``start``; return the next index.
 
@@ -1068,7 +1068,7 @@ def _build_shapes(shape_index, built_index, modes, tables, segment_exists, shape
             line_shape.build_late_line_shape(s, shape_index, modes, tables, shape)
 
 
-@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+@njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _evaluate_segment(
     s,
     i,
