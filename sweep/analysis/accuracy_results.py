@@ -542,7 +542,7 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
 
 
 def _reference_sentence(attributes: dict) -> str:
-    """Return the sentences on the reference setting and its difference from the time domain."""
+    """Return sentences that name the reference setting and its error against the time domain."""
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
         return text + ". It is not compared with the time domain."

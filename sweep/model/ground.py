@@ -110,13 +110,13 @@ class _PlaneGeometry(NamedTuple):
     grazing_angle: np.ndarray
     """Angle between beam and plane [rad], pi/2 at normal incidence."""
     position_spread_angle: np.ndarray
-    """Full 1/e^2 angle over which positions on the target are spread [rad]."""
+    """Full 1/e^2 angle [rad] of the illuminated positions on the target, seen from the lidar."""
     radial_velocity: np.ndarray
     """Radial velocity [m/s], positive when closing; 0 if all beamlets share the axis's velocity."""
     transverse_velocity: np.ndarray
     """Velocity across the beam [m/s]; 0 if all beamlets share the axis's velocity."""
     direction_spread_angle: np.ndarray | None = None
-    """Full 1/e^2 angle over which directions of the light are spread [rad]."""
+    """Full 1/e^2 angle of the spread of light directions [rad]."""
     linear_range_loss: np.ndarray | None = None
     """Coefficient b of the range loss 1 + b x + c x^2 for a relative range change x."""
     quadratic_range_loss: np.ndarray | None = None

@@ -456,7 +456,7 @@ class NoiselessSpectra(NamedTuple):
     alarm."""
     leaked_slice: np.ndarray
     """(m, 3, 2) int64: begin and end of each segment's bins in the arrays ``leaked_*`` and
-    ``exempt_neighbour_*``; equal without leaked signal."""
+    ``exempt_neighbour_*``. They are equal in segments without leaked signal."""
     leaked_index: np.ndarray
     """(leaked,) int64: numbers, from ``first_bin``, of the bins with signal leaked from an echo.
     With noise they may raise a false alarm."""
@@ -471,7 +471,7 @@ class NoiselessSpectra(NamedTuple):
 
     @classmethod
     def empty(cls, n_points: int) -> "NoiselessSpectra":
-        """Return a record without bins, for draws that compare numbers with probabilities."""
+        """Return spectra without bins, for draws that compare random numbers with probabilities."""
         zeros, empty_slices = (
             np.zeros((n_points, 3), np.int64),
             np.zeros((n_points, 3, 2), np.int64),

@@ -250,7 +250,7 @@ class SpectrumWorkspace(NamedTuple):
     """Arrays for computing the spectrum of one segment of one point."""
 
     field: FieldWorkspace
-    """Lines and their spectrum without images."""
+    """Lines of the segment, and their spectrum without images (mirrors at negative frequency)."""
     inverse_gain_re: np.ndarray
     """Scratch of :func:`sweep.model.spectrum.lines.compute_lines`: real part of 1 over the gain."""
     inverse_gain_im: np.ndarray
