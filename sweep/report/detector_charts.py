@@ -406,7 +406,10 @@ The report also counts the points that reach it.
 """
 
 UNBROKEN_LABEL = "kept all the way"
-"""Label of the maximum range up to which pd is never below the chosen level."""
+"""Label, in charts and tables, of one kind of maximum range.
+
+Up to this range pd is at least the chosen level without interruption.
+"""
 
 LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
 """Variables of :func:`.detection_limits.limit` with the two kinds of maximum range, by label."""

@@ -86,7 +86,7 @@ VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
 """Framing of the points of a cloud in plotly's view.
 
 The first is the fraction of the field of view that the points' box fills; the rest is for labels.
-The second is the least width-to-height ratio of the plot, that of a phone.
+The second is the least width-to-height ratio of the plot, which a phone has.
 """
 
 CAMERA_POSITION_BY_VIEW = {

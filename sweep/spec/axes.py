@@ -440,9 +440,9 @@ def _name_coordinates(axes: list[Axis]) -> list[Axis]:
 
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
-    """Return the shortest last part of a dotted path that identifies a parameter, with underscores.
+    """Return the shortest unambiguous end of a parameter's path, with underscores in place of dots.
 
-    No other path ends with this part, and no variable of a store has this name.
+    No other path in ``paths`` has this end, and no variable of a store has this name.
     """
     keys, *other_keys = (
         parameter_path.removesuffix(".kind").split(".")

@@ -128,7 +128,7 @@ def _format_list(rule: Rule | None, values: Sequence[Any]) -> str:
 
 
 def _unit_suffix(rule: Rule | None) -> str:
-    """Return a blank and the unit in which a field is shown; empty for a pure number.
+    """Return the unit in which a field is shown, after a blank; empty for a pure number.
 
     Angles are shown in the unit of the field's example, all other quantities in SI units.
     """

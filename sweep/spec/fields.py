@@ -35,7 +35,7 @@ from sweep.spec.rules import (
 AUTO, ON, OFF = EFFECT_MODES
 """Modes of an effect: simulated only where the tolerance requires it, always, or never."""
 ModelClasses = tuple[type[BaseModel], ...]
-"""Pydantic models (sections of a spec) as one of which a value is validated."""
+"""Pydantic models, each a kind of section. A value is validated as one of them."""
 KeyPath = tuple[str, ...]
 """Keys that lead to a value in a spec: the names of the sections around it and of its field."""
 SectionT = TypeVar("SectionT", bound=BaseModel)
@@ -333,7 +333,10 @@ def add_effect_parameters(section_path: str) -> Callable[[type[SectionT]], type[
 
 
 def add_effect_modes(section: type[SectionT]) -> type[SectionT]:
-    """Class decorator that adds the mode of every effect to a section, `auto` by default."""
+    """Return a subclass of a section that has a field for the mode of every effect.
+
+    The default mode is `auto`.
+    """
     mode_rules = {
         effect.name: ChoiceRule(
             description=effect.description[0].upper() + effect.description[1:], options=EFFECT_MODES
@@ -464,9 +467,9 @@ class ResolvedLocation(NamedTuple):
     location: Location
     """Keys and indices that lead to the value in the file."""
     value_models: ModelClasses
-    """Models that the value may be validated as; empty for a scalar or list."""
+    """Pydantic models of the value, one for each kind of it; empty for a scalar or list."""
     section_models: ModelClasses
-    """Models that the section around the value may be validated as."""
+    """Pydantic models of the section that contains the value, one for each kind of section."""
 
 
 def translate_error_location(pydantic_location: Location, root: Any) -> ResolvedLocation:

@@ -847,7 +847,7 @@ EFFECT_PARAMETER_REQUIREMENTS = (
         "set it to 1 au or so",
     ),
 )
-"""What parameters of effects require of other parameters: the values that exclude each other."""
+"""Requirements of effect parameters on other parameters: values that exclude each other."""
 
 
 def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:

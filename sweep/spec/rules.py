@@ -37,7 +37,7 @@ Location = tuple[str | int, ...]
 """Keys and list indices that lead to a value in a spec."""
 
 MISSING = object()
-"""Value that stands for one that the spec does not contain."""
+"""Marker that takes the place of a value which the spec does not contain."""
 _SHOWN_VALUE_CHARACTERS_MAX = 60
 """Maximum number of characters of a wrong value that an error message shows."""
 _PARTIAL_NAME_CHARACTERS_MIN, _SUGGESTIONS_MAX = 4, 3
@@ -199,7 +199,7 @@ def suggest_similar_name(name: str, known_names: Iterable[str], *, fallback: str
 # Rules
 
 RULE_ERROR_TYPE = "broken_rule"
-"""Type by which pydantic errors that rules raise are told from all others."""
+"""Type of the pydantic errors that rules raise, which distinguishes them from all others."""
 
 JsonObject = dict[str, Any]
 """Mapping with text keys, as in JSON."""
@@ -214,7 +214,7 @@ def rule_error(problem: str, suggestion: str) -> PydanticCustomError:
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Base of rules: what values a field may hold."""
+    """Base of rules. A rule defines which values a field may hold."""
 
     description: str
     """Description of the field for users."""
@@ -332,7 +332,7 @@ class NumericRule(Rule):
 
     @property
     def bounds(self) -> dict[str, str]:
-        """Text of each bound that is set, by its kind, such as ``at_least``."""
+        """Text of each bound that is set, by the name of its field, such as ``at_least``."""
         bound_texts = {name: getattr(self, name) for name in _BOUND_KINDS}
         return {
             name: bound_text for name, bound_text in bound_texts.items() if bound_text is not None

@@ -706,7 +706,7 @@ class SceneSpec(BaseSpec):
     def parameters(self) -> dict[str, float | int | str]:
         """Return the SI values of all parameters by dotted path.
 
-        A parameter on an axis has the value of its field. The number of beamlets is that of the
+        A parameter on an axis has the value of its field. The number of beamlets is the number of
         rays cast per shot; detector and estimator are left out unless whole spectra are drawn.
         """
         parameters = super().parameters()

@@ -255,8 +255,8 @@ class Document:
     def _locate_cause(self, finding: Finding) -> tuple[str, int | None]:
         """Return file and line of the user's field that causes a mistake in a field of the library.
 
-        The first of these that exists in the user's file: a field that the finding names by path or
-        in words, a field of the same section, the name of the instrument.
+        It is the first of these that exists in the user's file: a field that the finding names by
+        path or in words, a field of the same section, and the name of the instrument.
         """
         location, message = finding.location, f"{finding.problem} {finding.suggestion}"
         section = location if isinstance(_value_at(self.content, location), dict) else location[:-1]
@@ -797,7 +797,7 @@ _SPEC_OF_FIGURE_KIND = {
     for kind, target in ((GridFigure, "a target"), (SceneFigure, "a scene"))
     for model in spec_fields.models_of_annotation(kind)
 }
-"""What a study must have to draw a figure, ``a target`` or ``a scene``, by the figure's kind."""
+"""Section that a study needs for a figure, ``a target`` or ``a scene``, by the figure's kind."""
 
 
 def validation_findings(error: ValidationError, annotation: Any) -> list[Finding]:
