@@ -186,9 +186,9 @@ def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any
     Raises
     ------
     StoreError
-        If the store is not sweep's, holds another study, was begun with other versions, is damaged
-        in objects older than its results, or is being written by another process. The store is not
-        changed.
+        If the store is not sweep's, holds another study, was begun with other versions, has damaged
+        objects from before its first result, or is being written by another process. The store
+        does not change.
     ClusterError
         If no scheduler or worker is available.
     """
@@ -355,7 +355,8 @@ def _refuse_altered_store(
 ) -> None:
     """Raise a StoreError if a store can't be continued by this software.
 
-    It was begun with other versions, or its objects older than any result are damaged.
+    Reasons are other versions of the software, changed attributes, blocks of another shape, and
+    damage to objects that were written before the first result.
     """
     refuse_other_versions(store_path, attributes, study.model_version, reader="this machine")
     if study.id != attributes["study_id"]:
@@ -483,7 +484,7 @@ def _compute_into_path(
 def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
     """Move a complete store from its staging path to its final path.
 
-    The caller holds the lock there.
+    The caller holds the lock of the store at the final path.
     """
     staging_path = staging_path_for(final_path)
     with raise_as_store_error(f"{staging_path} can't take the place of {final_path}"):
@@ -594,9 +595,10 @@ def _compute_missing_blocks(
 
 
 def _is_flight_complete(store_path: Location, study: FlightStudy) -> bool:
-    """Return True if all blocks of a flight are stored, and all of its existing eyepoint stores.
+    """Return True if all blocks of a flight are stored, and its eyepoint stores are complete.
 
-    An eyepoint store holds the geometry of the shots, as rays have found it.
+    An eyepoint store holds the geometry of the shots, as rays have found it. Missing eyepoint
+    stores do not count.
     """
     return bool(
         blocks_with_receipt(store_path, study).all() and committed_blocks(store_path, study).all()

@@ -67,10 +67,12 @@ In each round every setting is timed once on every part of the sample.
 """
 
 TRIAL_TIME_FRACTION = 0.003
-"""Aimed duration of one trial of a setting, as a fraction of the measurement's time limit."""
+"""Target duration of one trial of a setting, as a fraction of the measurement's time limit."""
 
 TIMED_SEQUENCE_TIME_FACTOR = 2
-"""Aimed time of the points that are timed for a setting, as a multiple of a trial's aimed duration.
+"""Target duration of the sequence of points on which a setting is timed.
+
+It is a multiple of the target duration of a trial.
 """
 
 FIRST_TIMED_SEQUENCE_DIVISOR = 8
@@ -94,7 +96,8 @@ The least number is simulated even if the time limit is exceeded.
 TIME_DOMAIN_BEAMLET_COUNT = 109
 """Number of beamlets (rays of a beam) in the time-domain simulation.
 
-It is used if the spec's accuracy sets their number. Few are used because each needs a record.
+It replaces the reference setting's number, if that setting states one. It is small, because each
+beamlet needs a time-domain record of its own.
 """
 
 REPEATED_TRIAL_SECONDS_MAX = 1.0
@@ -428,8 +431,8 @@ class AccuracyMeasurement:
         """Compare the most accurate setting, the reference, with time-domain records.
 
         The records are made at some of the points, as time allows. Return the differences at each
-        point, by :func:`result_differences`, and the number of beamlets of both. That number is 0
-        if it is the reference's own.
+        point, by :func:`result_differences`, and the number of beamlets with which both were
+        computed. 0 stands for the reference setting's own number.
         """
         reference_setting, beamlets_field = self._setting_ladder.reference, "footprint.beamlets"
         differences: dict[int, np.ndarray] = {}

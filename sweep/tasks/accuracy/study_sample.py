@@ -239,9 +239,10 @@ class StudySample(ABC):
     def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Return the effects planned at each point (n,), one bit each.
+        """Choose the effects at each of n points.
 
-        Return also the time of planning per point [s].
+        Return their flags (n,), one bit per effect, and the time that the choice took per point
+        [s].
         """
 
     @abstractmethod

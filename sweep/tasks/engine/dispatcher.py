@@ -185,7 +185,7 @@ class TaskDispatcher:
 
         Once `is_stopping` returns True no more tasks are sent. The iteration ends when all sent
         tasks have ended, or at once if there is no worker. SchedulerLostError is raised if the
-        scheduler is gone; StoreError or OSError if no worker can write to the store.
+        scheduler is gone; StoreError or OSError is raised if no worker can write to the store.
         """
         try:
             while True:
@@ -415,10 +415,7 @@ class TaskDispatcher:
         return task_result
 
     def _finish_task(self, future: Future) -> TaskResult:
-        """Return the result of a task that has ended.
-
-        Update the state of blocks and workers by it.
-        """
+        """Return the result of a task that has ended, after updating blocks and workers with it."""
         task = self._in_flight[future.key]
         for key in task.futures_by_key:
             del self._in_flight[key]

@@ -26,7 +26,7 @@ ALLOWED_MODULES_VARIABLE = "SWEEP_ALLOW_CODE"
 def allow_modules(modules: Iterable[str]) -> None:
     """Allow this process, and the processes that it starts, to import modules.
 
-    The names are those before the colon in a spec. CodeError for an invalid name.
+    A module's name is the text before the colon in a spec. CodeError is raised for an invalid name.
     """
     for module in (modules := list(modules)):
         if module.endswith(".py") or not all(
@@ -88,7 +88,7 @@ def allow_identical_module(module: str, digest: str) -> None:
 
 
 def import_user_module(name: str) -> ModuleType:
-    """Import a module of the user's; CodeError with the reason if that fails."""
+    """Import a module of the user's; raise CodeError, with the reason, if that fails."""
     _import_from_working_directory()
     try:
         return import_module(name)

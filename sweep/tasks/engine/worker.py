@@ -115,7 +115,10 @@ def get_block_writer(
 def _open_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
-    """Open the store of a study for writing; StoreError for another study or other versions."""
+    """Open the store of a study for writing.
+
+    StoreError is raised for another study, or for a store of other versions of the software.
+    """
     attributes, stored_study = read_study(parse_location(store_path))
     _refuse_replaced_store(store_path, study_id)
     study_store.refuse_other_versions(
@@ -482,7 +485,7 @@ def _accept_result(
     """Return the result of a task of this process, after a check that its blocks are in the store.
 
     Failures replace the receipts of blocks that are missing there. Unfinished blocks go back to the
-    queue. The error that prevents any block from being computed is raised.
+    queue. An error that would prevent every block from being computed is raised.
     """
     if task_result.worker_error is not None:
         raise task_result.worker_error

@@ -28,7 +28,7 @@ class WorkerMemory:
     find_bytes_max: Callable[[], float]
     """Function that returns the largest memory that the process may use [bytes]."""
     process_name: str
-    """Name of the process in messages, as the subject of a sentence: `this machine`."""
+    """Name of the process in messages, such as `this machine` or `a worker of the client`."""
     workers_sharing: int = 1
     """Number of workers that share the machine's memory; 1 if each worker has its own limit."""
 

@@ -50,7 +50,10 @@ class ExtendableStudy(BlockStudy):
         return block
 
     def pop_reused_point_count(self, block: int) -> int:
-        """Return how many points of a block came from the smaller study's store, and forget it."""
+        """Return how many points of a block came from the smaller study's store.
+
+        The number is deleted, so that a second call returns 0.
+        """
         reuse_source = self.reuse_source
         return reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0
 

@@ -244,7 +244,10 @@ class FlightStudy(ExtendableStudy):
         )
 
     def locate_flight_block(self, block: int) -> tuple[ScannerGrid, FlightBlock]:
-        """Return the grid of a block's scanner, and the block; IndexError if there is none."""
+        """Return the grid of a block's scanner, and the block within this grid.
+
+        IndexError is raised if there is no such block.
+        """
         grid, block_in_grid = self.locate_in_grid(block)
         scanner_grid = self.scanner_grids[grid.group]
         return scanner_grid, scanner_grid.flight_block(block_in_grid)
@@ -583,7 +586,7 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _read_reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
-        """Return a block's results in the smaller study, for shots with the same effects."""
+        """Return the smaller study's results of the shots of a block that have the same effects."""
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
             self.reuse_source,

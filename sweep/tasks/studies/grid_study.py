@@ -112,7 +112,7 @@ POINTS_PER_TILE_MAX = 1024
 #: Number of points whose effects are planned at once, and number per tile in a first, rough plan.
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
 
-#: Numeric parameters whose values must be equal in a tile: sizes of records, and accuracy.
+#: Numeric parameters whose values must be equal in a tile: sizes of records, and the tolerance.
 PARAMETERS_CONSTANT_IN_TILE = (
     "instrument.processing.fft_size",
     "instrument.processing.sample_rate",
@@ -157,7 +157,10 @@ class SelectedEffects(NamedTuple):
 
 
 class TileGroup(NamedTuple):
-    """Tiles (boxes of neighbouring points) that share the values of all strings and sizes."""
+    """Tiles (boxes of neighbouring points) with equal text parameters and equal record sizes.
+
+    Record sizes are the :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the FFT size.
+    """
 
     group_number: int  # number of the group in the grid
     requested_indices: np.ndarray  # (m,): indices of the tiles in the request
@@ -171,7 +174,8 @@ class TileGroup(NamedTuple):
 class TileGrid(BlockGrid):
     """Tiles of a grid: boxes of neighbouring points whose effects are chosen together.
 
-    The points of a tile share the values of all strings and sizes.
+    The points of a tile have equal text parameters, and equal
+    :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the FFT size.
     """
 
     def __init__(self, grid: ParameterBlockGrid) -> None:
@@ -199,7 +203,7 @@ class TileGrid(BlockGrid):
         return tiles, tile_index.ravel()
 
     def group_tiles(self, tiles: np.ndarray, stride: int = 1) -> Iterator[TileGroup]:
-        """Yield groups of tiles that share strings and sizes, with the parameters of their points.
+        """Yield the groups of tiles that can be planned together, with their points' parameters.
 
         With a ``stride`` n the parameters are those of every n-th point along each axis, and of the
         point with the largest value of each parameter.
@@ -221,7 +225,8 @@ class TileGrid(BlockGrid):
     def _is_constant_in_tile(self, axis: int) -> bool:
         """Return True if an axis must have a single value within a tile.
 
-        It then varies a string or a size, such as the FFT size.
+        Such an axis varies a text parameter or a :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the
+        FFT size.
         """
         return any(
             values.dtype.kind in "UO"
@@ -373,7 +378,7 @@ class EffectPlanner:
             remaining = np.concatenate(unsettled) if unsettled else remaining[:0]
 
     def _plan_group(self, tile_group: TileGroup) -> EffectPlan:
-        """Return the choice of effects for tiles that share the values of all strings and sizes."""
+        """Return the choice of effects for the tiles of a group."""
         from sweep.model.effects.planning import plan_effects
 
         parameters, n_tiles = tile_group.parameters, len(tile_group.requested_indices)
@@ -506,8 +511,8 @@ class GridStudy(ExtendableStudy):
     ) -> Results:
         """Compute a block. Points that the model does not support get fill values.
 
-        Points in `checkpoint_results` are not computed again, or continued. `UnfinishedBlock` is
-        raised at the deadline.
+        Finished points in `checkpoint_results` are not computed again; unfinished points are
+        continued. `UnfinishedBlock` is raised at the deadline.
         """
         selected_effects = self.effect_planner.select_for_block(block)
         reused = self._read_reused_results(block, selected_effects)
@@ -552,7 +557,7 @@ class GridStudy(ExtendableStudy):
         return self.evaluate(block, checkpoint_results, deadline)
 
     def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
-        """Return the results of a block in the smaller study: final results, or first draws."""
+        """Return the smaller study's results of a block's points: final results, or first draws."""
         if (reuse_source := self.reuse_source) is None:
             return EarlierResults()
         parts = []
@@ -850,7 +855,7 @@ def zero_running_sums(spec: GridSpec, n_points: int) -> Results:
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:
-    """Return a copy of the spec in which no point has more than `draws_max` draws."""
+    """Return a copy of the spec that makes at most `draws_max` draws of a point."""
     draw_counts = {
         "number": min(spec.draws.number, draws_max),
         "limit": min(spec.draws.limit, draws_max),

@@ -356,7 +356,7 @@ class AccuracyRow:
 def accuracy_rows_of_draws(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row of errors for each probability whose accuracy the tolerance promises.
+    """Return a row of errors for each probability whose error the tolerance bounds.
 
     The result is empty without draws or results.
     """

@@ -374,8 +374,8 @@ def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
 def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
     """Restore damaged objects of the template, each in one step. Return their names.
 
-    The template is all that is older than any result. The caller holds the store's lock. StoreError
-    is raised if this machine can't make the same objects.
+    The template is everything that the store contained before the first result. The caller holds
+    the store's lock. StoreError is raised if this machine can't make the same objects.
     """
     study_store.refuse_links(store_path)
     try:
