@@ -1083,4 +1083,4 @@ def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
 
 def _smallest_value_text(rule: Rule) -> str:
     """Return the smallest value of a field, as a user would write it."""
-    return rule.bounds.get("at_least", "0") if isinstance(rule, NumericRule) else "0"
+    return rule.bound_texts.get("at_least", "0") if isinstance(rule, NumericRule) else "0"

@@ -236,14 +236,16 @@ def detect_with_leakage(
         ),
         float(clearance),
     )
-    tolerance_left = limits.tolerance - _leakage_bound_beyond(
+    tolerance_left = limits.tolerance - _far_false_alarm_bound(
         far_weight, distance_min, image_distance, brightest_limits, envelope
     )
     if tolerance_left < 0.0 or crossing_distance > clearance:
         n_sources = compute_sources(
             bundle, float(clearance), SOURCE_LOG_ACCURACY, layout, workspace.field
         )
-        far_weight = far_line_weight(weight_sum, n_sources, layout, workspace.field.sources)
+        far_weight = far_line_weight(
+            weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
+        )
         crossing_distance = max(
             distance_below_level_with_images(
                 brightest_limits.threshold, far_weight, seen, envelope, layout
@@ -251,14 +253,14 @@ def detect_with_leakage(
             float(clearance),
         )
         distance_min = min(crossing_distance, float(clearance + nyquist_bin))
-        tolerance_left = limits.tolerance - _leakage_bound_beyond(
+        tolerance_left = limits.tolerance - _far_false_alarm_bound(
             far_weight, distance_min, image_distance, brightest_limits, envelope
         )
         while (
             tolerance_left < 0.0 and distance_min < layout.table_bins
         ):  # bins of the table take less time than an integral
             distance_min = min(1.25 * distance_min, float(layout.table_bins))
-            tolerance_left = limits.tolerance - _leakage_bound_beyond(
+            tolerance_left = limits.tolerance - _far_false_alarm_bound(
                 far_weight, distance_min, image_distance, brightest_limits, envelope
             )
     # Wide enough if the integral may be left out, else a first guess.
@@ -624,7 +626,7 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, envelope):
+def _far_false_alarm_bound(weight_sum, distance_min, image_distance, limits, envelope):
     """Bound the probability of false alarms by leaked signal in all bins far from the lines.
 
     The bins are ``distance_min`` or more bins away from the lines.
@@ -986,7 +988,7 @@ def _fill_far_powers(
                 ZERO,
                 n_points,
                 ZERO,
-                field.sources,
+                field.far_equivalent_lines,
                 source,
                 log_accuracy + END_POLYNOMIAL_EXTRA_LOG_ACCURACY,
                 shape.ends,
