@@ -367,7 +367,7 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
     ) + _closed_form_sentences(settings)
-    conclusions.append(_reference_sentence(attributes))
+    conclusions.append(_reference_sentences(attributes))
     notes = attributes["notes"]  # a list in stores of earlier versions
     notes = notes.splitlines() if isinstance(notes, str) else notes
     conclusions += [note[0].upper() + note[1:] + "." for note in notes]
@@ -541,7 +541,7 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
     return [text + (f" Speed-up over improved versions: {improved_text}." if improved_text else "")]
 
 
-def _reference_sentence(attributes: dict) -> str:
+def _reference_sentences(attributes: dict) -> str:
     """Return sentences that name the reference setting and its error against the time domain."""
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:

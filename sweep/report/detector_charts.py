@@ -405,13 +405,13 @@ REPORTED_PD_LEVEL = 0.9
 The report also counts the points that reach it.
 """
 
-UNBROKEN_LABEL = "kept all the way"
+UNBROKEN_RANGE_LABEL = "kept all the way"
 """Label, in charts and tables, of one kind of maximum range.
 
 Up to this range pd is at least the chosen level without interruption.
 """
 
-LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
+LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_RANGE_LABEL: "unbroken", "reached at all": "farthest"}
 """Variables of :func:`.detection_limits.limit` with the two kinds of maximum range, by label."""
 
 INTERVAL_END_LABELS = {"low": "lower end", "high": "upper end"}

@@ -205,7 +205,7 @@ def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions)
     attributes, study = _read_resumable_study(working_path)
     if spec is not None:
         refuse_other_study(working_path, attributes, study.spec, spec)
-    _refuse_altered_store(working_path, attributes, study)
+    _refuse_unresumable_store(working_path, attributes, study)
     _check_user_functions(study.spec)
     if spec is None:
         refuse_damaged_recipe(working_path)
@@ -276,7 +276,7 @@ def extend(
     target_spec = apply_changes(source_study.spec if spec is None else spec, changes or {})
     _check_user_functions(target_spec)
     backend = _make_backend(run_options, target_spec)
-    _refuse_altered_store(source_path, attributes, source_study)
+    _refuse_unresumable_store(source_path, attributes, source_study)
     if target_spec.id == attributes["study_id"]:
         backend.progress.say(f"nothing to extend: {source_path} holds this very study")
         return _compute_missing_blocks(source_path, source_study, backend)
@@ -350,7 +350,7 @@ def _read_resumable_study(
     return attributes, study
 
 
-def _refuse_altered_store(
+def _refuse_unresumable_store(
     store_path: Location, attributes: dict[str, Any], study: GridStudy | FlightStudy
 ) -> None:
     """Raise a StoreError if a store can't be continued by this software.
@@ -431,7 +431,7 @@ def _compute_into_path(
         elif already_exists:
             stored_attributes, stored_study = _read_resumable_study(working_path)
             refuse_other_study(working_path, stored_attributes, stored_study.spec, spec)
-            _refuse_altered_store(working_path, stored_attributes, stored_study)
+            _refuse_unresumable_store(working_path, stored_attributes, stored_study)
             write_recipe(working_path, **read_recipe(working_path) | recipe)
         if isinstance(spec, SceneSpec) and (from_scratch or not already_exists):
             with show_activity("building the scene", backend.progress):

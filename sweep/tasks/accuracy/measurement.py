@@ -175,7 +175,7 @@ def measure_accuracy(
             measured_template = AccuracyMeasurement(
                 sample, time_limit=time_limit, progress=listener, interrupts=interrupts
             ).run()
-        except NothingMeasured:
+        except NoMeasurementError:
             return False
     measured_template.storing_seconds = measure_storing_seconds(make_study(spec, store_path))
     _refuse_occupied_path(store_path, overwrite)  # another process may have written to it
@@ -223,7 +223,7 @@ def measure_storing_seconds(study: BlockStudy) -> float:
         )
 
 
-class NothingMeasured(Exception):
+class NoMeasurementError(Exception):
     """Exception raised if the measurement is interrupted before any point has all its results."""
 
 
@@ -256,7 +256,7 @@ class AccuracyMeasurement:
     def run(self) -> AccuracyTemplate:
         """Run as many rounds as the time limit allows. Return the content of the store.
 
-        NothingMeasured is raised if the run is interrupted before any point is complete.
+        NoMeasurementError is raised if the run is interrupted before any point is complete.
         """
         n_settings = len(self._settings)
         self._progress.say(
@@ -281,7 +281,7 @@ class AccuracyMeasurement:
             "",
         )
         if not first_round:
-            raise NothingMeasured
+            raise NoMeasurementError
         if len(first_round) < len(parts):
             stop_reason = "interrupted" if self._interrupts.is_stopping else "time limit"
         parts = parts[: len(first_round)]
@@ -381,7 +381,7 @@ class AccuracyMeasurement:
         """Compute a part of the sample with one setting. Return the wall time that it took [s]."""
         start = time.monotonic()
         if self._interrupts.is_stopping:
-            raise NothingMeasured
+            raise NoMeasurementError
         self._try_setting(setting_number, part)
         self._sample.clear_caches()
         return time.monotonic() - start
@@ -496,7 +496,7 @@ ERROR_ARRAY_LONG_NAMES = {
 The first four are in the order of :func:`result_differences`.
 """
 
-N_PROMISED_ERRORS = 3
+N_ERRORS_BOUNDED_BY_TOLERANCE = 3
 """Number of arrays of errors that the tolerance bounds: the first ones of `ERROR_ARRAY_LONG_NAMES`.
 """
 

@@ -415,7 +415,7 @@ class GridSample(StudySample):
         study = self.study_with_setting(setting)
         for rows, effect_names in SelectedEffects(
             effect_flags, np.zeros(effect_flags.size)
-        ).iter_equal_groups():
+        ).iter_groups_by_effects():
             parameters = study.grid.parameters_at(point_indices[rows])
             if find_peaks is None:
                 yield rows, evaluate_points(study.spec, parameters, rows.size, effect_names)

@@ -57,7 +57,7 @@ class ExtendableStudy(BlockStudy):
         reuse_source = self.reuse_source
         return reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0
 
-    def count_reusable_points(self, block: int) -> int:
+    def count_reusable_points_of_block(self, block: int) -> int:
         """Count the points of a block that the smaller study's store has, damaged or not."""
         shared = self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
         return (

@@ -478,7 +478,7 @@ class FlightStudy(ExtendableStudy):
         """
         for members, effect_names, effect_flags in selected_effects.subset(
             rows
-        ).iter_joint_groups():
+        ).iter_groups_computed_together():
             group_rows, simulate_group = rows[members], partial(simulate_cloud, effect_names)
             results = simulate_group(
                 eyepoints.select(group_rows), shot_numbers[group_rows], effect_flags

@@ -135,7 +135,7 @@ class SelectedEffects(NamedTuple):
         """Return the effects of some of the points."""
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
-    def iter_equal_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
+    def iter_groups_by_effects(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
         """Yield indices (m,) of points with the same simulated effects, and the names of these."""
         for group_flags in np.unique(self.effect_flags):
             yield (
@@ -143,7 +143,9 @@ class SelectedEffects(NamedTuple):
                 unpack_effect_flags(int(group_flags)),
             )
 
-    def iter_joint_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
+    def iter_groups_computed_together(
+        self,
+    ) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
         """Yield groups of points that are computed together though their effects may differ.
 
         A group has the indices (m,) of its points, the names of all their effects, and one flag per
@@ -593,7 +595,7 @@ class GridStudy(ExtendableStudy):
             else EarlierResults(unfinished=reused)
         )
 
-    def count_reusable_points(self, block: int) -> int:
+    def count_reusable_points_of_block(self, block: int) -> int:
         """Count the points of a block that the smaller study has with the same effects."""
         if (reuse_source := self.reuse_source) is None:
             return 0
@@ -683,7 +685,7 @@ def iter_block_results(
     finished, points_per_call = [checkpoint_results.finished], _points_per_call(spec)
     pending = deque(
         (effects, local_indices)
-        for members, effects in selected_effects.subset(order).iter_equal_groups()
+        for members, effects in selected_effects.subset(order).iter_groups_by_effects()
         for local_indices in np.split(
             order[members], range(points_per_call, len(members), points_per_call)
         )

@@ -139,7 +139,7 @@ def count_unsupported_points(
 def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) -> str:
     """Return the reason why the model does not support one point of a block, as text."""
     ((_, effects),) = (
-        study.effect_planner.select_for_block(block).subset(local_index).iter_equal_groups()
+        study.effect_planner.select_for_block(block).subset(local_index).iter_groups_by_effects()
     )
     try:
         parameters = select_parameters(study.grid.parameters_of_block(block), local_index)

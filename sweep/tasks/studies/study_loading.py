@@ -310,7 +310,7 @@ def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
     n_points_there, remark = study.count_points_in_blocks(is_done), ""
     if study.reuse_source is not None:
         n_points_there += sum(
-            study.count_reusable_points(int(block)) for block in np.flatnonzero(~is_done)
+            study.count_reusable_points_of_block(int(block)) for block in np.flatnonzero(~is_done)
         )
         remark = study.reuse_source.reuse_remark()
     count_text = f"{n_points_there:,} of {study.n_points:,} {study.points_noun} are there; "

@@ -267,7 +267,7 @@ def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tu
     parameters = study.grid.parameters_of_block(block)
     for members, effects in study.effect_planner.select_for_block(
         block, local_indices
-    ).iter_equal_groups():
+    ).iter_groups_by_effects():
         group_parameters = select_parameters(parameters, local_indices[members])
         draws_max = TIMED_SPECTRA_MAX if spec.draws.draws_whole_spectra else TIMED_DRAWS_MAX
         extrapolated_seconds += time_points(
