@@ -769,8 +769,8 @@ class SceneSpec(BaseSpec):
     def unstated_error_sentences(self) -> list[str]:
         """Return sentences about errors whose size the spec does not state.
 
-        They concern the error floor that comes with the instrument, the drift of lines within a
-        record, and errors that navigation does not know of.
+        The sentences concern an error floor that comes with the instrument or is missing, the drift
+        of lines within a record, and relief that navigation does not take into account.
         """
         sentences = []
         floor_values, rules = (

@@ -150,7 +150,7 @@ class SettledLeakage(NamedTuple):
 
 
 class EnvelopeBeyond(NamedTuple):
-    """Bounds on a line's spectrum at all distances above a given one. The line has amplitude 1."""
+    """Bounds on the spectrum of a line of amplitude 1, at all distances from a given one on."""
 
     magnitude: float
     """Largest magnitude of the line's spectrum."""

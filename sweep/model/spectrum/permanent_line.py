@@ -233,7 +233,9 @@ def raised_magnitude(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return the magnitude of an echo that alone crosses the threshold as often as with the line.
+    """Return the magnitude of one echo that replaces an echo together with the permanent line.
+
+    An echo of this magnitude alone crosses the threshold as often as the given echo with the line.
 
     Parameters
     ----------

@@ -134,7 +134,7 @@ def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
 
 
 def nan_results(n_points: int) -> SampleResults:
-    """Return results of `n` points that are all nan."""
+    """Return the results of n_points points, all of them nan."""
     shapes = (
         (n_points, 4),
         (n_points, 2),
@@ -444,9 +444,10 @@ class GridSample(StudySample):
 class FlightSample(StudySample):
     """Sample of the shots of a flight, in complete tiles (runs of consecutive shots).
 
-    Tiles are complete because effects are planned tile by tile. The time includes rays, plans,
-    spectra and probabilities. Draws, points and navigation take the same time whatever the
-    accuracy. `point_indices` are indices of shots within the sample.
+    Tiles are complete because effects are planned tile by tile. The measured time
+    includes rays, plans, spectra and probabilities. Draws, points and navigation are left out,
+    because they take the same time whatever the accuracy. `point_indices` are indices of shots
+    within the sample.
     """
 
     points_noun = "shots"

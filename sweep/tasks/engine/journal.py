@@ -576,7 +576,7 @@ class LockHolder:
 def _machine_id() -> str:
     """Return a text that identifies the machine's boot and the process's namespace; '' if unknown.
 
-    Process numbers are unique within both.
+    A process number is unique only among the processes with the same text.
     """
     try:
         boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()

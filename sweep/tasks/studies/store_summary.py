@@ -65,7 +65,7 @@ class DetectionRow:
 
     @classmethod
     def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
-        """Return the row for n points. Arrays of the Doppler segment may be missing."""
+        """Return the row for n points; ``pd_doppler`` may be nan, as without a Doppler segment."""
         is_computed = ~np.isnan(pd_shot)
         pd_shot, pd_doppler = (
             pd_shot[is_computed],
