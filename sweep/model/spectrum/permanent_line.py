@@ -225,7 +225,7 @@ def line_bin_masks(
     return is_masked, is_searched, is_searched & ~is_masked & (magnitude_max >= floor * noise_sigma)
 
 
-def raised_magnitude(
+def equivalent_echo_magnitude(
     echo_magnitude: np.ndarray,
     line_rms: np.ndarray,
     *,
@@ -330,20 +330,20 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
             shots, int(bin_spans.point_numbers[i]), segment_index, peak_frequency
         )
         skirt_rms = np.where(is_masked[bins], 0.0, skirt_half_amplitude * line.magnitude_rms[bins])
-        raised_magnitudes = raised_magnitude(
+        equivalent_magnitudes = equivalent_echo_magnitude(
             bin_spans.magnitudes[bin_slice],
             skirt_rms,
             noise_sigma=line_noise_sigma[i],
             threshold=threshold[i],
             in_speckle=shots.speckle.segment_correlations is not None,
         )
-        raised_magnitudes[is_masked[bins]] = 0.0
-        magnitudes[bin_slice] = raised_magnitudes
+        equivalent_magnitudes[is_masked[bins]] = 0.0
+        magnitudes[bin_slice] = equivalent_magnitudes
         if is_masked[bins[peak]]:
             pd[segment_index, i], miss[segment_index, i] = 0.0, 1.0
         else:
             pd[segment_index, i], miss[segment_index, i] = pd_and_miss(
-                EchoBins(raised_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
+                EchoBins(equivalent_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
                 peak,
                 rule,
                 bin_threshold_at(shots.bin_thresholds, bin_spans.point_numbers[i]),
