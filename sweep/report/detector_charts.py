@@ -532,12 +532,12 @@ def _maximum_range_selection(
     if indices.size < dataset.sizes[dim]:
         dataset = dataset.isel({dim: indices})
     max_range = dataset.sweep.maximum_range(REPORTED_PD_LEVEL)
-    converted = {
+    converted_arrays = {
         str(variable): (array * unit_factor).assign_attrs(array.attrs)
         for variable, array in max_range.data_vars.items()
         if not str(variable).endswith("reason")
     }
-    return PointSelection.from_dataset(max_range.assign(converted))
+    return PointSelection.from_dataset(max_range.assign(converted_arrays))
 
 
 def _choose_x_coordinate(results: GridResults, points: PointSelection) -> str:

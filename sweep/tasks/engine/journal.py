@@ -822,8 +822,12 @@ class _ObjectLock:
 
     def read_holder_json(self) -> str | None:
         """Return the JSON text of the holder; None if the lock is free."""
-        tagged = self._read_content_and_version()
-        return _holder_json_of_content(tagged[0]) if tagged and tagged[0] else None
+        content_and_version = self._read_content_and_version()
+        return (
+            _holder_json_of_content(content_and_version[0])
+            if content_and_version and content_and_version[0]
+            else None
+        )
 
     def _read_content_and_version(self) -> tuple[bytes, ObjectVersion] | None:
         """Return the content of the lock and its version, read once more if it is incomplete.
@@ -832,32 +836,38 @@ class _ObjectLock:
         raised if it is incomplete twice.
         """
         for _ in range(2):
-            tagged = self._lock_path.read_with_version()
-            if tagged is None or tagged[0].count(b"\n") == 2 or not tagged[0]:
-                return tagged
-        if tagged:
-            self._lock_path.refuse_truncated_content(tagged[0])
-        return tagged
+            content_and_version = self._lock_path.read_with_version()
+            if (
+                content_and_version is None
+                or content_and_version[0].count(b"\n") == 2
+                or not content_and_version[0]
+            ):
+                return content_and_version
+        if content_and_version:
+            self._lock_path.refuse_truncated_content(content_and_version[0])
+        return content_and_version
 
     def heartbeat_version(self) -> object:
         """Return a value that changes with every heartbeat; None if there is no lock."""
-        tagged = self._read_content_and_version()
-        return tagged and tagged[0]
+        content_and_version = self._read_content_and_version()
+        return content_and_version and content_and_version[0]
 
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
         """Acquire the lock for a holder; `check_holder` raises if the present holder lives."""
         for _ in range(LOCK_ATTEMPTS_MAX):
-            tagged = self._read_content_and_version()
+            content_and_version = self._read_content_and_version()
             if (
-                tagged and _holder_json_of_content(tagged[0]) == holder_json
+                content_and_version
+                and _holder_json_of_content(content_and_version[0]) == holder_json
             ):  # put, but the response was lost
-                self._holder_json, self._tag = holder_json, tagged[1]
+                self._holder_json, self._tag = holder_json, content_and_version[1]
                 return
             check_holder()
             tag = self._lock_path.put_if_unchanged(
-                f"{holder_json}\n0\n".encode(), tagged[1] if tagged else None
+                f"{holder_json}\n0\n".encode(),
+                content_and_version[1] if content_and_version else None,
             )
             if tag is not None:
                 self._holder_json, self._tag = holder_json, tag
@@ -877,9 +887,12 @@ class _ObjectLock:
         """Replace the content of the lock, if this process still holds it."""
         tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
         if tag is None:
-            tagged = self._read_content_and_version()
-            if tagged and _holder_json_of_content(tagged[0]) == self._holder_json:
-                tag = self._lock_path.put_if_unchanged(content.encode(), tagged[1])
+            content_and_version = self._read_content_and_version()
+            if (
+                content_and_version
+                and _holder_json_of_content(content_and_version[0]) == self._holder_json
+            ):
+                tag = self._lock_path.put_if_unchanged(content.encode(), content_and_version[1])
         if tag is not None:
             self._tag = tag
 

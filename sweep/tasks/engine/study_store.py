@@ -501,8 +501,8 @@ def find_template_damages(store_path: Location) -> list[Damage]:
         for line_number, record_or_none in enumerate(records, 1)
         if record_or_none is None
     ]
-    undamaged = [record for record in records if record]
-    if not problems and undamaged[0].get("objects") != len(undamaged) - 1:
+    undamaged_records = [record for record in records if record]
+    if not problems and undamaged_records[0].get("objects") != len(undamaged_records) - 1:
         problems.append(Damage(MANIFEST_PATH, "lacks lines", repaired_by="repair"))
     return problems + [
         Damage(name, problem, repaired_by="repair")

@@ -38,9 +38,9 @@ def allow_modules(modules: Iterable[str]) -> None:
                 f"{module!r} is no name of a Python module, as a spec has it before the "
                 f"colon{suggestion_text}"
             )
-    allowed = {*allowed_modules(), *modules}
-    if allowed:
-        os.environ[ALLOWED_MODULES_VARIABLE] = ",".join(sorted(allowed))
+    module_names = {*allowed_modules(), *modules}
+    if module_names:
+        os.environ[ALLOWED_MODULES_VARIABLE] = ",".join(sorted(module_names))
         _import_from_working_directory()  # spawned workers inherit the search path
 
 
@@ -77,12 +77,12 @@ def allow_identical_module(module: str, digest: str) -> None:
     not change with its file.
     """
     allow_modules([module])
-    imported = import_user_module(module)
-    local_digest = _module_file_digest(imported)
+    imported_module = import_user_module(module)
+    local_digest = _module_file_digest(imported_module)
     if digest and local_digest != digest:
         raise CodeError(
             f"the module {module} is not the same file on {socket.gethostname()} "
-            f"({getattr(imported, '__file__', None)}) as where the run was started: "
+            f"({getattr(imported_module, '__file__', None)}) as where the run was started: "
             "put the same file on all machines"
         )
 

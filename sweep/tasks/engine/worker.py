@@ -351,7 +351,7 @@ class BlockQueue:
         self._untried = _iter_false_indices(is_done)
         self._failed_once: deque[int] = deque()
         self._requeued: deque[int] = deque()
-        self.failed: set[int] = set()
+        self.failed_blocks: set[int] = set()
 
     def take_blocks(self, count: int, *, include_failed: bool = True) -> list[int]:
         """Remove up to `count` blocks from the queue, for one task.
@@ -369,9 +369,9 @@ class BlockQueue:
 
     def requeue_failed(self, block: int) -> bool:
         """Put a failed block back. Return False, and drop it, at its second failure."""
-        if block in self.failed:
+        if block in self.failed_blocks:
             return False
-        self.failed.add(block)
+        self.failed_blocks.add(block)
         self._failed_once.append(block)
         return True
 
@@ -381,7 +381,7 @@ class BlockQueue:
         A block that failed before is still taken alone.
         """
         for block in blocks:
-            (self._failed_once if block in self.failed else self._requeued).append(block)
+            (self._failed_once if block in self.failed_blocks else self._requeued).append(block)
 
 
 def _iter_false_indices(mask: np.ndarray, step: int = 1 << 16) -> Iterator[int]:

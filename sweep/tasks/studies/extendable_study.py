@@ -59,8 +59,10 @@ class ExtendableStudy(BlockStudy):
 
     def count_reusable_points_of_block(self, block: int) -> int:
         """Count the points of a block that the smaller study's store has, damaged or not."""
-        shared = self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
+        shared_point_groups = (
+            self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
+        )
         return (
-            sum(shared_points.local_indices.size for shared_points in shared)
+            sum(shared_points.local_indices.size for shared_points in shared_point_groups)
             * self.locate_in_grid(block)[0].fine_steps
         )

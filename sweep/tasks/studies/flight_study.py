@@ -357,9 +357,11 @@ class FlightStudy(ExtendableStudy):
             EFFECTS_ARRAY: selected_effects.effect_flags,
             EFFECTS_ERROR_ARRAY: selected_effects.error_bound,
         }
-        reused = self._read_reused_cloud(block, selected_effects) if self.reuse_source else None
+        reused_cloud = (
+            self._read_reused_cloud(block, selected_effects) if self.reuse_source else None
+        )
         results |= self.simulate_shots(
-            flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers, reused
+            flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers, reused_cloud
         )
         chunks = {}
         for name in self.chunk_positions(block):
@@ -406,7 +408,7 @@ class FlightStudy(ExtendableStudy):
             self.parameters_at(flight_block),
             self.surfaces,
             modes=self.spec.effect_modes(),
-            rotating=self.spec.has_rotating_bodies,
+            has_rotating_bodies=self.spec.has_rotating_bodies,
             rays_by_tolerance=self.spec.is_ray_number_set_by_tolerance,
         )
 
@@ -417,15 +419,15 @@ class FlightStudy(ExtendableStudy):
         eyepoints: Eyepoints,
         selected_effects: SelectedEffects,
         shot_numbers: np.ndarray,
-        reused: ReusedCloud | None = None,
+        reused_cloud: ReusedCloud | None = None,
     ) -> Results:
         """Simulate radiometry, draws and navigation of shots that make complete measurement cycles.
 
-        Results that are ``reused`` are not simulated again.
+        Results that are ``reused_cloud`` holds are not simulated again.
         """
         scanner_grid = self.scanner_grids[flight_block.scanner]
         n_draws, shots_per_cycle = len(flight_block.draws), scanner_grid.shots_per_cycle
-        is_reused, results = reused or self._empty_cloud(
+        is_reused, results = reused_cloud or self._empty_cloud(
             scanner_grid, selected_effects.effect_flags.size, n_draws
         )
         for rows, draw_slice in _iter_missing_draws(~is_reused):
@@ -593,15 +595,15 @@ class FlightStudy(ExtendableStudy):
             self.locate_flight_block(block),
         )
         shots_per_cycle = scanner_grid.shots_per_cycle
-        is_reused, results = reused = self._empty_cloud(
+        is_reused, results = reused_cloud = self._empty_cloud(
             scanner_grid, selected_effects.effect_flags.size, len(flight_block.draws)
         )
-        for shared in reuse_source.iter_shared_points(block):
+        for shared_points in reuse_source.iter_shared_points(block):
             first_draw_results, block_results = (
                 reuse_source.read_block(source_block)
                 for source_block in (
-                    reuse_source.source_study.first_draw_block(shared.source_block),
-                    shared.source_block,
+                    reuse_source.source_study.first_draw_block(shared_points.source_block),
+                    shared_points.source_block,
                 )
             )
             if first_draw_results is None or block_results is None:
@@ -616,9 +618,10 @@ class FlightStudy(ExtendableStudy):
                 if name not in GEOMETRY_OUTPUTS
             }
             (draw_index, cycle_index), (source_draw, source_cycle) = (
-                np.divmod(shared.local_indices, len(flight_block.cycles)),
+                np.divmod(shared_points.local_indices, len(flight_block.cycles)),
                 np.divmod(
-                    shared.source_local_indices, len(source_results["flags"]) // shots_per_cycle
+                    shared_points.source_local_indices,
+                    len(source_results["flags"]) // shots_per_cycle,
                 ),
             )
             shot_rows, source_rows = (
@@ -645,7 +648,7 @@ class FlightStudy(ExtendableStudy):
                 }
                 _insert_results(results, cycle_index, draw_index, part_results)
         reuse_source.reused_points_by_block[block] = int(is_reused.sum())
-        return reused
+        return reused_cloud
 
     def parameters_at(self, flight_block: FlightBlock) -> Mapping[str, Any]:
         """Return the SI values of all parameters at a block's point of the axes, by dotted path."""
@@ -663,19 +666,26 @@ class FlightStudy(ExtendableStudy):
         """Standard deviations of instrument errors that do not decrease with a stronger echo."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
-        stated = self.spec.error_floor
+        floor_section = self.spec.error_floor
         return ErrorFloor(
-            stated.pointing_error, stated.clock_error, stated.wavelength_error, stated.vibration,
-            stated.range_noise,
-        )  # fmt: skip
+            floor_section.pointing_error,
+            floor_section.clock_error,
+            floor_section.wavelength_error,
+            floor_section.vibration,
+            floor_section.range_noise,
+        )
 
     @cached_property
     def motion_priors(self) -> MotionPriors:
         """Standard deviations, from the spec, of motion that the instrument does not measure."""
         from sweep.model.pointcloud.ego_motion import MotionPriors
 
-        stated = self.spec.navigation
-        return MotionPriors(stated.terrain_slope, stated.target_speed, stated.target_acceleration)
+        navigation_section = self.spec.navigation
+        return MotionPriors(
+            navigation_section.terrain_slope,
+            navigation_section.target_speed,
+            navigation_section.target_acceleration,
+        )
 
     @cached_property
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
@@ -775,7 +785,7 @@ def plan_shot_effects(
     surfaces: Sequence[SurfaceMaterial],
     *,
     modes: Mapping[str, str],
-    rotating: bool,
+    has_rotating_bodies: bool,
     rays_by_tolerance: bool = False,
 ) -> ShotEffectPlan | None:
     """Choose the effects of a flight's shots at one point of the axes.
@@ -796,7 +806,9 @@ def plan_shot_effects(
     shots, ground = parameters_and_ground_of_eyepoints(
         hitting_eyepoints, PARAMETER_DEFAULTS | dict(parameters), surfaces
     )
-    points = PlannerInputs(shots, extent_of_ray_traced_ground(ground), has_rotating_body=rotating)
+    points = PlannerInputs(
+        shots, extent_of_ray_traced_ground(ground), has_rotating_body=has_rotating_bodies
+    )
 
     def max_per_tile(values: np.ndarray) -> np.ndarray:
         return np.maximum.reduceat(

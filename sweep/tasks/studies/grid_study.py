@@ -358,13 +358,13 @@ class EffectPlanner:
             ),
             1,
         )
-        remaining = np.arange(len(tiles))
+        remaining_tiles = np.arange(len(tiles))
         for stride in (preview_stride, 1) if preview_stride > 1 else (1,):
             points_per_tile = math.prod(-(-tile_length // stride) for tile_length in tile_lengths)
             tiles_per_plan = max(POINTS_PER_PLAN_MAX // points_per_tile, 1)
-            unsettled = []
-            for start in range(0, len(remaining), tiles_per_plan):
-                batch = remaining[start : start + tiles_per_plan]
+            unsettled_tiles = []
+            for start in range(0, len(remaining_tiles), tiles_per_plan):
+                batch = remaining_tiles[start : start + tiles_per_plan]
                 for tile_group in self.tiles.group_tiles(tiles[batch], stride):
                     plan = self._plan_group(tile_group)
                     is_settled = (
@@ -376,8 +376,10 @@ class EffectPlanner:
                             batch[tile_group.requested_indices[is_settled]],
                             plan.select(is_settled),
                         )
-                    unsettled.append(batch[tile_group.requested_indices[~is_settled]])
-            remaining = np.concatenate(unsettled) if unsettled else remaining[:0]
+                    unsettled_tiles.append(batch[tile_group.requested_indices[~is_settled]])
+            remaining_tiles = (
+                np.concatenate(unsettled_tiles) if unsettled_tiles else remaining_tiles[:0]
+            )
 
     def _plan_group(self, tile_group: TileGroup) -> EffectPlan:
         """Return the choice of effects for the tiles of a group."""
@@ -517,7 +519,7 @@ class GridStudy(ExtendableStudy):
         continued. `UnfinishedBlock` is raised at the deadline.
         """
         selected_effects = self.effect_planner.select_for_block(block)
-        reused = self._read_reused_results(block, selected_effects)
+        reused_results = self._read_reused_results(block, selected_effects)
         extent, n_points = self.grid.actual_block_shape(block), self.grid.count_block_points(block)
         results = {
             name: np.full((n_points, *layout.shape[len(extent) :]), layout.fill_value, layout.dtype)
@@ -532,12 +534,12 @@ class GridStudy(ExtendableStudy):
             self.grid,
             block,
             selected_effects,
-            reused,
+            reused_results,
             checkpoint_results,
             deadline or Deadline(),
         )
         for local_indices, part_results in (
-            reused.finished,
+            reused_results.finished,
             checkpoint_results.finished,
             *computed,
         ):
@@ -563,36 +565,36 @@ class GridStudy(ExtendableStudy):
         if (reuse_source := self.reuse_source) is None:
             return EarlierResults()
         parts = []
-        for shared in reuse_source.iter_shared_points(block):
-            if (source_results := reuse_source.read_block(shared.source_block)) is None:
+        for shared_points in reuse_source.iter_shared_points(block):
+            if (source_results := reuse_source.read_block(shared_points.source_block)) is None:
                 continue
             n_axes, n_source_points = (
                 len(reuse_source.source_study.grids[0].shape),
-                reuse_source.source_study.count_block_points(shared.source_block),
+                reuse_source.source_study.count_block_points(shared_points.source_block),
             )
             has_same_effects = (
-                source_results[EFFECTS_ARRAY].ravel()[shared.source_local_indices]
-                == selected_effects.effect_flags[shared.local_indices]
+                source_results[EFFECTS_ARRAY].ravel()[shared_points.source_local_indices]
+                == selected_effects.effect_flags[shared_points.local_indices]
             )
             results = {
                 name: values.reshape(n_source_points, *values.shape[n_axes:])[
-                    shared.source_local_indices[has_same_effects]
+                    shared_points.source_local_indices[has_same_effects]
                 ]
                 for name, values in source_results.items()
                 if name not in (EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY)
             }
-            parts.append(PartialResults(shared.local_indices[has_same_effects], results))
+            parts.append(PartialResults(shared_points.local_indices[has_same_effects], results))
         local_indices, results = concatenate_results(parts)
-        reused = PartialResults(
+        reused_results = PartialResults(
             local_indices, zero_running_sums(self.spec, local_indices.size) | results
         )
         reuse_source.reused_points_by_block[block] = (
             local_indices.size if reuse_source.has_final_results else 0
         )
         return (
-            EarlierResults(finished=reused)
+            EarlierResults(finished=reused_results)
             if reuse_source.has_final_results
-            else EarlierResults(unfinished=reused)
+            else EarlierResults(unfinished=reused_results)
         )
 
     def count_reusable_points_of_block(self, block: int) -> int:
@@ -600,13 +602,13 @@ class GridStudy(ExtendableStudy):
         if (reuse_source := self.reuse_source) is None:
             return 0
         selected_effects, n_reusable = self.effect_planner.select_for_block(block), 0
-        for shared in reuse_source.iter_shared_points(block):
+        for shared_points in reuse_source.iter_shared_points(block):
             with suppress(*CHUNK_READ_ERRORS):
-                flags = reuse_source.read_chunk(EFFECTS_ARRAY, shared.source_block).ravel()
+                flags = reuse_source.read_chunk(EFFECTS_ARRAY, shared_points.source_block).ravel()
                 n_reusable += int(
                     np.sum(
-                        flags[shared.source_local_indices]
-                        == selected_effects.effect_flags[shared.local_indices]
+                        flags[shared_points.source_local_indices]
+                        == selected_effects.effect_flags[shared_points.local_indices]
                     )
                 )
         return n_reusable
@@ -666,20 +668,21 @@ def iter_block_results(
     grid: ParameterBlockGrid,
     block: int,
     selected_effects: SelectedEffects,
-    reused: EarlierResults,
+    reused_results: EarlierResults,
     checkpoint_results: EarlierResults,
     deadline: Deadline,
 ) -> Iterator[PartialResults]:
     """Yield the results of a block's points that are not done, in groups with the same effects.
 
-    Points in ``reused``, from another study, or in ``checkpoint_results``, from an earlier task,
-    are not computed again. `UnfinishedBlock` is raised at the deadline; a later call continues to
-    the same bits.
+    ``reused_results`` are from another study, ``checkpoint_results`` from an earlier task. Finished
+    points in them are not computed again, and unfinished points are continued. `UnfinishedBlock` is
+    raised at the deadline; a later call continues to the same bits.
     """
     parameters, order = grid.parameters_of_block(block), grid.geometry_order(block)
     order = order[
         ~np.isin(
-            order, [*reused.finished.local_indices, *checkpoint_results.finished.local_indices]
+            order,
+            [*reused_results.finished.local_indices, *checkpoint_results.finished.local_indices],
         )
     ]
     finished, points_per_call = [checkpoint_results.finished], _points_per_call(spec)
@@ -696,7 +699,7 @@ def iter_block_results(
             raise _make_unfinished_block(spec, finished, NO_RESULTS)
         is_resumed = np.isin(local_indices, checkpoint_results.unfinished.local_indices).any()
         prior_draws = extract_prior_draws(
-            spec, (checkpoint_results if is_resumed else reused).unfinished, local_indices
+            spec, (checkpoint_results if is_resumed else reused_results).unfinished, local_indices
         )
         subset = select_parameters(parameters, local_indices)
         try:

@@ -420,11 +420,11 @@ def refuse_not_larger_study(
         )
     obstacles = extension_obstacles(source_spec, target_spec)
     if obstacles:
-        listed = "\n".join(f"  {obstacle}" for obstacle in obstacles)
+        obstacle_lines = "\n".join(f"  {obstacle}" for obstacle in obstacles)
         scanners = " new scanners," if _scanner_names(target_spec) else ""
         raise StoreError(
             f"{source_path} can't be extended to this study (in the store -> asked "
-            f"for):\n{listed}\n"
+            f"for):\n{obstacle_lines}\n"
             f"A store is extended by values on axes, new axes,{scanners} more draws or a tighter "
             "accuracy.tolerance. Any other study needs a store of its own: "
             f"{suggested_call('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
@@ -508,12 +508,10 @@ def _lost_values_text(grid: ParameterGrid, path: str, indices: np.ndarray) -> st
         if path in axis_values:
             values = axis_values[path][np.unique(index)].tolist()
     value_texts = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
-    more = ["..."] if len(value_texts) > LOST_VALUES_LISTED_MAX else []
+    ellipsis_texts = ["..."] if len(value_texts) > LOST_VALUES_LISTED_MAX else []
     units = parameter_rules()[path].value_unit
-    return (
-        f"{path}: "
-        f"{', '.join(value_texts[:LOST_VALUES_LISTED_MAX] + more)}{f' {units}' if units else ''}"
-    )
+    values_text = ", ".join(value_texts[:LOST_VALUES_LISTED_MAX] + ellipsis_texts)
+    return f"{path}: {values_text}{f' {units}' if units else ''}"
 
 
 class AxisLookup(NamedTuple):

@@ -124,8 +124,8 @@ def _import_user_function(name: str) -> Callable[..., Any]:
         ) from None
     if not callable(function):
         raise CodeError(f"{name} is a {type(function).__name__}, and no function")
-    checked: Callable[..., Any] = function
-    return checked
+    user_function: Callable[..., Any] = function
+    return user_function
 
 
 def _read_only_view(array: np.ndarray) -> np.ndarray:
