@@ -235,12 +235,15 @@ def fastest_setting_within_error(
 
 
 class SettingComparison(NamedTuple):
-    """Adaptive setting (effects as needed) and another setting of comparable error."""
+    """Fastest adaptive setting, and another setting of comparable error.
+
+    An adaptive setting chooses the effects point by point.
+    """
 
     adaptive: MeasuredSetting
-    """Adaptive setting."""
+    """Setting that chooses the effects point by point."""
     other: MeasuredSetting | None
-    """Other setting; None if no other setting is accurate enough."""
+    """Setting with fixed effects, or of the thesis's method; None if none is accurate enough."""
 
     def speedup(self, extra_seconds: float = 0.0) -> float:
         """Return the time of the other setting over the time of the adaptive one.

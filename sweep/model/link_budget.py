@@ -120,7 +120,8 @@ class WaveformSettings:
     :attr:`chirp_rate`. They are numbers, or arrays if points differ.
     """
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """Frequency at the start of each segment [Hz], by which the echo's delay makes a phase."""
+    """Frequency at the start of each segment [Hz]. Times the echo's delay it gives the echo's phase
+    in cycles."""
     chirp_bandwidth: np.ndarray
     """Bandwidth of the up-chirp [Hz]."""
     chirp_duration: np.ndarray

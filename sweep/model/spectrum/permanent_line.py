@@ -86,7 +86,8 @@ def line_of_point(
     i, segment : int
         Indices of the point and of the segment.
     noise_frequency : float, optional
-        Frequency [Hz] whose noise density whitens the line, for skirts; by default the line's.
+        Frequency [Hz] at which the noise density is taken that whitens the line. It is given for
+        the line's skirts; by default it is the line's own frequency.
 
     Returns
     -------

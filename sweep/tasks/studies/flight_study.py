@@ -265,8 +265,9 @@ class FlightStudy(ExtendableStudy):
         """Return title, question, spec, names of scanners and surfaces, and origins.
 
         ``projection`` is the WKT of the coordinates in the scene's files, or empty. ``origin`` [m]
-        and ``time_origin`` [s], a decimal with all its digits, are the coordinates in these files
-        of the store's zero of positions and times.
+        is the position in these coordinates that has the coordinates 0 in the store.
+        ``time_origin`` [s], a decimal with all its digits, is the time in these files at which time
+        is 0 in the store.
         """
         return {
             "kind": "scene",
