@@ -96,12 +96,12 @@ class LineMotion(NamedTuple):
     look is one of several records of the same segment.
     """
     range_walk_time: np.ndarray | float = 0.0
-    """Time [s] of closing between the start of the shot and the instant of the range that beats
-    measure.
+    """Time [s] from the start of the shot to the instant at which the target has the range that
+    beats measure.
     """
     velocity_drift_time: np.ndarray | float = 0.0
-    """Time [s] of acceleration between the start of a segment and the instant of the velocity that
-    its beat measures.
+    """Time [s] from the start of a segment to the instant at which the target has the velocity that
+    the segment's beat measures.
     """
     velocity_bias_fraction: np.ndarray | float = 0.0
     """Fraction of the radial velocity by which beats underestimate it."""

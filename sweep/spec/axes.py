@@ -218,8 +218,8 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
 def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
     """Return the dotted path and the written values of each parameter of an axis.
 
-    A zipped axis consists of pieces, parts one after the other. It has one pair for each parameter
-    of each piece.
+    A zipped axis is written in pieces, one after the other. Its result has one pair for each
+    parameter of each piece.
     """
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
         return [(key, raw_axis)]

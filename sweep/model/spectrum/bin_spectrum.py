@@ -441,7 +441,8 @@ def compute_sources(bundle, distance_min, log_accuracy, layout, field):
     layout
         :class:`SpectrumLayout`.
     field
-        :class:`FieldWorkspace`, whose ``line_ends`` and ``sources`` are results.
+        :class:`FieldWorkspace`, whose ``line_ends`` and ``far_equivalent_lines`` (the sources)
+        are results.
 
     Returns
     -------
