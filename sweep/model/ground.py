@@ -112,9 +112,10 @@ class _PlaneGeometry(NamedTuple):
     position_spread_angle: np.ndarray
     """Full 1/e^2 angle [rad] of the illuminated positions on the target, seen from the lidar."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s], positive when closing; 0 if all beamlets share the axis's velocity."""
+    """Radial velocity on the beam's axis [m/s], positive when closing; 0 if beamlets have no
+    velocities of their own."""
     transverse_velocity: np.ndarray
-    """Velocity across the beam [m/s]; 0 if all beamlets share the axis's velocity."""
+    """Velocity across the beam [m/s]; 0 if beamlets have no velocities of their own."""
     direction_spread_angle: np.ndarray | None = None
     """Full 1/e^2 angle of the spread of light directions [rad]."""
     range_loss_linear_coefficient: np.ndarray | None = None
