@@ -19,7 +19,7 @@ from rich.progress import Progress
 from sweep.model.error_budget import ErrorBudget
 from sweep.spec import GridSpec, SceneSpec, SpecError, load
 from sweep.tasks.accuracy.measurement import (
-    N_PROMISED_ERRORS,
+    N_ERRORS_BOUNDED_BY_TOLERANCE,
     add_settings_with_fixed_effects,
     result_differences,
     tolerance_of_setting,
@@ -286,7 +286,7 @@ def random_points(spec: GridSpec) -> np.ndarray:
 
 def worst_error(errors: Sequence[np.ndarray]) -> float:
     """Return the largest of the errors that the tolerance covers."""
-    return float(np.nanmax(np.concatenate(errors[:N_PROMISED_ERRORS])))
+    return float(np.nanmax(np.concatenate(errors[:N_ERRORS_BOUNDED_BY_TOLERANCE])))
 
 
 def rays_text(rays_by_shot: np.ndarray) -> str:

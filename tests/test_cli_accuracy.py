@@ -55,7 +55,7 @@ def test_mistakes_end_in_plain_words_and_exit_code_2(here):
 
 def test_nothing_is_left_where_it_is_broken_off_at_once(here, monkeypatch):
     def broken(self):
-        raise measurement.NothingMeasured
+        raise measurement.NoMeasurementError
 
     monkeypatch.setattr(measurement.AccuracyMeasurement, "run", broken)
     result = sweep("accuracy", "small.yaml")

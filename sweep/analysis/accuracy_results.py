@@ -235,12 +235,15 @@ def fastest_setting_within_error(
 
 
 class SettingComparison(NamedTuple):
-    """Adaptive setting (effects as needed) and another setting of comparable error."""
+    """Fastest adaptive setting, and another setting of comparable error.
+
+    An adaptive setting chooses the effects point by point.
+    """
 
     adaptive: MeasuredSetting
-    """Adaptive setting."""
+    """Setting that chooses the effects point by point."""
     other: MeasuredSetting | None
-    """Other setting; None if no other setting is accurate enough."""
+    """Setting with fixed effects, or of the thesis's method; None if none is accurate enough."""
 
     def speedup(self, extra_seconds: float = 0.0) -> float:
         """Return the time of the other setting over the time of the adaptive one.
@@ -367,7 +370,7 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
     ) + _closed_form_sentences(settings)
-    conclusions.append(_reference_sentence(attributes))
+    conclusions.append(_reference_sentences(attributes))
     notes = attributes["notes"]  # a list in stores of earlier versions
     notes = notes.splitlines() if isinstance(notes, str) else notes
     conclusions += [note[0].upper() + note[1:] + "." for note in notes]
@@ -541,8 +544,8 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
     return [text + (f" Speed-up over improved versions: {improved_text}." if improved_text else "")]
 
 
-def _reference_sentence(attributes: dict) -> str:
-    """Return the sentences on the reference setting and its difference from the time domain."""
+def _reference_sentences(attributes: dict) -> str:
+    """Return sentences that name the reference setting and its error against the time domain."""
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
         return text + ". It is not compared with the time domain."

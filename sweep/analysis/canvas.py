@@ -75,10 +75,10 @@ MATPLOTLIB_RC_PARAMS: dict[Any, Any] = {
 """Settings of matplotlib for all pictures."""
 
 PNG_SOURCE_FIELD = "Source"
-"""Name of the PNG metadata field with the source of the picture."""
+"""Name of the PNG metadata field that states from what a picture was made."""
 
 _SOURCE_FIELD_BY_FORMAT = {"png": PNG_SOURCE_FIELD, "pdf": "Subject", "svg": "Description"}
-"""Names of the metadata fields with the source of the picture, by file format."""
+"""Names of the metadata fields that state from what a picture was made, by file format."""
 
 _OMITTED_METADATA_BY_FORMAT: dict[str, dict[str, str | None]] = {
     "png": {"Software": None},

@@ -42,11 +42,17 @@ class SortedCoordinate:
     """Values of the coordinate, without duplicates."""
 
     def points_per_cell(self, cells_max: int) -> int:
-        """Return the number of adjacent points per cell for at most ``cells_max`` cells."""
+        """Return the number of adjacent values that share a cell of a figure.
+
+        It is the smallest number for which at most ``cells_max`` cells are needed.
+        """
         return 1 if labels.is_categorical(self.values) else -(-self.values.size // cells_max)
 
     def cell_means(self, cells_max: int) -> np.ndarray:
-        """Return the mean of the coordinate in each cell, for at most ``cells_max`` cells."""
+        """Return the mean of the coordinate's values in each cell of a figure.
+
+        Cells hold adjacent values, and there are at most ``cells_max``.
+        """
         cell_size = self.points_per_cell(cells_max)
         if cell_size == 1:
             return self.values

@@ -677,7 +677,7 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
 def print_effects(table: EffectsTable) -> None:
     """Print where each effect is simulated, and its cost in time.
 
-    Warn of effects that are forced off.
+    Warn of disabled effects that change results by more than the tolerance.
     """
     active_rows = [row for row in table.rows if row.change_bound > 0 or row.simulated_fraction > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]

@@ -244,10 +244,10 @@ class FootprintAngles(NamedTuple):
     """Full 1/e^2 angles of the effective footprint [rad], by position and by light direction."""
 
     positions: np.ndarray
-    """Full 1/e^2 angle over which positions on the target are spread [rad]."""
+    """Full 1/e^2 angle [rad] of the illuminated positions on the target, seen from the lidar."""
     directions: np.ndarray
-    """Full 1/e^2 angle over which directions of the light are spread [rad]. It determines the
-    spread of Doppler shifts.
+    """Full 1/e^2 angle of the spread of light directions [rad], from which the spread of Doppler
+    shifts follows.
     """
 
 

@@ -110,16 +110,17 @@ class _PlaneGeometry(NamedTuple):
     grazing_angle: np.ndarray
     """Angle between beam and plane [rad], pi/2 at normal incidence."""
     position_spread_angle: np.ndarray
-    """Full 1/e^2 angle over which positions on the target are spread [rad]."""
+    """Full 1/e^2 angle [rad] of the illuminated positions on the target, seen from the lidar."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s], positive when closing; 0 if all beamlets share the axis's velocity."""
+    """Radial velocity on the beam's axis [m/s], positive when closing; 0 if beamlets have no
+    velocities of their own."""
     transverse_velocity: np.ndarray
-    """Velocity across the beam [m/s]; 0 if all beamlets share the axis's velocity."""
+    """Velocity across the beam [m/s]; 0 if beamlets have no velocities of their own."""
     direction_spread_angle: np.ndarray | None = None
-    """Full 1/e^2 angle over which directions of the light are spread [rad]."""
-    linear_range_loss: np.ndarray | None = None
+    """Full 1/e^2 angle of the spread of light directions [rad]."""
+    range_loss_linear_coefficient: np.ndarray | None = None
     """Coefficient b of the range loss 1 + b x + c x^2 for a relative range change x."""
-    quadratic_range_loss: np.ndarray | None = None
+    range_loss_quadratic_coefficient: np.ndarray | None = None
     """Coefficient c of the range loss 1 + b x + c x^2 for a relative range change x."""
 
     @property
@@ -268,9 +269,12 @@ class FlatGround:
             direction_spread_angle=geometry.direction_spread_angle,
         )
         range_loss = (1 + relative_range_offset) ** 2
-        if geometry.linear_range_loss is not None and geometry.quadratic_range_loss is not None:
-            linear = geometry.linear_range_loss[:, None]
-            quadratic = geometry.quadratic_range_loss[:, None]
+        if (
+            geometry.range_loss_linear_coefficient is not None
+            and geometry.range_loss_quadratic_coefficient is not None
+        ):
+            linear = geometry.range_loss_linear_coefficient[:, None]
+            quadratic = geometry.range_loss_quadratic_coefficient[:, None]
             range_loss = 1 + relative_range_offset * (linear + relative_range_offset * quadratic)
         relative_echo = weights * backscatter(self._reflectance_law, cos_incidence) / range_loss
         doppler_ratio_offset = np.where(weights > 0, 2 * closing_offset / SPEED_OF_LIGHT, 0.0)

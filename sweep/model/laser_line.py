@@ -384,10 +384,10 @@ def apparent_line_and_pedestal(
 
 @lru_cache(maxsize=16)
 def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
-    """Return the window at evenly spaced positions in the record, and its double integral.
+    """Return samples of the window, and its double integral over the position in the record.
 
-    Positions are in record lengths, 0..1. The samples, (n,), have the sum 1. The integral is a
-    spline that is scaled so that its slope at the end of the record is 1.
+    The samples, (n,), are at evenly spaced positions and have the sum 1. The integral is a spline
+    of the position in record lengths, 0..1. It is scaled so that its slope at 1 is 1.
     """
     from scipy.interpolate import CubicSpline  # slow to import
 

@@ -405,10 +405,13 @@ REPORTED_PD_LEVEL = 0.9
 The report also counts the points that reach it.
 """
 
-UNBROKEN_LABEL = "kept all the way"
-"""Label of the maximum range up to which pd is never below the chosen level."""
+UNBROKEN_RANGE_LABEL = "kept all the way"
+"""Label, in charts and tables, of one kind of maximum range.
 
-LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
+Up to this range pd is at least the chosen level without interruption.
+"""
+
+LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_RANGE_LABEL: "unbroken", "reached at all": "farthest"}
 """Variables of :func:`.detection_limits.limit` with the two kinds of maximum range, by label."""
 
 INTERVAL_END_LABELS = {"low": "lower end", "high": "upper end"}
@@ -529,12 +532,12 @@ def _maximum_range_selection(
     if indices.size < dataset.sizes[dim]:
         dataset = dataset.isel({dim: indices})
     max_range = dataset.sweep.maximum_range(REPORTED_PD_LEVEL)
-    converted = {
+    converted_arrays = {
         str(variable): (array * unit_factor).assign_attrs(array.attrs)
         for variable, array in max_range.data_vars.items()
         if not str(variable).endswith("reason")
     }
-    return PointSelection.from_dataset(max_range.assign(converted))
+    return PointSelection.from_dataset(max_range.assign(converted_arrays))
 
 
 def _choose_x_coordinate(results: GridResults, points: PointSelection) -> str:

@@ -86,7 +86,7 @@ VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
 """Framing of the points of a cloud in plotly's view.
 
 The first is the fraction of the field of view that the points' box fills; the rest is for labels.
-The second is the least width-to-height ratio of the plot, that of a phone.
+The second is the least width-to-height ratio of the plot, which a phone has.
 """
 
 CAMERA_POSITION_BY_VIEW = {
@@ -145,14 +145,14 @@ def cloud_plot(
     """
     points_max = PAGE_POINTS_MAX // len(labelled_recordings)
     cloud_by_label = {
-        labelled.label: gather_point_cloud(
-            labelled.recording,
+        labelled_recording.label: gather_point_cloud(
+            labelled_recording.recording,
             [*CLOUD_COLOUR_QUANTITIES, "pd"],
             ranges=INTERPOLATED_RANGES,
             with_path=True,
             points_max=points_max,
         )
-        for labelled in labelled_recordings
+        for labelled_recording in labelled_recordings
     }
     shown_clouds = {
         cloud_label: cloud for cloud_label, cloud in cloud_by_label.items() if cloud is not None
@@ -500,16 +500,16 @@ def _time_panels(
     """
     panels: list[Panel] = []
     thinning_step = 1
-    for labelled in labelled_recordings:
-        thinned = labelled.recording.read_thinned_rows(
+    for labelled_recording in labelled_recordings:
+        thinned_rows = labelled_recording.recording.read_thinned_rows(
             names, PAGE_SHOTS_MAX // len(labelled_recordings), ranges=INTERPOLATED_RANGES
         )
-        thinning_step = max(thinning_step, thinned.step)
-        column_arrays = thinned.to_columns()
+        thinning_step = max(thinning_step, thinned_rows.step)
+        column_arrays = thinned_rows.to_columns()
         for quantity_text, y_axis, lines in (
             quantity_lines(column_arrays) if column_arrays and column_arrays["time"].size else ()
         ):
-            facet_choices = {"cloud": labelled.label, "quantity": quantity_text}
+            facet_choices = {"cloud": labelled_recording.label, "quantity": quantity_text}
             panels.append(Panel(facet_choices, ChartAxis("time (s)"), y_axis, lines))
     return panels, f"One {noun} in {thinning_step} shown: reduced for this page" * (
         thinning_step > 1
@@ -550,10 +550,12 @@ def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable
     Shots and points are counted over all draws.
     """
     rows = []
-    for labelled in labelled_recordings:
+    for labelled_recording in labelled_recordings:
         kind_counts, n_shots = np.zeros(len(POINT_KIND_BITS), int), 0
-        for shot_slice in labelled.recording.iter_shot_slices():
-            flags = np.asarray(labelled.recording.dataset["flags"].isel(shot=shot_slice).values)
+        for shot_slice in labelled_recording.recording.iter_shot_slices():
+            flags = np.asarray(
+                labelled_recording.recording.dataset["flags"].isel(shot=shot_slice).values
+            )
             n_shots += flags.shape[0] * flags.shape[1]
             kind_counts += np.bincount(
                 point_kind_indices(flags).ravel() + 1, minlength=len(POINT_KIND_BITS) + 1
@@ -561,7 +563,7 @@ def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable
         count_by_kind = dict(
             zip(map(labels.coordinate_label, POINT_KIND_BITS), kind_counts.tolist(), strict=True)
         )
-        rows.append({"what": labelled.label or "all", "shots": n_shots} | count_by_kind)
+        rows.append({"what": labelled_recording.label or "all", "shots": n_shots} | count_by_kind)
     caption = ["Shots times draws, and points by kind."]
     return HtmlTable("Shots and points", caption, pandas.DataFrame(rows), "returns")
 
@@ -610,7 +612,10 @@ def flight_navigation_error_chart(
 
     The errors are those of velocity and altitude.
     """
-    named_recordings = [(labelled.label, labelled.recording) for labelled in labelled_recordings]
+    named_recordings = [
+        (labelled_recording.label, labelled_recording.recording)
+        for labelled_recording in labelled_recordings
+    ]
     error_curves = [
         curve
         for quantity in ("velocity", "altitude")
@@ -646,8 +651,8 @@ def noise_budget_of_flight(
     try:
         panels = [
             panel
-            for labelled in labelled_recordings
-            if (panel := _flight_noise_panel(results, labelled)).lines
+            for labelled_recording in labelled_recordings
+            if (panel := _flight_noise_panel(results, labelled_recording)).lines
         ]
     except NotAStoreError:
         return None
@@ -661,12 +666,12 @@ def noise_budget_of_flight(
     )  # fmt: skip
 
 
-def _flight_noise_panel(results: SceneResults, labelled: LabelledRecording) -> Panel:
+def _flight_noise_panel(results: SceneResults, labelled_recording: LabelledRecording) -> Panel:
     """Return the panel with the shares of noise sources in shots spread over a flight.
 
     Shots without a target are left out.
     """
-    recording = labelled.recording
+    recording = labelled_recording.recording
     n_shots = recording.n_shots
     shot_indices = np.unique(
         np.linspace(0, n_shots - 1, min(NOISE_BUDGET_POINTS, n_shots)).round().astype(int)
@@ -675,7 +680,7 @@ def _flight_noise_panel(results: SceneResults, labelled: LabelledRecording) -> P
     seen_indices = np.flatnonzero(eyepoints.has_target)
     flags = np.asarray(recording.dataset["effects"].isel(shot=shot_indices[seen_indices]).values)
     parameters, surfaces = (
-        parameters_at(results.spec, labelled.axis_position.axis_indices),
+        parameters_at(results.spec, labelled_recording.axis_position.axis_indices),
         results.spec.surfaces(),
     )
     budgets = [
@@ -684,7 +689,7 @@ def _flight_noise_panel(results: SceneResults, labelled: LabelledRecording) -> P
         ).noise.variances
         for i, flag in zip(seen_indices, flags, strict=True)
     ]
-    facet_choices = {"part": labelled.label}
+    facet_choices = {"part": labelled_recording.label}
     return noise_budget_panel(
         facet_choices, ChartAxis("time (s)"), eyepoints.time[seen_indices], budgets
     )

@@ -112,7 +112,7 @@ def trace_meta(palette_index: int | None = None, **choices: str) -> dict[str, An
 
 
 def to_sentences(parts: Sequence[str]) -> list[str]:
-    """Turn each phrase into a sentence; empty phrases are skipped."""
+    """Return each phrase as a sentence; empty phrases are left out."""
     return [labels.join_sentences([part]) for part in parts if part]
 
 

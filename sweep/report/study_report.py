@@ -184,13 +184,20 @@ def _main_results_section(
     for group in groups:
         pd = group["pd_shot"]
         exceedances = [group[name] > limit for name, limit in limits.items() if name in group]
-        missed = sum(exceedances, xr.DataArray(0)) > 0
-        unchecked = pd.notnull() & group["beamlets_error"].isnull()
+        is_missed = sum(exceedances, xr.DataArray(0)) > 0
+        is_unchecked = pd.notnull() & group["beamlets_error"].isnull()
         lazy_counts.append(
-            (pd.count(), (pd >= pd_level).sum(), pd.sum(), pd.min(), missed.sum(), unchecked.sum())
+            (
+                pd.count(),
+                (pd >= pd_level).sum(),
+                pd.sum(),
+                pd.min(),
+                is_missed.sum(),
+                is_unchecked.sum(),
+            )
         )
     counts_by_statistic = np.array(dask.compute(lazy_counts)[0], float).T  # one column per group
-    n_computed, n_at_level, pd_sum, _, missed, unchecked = counts_by_statistic.sum(axis=1)
+    n_computed, n_at_level, pd_sum, _, n_missed, n_unchecked = counts_by_statistic.sum(axis=1)
     if not n_computed:
         return PageSection("answer", "Answer", ["No result is there yet."])
     sentences = [
@@ -206,15 +213,15 @@ def _main_results_section(
             f"Noise alone raises a false alarm in either chirp with probability {alarm_text}."
         )
     tolerance_text = (
-        f"missed at {missed:,.0f} {counted_unit}"
-        if missed
+        f"missed at {n_missed:,.0f} {counted_unit}"
+        if n_missed
         else f"kept at all of these {counted_unit}"
     )
     sentences.append(f"The tolerance of {tolerance:g} is {tolerance_text}.")
-    if unchecked:
+    if n_unchecked:
         sentences.append(
-            f"Whether the number of beamlets keeps it is not checked at {unchecked:,.0f} of them: "
-            "their number is given, or their amplitudes add."
+            f"Whether the number of beamlets keeps it is not checked at {n_unchecked:,.0f} of "
+            "them: their number is given, or their amplitudes add."
         )
     return PageSection("answer", "Answer", sentences)
 
@@ -394,10 +401,12 @@ def _grid_point_table(results: GridResults) -> HtmlTable | None:
         dim: np.unique(np.linspace(0, size_by_dim[dim] - 1, length).round().astype(int))
         for dim, length in reduced_size.items()
     }
-    reduced = dataset[variables].isel(indices)  # type: ignore[arg-type]
+    reduced_dataset = dataset[variables].isel(indices)  # type: ignore[arg-type]
     for name in variables:
-        reduced[name] = to_float_with_nan(reduced[name]).assign_attrs(dataset[name].attrs)
-    frame = reduced.to_dataframe().reset_index()
+        reduced_dataset[name] = to_float_with_nan(reduced_dataset[name]).assign_attrs(
+            dataset[name].attrs
+        )
+    frame = reduced_dataset.to_dataframe().reset_index()
     frame = frame[[c for c in frame.columns if c in dataset.coords or c in variables]]
     frame = frame.rename(
         columns={
@@ -421,15 +430,15 @@ def _table_share_caption(n_rows: int, n_total: int) -> list[str]:
 def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTable:
     """Return a table of points of all recordings in the first draw, thinned for the page."""
     frames, n_total = [], 0
-    for labelled in labelled_recordings:
-        thinned = labelled.recording.read_thinned_rows(
+    for labelled_recording in labelled_recordings:
+        thinned_rows = labelled_recording.recording.read_thinned_rows(
             CLOUD_TABLE_QUANTITIES,
             TABLE_POINTS_MAX // len(labelled_recordings),
             ranges=INTERPOLATED_RANGES,
         )
-        n_total += thinned.n_total
-        if thinned.n_total:
-            column_arrays = thinned.to_columns()
+        n_total += thinned_rows.n_total
+        if thinned_rows.n_total:
+            column_arrays = thinned_rows.to_columns()
             columns = {
                 labels.column_label(
                     name, "dB" if name == "snr" else QUANTITY_BY_NAME[name].units
@@ -437,7 +446,9 @@ def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTabl
                 for name, values in column_arrays.items()
             }
             frames.append(
-                pandas.DataFrame({"recorded by": labelled.label or "the scanner"} | columns)
+                pandas.DataFrame(
+                    {"recorded by": labelled_recording.label or "the scanner"} | columns
+                )
             )
     frame = pandas.concat(frames, ignore_index=True) if frames else pandas.DataFrame()
     return HtmlTable("Points", _table_share_caption(len(frame), n_total), frame, "points")

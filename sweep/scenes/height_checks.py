@@ -104,7 +104,7 @@ def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) 
 def _shortest_decimal_text(value: float) -> str:
     """Return the shortest decimal text that reads back as the number.
 
-    The text is that of the single-precision number if both are equal.
+    A number that is exact in single precision has the text of the single-precision number.
     """
     with np.errstate(over="ignore"):
         single_precision = np.float32(value)

@@ -468,7 +468,7 @@ _STL_HEADER_STRUCT = struct.Struct("<80sI")
 _STL_TRIANGLE_BYTES = 50
 """Bytes per triangle of a binary STL."""
 _STL_PROBE_BYTES = 1000
-"""Number of bytes at the start of an STL file by which text and binary files are told apart."""
+"""Number of bytes at the start of an STL file that distinguish text from binary files."""
 
 
 def _check_stl(path: Path) -> None:

@@ -28,7 +28,7 @@ from sweep.scenes.scene_files import SceneError, require_file, require_memory
 from sweep.scenes.terrain import AreaBounds, Terrain
 
 GRID_CELLS_MAX = 50_000_000
-"""Maximum number of heights of a terrain. Each makes about two triangles."""
+"""Maximum number of heights of a terrain. Each height makes about two triangles."""
 
 RASTER_FILE_CELLS_MAX = 1_000_000_000
 """Maximum number of heights in a raster file. All of them are read to compute the file's digest."""

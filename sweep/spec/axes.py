@@ -218,8 +218,8 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
 def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
     """Return the dotted path and the written values of each parameter of an axis.
 
-    A zipped axis consists of pieces, parts one after the other. It has one pair for each parameter
-    of each piece.
+    A zipped axis is written in pieces, one after the other. Its result has one pair for each
+    parameter of each piece.
     """
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
         return [(key, raw_axis)]
@@ -440,9 +440,9 @@ def _name_coordinates(axes: list[Axis]) -> list[Axis]:
 
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
-    """Return the shortest last part of a dotted path that identifies a parameter, with underscores.
+    """Return the shortest unambiguous end of a parameter's path, with underscores in place of dots.
 
-    No other path ends with this part, and no variable of a store has this name.
+    No other path in ``paths`` has this end, and no variable of a store has this name.
     """
     keys, *other_keys = (
         parameter_path.removesuffix(".kind").split(".")

@@ -179,7 +179,7 @@ class ClusterConfig(SpecSection):
     """Folder that paths in the configuration are relative to."""
 
     def resolve_path(self, raw_path: str) -> str:
-        """Return the path of a file whose path in the cluster's file is relative to its folder."""
+        """Return the path of a file; ``raw_path`` may be relative to the cluster file's folder."""
         return str(self._base / os.path.expanduser(raw_path))  # an unknown ~user is left as it is
 
     def certificate_paths(self) -> tuple[str, str, str] | None:

@@ -61,12 +61,14 @@ def describe_differences(a: Any, b: Any) -> list[str]:
     identities = (
         identity if isinstance(identity, Mapping) else identity.identity() for identity in (a, b)
     )
-    left, right = (_flatten_identity(spec_fields.to_canonical(identity)) for identity in identities)
+    identity_a, identity_b = (
+        _flatten_identity(spec_fields.to_canonical(identity)) for identity in identities
+    )
     lines = []
-    for path in [*left, *(path for path in right if path not in left)]:
-        if left.get(path) != right.get(path):
+    for path in [*identity_a, *(path for path in identity_b if path not in identity_a)]:
+        if identity_a.get(path) != identity_b.get(path):
             old_text, new_text = (
-                _format_entry(path, identity.get(path)) for identity in (left, right)
+                _format_entry(path, identity.get(path)) for identity in (identity_a, identity_b)
             )
             lines.append(f"{path}: {old_text} -> {new_text}")
     return lines
@@ -128,7 +130,7 @@ def _format_list(rule: Rule | None, values: Sequence[Any]) -> str:
 
 
 def _unit_suffix(rule: Rule | None) -> str:
-    """Return a blank and the unit in which a field is shown; empty for a pure number.
+    """Return the unit in which a field is shown, after a blank; empty for a pure number.
 
     Angles are shown in the unit of the field's example, all other quantities in SI units.
     """

@@ -35,7 +35,7 @@ from sweep.spec.rules import (
 AUTO, ON, OFF = EFFECT_MODES
 """Modes of an effect: simulated only where the tolerance requires it, always, or never."""
 ModelClasses = tuple[type[BaseModel], ...]
-"""Pydantic models (sections of a spec) as one of which a value is validated."""
+"""Pydantic models, each a kind of section. A value is validated as one of them."""
 KeyPath = tuple[str, ...]
 """Keys that lead to a value in a spec: the names of the sections around it and of its field."""
 SectionT = TypeVar("SectionT", bound=BaseModel)
@@ -313,7 +313,7 @@ def file_path_field(description: str, default: Any = ..., **rule_options: Any) -
 # Fields of physical effects, declared by the model's catalogue
 
 
-def add_effect_parameters(section_path: str) -> Callable[[type[SectionT]], type[SectionT]]:
+def add_effect_parameter_fields(section_path: str) -> Callable[[type[SectionT]], type[SectionT]]:
     """Return a class decorator that adds a field for each effect parameter of a section.
 
     `section_path` is the dotted path of the section that is decorated.
@@ -332,8 +332,11 @@ def add_effect_parameters(section_path: str) -> Callable[[type[SectionT]], type[
     return lambda section: _extend_section(section, field_definitions)
 
 
-def add_effect_modes(section: type[SectionT]) -> type[SectionT]:
-    """Class decorator that adds the mode of every effect to a section, `auto` by default."""
+def add_effect_mode_fields(section: type[SectionT]) -> type[SectionT]:
+    """Return a subclass of a section that has a field for the mode of every effect.
+
+    The default mode is `auto`.
+    """
     mode_rules = {
         effect.name: ChoiceRule(
             description=effect.description[0].upper() + effect.description[1:], options=EFFECT_MODES
@@ -464,9 +467,9 @@ class ResolvedLocation(NamedTuple):
     location: Location
     """Keys and indices that lead to the value in the file."""
     value_models: ModelClasses
-    """Models that the value may be validated as; empty for a scalar or list."""
-    section_models: ModelClasses
-    """Models that the section around the value may be validated as."""
+    """Pydantic models of the value, one for each kind of it; empty for a scalar or list."""
+    enclosing_section_models: ModelClasses
+    """Pydantic models of the section that contains the value, one for each kind of section."""
 
 
 def translate_error_location(pydantic_location: Location, root: Any) -> ResolvedLocation:
@@ -481,20 +484,20 @@ def translate_error_location(pydantic_location: Location, root: Any) -> Resolved
     """
     annotation = root
     keys: list[str | int] = []
-    section_models: ModelClasses = ()
+    enclosing_section_models: ModelClasses = ()
     for key in pydantic_location:
         models = models_of_annotation(annotation)
         if len(models) > 1:
             annotation = next((model for model in models if kind_of_model(model) == key), None)
             continue
-        section_models = models
+        enclosing_section_models = models
         keys.append(key)
         if models:
             field = fields_by_name(models[0]).get(str(key))
             annotation = None if field is None else field.annotation
         else:
             annotation = _element_annotation(annotation)
-    return ResolvedLocation(tuple(keys), models_of_annotation(annotation), section_models)
+    return ResolvedLocation(tuple(keys), models_of_annotation(annotation), enclosing_section_models)
 
 
 # Traversal of the values of sections

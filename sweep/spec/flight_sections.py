@@ -258,7 +258,7 @@ class RigidMotion(SpecSection):
     ) -> motion_laws.AttitudeLaw:
         """Return the attitude law along a path.
 
-        An attitude from a table that names no file uses the file of the path's waypoints.
+        A tabulated attitude without a file of its own is read from the path's file of waypoints.
         """
         attitude = self.attitude
         if (

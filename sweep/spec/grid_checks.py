@@ -31,7 +31,7 @@ from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
 from sweep.model.effects.phase_errors import ERROR_TABLE_PATH, NO_TABLE
-from sweep.model.effects.sweep_error_table import fit_sweep_error
+from sweep.model.effects.sweep_error_table import fit_sweep_frequency_error
 from sweep.model.link_budget import RECORD_PATH
 from sweep.model.waveform import SEARCH_BAND_PATHS, SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
 from sweep.spec.axes import Axis, parameter_location
@@ -422,7 +422,7 @@ def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
     if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
         return
     table, duration_max = (
-        fit_sweep_error(table_text),
+        fit_sweep_frequency_error(table_text),
         float(grid.parameter_values(CHIRP_DURATION_PATH).max()),
     )
     if table.first_time > 1e-9 * duration_max or table.last_time < (1 - 1e-9) * duration_max:
@@ -847,7 +847,7 @@ EFFECT_PARAMETER_REQUIREMENTS = (
         "set it to 1 au or so",
     ),
 )
-"""What parameters of effects require of other parameters: the values that exclude each other."""
+"""Requirements of effect parameters on other parameters: values that exclude each other."""
 
 
 def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:

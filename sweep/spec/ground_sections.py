@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 GRID_STEPS_PER_SIDE_MAX = 7000
 """Maximum number of grid steps along one side of a square."""
 _RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
-"""What random numbers are used for. The index of a use selects its stream of random numbers."""
+"""Uses of random numbers. The index of a use selects its stream of random numbers."""
 
 Vector = tuple[float, ...]
 """Components of a vector along x, y and z, in SI units."""

@@ -26,7 +26,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from sweep.messages import escape_unprintable
 from sweep.model.effects.phase_errors import NO_TABLE
-from sweep.model.effects.sweep_error_table import fit_sweep_error
+from sweep.model.effects.sweep_error_table import fit_sweep_frequency_error
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, WINDOW_NAME_ALIASES
 from sweep.scenes.scene_files import file_digest
 from sweep.units import DECIBEL, QuantityError, Unit, read_number, read_quantity
@@ -37,7 +37,7 @@ Location = tuple[str | int, ...]
 """Keys and list indices that lead to a value in a spec."""
 
 MISSING = object()
-"""Value that stands for one that the spec does not contain."""
+"""Marker that takes the place of a value which the spec does not contain."""
 _SHOWN_VALUE_CHARACTERS_MAX = 60
 """Maximum number of characters of a wrong value that an error message shows."""
 _PARTIAL_NAME_CHARACTERS_MIN, _SUGGESTIONS_MAX = 4, 3
@@ -199,7 +199,7 @@ def suggest_similar_name(name: str, known_names: Iterable[str], *, fallback: str
 # Rules
 
 RULE_ERROR_TYPE = "broken_rule"
-"""Type by which pydantic errors that rules raise are told from all others."""
+"""Type of the pydantic errors that rules raise, which distinguishes them from all others."""
 
 JsonObject = dict[str, Any]
 """Mapping with text keys, as in JSON."""
@@ -214,7 +214,7 @@ def rule_error(problem: str, suggestion: str) -> PydanticCustomError:
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Base of rules: what values a field may hold."""
+    """Base of rules. A rule defines which values a field may hold."""
 
     description: str
     """Description of the field for users."""
@@ -331,8 +331,8 @@ class NumericRule(Rule):
         return "" if self.si_unit == DECIBEL else self.si_unit
 
     @property
-    def bounds(self) -> dict[str, str]:
-        """Text of each bound that is set, by its kind, such as ``at_least``."""
+    def bound_texts(self) -> dict[str, str]:
+        """Text of each bound that is set, by the name of its field, such as ``at_least``."""
         bound_texts = {name: getattr(self, name) for name in _BOUND_KINDS}
         return {
             name: bound_text for name, bound_text in bound_texts.items() if bound_text is not None
@@ -421,7 +421,7 @@ class NumericRule(Rule):
         (int, str) or None
             None if all values are within the bounds.
         """
-        for name, bound_text in self.bounds.items():
+        for name, bound_text in self.bound_texts.items():
             comparison, violates, _ = _BOUND_KINDS[name]
             is_outside = violates(values, _bound_in_si(self, bound_text))
             if is_outside.any():
@@ -442,7 +442,7 @@ class NumericRule(Rule):
 
     def _value_schema(self) -> JsonObject:
         bounds = [
-            f"{_BOUND_KINDS[name][0]} {bound_text}" for name, bound_text in self.bounds.items()
+            f"{_BOUND_KINDS[name][0]} {bound_text}" for name, bound_text in self.bound_texts.items()
         ]
         description = "; ".join([self.description, *([", ".join(bounds)] if bounds else [])])
         base_schema: JsonObject = {"description": description, "examples": [self.example]}
@@ -452,7 +452,7 @@ class NumericRule(Rule):
             return base_schema | {"type": "string", "pattern": pattern}
         bound_keywords = {
             _BOUND_KINDS[name][2]: _bound_in_si(self, limit_text)
-            for name, limit_text in self.bounds.items()
+            for name, limit_text in self.bound_texts.items()
         }
         unit_pattern = "(%|dB)?" if self.is_power_ratio else "%?"
         schemas: list[JsonObject] = [
@@ -725,7 +725,7 @@ class FrequencyErrorTableRule(Rule):
             raise QuantityError("has times that do not rise", "sort the rows by time")
         table_text = ", ".join(f"{time!r} {error!r}" for time, error in rows)
         try:
-            fit_sweep_error(table_text)
+            fit_sweep_frequency_error(table_text)
         except ValueError as error:
             raise QuantityError(str(error), "smooth it, or give more rows") from None
         return table_text

@@ -157,7 +157,7 @@ def _ground_reference_findings(
     objects: Mapping[str, Any],
     extra_remedy: str,
 ) -> Iterator[Finding]:
-    """Yield a finding if a name is that of no ground of the scene."""
+    """Yield a finding if no ground of the scene has the name."""
     grounds = [key for key, scene_object in objects.items() if isinstance(scene_object, Ground)]
     remedy = f"the grounds are {', '.join(grounds)}" if grounds else "add a ground"
     remedy += extra_remedy

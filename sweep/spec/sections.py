@@ -21,7 +21,12 @@ from sweep.model.detection.looks import COMBINE_KINDS, SPECKLE_KINDS
 from sweep.model.error_budget import AUTOMATIC, COUNT_INTERVALS
 from sweep.model.ground import REFLECTANCE_LAWS
 from sweep.model.threshold import PROCESSING_PREFIX, THRESHOLD_PATHS
-from sweep.spec.fields import SpecSection, add_effect_modes, add_effect_parameters, rules_by_path
+from sweep.spec.fields import (
+    SpecSection,
+    add_effect_mode_fields,
+    add_effect_parameter_fields,
+    rules_by_path,
+)
 from sweep.spec.rules import (
     ChoiceOrFunctionRule,
     Rule,
@@ -42,7 +47,7 @@ _WAIST_EXAMPLE_AND_BOUNDS = ("5 mm", "100 nm", "1 km")
 """Example, lower bound and upper bound of the waist radius of a beam, with units."""
 
 
-@add_effect_parameters("instrument.laser")
+@add_effect_parameter_fields("instrument.laser")
 class Laser(SpecSection):
     """Transmitter: wavelength, power and beam."""
 
@@ -66,7 +71,7 @@ class Laser(SpecSection):
     )  # fmt: skip
 
 
-@add_effect_parameters("instrument.chirp")
+@add_effect_parameter_fields("instrument.chirp")
 class Chirp(SpecSection):
     """Segments of a shot: linear frequency sweeps, and the segment without a sweep."""
 
@@ -101,7 +106,7 @@ class Chirp(SpecSection):
     )  # fmt: skip
 
 
-@add_effect_parameters("instrument.telescope")
+@add_effect_parameter_fields("instrument.telescope")
 class Telescope(SpecSection):
     """Receiving optics."""
 
@@ -117,7 +122,7 @@ class Telescope(SpecSection):
     )
 
 
-@add_effect_parameters("instrument.receiver")
+@add_effect_parameter_fields("instrument.receiver")
 class Receiver(SpecSection):
     """Detector, local oscillator and amplifiers."""
 
@@ -276,7 +281,7 @@ def _design_pfa_field(noise_scope: str) -> Any:
     return declare.number_field(description, "1e-6", "1e-300", "0.99", default=None)
 
 
-@add_effect_parameters("instrument.processing")
+@add_effect_parameter_fields("instrument.processing")
 class Processing(SpecSection):
     """Sampling, transform and threshold."""
 
@@ -413,7 +418,7 @@ REFLECTANCE_FIELD = declare.number_field("Fraction of light scattered back", "0.
 """Declaration of a field for a reflectance, 0..1."""
 
 
-@add_effect_parameters("target")
+@add_effect_parameter_fields("target")
 class Target(SpecSection):
     """Flat target, seen at a grazing angle."""
 
@@ -433,7 +438,7 @@ class Target(SpecSection):
     solar_irradiance: float = sunlight_field("target")
 
 
-@add_effect_parameters("footprint")
+@add_effect_parameter_fields("footprint")
 class Footprint(SpecSection):
     """Sampling of the illuminated spot by beamlets."""
 
@@ -449,12 +454,12 @@ class Footprint(SpecSection):
     )
 
 
-@add_effect_parameters("atmosphere")
+@add_effect_parameter_fields("atmosphere")
 class Atmosphere(SpecSection):
     """Atmosphere between instrument and target."""
 
 
-@add_effect_modes
+@add_effect_mode_fields
 class Effects(SpecSection):
     """Modes of physical effects: simulated if the tolerance requires it, always or never."""
 

@@ -706,7 +706,7 @@ class SceneSpec(BaseSpec):
     def parameters(self) -> dict[str, float | int | str]:
         """Return the SI values of all parameters by dotted path.
 
-        A parameter on an axis has the value of its field. The number of beamlets is that of the
+        A parameter on an axis has the value of its field. The number of beamlets is the number of
         rays cast per shot; detector and estimator are left out unless whole spectra are drawn.
         """
         parameters = super().parameters()
@@ -769,8 +769,8 @@ class SceneSpec(BaseSpec):
     def unstated_error_sentences(self) -> list[str]:
         """Return sentences about errors whose size the spec does not state.
 
-        They concern the error floor that comes with the instrument, the drift of lines within a
-        record, and errors that navigation does not know of.
+        The sentences concern an error floor that comes with the instrument or is missing, the drift
+        of lines within a record, and relief that navigation does not take into account.
         """
         sentences = []
         floor_values, rules = (
@@ -1083,4 +1083,4 @@ def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
 
 def _smallest_value_text(rule: Rule) -> str:
     """Return the smallest value of a field, as a user would write it."""
-    return rule.bounds.get("at_least", "0") if isinstance(rule, NumericRule) else "0"
+    return rule.bound_texts.get("at_least", "0") if isinstance(rule, NumericRule) else "0"

@@ -255,8 +255,8 @@ class Document:
     def _locate_cause(self, finding: Finding) -> tuple[str, int | None]:
         """Return file and line of the user's field that causes a mistake in a field of the library.
 
-        The first of these that exists in the user's file: a field that the finding names by path or
-        in words, a field of the same section, the name of the instrument.
+        It is the first of these that exists in the user's file: a field that the finding names by
+        path or in words, a field of the same section, and the name of the instrument.
         """
         location, message = finding.location, f"{finding.problem} {finding.suggestion}"
         section = location if isinstance(_value_at(self.content, location), dict) else location[:-1]
@@ -797,7 +797,7 @@ _SPEC_OF_FIGURE_KIND = {
     for kind, target in ((GridFigure, "a target"), (SceneFigure, "a scene"))
     for model in spec_fields.models_of_annotation(kind)
 }
-"""What a study must have to draw a figure, ``a target`` or ``a scene``, by the figure's kind."""
+"""Section that a study needs for a figure, ``a target`` or ``a scene``, by the figure's kind."""
 
 
 def validation_findings(error: ValidationError, annotation: Any) -> list[Finding]:
@@ -890,8 +890,8 @@ def _missing_field_remedy(resolved: spec_fields.ResolvedLocation) -> str:
     if resolved.location == _INSTRUMENT_LOCATION:
         return missing_instrument_remedy()
     field = (
-        spec_fields.fields_by_name(resolved.section_models[0]).get(str(name))
-        if resolved.section_models
+        spec_fields.fields_by_name(resolved.enclosing_section_models[0]).get(str(name))
+        if resolved.enclosing_section_models
         else None
     )
     rule = spec_fields.rule_of_field(field) if field is not None else None
@@ -934,9 +934,11 @@ def _suggest_field(resolved: spec_fields.ResolvedLocation, root_model: type[Base
     """Suggest a known field for an unknown one: of the same section, else of the whole spec."""
     name = str(resolved.location[-1])
     sibling_names = [
-        field for model in resolved.section_models for field in spec_fields.fields_by_name(model)
+        field
+        for model in resolved.enclosing_section_models
+        for field in spec_fields.fields_by_name(model)
     ]
-    if name in _OTHER_SPEC_REMEDIES and resolved.section_models == (root_model,):
+    if name in _OTHER_SPEC_REMEDIES and resolved.enclosing_section_models == (root_model,):
         return _OTHER_SPEC_REMEDIES[name]
     known_paths = dict.fromkeys((*parameter_rules(), *spec_fields.rules_by_path(root_model, "")))
     if name[:1].isdigit():

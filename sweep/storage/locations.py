@@ -76,7 +76,7 @@ FIRST_CONTACT_RETRY_CONFIG = {
 CLIENT_OPTIONS = {"timeout": "30s", "connect_timeout": "5s"}
 
 ObjectVersion = Any
-"""Tag (ETag or version) by which an object store tells versions of one object apart."""
+"""Tag (ETag or version) by which an object store distinguishes the versions of an object."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -481,7 +481,7 @@ def file_sizes_below(location: Location) -> dict[str, int]:
 def derived_files_dir(location: Location) -> Path:
     """Return the folder for files made from a store, such as figures.
 
-    It is the folder of a store on disk, and the current folder for one in an object store.
+    It is the folder that contains the store; for an object store it is the current folder.
     """
     return location.parent if isinstance(location, Path) else Path()
 
@@ -495,7 +495,7 @@ def atomic_write(location: Location, content: bytes) -> None:
 
 
 def atomic_write_file(file_path: str, content: bytes, *, durable: bool = False) -> None:
-    """Write a file on disk atomically, even if a directory has its name.
+    """Write a file on disk atomically; a directory of the same name is deleted.
 
     With ``durable``, the content is flushed to the disk before the draft is renamed, so that a
     power cut can't leave an empty file.
@@ -558,7 +558,7 @@ PID_MAX = 2**31 - 1
 
 
 def process_start_id(pid: int) -> int:
-    """Return the start time of a process, which tells it from others with the same number.
+    """Return the start time of a process, which distinguishes it from others with the same number.
 
     The unit is clock ticks since the machine was booted on Linux, and 0.01 s since the epoch on
     other systems. Changes of the clock do not alter it. Return 0 if no such process runs, and
@@ -615,7 +615,11 @@ def staging_path_for(path: Path) -> Path:
 
 
 def final_path_for(path: Path) -> Path:
-    """Return the path that a complete store has: its own, or that of the store it replaces."""
+    """Return the path that a store has once it is complete.
+
+    If ``path`` is a staging path, it is the path of the store that will be replaced, otherwise
+    ``path`` itself.
+    """
     staging_match = re.fullmatch(rf"\.(.+){re.escape(STAGING_SUFFIX)}", path.name)
     return path.with_name(staging_match[1]) if staging_match else path
 

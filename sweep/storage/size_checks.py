@@ -51,7 +51,7 @@ def compressed_bytes_max(raw_bytes: int) -> int:
 
 
 class ArrayFileLayout(NamedTuple):
-    """Numbers of values per chunk, and of chunks per file, of an array."""
+    """Layout of an array in files: number of values per chunk, and of chunks per file."""
 
     values_per_chunk: int  # number of values in a chunk
     bytes_per_value: int  # size of a value [bytes]; 0 for strings

@@ -186,9 +186,9 @@ def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any
     Raises
     ------
     StoreError
-        If the store is not sweep's, holds another study, was begun with other versions, is damaged
-        in objects older than its results, or is being written by another process. The store is not
-        changed.
+        If the store is not sweep's, holds another study, was begun with other versions, has damaged
+        objects from before its first result, or is being written by another process. The store
+        does not change.
     ClusterError
         If no scheduler or worker is available.
     """
@@ -205,7 +205,7 @@ def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions)
     attributes, study = _read_resumable_study(working_path)
     if spec is not None:
         refuse_other_study(working_path, attributes, study.spec, spec)
-    _refuse_altered_store(working_path, attributes, study)
+    _refuse_unresumable_store(working_path, attributes, study)
     _check_user_functions(study.spec)
     if spec is None:
         refuse_damaged_recipe(working_path)
@@ -276,7 +276,7 @@ def extend(
     target_spec = apply_changes(source_study.spec if spec is None else spec, changes or {})
     _check_user_functions(target_spec)
     backend = _make_backend(run_options, target_spec)
-    _refuse_altered_store(source_path, attributes, source_study)
+    _refuse_unresumable_store(source_path, attributes, source_study)
     if target_spec.id == attributes["study_id"]:
         backend.progress.say(f"nothing to extend: {source_path} holds this very study")
         return _compute_missing_blocks(source_path, source_study, backend)
@@ -350,12 +350,13 @@ def _read_resumable_study(
     return attributes, study
 
 
-def _refuse_altered_store(
+def _refuse_unresumable_store(
     store_path: Location, attributes: dict[str, Any], study: GridStudy | FlightStudy
 ) -> None:
     """Raise a StoreError if a store can't be continued by this software.
 
-    It was begun with other versions, or its objects older than any result are damaged.
+    Reasons are other versions of the software, changed attributes, blocks of another shape, and
+    damage to objects that were written before the first result.
     """
     refuse_other_versions(store_path, attributes, study.model_version, reader="this machine")
     if study.id != attributes["study_id"]:
@@ -430,7 +431,7 @@ def _compute_into_path(
         elif already_exists:
             stored_attributes, stored_study = _read_resumable_study(working_path)
             refuse_other_study(working_path, stored_attributes, stored_study.spec, spec)
-            _refuse_altered_store(working_path, stored_attributes, stored_study)
+            _refuse_unresumable_store(working_path, stored_attributes, stored_study)
             write_recipe(working_path, **read_recipe(working_path) | recipe)
         if isinstance(spec, SceneSpec) and (from_scratch or not already_exists):
             with show_activity("building the scene", backend.progress):
@@ -483,7 +484,7 @@ def _compute_into_path(
 def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
     """Move a complete store from its staging path to its final path.
 
-    The caller holds the lock there.
+    The caller holds the lock of the store at the final path.
     """
     staging_path = staging_path_for(final_path)
     with raise_as_store_error(f"{staging_path} can't take the place of {final_path}"):
@@ -594,9 +595,10 @@ def _compute_missing_blocks(
 
 
 def _is_flight_complete(store_path: Location, study: FlightStudy) -> bool:
-    """Return True if all blocks of a flight are stored, and all of its existing eyepoint stores.
+    """Return True if all blocks of a flight are stored, and its eyepoint stores are complete.
 
-    An eyepoint store holds the geometry of the shots, as rays have found it.
+    An eyepoint store holds the geometry of the shots, as rays have found it. Missing eyepoint
+    stores do not count.
     """
     return bool(
         blocks_with_receipt(store_path, study).all() and committed_blocks(store_path, study).all()

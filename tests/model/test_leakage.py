@@ -89,7 +89,7 @@ def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(nam
         lines.position[:n], lines.re[:n], lines.im[:n] = places, s.real, s.imag
         clearance = float(layout.clearance_bins)
         n_sources = compute_sources(bundle, clearance, SOURCE_LOG_ACCURACY, layout, field)
-        bound = far_line_weight(total, n_sources, layout, field.sources)
+        bound = far_line_weight(total, n_sources, layout, field.far_equivalent_lines)
         away = np.geomspace(layout.clearance_bins + 1, 2000, 24) + generator.uniform(0, 1)
         y = half + away[:, None] - places
         kernel = direct_transform(shape, y.ravel()).reshape(y.shape) * np.exp(1j * np.pi * y)

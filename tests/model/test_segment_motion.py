@@ -261,7 +261,7 @@ def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
         )
         planned = plan_shot_effects(
             seen, np.zeros(1, np.int64), scene_parameters(table_4_1, beamlets=7), ground, modes={},
-            rotating=False,
+            has_rotating_bodies=False,
         )  # fmt: skip
         flags = planned.selected_effects(1).effect_flags
         called.append({"acceleration", "segment_motion"} & set(unpack_effect_flags(int(flags[0]))))

@@ -87,7 +87,7 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     steep = study.dataset.isel(cut=study.dataset.grazing_angle.values == 85)
     expected = steep.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).unbroken / 1000
     (line,) = drawn_lines(
-        chart, part="grazing angle 85°", answer=detector_charts.UNBROKEN_LABEL
+        chart, part="grazing angle 85°", answer=detector_charts.UNBROKEN_RANGE_LABEL
     ).values()
     np.testing.assert_allclose(line.y, expected, rtol=1e-6)
     target = GRID_SPEC["target"] | {"range": "1 km", "grazing_angle": "50 deg"}
@@ -124,7 +124,7 @@ def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
 def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
     chart = detector_charts.maximum_range_item(drawn)
     expected = drawn.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute() / 1000
-    (line,) = drawn_lines(chart, answer=detector_charts.UNBROKEN_LABEL).values()
+    (line,) = drawn_lines(chart, answer=detector_charts.UNBROKEN_RANGE_LABEL).values()
     known = np.isfinite(expected.unbroken_low + expected.unbroken_high)
     assert known.any()
     np.testing.assert_allclose(line.low[known], expected.unbroken_low[known], rtol=1e-6)

@@ -23,7 +23,12 @@ from sweep.spec import (
     json_schema,
 )
 from sweep.spec.axes import read_axes
-from sweep.spec.fields import SpecSection, add_effect_modes, add_effect_parameters, rule_of_field
+from sweep.spec.fields import (
+    SpecSection,
+    add_effect_mode_fields,
+    add_effect_parameter_fields,
+    rule_of_field,
+)
 from sweep.spec.grid_checks import GridValues
 from sweep.spec.rules import NumericRule
 from sweep.spec.sections import Effects, Laser, parameter_rules
@@ -129,14 +134,14 @@ def test_a_new_parameter_or_effect_touches_no_section(monkeypatch):
     class Bare(SpecSection):
         """A section."""
 
-    Lamp = add_effect_parameters("instrument.laser")(Bare)
+    Lamp = add_effect_parameter_fields("instrument.laser")(Bare)
     assert Lamp.model_validate({}).colours == 2 and Lamp.model_validate({"colours": 3}).colours == 3
     assert Lamp.__doc__ == "A section." and Lamp.__name__ == "Bare"
     assert Lamp.__module__ == __name__
-    assert set(add_effect_modes(Bare).model_fields) == {EFFECTS[0].name}
-    assert not add_effect_parameters("instrument")(Bare).model_fields
+    assert set(add_effect_mode_fields(Bare).model_fields) == {EFFECTS[0].name}
+    assert not add_effect_parameter_fields("instrument")(Bare).model_fields
     with pytest.raises(TypeError, match="has colours already"):
-        add_effect_parameters("instrument.laser")(Lamp)
+        add_effect_parameter_fields("instrument.laser")(Lamp)
 
 
 def test_a_section_keeps_its_name_and_words():

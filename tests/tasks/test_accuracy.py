@@ -465,7 +465,7 @@ def test_whole_parts_are_kept_where_it_is_broken_off(trials, kept):
     )
     asked.left = int(trials * len(tried._setting_ladder.settings)) if kept else 3
     if not kept:
-        with pytest.raises(measurement.NothingMeasured):
+        with pytest.raises(measurement.NoMeasurementError):
             tried.run()
         return
     found = tried.run()

@@ -120,11 +120,11 @@ def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_a
     flags = np.array([base, base | noise, base | image, base, base | image | noise], np.uint32)
     found = {
         tuple(index): names
-        for index, names, own in SelectedEffects(flags, flags * 0.0).iter_joint_groups()
+        for index, names, own in SelectedEffects(flags, flags * 0.0).iter_groups_computed_together()
     }
     plain = ("footprint", "doppler", "signal_shot_noise")
     assert found == {(0, 1, 3): plain, (2, 4): (*plain, "image")}
-    for index, _, own in SelectedEffects(flags, flags * 0.0).iter_joint_groups():
+    for index, _, own in SelectedEffects(flags, flags * 0.0).iter_groups_computed_together():
         np.testing.assert_array_equal(own, flags[index])
 
 

@@ -20,7 +20,7 @@ HUGE = {"instrument.processing.fft_size": [2**16, 2**30]}
 def set_machine_memory(monkeypatch, limit):
     """Let this machine have so many bytes, and be asked for any number of them."""
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", limit)
-    monkeypatch.setattr(worker_memory, "SMALL_BYTES", 0)
+    monkeypatch.setattr(worker_memory, "ALWAYS_AVAILABLE_BYTES", 0)
 
 
 def runs(spec, path):

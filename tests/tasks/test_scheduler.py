@@ -35,7 +35,7 @@ def test_a_failed_block_comes_back_once_and_alone():
     assert blocks.take_blocks(3) == [1]
     blocks.requeue([1])
     assert blocks.take_blocks(3) == [1]
-    assert blocks.failed == {1}
+    assert blocks.failed_blocks == {1}
     assert not blocks.requeue_failed(1)
     assert blocks.take_blocks(3) == [3, 4, 5]
 

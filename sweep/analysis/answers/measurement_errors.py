@@ -220,8 +220,9 @@ def _cramer_rao_bounds(
     snr
         Signal-to-noise ratios of the three segments.
     parameters
-        SI values at each point of the parameters in `_PATH_BY_PARAMETER`, of the target, and of the
-        flags ``walks``, ``moves`` and ``late``.
+        SI values at each point of the parameters in `_PATH_BY_PARAMETER` and of the target. Also
+        three flags of simulated effects: ``walks`` (range walk), ``moves`` (motion between
+        segments) and ``late`` (echoes after the start of their record).
     """
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *parameters.values())))
     flat_parameters = {name: np.broadcast_to(a, shape).ravel() for name, a in parameters.items()}

@@ -57,7 +57,7 @@ UNIT_BY_COLUMN = {
 UNIT_BY_COLUMN["scan_angle"] = "deg"
 
 REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING_SIGN_NOTE)
-"""Remarks on columns whose units do not explain the values: signs of velocities."""
+"""Remark on the sign of the values, for each column with a velocity."""
 
 DESCRIPTION_BY_COLUMN = {
     name: "; ".join(filter(None, [UNIT_BY_COLUMN.get(name), REMARK_BY_COLUMN.get(name)]))

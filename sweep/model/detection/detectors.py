@@ -207,7 +207,7 @@ def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """
     circular_bins = _circular_bins(power, settings)
     level_max, n_below = (
-        circular_bins / _settings_factor(OS_CFAR, settings),
+        circular_bins / _cfar_factor_of_settings(OS_CFAR, settings),
         np.zeros(circular_bins.shape, np.int64),
     )
     for below, above in _iter_training_pairs(power, settings):
@@ -224,7 +224,7 @@ DETECTORS: dict[str, Detector] = {
 }
 
 
-def _settings_factor(kind: str, settings: SpectrumSettings) -> float:
+def _cfar_factor_of_settings(kind: str, settings: SpectrumSettings) -> float:
     """Return the threshold over the estimated noise level of a CFAR detector with these settings.
 
     ``kind`` is a name of :data:`DETECTORS`, such as ``ca_cfar``.
@@ -272,5 +272,6 @@ def _exceeds_cfar_threshold(
 ) -> np.ndarray:
     """Test if the power of bins is at or above the CFAR factor times their noise level."""
     return _pad_to_all_bins(
-        _circular_bins(power, settings) >= _settings_factor(kind, settings) * level, settings
+        _circular_bins(power, settings) >= _cfar_factor_of_settings(kind, settings) * level,
+        settings,
     )

@@ -164,9 +164,9 @@ def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
 
 
 def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the frequency of the spectrum's maximum; an :data:`Estimator`.
+    """Return the positions of the maxima of spectra [bins]; an :data:`Estimator`.
 
-    A chirp-z transform samples the spectrum finely around the peak bin.
+    A chirp-z transform samples each spectrum finely around its peak bin.
     """
     zoom, positions = (
         _zoom_transform(settings.window.length, settings.fft_size),

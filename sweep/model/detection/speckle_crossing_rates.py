@@ -80,8 +80,8 @@ class SpeckleCrossingRates(NamedTuple):
     log_amplitude_step: float
     """Difference of ln(amplitude) between successive table entries."""
     position_max: float
-    """Largest fractional entry number at mean speckle power for which the rates at all speckle
-    powers lie in the table."""
+    """Largest table position (fractional entry number) of a bin's amplitude at the faintest speckle
+    power. From larger positions the rate at the brightest speckle would lie outside the table."""
     relative_rates: np.ndarray
     """(p + 5, columns): relative rates, with p entries between two speckle powers. Entry number
     p c + r is in row r and column c. The powers of a bin are thus adjacent in a row, and the six

@@ -430,9 +430,9 @@ def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndar
 def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     """Add the shot noise of backscattered light.
 
-    The beat of this light with the local oscillator is neglected. It comes from ever new grains,
-    and is spread over the bins from the nearest range to the target's. [T 3.3.1] counts
-    backscatter as noise as well.
+    The beat of this light with the local oscillator is neglected. The grains that scatter it keep
+    changing, and its beat is spread over the bins from the nearest range to the target's range.
+    [T 3.3.1] counts backscatter as noise as well.
     """
     parameters = context.parameters
     profile = extinction_profile(parameters)

@@ -159,8 +159,8 @@ class Effect:
     parameters: tuple[Parameter, ...] = ()
     """Parameters of the effect, which become fields of a spec."""
     parent: str = ""
-    """Name of the effect that this one is part of. The parent is kept wherever this effect is, and
-    this effect is off where the parent is."""
+    """Name of the effect that this one is part of. Where this effect is simulated, so is the
+    parent. Where the parent is off, so is this effect."""
     needs_separate_batches: bool = True
     """True if points with and without the effect are computed separately. If False, `apply` uses
     :attr:`EffectContext.presence` and leaves the bits of points without the effect unchanged."""

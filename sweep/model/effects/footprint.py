@@ -104,7 +104,9 @@ FOOTPRINT = Effect(
 
 
 def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by optical phases, which may cancel or amplify lines.
+    """Bound the change of the largest bin that the optical phases of beamlets cause.
+
+    Phases may amplify lines or cancel them.
 
     Notes
     -----

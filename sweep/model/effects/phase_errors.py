@@ -73,7 +73,7 @@ from sweep.model.effects.error_bounds import (
     PhaseErrorBound,
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.effects.sweep_error_table import SweepErrorTable, fit_sweep_error
+from sweep.model.effects.sweep_error_table import SweepFrequencyError, fit_sweep_frequency_error
 from sweep.model.link_budget import CHIRP_PREFIX
 from sweep.model.preparation import Shots
 from sweep.model.shot_records import PhaseError
@@ -601,7 +601,7 @@ ERROR_TABLE_PATH, NO_TABLE = CHIRP_PREFIX + "error_table", "none"
 def error_table_phase(
     position: np.ndarray,
     *,
-    table: SweepErrorTable,
+    table: SweepFrequencyError,
     sign: int,
     chirp_duration: np.ndarray,
     range: np.ndarray,
@@ -615,7 +615,7 @@ def error_table_phase(
     ----------
     position : ndarray (m,)
         Positions x in the record, -1..1.
-    table : SweepErrorTable
+    table : SweepFrequencyError
         Measured frequency error of the sweep over the time in the up-chirp.
     sign : int
         Sign s of the chirp; 0 for the Doppler segment.
@@ -717,7 +717,7 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
         return (
             None
             if table_text == NO_TABLE
-            else _error_table_phase_bound(points, fit_sweep_error(table_text))
+            else _error_table_phase_bound(points, fit_sweep_frequency_error(table_text))
         )
     quadratic, cubic, sinusoidal = (points[path] for path in _ERROR_PEAK_PATHS)
     half_duration, chirp_rates = 0.5 * points.record.duration, points.existing_chirp_rates
@@ -758,11 +758,13 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
     return (
         phase_bound
         if table_text == NO_TABLE
-        else phase_bound.plus(_error_table_phase_bound(points, fit_sweep_error(table_text)))
+        else phase_bound.plus(
+            _error_table_phase_bound(points, fit_sweep_frequency_error(table_text))
+        )
     )
 
 
-def _error_table_phase_bound(points: PlannerInputs, table: SweepErrorTable) -> PhaseErrorBound:
+def _error_table_phase_bound(points: PlannerInputs, table: SweepFrequencyError) -> PhaseErrorBound:
     """Bound the phase that a measured frequency error of the sweep adds over the record.
 
     The phase is about minus the echo's delay times the error. It is bounded by the middle of the
@@ -820,7 +822,9 @@ def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
     )
     if (table_text := str(parameters[ERROR_TABLE_PATH])) != NO_TABLE:
         shots = _add_phase_error(
-            shots, partial(error_table_phase, table=fit_sweep_error(table_text)), **phase_inputs
+            shots,
+            partial(error_table_phase, table=fit_sweep_frequency_error(table_text)),
+            **phase_inputs,
         )
     return _add_phase_error(
         shots,

@@ -171,8 +171,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 def total_beat_amplitude(shots: Shots) -> np.ndarray:
     """Return the amplitude at the ADC [V] of a sine with the power of all lines, (n,).
 
-    It is that of the existing segment with the lowest beat frequency, which passes the receiver
-    best.
+    The receiver's gain is taken at the lowest beat frequency of all segments, where it is largest.
     """
     beat_inputs = {
         "chirp_rate": shots.waveform.chirp_rate, "range": shots.range,

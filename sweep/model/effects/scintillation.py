@@ -39,8 +39,8 @@ from sweep.model.link_budget import ECHO_NOISE_SOURCES, LASER_PREFIX, TELESCOPE_
 from sweep.model.preparation import Shots
 
 _DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
-"""Exponents, by kind of wave, of the distances to receiver and to source in the Rytov variance's
-integral over the path."""
+"""Exponents of two factors in the Rytov variance's integral over the path, by kind of wave. The
+factors are the distance to the receiver and the distance to the source."""
 _LARGE_EDDY_COEFFICIENTS = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
 """Coefficients, by kind of wave, of two terms in the log variance by large eddies. The first term
 is the aperture's, the second that of the strength of turbulence."""
@@ -312,7 +312,10 @@ _DISTRIBUTION_PATH = "atmosphere.scintillation_law"
 
 
 def turbulence_profile(parameters: Mapping[str, np.ndarray]) -> TurbulenceProfile | None:
-    """Return the turbulence over height for points of one category; None in still air."""
+    """Return the strength of turbulence over height, Cn^2; None in still air.
+
+    All points have the same text parameters (one category).
+    """
     name = str(parameters[_TURBULENCE_PATH])
     if name == "uniform":
         return TurbulenceProfile(uniform=float(parameters[_STRUCTURE_CONSTANT_PATH]))

@@ -17,7 +17,7 @@ CHEBYSHEV_DEGREE_MAX = 64
 """Largest degree of the Chebyshev series that is fitted to a table of frequency errors."""
 
 
-class SweepErrorTable(NamedTuple):
+class SweepFrequencyError(NamedTuple):
     """Measured frequency error of the sweep over the time in the up-chirp."""
 
     first_time: float
@@ -64,7 +64,7 @@ class SweepErrorTable(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def fit_sweep_error(table_text: str) -> SweepErrorTable:
+def fit_sweep_frequency_error(table_text: str) -> SweepFrequencyError:
     """Fit a Chebyshev series to a table of frequency errors by least squares.
 
     Parameters
@@ -81,7 +81,7 @@ def fit_sweep_error(table_text: str) -> SweepErrorTable:
 
     Examples
     --------
-    >>> table = fit_sweep_error("0.0 0.0, 1.0 1.0, 2.0 2.0")  # a straight line
+    >>> table = fit_sweep_frequency_error("0.0 0.0, 1.0 1.0, 2.0 2.0")  # a straight line
     >>> table.chebyshev_coefficients.round(12).tolist()
     [1.0, 1.0]
     """
@@ -97,7 +97,7 @@ def fit_sweep_error(table_text: str) -> SweepErrorTable:
         residual = residual - orthogonal_basis[:, degree] * projection[degree]
         if np.abs(residual).max() <= RESIDUAL_MAX_OVER_SPAN * span + 1e-12 * np.abs(error).max():
             used_terms = slice(0, degree + 1)
-            return SweepErrorTable(
+            return SweepFrequencyError(
                 time[0],
                 time[-1],
                 np.linalg.solve(triangular_factor[used_terms, used_terms], projection[used_terms]),

@@ -108,10 +108,10 @@ class CountInputs(NamedTuple):
     pfa: np.ndarray
     """(3, m): probability of a false alarm in those bins of each segment that are not drawn one by
     one."""
-    pd_otherwise: np.ndarray
+    pd_without_condition: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
     :func:`_draw_probabilities` is not met; unused if noise is drawn."""
-    pd_if_condition: np.ndarray
+    pd_with_condition: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
     :func:`_draw_probabilities` is met; unused if noise is drawn."""
     any_two: np.ndarray
@@ -157,8 +157,8 @@ def count_by_probability(
         line_noise_ratio=np.zeros(n_rows),
         bin_thresholds=BinThresholds(*np.zeros((7, n_rows))),
         pfa=probabilities[0],
-        pd_otherwise=probabilities[1],
-        pd_if_condition=probabilities[2],
+        pd_without_condition=probabilities[1],
+        pd_with_condition=probabilities[2],
         any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
         mixing=np.empty((0, n_rows)),
         ratio_row=np.zeros((3, n_rows), np.int64),
@@ -209,8 +209,8 @@ def count_in_noise(
             line_noise_ratio=line_noise_ratio[indices],
             bin_thresholds=shots.bin_thresholds.select(indices),
             pfa=np.ascontiguousarray(pfa_elsewhere),
-            pd_otherwise=no_probabilities,
-            pd_if_condition=no_probabilities,
+            pd_without_condition=no_probabilities,
+            pd_with_condition=no_probabilities,
             any_two=np.full(indices.size, shots.any_two),
             mixing=mixing[:, indices].copy(),
             ratio_row=speckle_table.ratio_row[:, indices].copy(),
@@ -456,7 +456,7 @@ class NoiselessSpectra(NamedTuple):
     alarm."""
     leaked_slice: np.ndarray
     """(m, 3, 2) int64: begin and end of each segment's bins in the arrays ``leaked_*`` and
-    ``exempt_neighbour_*``; equal without leaked signal."""
+    ``exempt_neighbour_*``. They are equal in segments without leaked signal."""
     leaked_index: np.ndarray
     """(leaked,) int64: numbers, from ``first_bin``, of the bins with signal leaked from an echo.
     With noise they may raise a false alarm."""
@@ -471,7 +471,7 @@ class NoiselessSpectra(NamedTuple):
 
     @classmethod
     def empty(cls, n_points: int) -> "NoiselessSpectra":
-        """Return a record without bins, for draws that compare numbers with probabilities."""
+        """Return spectra without bins, for draws that compare random numbers with probabilities."""
         zeros, empty_slices = (
             np.zeros((n_points, 3), np.int64),
             np.zeros((n_points, 3, 2), np.int64),
@@ -677,7 +677,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                         address, stream, peak_index, crossing, random_words, is_detected[s]
                     )
                 else:
-                    pd_pair = inputs.pd_otherwise[s, j], inputs.pd_if_condition[s, j]
+                    pd_pair = inputs.pd_without_condition[s, j], inputs.pd_with_condition[s, j]
                     one = is_detected[0] if s == 2 else is_detected[0] ^ is_detected[2]
                     _mark_random_events(
                         address, STREAM_DETECTION[s], pd_pair, one, random_words, is_detected[s]

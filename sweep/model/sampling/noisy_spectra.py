@@ -857,7 +857,7 @@ class SegmentDetections(NamedTuple):
     """(m,) int64: number of runs of adjacent flagged bins outside the bins of the echo: false
     alarms."""
     n_false_bins: np.ndarray
-    """(m,) int64: number of flagged bins in these false alarms."""
+    """(m,) int64: number of flagged bins in the false alarms that ``n_false_groups`` counts."""
     frequency: np.ndarray
     """(m,): estimated frequency of the echo [bins], signed for a complex record."""
     peak_offset: np.ndarray

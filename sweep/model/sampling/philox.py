@@ -91,9 +91,13 @@ class CounterIncrements(NamedTuple):
 FIRST_BLOCK_NUMBER = np.int64(0)
 """Number of the first block (four random words) of a stream."""
 DRAW_INCREMENTS = CounterIncrements(draw=1, block=0)
-"""Increments with which columns hold the same block (four random words) of successive draws."""
+"""Increments from column to column of a table of random words: the draw grows by 1.
+
+All columns hold the same block (four random words) of the stream."""
 BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
-"""Increments with which columns hold successive blocks (four random words) of one draw."""
+"""Increments from column to column of a table of random words: the block grows by 1.
+
+All columns hold words of the same draw. A block is four random words."""
 
 
 @njit(cache=True)

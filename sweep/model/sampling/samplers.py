@@ -390,7 +390,9 @@ class DetectionSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make draws of points and count their events; add draws of random effects to the means.
+        """Make draws of points and count their events.
+
+        If effects are random, statistics of each draw are added to running means.
 
         The arguments are those of :meth:`Sampler.count_draws`.
         """

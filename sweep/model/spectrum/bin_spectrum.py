@@ -200,7 +200,7 @@ class FieldWorkspace(NamedTuple):
     """Imaginary part of the weights in the table cells over which lines are spread."""
     line_ends: EndStrengths
     """Amplitudes of the segment's lines at the record's start and end."""
-    sources: EndStrengths
+    far_equivalent_lines: EndStrengths
     """Equivalent lines (sources), which replace the segment's lines in bins far away."""
     far_bins: FarBins
     """Trigonometric values and scratch arrays for a batch of bins far from the lines."""
@@ -250,7 +250,7 @@ class SpectrumWorkspace(NamedTuple):
     """Arrays for computing the spectrum of one segment of one point."""
 
     field: FieldWorkspace
-    """Lines and their spectrum without images."""
+    """Lines of the segment, and their spectrum without images (mirrors at negative frequency)."""
     inverse_gain_re: np.ndarray
     """Scratch of :func:`sweep.model.spectrum.lines.compute_lines`: real part of 1 over the gain."""
     inverse_gain_im: np.ndarray
@@ -307,7 +307,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
         cell_re=next(rows),
         cell_im=next(rows),
         line_ends=EndStrengths(lines.position, *next_rows(4)),
-        sources=EndStrengths(*next_rows(5)),
+        far_equivalent_lines=EndStrengths(*next_rows(5)),
         far_bins=FarBins(*next_rows(8)),
         re=next(rows),
         im=next(rows),
@@ -441,7 +441,8 @@ def compute_sources(bundle, distance_min, log_accuracy, layout, field):
     layout
         :class:`SpectrumLayout`.
     field
-        :class:`FieldWorkspace`, whose ``line_ends`` and ``sources`` are results.
+        :class:`FieldWorkspace`, whose ``line_ends`` and ``far_equivalent_lines`` (the sources)
+        are results.
 
     Returns
     -------
@@ -450,7 +451,7 @@ def compute_sources(bundle, distance_min, log_accuracy, layout, field):
     """
     adds_powers = layout.adds_powers
     half_record_ratio = 0.5 * layout.record_length / layout.fft_size
-    lines, line_ends, sources = field.lines, field.line_ends, field.sources
+    lines, line_ends, sources = field.lines, field.line_ends, field.far_equivalent_lines
     for line in range(bundle.n_lines):
         sine, cosine = sincos_cycles(
             (2.0 if adds_powers else 1.0) * half_record_ratio * lines.position[line]
@@ -698,7 +699,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
                     ZERO,
                     stop - current,
                     current - first_bin,
-                    field.sources,
+                    field.far_equivalent_lines,
                     source,
                     polynomial_log_accuracy,
                     shape.ends,
@@ -999,7 +1000,9 @@ def detect_in_span(
         n_sources = compute_sources(
             bundle, float(layout.clearance_bins), SOURCE_LOG_ACCURACY, layout, workspace.field
         )
-        far_weight = far_line_weight(weight_sum, n_sources, layout, workspace.field.sources)
+        far_weight = far_line_weight(
+            weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
+        )
         margin_bins = max(
             distance_below_level_with_images(
                 lowest_level, far_weight, seen, shape.envelope, layout

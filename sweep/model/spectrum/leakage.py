@@ -149,8 +149,8 @@ class SettledLeakage(NamedTuple):
     """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
 
 
-class EnvelopeBeyond(NamedTuple):
-    """Bounds on a line's spectrum at all distances above a given one. The line has amplitude 1."""
+class FarLineBounds(NamedTuple):
+    """Bounds on the spectrum of a line of amplitude 1, at all distances from a given one on."""
 
     magnitude: float
     """Largest magnitude of the line's spectrum."""
@@ -236,14 +236,16 @@ def detect_with_leakage(
         ),
         float(clearance),
     )
-    tolerance_left = limits.tolerance - _leakage_bound_beyond(
+    tolerance_left = limits.tolerance - _far_false_alarm_bound(
         far_weight, distance_min, image_distance, brightest_limits, envelope
     )
     if tolerance_left < 0.0 or crossing_distance > clearance:
         n_sources = compute_sources(
             bundle, float(clearance), SOURCE_LOG_ACCURACY, layout, workspace.field
         )
-        far_weight = far_line_weight(weight_sum, n_sources, layout, workspace.field.sources)
+        far_weight = far_line_weight(
+            weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
+        )
         crossing_distance = max(
             distance_below_level_with_images(
                 brightest_limits.threshold, far_weight, seen, envelope, layout
@@ -251,14 +253,14 @@ def detect_with_leakage(
             float(clearance),
         )
         distance_min = min(crossing_distance, float(clearance + nyquist_bin))
-        tolerance_left = limits.tolerance - _leakage_bound_beyond(
+        tolerance_left = limits.tolerance - _far_false_alarm_bound(
             far_weight, distance_min, image_distance, brightest_limits, envelope
         )
         while (
             tolerance_left < 0.0 and distance_min < layout.table_bins
         ):  # bins of the table take less time than an integral
             distance_min = min(1.25 * distance_min, float(layout.table_bins))
-            tolerance_left = limits.tolerance - _leakage_bound_beyond(
+            tolerance_left = limits.tolerance - _far_false_alarm_bound(
                 far_weight, distance_min, image_distance, brightest_limits, envelope
             )
     # Wide enough if the integral may be left out, else a first guess.
@@ -310,7 +312,7 @@ def detect_with_leakage(
                     n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates
                 )
             return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, leakage)
-        result = _leakage_of_span_and_beyond(
+        result = _leakage_of_span_and_far_bins(
             DetectedSpan(first_bin, n_bins, peak_index, n_exempt, 0.0),
             bundle,
             seen,
@@ -422,7 +424,7 @@ def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_over_speckle(
-    first_index, end_index, limits, span, speckle_rates, relative_rates_beyond
+    first_index, end_index, limits, span, speckle_rates, relative_rates_of_far_bins
 ):
     """Return the mean probability, over speckle, of a false peak by leaked signal.
 
@@ -439,7 +441,7 @@ def _mean_leakage_over_speckle(
     speckle_rates
         :class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates` of the threshold
         over sigma.
-    relative_rates_beyond
+    relative_rates_of_far_bins
         (N_SPECKLE_POWERS,): sum of the crossing rates of the bins beyond the span at each speckle
         power, over this power.
     """
@@ -469,7 +471,7 @@ def _mean_leakage_over_speckle(
             if not is_gap_listed:
                 n_listed, is_gap_listed = n_listed + 1, True
     rate_at_brightest = rate_sums[N_SPECKLE_POWERS - 1] + max(
-        relative_rates_beyond[N_SPECKLE_POWERS - 1], 0.0
+        relative_rates_of_far_bins[N_SPECKLE_POWERS - 1], 0.0
     )
     for i in range(n_listed):
         rate_at_brightest += joining_rates[i, N_SPECKLE_POWERS - 1]
@@ -482,7 +484,7 @@ def _mean_leakage_over_speckle(
     for k in range(log_rates.size):
         power_index = N_SPECKLE_POWERS - 1 - k * power_stride
         power = TABULATED_SPECKLE_POWERS[power_index]
-        rate = power * (rate_sums[power_index] + max(relative_rates_beyond[power_index], 0.0))
+        rate = power * (rate_sums[power_index] + max(relative_rates_of_far_bins[power_index], 0.0))
         if n_listed > 0:
             for i in range(n_listed):
                 probabilities[i] = -math.expm1(-power * joining_rates[i, power_index])
@@ -624,7 +626,7 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, envelope):
+def _far_false_alarm_bound(weight_sum, distance_min, image_distance, limits, envelope):
     """Bound the probability of false alarms by leaked signal in all bins far from the lines.
 
     The bins are ``distance_min`` or more bins away from the lines.
@@ -659,10 +661,10 @@ def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, enve
     """
     weight_ratio, b = weight_sum / limits.noise_sigma, limits.threshold / limits.noise_sigma
     y = 0.5 * b * b
-    beyond = _envelope_beyond(distance_min, envelope)
-    nearest_envelope, square_sum = beyond.magnitude, beyond.square_sum
+    far_bounds = _far_line_bounds(distance_min, envelope)
+    nearest_envelope, square_sum = far_bounds.magnitude, far_bounds.square_sum
     if image_distance < math.inf:
-        image = _envelope_beyond(max(distance_min, image_distance), envelope)
+        image = _far_line_bounds(max(distance_min, image_distance), envelope)
         image_square_sum = image.square_sum + (
             max(image_distance - distance_min, 0.0) * image.magnitude * image.magnitude
         )
@@ -678,11 +680,11 @@ def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, enve
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _envelope_beyond(distance_min, envelope):
-    """Return the :class:`EnvelopeBeyond` of a line from a distance of ``distance_min`` bins on."""
+def _far_line_bounds(distance_min, envelope):
+    """Return the :class:`FarLineBounds` of a line from a distance of ``distance_min`` bins on."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
-    return EnvelopeBeyond(magnitude, magnitude * magnitude + envelope.square_integral[index])
+    return FarLineBounds(magnitude, magnitude * magnitude + envelope.square_integral[index])
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -745,8 +747,8 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
     The leakage integral covers the bins beyond them. The number is a heuristic. It depends on the
     threshold, on the smoothness of the false-alarm rate, and on 3/4 of ``line_extent``, the extent
     of the lines [bins]. It is a multiple of 8. :func:`detect_with_leakage` doubles it until
-    :func:`_leakage_of_span_and_beyond` is accurate. ``crossing_distance`` is the distance from the
-    lines [bins] up to which signal alone may cross the threshold.
+    :func:`_leakage_of_span_and_far_bins` is accurate. ``crossing_distance`` is the distance from
+    the lines [bins] up to which signal alone may cross the threshold.
     """
     clearance = layout.clearance_bins
     edge_signal = envelope.magnitude[clearance] * weight_sum / limits.noise_sigma
@@ -763,7 +765,7 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def _leakage_of_span_and_beyond(
+def _leakage_of_span_and_far_bins(
     detected,
     bundle,
     seen,
@@ -798,14 +800,14 @@ def _leakage_of_span_and_beyond(
     _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
     centre_bin = abs(math.floor(0.5 * (seen.lowest_position + seen.highest_position) + 0.5))
     centre_bin = fft_size - centre_bin if centre_bin > nyquist_bin else centre_bin
-    rate_beyond, last_terms, n_points = 0.0, 0.0, ZERO
+    far_rate, last_terms, n_points = 0.0, 0.0, ZERO
     for side in (-1, 1):
         if not (goes_on_below if side < 0 else goes_on_above):
             continue
         near_end = _near_end_correction(side, n_bins, span)
         if not near_end.exists:
             return SettledLeakage(0.0, False)
-        rate_beyond += near_end.correction
+        far_rate += near_end.correction
         last_terms += near_end.last_term
         end_distance = (
             centre_bin - first_bin - INTEGRAL_END_CORRECTION_BINS
@@ -859,11 +861,11 @@ def _leakage_of_span_and_beyond(
     for i in range(n_points):
         integral.half_square[i] *= scale
         span.half_square[i] = integral.half_square[i]
-    largest_beyond = largest_or_zero(integral.half_square[:n_points])
+    largest_far_half_square = largest_or_zero(integral.half_square[:n_points])
     fill_added_crossings(
         span.half_square, n_points, threshold_ratio, crossing_series, span.crossing_probability
     )
-    rate_beyond += weighted_crossing_rate(
+    far_rate += weighted_crossing_rate(
         span.crossing_probability[:n_points], integral.weight[:n_points]
     )
     half_square_max = min(
@@ -871,13 +873,13 @@ def _leakage_of_span_and_beyond(
         span.magnitude[peak_index] * span.magnitude[peak_index] * scale,
     )
     if not (
-        largest_beyond <= half_square_max
-        and last_terms <= END_CORRECTION_ERROR_MAX * (span_leakage + rate_beyond)
+        largest_far_half_square <= half_square_max
+        and last_terms <= END_CORRECTION_ERROR_MAX * (span_leakage + far_rate)
     ):
         return SettledLeakage(0.0, False)
     if speckle_power_max > 1.0:
         return SettledLeakage(
-            _mean_leakage_of_span_and_beyond(
+            _mean_leakage_of_span_and_far_bins(
                 n_bins,
                 n_points,
                 limits,
@@ -889,11 +891,11 @@ def _leakage_of_span_and_beyond(
             ),
             True,
         )
-    return SettledLeakage(span_leakage - (1.0 - span_leakage) * math.expm1(-rate_beyond), True)
+    return SettledLeakage(span_leakage - (1.0 - span_leakage) * math.expm1(-far_rate), True)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_leakage_of_span_and_beyond(
+def _mean_leakage_of_span_and_far_bins(
     n_bins, n_points, limits, goes_on_below, goes_on_above, span, integral, speckle_rates
 ):
     """Return the mean leakage over developed speckle of computed bins and of the integral's bins.
@@ -901,7 +903,7 @@ def _mean_leakage_of_span_and_beyond(
     The integral covers the bins beyond the computed ones, below them, above them, or both. It has
     ``n_points`` quadrature points.
     """
-    relative_rates_beyond = np.zeros(N_SPECKLE_POWERS)
+    relative_rates_of_far_bins = np.zeros(N_SPECKLE_POWERS)
     scale = 1.0 / (limits.noise_sigma * limits.noise_sigma)
     for side in (-1, 1):
         if not (goes_on_below if side < 0 else goes_on_above):
@@ -915,21 +917,21 @@ def _mean_leakage_of_span_and_beyond(
                 magnitude * magnitude * scale,
                 _end_correction_factor(offset),
                 speckle_rates,
-                relative_rates_beyond,
+                relative_rates_of_far_bins,
             )
     for i in range(n_points):
         add_rates_by_power(
             2.0 * integral.half_square[i],
             integral.weight[i],
             speckle_rates,
-            relative_rates_beyond,
+            relative_rates_of_far_bins,
         )
     first_index, end_index = (
         INTEGRAL_END_CORRECTION_BINS if goes_on_below else ZERO,
         n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
     return _mean_leakage_over_speckle(
-        first_index, end_index, limits, span, speckle_rates, relative_rates_beyond
+        first_index, end_index, limits, span, speckle_rates, relative_rates_of_far_bins
     )
 
 
@@ -986,7 +988,7 @@ def _fill_far_powers(
                 ZERO,
                 n_points,
                 ZERO,
-                field.sources,
+                field.far_equivalent_lines,
                 source,
                 log_accuracy + END_POLYNOMIAL_EXTRA_LOG_ACCURACY,
                 shape.ends,

@@ -86,7 +86,8 @@ def line_of_point(
     i, segment : int
         Indices of the point and of the segment.
     noise_frequency : float, optional
-        Frequency [Hz] whose noise density whitens the line, for skirts; by default the line's.
+        Frequency [Hz] at which the noise density is taken that whitens the line. It is given for
+        the line's skirts; by default it is the line's own frequency.
 
     Returns
     -------
@@ -225,7 +226,7 @@ def line_bin_masks(
     return is_masked, is_searched, is_searched & ~is_masked & (magnitude_max >= floor * noise_sigma)
 
 
-def raised_magnitude(
+def equivalent_echo_magnitude(
     echo_magnitude: np.ndarray,
     line_rms: np.ndarray,
     *,
@@ -233,7 +234,9 @@ def raised_magnitude(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return the magnitude of an echo that alone crosses the threshold as often as with the line.
+    """Return the magnitude of one echo that replaces an echo together with the permanent line.
+
+    An echo of this magnitude alone crosses the threshold as often as the given echo with the line.
 
     Parameters
     ----------
@@ -328,20 +331,20 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
             shots, int(bin_spans.point_numbers[i]), segment_index, peak_frequency
         )
         skirt_rms = np.where(is_masked[bins], 0.0, skirt_half_amplitude * line.magnitude_rms[bins])
-        raised_magnitudes = raised_magnitude(
+        equivalent_magnitudes = equivalent_echo_magnitude(
             bin_spans.magnitudes[bin_slice],
             skirt_rms,
             noise_sigma=line_noise_sigma[i],
             threshold=threshold[i],
             in_speckle=shots.speckle.segment_correlations is not None,
         )
-        raised_magnitudes[is_masked[bins]] = 0.0
-        magnitudes[bin_slice] = raised_magnitudes
+        equivalent_magnitudes[is_masked[bins]] = 0.0
+        magnitudes[bin_slice] = equivalent_magnitudes
         if is_masked[bins[peak]]:
             pd[segment_index, i], miss[segment_index, i] = 0.0, 1.0
         else:
             pd[segment_index, i], miss[segment_index, i] = pd_and_miss(
-                EchoBins(raised_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
+                EchoBins(equivalent_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
                 peak,
                 rule,
                 bin_threshold_at(shots.bin_thresholds, bin_spans.point_numbers[i]),

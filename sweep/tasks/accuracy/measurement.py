@@ -67,10 +67,12 @@ In each round every setting is timed once on every part of the sample.
 """
 
 TRIAL_TIME_FRACTION = 0.003
-"""Aimed duration of one trial of a setting, as a fraction of the measurement's time limit."""
+"""Target duration of one trial of a setting, as a fraction of the measurement's time limit."""
 
 TIMED_SEQUENCE_TIME_FACTOR = 2
-"""Aimed time of the points that are timed for a setting, as a multiple of a trial's aimed duration.
+"""Target duration of the sequence of points on which a setting is timed.
+
+It is a multiple of the target duration of a trial.
 """
 
 FIRST_TIMED_SEQUENCE_DIVISOR = 8
@@ -94,7 +96,8 @@ The least number is simulated even if the time limit is exceeded.
 TIME_DOMAIN_BEAMLET_COUNT = 109
 """Number of beamlets (rays of a beam) in the time-domain simulation.
 
-It is used if the spec's accuracy sets their number. Few are used because each needs a record.
+It replaces the reference setting's number, if that setting states one. It is small, because each
+beamlet needs a time-domain record of its own.
 """
 
 REPEATED_TRIAL_SECONDS_MAX = 1.0
@@ -172,7 +175,7 @@ def measure_accuracy(
             measured_template = AccuracyMeasurement(
                 sample, time_limit=time_limit, progress=listener, interrupts=interrupts
             ).run()
-        except NothingMeasured:
+        except NoMeasurementError:
             return False
     measured_template.storing_seconds = measure_storing_seconds(make_study(spec, store_path))
     _refuse_occupied_path(store_path, overwrite)  # another process may have written to it
@@ -220,7 +223,7 @@ def measure_storing_seconds(study: BlockStudy) -> float:
         )
 
 
-class NothingMeasured(Exception):
+class NoMeasurementError(Exception):
     """Exception raised if the measurement is interrupted before any point has all its results."""
 
 
@@ -253,7 +256,7 @@ class AccuracyMeasurement:
     def run(self) -> AccuracyTemplate:
         """Run as many rounds as the time limit allows. Return the content of the store.
 
-        NothingMeasured is raised if the run is interrupted before any point is complete.
+        NoMeasurementError is raised if the run is interrupted before any point is complete.
         """
         n_settings = len(self._settings)
         self._progress.say(
@@ -278,7 +281,7 @@ class AccuracyMeasurement:
             "",
         )
         if not first_round:
-            raise NothingMeasured
+            raise NoMeasurementError
         if len(first_round) < len(parts):
             stop_reason = "interrupted" if self._interrupts.is_stopping else "time limit"
         parts = parts[: len(first_round)]
@@ -378,7 +381,7 @@ class AccuracyMeasurement:
         """Compute a part of the sample with one setting. Return the wall time that it took [s]."""
         start = time.monotonic()
         if self._interrupts.is_stopping:
-            raise NothingMeasured
+            raise NoMeasurementError
         self._try_setting(setting_number, part)
         self._sample.clear_caches()
         return time.monotonic() - start
@@ -428,8 +431,8 @@ class AccuracyMeasurement:
         """Compare the most accurate setting, the reference, with time-domain records.
 
         The records are made at some of the points, as time allows. Return the differences at each
-        point, by :func:`result_differences`, and the number of beamlets of both. That number is 0
-        if it is the reference's own.
+        point, by :func:`result_differences`, and the number of beamlets with which both were
+        computed. 0 stands for the reference setting's own number.
         """
         reference_setting, beamlets_field = self._setting_ladder.reference, "footprint.beamlets"
         differences: dict[int, np.ndarray] = {}
@@ -493,7 +496,7 @@ ERROR_ARRAY_LONG_NAMES = {
 The first four are in the order of :func:`result_differences`.
 """
 
-N_PROMISED_ERRORS = 3
+N_ERRORS_BOUNDED_BY_TOLERANCE = 3
 """Number of arrays of errors that the tolerance bounds: the first ones of `ERROR_ARRAY_LONG_NAMES`.
 """
 

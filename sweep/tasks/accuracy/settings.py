@@ -34,7 +34,7 @@ MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
     "draws counted",
     "draws in noise",
 )
-"""Kinds of settings with random draws, by how pd of a point follows from the draws."""
+"""Kinds of settings with random draws. They differ in how a point's pd follows from the draws."""
 
 TRIED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
@@ -73,8 +73,9 @@ Larger numbers would take as much time as all other trials together.
 FIXED_RAYS_PER_SHOT_MIN, RAYS_TIMES_TOLERANCE = 19, 0.1
 """Constants for the number of rays per shot in settings with fixed effects.
 
-That number is the second constant over the tolerance, but at least the first, rounded up to a tried
-number. About one shot in a thousand over open ground then exceeds the tolerance.
+The number is `RAYS_TIMES_TOLERANCE` over the tolerance, but at least `FIXED_RAYS_PER_SHOT_MIN`. It
+is rounded up to one of the numbers that are tried. About one shot in a thousand over open ground
+then exceeds the tolerance.
 """
 
 REFERENCE_TOLERANCE = 1e-9

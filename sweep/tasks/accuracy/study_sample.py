@@ -134,7 +134,7 @@ def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
 
 
 def nan_results(n_points: int) -> SampleResults:
-    """Return results of `n` points that are all nan."""
+    """Return the results of n_points points, all of them nan."""
     shapes = (
         (n_points, 4),
         (n_points, 2),
@@ -239,9 +239,10 @@ class StudySample(ABC):
     def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Return the effects planned at each point (n,), one bit each.
+        """Choose the effects at each of n points.
 
-        Return also the time of planning per point [s].
+        Return their flags (n,), one bit per effect, and the time that the choice took per point
+        [s].
         """
 
     @abstractmethod
@@ -414,7 +415,7 @@ class GridSample(StudySample):
         study = self.study_with_setting(setting)
         for rows, effect_names in SelectedEffects(
             effect_flags, np.zeros(effect_flags.size)
-        ).iter_equal_groups():
+        ).iter_groups_by_effects():
             parameters = study.grid.parameters_at(point_indices[rows])
             if find_peaks is None:
                 yield rows, evaluate_points(study.spec, parameters, rows.size, effect_names)
@@ -443,9 +444,10 @@ class GridSample(StudySample):
 class FlightSample(StudySample):
     """Sample of the shots of a flight, in complete tiles (runs of consecutive shots).
 
-    Tiles are complete because effects are planned tile by tile. The time includes rays, plans,
-    spectra and probabilities. Draws, points and navigation take the same time whatever the
-    accuracy. `point_indices` are indices of shots within the sample.
+    Tiles are complete because effects are planned tile by tile. The measured time
+    includes rays, plans, spectra and probabilities. Draws, points and navigation are left out,
+    because they take the same time whatever the accuracy. `point_indices` are indices of shots
+    within the sample.
     """
 
     points_noun = "shots"

@@ -115,9 +115,9 @@ CF_CONVENTIONS = "CF-1.11"
 class BlockGrid:
     """Grid of points, cut into blocks along named dimensions; the last dimension varies fastest.
 
-    Blocks and points are numbered in C order. ``fine_dim`` names a further dimension: each step of
-    the last one has ``fine_steps`` of its steps. Arrays are in the ``group`` of the store, or in
-    its root if that is empty.
+    Blocks and points are numbered in C order. ``fine_dim`` names a finer dimension: one step along
+    the last grid dimension is ``fine_steps`` steps along the finer one. Arrays are in the ``group``
+    of the store, or in its root if ``group`` is empty.
     """
 
     def __init__(

@@ -33,7 +33,7 @@ CONNECT_TIMEOUT_SECONDS = 15.0
 
 
 class ClusterConnection(NamedTuple):
-    """Connection to a Dask cluster: its client, and what the session may do with its workers."""
+    """Connection to a Dask cluster: client, number of worker threads, and restart of workers."""
 
     client: Client
     expected_worker_threads: int  # largest number of worker threads; 0 if unknown

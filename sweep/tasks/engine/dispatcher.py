@@ -185,7 +185,7 @@ class TaskDispatcher:
 
         Once `is_stopping` returns True no more tasks are sent. The iteration ends when all sent
         tasks have ended, or at once if there is no worker. SchedulerLostError is raised if the
-        scheduler is gone; StoreError or OSError if no worker can write to the store.
+        scheduler is gone; StoreError or OSError is raised if no worker can write to the store.
         """
         try:
             while True:
@@ -213,7 +213,7 @@ class TaskDispatcher:
         tasks = set(self._in_flight.values())
         lines = [
             f"{counted(self._block_queue.n_unassigned, 'block')} not yet sent, "
-            f"{len(self._block_queue.failed):,} failed once, "
+            f"{len(self._block_queue.failed_blocks):,} failed once, "
             f"{len(self._unverified_receipts):,} written but not yet found in the store",
             f"{counted(len(tasks), 'task')} in flight, {len(self._superseded):,} superseded; "
             f"{counted(self._throughput.n_blocks, 'block')} came back in "
@@ -306,15 +306,17 @@ class TaskDispatcher:
 
         Two such blocks at once could each be blamed for the error of the other.
         """
-        failed = self._block_queue.failed
-        return bool(failed) and any(task.blocks[0] in failed for task in self._in_flight.values())
+        failed_blocks = self._block_queue.failed_blocks
+        return bool(failed_blocks) and any(
+            task.blocks[0] in failed_blocks for task in self._in_flight.values()
+        )
 
     def _placement_kwargs(self, block: int) -> dict[str, Any]:
         """Return arguments of `Client.submit` that keep a block from the worker where it failed."""
         failing_worker = self._failing_worker.get(block)
-        others = [worker for worker in self._usable_workers() if worker != failing_worker]
-        if failing_worker and others:
-            return {"workers": others, "allow_other_workers": not self._excluded_workers}
+        other_workers = [worker for worker in self._usable_workers() if worker != failing_worker]
+        if failing_worker and other_workers:
+            return {"workers": other_workers, "allow_other_workers": not self._excluded_workers}
         return {"workers": self._usable_workers()} if self._excluded_workers else {}
 
     def _submit_task(self, task: _InFlightTask, **placement: Any) -> None:
@@ -323,7 +325,7 @@ class TaskDispatcher:
         key = task_key(
             self._settings,
             task.blocks,
-            first_block in self._block_queue.failed,
+            first_block in self._block_queue.failed_blocks,
             self._resend_counts[first_block],
         )
         future = self._client.submit(
@@ -338,7 +340,7 @@ class TaskDispatcher:
     def _duplicate_stragglers(self) -> None:
         """Send tasks of workers that have been silent for long to idle workers as well."""
         now = time.monotonic()
-        overdue = [
+        overdue_tasks = [
             task
             for task in set(self._in_flight.values())
             if now - task.last_sent_at > self._seconds_until_resend(task)
@@ -346,14 +348,14 @@ class TaskDispatcher:
                 future.done() for future in task.futures_by_key.values()
             )  # yet to be collected
         ]
-        if not overdue:
+        if not overdue_tasks:
             return
         keys_by_worker = {worker: set(keys) for worker, keys in self._client.processing().items()}
         tasks_by_silent_worker = {
             worker: tasks
             for worker, keys in keys_by_worker.items()
             if now - self._last_response.get(worker, -1e9) > WORKER_SILENCE_SECONDS
-            and (tasks := [task for task in overdue if keys & task.futures_by_key.keys()])
+            and (tasks := [task for task in overdue_tasks if keys & task.futures_by_key.keys()])
         }
         idle_workers = [
             worker
@@ -372,12 +374,12 @@ class TaskDispatcher:
                 f"worker {worker} is silent ({duration_text(silent_seconds)}): {n_blocks} "
                 f"block{'s' if n_blocks > 1 else ''} of its go to others as well"
             )
-        unassigned = [
+        unassigned_tasks = [
             task
-            for task in overdue
+            for task in overdue_tasks
             if not any(task.futures_by_key.keys() & k for k in keys_by_worker.values())
         ]
-        for task in {*unassigned, *chain.from_iterable(tasks_by_silent_worker.values())}:
+        for task in {*unassigned_tasks, *chain.from_iterable(tasks_by_silent_worker.values())}:
             self._resend_counts[task.blocks[0]] += 1
             self._submit_task(task, workers=idle_workers)
 
@@ -415,10 +417,7 @@ class TaskDispatcher:
         return task_result
 
     def _finish_task(self, future: Future) -> TaskResult:
-        """Return the result of a task that has ended.
-
-        Update the state of blocks and workers by it.
-        """
+        """Return the result of a task that has ended, after updating blocks and workers with it."""
         task = self._in_flight[future.key]
         for key in task.futures_by_key:
             del self._in_flight[key]
@@ -465,15 +464,16 @@ class TaskDispatcher:
         its worker is excluded.
         """
         now = time.monotonic()
-        pending = [
+        receipts_to_verify = [
             (receipt, task_result.worker_address, now + FILE_VISIBILITY_SECONDS_MAX)
             for receipt in task_result.receipts
         ]
         if now - self._rechecked_at > IDLE_POLL_SECONDS:
             self._rechecked_at = now
-            pending, self._unverified_receipts = self._unverified_receipts + pending, []
+            receipts_to_verify = self._unverified_receipts + receipts_to_verify
+            self._unverified_receipts = []
         task_result.receipts = []
-        for receipt, worker, deadline in pending:
+        for receipt, worker, deadline in receipts_to_verify:
             if self._verify_receipt(receipt, worker not in self._verified_workers):
                 self._verified_workers.add(worker)
                 task_result.receipts.append(receipt)

@@ -149,7 +149,10 @@ class Journal:
         )
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write pending lines that are due, or all if `force`. Return True if none is left."""
+        """Write the pending lines that are due, or all if `force`.
+
+        Return True if no pending line is left.
+        """
         is_flushed = [log.flush(force=force) for log in self._logs.values()]
         return all(is_flushed)
 
@@ -439,7 +442,7 @@ def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoi
 
 
 def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the arrays of a `numpy.savez` archive by name; ValueError if a size is wrong."""
+    """Yield the arrays of a `numpy.savez` archive by name; raise ValueError if a size is wrong."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED or member.file_size > len(content):
@@ -573,7 +576,7 @@ class LockHolder:
 def _machine_id() -> str:
     """Return a text that identifies the machine's boot and the process's namespace; '' if unknown.
 
-    Process numbers are unique within both.
+    A process number is unique only among the processes with the same text.
     """
     try:
         boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -753,7 +756,10 @@ class _FileLock:
     def _create_lock_file(
         self, new_lock_path: Path, holder_json: str, say: Callable[[str], None]
     ) -> None:
-        """Move a new lock file into place; FileExistsError if another process was quicker."""
+        """Move a new lock file into place.
+
+        FileExistsError is raised if another process has created the lock file meanwhile.
+        """
         try:
             os.link(new_lock_path, self._lock_path)  # fails if the lock exists, on NFS too
             return
@@ -816,42 +822,52 @@ class _ObjectLock:
 
     def read_holder_json(self) -> str | None:
         """Return the JSON text of the holder; None if the lock is free."""
-        tagged = self._read_content_and_version()
-        return _holder_json_of_content(tagged[0]) if tagged and tagged[0] else None
+        content_and_version = self._read_content_and_version()
+        return (
+            _holder_json_of_content(content_and_version[0])
+            if content_and_version and content_and_version[0]
+            else None
+        )
 
     def _read_content_and_version(self) -> tuple[bytes, ObjectVersion] | None:
         """Return the content of the lock and its version, read once more if it is incomplete.
 
-        An incomplete lock would look like that of another process. ObjectStoreError if it is
-        incomplete twice.
+        An incomplete content would be taken for the lock of another process. ObjectStoreError is
+        raised if it is incomplete twice.
         """
         for _ in range(2):
-            tagged = self._lock_path.read_with_version()
-            if tagged is None or tagged[0].count(b"\n") == 2 or not tagged[0]:
-                return tagged
-        if tagged:
-            self._lock_path.refuse_truncated_content(tagged[0])
-        return tagged
+            content_and_version = self._lock_path.read_with_version()
+            if (
+                content_and_version is None
+                or content_and_version[0].count(b"\n") == 2
+                or not content_and_version[0]
+            ):
+                return content_and_version
+        if content_and_version:
+            self._lock_path.refuse_truncated_content(content_and_version[0])
+        return content_and_version
 
     def heartbeat_version(self) -> object:
         """Return a value that changes with every heartbeat; None if there is no lock."""
-        tagged = self._read_content_and_version()
-        return tagged and tagged[0]
+        content_and_version = self._read_content_and_version()
+        return content_and_version and content_and_version[0]
 
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
         """Acquire the lock for a holder; `check_holder` raises if the present holder lives."""
         for _ in range(LOCK_ATTEMPTS_MAX):
-            tagged = self._read_content_and_version()
+            content_and_version = self._read_content_and_version()
             if (
-                tagged and _holder_json_of_content(tagged[0]) == holder_json
+                content_and_version
+                and _holder_json_of_content(content_and_version[0]) == holder_json
             ):  # put, but the response was lost
-                self._holder_json, self._tag = holder_json, tagged[1]
+                self._holder_json, self._tag = holder_json, content_and_version[1]
                 return
             check_holder()
             tag = self._lock_path.put_if_unchanged(
-                f"{holder_json}\n0\n".encode(), tagged[1] if tagged else None
+                f"{holder_json}\n0\n".encode(),
+                content_and_version[1] if content_and_version else None,
             )
             if tag is not None:
                 self._holder_json, self._tag = holder_json, tag
@@ -871,9 +887,12 @@ class _ObjectLock:
         """Replace the content of the lock, if this process still holds it."""
         tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
         if tag is None:
-            tagged = self._read_content_and_version()
-            if tagged and _holder_json_of_content(tagged[0]) == self._holder_json:
-                tag = self._lock_path.put_if_unchanged(content.encode(), tagged[1])
+            content_and_version = self._read_content_and_version()
+            if (
+                content_and_version
+                and _holder_json_of_content(content_and_version[0]) == self._holder_json
+            ):
+                tag = self._lock_path.put_if_unchanged(content.encode(), content_and_version[1])
         if tag is not None:
             self._tag = tag
 
@@ -892,8 +911,8 @@ def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
 def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
     """Wait until the last heartbeat of a lock's holder is too old, or a new one arrives.
 
-    The holder is on another machine. A job that is restarted on another node soon after it was
-    killed thus need not be refused.
+    The holder is on another machine. A job that was killed and soon restarted on another node is
+    thus not refused.
     """
     other_holder, heartbeat_version = (
         read_lock_holder(store_path),
@@ -919,7 +938,7 @@ def _sends_no_heartbeat(
 ) -> bool:
     """Watch a lock for some time by this process's clock.
 
-    Return True if its holder did not update it.
+    Return True if the holder sent no heartbeat in this time.
     """
     holder_text = f"process {other_holder.pid} on {escape_to_one_line(other_holder.host)}"
     say(
@@ -940,8 +959,8 @@ def _sends_no_heartbeat(
 class StoreLock:
     """Lock of a store. It is acquired on construction and updated regularly until it is released.
 
-    BusyError is raised if a living process holds the lock, StoreError if the store can't be
-    written. ``say`` gets messages for the user; by default they are warnings.
+    BusyError is raised if a living process holds the lock. StoreError is raised if the store can't
+    be written. ``say`` gets messages for the user; by default they are warnings.
     """
 
     def __init__(self, store_path: Location, say: Callable[[str], None] = warnings.warn) -> None:

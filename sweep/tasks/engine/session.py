@@ -187,7 +187,10 @@ class RunOptions:
 
     @classmethod
     def from_mapping(cls, options: Mapping[str, Any]) -> RunOptions:
-        """Return options by name; TypeError with the most similar name for an unknown one."""
+        """Return the options of a mapping.
+
+        TypeError, with the most similar name, is raised for an unknown name.
+        """
         names = [field.name for field in fields(cls)]
         for name in options.keys() - set(names):
             raise TypeError(
@@ -196,9 +199,9 @@ class RunOptions:
         return cls(**options)
 
     def resolve_cluster(self, workload: Workload) -> AnyClusterConfig | None:
-        """Return the cluster that the options name, or else the spec's `execution`.
+        """Return the cluster that the options name, or else that of the spec's section `execution`.
 
-        None if blocks are computed in this process.
+        The result is None if blocks are computed in this process.
 
         ClusterError is raised if both a scheduler and a cluster are named, or a number of workers
         for a scheduler that runs already.
@@ -369,7 +372,7 @@ class ComputeBackend(ExitStack):
     def connect(self) -> ClusterConnection:
         """Connect to the workers, and start at most `max_workers` if they do not run yet.
 
-        ClusterError if no worker is available.
+        ClusterError is raised if no worker is available.
         """
         from sweep.tasks.engine.cluster_connection import (
             ClusterConnection,

@@ -170,7 +170,7 @@ def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
 def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
     """Mark a path in an object store as reserved while a store is created there.
 
-    StoreError if something else is at the path.
+    StoreError is raised if something else is at the path.
     """
     marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER_FILE
     with StoreLock(store_path):
@@ -249,7 +249,7 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
 def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
-    """Write the manifest: root attributes, and digests of all objects older than any result."""
+    """Write the manifest: root attributes, and digests of all objects without results."""
     records = [encode_record({"attributes": attributes, "objects": len(digests)})]
     records += [
         encode_record({"object": name, "digest": object_digest})
@@ -305,8 +305,8 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
     """Return the bytes of a chunk of numbers, as Zarr writes it.
 
     `values` may be smaller than a chunk at the edge of the array; the rest is filled. The bytes are
-    compressed little-endian values in C order, and their crc32c. Zarr takes ten times as long, some
-    2 % of one second's work for a block of 26 arrays.
+    compressed little-endian values in C order, and their crc32c. Zarr's own encoder takes ten times
+    as long: for a block of 26 arrays that takes a second to compute, some 2 % of the second.
     """
     dtype = np.dtype(layout.dtype).newbyteorder("<")
     if values.shape == layout.chunks:
@@ -332,7 +332,7 @@ class BlockWriter:
         self.store_path, self.study = parse_location(store_path), study
 
     def write(self, block: int, results: Mapping[str, np.ndarray]) -> StoredBlock:
-        """Write all chunks of one block; ValueError if the results don't match its arrays."""
+        """Write all chunks of one block; raise ValueError if the results don't match its arrays."""
         positions = self.study.chunk_positions(block)
         if results.keys() != positions.keys():
             mismatched_names = sorted(results.keys() ^ positions.keys())
@@ -491,7 +491,7 @@ def read_manifest_digests(store_path: Location) -> dict[str, str]:
 def find_template_damages(store_path: Location) -> list[Damage]:
     """Return the damaged objects of the template, and the damaged lines of the manifest.
 
-    The template is everything that the store contained before any result.
+    The template is everything that the store contained before the first result.
     """
     records = [record for _, record in iter_lines_and_records(store_path / MANIFEST_PATH)]
     if not records:
@@ -501,8 +501,8 @@ def find_template_damages(store_path: Location) -> list[Damage]:
         for line_number, record_or_none in enumerate(records, 1)
         if record_or_none is None
     ]
-    undamaged = [record for record in records if record]
-    if not problems and undamaged[0].get("objects") != len(undamaged) - 1:
+    undamaged_records = [record for record in records if record]
+    if not problems and undamaged_records[0].get("objects") != len(undamaged_records) - 1:
         problems.append(Damage(MANIFEST_PATH, "lacks lines", repaired_by="repair"))
     return problems + [
         Damage(name, problem, repaired_by="repair")
@@ -525,7 +525,7 @@ def describe_template_object_damage(
 
 
 def refuse_damaged_template(store_path: Location) -> None:
-    """Raise a StoreError if objects older than any result are damaged.
+    """Raise a StoreError if an object that was written before the first result is damaged.
 
     New results might not fit such a store.
     """
@@ -565,7 +565,8 @@ def _shape_text(shape: tuple[int, ...]) -> str:
 def damage_or_read_error(read_damage: Callable[[], str]) -> str:
     """Return the damage that `read_damage` finds in an object, or why the object can't be read.
 
-    The text is empty if the object is as it was written. ObjectStoreError if an object store fails.
+    The text is empty if the object is as it was written. ObjectStoreError is raised if an object
+    store fails.
     """
     try:
         return read_damage()
@@ -664,7 +665,7 @@ def refuse_foreign_files(store_path: Location) -> None:
 def find_pending_replacement(store_path: Location) -> Path | None:
     """Return the unfinished store that will replace the one at a path; None without one.
 
-    StoreError if the unfinished store was begun to replace another store.
+    StoreError is raised if the unfinished store was begun to replace another store.
     """
     recover_interrupted_replace(store_path)
     if (

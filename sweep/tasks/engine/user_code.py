@@ -26,7 +26,7 @@ ALLOWED_MODULES_VARIABLE = "SWEEP_ALLOW_CODE"
 def allow_modules(modules: Iterable[str]) -> None:
     """Allow this process, and the processes that it starts, to import modules.
 
-    The names are those before the colon in a spec. CodeError for an invalid name.
+    A module's name is the text before the colon in a spec. CodeError is raised for an invalid name.
     """
     for module in (modules := list(modules)):
         if module.endswith(".py") or not all(
@@ -38,9 +38,9 @@ def allow_modules(modules: Iterable[str]) -> None:
                 f"{module!r} is no name of a Python module, as a spec has it before the "
                 f"colon{suggestion_text}"
             )
-    allowed = {*allowed_modules(), *modules}
-    if allowed:
-        os.environ[ALLOWED_MODULES_VARIABLE] = ",".join(sorted(allowed))
+    module_names = {*allowed_modules(), *modules}
+    if module_names:
+        os.environ[ALLOWED_MODULES_VARIABLE] = ",".join(sorted(module_names))
         _import_from_working_directory()  # spawned workers inherit the search path
 
 
@@ -77,18 +77,18 @@ def allow_identical_module(module: str, digest: str) -> None:
     not change with its file.
     """
     allow_modules([module])
-    imported = import_user_module(module)
-    local_digest = _module_file_digest(imported)
+    imported_module = import_user_module(module)
+    local_digest = _module_file_digest(imported_module)
     if digest and local_digest != digest:
         raise CodeError(
             f"the module {module} is not the same file on {socket.gethostname()} "
-            f"({getattr(imported, '__file__', None)}) as where the run was started: "
+            f"({getattr(imported_module, '__file__', None)}) as where the run was started: "
             "put the same file on all machines"
         )
 
 
 def import_user_module(name: str) -> ModuleType:
-    """Import a module of the user's; CodeError with the reason if that fails."""
+    """Import a module of the user's; raise CodeError, with the reason, if that fails."""
     _import_from_working_directory()
     try:
         return import_module(name)

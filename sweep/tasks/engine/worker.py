@@ -115,7 +115,10 @@ def get_block_writer(
 def _open_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
-    """Open the store of a study for writing; StoreError for another study or other versions."""
+    """Open the store of a study for writing.
+
+    StoreError is raised for another study, or for a store of other versions of the software.
+    """
     attributes, stored_study = read_study(parse_location(store_path))
     _refuse_replaced_store(store_path, study_id)
     study_store.refuse_other_versions(
@@ -348,7 +351,7 @@ class BlockQueue:
         self._untried = _iter_false_indices(is_done)
         self._failed_once: deque[int] = deque()
         self._requeued: deque[int] = deque()
-        self.failed: set[int] = set()
+        self.failed_blocks: set[int] = set()
 
     def take_blocks(self, count: int, *, include_failed: bool = True) -> list[int]:
         """Remove up to `count` blocks from the queue, for one task.
@@ -366,9 +369,9 @@ class BlockQueue:
 
     def requeue_failed(self, block: int) -> bool:
         """Put a failed block back. Return False, and drop it, at its second failure."""
-        if block in self.failed:
+        if block in self.failed_blocks:
             return False
-        self.failed.add(block)
+        self.failed_blocks.add(block)
         self._failed_once.append(block)
         return True
 
@@ -378,7 +381,7 @@ class BlockQueue:
         A block that failed before is still taken alone.
         """
         for block in blocks:
-            (self._failed_once if block in self.failed else self._requeued).append(block)
+            (self._failed_once if block in self.failed_blocks else self._requeued).append(block)
 
 
 def _iter_false_indices(mask: np.ndarray, step: int = 1 << 16) -> Iterator[int]:
@@ -482,7 +485,7 @@ def _accept_result(
     """Return the result of a task of this process, after a check that its blocks are in the store.
 
     Failures replace the receipts of blocks that are missing there. Unfinished blocks go back to the
-    queue. The error that prevents any block from being computed is raised.
+    queue. An error that would prevent every block from being computed is raised.
     """
     if task_result.worker_error is not None:
         raise task_result.worker_error

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 #: Memory that every machine has which runs this program [bytes]. The machine is not asked for so
 #: little, as asking it imports Dask, which takes longer than small studies do.
-SMALL_BYTES = 1e8
+ALWAYS_AVAILABLE_BYTES = 1e8
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class WorkerMemory:
     find_bytes_max: Callable[[], float]
     """Function that returns the largest memory that the process may use [bytes]."""
     process_name: str
-    """Name of the process in messages, as the subject of a sentence: `this machine`."""
-    workers_sharing: int = 1
+    """Name of the process in messages, such as `this machine` or `a worker of the client`."""
+    n_workers_sharing_memory: int = 1
     """Number of workers that share the machine's memory; 1 if each worker has its own limit."""
 
     @cached_property
@@ -39,7 +39,7 @@ class WorkerMemory:
 
     def suffices_for(self, bytes_needed: float) -> bool:
         """Return True if the process may use the given amount of memory [bytes]."""
-        return bytes_needed < SMALL_BYTES or bytes_needed <= self.bytes_max
+        return bytes_needed < ALWAYS_AVAILABLE_BYTES or bytes_needed <= self.bytes_max
 
 
 def process_memory() -> WorkerMemory:
@@ -62,9 +62,9 @@ def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> Wo
         from sweep.tasks.engine.deploy.local_ssh import worker_memory_limit
 
         bounds = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
-        workers_sharing = 1 if cluster.worker.memory else bounds.most
+        n_workers_sharing_memory = 1 if cluster.worker.memory else bounds.most
         return WorkerMemory(
-            lambda: worker_memory_limit(cluster, bounds), "each worker", workers_sharing
+            lambda: worker_memory_limit(cluster, bounds), "each worker", n_workers_sharing_memory
         )
     bytes_max = getattr(getattr(cluster, "worker", None), "memory", None)
     return WorkerMemory(lambda: bytes_max or np.inf, "each worker of the cluster")

@@ -50,14 +50,19 @@ class ExtendableStudy(BlockStudy):
         return block
 
     def pop_reused_point_count(self, block: int) -> int:
-        """Return how many points of a block came from the smaller study's store, and forget it."""
+        """Return how many points of a block came from the smaller study's store.
+
+        The number is deleted, so that a second call returns 0.
+        """
         reuse_source = self.reuse_source
         return reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0
 
-    def count_reusable_points(self, block: int) -> int:
+    def count_reusable_points_of_block(self, block: int) -> int:
         """Count the points of a block that the smaller study's store has, damaged or not."""
-        shared = self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
+        shared_point_groups = (
+            self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
+        )
         return (
-            sum(shared_points.local_indices.size for shared_points in shared)
+            sum(shared_points.local_indices.size for shared_points in shared_point_groups)
             * self.locate_in_grid(block)[0].fine_steps
         )

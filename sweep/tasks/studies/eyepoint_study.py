@@ -125,7 +125,7 @@ class EyepointStudy(BlockStudy):
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the power fractions of the beamlets, the only array known in advance."""
+        """Return the power fractions of the beamlets, the only array known before rays are cast."""
         weight_attributes = cf_attributes(
             BEAMLET_WEIGHT_VARIABLE.units, BEAMLET_WEIGHT_VARIABLE.long_name
         )
@@ -273,7 +273,8 @@ def height_above_surface(
 ) -> np.ndarray:
     """Return the height of positions (n, 3) above the surface straight below them [m].
 
-    `times` (n,) are in s. The result is inf if nothing is below a position.
+    `time` [s] is one time for all positions, or (n,). The result is inf if nothing is below a
+    position.
     """
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(
@@ -306,7 +307,7 @@ def below_surface_warning(spec: SceneSpec) -> str:
 def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
     """Return position and attitude of each body of the scene; None for bodies at rest.
 
-    They are those at one time, or at one time per ray.
+    `time` [s] is one time, or one time per ray.
     """
     from sweep.model.geometry.ray_casting import Pose
 

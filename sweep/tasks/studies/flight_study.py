@@ -244,7 +244,10 @@ class FlightStudy(ExtendableStudy):
         )
 
     def locate_flight_block(self, block: int) -> tuple[ScannerGrid, FlightBlock]:
-        """Return the grid of a block's scanner, and the block; IndexError if there is none."""
+        """Return the grid of a block's scanner, and the block within this grid.
+
+        IndexError is raised if there is no such block.
+        """
         grid, block_in_grid = self.locate_in_grid(block)
         scanner_grid = self.scanner_grids[grid.group]
         return scanner_grid, scanner_grid.flight_block(block_in_grid)
@@ -262,8 +265,9 @@ class FlightStudy(ExtendableStudy):
         """Return title, question, spec, names of scanners and surfaces, and origins.
 
         ``projection`` is the WKT of the coordinates in the scene's files, or empty. ``origin`` [m]
-        and ``time_origin`` [s], a decimal with all its digits, are the coordinates in these files
-        of the store's zero of positions and times.
+        is the position in these coordinates that has the coordinates 0 in the store.
+        ``time_origin`` [s], a decimal with all its digits, is the time in these files at which time
+        is 0 in the store.
         """
         return {
             "kind": "scene",
@@ -354,9 +358,11 @@ class FlightStudy(ExtendableStudy):
             EFFECTS_ARRAY: selected_effects.effect_flags,
             EFFECTS_ERROR_ARRAY: selected_effects.error_bound,
         }
-        reused = self._read_reused_cloud(block, selected_effects) if self.reuse_source else None
+        reused_cloud = (
+            self._read_reused_cloud(block, selected_effects) if self.reuse_source else None
+        )
         results |= self.simulate_shots(
-            flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers, reused
+            flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers, reused_cloud
         )
         chunks = {}
         for name in self.chunk_positions(block):
@@ -403,7 +409,7 @@ class FlightStudy(ExtendableStudy):
             self.parameters_at(flight_block),
             self.surfaces,
             modes=self.spec.effect_modes(),
-            rotating=self.spec.has_rotating_bodies,
+            has_rotating_bodies=self.spec.has_rotating_bodies,
             rays_by_tolerance=self.spec.is_ray_number_set_by_tolerance,
         )
 
@@ -414,15 +420,15 @@ class FlightStudy(ExtendableStudy):
         eyepoints: Eyepoints,
         selected_effects: SelectedEffects,
         shot_numbers: np.ndarray,
-        reused: ReusedCloud | None = None,
+        reused_cloud: ReusedCloud | None = None,
     ) -> Results:
         """Simulate radiometry, draws and navigation of shots that make complete measurement cycles.
 
-        Results that are ``reused`` are not simulated again.
+        Results that are ``reused_cloud`` holds are not simulated again.
         """
         scanner_grid = self.scanner_grids[flight_block.scanner]
         n_draws, shots_per_cycle = len(flight_block.draws), scanner_grid.shots_per_cycle
-        is_reused, results = reused or self._empty_cloud(
+        is_reused, results = reused_cloud or self._empty_cloud(
             scanner_grid, selected_effects.effect_flags.size, n_draws
         )
         for rows, draw_slice in _iter_missing_draws(~is_reused):
@@ -475,7 +481,7 @@ class FlightStudy(ExtendableStudy):
         """
         for members, effect_names, effect_flags in selected_effects.subset(
             rows
-        ).iter_joint_groups():
+        ).iter_groups_computed_together():
             group_rows, simulate_group = rows[members], partial(simulate_cloud, effect_names)
             results = simulate_group(
                 eyepoints.select(group_rows), shot_numbers[group_rows], effect_flags
@@ -583,22 +589,22 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _read_reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
-        """Return a block's results in the smaller study, for shots with the same effects."""
+        """Return the smaller study's results of the shots of a block that have the same effects."""
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
             self.reuse_source,
             self.locate_flight_block(block),
         )
         shots_per_cycle = scanner_grid.shots_per_cycle
-        is_reused, results = reused = self._empty_cloud(
+        is_reused, results = reused_cloud = self._empty_cloud(
             scanner_grid, selected_effects.effect_flags.size, len(flight_block.draws)
         )
-        for shared in reuse_source.iter_shared_points(block):
+        for shared_points in reuse_source.iter_shared_points(block):
             first_draw_results, block_results = (
                 reuse_source.read_block(source_block)
                 for source_block in (
-                    reuse_source.source_study.first_draw_block(shared.source_block),
-                    shared.source_block,
+                    reuse_source.source_study.first_draw_block(shared_points.source_block),
+                    shared_points.source_block,
                 )
             )
             if first_draw_results is None or block_results is None:
@@ -613,9 +619,10 @@ class FlightStudy(ExtendableStudy):
                 if name not in GEOMETRY_OUTPUTS
             }
             (draw_index, cycle_index), (source_draw, source_cycle) = (
-                np.divmod(shared.local_indices, len(flight_block.cycles)),
+                np.divmod(shared_points.local_indices, len(flight_block.cycles)),
                 np.divmod(
-                    shared.source_local_indices, len(source_results["flags"]) // shots_per_cycle
+                    shared_points.source_local_indices,
+                    len(source_results["flags"]) // shots_per_cycle,
                 ),
             )
             shot_rows, source_rows = (
@@ -642,7 +649,7 @@ class FlightStudy(ExtendableStudy):
                 }
                 _insert_results(results, cycle_index, draw_index, part_results)
         reuse_source.reused_points_by_block[block] = int(is_reused.sum())
-        return reused
+        return reused_cloud
 
     def parameters_at(self, flight_block: FlightBlock) -> Mapping[str, Any]:
         """Return the SI values of all parameters at a block's point of the axes, by dotted path."""
@@ -660,19 +667,26 @@ class FlightStudy(ExtendableStudy):
         """Standard deviations of instrument errors that do not decrease with a stronger echo."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
-        stated = self.spec.error_floor
+        floor_section = self.spec.error_floor
         return ErrorFloor(
-            stated.pointing_error, stated.clock_error, stated.wavelength_error, stated.vibration,
-            stated.range_noise,
-        )  # fmt: skip
+            floor_section.pointing_error,
+            floor_section.clock_error,
+            floor_section.wavelength_error,
+            floor_section.vibration,
+            floor_section.range_noise,
+        )
 
     @cached_property
     def motion_priors(self) -> MotionPriors:
         """Standard deviations, from the spec, of motion that the instrument does not measure."""
         from sweep.model.pointcloud.ego_motion import MotionPriors
 
-        stated = self.spec.navigation
-        return MotionPriors(stated.terrain_slope, stated.target_speed, stated.target_acceleration)
+        navigation_section = self.spec.navigation
+        return MotionPriors(
+            navigation_section.terrain_slope,
+            navigation_section.target_speed,
+            navigation_section.target_acceleration,
+        )
 
     @cached_property
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
@@ -772,7 +786,7 @@ def plan_shot_effects(
     surfaces: Sequence[SurfaceMaterial],
     *,
     modes: Mapping[str, str],
-    rotating: bool,
+    has_rotating_bodies: bool,
     rays_by_tolerance: bool = False,
 ) -> ShotEffectPlan | None:
     """Choose the effects of a flight's shots at one point of the axes.
@@ -793,7 +807,9 @@ def plan_shot_effects(
     shots, ground = parameters_and_ground_of_eyepoints(
         hitting_eyepoints, PARAMETER_DEFAULTS | dict(parameters), surfaces
     )
-    points = PlannerInputs(shots, extent_of_ray_traced_ground(ground), has_rotating_body=rotating)
+    points = PlannerInputs(
+        shots, extent_of_ray_traced_ground(ground), has_rotating_body=has_rotating_bodies
+    )
 
     def max_per_tile(values: np.ndarray) -> np.ndarray:
         return np.maximum.reduceat(

@@ -112,7 +112,7 @@ POINTS_PER_TILE_MAX = 1024
 #: Number of points whose effects are planned at once, and number per tile in a first, rough plan.
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
 
-#: Numeric parameters whose values must be equal in a tile: sizes of records, and accuracy.
+#: Numeric parameters whose values must be equal in a tile: sizes of records, and the tolerance.
 PARAMETERS_CONSTANT_IN_TILE = (
     "instrument.processing.fft_size",
     "instrument.processing.sample_rate",
@@ -135,7 +135,7 @@ class SelectedEffects(NamedTuple):
         """Return the effects of some of the points."""
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
-    def iter_equal_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
+    def iter_groups_by_effects(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
         """Yield indices (m,) of points with the same simulated effects, and the names of these."""
         for group_flags in np.unique(self.effect_flags):
             yield (
@@ -143,7 +143,9 @@ class SelectedEffects(NamedTuple):
                 unpack_effect_flags(int(group_flags)),
             )
 
-    def iter_joint_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
+    def iter_groups_computed_together(
+        self,
+    ) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
         """Yield groups of points that are computed together though their effects may differ.
 
         A group has the indices (m,) of its points, the names of all their effects, and one flag per
@@ -157,7 +159,10 @@ class SelectedEffects(NamedTuple):
 
 
 class TileGroup(NamedTuple):
-    """Tiles (boxes of neighbouring points) that share the values of all strings and sizes."""
+    """Tiles (boxes of neighbouring points) with equal text parameters and equal record sizes.
+
+    Record sizes are the :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the FFT size.
+    """
 
     group_number: int  # number of the group in the grid
     requested_indices: np.ndarray  # (m,): indices of the tiles in the request
@@ -171,7 +176,8 @@ class TileGroup(NamedTuple):
 class TileGrid(BlockGrid):
     """Tiles of a grid: boxes of neighbouring points whose effects are chosen together.
 
-    The points of a tile share the values of all strings and sizes.
+    The points of a tile have equal text parameters, and equal
+    :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the FFT size.
     """
 
     def __init__(self, grid: ParameterBlockGrid) -> None:
@@ -199,7 +205,7 @@ class TileGrid(BlockGrid):
         return tiles, tile_index.ravel()
 
     def group_tiles(self, tiles: np.ndarray, stride: int = 1) -> Iterator[TileGroup]:
-        """Yield groups of tiles that share strings and sizes, with the parameters of their points.
+        """Yield the groups of tiles that can be planned together, with their points' parameters.
 
         With a ``stride`` n the parameters are those of every n-th point along each axis, and of the
         point with the largest value of each parameter.
@@ -221,7 +227,8 @@ class TileGrid(BlockGrid):
     def _is_constant_in_tile(self, axis: int) -> bool:
         """Return True if an axis must have a single value within a tile.
 
-        It then varies a string or a size, such as the FFT size.
+        Such an axis varies a text parameter or a :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the
+        FFT size.
         """
         return any(
             values.dtype.kind in "UO"
@@ -351,13 +358,13 @@ class EffectPlanner:
             ),
             1,
         )
-        remaining = np.arange(len(tiles))
+        remaining_tiles = np.arange(len(tiles))
         for stride in (preview_stride, 1) if preview_stride > 1 else (1,):
             points_per_tile = math.prod(-(-tile_length // stride) for tile_length in tile_lengths)
             tiles_per_plan = max(POINTS_PER_PLAN_MAX // points_per_tile, 1)
-            unsettled = []
-            for start in range(0, len(remaining), tiles_per_plan):
-                batch = remaining[start : start + tiles_per_plan]
+            unsettled_tiles = []
+            for start in range(0, len(remaining_tiles), tiles_per_plan):
+                batch = remaining_tiles[start : start + tiles_per_plan]
                 for tile_group in self.tiles.group_tiles(tiles[batch], stride):
                     plan = self._plan_group(tile_group)
                     is_settled = (
@@ -369,11 +376,13 @@ class EffectPlanner:
                             batch[tile_group.requested_indices[is_settled]],
                             plan.select(is_settled),
                         )
-                    unsettled.append(batch[tile_group.requested_indices[~is_settled]])
-            remaining = np.concatenate(unsettled) if unsettled else remaining[:0]
+                    unsettled_tiles.append(batch[tile_group.requested_indices[~is_settled]])
+            remaining_tiles = (
+                np.concatenate(unsettled_tiles) if unsettled_tiles else remaining_tiles[:0]
+            )
 
     def _plan_group(self, tile_group: TileGroup) -> EffectPlan:
-        """Return the choice of effects for tiles that share the values of all strings and sizes."""
+        """Return the choice of effects for the tiles of a group."""
         from sweep.model.effects.planning import plan_effects
 
         parameters, n_tiles = tile_group.parameters, len(tile_group.requested_indices)
@@ -506,11 +515,11 @@ class GridStudy(ExtendableStudy):
     ) -> Results:
         """Compute a block. Points that the model does not support get fill values.
 
-        Points in `checkpoint_results` are not computed again, or continued. `UnfinishedBlock` is
-        raised at the deadline.
+        Finished points in `checkpoint_results` are not computed again; unfinished points are
+        continued. `UnfinishedBlock` is raised at the deadline.
         """
         selected_effects = self.effect_planner.select_for_block(block)
-        reused = self._read_reused_results(block, selected_effects)
+        reused_results = self._read_reused_results(block, selected_effects)
         extent, n_points = self.grid.actual_block_shape(block), self.grid.count_block_points(block)
         results = {
             name: np.full((n_points, *layout.shape[len(extent) :]), layout.fill_value, layout.dtype)
@@ -525,12 +534,12 @@ class GridStudy(ExtendableStudy):
             self.grid,
             block,
             selected_effects,
-            reused,
+            reused_results,
             checkpoint_results,
             deadline or Deadline(),
         )
         for local_indices, part_results in (
-            reused.finished,
+            reused_results.finished,
             checkpoint_results.finished,
             *computed,
         ):
@@ -552,54 +561,54 @@ class GridStudy(ExtendableStudy):
         return self.evaluate(block, checkpoint_results, deadline)
 
     def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
-        """Return the results of a block in the smaller study: final results, or first draws."""
+        """Return the smaller study's results of a block's points: final results, or first draws."""
         if (reuse_source := self.reuse_source) is None:
             return EarlierResults()
         parts = []
-        for shared in reuse_source.iter_shared_points(block):
-            if (source_results := reuse_source.read_block(shared.source_block)) is None:
+        for shared_points in reuse_source.iter_shared_points(block):
+            if (source_results := reuse_source.read_block(shared_points.source_block)) is None:
                 continue
             n_axes, n_source_points = (
                 len(reuse_source.source_study.grids[0].shape),
-                reuse_source.source_study.count_block_points(shared.source_block),
+                reuse_source.source_study.count_block_points(shared_points.source_block),
             )
             has_same_effects = (
-                source_results[EFFECTS_ARRAY].ravel()[shared.source_local_indices]
-                == selected_effects.effect_flags[shared.local_indices]
+                source_results[EFFECTS_ARRAY].ravel()[shared_points.source_local_indices]
+                == selected_effects.effect_flags[shared_points.local_indices]
             )
             results = {
                 name: values.reshape(n_source_points, *values.shape[n_axes:])[
-                    shared.source_local_indices[has_same_effects]
+                    shared_points.source_local_indices[has_same_effects]
                 ]
                 for name, values in source_results.items()
                 if name not in (EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY)
             }
-            parts.append(PartialResults(shared.local_indices[has_same_effects], results))
+            parts.append(PartialResults(shared_points.local_indices[has_same_effects], results))
         local_indices, results = concatenate_results(parts)
-        reused = PartialResults(
+        reused_results = PartialResults(
             local_indices, zero_running_sums(self.spec, local_indices.size) | results
         )
         reuse_source.reused_points_by_block[block] = (
             local_indices.size if reuse_source.has_final_results else 0
         )
         return (
-            EarlierResults(finished=reused)
+            EarlierResults(finished=reused_results)
             if reuse_source.has_final_results
-            else EarlierResults(unfinished=reused)
+            else EarlierResults(unfinished=reused_results)
         )
 
-    def count_reusable_points(self, block: int) -> int:
+    def count_reusable_points_of_block(self, block: int) -> int:
         """Count the points of a block that the smaller study has with the same effects."""
         if (reuse_source := self.reuse_source) is None:
             return 0
         selected_effects, n_reusable = self.effect_planner.select_for_block(block), 0
-        for shared in reuse_source.iter_shared_points(block):
+        for shared_points in reuse_source.iter_shared_points(block):
             with suppress(*CHUNK_READ_ERRORS):
-                flags = reuse_source.read_chunk(EFFECTS_ARRAY, shared.source_block).ravel()
+                flags = reuse_source.read_chunk(EFFECTS_ARRAY, shared_points.source_block).ravel()
                 n_reusable += int(
                     np.sum(
-                        flags[shared.source_local_indices]
-                        == selected_effects.effect_flags[shared.local_indices]
+                        flags[shared_points.source_local_indices]
+                        == selected_effects.effect_flags[shared_points.local_indices]
                     )
                 )
         return n_reusable
@@ -659,26 +668,27 @@ def iter_block_results(
     grid: ParameterBlockGrid,
     block: int,
     selected_effects: SelectedEffects,
-    reused: EarlierResults,
+    reused_results: EarlierResults,
     checkpoint_results: EarlierResults,
     deadline: Deadline,
 ) -> Iterator[PartialResults]:
     """Yield the results of a block's points that are not done, in groups with the same effects.
 
-    Points in ``reused``, from another study, or in ``checkpoint_results``, from an earlier task,
-    are not computed again. `UnfinishedBlock` is raised at the deadline; a later call continues to
-    the same bits.
+    ``reused_results`` are from another study, ``checkpoint_results`` from an earlier task. Finished
+    points in them are not computed again, and unfinished points are continued. `UnfinishedBlock` is
+    raised at the deadline; a later call continues to the same bits.
     """
     parameters, order = grid.parameters_of_block(block), grid.geometry_order(block)
     order = order[
         ~np.isin(
-            order, [*reused.finished.local_indices, *checkpoint_results.finished.local_indices]
+            order,
+            [*reused_results.finished.local_indices, *checkpoint_results.finished.local_indices],
         )
     ]
     finished, points_per_call = [checkpoint_results.finished], _points_per_call(spec)
     pending = deque(
         (effects, local_indices)
-        for members, effects in selected_effects.subset(order).iter_equal_groups()
+        for members, effects in selected_effects.subset(order).iter_groups_by_effects()
         for local_indices in np.split(
             order[members], range(points_per_call, len(members), points_per_call)
         )
@@ -689,7 +699,7 @@ def iter_block_results(
             raise _make_unfinished_block(spec, finished, NO_RESULTS)
         is_resumed = np.isin(local_indices, checkpoint_results.unfinished.local_indices).any()
         prior_draws = extract_prior_draws(
-            spec, (checkpoint_results if is_resumed else reused).unfinished, local_indices
+            spec, (checkpoint_results if is_resumed else reused_results).unfinished, local_indices
         )
         subset = select_parameters(parameters, local_indices)
         try:
@@ -850,7 +860,7 @@ def zero_running_sums(spec: GridSpec, n_points: int) -> Results:
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:
-    """Return a copy of the spec in which no point has more than `draws_max` draws."""
+    """Return a copy of the spec that makes at most `draws_max` draws of a point."""
     draw_counts = {
         "number": min(spec.draws.number, draws_max),
         "limit": min(spec.draws.limit, draws_max),

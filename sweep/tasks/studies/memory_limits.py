@@ -112,10 +112,10 @@ def _available_memory_phrase(worker_memory: WorkerMemory) -> str:
 
 def _fewer_workers_remedy(worker_memory: WorkerMemory, bytes_needed: float) -> str:
     """Return a remedy such as ', or --workers 4' if fewer workers would suffice, else ''."""
-    n_workers = int(worker_memory.bytes_max * worker_memory.workers_sharing / bytes_needed)
+    n_workers = int(worker_memory.bytes_max * worker_memory.n_workers_sharing_memory / bytes_needed)
     return (
         f", or {option_text('workers', n_workers)}"
-        if 1 <= n_workers < worker_memory.workers_sharing
+        if 1 <= n_workers < worker_memory.n_workers_sharing_memory
         else ""
     )
 

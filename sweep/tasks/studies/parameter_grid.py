@@ -86,9 +86,9 @@ def flight_block_size(
 ) -> tuple[int, int]:
     """Return the largest numbers of shots and of draws of a flight's block.
 
-    Both are those of the section `storage`. If it has its defaults, blocks are cut further to have
-    work for all cores: along the draws first, as the effects of 256 consecutive shots are planned
-    together.
+    The spec's section `storage` states both numbers. If they are defaults, blocks are cut further
+    to have work for all cores. They are cut along the draws first, because the effects of 256
+    consecutive shots are planned together.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ class DetectionRow:
 
     @classmethod
     def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
-        """Return the row for n points. Arrays of the Doppler segment may be missing."""
+        """Return the row for n points; ``pd_doppler`` may be nan, as without a Doppler segment."""
         is_computed = ~np.isnan(pd_shot)
         pd_shot, pd_doppler = (
             pd_shot[is_computed],
@@ -139,7 +139,7 @@ def count_unsupported_points(
 def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) -> str:
     """Return the reason why the model does not support one point of a block, as text."""
     ((_, effects),) = (
-        study.effect_planner.select_for_block(block).subset(local_index).iter_equal_groups()
+        study.effect_planner.select_for_block(block).subset(local_index).iter_groups_by_effects()
     )
     try:
         parameters = select_parameters(study.grid.parameters_of_block(block), local_index)
@@ -356,7 +356,7 @@ class AccuracyRow:
 def accuracy_rows_of_draws(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row of errors for each probability whose accuracy the tolerance promises.
+    """Return a row of errors for each probability whose error the tolerance bounds.
 
     The result is empty without draws or results.
     """

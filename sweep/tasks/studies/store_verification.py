@@ -177,14 +177,14 @@ def _verify_store(
     store_path: Location, study: AnyStudy | None, repair: bool, progress: Progress
 ) -> VerificationReport:
     """Verify one store; restore its template if `repair`."""
-    template_damage, restored = study_store.find_template_damages(store_path), []
+    template_damage, restored_names = study_store.find_template_damages(store_path), []
     if template_damage and study and repair:
         study_store.refuse_foreign_store(store_path)  # a lock would be its first file made by sweep
         with journal.StoreLock(store_path, progress.say):
-            template_damage, restored = [], restore_template(store_path, study)
+            template_damage, restored_names = [], restore_template(store_path, study)
     log_damage = _find_log_damages(store_path)
     block_damage = list(_iter_block_damages(store_path, study, progress)) if study else []
-    surplus = (
+    surplus_chunks = (
         []
         if study_store.find_template_damages(store_path)
         else _iter_surplus_chunks(store_path, study)
@@ -193,8 +193,8 @@ def _verify_store(
         store=store_path,
         blocks=study.n_blocks if study else 0,
         undamaged_blocks=_count_undamaged_blocks(store_path, study, block_damage) if study else 0,
-        damages=(*template_damage, *log_damage, *block_damage, *surplus),
-        restored_objects=tuple(restored),
+        damages=(*template_damage, *log_damage, *block_damage, *surplus_chunks),
+        restored_objects=tuple(restored_names),
         foreign_objects=tuple(_foreign_object_names(store_path)),
         withdrawal_error=_withdraw_receipts(store_path, block_damage, progress)
         if log_damage or block_damage
@@ -374,8 +374,8 @@ def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
 def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
     """Restore damaged objects of the template, each in one step. Return their names.
 
-    The template is all that is older than any result. The caller holds the store's lock. StoreError
-    is raised if this machine can't make the same objects.
+    The template is everything that the store contained before the first result. The caller holds
+    the store's lock. StoreError is raised if this machine can't make the same objects.
     """
     study_store.refuse_links(store_path)
     try:

@@ -60,9 +60,9 @@ AnyStudy = GridOrFlightStudy | EyepointStudy
 def make_study(
     spec: GridSpec | SceneSpec, store_path: Location, source_path: Location | None = None
 ) -> GridOrFlightStudy:
-    """Return the study of a spec, to be stored at a path.
+    """Return the study of a spec, whose results are stored at ``store_path``.
 
-    It takes results from the store at `source_path`, if given.
+    If ``source_path`` is given, the study takes results over from the store there.
     """
     study = FlightStudy(spec, store_path) if isinstance(spec, SceneSpec) else GridStudy(spec)
     if source_path:
@@ -73,7 +73,7 @@ def make_study(
 def _find_reuse_source(
     source_path: Location, target_study: GridOrFlightStudy
 ) -> ReuseSource | None:
-    """Return the results that the store at a path has of a study; None if it is unusable."""
+    """Return the results in a store that a study can take over; None if the store is unusable."""
     try:
         attributes = store_format.read_attributes(source_path)
         study_store.refuse_other_versions(source_path, attributes, VERSION, reader="this machine")
@@ -95,7 +95,7 @@ def _find_reuse_source(
 
 
 def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
-    """Return the attributes of a store, and its study; StoreError if it can't be read."""
+    """Return the attributes of a store, and its study; raise StoreError if it can't be read."""
     attributes = store_format.read_attributes(store_path)
     if attributes["kind"] == ACCURACY_STORE_KIND:
         figures_command = shell_command("figures", store_path)
@@ -106,7 +106,7 @@ def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
 
 
 def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
-    """Return the study of a store from its attributes; StoreError if it can't be read."""
+    """Return the study of a store from its attributes; raise StoreError if it can't be read."""
     recipe = read_recipe(store_path)
     if attributes["kind"] == "eyepoints":
         if "spec" not in recipe:
@@ -124,7 +124,7 @@ def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
 
 
 def _read_spec(store_path: Location, recipe: dict[str, Any], spec_json: str) -> Any:
-    """Return the spec of a store; StoreError if this version of sweep can't read it."""
+    """Return the spec of a store; raise StoreError if this version of sweep can't read it."""
     try:
         return from_stored(spec_json, base=Path(recipe["base"]) if "base" in recipe else None)
     except (SpecError, ValueError) as error:
@@ -160,20 +160,23 @@ FIELDS_THAT_MAY_CHANGE = ("storage.block_points", "storage.block_shots", "storag
 #: Largest number of lost values of an axis that an error message lists.
 LOST_VALUES_LISTED_MAX = 5
 
-#: Number of blocks of the older store that a process keeps in memory.
+#: Number of blocks of the smaller study that a process keeps in memory.
 CACHED_BLOCKS_MAX = 2
 
 
 class SharedPoints(NamedTuple):
-    """Points that a block of this study and a block of the older store have in common."""
+    """Points that a block of the larger study and a block of the smaller one have in common."""
 
-    source_block: int  # block of the older store
-    local_indices: np.ndarray  # (m,) int64: indices in C order over the new block
-    source_local_indices: np.ndarray  # (m,) int64: indices in C order over the older block
+    source_block: int  # block of the smaller study
+    local_indices: np.ndarray  # (m,) int64: indices in C order over the larger study's block
+    source_local_indices: np.ndarray  # (m,) int64: indices in C order over `source_block`
 
 
 class ReuseSource:
-    """Results in the store of a smaller study that a larger study takes over."""
+    """Results of a smaller study, read from its store, that a larger study takes over.
+
+    The smaller study is the source, the larger one the target.
+    """
 
     def __init__(
         self,
@@ -199,7 +202,7 @@ class ReuseSource:
         self._matching_of_group = cache(self._match_points_of_group)
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
-        """Yield the points of a block that committed blocks of the older store contain."""
+        """Yield those points of a block that committed blocks of the smaller study contain."""
         target_grid, block_in_grid = self._target_study.locate_in_grid(block)
         source_grids = {grid.group: grid for grid in self.source_study.grids}
         if (
@@ -236,7 +239,7 @@ class ReuseSource:
                 )
 
     def _match_points_of_group(self, group: str) -> PointMatching:
-        """Return which points of a group's grid are also in the grid of the other study."""
+        """Return which points of a group's grid are also in the grid of the smaller study."""
         source_grid, target_grid = (
             next(grid for grid in study.grids if grid.group == group)
             for study in (self.source_study, self._target_study)
@@ -248,7 +251,10 @@ class ReuseSource:
         )
 
     def _read_block(self, source_block: int) -> Results | None:
-        """Return the results of an older block by array; None if a chunk is damaged or missing."""
+        """Return the results of a block of the smaller study, by the name of the array.
+
+        None if a chunk is damaged or missing.
+        """
         try:
             chunk_paths = study_store.chunk_names_of_block(self.source_study, source_block)
             digest = store_format.stored_objects_digest(
@@ -264,14 +270,14 @@ class ReuseSource:
             return None
 
     def read_chunk(self, name: str, source_block: int) -> np.ndarray:
-        """Return a chunk of an older block, without checking its digest."""
+        """Return a chunk of a block of the smaller study, without checking its digest."""
         return np.asarray(
             self._source_arrays[name].blocks[self.source_study.chunk_positions(source_block)[name]]
         )
 
     @cached_property
     def _source_arrays(self) -> Any:
-        """Arrays of the older store, opened once."""
+        """Arrays of the smaller study's store, opened once."""
         return open_verified_group(self._source_path)
 
     def reuse_remark(self) -> str:
@@ -304,7 +310,7 @@ def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
     n_points_there, remark = study.count_points_in_blocks(is_done), ""
     if study.reuse_source is not None:
         n_points_there += sum(
-            study.count_reusable_points(int(block)) for block in np.flatnonzero(~is_done)
+            study.count_reusable_points_of_block(int(block)) for block in np.flatnonzero(~is_done)
         )
         remark = study.reuse_source.reuse_remark()
     count_text = f"{n_points_there:,} of {study.n_points:,} {study.points_noun} are there; "
@@ -381,7 +387,7 @@ def _fixed_tolerance(spec: AnySpec) -> float | None:
 def apply_changes(spec: AnySpec, changes: Mapping[str, Any]) -> AnySpec:
     """Return a spec with values changed by dotted path: ``{"axes.target.range": ["1 km"]}``.
 
-    SpecError if the result is no valid spec.
+    SpecError is raised if the result is no valid spec.
     """
     mapping = spec.to_yaml_mapping()
     for path, value in changes.items():
@@ -414,11 +420,11 @@ def refuse_not_larger_study(
         )
     obstacles = extension_obstacles(source_spec, target_spec)
     if obstacles:
-        listed = "\n".join(f"  {obstacle}" for obstacle in obstacles)
+        obstacle_lines = "\n".join(f"  {obstacle}" for obstacle in obstacles)
         scanners = " new scanners," if _scanner_names(target_spec) else ""
         raise StoreError(
             f"{source_path} can't be extended to this study (in the store -> asked "
-            f"for):\n{listed}\n"
+            f"for):\n{obstacle_lines}\n"
             f"A store is extended by values on axes, new axes,{scanners} more draws or a tighter "
             "accuracy.tolerance. Any other study needs a store of its own: "
             f"{suggested_call('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
@@ -502,16 +508,17 @@ def _lost_values_text(grid: ParameterGrid, path: str, indices: np.ndarray) -> st
         if path in axis_values:
             values = axis_values[path][np.unique(index)].tolist()
     value_texts = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
-    more = ["..."] if len(value_texts) > LOST_VALUES_LISTED_MAX else []
+    ellipsis_texts = ["..."] if len(value_texts) > LOST_VALUES_LISTED_MAX else []
     units = parameter_rules()[path].value_unit
-    return (
-        f"{path}: "
-        f"{', '.join(value_texts[:LOST_VALUES_LISTED_MAX] + more)}{f' {units}' if units else ''}"
-    )
+    values_text = ", ".join(value_texts[:LOST_VALUES_LISTED_MAX] + ellipsis_texts)
+    return f"{path}: {values_text}{f' {units}' if units else ''}"
 
 
 class AxisLookup(NamedTuple):
-    """Positions of parameter values of one study along an axis of another study."""
+    """Positions of parameter values of this study along an axis of the other study.
+
+    Both studies are those of :class:`PointMatching`.
+    """
 
     paths: tuple[str, ...]
     axis: int | None  # axis of the other study; None if the parameters are fixed there
@@ -523,10 +530,10 @@ class AxisLookup(NamedTuple):
 
 
 class PointMatching:
-    """Mapping from the points of one study to the points of another with equal parameters.
+    """Mapping from each point of this study to the point of the other one with equal parameters.
 
-    Axes may be longer, in another order, new, or zipped differently. Parameters in ``ignored`` may
-    differ.
+    ``grid`` is the grid of this study, ``other_grid`` that of the other one. Axes may be longer, in
+    another order, new, or zipped differently. Parameters in ``ignored`` may differ.
     """
 
     def __init__(

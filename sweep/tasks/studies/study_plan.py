@@ -267,7 +267,7 @@ def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tu
     parameters = study.grid.parameters_of_block(block)
     for members, effects in study.effect_planner.select_for_block(
         block, local_indices
-    ).iter_equal_groups():
+    ).iter_groups_by_effects():
         group_parameters = select_parameters(parameters, local_indices[members])
         draws_max = TIMED_SPECTRA_MAX if spec.draws.draws_whole_spectra else TIMED_DRAWS_MAX
         extrapolated_seconds += time_points(
@@ -662,7 +662,7 @@ Stopwatch = Callable[[], float]
 def _grid_effect_cost(
     spec: GridSpec, sample_tile: Callable[[int], _PointSample], tiles: np.ndarray, effect_name: str
 ) -> float:
-    """Return the fraction of the computing time of grid points that an effect takes."""
+    """Return an effect's share of the computing time of grid points, measured on tiles."""
 
     def stopwatches_of_tile(tile: int) -> tuple[Stopwatch, Stopwatch]:
         parameters, n_points, effect_names = sample_tile(tile)
@@ -678,7 +678,7 @@ def _grid_effect_cost(
 
 
 def reproducible_time_fraction(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> float:
-    """Return the fraction of the time that an effect takes; nan if it is not reproducible.
+    """Return an effect's share of the computing time; nan if it is not reproducible.
 
     Parameters
     ----------
@@ -769,7 +769,7 @@ def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
 def _flight_effect_cost(
     study: FlightStudy, shot_samples: Sequence[_ShotSample], effect_name: str
 ) -> float:
-    """Return the fraction of the computing time of shots that an effect takes."""
+    """Return an effect's share of the computing time of shots, measured on sampled cycles."""
     no_flags, effect_flag = np.uint32(0), np.uint32(1 << EFFECT_NAMES.index(effect_name))
 
     def stopwatches_of_sample(sample: _ShotSample) -> tuple[Stopwatch, Stopwatch]:

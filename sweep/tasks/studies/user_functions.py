@@ -31,7 +31,7 @@ DETECTOR_ROLE, ESTIMATOR_ROLE = SPECTRUM_METHOD_PARAMETERS
 
 
 def check_user_functions(spec: GridSpec | SceneSpec) -> None:
-    """Import the functions that a study names, and test each; CodeError if one fails."""
+    """Import the functions that a study names, and test each; raise CodeError if one fails."""
     for role, name in iter_user_functions(spec):
         _test_user_function(role, name)
 
@@ -79,7 +79,7 @@ def load_checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
 
 
 def _call_user_function(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a user's function; CodeError with file and line if it fails."""
+    """Call a user's function; raise CodeError, with file and line, if it fails."""
     try:
         return function(*arguments)
     except Exception as error:
@@ -106,7 +106,7 @@ def _error_place_text(error: BaseException, module: ModuleType) -> str:
 
 
 def _import_user_function(name: str) -> Callable[..., Any]:
-    """Import a user's function; CodeError if it is not allowed, missing, or no function."""
+    """Import a user's function; raise CodeError if it is not allowed, missing, or no function."""
     module, _, attribute = name.partition(":")
     if module not in user_code.allowed_modules():
         raise CodeError(
@@ -124,8 +124,8 @@ def _import_user_function(name: str) -> Callable[..., Any]:
         ) from None
     if not callable(function):
         raise CodeError(f"{name} is a {type(function).__name__}, and no function")
-    checked: Callable[..., Any] = function
-    return checked
+    user_function: Callable[..., Any] = function
+    return user_function
 
 
 def _read_only_view(array: np.ndarray) -> np.ndarray:
@@ -138,7 +138,10 @@ def _read_only_view(array: np.ndarray) -> np.ndarray:
 def _check_returned_array(
     name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype
 ) -> np.ndarray:
-    """Return the array that a function returned; CodeError for a wrong type, shape or value."""
+    """Return the array that a function returned, after a check.
+
+    CodeError is raised for a wrong type, shape or value.
+    """
     if not isinstance(answer, np.ndarray):
         raise CodeError(f"{name} gives a {type(answer).__name__}, and must give a numpy array")
     if answer.shape != shape or answer.dtype != dtype:

@@ -5,7 +5,7 @@ import pytest
 from random_planner_points import planner_inputs, prepare_single_category
 
 from sweep.model.effects import phase_errors
-from sweep.model.effects.sweep_error_table import fit_sweep_error
+from sweep.model.effects.sweep_error_table import fit_sweep_frequency_error
 from sweep.model.spectrum.segment_spectra import segment_spectrum
 
 LIGHT = 299792458.0
@@ -72,7 +72,7 @@ def test_a_quadratic_error_in_a_table_is_the_quadratic_law(sign, range_, velocit
     place = {"range": np.array([range_]), "radial_velocity": np.array([velocity])}
     scene = error_of(sign, quadratic=2e5, **place)
     x, names = np.linspace(-1, 1, 9), ("sign", "chirp_duration", "start", "duration")
-    table = fit_sweep_error(text)
+    table = fit_sweep_frequency_error(text)
     assert table.chebyshev_coefficients.size == 3
     found = phase_errors.error_table_phase(x, table=table, **place, **{n: scene[n] for n in names})
     expected = phase_errors.chirp_nonlinearity_phase(x, **scene)
@@ -80,7 +80,7 @@ def test_a_quadratic_error_in_a_table_is_the_quadratic_law(sign, range_, velocit
 
 
 def test_a_table_is_held_beyond_its_ends():
-    table = fit_sweep_error("0.0 -1.0, 1.0 0.0, 2.0 1.0")
+    table = fit_sweep_frequency_error("0.0 -1.0, 1.0 0.0, 2.0 1.0")
     # From -1 to 3: -1 a second long, 0 over the table, 1 a second long; from 1.5 to 3.5 by hand.
     np.testing.assert_allclose(
         table.integrate_error(np.array([-1.0]), np.array([3.0])), 0, atol=1e-15
@@ -139,7 +139,7 @@ def test_a_tables_size_covers_what_it_does_to_the_record(table_4_1):
     )
     x, t = np.linspace(-1, 1, 4001), 2**17 / 6e8
     psi = phase_errors.error_table_phase(
-        x, table=fit_sweep_error(text), sign=1, chirp_duration=CHIRP,
+        x, table=fit_sweep_frequency_error(text), sign=1, chirp_duration=CHIRP,
         range=np.array([100.0, 3000.0]), radial_velocity=np.array([30.0, 30.0]), start=0.0,
         duration=t,
     )  # fmt: skip

@@ -142,7 +142,7 @@ def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
     """Return the keyword arguments for the cluster classes of dask-jobqueue."""
     worker, job = cluster.worker, cluster.job
     lifetime, stagger = worker_lifetime(job.walltime)
-    required: dict[str, Any] = {
+    required_options: dict[str, Any] = {
         "n_workers": 0,
         "cores": job.workers * worker.threads,
         "processes": job.workers,
@@ -166,7 +166,7 @@ def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
         "scheduler_options": local_ssh.scheduler_options(cluster.scheduler),
     }
     optional = {"queue": job.queue, "account": job.account, "python": cluster.python}
-    return required | {name: value for name, value in optional.items() if value}
+    return required_options | {name: value for name, value in optional.items() if value}
 
 
 def worker_lifetime(walltime: float) -> tuple[float, float]:

@@ -118,7 +118,8 @@ def shows_dashboard(scheduler: SchedulerConfig) -> bool:
 def dashboard_address(scheduler: SchedulerConfig) -> str:
     """Return the address of a scheduler's HTTP server, on this machine's loopback interface.
 
-    The port is the requested one; any free port if that is taken, or if no dashboard is asked for.
+    The port is the requested one. If it is taken, or if no dashboard is requested, the port is 0,
+    which stands for any free port.
     """
     port = int(scheduler.dashboard.rpartition(":")[2]) if shows_dashboard(scheduler) else 0
     with socket.socket() as test_socket:
