@@ -362,7 +362,7 @@ def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]
 def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> list[str]:
     """Return sentences with the conclusions from a measurement of accuracy."""
     attributes = dataset.attrs
-    conclusions = [_as_written_sentence(dataset, settings)]
+    conclusions = [_as_written_setting_sentences(dataset, settings)]
     conclusions += _fixed_sentences(compare_adaptive_with_fixed(settings), attributes)
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
@@ -395,7 +395,7 @@ def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> T
     )
 
 
-def _as_written_sentence(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
+def _as_written_setting_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
     """Return the sentences on the spec as written: its time and error, and a faster setting."""
     (as_written,) = select_settings_of_kinds(settings, AS_WRITTEN_KIND)
     n_points, unit = dataset.attrs["study_points"], dataset.attrs["unit"]

@@ -147,7 +147,7 @@ def split_with_beamlet_counts(
     effects : collection of str
         Names of the effects to simulate; without ``footprint`` one beamlet is enough.
     further_paths : collection of str
-        Numeric parameters that points must share, as of
+        Numeric parameters that points must share, as in
         :func:`sweep.model.preparation.split_by_category`.
 
     Yields
@@ -213,7 +213,7 @@ def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -
     n_rays : int
         Number of rays of the last cast, one of `ErrorBudget.ray_counts`.
     error : ndarray (n,)
-        Estimated error, as of :func:`sweep.model.pointcloud.ray_error.estimate_ray_error`; nan
+        Estimated error, as in :func:`sweep.model.pointcloud.ray_error.estimate_ray_error`; nan
         where nothing is hit. It falls about as the reciprocal of the number of rays.
     error_budget : ErrorBudget
         Accuracy of the study.
@@ -600,7 +600,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     weight = _window_autocorrelation(window_name, lag)
     errors = np.empty((NODE_COUNTS.size, spreads.size + 1))
     for row, n_nodes in zip(errors, NODE_COUNTS.tolist(), strict=True):
-        row[:] = np.append(_substitute_error(spreads, n_nodes), np.inf)
+        row[:] = np.append(_node_spacing_as_error(spreads, n_nodes), np.inf)
         for i, spread in enumerate(spreads.tolist()):
             rule_error = (
                 weight * _quadrature_error_for_cosine(n_nodes, 2 * np.pi * spread * lag)
@@ -608,7 +608,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
             if rule_error > 1:
                 break  # wider spreads have larger errors
             row[i] = rule_error
-        row[-1] = _substitute_error(1e3, n_nodes)
+        row[-1] = _node_spacing_as_error(1e3, n_nodes)
     return (
         spreads,
         np.maximum.accumulate(errors, axis=1),
@@ -616,7 +616,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     )
 
 
-def _substitute_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
+def _node_spacing_as_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
     """Return the distance between nodes [bins], at least 1, in place of an unbounded error.
 
     More nodes are then preferred where no error has a bound.
@@ -651,7 +651,8 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
             * np.interp(phase, _CURVATURE_PHASES, _quadrature_error_for_quadratic_phase(n_nodes))
         ).sum(axis=1)
         return np.append(
-            np.where(rule_errors < 1, rule_errors, _substitute_error(_CURVATURES, n_nodes)), 1e3
+            np.where(rule_errors < 1, rule_errors, _node_spacing_as_error(_CURVATURES, n_nodes)),
+            1e3,
         )
 
     along, across = NODE_COUNTS.tolist(), (2 * NODE_COUNTS_ACROSS_SLOPE).tolist()

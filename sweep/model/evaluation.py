@@ -111,7 +111,7 @@ def prepare_ray_traced_shots(
     Parameters
     ----------
     parameters : mapping
-        As of :func:`prepare_shots`. Ranges and radial velocities are those of the beam's centre;
+        As in :func:`prepare_shots`. Ranges and radial velocities are those of the beam's centre;
         grazing angle and reflectance law are not used.
     ground : RayTracedGround
         Footprints of the shots.
@@ -186,7 +186,7 @@ def evaluate(
     Parameters
     ----------
     parameters : mapping
-        As of :func:`prepare_shots`.
+        As in :func:`prepare_shots`.
     effects : collection of str
         Names of the effects to simulate.
     segment_evaluator : callable

@@ -250,7 +250,9 @@ class FlatGround:
         grazing_angles, angle_index = np.unique(self._geometry.grazing_angle, return_inverse=True)
         relative_echo = backscatter(self._reflectance_law, np.sin(grazing_angles))[:, None]
         zeros = np.zeros_like(relative_echo)
-        return BeamletTable(_row_indices(angle_index, n_points), zeros, zeros, relative_echo)
+        return BeamletTable(
+            _table_rows_of_points(angle_index, n_points), zeros, zeros, relative_echo
+        )
 
     @cached_property
     def beamlets(self) -> BeamletTable:
@@ -275,7 +277,7 @@ class FlatGround:
         relative_echo = weights * backscatter(self._reflectance_law, cos_incidence) / range_loss
         doppler_ratio_offset = np.where(weights > 0, 2 * closing_offset / SPEED_OF_LIGHT, 0.0)
         return BeamletTable(
-            _row_indices(geometry_of_point, self._n_points),
+            _table_rows_of_points(geometry_of_point, self._n_points),
             relative_range_offset,
             doppler_ratio_offset,
             relative_echo,
@@ -332,7 +334,7 @@ def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
     return "hexagonal" if beamlets_add_as_powers(parameters) else "sunflower"
 
 
-def _row_indices(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
+def _table_rows_of_points(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
     """Return the table row of each of n points, (n,) int64.
 
     ``row_of_point`` is (n,), or one row for all points.
@@ -364,7 +366,7 @@ class FootprintExtent(NamedTuple):
     """
 
 
-def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
+def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
     """Compute the :class:`FootprintExtent` of footprints by ray tracing."""
     _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
     off_axis_surface = ground.off_axis_surface

@@ -415,7 +415,7 @@ def range_velocity_of_beats(  # type: ignore[no-untyped-def]  # of arrays, or co
     Parameters
     ----------
     f_d, f_r : float or ndarray
-        Signed Doppler frequency and range beat [Hz], as of :func:`beats_of_reading`.
+        Signed Doppler frequency and range beat [Hz], as in :func:`beats_of_reading`.
     carrier, bandwidth, duration : float or ndarray
         Carrier of the up-chirp [Hz], bandwidth [Hz] and duration [s] of a chirp.
 
@@ -634,7 +634,7 @@ def range_velocity_response(
     beats : ndarray (k, n)
         Changes of the signed beats [Hz].
     weights, carriers, chirp_rates : ndarray (k, n)
-        As of :func:`fit_range_velocity`.
+        As in :func:`fit_range_velocity`.
 
     Returns
     -------

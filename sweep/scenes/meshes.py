@@ -172,7 +172,7 @@ def join_facets(facets_list: Sequence[Facets]) -> Facets:
     )
 
 
-_REPAIR_TEXT_BY_COUNT = {
+_REPAIR_TEXT_BY_REPORT_FIELD = {
     "n_non_finite_faces": "{} faces without data dropped",
     "n_degenerate_faces": "{} faces without area dropped",
     "n_duplicate_faces": "{} duplicate faces dropped",
@@ -206,7 +206,8 @@ class MeshCleaningReport:
     def summary(self) -> str:
         """Return one line of text: numbers of faces and vertices before cleaning, and repairs."""
         counts = [
-            (template, getattr(self, name)) for name, template in _REPAIR_TEXT_BY_COUNT.items()
+            (template, getattr(self, name))
+            for name, template in _REPAIR_TEXT_BY_REPORT_FIELD.items()
         ]
         repairs = [template.format(count) for template, count in counts if count]
         input_text = f"{self.n_faces:,} faces on {self.n_vertices:,} vertices"

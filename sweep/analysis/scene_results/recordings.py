@@ -428,7 +428,7 @@ class AxisPosition:
     """Index along each axis, by the axis's name."""
     label: str
     """Coordinates of the position, as text."""
-    open_axes: tuple[str, ...]
+    undetermined_axes: tuple[str, ...]
     """Names of the axes along which the request leaves several values to choose from."""
 
     def open_recording(self, tree: xr.DataTree, scanner: str) -> Recording:
@@ -474,8 +474,10 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
     if mistakes:
         raise SpecError(mistakes)
     axis_indices = {name: int(np.argmax(is_wanted)) for name, is_wanted in allowed_by_axis.items()}
-    open_axes = tuple(name for name, is_wanted in allowed_by_axis.items() if is_wanted.sum() > 1)
-    return AxisPosition(axis_indices, _axis_position_label(spec, axis_indices), open_axes)
+    undetermined_axes = tuple(
+        name for name, is_wanted in allowed_by_axis.items() if is_wanted.sum() > 1
+    )
+    return AxisPosition(axis_indices, _axis_position_label(spec, axis_indices), undetermined_axes)
 
 
 def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:

@@ -324,41 +324,41 @@ def exclude_bins_joining_echo(
     sidelobe_correlation
         Correlation of neighbouring bins' noise components in phase with the signal.
     """
-    stretch_end = first_index
-    while stretch_end < end_index:
-        stretch_begin = stretch_end
-        while stretch_end < end_index and not is_exempt[stretch_end]:
-            stretch_end += 1
-        n_bins = stretch_end - stretch_begin
+    gap_end = first_index
+    while gap_end < end_index:
+        gap_begin = gap_end
+        while gap_end < end_index and not is_exempt[gap_end]:
+            gap_end += 1
+        n_bins = gap_end - gap_begin
         n_joining_below, n_joining_above, p_join_below, p_join_above = 0, 0, 0.0, 0.0
-        if n_bins > 0 and stretch_begin > first_index and probabilities[stretch_begin] > 0.0:
-            n_joining_below = _count_joining_bins(probabilities, stretch_begin, 1, n_bins)
+        if n_bins > 0 and gap_begin > first_index and probabilities[gap_begin] > 0.0:
+            n_joining_below = _count_joining_bins(probabilities, gap_begin, 1, n_bins)
             p_join_below = edge_crossing_probability(
-                magnitudes[stretch_begin - 1] / noise_sigma,
-                magnitudes[stretch_begin] / noise_sigma,
+                magnitudes[gap_begin - 1] / noise_sigma,
+                magnitudes[gap_begin] / noise_sigma,
                 threshold / noise_sigma,
                 sidelobe_correlation,
             )
-        if n_bins > 0 and stretch_end < end_index and probabilities[stretch_end - 1] > 0.0:
-            n_joining_above = _count_joining_bins(probabilities, stretch_end - 1, -1, n_bins)
+        if n_bins > 0 and gap_end < end_index and probabilities[gap_end - 1] > 0.0:
+            n_joining_above = _count_joining_bins(probabilities, gap_end - 1, -1, n_bins)
             p_join_above = edge_crossing_probability(
-                magnitudes[stretch_end] / noise_sigma,
-                magnitudes[stretch_end - 1] / noise_sigma,
+                magnitudes[gap_end] / noise_sigma,
+                magnitudes[gap_end - 1] / noise_sigma,
                 threshold / noise_sigma,
                 sidelobe_correlation,
             )
         if n_joining_below + n_joining_above > n_bins:
             _fill_further_group_probability(
-                probabilities, stretch_begin, 1, n_bins, p_join_below, p_join_above
+                probabilities, gap_begin, 1, n_bins, p_join_below, p_join_above
             )
         else:
             _fill_further_group_probability(
-                probabilities, stretch_begin, 1, n_joining_below, p_join_below, 0.0
+                probabilities, gap_begin, 1, n_joining_below, p_join_below, 0.0
             )
             _fill_further_group_probability(
-                probabilities, stretch_end - 1, -1, n_joining_above, p_join_above, 0.0
+                probabilities, gap_end - 1, -1, n_joining_above, p_join_above, 0.0
             )
-        stretch_end += 1
+        gap_end += 1
 
 
 @njit(cache=True, error_model="numpy")

@@ -176,7 +176,7 @@ def look_covariances(
     Parameters
     ----------
     correlation_by_lag, look_power
-        (..., N): as of :class:`LookSpeckle`.
+        (..., N): as in :class:`LookSpeckle`.
     looks_max
         Largest number k of rows. More looks are represented by this number of looks, at
         :func:`representative_look_positions`.
@@ -216,7 +216,7 @@ def phase_rotated_look_covariances(
     Parameters
     ----------
     correlation_by_lag, look_power
-        (m, N): as of :class:`LookSpeckle`.
+        (m, N): as in :class:`LookSpeckle`.
     cycles_per_look
         (m,): rotation of the line's phase from one look to the next [cycles].
     """
@@ -375,7 +375,7 @@ def correlated_speckle_magnitudes(speckle, covariance_root):
     speckle
         (m, k) complex: m realisations of independent amplitudes z.
     covariance_root
-        (N, k) complex: A, as of :meth:`LookSpeckle.covariance_root`.
+        (N, k) complex: A, as in :meth:`LookSpeckle.covariance_root`.
     """
     magnitude = np.empty((speckle.shape[0], covariance_root.shape[0]))
     for i in range(speckle.shape[0]):

@@ -462,7 +462,7 @@ class Looks(NamedTuple):
             covariance = (pd_first * pd_second * weight).sum(
                 axis=-1
             ) - mean_pd_first * mean_pd_second
-            shared_fraction = self._shared_fraction(p, q, correlation, look_speckle)
+            shared_fraction = self._shared_covariance_fraction(p, q, correlation, look_speckle)
             return np.where(
                 is_defined,
                 np.clip(p * q + shared_fraction * covariance, 0.0, np.minimum(p, q)),
@@ -509,7 +509,7 @@ class Looks(NamedTuple):
             is_defined, np.minimum((p_cross * weight).sum(axis=-1), np.minimum(p, q)), np.nan
         )
 
-    def _shared_fraction(
+    def _shared_covariance_fraction(
         self,
         p: np.ndarray,
         q: np.ndarray,
@@ -597,7 +597,9 @@ class Looks(NamedTuple):
         pd_by_signal, weight = self.pd_given_speckle(a, threshold_ratio, look_speckle)
         up_doppler, up_down, doppler_down = (
             np.maximum(
-                self._shared_fraction(p[i], p[j], np.minimum(correlations[k], 1.0), look_speckle),
+                self._shared_covariance_fraction(
+                    p[i], p[j], np.minimum(correlations[k], 1.0), look_speckle
+                ),
                 1e-12,
             )
             for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)))
@@ -953,18 +955,18 @@ def coherent_gain(
 
 
 def solve_threshold_ratio(
-    log_pfa: np.ndarray, log_pfa_law: Callable[[np.ndarray], np.ndarray]
+    log_pfa: np.ndarray, log_pfa_of_threshold: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
     """Return the threshold (n,) at which noise is detected with a given probability pfa.
 
-    It is found by bisection, in units of the noise per quadrature. ``log_pfa_law`` is the
+    It is found by bisection, in units of the noise per quadrature. ``log_pfa_of_threshold`` is the
     decreasing function from the threshold to ln(pfa). ``log_pfa`` (n,) are the given ln(pfa).
     """
     # n bins raise an alarm at least as often as one, and at most n times as often.
     low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
     for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
-        is_above = log_pfa_law(middle) > log_pfa
+        is_above = log_pfa_of_threshold(middle) > log_pfa
         low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
     return 0.5 * (low + high)
 

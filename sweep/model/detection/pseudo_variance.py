@@ -116,24 +116,24 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
 def mean_over_phases(
     phase_factors: np.ndarray,
     pd_by_segment: tuple[np.ndarray, ...],
-    joint_law: Callable[..., tuple[np.ndarray, ...]],
+    joint_pd_function: Callable[..., tuple[np.ndarray, ...]],
 ) -> tuple[np.ndarray, ...]:
     """Average a joint probability of detection over the phases of the segments' noncircular echoes.
 
     Parameters
     ----------
     phase_factors
-        (segments, n, N_PHASE_NODES): relative echo power at the phase nodes, as of
+        (segments, n, N_PHASE_NODES): relative echo power at the phase nodes, as in
         :class:`SignalPseudoVariance`.
     pd_by_segment
         (..., n) for each segment: probability that it is detected.
-    joint_law
+    joint_pd_function
         Function from the segments' probabilities to arrays (..., n), for circular echoes.
 
     Returns
     -------
     tuple of numpy.ndarray
-        Mean over the phases of each result of ``joint_law``, (..., n).
+        Mean over the phases of each result of ``joint_pd_function``, (..., n).
 
     Notes
     -----
@@ -147,7 +147,7 @@ def mean_over_phases(
     sums: list[np.ndarray] = []
     for j in range(N_PHASE_NODES):
         # No two segments have the same order of phases.
-        results = joint_law(
+        results = joint_pd_function(
             *(
                 segment_pd[(1 + 2 * s) * j % N_PHASE_NODES]
                 for s, segment_pd in enumerate(pd_at_phases)

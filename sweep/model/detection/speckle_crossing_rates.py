@@ -231,7 +231,7 @@ def rate_at_brightest_speckle(squared_ratio, rate_table):
 
     c is the probability that leaked signal makes the bin cross the threshold.
 
-    ``squared_ratio`` and ``rate_table`` are as of :func:`add_rates_by_power`.
+    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_power`.
     """
     table_position = (
         0.5 * math.log(squared_ratio)

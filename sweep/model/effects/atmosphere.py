@@ -344,7 +344,7 @@ def backscatter_integral(
     profile : ExtinctionProfile
         Extinction alpha over height.
     start_height, end_height, range : array_like
-        Heights of the path's ends and its length R [m], as of :func:`optical_depth`.
+        Heights of the path's ends and its length R [m], as in :func:`optical_depth`.
     near_range : array_like
         r_0 = D/Theta [m]: diameter of the aperture over full angle of the field of view.
 

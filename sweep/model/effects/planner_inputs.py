@@ -95,7 +95,7 @@ class PlannerInputs(LinkBudget):
                 ground.beamlet_pattern(self.parameters),
             )
         self.existing_chirp_rates = self.stack_segments(
-            *self._of_existing_segments(self.waveform.chirp_slopes)
+            *self._select_existing_segments(self.waveform.chirp_slopes)
         )
         """Signed chirp rate of each existing segment, relative to that of the up-chirp."""
         is_direct = self.waveform.architecture == "direct"
@@ -121,7 +121,7 @@ class PlannerInputs(LinkBudget):
         """Return True if any of several numeric parameters is nonzero at any point."""
         return any(bool(self.parameters[path].any()) for path in paths)
 
-    def _of_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
+    def _select_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
         """Select the values of existing segments from those of up, Doppler and down."""
         named_values = zip(waveform.SEGMENT_NAMES, values_by_segment, strict=True)
         return [value for name, value in named_values if name in self.waveform.segment_order]
@@ -161,7 +161,7 @@ class PlannerInputs(LinkBudget):
     @cached_property
     def carriers(self) -> np.ndarray:
         """Frequency [Hz], by segment, that turns the echo's delay into a phase of the beat."""
-        return self.stack_segments(*self._of_existing_segments(self.waveform.carriers))
+        return self.stack_segments(*self._select_existing_segments(self.waveform.carriers))
 
     @property
     def noise_maximum_ratio(self) -> float | None:
@@ -254,7 +254,7 @@ class PlannerInputs(LinkBudget):
         Segments start at these times whether or not the motion between them is simulated.
         """
         starts = self.waveform.middle_look_starts(self.looks)
-        return self.stack_segments(*self._of_existing_segments(starts))
+        return self.stack_segments(*self._select_existing_segments(starts))
 
     @cached_property
     def existing_segments(self) -> list[WaveformSegment]:
@@ -265,7 +265,7 @@ class PlannerInputs(LinkBudget):
             if "segment_motion" in self.effects_off
             else self.waveform.middle_look_starts(self.looks),
         )
-        return self._of_existing_segments(self.waveform.segments(self.target, motion))
+        return self._select_existing_segments(self.waveform.segments(self.target, motion))
 
     @cached_property
     def beat_frequency(self) -> np.ndarray:

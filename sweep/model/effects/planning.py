@@ -49,7 +49,7 @@ class EffectPlan(NamedTuple):
     """(effects, tiles) bool: True if the effect is simulated."""
     omission_error: np.ndarray
     """(effects, tiles): change if the effect is omitted, 0..1. The largest change of pd, log10
-    pfa or the relative |X| at any point of the tile, as of :func:`omission_errors`."""
+    pfa or the relative |X| at any point of the tile, as in :func:`omission_errors`."""
     total_error: np.ndarray
     """(tiles,): sum of the changes by omitted effects, plus :attr:`residual_error`. Only the latter
     and effects that are off can make it exceed the tolerance."""

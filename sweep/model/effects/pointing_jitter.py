@@ -103,7 +103,7 @@ def perturb_geometry(
     )
 
 
-def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
+def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest relative change of range, and shift of lines [bins], by beam deflections.
 
     They hold in all draws but a fraction :data:`RARE_DRAW_PROBABILITY`, and for the lowest beamlets
@@ -145,7 +145,10 @@ def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None
-    return PhaseErrorBound(extra_shift_window_bins=_largest_turn(points)[1] / points.padding_factor)
+    return PhaseErrorBound(
+        extra_shift_window_bins=_largest_range_change_and_line_shift(points)[1]
+        / points.padding_factor
+    )
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -159,7 +162,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None
-    range_ratio, shift_bins = _largest_turn(points)
+    range_ratio, shift_bins = _largest_range_change_and_line_shift(points)
     echo_change = 3 * range_ratio * (1 + range_ratio) ** 2
     power_change = (
         points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins) + echo_change

@@ -90,7 +90,7 @@ def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.nda
     Parameters
     ----------
     element_angles : sequence of float
-        Angles of the n elements of each axis [rad], as of :func:`stacked_angles`.
+        Angles of the n elements of each axis [rad], as in :func:`stacked_angles`.
 
     Returns
     -------

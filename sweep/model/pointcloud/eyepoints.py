@@ -119,7 +119,7 @@ class Eyepoints(NamedTuple):
         return Eyepoints._make([*(values[selection] for values in self[:-1]), self.weight])
 
 
-def observe_eyepoints(
+def compute_eyepoints(
     shot_numbers: np.ndarray,
     *,
     flight: MovingBody,

@@ -80,7 +80,7 @@ _INTERPOLATION_ERROR_MIN = 1e-6
 """Smallest standard error of a value interpolated between bins, as a fraction of the standard error
 of the value by whole bins."""
 
-_ONE_SIGMA_PROBABILITY = 0.8413447460685429
+_BELOW_ONE_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal random number is below its mean plus one standard deviation."""
 
 _ROUNDING_ERROR = 1e-14
@@ -379,7 +379,9 @@ def _covariance_scale(
     """
     n_residual_degrees = np.maximum(residual_degrees, 1)
     scale = (
-        chi_square / n_residual_degrees * stdtrit(n_residual_degrees, _ONE_SIGMA_PROBABILITY) ** 2
+        chi_square
+        / n_residual_degrees
+        * stdtrit(n_residual_degrees, _BELOW_ONE_SIGMA_PROBABILITY) ** 2
     )
     return np.where(_residuals_contradict(chi_square, degrees_of_freedom), scale, 1.0)
 
@@ -648,7 +650,7 @@ def solve_navigation(
             motion_priors,
         )
         solutions = _solve_cycles(
-            beam_motion.by_cycle(shots_per_cycle),
+            beam_motion.reshape_by_cycle(shots_per_cycle),
             _select_beams(point_arrays, shot_slice, shots_per_cycle, error_floor, known_motion),
             {"test_level": test_level or None},
             {"slope": ground_slope, "relief": relief},
@@ -688,7 +690,7 @@ class BeamMotion(NamedTuple):
     acceleration: np.ndarray
     """(..., 3): acceleration of the instrument in the world's frame [m/s^2]."""
 
-    def by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
+    def reshape_by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
         """Reshape the arrays (n, 3) of n shots to (cycles, beams, 3)."""
         return BeamMotion(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
 
@@ -789,7 +791,7 @@ def _solve_cycles(
     beam_motion
         Motion of the instrument and its beams, (cycles, beams, 3).
     beams
-        Measurements, as of :func:`_select_beams`.
+        Measurements, as in :func:`_select_beams`.
     test_arguments, ground_arguments
         Arguments ``test_level``, and ``slope`` and ``relief``, of :func:`solve_altitude`.
     pointing_jitter
@@ -916,7 +918,7 @@ def _add_pointing_errors(
     offset
         (cycles, 1, beams, 3): position of the instrument relative to that at the first shot [m].
     beams
-        Measurements, as of :func:`_select_beams`.
+        Measurements, as in :func:`_select_beams`.
     ground_arguments
         Arguments ``slope`` and ``relief`` of :func:`ground_gradient`.
     pointing_jitter

@@ -108,10 +108,10 @@ class CountInputs(NamedTuple):
     pfa: np.ndarray
     """(3, m): probability of a false alarm in those bins of each segment that are not drawn one by
     one."""
-    pd_otherwise: np.ndarray
+    pd_if_condition_fails: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
     :func:`_draw_probabilities` is not met; unused if noise is drawn."""
-    pd_if_condition: np.ndarray
+    pd_if_condition_holds: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
     :func:`_draw_probabilities` is met; unused if noise is drawn."""
     any_two: np.ndarray
@@ -157,8 +157,8 @@ def count_by_probability(
         line_noise_ratio=np.zeros(n_rows),
         bin_thresholds=BinThresholds(*np.zeros((7, n_rows))),
         pfa=probabilities[0],
-        pd_otherwise=probabilities[1],
-        pd_if_condition=probabilities[2],
+        pd_if_condition_fails=probabilities[1],
+        pd_if_condition_holds=probabilities[2],
         any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
         mixing=np.empty((0, n_rows)),
         ratio_row=np.zeros((3, n_rows), np.int64),
@@ -209,8 +209,8 @@ def count_in_noise(
             line_noise_ratio=line_noise_ratio[indices],
             bin_thresholds=shots.bin_thresholds.select(indices),
             pfa=np.ascontiguousarray(pfa_elsewhere),
-            pd_otherwise=no_probabilities,
-            pd_if_condition=no_probabilities,
+            pd_if_condition_fails=no_probabilities,
+            pd_if_condition_holds=no_probabilities,
             any_two=np.full(indices.size, shots.any_two),
             mixing=mixing[:, indices].copy(),
             ratio_row=speckle_table.ratio_row[:, indices].copy(),
@@ -677,7 +677,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                         address, stream, peak_index, crossing, random_words, is_detected[s]
                     )
                 else:
-                    pd_pair = inputs.pd_otherwise[s, j], inputs.pd_if_condition[s, j]
+                    pd_pair = inputs.pd_if_condition_fails[s, j], inputs.pd_if_condition_holds[s, j]
                     one = is_detected[0] if s == 2 else is_detected[0] ^ is_detected[2]
                     _mark_random_events(
                         address, STREAM_DETECTION[s], pd_pair, one, random_words, is_detected[s]

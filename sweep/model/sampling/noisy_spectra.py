@@ -798,7 +798,7 @@ class PointSpectra(NamedTuple):
     key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[SegmentSignal | None, ...]
-    """Noiseless signal of each segment, as of ``shots``; None for a segment that does not exist."""
+    """Noiseless signal of each segment, as in ``shots``; None for a segment that does not exist."""
     look_shots: list[Shots]
     """Prepared shots at the time of each look (record of each segment), while the target moves."""
     settings: SpectrumSettings

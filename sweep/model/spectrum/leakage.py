@@ -67,8 +67,8 @@ from sweep.model.spectrum.bin_spectrum import (
     envelope_index,
     far_line_weight,
     is_mirrored,
-    seen_lines,
     tangent_at,
+    visible_line_range,
 )
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
@@ -137,7 +137,7 @@ class LeakageLimits(NamedTuple):
     """Correlation coefficient of the noise of adjacent bins, in phase with a line's sidelobes."""
 
 
-class SettledLeakage(NamedTuple):
+class LeakageResult(NamedTuple):
     """Leakage of the computed bins around the lines and of all bins beyond them.
 
     It is valid only if enough bins around the lines are computed.
@@ -145,11 +145,11 @@ class SettledLeakage(NamedTuple):
 
     leakage: float
     """Probability that the echo's signal far from its lines raises at least one false alarm."""
-    is_settled: bool
+    is_valid: bool
     """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
 
 
-class EnvelopeBeyond(NamedTuple):
+class EnvelopeTail(NamedTuple):
     """Bounds on a line's spectrum at all distances above a given one. The line has amplitude 1."""
 
     magnitude: float
@@ -224,19 +224,21 @@ def detect_with_leakage(
     nyquist_bin, clearance, far_weight = layout.fft_size // 2, layout.clearance_bins, weight_sum
     if lobe_half_width > clearance // 2:  # an echo whose pedestal reaches far
         clearance += lobe_half_width
-    seen = seen_lines(bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout)
+    visible_range = visible_line_range(
+        bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout
+    )
     image_distance = (
-        max(min(seen.lowest_position, nyquist_bin - seen.highest_position), 0.0)
+        max(min(visible_range.lowest_position, nyquist_bin - visible_range.highest_position), 0.0)
         if layout.spectrum_type == REAL_WITH_IMAGES
         else math.inf
     )
     distance_min = crossing_distance = max(
         distance_below_level_with_images(
-            brightest_limits.threshold, weight_sum, seen, envelope, layout
+            brightest_limits.threshold, weight_sum, visible_range, envelope, layout
         ),
         float(clearance),
     )
-    tolerance_left = limits.tolerance - _leakage_bound_beyond(
+    tolerance_left = limits.tolerance - _far_leakage_bound(
         far_weight, distance_min, image_distance, brightest_limits, envelope
     )
     if tolerance_left < 0.0 or crossing_distance > clearance:
@@ -246,25 +248,25 @@ def detect_with_leakage(
         far_weight = far_line_weight(weight_sum, n_sources, layout, workspace.field.sources)
         crossing_distance = max(
             distance_below_level_with_images(
-                brightest_limits.threshold, far_weight, seen, envelope, layout
+                brightest_limits.threshold, far_weight, visible_range, envelope, layout
             ),
             float(clearance),
         )
         distance_min = min(crossing_distance, float(clearance + nyquist_bin))
-        tolerance_left = limits.tolerance - _leakage_bound_beyond(
+        tolerance_left = limits.tolerance - _far_leakage_bound(
             far_weight, distance_min, image_distance, brightest_limits, envelope
         )
         while (
             tolerance_left < 0.0 and distance_min < layout.table_bins
         ):  # bins of the table take less time than an integral
             distance_min = min(1.25 * distance_min, float(layout.table_bins))
-            tolerance_left = limits.tolerance - _leakage_bound_beyond(
+            tolerance_left = limits.tolerance - _far_leakage_bound(
                 far_weight, distance_min, image_distance, brightest_limits, envelope
             )
     # Wide enough if the integral may be left out, else a first guess.
     is_integral_negligible = tolerance_left >= 0.0
     near_bins = bins_around_lines(
-        distance_min if is_integral_negligible else float(clearance), seen, layout
+        distance_min if is_integral_negligible else float(clearance), visible_range, layout
     )
     extra_bins = ZERO
     if not is_integral_negligible:
@@ -310,10 +312,10 @@ def detect_with_leakage(
                     n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates
                 )
             return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, leakage)
-        result = _leakage_of_span_and_beyond(
+        result = _leakage_of_all_bins(
             DetectedSpan(first_bin, n_bins, peak_index, n_exempt, 0.0),
             bundle,
-            seen,
+            visible_range,
             limits,
             speckle_power_max,
             shape,
@@ -323,7 +325,7 @@ def detect_with_leakage(
             crossing_series,
             speckle_rates,
         )
-        if result.is_settled:
+        if result.is_valid:
             return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, result.leakage)
         extra_bins *= 2
 
@@ -511,22 +513,22 @@ def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates)
     number of bins to be listed one by one: marked bins, the echo's bins next to them, and one for
     each gap between them.
     """
-    n_listed_max, stretch_end = 0, first_index
+    n_listed_max, gap_end = 0, first_index
     for i in range(first_index, end_index):
         span.crossing_probability[i] = 0.0
-    while stretch_end < end_index:
-        stretch_begin = stretch_end
-        while stretch_end < end_index and not span.is_exempt[stretch_end]:
-            stretch_end += 1
-        if stretch_end > stretch_begin and stretch_begin > first_index:
+    while gap_end < end_index:
+        gap_begin = gap_end
+        while gap_end < end_index and not span.is_exempt[gap_end]:
+            gap_end += 1
+        if gap_end > gap_begin and gap_begin > first_index:
             n_listed_max += 2 + _mark_bins_that_may_all_cross(
-                stretch_begin, 1, stretch_end - stretch_begin, noise_sigma, span, speckle_rates
+                gap_begin, 1, gap_end - gap_begin, noise_sigma, span, speckle_rates
             )
-        if stretch_end > stretch_begin and stretch_end < end_index:
+        if gap_end > gap_begin and gap_end < end_index:
             n_listed_max += 2 + _mark_bins_that_may_all_cross(
-                stretch_end - 1, -1, stretch_end - stretch_begin, noise_sigma, span, speckle_rates
+                gap_end - 1, -1, gap_end - gap_begin, noise_sigma, span, speckle_rates
             )
-        stretch_end += 1
+        gap_end += 1
     return n_listed_max
 
 
@@ -624,7 +626,7 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, envelope):
+def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelope):
     """Bound the probability of false alarms by leaked signal in all bins far from the lines.
 
     The bins are ``distance_min`` or more bins away from the lines.
@@ -659,10 +661,10 @@ def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, enve
     """
     weight_ratio, b = weight_sum / limits.noise_sigma, limits.threshold / limits.noise_sigma
     y = 0.5 * b * b
-    beyond = _envelope_beyond(distance_min, envelope)
+    beyond = _envelope_tail(distance_min, envelope)
     nearest_envelope, square_sum = beyond.magnitude, beyond.square_sum
     if image_distance < math.inf:
-        image = _envelope_beyond(max(distance_min, image_distance), envelope)
+        image = _envelope_tail(max(distance_min, image_distance), envelope)
         image_square_sum = image.square_sum + (
             max(image_distance - distance_min, 0.0) * image.magnitude * image.magnitude
         )
@@ -678,11 +680,11 @@ def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, enve
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _envelope_beyond(distance_min, envelope):
-    """Return the :class:`EnvelopeBeyond` of a line from a distance of ``distance_min`` bins on."""
+def _envelope_tail(distance_min, envelope):
+    """Return the :class:`EnvelopeTail` of a line from a distance of ``distance_min`` bins on."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
-    return EnvelopeBeyond(magnitude, magnitude * magnitude + envelope.square_integral[index])
+    return EnvelopeTail(magnitude, magnitude * magnitude + envelope.square_integral[index])
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -745,7 +747,7 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
     The leakage integral covers the bins beyond them. The number is a heuristic. It depends on the
     threshold, on the smoothness of the false-alarm rate, and on 3/4 of ``line_extent``, the extent
     of the lines [bins]. It is a multiple of 8. :func:`detect_with_leakage` doubles it until
-    :func:`_leakage_of_span_and_beyond` is accurate. ``crossing_distance`` is the distance from the
+    :func:`_leakage_of_all_bins` is accurate. ``crossing_distance`` is the distance from the
     lines [bins] up to which signal alone may cross the threshold.
     """
     clearance = layout.clearance_bins
@@ -763,10 +765,10 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def _leakage_of_span_and_beyond(
+def _leakage_of_all_bins(
     detected,
     bundle,
-    seen,
+    visible_range,
     limits,
     speckle_power_max,
     shape,
@@ -776,27 +778,29 @@ def _leakage_of_span_and_beyond(
     crossing_series,
     speckle_rates,
 ):
-    """Compute the :class:`SettledLeakage` of the bins around the lines and of all other bins.
+    """Compute the :class:`LeakageResult` of the bins around the lines and of all other bins.
 
     Parameters are those of :func:`detect_with_leakage`, with the :class:`DetectedSpan` and the
-    :class:`sweep.model.spectrum.bin_spectrum.SeenLines`. If the echo is in developed speckle, the
-    leakage is the mean over the speckle.
+    :class:`sweep.model.spectrum.bin_spectrum.VisibleLineRange`. If the echo is in developed
+    speckle, the leakage is the mean over the speckle.
     """
-    span, integral = workspace.span, workspace.integral
+    span, integral = workspace.span, workspace.leakage_quadrature
     first_bin, n_bins, peak_index = detected.first_bin, detected.n_bins, detected.peak_index
     noise_sigma, threshold = limits.noise_sigma, limits.threshold
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     threshold_ratio, scale = threshold / noise_sigma, 0.5 / (noise_sigma * noise_sigma)
     goes_on_below, goes_on_above = first_bin > 0, first_bin + n_bins - 1 < nyquist_bin
     if not goes_on_below and not goes_on_above:
-        return SettledLeakage(
+        return LeakageResult(
             _leakage_of_span(
                 n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates
             ),
             True,
         )
     _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
-    centre_bin = abs(math.floor(0.5 * (seen.lowest_position + seen.highest_position) + 0.5))
+    centre_bin = abs(
+        math.floor(0.5 * (visible_range.lowest_position + visible_range.highest_position) + 0.5)
+    )
     centre_bin = fft_size - centre_bin if centre_bin > nyquist_bin else centre_bin
     rate_beyond, last_terms, n_points = 0.0, 0.0, ZERO
     for side in (-1, 1):
@@ -804,7 +808,7 @@ def _leakage_of_span_and_beyond(
             continue
         near_end = _near_end_correction(side, n_bins, span)
         if not near_end.exists:
-            return SettledLeakage(0.0, False)
+            return LeakageResult(0.0, False)
         rate_beyond += near_end.correction
         last_terms += near_end.last_term
         end_distance = (
@@ -874,10 +878,10 @@ def _leakage_of_span_and_beyond(
         largest_beyond <= half_square_max
         and last_terms <= END_CORRECTION_ERROR_MAX * (span_leakage + rate_beyond)
     ):
-        return SettledLeakage(0.0, False)
+        return LeakageResult(0.0, False)
     if speckle_power_max > 1.0:
-        return SettledLeakage(
-            _mean_leakage_of_span_and_beyond(
+        return LeakageResult(
+            _mean_leakage_of_all_bins(
                 n_bins,
                 n_points,
                 limits,
@@ -889,11 +893,11 @@ def _leakage_of_span_and_beyond(
             ),
             True,
         )
-    return SettledLeakage(span_leakage - (1.0 - span_leakage) * math.expm1(-rate_beyond), True)
+    return LeakageResult(span_leakage - (1.0 - span_leakage) * math.expm1(-rate_beyond), True)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_leakage_of_span_and_beyond(
+def _mean_leakage_of_all_bins(
     n_bins, n_points, limits, goes_on_below, goes_on_above, span, integral, speckle_rates
 ):
     """Return the mean leakage over developed speckle of computed bins and of the integral's bins.
@@ -951,12 +955,12 @@ def _fill_far_powers(
 ):
     """Compute the squared magnitude of the spectrum at the leakage integral's points.
 
-    The result goes to ``workspace.integral.half_square``.
-    The relative error is exp(-``log_accuracy``). ``workspace.integral.cotangent`` contains tan(pi q
-    / N) of each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there
-    are fewer lines than equivalent lines needed, the lines are summed exactly.
+    The result goes to ``workspace.leakage_quadrature.half_square``. The relative error is
+    exp(-``log_accuracy``). ``workspace.leakage_quadrature.cotangent`` contains tan(pi q / N) of
+    each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there are
+    fewer lines than equivalent lines needed, the lines are summed exactly.
     """
-    field, integral = workspace.field, workspace.integral
+    field, integral = workspace.field, workspace.leakage_quadrature
     far_bins = field.far_bins
     is_mirror_image = is_mirrored(
         bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout.spectrum_type

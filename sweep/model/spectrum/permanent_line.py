@@ -225,7 +225,7 @@ def line_bin_masks(
     return is_masked, is_searched, is_searched & ~is_masked & (magnitude_max >= floor * noise_sigma)
 
 
-def raised_magnitude(
+def echo_magnitude_with_line(
     echo_magnitude: np.ndarray,
     line_rms: np.ndarray,
     *,
@@ -276,7 +276,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
     shots : Shots
         Prepared shots.
     bin_spans : BinSpans
-        Spectra around the echoes, as of :func:`sweep.model.spectrum.segment_spectra.iter_spans`.
+        Spectra around the echoes, as in :func:`sweep.model.spectrum.segment_spectra.iter_spans`.
 
     Returns
     -------
@@ -328,7 +328,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
             shots, int(bin_spans.point_numbers[i]), segment_index, peak_frequency
         )
         skirt_rms = np.where(is_masked[bins], 0.0, skirt_half_amplitude * line.magnitude_rms[bins])
-        raised_magnitudes = raised_magnitude(
+        raised_magnitudes = echo_magnitude_with_line(
             bin_spans.magnitudes[bin_slice],
             skirt_rms,
             noise_sigma=line_noise_sigma[i],

@@ -132,7 +132,7 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
 
     def by_point(values: np.ndarray | float) -> np.ndarray:
         """Return values of the points as a column (m, 1)."""
-        return as_columns(shots, values)[points]
+        return append_trailing_axes(shots, values)[points]
 
     hertz_per_metre = by_point(shots.waveform.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
     axis_range_beat = hertz_per_metre * by_point(shots.range)
@@ -196,7 +196,7 @@ def _fold_to_bins(shots: Any, cycles_per_sample: np.ndarray) -> np.ndarray:
     return np.asarray(positions if shots.complex_record else abs(positions))
 
 
-def as_columns(shots: Any, values: np.ndarray | float, n_trailing: int = 1) -> np.ndarray:
+def append_trailing_axes(shots: Any, values: np.ndarray | float, n_trailing: int = 1) -> np.ndarray:
     """Broadcast ``values`` to all n points and append ``n_trailing`` dimensions of size 1."""
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * n_trailing)
 
@@ -303,7 +303,7 @@ def _restrict_spans(
             )
             n_exempt[s, j] = is_exempt.sum()
             if evaluates_leakage[s]:
-                leakage[s, j] = span_leakage(
+                leakage[s, j] = span_leakage_probability(
                     magnitudes,
                     is_exempt,
                     threshold,
@@ -360,7 +360,7 @@ def _mark_searched_echoes(
 
 
 @njit(cache=True, error_model="numpy")
-def span_leakage(
+def span_leakage_probability(
     magnitudes,
     is_exempt,
     alarm_threshold,

@@ -40,7 +40,7 @@ from sweep.model.detection.echo_detection import (
     pd_and_miss,
 )
 from sweep.model.detection.marcum import marcum_q1_tails
-from sweep.model.spectrum.search_restriction import span_leakage
+from sweep.model.spectrum.search_restriction import span_leakage_probability
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 GAUSS_ORDER = 4
@@ -362,7 +362,7 @@ def _evaluate_levels(
                         loss_at_level = at_level.miss - at_threshold.miss
                     pd_loss[s, j, k] = max(loss_at_level, 0.0)
                 if includes_leakage:
-                    p_leak = span_leakage(
+                    p_leak = span_leakage_probability(
                         magnitudes,
                         is_echo,
                         level,

@@ -21,7 +21,7 @@ from sweep.model.effects.catalogue import (
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.ground import extent_of_ray_traced_ground
+from sweep.model.ground import ray_traced_footprint_extent
 from sweep.model.outputs import (
     BEAMLET_VARIABLES,
     CYCLE_VARIABLES,
@@ -793,7 +793,7 @@ def plan_shot_effects(
     shots, ground = parameters_and_ground_of_eyepoints(
         hitting_eyepoints, PARAMETER_DEFAULTS | dict(parameters), surfaces
     )
-    points = PlannerInputs(shots, extent_of_ray_traced_ground(ground), has_rotating_body=rotating)
+    points = PlannerInputs(shots, ray_traced_footprint_extent(ground), has_rotating_body=rotating)
 
     def max_per_tile(values: np.ndarray) -> np.ndarray:
         return np.maximum.reduceat(
