@@ -117,8 +117,9 @@ class LineSpreadBins(NamedTuple):
     deviation: np.ndarray
     """(n,): largest standard deviation of line frequencies of any segment [bins of fs/L]."""
     linear: np.ndarray
-    """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. Further rows are
-    that of the phase [cycles] by which segments differ.
+    """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. If the target has
+    a roughness, a further row holds twice the spread of the phase difference between segments
+    [cycles].
     """
     quadratic: np.ndarray
     """(rows, n): magnitude of the quadratic spread c [bins of fs/L], with the rows of `linear`."""
@@ -136,9 +137,10 @@ class LineSpreadBins(NamedTuple):
 def split_with_beamlet_counts(
     parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points by category, and set the number of beamlets if it is not stated.
+    """Split points into categories, and choose the number of beamlets where none is stated.
 
-    The number then follows from the tolerance.
+    Points of a category share text parameters and array sizes. The chosen number follows from the
+    tolerance.
 
     Parameters
     ----------
@@ -184,7 +186,10 @@ def split_with_beamlet_counts(
 
 
 def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[int, str]:
-    """Return the largest number of beamlets of points of one category, and the pattern's name."""
+    """Return the largest number of beamlets of any point, and the name of their pattern.
+
+    All points share text parameters and array sizes.
+    """
     if beamlets_converge(parameters):
         return ErrorBudget.beamlets_max, "line"
     return ErrorBudget.thesis_beamlet_count, ground.beamlet_pattern(parameters)
@@ -193,7 +198,7 @@ def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[in
 def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) -> int:
     """Return the number of rays of each shot of a flight in the first of several casts.
 
-    It is used for flights whose number of rays follows from the tolerance.
+    This number is used for flights whose number of rays follows from the tolerance.
     """
     if not beamlets_converge(parameters):
         return error_budget.thesis_beamlet_count
@@ -259,7 +264,10 @@ def has_numerics_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
-    """Return True if the error of points of one category falls to 0 with more beamlets."""
+    """Return True if the error of points falls to 0 with more beamlets.
+
+    All points share text parameters.
+    """
     return ground.beamlets_add_as_powers(parameters) and str(parameters[PATTERN_PATH]) not in (
         "hexagonal",
         "sunflower",
@@ -274,7 +282,7 @@ def required_beamlets(
     Parameters
     ----------
     parameters : mapping
-        Parameters by dotted path, as arrays, of points of one category.
+        Parameters by dotted path, as arrays; all points share text parameters and array sizes.
     n_points : int
         Number of points n.
 
@@ -564,8 +572,8 @@ def _choose_node_lines(
 def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
     """Return the quadrature error of a single line of nodes due to curvature, (n,).
 
-    It is in units of the power of a bin on which a spectral line is centred. The factor 2 includes
-    the equal error along the slope with the fewest nodes.
+    The error is in units of the power of a bin on which a spectral line is centred. The factor 2
+    includes the equal error along the slope with the fewest nodes.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
@@ -644,7 +652,7 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
     def errors_of_rule(n_nodes: int) -> np.ndarray:
         """Return the errors of a quadrature with `n_nodes` nodes, (m + 1,).
 
-        They apply at _CURVATURES; the last one applies beyond the largest curvature.
+        The errors apply at _CURVATURES; the last one applies beyond the largest curvature.
         """
         rule_errors = (
             weight
@@ -714,7 +722,7 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
 def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
     """Return the magnitude of a window's autocorrelation at lags [record lengths].
 
-    It is divided by the signed sum of the autocorrelation over all lags.
+    The magnitude is divided by the signed sum of the autocorrelation over all lags.
     """
     w = window_samples(window_name, _WINDOW_SAMPLES)
     r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _WINDOW_SAMPLES)) ** 2)[: _WINDOW_SAMPLES + 1]

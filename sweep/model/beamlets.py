@@ -147,7 +147,7 @@ def _hexagonal_lattice(n_points: int) -> np.ndarray:
 def lattice_radius(n_beamlets: int) -> float:
     """Return the radius of a hexagonal lattice before it is mapped to the beam's covariance.
 
-    It is in standard deviations of the beam.
+    The radius is in standard deviations of the beam.
     """
     return math.sqrt(
         PATTERN_RADIUS_SIGMA**2 + SQUARED_RADIUS_GROWTH * math.log(max(n_beamlets, 19) / 19)
@@ -261,7 +261,7 @@ def plane_footprint(
 class OffsetMoments(NamedTuple):
     """Moments of beamlets' offsets from the beam's axis in range or velocity.
 
-    They are weighted by echo power.
+    The moments are weighted by echo power.
     """
 
     mean: np.ndarray | float
@@ -432,8 +432,8 @@ def bins_per_velocity(
 
     Notes
     -----
-    2/c times the sum of the carrier and of twice the range's beat, which the Doppler ratio beta
-    scales.
+    The shift is (2 / c) (f + 2 f_R) over the bin width, with the carrier f and the range beat f_R =
+    2 S R / c of the chirp rate S and the range R.
     """
     doubled_range_beat = (
         np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)

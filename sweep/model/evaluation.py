@@ -410,7 +410,7 @@ def fit_peaks(
 def _false_alarm_probabilities(shots: Shots, n_exempt: np.ndarray) -> dict[str, np.ndarray]:
     """Compute the false-alarm probabilities of noise, and their decimal logarithms.
 
-    They refer to a bin, the up-chirp, both chirps and any segment of the shot.
+    The probabilities refer to a bin, the up-chirp, both chirps and any segment of the shot.
 
     Parameters
     ----------

@@ -90,7 +90,7 @@ class BeamletTable(NamedTuple):
 class BeamGradients(NamedTuple):
     """Changes of Doppler ratio, range and echo across a footprint.
 
-    They are per standard deviation of the beam, (n,) each.
+    The changes are per standard deviation of the beam, (n,) each.
     """
 
     doppler_ratio: np.ndarray
@@ -134,7 +134,7 @@ class _PlaneGeometry(NamedTuple):
 
 
 class FlatGround:
-    """Flat ground that the beams of one category of points meet.
+    """Flat ground that the beams of n points with the same text parameters meet.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ class FlatGround:
     def gradients(self) -> "BeamGradients":
         """Changes of Doppler ratio, range and echo towards the near side of the plane.
 
-        They are per standard deviation of the beam.
+        The changes are per standard deviation of the beam.
         """
         geometry = self._geometry
         range_gradient = (geometry.position_spread_angle / 4) / np.tan(geometry.grazing_angle)
@@ -317,7 +317,7 @@ Ground = FlatGround | RayTracedGround
 def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
     """Return True if beamlets add as powers, False if as amplitudes.
 
-    All points have to be of one category.
+    All points must have the same text parameters.
     """
     incoherent = str(parameters["footprint.phases"]) == "incoherent"
     return incoherent and str(parameters["instrument.receiver.architecture"]) != "direct"

@@ -185,7 +185,7 @@ class WaveformSettings:
     def look_period(self) -> np.ndarray:
         """Time [s] from the start of one look to that of the next.
 
-        It is the duration of all segments and gaps of the shot.
+        The time is the duration of all segments and gaps of the shot.
         """
         return len(self.segment_order) * (self.chirp_duration + self.segment_gap)
 
@@ -575,7 +575,8 @@ class LinkBudget:
     def tnr(self) -> np.ndarray:
         """Threshold-to-noise ratio, as set by the processing parameters.
 
-        It is the threshold over the standard deviation of a bin's magnitude with noise alone.
+        The ratio is the threshold over the standard deviation of a bin's magnitude with noise
+        alone.
         """
         return tnr_from_parameters(self.parameters)
 
@@ -619,7 +620,7 @@ def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the speed at which the range along the beam falls [m/s], (n,) or scalar.
 
-    It differs from the radial velocity if the beam slides over sloping ground.
+    This speed differs from the radial velocity if the beam slides over sloping ground.
 
     Notes
     -----

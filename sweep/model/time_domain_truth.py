@@ -241,9 +241,9 @@ def _start_phase_cycles(
 ) -> float:
     """Compute the phase of a beamlet's beat at the segment's start [cycles], in exact fractions.
 
-    It is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is ``carrier``,
-    s ``chirp_slope``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR ``range_offset`` and
-    decrease ``range_decrease``.
+    The phase is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is
+    ``carrier``, s ``chirp_slope``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR
+    ``range_offset`` and decrease ``range_decrease``.
     """
     delay = Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease)
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)

@@ -102,7 +102,8 @@ class WaveformSegment(NamedTuple):
     carrier: np.ndarray
     """Frequency at the segment's start [Hz], by which a delay makes a phase."""
     includes_leakage: bool
-    """True if leakage, false alarms by the echo's signal far from its line, is evaluated here."""
+    """True if leakage, false alarms due to the echo's signal far from its line, is evaluated
+    here."""
     range_decrease: np.ndarray | float
     """Decrease of the target's range from the start of the shot to that of the segment [m]."""
     doppler_ratio: np.ndarray | float
@@ -287,8 +288,8 @@ this counts as inside."""
 def record_length(parameters: Mapping[str, Any]) -> np.ndarray:
     """Return the number of samples in the record, (n,) int64, for parameters by dotted path.
 
-    It is the FFT size, or the number of samples between the acquisition delay and the chirp's end,
-    if that is smaller.
+    The number is the FFT size, or the number of samples between the acquisition delay and the
+    chirp's end, if that is smaller.
     """
     time_left = (
         parameters["instrument.chirp.duration"]

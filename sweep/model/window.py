@@ -112,7 +112,7 @@ class Window:
     def equivalent_noise_bandwidth(self) -> float:
         """Equivalent noise bandwidth [bins of fs/L].
 
-        It is L times the sum of squared samples, over the squared sum of samples.
+        The bandwidth is L times the sum of squared samples, over the squared sum of samples.
         """
         return self.length * self.energy / self.sum**2
 

@@ -179,7 +179,8 @@ _REPAIR_TEXT_BY_REPORT_FIELD = {
     "n_merged_vertices": "{} coincident vertices merged",
     "n_unreferenced_vertices": "{} unused vertices dropped",
 }
-"""Texts about repairs of a mesh, with a place for the number, by field of `MeshCleaningReport`."""
+"""Templates of texts about repairs of a mesh, each for one number of `MeshCleaningReport`, by the
+name of its field."""
 
 
 @dataclass(frozen=True)
@@ -401,12 +402,12 @@ def _read_polygon_facets(path: Path) -> tuple[list[Facets], str | None]:
 
 
 def _read_triangle_facets(path: Path) -> tuple[list[Facets], str | None]:
-    """Read the parts of a file of triangles.
+    """Read the meshes of a glTF or STL file.
 
     Returns
     -------
     facets : list of Facets
-        Facets of each part, in the coordinates of the file.
+        Facets of each mesh of the file's scene, in the coordinates of the file.
     unit : str or None
         Unit of length that the file states.
     """

@@ -91,7 +91,7 @@ class Quantity:
     """Description of a quantity that each shot, or each point, has."""
 
     long_name: str
-    """Name in labels."""
+    """Name of the quantity in labels of figures."""
     units: str
     """Units of the stored values."""
     is_per_point: bool

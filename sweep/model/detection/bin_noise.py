@@ -105,8 +105,8 @@ def _equivalent_bins_per_bin(
 ) -> np.ndarray:
     """Return by how many independent bins each further adjacent bin counts, 0..1.
 
-    It is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and h that of a bin whose
-    neighbour does not cross.
+    The number is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and h that of a
+    bin whose neighbour does not cross.
     """
     from sweep.model.detection.marcum import marcum_q1
 

@@ -67,8 +67,8 @@ def negligible_signal_ratio(
     Parameters
     ----------
     leakage_probability
-        (n,): tolerated error of the probability of a false peak by leaked signal, summed over all
-        bins that count as noise alone.
+        (n,): tolerated error of the probability of a false peak due to leaked signal, summed over
+        all bins that count as noise alone.
     threshold_ratio
         (n,): threshold b [sigma].
     n_bins
@@ -85,8 +85,8 @@ def negligible_signal_ratio(
 
         x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
 
-    to the probability of a false peak by leaked signal (:mod:`sweep.model.spectrum.leakage`). The
-    last factor is taken at a b = 1, the largest product that is returned.
+    to the probability of a false peak due to leaked signal (:mod:`sweep.model.spectrum.leakage`).
+    The last factor is taken at a b = 1, the largest product that is returned.
     """
     y = 0.5 * np.square(threshold_ratio)
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
@@ -329,8 +329,8 @@ def bin_threshold_at(bin_thresholds, point):
 def echo_half_width(rule, pedestal_reach_bins):
     """Return the half-width [bins] of an echo about its lines.
 
-    It is the larger of the half-widths of the main lobe and of the phase-noise pedestal. ``rule``
-    is a :class:`DetectionRule`.
+    The half-width is the larger of the half-widths of the main lobe and of the phase-noise
+    pedestal. ``rule`` is a :class:`DetectionRule`.
     """
     return max(rule.lobe_half_width, int(pedestal_reach_bins))
 
@@ -1028,9 +1028,9 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     DC and Nyquist the mode's power depends on the phase of z as 1 + q_k cos t, with the
     pseudo-variance ratio q_k of bin k and t uniform (:mod:`sweep.model.detection.pseudo_variance`).
 
-    Stretches of adjacent echo bins fade independently of each other if they hold a bin of at least
-    half the largest magnitude. Weaker stretches belong to the strong bin_run below. Errors of these
-    approximations: docs/physics.md.
+    Runs of adjacent echo bins fade independently of each other if they hold a bin of at least half
+    the largest magnitude. A weaker run fades with the strong run below it. docs/physics.md states
+    the errors of these approximations.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     largest = 0.0
@@ -1054,9 +1054,7 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
                 )
             n_runs += 1
         i += 1
-    bin_run = _pd_and_miss_of_run(
-        echo, run_begin, magnitude.size, rule, bin_threshold, bin_speckle
-    )
+    bin_run = _pd_and_miss_of_run(echo, run_begin, magnitude.size, rule, bin_threshold, bin_speckle)
     return Detection(pd + miss * bin_run.pd, miss * bin_run.miss)
 
 
@@ -1079,10 +1077,10 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_of_run(echo, begin, end, rule, bin_threshold, bin_speckle):
-    """Return the :class:`Detection` of one bin_run of an echo in developed speckle.
+    """Return the :class:`Detection` of a run of bins of an echo in developed speckle.
 
-    A bin_run is a run of adjacent bins that fade together, bins begin .. end - 1 of ``echo``
-    (:func:`pd_and_miss_in_speckle`).
+    The adjacent bins of the run fade together (:func:`pd_and_miss_in_speckle`). They are bins begin
+    .. end - 1 of ``echo``.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     nyquist_bin = rule.fft_size // 2 if rule.real_record_in_speckle else 0
@@ -1169,8 +1167,8 @@ def _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle):
 def _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
     """Return the mean :class:`Detection` over power and phase t of the strongest speckle mode.
 
-    This is for bins near DC and Nyquist. Let q be the ratio E[X^2] / E[|X|^2] of a bin X. At the
-    phase t the power of all modes in the bin is 1 + q cos t times the mean over t.
+    The result applies to bins near DC and Nyquist. Let q be the ratio E[X^2] / E[|X|^2] of a bin X.
+    At the phase t the power of all modes in the bin is 1 + q cos t times the mean over t.
     """
     pd, miss, n_bins = 0.0, 0.0, echo.is_echo.size
     given_phase = BinsGivenMode(
@@ -1495,7 +1493,7 @@ class SpectrumDetections(NamedTuple):
     n_exempt: np.ndarray
     """(m,): number of bins that belong to the echo and so can raise no false alarm."""
     leakage: np.ndarray
-    """(m,): zeros in place of the probability of a false peak by leaked signal, which is not
+    """(m,): zeros in place of the probability of a false peak due to leaked signal, which is not
     evaluated here."""
 
 

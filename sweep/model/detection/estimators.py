@@ -240,7 +240,7 @@ def _three_bins_about_middle(
 def _parabola_vertex(values: np.ndarray) -> np.ndarray:
     """Return the vertex, -1/2..1/2 from the middle, of parabolas through values (m, 3).
 
-    It is 0 where the parabola has no maximum.
+    The vertex is 0 where the parabola has no maximum.
     """
     below, middle, above = values.T
     curvature = 2 * middle - below - above

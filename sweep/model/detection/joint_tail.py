@@ -75,7 +75,7 @@ def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
 def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
     """Compute :func:`joint_tail_excess` for a given ``correlation``, with 4 quadrature nodes.
 
-    It is less precise than the 12 nodes of a :class:`JointTailRule`, and needs none.
+    The result is less precise than the 12 nodes of a :class:`JointTailRule`, and needs none.
     """
     excess, half_angle = 0.0, 0.5 * math.asin(correlation)
     for j in range(_JOINT_TAIL_NODES.size):

@@ -148,7 +148,7 @@ class Looks(NamedTuple):
     def amplitude_gain_max(self) -> float:
         """Upper bound of the gain in signal over noise that combining the looks can bring.
 
-        It is that of the amplitude: sqrt(N) for N looks whose powers or crossings are combined,
+        The gain is one of amplitude: sqrt(N) for N looks whose powers or crossings are combined,
         else 1.
         """
         return math.sqrt(self.number) if self.is_noncoherent else 1.0
@@ -516,10 +516,10 @@ class Looks(NamedTuple):
         correlation: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> np.ndarray:
-        """Return the covariance of two segments' detections, relative to equal speckle, 0..1.
+        """Return the covariance of two segments' detections over that for equal speckle, 0..1.
 
-        It is divided by the covariance that the detections would have if both segments had the same
-        speckle.
+        The fraction is 1 if both segments have the same speckle, and 0 if their speckle is
+        independent.
 
         Parameters
         ----------
@@ -546,7 +546,7 @@ class Looks(NamedTuple):
         return np.asarray(inverse_looks * fraction + (1 - inverse_looks) * np.square(correlation))
 
     def _effective_looks(self, look_speckle: "LookSpeckle | None") -> np.ndarray | float:
-        """Return how many looks of independent speckle fade as little as all looks together."""
+        """Return the effective number of looks: that of independent looks that fade equally."""
         if look_speckle is not None:
             return np.asarray(look_speckle.effective_looks.mean(axis=0))
         return float(self.number if self.has_independent_speckle else 1)
@@ -632,7 +632,7 @@ class Looks(NamedTuple):
     def log_pfa(self, threshold_ratio: np.ndarray) -> np.ndarray:
         """Return the natural logarithm of the probability that a bin of noise alone is detected.
 
-        It is precise even where the probability itself underflows.
+        The logarithm is precise even where the probability itself underflows.
 
         Parameters
         ----------
@@ -675,7 +675,7 @@ class Looks(NamedTuple):
     def decisive_magnitude(self, magnitudes: np.ndarray) -> np.ndarray:
         """Return the magnitude that reaches the threshold if and only if the looks detect the bin.
 
-        It is the root of the mean power, or the M-th largest |X| for M votes.
+        The magnitude is the root of the mean power, or the M-th largest |X| for M votes.
 
         Parameters
         ----------
@@ -807,7 +807,7 @@ class Looks(NamedTuple):
     ) -> np.ndarray:
         """Return the signal amplitude below which bins may count as noise alone, (n,).
 
-        It is in units of the noise per quadrature of one record. Parameters are those of
+        The amplitude is in units of the noise per quadrature of one record. Parameters are those of
         :func:`sweep.model.detection.echo_detection.negligible_signal_ratio`.
         """
         # At small signals the added probability is proportional to the signal's power.
@@ -923,9 +923,9 @@ SINGLE_LOOK = Looks()
 def coherent_gain(
     looks: Looks, *, acceleration: np.ndarray, carrier: np.ndarray, look_period: np.ndarray
 ) -> np.ndarray:
-    """Return how much an accelerated target's amplitude falls when looks are added coherently.
+    """Return the factor by which acceleration reduces the amplitude of coherently added looks.
 
-    It is the amplitude of the mean over all looks, relative to that of one look.
+    The factor is the amplitude of the mean over all looks, relative to the amplitude of one look.
 
     Parameters
     ----------
@@ -959,8 +959,9 @@ def solve_threshold_ratio(
 ) -> np.ndarray:
     """Return the threshold (n,) at which noise is detected with a given probability pfa.
 
-    It is found by bisection, in units of the noise per quadrature. ``log_pfa_of_threshold`` is the
-    decreasing function from the threshold to ln(pfa). ``log_pfa`` (n,) are the given ln(pfa).
+    The threshold is found by bisection, in units of the noise per quadrature.
+    ``log_pfa_of_threshold`` is the decreasing function from the threshold to ln(pfa). ``log_pfa``
+    (n,) are the given ln(pfa).
     """
     # n bins raise an alarm at least as often as one, and at most n times as often.
     low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
@@ -1129,8 +1130,8 @@ def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _added_crossing_table(looks: Looks, threshold_ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the table that :meth:`Looks.added_crossing_probability` interpolates.
 
-    It holds ln(signal), and ln of the probability that the signal makes a bin cross where noise
-    alone does not.
+    The table holds ln(signal), and ln of the probability that the signal makes a bin cross where
+    noise alone does not.
     """
     signal = np.geomspace(1e-3 / math.sqrt(looks.number), threshold_ratio + 1.0, 300)
     noise = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio]))

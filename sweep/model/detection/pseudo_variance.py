@@ -160,8 +160,8 @@ def mean_over_phases(
 def _pd_at_phases(mean_pd: np.ndarray, phase_factors: np.ndarray) -> np.ndarray:
     """Return probabilities of detection at all speckle phases, (N_PHASE_NODES, ..., n).
 
-    They are exp(-A / f), with the relative echo power f at each phase. A is found by bisection so
-    that the mean over the phases is ``mean_pd`` (..., n).
+    The probabilities are exp(-A / f), with the relative echo power f at each phase. A is found by
+    bisection so that the mean over the phases is ``mean_pd`` (..., n).
     """
     phase_factors = phase_factors.T.reshape(N_PHASE_NODES, *[1] * (mean_pd.ndim - 1), -1)
     is_defined = np.isfinite(mean_pd)
@@ -196,7 +196,8 @@ def n_tabulated_bins(window: Window, fft_size: int) -> int:
 def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
     """Return the pseudo-variance ratio E[n^2] / E[|n|^2] of white noise n by bin, (bins,).
 
-    It is W2(2k) / W2(0) for bins k = 0, 1, .. from DC, with the transform W2 of the squared window.
+    The ratio is W2(2k) / W2(0) for bins k = 0, 1, .. from DC, with the transform W2 of the squared
+    window.
     """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
@@ -219,8 +220,8 @@ def _image_reach(window: Window) -> float:
 
 
 _POWER_FRACTION_MIN = 1e-7
-"""Limit below which an eigenvalue of the covariance of the looks' echo amplitudes is neglected. It
-is a fraction of the power of all looks."""
+"""Smallest fraction of all looks' power for which an eigenvalue of the covariance of their echo
+amplitudes is kept."""
 
 
 def multilook_pd_and_miss_near_ends(

@@ -26,7 +26,7 @@ def fill_peak_bin_correlation(
 ):
     """Fill ``correlation`` with the speckle correlation of two segments at the given points.
 
-    It is mu of equation (3) of :mod:`sweep.model.detection.speckle_correlation`.
+    The correlation is mu of equation (3) of :mod:`sweep.model.detection.speckle_correlation`.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ class Interpolator(NamedTuple):
 def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, float]:
     """Return the noise correlations of two bins that are one bin apart, and two bins apart.
 
-    They are those of the noise components in phase with the main lobe of a tone.
+    The correlations are those of the noise components in phase with the main lobe of a tone.
     """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
@@ -124,9 +124,9 @@ def sidelobe_correlation(window: Window, fft_size: int) -> float:
 def interpolator(window: Window, fft_size: int) -> Interpolator:
     """Return the tables that give a peak's position from three magnitudes (cached).
 
-    They hold for records with this window that are padded to `fft_size` samples. For a flat-top
-    window in a padded FFT, no measure of the magnitudes rises with the offset of the tone from the
-    centre bin. The offset is then given as 0, with an error of half a bin.
+    The tables hold for records with this window that are padded to `fft_size` samples. For a
+    flat-top window in a padded FFT, no measure of the magnitudes rises with the offset of the tone
+    from the centre bin. The offset is then given as 0, with an error of half a bin.
     """
     offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
@@ -164,7 +164,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
 def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
     """Return exp(-2 pi i cycles n) for n = 0 .. ``n_values`` - 1.
 
-    They are products of about 2 sqrt(n_values) exponentials.
+    The exponentials are products of about 2 sqrt(n_values) exponentials.
     """
     step = math.isqrt(n_values) + 1
     angle = -2j * np.pi * cycles * np.arange(step)
@@ -257,9 +257,9 @@ def _least_squares_weights(
 def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpolator) -> np.ndarray:
     """Return the error of a position over the variance of the lines' narrow Gaussian spread, (m,).
 
-    It is tabulated over the distance of the lines' mean from the centre bin [1/bins]. Three lines
-    of weights 1/6, 2/3, 1/6 represent the spread. Their moments up to the fifth are those of a
-    Gaussian.
+    The error is tabulated over the distance of the lines' mean from the centre bin [1/bins]. Three
+    lines of weights 1/6, 2/3, 1/6 represent the spread. Their moments up to the fifth are those of
+    a Gaussian.
     """
     positions = np.linspace(0.0, 1.0, _N_SPREAD_POSITIONS)
     power = np.zeros((3, _N_SPREAD_POSITIONS))

@@ -44,7 +44,8 @@ the mean extinction over height is defined."""
 class ExtinctionProfile(NamedTuple):
     """Extinction coefficient of the air, tabulated over height above the ground.
 
-    It is exponential between two heights, constant below the first, and 0 above the last.
+    The coefficient is exponential between two heights, constant below the first, and 0 above the
+    last.
     """
 
     height: tuple[float, ...]
@@ -190,7 +191,7 @@ def _mean_extinction(
 def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:
     """Return the extinction profile of points that share all text parameters.
 
-    None without an atmosphere.
+    The result is None without an atmosphere.
     """
     name = str(parameters["atmosphere.profile"])
     surface_extinction, depth = (
@@ -247,7 +248,7 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
 
 
 def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the changes that omitting extinction makes to the echo and to the shot noise.
+    """Return bounds on the changes of the echo and of shot noise if extinction is omitted.
 
     The shot noise is that of light from the target.
     """
@@ -418,7 +419,7 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
 def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
     """Return the power [W] of light that the air returns to the detector.
 
-    It follows from :func:`backscatter_integral`.
+    The power follows from :func:`backscatter_integral`.
     """
     collected_power = parameters[LASER_PREFIX + "power"] * aperture_area(
         beam.receiving_aperture_and_angle(parameters)[0]
@@ -430,9 +431,9 @@ def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndar
 def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     """Add the shot noise of backscattered light.
 
-    The beat of this light with the local oscillator is neglected. It comes from ever new grains,
-    and is spread over the bins from the nearest range to the target's. [T 3.3.1] counts
-    backscatter as noise as well.
+    The beat of this light with the local oscillator is neglected. This light comes from grains that
+    change all the time, and is spread over the bins from the nearest range to the target's. [T
+    3.3.1] counts backscatter as noise as well.
     """
     parameters = context.parameters
     profile = extinction_profile(parameters)
@@ -452,11 +453,11 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
 
 
 def backscatter_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the shot noise of backscattered light, over the receiver's noise.
+    """Return a bound on the shot noise of backscattered light, over the receiver's noise.
 
-    The threshold is set on the noise with it. The bound is the smaller of two. The first takes the
-    path as filled with the air of its lower end, without extinction. The second returns all light
-    that is lost on the path from the beam's near end.
+    The threshold is set on noise that includes this shot noise. The bound is the smaller of two.
+    The first takes the path as filled with the air of its lower end, without extinction. The second
+    returns all light that is lost on the path from the beam's near end.
     """
     parameters = points.parameters
     profile = extinction_profile(parameters)

@@ -31,7 +31,7 @@ counts as an error of 1, so that the effect is always simulated."""
 
 
 def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if the Doppler shift of all lines is omitted.
+    """Return a bound on the change of the largest bin if the lines' Doppler shift is omitted.
 
     Notes
     -----
@@ -48,7 +48,7 @@ def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBound:
-    """Bound the change of the largest bin by a common shift of all lines.
+    """Return a bound on the change of the largest bin due to a common shift of all lines.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ DOPPLER = Effect(
 
 
 def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if velocities are taken as equal over the footprint.
+    """Return a bound on the change of the largest bin if all beamlets have one velocity.
 
     Notes
     -----

@@ -190,5 +190,8 @@ class Effect:
 
 
 def add_noise_sources(shots: Shots, **variances: np.ndarray) -> Shots:
-    """Return shots with additional noise sources, given as variances at the ADC [V^2] by name."""
+    """Return shots with additional noise sources.
+
+    ``variances`` are noise variances at the ADC [V^2], by name of the source.
+    """
     return replace(shots, noise=shots.noise.with_sources(**variances))

@@ -23,7 +23,7 @@ from sweep.model.preparation import Shots
 def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
     """Return moments of the lines' offsets [FFT bins] from the line on the beam's axis.
 
-    They are due to the ranges of beamlets on the surface that the axis meets.
+    The offsets are due to the ranges of beamlets on the surface that the axis meets.
     """
     return points.footprint_extent.axis_surface_range_offsets.scaled_by(
         points.bins_per_relative_range
@@ -31,7 +31,7 @@ def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
 
 
 def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if the echo is one line on the beam's axis.
+    """Return a bound on the change of the largest bin if the echo is one line on the axis.
 
     Notes
     -----
@@ -104,7 +104,9 @@ FOOTPRINT = Effect(
 
 
 def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by optical phases, which may cancel or amplify lines.
+    """Return a bound on the change of the largest bin due to optical phases of beamlets.
+
+    Lines with these phases may cancel or amplify each other.
 
     Notes
     -----
@@ -123,7 +125,7 @@ def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_footprint_phase(shots: Shots, context: EffectContext) -> Shots:
-    """Let the lines of beamlets add as complex amplitudes instead of powers.
+    """Add the lines of beamlets as complex amplitudes instead of powers.
 
     This applies if the spec states that the optical phases follow the surface. Otherwise the shots
     are returned unchanged.
@@ -151,9 +153,10 @@ FOOTPRINT_PHASE = Effect(
 
 
 def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if all surfaces are taken at the range of the axis's.
+    """Return a bound on the change of the largest bin if all surfaces are at one range.
 
-    None if all power is on the surface that the beam's axis meets.
+    That range is the one on the beam's axis. The result is None if all power is on the surface that
+    the axis meets.
 
     Notes
     -----

@@ -52,9 +52,10 @@ def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return how far from a line's centre a Gaussian laser line spreads light.
+    """Return how far from its centre a Gaussian laser line spreads light.
 
-    It is given as the shift of a :class:`PhaseErrorBound`. None for other line shapes.
+    The distance is the shift of a :class:`PhaseErrorBound`. The result is None for other line
+    shapes.
     """
     if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
         return None
@@ -64,7 +65,7 @@ def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the detecting bins if the line width is omitted.
+    """Return a bound on the change of the detecting bins if the line width is omitted.
 
     Parameters
     ----------
@@ -114,9 +115,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
-    """Bound the changes if the width of a Lorentzian laser line is omitted.
+    """Return bounds on the changes if the width of a Lorentzian laser line is omitted.
 
-    They are the power that the pure line loses, and the pedestal of noise around it.
+    The changes are the power that the pure line loses, and the pedestal of noise around it.
     """
     line_width, delay = points[_WIDTH_PATH], np.minimum(points.target.delay, points.record.duration)
     coherent_fraction = pure_line_power_fraction(
@@ -161,7 +162,7 @@ def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.nda
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Give the beat a Gaussian line; or attenuate the pure line and add a pedestal of noise.
+    """Apply the laser's line: a Gaussian shape, or a weaker pure line and a pedestal of noise.
 
     Notes
     -----

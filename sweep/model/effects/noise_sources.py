@@ -223,7 +223,7 @@ def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np
 def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the variance of the local oscillator's intensity noise over that of the receiver's.
 
-    It is exact, not a bound. The threshold is set on the noise with it.
+    The variance is exact, not a bound. The threshold is set on the noise with it.
     """
     if points.waveform.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
@@ -303,7 +303,7 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
     """Add the ADC's rounding noise, if a number of bits is stated.
 
-    It is white, of the variance lsb^2/12 for steps of lsb [V].
+    The noise is white, of the variance lsb^2/12 for steps of lsb [V].
 
     Notes
     -----

@@ -196,8 +196,8 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
 def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
     """Return the change that a phase error makes to sums of lines and images as amplitudes.
 
-    It is :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters to lines
-    next to their images, and to a line to which a distant image is added.
+    The change is :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters
+    to lines next to their images, and to a line to which a distant image is added.
     """
     moments = window_moments(points.window)
     phase_anywhere = np.minimum(
@@ -215,7 +215,9 @@ def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -
 
 
 def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
-    """Bound the change if one of the phase errors is omitted, whichever of the others are present.
+    """Return a bound on the change of results if one of the phase errors is omitted.
+
+    The bound holds whichever of the other phase errors are present.
 
     Parameters
     ----------
@@ -384,7 +386,7 @@ def range_walk_phase(
 def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Return the bound of the phase that range walk adds over the record.
 
-    Range walk is the drift of the beat as the range changes. None without it.
+    Range walk is the drift of the beat as the range changes. The result is None without it.
     """
     doppler_ratio_growth = points.stack_segments(
         *(
@@ -403,7 +405,7 @@ def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
-    """Let the beats of the two chirps drift over the record, as the range falls.
+    """Make the beats of the two chirps drift over the record, as the range falls.
 
     Notes
     -----
@@ -535,10 +537,10 @@ def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if the target's acceleration is omitted.
+    """Return a bound on the change of the largest bin if acceleration is omitted.
 
-    It makes lines drift within a record and from look to look (record of each segment). The loss of
-    looks that are added in amplitude is exact.
+    The target's acceleration makes lines drift within a record and from look to look (record of
+    each segment). The loss of looks that are added in amplitude is exact.
     """
     bound = phase_omission_bound(points, "acceleration")
     if bound is None or points.looks.n_coherent == 1:
@@ -551,7 +553,7 @@ def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
-    """Let the Doppler frequency drift over the record of every segment, as the target accelerates.
+    """Make the Doppler frequency drift over all records, as the target accelerates.
 
     The loss that it causes in looks that are added in amplitude is included.
     """
@@ -709,8 +711,8 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
     """Return the bound of the phase that the sweep's frequency error adds over the record.
 
     Quadratic and cubic errors are polynomials in the position in the record. A sine, and a table's
-    departure from the middle of its range of values, are taken at their largest. None without an
-    error.
+    departure from the middle of its range of values, are taken at their largest. The result is None
+    without an error.
     """
     table_text = points.option(ERROR_TABLE_PATH)
     if not points.any_nonzero(*_ERROR_PEAK_PATHS):
@@ -763,7 +765,7 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
 
 
 def _error_table_phase_bound(points: PlannerInputs, table: SweepErrorTable) -> PhaseErrorBound:
-    """Bound the phase that a measured frequency error of the sweep adds over the record.
+    """Return a bound on the phase that a measured error of the sweep adds over the record.
 
     The phase is about minus the echo's delay times the error. It is bounded by the middle of the
     error's range of values, the largest departure from it, and the error's derivative.

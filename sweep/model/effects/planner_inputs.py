@@ -167,8 +167,8 @@ class PlannerInputs(LinkBudget):
     def noise_maximum_ratio(self) -> float | None:
         """Level that the noise of all bins together exceeds with a probability of at most 0.001.
 
-        It is a level of |X| over the noise per quadrature. None if segments report all peaks that
-        cross the threshold.
+        The level is one of |X| over the noise per quadrature. It is None if segments report all
+        peaks that cross the threshold.
         """
         if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
@@ -300,7 +300,7 @@ class PlannerInputs(LinkBudget):
     def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest relative magnitude of a bin at least ``distance`` [bins] from a line.
 
-        It is relative to the line's peak in a record that the echo fills.
+        The magnitude is relative to the line's peak in a record that the echo fills.
         """
         response_max = self.window_response.sidelobe_max(distance)
         if self.missing_samples is None:
@@ -353,7 +353,7 @@ class PlannerInputs(LinkBudget):
     def line_signal_ratio(self) -> np.ndarray:
         """|X| of the line on the beam's axis if it lay on a bin, over the noise per quadrature.
 
-        By segment.
+        There is a value for each segment.
         """
         receiver_filter, noise = self.receiver_filter, self.noise
         # Where an anti-alias filter passes almost no noise, the ADC's noise remains.
@@ -369,7 +369,7 @@ class PlannerInputs(LinkBudget):
     def peak_ratio(self) -> np.ndarray:
         """|X| in the largest bin of the line on the beam's axis, over the noise per quadrature.
 
-        By segment.
+        There is a value for each segment.
         """
         return self.line_signal_ratio * self.window_response.scalloping_gain(self.bin_offset)
 
@@ -406,7 +406,7 @@ class PlannerInputs(LinkBudget):
     def line_spread(self) -> OffsetMoments:
         """Bounds of the moments of offsets [FFT bins] of beamlets' lines from the axis's.
 
-        They include offsets due to both range and radial velocity.
+        The bounds include offsets due to both range and radial velocity.
         """
         return self.range_spread.sum_bound(self.velocity_spread)
 
@@ -420,7 +420,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def phase_error_shift_bins(self) -> np.ndarray | float:
-        """Largest shift in frequency of a line's light by phase errors over the record [bins]."""
+        """Largest frequency shift of light from its line that phase errors cause [bins]."""
         return self.total_phase_error_bound.shift_window_bins * self.padding_factor
 
     @cached_property
@@ -437,7 +437,7 @@ class PlannerInputs(LinkBudget):
     def image_bound(self) -> np.ndarray:
         """Largest |X| that images (at negative frequencies) can add to the largest bin.
 
-        It is relative to the |X| of all lines in phase.
+        The result is relative to the |X| of all lines in phase.
         """
         smear_factor = 1 + 2 * self.phase_error_shift_bins / self.padding_factor
         gain_rise = np.exp(np.minimum(self.gain_slope_max * self.line_spread.extreme, 50.0))
@@ -467,7 +467,7 @@ class PlannerInputs(LinkBudget):
         return self.peak_power_bounds_for(self.line_spread)
 
     def peak_power_bounds_for(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
-        """Bound the largest bin's power for lines of a given spread.
+        """Return bounds on the largest bin's power for lines of a given spread.
 
         Parameters
         ----------
@@ -523,7 +523,7 @@ class PlannerInputs(LinkBudget):
         present_moments: OffsetMoments,
         shift_bins: np.ndarray | float = 0.0,
     ):
-        """Bound the relative change of the largest bin's power as lines move or spread further.
+        """Return a bound on the relative change of the largest bin's power as lines move or spread.
 
         Parameters
         ----------
@@ -558,10 +558,11 @@ class PlannerInputs(LinkBudget):
         return image_factor * np.exp(np.minimum(gain_exponent, 50.0)) * power_change / power_min
 
     def coherent_sum_bound(self, shift_bins: np.ndarray | float) -> np.ndarray:
-        """Bound the relative change of a sum of amplitudes whose lines move by ``shift_bins``.
+        """Return a bound on the relative change of a sum of amplitudes whose lines move.
 
-        It is relative to the sum in phase. It follows from the derivatives of the window's
-        transform and of the receiver's gain, and from the phases at mid-record of line and image.
+        Lines move by ``shift_bins``. The change is relative to the sum in phase. Its bound follows
+        from the derivatives of the window's transform and of the receiver's gain, and from the
+        phases at mid-record of line and image.
         """
         phase_per_bin = (
             2

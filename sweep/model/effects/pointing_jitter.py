@@ -106,7 +106,7 @@ def perturb_geometry(
 def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest relative change of range, and shift of lines [bins], by beam deflections.
 
-    They hold in all draws but a fraction :data:`RARE_DRAW_PROBABILITY`, and for the lowest beamlets
+    Both hold in all draws but a fraction :data:`RARE_DRAW_PROBABILITY`, and for the lowest beamlets
     too. The change of range is infinite if a beamlet may pass over the horizon.
     """
     turn_max = points[_JITTER_PATH] * math.sqrt(2 * math.log(1 / RARE_DRAW_PROBABILITY))
@@ -141,7 +141,7 @@ def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndar
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Return how far random deflections of the beam shift lines; None without jitter.
 
-    It is given as the shift of a :class:`PhaseErrorBound`.
+    The distance is the shift of a :class:`PhaseErrorBound`.
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None
@@ -152,7 +152,7 @@ def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change if jitter is omitted, in all but rare draws.
+    """Return a bound on the change of results if jitter is omitted, in all but rare draws.
 
     Notes
     -----

@@ -61,7 +61,7 @@ class ClippingGains(NamedTuple):
 def clipping_gains(
     *, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike
 ) -> ClippingGains:
-    """Compute the gains of line and noise by clipping.
+    """Compute the factors by which clipping reduces a line and the noise.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray
 
 
 def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean loss of x + n by clipping, x >= 0, and the variance that remains.
+    """Return the mean that x + n loses when it is clipped, and its remaining variance; x >= 0.
 
     In units of s, with a = (V - x)/s and b = (-V - x)/s, clipped noise is a above a, and b below b.
     The mean loss above is f(a) - a Q(a), and likewise below.
@@ -171,8 +171,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 def total_beat_amplitude(shots: Shots) -> np.ndarray:
     """Return the amplitude at the ADC [V] of a sine with the power of all lines, (n,).
 
-    It is that of the existing segment with the lowest beat frequency, which passes the receiver
-    best.
+    The amplitude is that of the existing segment with the lowest beat frequency, which passes the
+    receiver best.
     """
     beat_inputs = {
         "chirp_rate": shots.waveform.chirp_rate, "range": shots.range,
@@ -194,7 +194,9 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change if clipping is omitted, whatever else adds noise or attenuates the echo.
+    """Return a bound on the change of results if clipping is omitted.
+
+    The bound holds whatever else adds noise or attenuates the echo.
 
     Notes
     -----

@@ -74,7 +74,7 @@ def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if all segments begin at one range and velocity.
+    """Return a bound on the change of the largest bin if segments share range and velocity.
 
     Phases of lines that add are included. A line meets its image at the phase of its new position.
     Beamlets with velocities of their own turn against each other.
@@ -103,7 +103,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Let the segments start one after the other, while the target moves.
+    """Start the segments one after the other, while the target moves.
 
     Notes
     -----

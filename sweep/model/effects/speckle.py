@@ -149,7 +149,9 @@ def draw_speckle_factors(
 
 
 def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the output change if speckle is omitted, in all but 1e-6 of draws; None if inactive.
+    """Return a bound on the change of results if speckle is omitted; None if it is absent.
+
+    The bound holds in all draws but a fraction of 1e-6.
 
     Notes
     -----
@@ -417,7 +419,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
 def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
     """Return each look's power in the strongest bin over the mean of looks, (3, n, looks).
 
-    It differs between looks because lines drift out of the bin.
+    The power differs between looks because lines drift out of the bin.
     """
     n_looks = shots.looks.number
     look_power = np.ones((3, shots.size, n_looks))
@@ -656,9 +658,9 @@ def _strongest_bins_with_images(
 ) -> np.ndarray:
     """Return the strongest bins of echoes at given positions, signed and unfolded [bins], (n,).
 
-    It is the nearest bin, unless a line near DC or Nyquist of a real record overlaps with its
-    image: of bins 0 and 1, bin 0 then has the light of both. ``line_deviation_bins`` is the
-    standard deviation of the lines.
+    The strongest bin is the nearest bin, unless a line near DC or Nyquist of a real record overlaps
+    with its image: of bins 0 and 1, bin 0 then has the light of both. ``line_deviation_bins`` is
+    the standard deviation of the lines.
     """
     nearest_bins = np.rint(line_positions)
     if not shots.real_fft_size or not shots.images.are_summed:

@@ -24,7 +24,7 @@ of the same seed."""
 def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
     """Return unit vectors of beams evenly spaced on a cone around nadir, (n_beams, 3).
 
-    They are in the body frame.
+    The vectors are in the body frame.
 
     Parameters
     ----------

@@ -79,8 +79,8 @@ class Eyepoints(NamedTuple):
     """(n,): speed at which the reference beamlet's range falls [m/s]; nan for a shot that hits
     nothing."""
     turn_rate: np.ndarray
-    """(n,): angular speed at which the reference beamlet's direction turns [rad/s], by scanner and
-    platform."""
+    """(n,): angular speed at which scanner and platform turn the direction of the reference beamlet
+    [rad/s]."""
     direction_rate: np.ndarray
     """(n, 3): time derivative of the commanded ``direction`` [1/s]."""
     platform_acceleration: np.ndarray

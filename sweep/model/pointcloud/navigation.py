@@ -327,7 +327,7 @@ def _ground_points(
     direction: np.ndarray, distance: np.ndarray, standard_error: np.ndarray,
     offset: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:  # fmt: skip
-    """Return the points of the ground that beams measure, with cycles along the last axis.
+    """Return the ground points that b beams of each of n cycles measure.
 
     Parameters
     ----------
@@ -337,8 +337,8 @@ def _ground_points(
     Returns
     -------
     ground_points : ndarray (3, b, n)
-        Ground points [m]. n is the product of the leading dimensions. Cycles come last, because
-        NumPy is fast along the last axis.
+        Ground points [m]. Cycles lie along the last axis, along which NumPy is fast. Their number n
+        is the product of the leading dimensions.
     directions : ndarray (3, b, n)
         Directions of the beams.
     errors : ndarray (b, n)
@@ -540,7 +540,7 @@ def _solve_without_false_beams(
     test_level: float | None,
     leading_shape: tuple[int, ...],
 ) -> NavigationSolution:
-    """Fit n cycles of b beams, and exclude a beam that contradicts the others.
+    """Fit a velocity or altitude to each of n cycles, without a beam that contradicts the others.
 
     Parameters
     ----------
@@ -553,7 +553,7 @@ def _solve_without_false_beams(
         Probability with which the test for a false beam rejects a cycle of true beams; None for no
         test.
     leading_shape
-        Leading dimensions of the result; their product is n.
+        Dimensions into which the n cycles of the result are reshaped; their product is n.
 
     Notes
     -----
@@ -619,7 +619,7 @@ def solve_navigation(
         Probability with which the test for one false beam rejects a cycle of true beams; None or 0
         for no test.
     pointing_jitter
-        Standard deviation of each angle of the pointing by jitter [rad].
+        Standard deviation of the pointing jitter about each axis [rad].
     error_floor
         Standard deviations of the instrument's errors that do not depend on the echo.
     motion_priors
@@ -704,8 +704,8 @@ def _select_beams(
 ) -> dict[str, np.ndarray]:
     """Select the measured point of each shot and draw that navigation uses.
 
-    It is the first point that a Doppler peak confirms and whose value and standard error are
-    finite.
+    That point is the first point that a Doppler peak confirms and whose value and standard error
+    are finite.
 
     Parameters
     ----------
@@ -725,11 +725,11 @@ def _select_beams(
     dict of str to ndarray
         Arrays (cycles, draws, beams), nan for a shot without such a point. The slip is the closing
         speed minus the speed at which the range falls. Standard errors exclude errors common to all
-        beams and errors by an unknown slip. The names are ``range`` and ``radial_velocity``, and
-        both with ``_standard_error``; ``radial_velocity_slip_error``, the error by an unknown slip
-        [m/s]; ``velocity_per_slip``; ``delay``, the time from the shot's start to that of the beats
-        [s]; ``range_then``, the range at that time [m]. If pointing has an error, ``position``
-        (cycles, draws, beams, 3) [m].
+        beams and errors due to an unknown slip. The names are ``range`` and ``radial_velocity``,
+        and both with ``_standard_error``; ``radial_velocity_slip_error``, the error due to an
+        unknown slip [m/s]; ``velocity_per_slip``; ``delay``, the time from the shot's start to that
+        of the beats [s]; ``range_then``, the range at that time [m]. If pointing has an error,
+        ``position`` (cycles, draws, beams, 3) [m].
     """
     flags = point_arrays["flags"][shot_slice]
     values_by_name: dict[str, np.ndarray] = {}
@@ -795,7 +795,7 @@ def _solve_cycles(
     test_arguments, ground_arguments
         Arguments ``test_level``, and ``slope`` and ``relief``, of :func:`solve_altitude`.
     pointing_jitter
-        Standard deviation of each angle of the pointing by jitter [rad].
+        Standard deviation of the pointing jitter about each axis [rad].
     error_floor
         Standard deviations of the instrument's errors that do not depend on the echo.
 
@@ -922,7 +922,7 @@ def _add_pointing_errors(
     ground_arguments
         Arguments ``slope`` and ``relief`` of :func:`ground_gradient`.
     pointing_jitter
-        Standard deviation of each angle of the pointing by jitter [rad]. It adds to both errors.
+        Standard deviation of the pointing jitter about each axis [rad]. It adds to both errors.
     pointing
         Standard deviation of a beam's known direction [rad]. It adds to the error of the range. The
         error of the velocity already includes it.

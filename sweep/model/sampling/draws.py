@@ -1,7 +1,7 @@
 """Random draws of shots: count detections and false alarms, batch by batch.
 
 Two methods agree in the mean. ``probabilities`` is the method of [T 3.3.2]. It compares uniform
-random numbers with pd and with the probability of a false alarm by noise and leakage together.
+random numbers with pd and with the probability of a false alarm due to noise and leakage together.
 ``noise`` adds complex Gaussian noise to the bins of the echo, in each look, correlated between bins
 as window and padding make it. The other bins hold noise alone. Their largest magnitude follows from
 the order statistic of an equivalent number of independent bins, which has the same probability of a
@@ -304,9 +304,9 @@ independent number for each bin."""
 def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
     """Return the triangular matrix (k, k) that makes the noise of k adjacent bins from k numbers.
 
-    It is the Cholesky factor of the covariance that a filter of :func:`make_echo_noise_filter`
-    gives, for at most ROOT_BINS_MAX bins. Frequency 0 and Nyquist, where the noise is real, need
-    :func:`draw_bin_noise` instead.
+    The matrix is the Cholesky factor of the covariance that a filter of
+    :func:`make_echo_noise_filter` gives, for at most ROOT_BINS_MAX bins. Frequency 0 and Nyquist,
+    where the noise is real, need :func:`draw_bin_noise` instead.
     """
     weights, start = filter_rule.weights, filter_rule.first_number
     n_bins = min(weights.shape[0], ROOT_BINS_MAX)
@@ -436,8 +436,8 @@ class NoiselessSpectra(NamedTuple):
     peak_index: np.ndarray
     """(m, 3) int64: number of the bin with the largest magnitude, counted from ``first_bin``."""
     peak_ratio: np.ndarray
-    """(m, 3): largest |X| of the segment's bins over sigma, the noise of a bin per quadrature; nan
-    for a segment that does not exist."""
+    """(m, 3): largest |X| / sigma in the segment's bins; nan for a segment that does not exist.
+    sigma is the noise of a bin per quadrature."""
     has_real_noise: np.ndarray
     """(m, 3) bool: True if the noise in the bin with the largest magnitude is real, as at frequency
     0 (DC) and Nyquist."""
@@ -446,8 +446,8 @@ class NoiselessSpectra(NamedTuple):
     n_bins: np.ndarray
     """(m, 3) int64: number of the segment's bins in ``bin_ratios`` and ``is_echo``."""
     bin_ratios: np.ndarray
-    """(bins,): |X| over sigma, the noise of a bin per quadrature, of the bins of all points and
-    segments."""
+    """(bins,): |X| / sigma in the bins of all points and segments. sigma is the noise of a bin per
+    quadrature."""
     is_echo: np.ndarray
     """(bins,) bool: True for bins that belong to an echo, of the bins of all points and segments.
     """
@@ -461,7 +461,8 @@ class NoiselessSpectra(NamedTuple):
     """(leaked,) int64: numbers, from ``first_bin``, of the bins with signal leaked from an echo.
     With noise they may raise a false alarm."""
     leaked_ratio: np.ndarray
-    """(leaked,): |X| of the bins of leaked signal over sigma, the noise of a bin per quadrature."""
+    """(leaked,): |X| / sigma in the bins that hold leaked signal. sigma is the noise of a bin per
+    quadrature."""
     exempt_neighbour_ratio: np.ndarray
     """(leaked,): |X| over sigma of the adjacent bin that belongs to an echo, and so cannot raise a
     false alarm; 0 if no adjacent bin does."""
@@ -749,7 +750,7 @@ def _mark_leakage_alarms(
     sidelobe_correlation
         Correlation of the noise of neighbouring bins in phase with the signal.
     magnitude_factors
-        (draws,): factors on magnitudes by speckle.
+        (draws,): factors that speckle puts on magnitudes.
     random_words
         (4, draws) uint64: scratch for random numbers.
     has_alarm
@@ -811,7 +812,7 @@ def _mark_leakage_alarms(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_factors(key, draw, group, mixing):
-    """Return the factors by speckle on an echo's magnitudes in up, Doppler and down segment.
+    """Return the factors that speckle puts on an echo's magnitudes in up, Doppler and down segment.
 
     Their mean square is 1. The arguments are those of :func:`speckle_amplitudes`.
     """
@@ -825,7 +826,7 @@ def speckle_factors(key, draw, group, mixing):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_amplitudes(key, draw, group, mixing):
-    """Return the complex factors by speckle on an echo in the three segments, of mean square 1.
+    """Return the complex factors, of mean square 1, that speckle puts on an echo in each segment.
 
     Parameters
     ----------
@@ -1154,8 +1155,8 @@ def largest_noise_magnitude(n_bins, probability, n_looks):
 def gamma_upper_quantile(order, probability):
     """Return the x that a Gamma variable exceeds with a given probability.
 
-    It solves Q(n, x) = ``probability``, with the regularised upper incomplete Gamma function Q. The
-    order n is an integer; the scale is 1.
+    The quantile x solves Q(n, x) = ``probability``, with the regularised upper incomplete Gamma
+    function Q. The order n is an integer; the scale is 1.
     """
     low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(probability, 1e-300)))
     for _ in range(60):

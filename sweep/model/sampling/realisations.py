@@ -110,7 +110,7 @@ def iter_realisations(
 def _realise_batch(
     parameters: dict[str, np.ndarray], effects: Collection[str], draw_keys: DrawAddresses
 ) -> Shots:
-    """Return prepared shots, with all effects, for m draws of points of one category.
+    """Return prepared shots, with all effects, for m draws of points that share text parameters.
 
     ``draw_keys`` holds the random key of each point and the number of each draw. Points of one
     category share all settings that are words or sizes.

@@ -167,9 +167,10 @@ class Sampler(ABC):
 
     @abstractmethod
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name.
+        """Return the results of all draws by name: outputs, standard errors and half-widths, (n,).
 
-        The running sums that further draws need are included, (n, columns).
+        Half-widths are those of confidence intervals. The running sums that further draws need are
+        included, (n, columns).
         """
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
@@ -186,7 +187,7 @@ class Sampler(ABC):
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return half-widths of the confidence intervals of fractions of detections, (4, points).
 
-        They follow from the counts of draws alone. Rows are in the order of PD_OUTPUTS.
+        The half-widths follow from the counts of draws alone. Rows are in the order of PD_OUTPUTS.
         """
         counts, n = self.n_detected()[:, point_indices], self.n_draws[point_indices]
         confidence = error_budget.select(point_indices, self.n_draws.size).confidence
@@ -222,7 +223,7 @@ class Sampler(ABC):
 def never_stop() -> bool:
     """Return False, so that drawing goes on until all draws are made.
 
-    It is the default of ``should_stop``.
+    This function is the default of ``should_stop``.
     """
     return False
 
@@ -440,7 +441,7 @@ class DetectionSampler(Sampler):
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name."""
+        """Return the results of all draws by name, as in :meth:`Sampler.results`."""
         if self._running_means is None:
             outputs = self._outputs | zero_standard_errors(self._outputs)
         else:
@@ -570,7 +571,7 @@ class SpectraSampler(Sampler):
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name."""
+        """Return the results of all draws by name, as in :meth:`Sampler.results`."""
         values, statistics = self._value_means, self._statistic_means.results()
         n, mean, squared_deviations, error = (
             dict(zip(AVERAGED_VALUE_NAMES, part, strict=True))

@@ -227,7 +227,7 @@ class SpanArrays(NamedTuple):
 class LeakageQuadrature(NamedTuple):
     """Quadrature points of an integral over bins far from the lines, which gives their leakage.
 
-    Leakage is the probability of false alarms by the echo's signal.
+    Leakage is the probability of false alarms due to the echo's signal.
     """
 
     cotangent: np.ndarray

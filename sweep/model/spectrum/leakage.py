@@ -1,6 +1,6 @@
 """Detection and leakage of a segment, where all bins count but few are computed.
 
-Leakage is the probability of false alarms by the echo's signal far from its lines.
+Leakage is the probability of false alarms due to the echo's signal far from its lines.
 
 A span, the adjacent bins around the lines, is computed bin by bin. It contains all bins that may
 cross the threshold, and as many more as it takes for the leaked signal to become smooth. Beyond the
@@ -78,7 +78,8 @@ side of that end."""
 
 END_CORRECTION_ERROR_MAX = 1e-7
 """Largest accepted value of the last end correction of the integral over bins, relative to the
-whole leakage. Leakage is the probability of false alarms by the echo's signal far from its lines.
+whole leakage. Leakage is the probability of false alarms due to the echo's signal far from its
+lines.
 """
 
 GAUSS_POINTS_MAX = 200
@@ -90,13 +91,13 @@ are NumPy booleans, because numba would compile the function anew for Python's."
 
 OCTAVE_STEP_LEAKAGE_MAX = 0.5
 """Leakage of the brightest speckle up to which one speckle power per octave is enough. Leakage is
-the probability of false alarms by the echo's signal far from its lines."""
+the probability of false alarms due to the echo's signal far from its lines."""
 RATE_MIN = 1e-30
-"""Lower limit of the bins' summed rate of false alarms by leaked signal. Smaller sums count as this
-value. The probability of at least one false alarm is 1 - exp(-sum)."""
+"""Lower limit of the bins' summed rate of false alarms due to leaked signal. Smaller sums count as
+this value. The probability of at least one false alarm is 1 - exp(-sum)."""
 CERTAIN_LEAKAGE_RATE = 34.5
-"""Upper limit of the bins' summed rate of false alarms by leaked signal. Larger sums count as this
-value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
+"""Upper limit of the bins' summed rate of false alarms due to leaked signal. Larger sums count as
+this value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
 
 _SPECKLE_INTEGRATION_STEPS = 160
 _RELATIVE_ROOT_POWERS = np.arange(1, _SPECKLE_INTEGRATION_STEPS + 1) / _SPECKLE_INTEGRATION_STEPS
@@ -140,7 +141,7 @@ class LeakageLimits(NamedTuple):
 class LeakageResult(NamedTuple):
     """Leakage of the computed bins around the lines and of all bins beyond them.
 
-    It is valid only if enough bins around the lines are computed.
+    The result is valid only if enough bins around the lines are computed.
     """
 
     leakage: float
@@ -161,7 +162,7 @@ class EnvelopeTail(NamedTuple):
 class NearEndCorrection(NamedTuple):
     """Correction of a sum over bins that is computed as an integral (Euler-Maclaurin).
 
-    It applies at the integral's end near the lines, on one side of them.
+    The correction applies at the integral's end near the lines, on one side of them.
     """
 
     correction: float
@@ -190,9 +191,9 @@ def detect_with_leakage(
 ):
     """Compute the bins around a segment's lines, the detection, and the leakage of all bins.
 
-    Leakage is the probability of false alarms by the echo's signal far from its lines. Parameters
-    and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`, with these
-    differences.
+    Leakage is the probability of false alarms due to the echo's signal far from its lines.
+    Parameters and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`,
+    with these differences.
 
     Parameters
     ----------
@@ -334,7 +335,7 @@ def detect_with_leakage(
 def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates):
     """Return the leakage of the computed bins around the lines, or its mean over speckle.
 
-    Leakage is the probability of false alarms by the echo's signal. The mean is taken over
+    Leakage is the probability of false alarms due to the echo's signal. The mean is taken over
     developed speckle if ``speckle_power_max`` is above 1.
     """
     if speckle_power_max > 1.0:
@@ -344,7 +345,7 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def leakage_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_series):
-    """Return the probability of a false peak by leaked signal in the bins of a span.
+    """Return the probability of a false peak that leaked signal raises in the bins of a span.
 
     A span is the computed bins around a segment's lines. Magnitudes below
     ``negligible_signal_ratio`` times the noise sigma are set to 0, except those of the echo.
@@ -413,7 +414,7 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
-    """Return the probability of a false peak by leaked signal, averaged over speckle.
+    """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
     The bins are the computed ones around a segment's lines (a span).
     """
@@ -426,9 +427,10 @@ def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
 def _mean_leakage_over_speckle(
     first_index, end_index, limits, span, speckle_rates, relative_rates_beyond
 ):
-    """Return the mean probability, over speckle, of a false peak by leaked signal.
+    """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
-    The bins are some of a span, the computed bins around the lines, and all bins beyond it.
+    The bins are some of those of a span (the computed bins around the lines), and all bins beyond
+    the span.
 
     Parameters
     ----------
@@ -627,7 +629,7 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelope):
-    """Bound the probability of false alarms by leaked signal in all bins far from the lines.
+    """Return a bound on the probability of false alarms due to leaked signal far from the lines.
 
     The bins are ``distance_min`` or more bins away from the lines.
 
@@ -681,7 +683,7 @@ def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelop
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _envelope_tail(distance_min, envelope):
-    """Return the :class:`EnvelopeTail` of a line from a distance of ``distance_min`` bins on."""
+    """Return bounds on a line's spectrum at ``distance_min`` bins or farther, `EnvelopeTail`."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
     return EnvelopeTail(magnitude, magnitude * magnitude + envelope.square_integral[index])
@@ -689,14 +691,14 @@ def _envelope_tail(distance_min, envelope):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_bound_of_span(n_bins, limits, span):
-    """Bound the leakage of computed bins from their magnitudes; inf if a bin is too strong.
+    """Return a bound on the leakage of computed bins; inf if a bin is too strong.
 
-    Leakage is the probability of false alarms by the echo's signal. With x = a^2/2 and y = b^2/2,
-    of the signal a and the threshold b over the noise sigma, Q_1 is convex in x up to y - 2. Q_1 is
-    the Marcum function. The reason is I_2(z) / I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z = a b.
-    Relative to the strongest bin each bin then adds at most the ratio of their powers. The
-    strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2 allows for the probability that
-    noise alone stays below the threshold, at least 1 - e^-2.
+    The bound follows from the bins' magnitudes. Leakage is the probability of false alarms due to
+    the echo's signal. With x = a^2/2 and y = b^2/2, of the signal a and the threshold b over the
+    noise sigma, Q_1 is convex in x up to y - 2. Q_1 is the Marcum function. The reason is I_2(z) /
+    I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z = a b. Relative to the strongest bin each bin then adds
+    at most the ratio of their powers. The strongest bin adds at most e^{-(b - a)^2 / 2}. The factor
+    1.2 allows for the probability that noise alone stays below the threshold, at least 1 - e^-2.
     """
     largest, square_sum = 0.0, 0.0
     for i in range(n_bins):
@@ -955,7 +957,7 @@ def _fill_far_powers(
 ):
     """Compute the squared magnitude of the spectrum at the leakage integral's points.
 
-    The result goes to ``workspace.leakage_quadrature.half_square``. The relative error is
+    The result is written to ``workspace.leakage_quadrature.half_square``. The relative error is
     exp(-``log_accuracy``). ``workspace.leakage_quadrature.cotangent`` contains tan(pi q / N) of
     each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there are
     fewer lines than equivalent lines needed, the lines are summed exactly.

@@ -932,7 +932,7 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
 def build_line_shape(segment, shape_index, previous_index, modes, tables, shape):
     """Compute one segment's line shape, the spectrum of a line of amplitude 1.
 
-    It is a sum of Chebyshev modes, or a copy of a table of all bins.
+    The line shape is a sum of Chebyshev modes, or a copy of a table of all bins.
 
     Parameters
     ----------

@@ -206,7 +206,8 @@ class PointParameters(NamedTuple):
     """Error of a bin's magnitude over ``noise_sigma`` that approximations of the lines may cause.
     """
     image_gain: np.ndarray
-    """Amplitude of a line's image by I/Q imbalance, over that of the line; 0 if there is none."""
+    """Amplitude of the image that I/Q imbalance makes of a line, over that of the line; 0 if there
+    is no image."""
     side_noise: np.ndarray
     """Noise standard deviation per quadrature in bins next to the lines [V, summed over the
     record]. It includes the whole phase-noise pedestal of the laser.
@@ -335,11 +336,13 @@ def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...])
 
 
 def _truncation_bound(log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Bound the remainder of a Chebyshev series after J terms, (tolerances, J), for ln z < ln 2 J.
+    """Return a bound on the remainder of a Chebyshev series after J terms, (tolerances, J).
 
-    The series represents exp(i z x t) at the position x of a line, -1 .. 1, and the time t in the
-    record. J_m is the Bessel function. The remainder is the weighted mean over t of 2 sum_{m >= J}
-    |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m! exp(-x^2 / (4 m + 4)).
+    The bound holds for ln z < ln 2 J. The series represents exp(i z x t) at the position x of a
+    line, -1
+    .. 1, and the time t in the record. J_m is the Bessel function. The remainder is the weighted
+    mean over t of 2 sum_{m >= J} |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m! exp(-x^2
+    / (4 m + 4)).
     """
     phase_span, weighted_sum = np.exp(log_z), np.zeros(log_z.shape)
     for record_position, weight in zip(np.linspace(0, 1, weights.size), weights, strict=True):

@@ -126,8 +126,8 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
     Returns
     -------
     numpy.ndarray
-        0 .. N/2; -N/2 .. N/2 of complex records. For lines that drift within the record, by range
-        walk and acceleration, the position is that in the middle of the record.
+        0 .. N/2; -N/2 .. N/2 of complex records. For lines that drift within the record, due to
+        range walk and acceleration, the position is that in the middle of the record.
     """
 
     def by_point(values: np.ndarray | float) -> np.ndarray:
@@ -248,7 +248,8 @@ def _restrict_spans(
     n_exempt
         (segments, m): number of exempt bins; the result for spans that are cut.
     leakage
-        (segments, m): probability of a false peak by leakage; the result for spans that are cut.
+        (segments, m): probability of a false peak due to leakage; the result for spans that are
+        cut.
     """
     first_bin, n_bins, peak_index, span_starts = (
         spans.first_bin,

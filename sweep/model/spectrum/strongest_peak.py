@@ -73,8 +73,8 @@ class SpanProbabilities(NamedTuple):
     p_alarm: np.ndarray
     """(segments, m): probability that any bin outside the echo crosses the threshold."""
     shared_gain: np.ndarray
-    """(m,): increase by shared speckle of the probability that both chirps report the echo's peak.
-    It includes only cases in which bins outside the echo cross the threshold too.
+    """(m,): increase of the probability that both chirps report the echo's peak, due to the speckle
+    that they share. It includes only cases in which bins outside the echo cross the threshold too.
     """
 
 

@@ -94,7 +94,7 @@ def connect_cluster(
 
 
 def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:
-    """Return the least and the largest number of workers, both limited to `max_workers`."""
+    """Return a cluster's least and largest number of workers, both limited to `max_workers`."""
     requested = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
     return WorkerBounds(*(min(n_workers, max(1, max_workers)) for n_workers in requested))
 

@@ -55,9 +55,9 @@ class SchedulerLostError(Exception):
 
 @contextmanager
 def raise_as_store_error(problem: str) -> Iterator[None]:
-    """Turn errors of the disk or of an object store into a StoreError.
+    """Context manager: raise errors of the disk or of an object store as a StoreError.
 
-    Its message begins with `problem`.
+    The message of the StoreError begins with `problem`.
     """
     try:
         yield

@@ -319,7 +319,7 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
 
 
 class BlockDigest(NamedTuple):
-    """Digest and size [bytes] of a block as it is stored."""
+    """Digest and size [bytes] of a stored block."""
 
     digest: str  # digest of the bytes and their paths, by `contents_digest`
     n_bytes: int  # size as stored

@@ -657,7 +657,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
-        """Standard deviations of instrument errors that do not decrease with a stronger echo."""
+        """Standard deviations of those instrument errors that a stronger echo does not reduce."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
         stated = self.spec.error_floor
