@@ -61,7 +61,7 @@ class ChartLine:
     y: np.ndarray
     """Values (n,); nan where missing."""
     name: str = ""
-    """Name in the legend."""
+    """Name of the line in the legend."""
     style_index: int = 0
     """Number that selects the line's colour, dash and marker from the common lists."""
     low: np.ndarray | None = None

@@ -96,12 +96,12 @@ class LineMotion(NamedTuple):
     look is one of several records of the same segment.
     """
     range_walk_time: np.ndarray | float = 0.0
-    """Time [s] of closing between the start of the shot and the instant of the range that beats
-    measure.
+    """Time [s] from the start of the shot to the instant whose range the beats measure. The target
+    closes in this time.
     """
     velocity_drift_time: np.ndarray | float = 0.0
-    """Time [s] of acceleration between the start of a segment and the instant of the velocity that
-    its beat measures.
+    """Time [s] from the start of a segment to the instant whose velocity its beat measures. The
+    target accelerates in this time.
     """
     velocity_bias_fraction: np.ndarray | float = 0.0
     """Fraction of the radial velocity by which beats underestimate it."""
@@ -120,7 +120,7 @@ class WaveformSettings:
     :attr:`chirp_rate`. They are numbers, or arrays if points differ.
     """
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """Frequency at the start of each segment [Hz], by which the echo's delay makes a phase."""
+    """Frequency at the start of each segment [Hz]; its product with the echo's delay is a phase."""
     chirp_bandwidth: np.ndarray
     """Bandwidth of the up-chirp [Hz]."""
     chirp_duration: np.ndarray

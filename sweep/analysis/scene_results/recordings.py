@@ -80,7 +80,7 @@ LOG_QUANTITIES = ("pfa_up", "pfa_down")
 """Quantities that are shown on a logarithmic scale: probabilities of false alarms."""
 
 POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Bits of a point's flags that say of which kind the point is, by the name of the kind.
+"""Bit of a point's flags for each kind of point, by the name of the kind.
 
 Each point has exactly one of these bits.
 """

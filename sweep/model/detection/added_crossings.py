@@ -106,7 +106,7 @@ def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabil
     series
         Result of :func:`fill_crossing_series` for this threshold.
     probabilities
-        (n_bins + 7,): the result; the last seven elements are scratch.
+        (n_bins + 7,): output array; the last seven elements are scratch.
     """
     y = 0.5 * threshold_ratio * threshold_ratio
     if y > SERIES_Y_MAX:
@@ -310,7 +310,7 @@ def exclude_bins_joining_echo(
     Parameters
     ----------
     probabilities
-        (bins,): probability that leaked signal makes each bin cross; the result.
+        (bins,): probability that leaked signal makes each bin cross; changed in place.
     first_index, end_index
         Index of the first bin to process, and of the bin after the last.
     magnitudes

@@ -399,7 +399,7 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
     bin_threshold
         :class:`BinThreshold`.
     pedestal_ratios
-        (bins,): the result.
+        (bins,): output array.
     """
     largest = 0.0
     noise_power = bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
@@ -654,7 +654,7 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
     threshold
         Threshold on |X|.
     is_exempt
-        Result, bool: True in bins that belong to an echo, and so can raise no false alarm.
+        Output array, bool: True in bins that belong to an echo, and so can raise no false alarm.
     lobe_half_width
         Half-width [bins] of an echo about its lines if any bin of the echo may detect it, else 0.
 

@@ -423,9 +423,9 @@ class Looks(NamedTuple):
         noncentral chi-square variable.
 
         Common speckle: with a correlation of 1 the joint probability is the mean over the speckle
-        of the product of both probabilities. With a smaller correlation the segments have a
-        fraction of the covariance at correlation 1: that which two Rayleigh magnitudes of the same
-        probabilities have. Partially correlated looks are treated likewise
+        of the product of both probabilities. With a smaller correlation the segments' covariance is
+        a fraction of that at correlation 1. The fraction is that of two Rayleigh magnitudes with
+        the same probabilities. Partially correlated looks are treated likewise
         (:mod:`sweep.model.detection.look_speckle`).
         """
         from scipy import stats

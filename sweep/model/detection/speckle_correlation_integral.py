@@ -43,7 +43,7 @@ def fill_peak_bin_correlation(
     nodes, weights
         Quadrature on -1 .. 1.
     correlation
-        (n,) complex: the result.
+        (n,) complex: output array.
     """
     node_power, previous_half_interval = np.empty(nodes.size), -1.0
     for point in point_indices:

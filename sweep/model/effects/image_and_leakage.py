@@ -201,8 +201,8 @@ IMAGE = Effect(
 
 
 _TABULATED_REACH_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
-"""Largest shifts of light from its line [bins], for each of which there is a table of leakage
-bounds."""
+"""Largest shifts of light from its line [bins]. There is a table of leakage bounds for each of
+them."""
 _ROWS_PER_OCTAVE, _OCTAVE_MIN, _OCTAVE_MAX = 2, -8, 30
 """Rows of tables of leakage bounds: number per octave, and first and last octave, of the magnitude
 of all lines over the threshold."""

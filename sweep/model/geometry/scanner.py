@@ -370,7 +370,7 @@ class LineScan:
     def sweep_rate(self, times: np.ndarray) -> np.ndarray:
         """Return the time derivative of the sweep angle at times [s], in rad/s.
 
-        At a turning point of the mirror it is that after the turn.
+        At a turning point of the mirror, the rate after the turn is returned.
         """
         lines_scanned = np.asarray(times, float) * self.line_rate
         if self.wave == "sine":

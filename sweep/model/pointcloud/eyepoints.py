@@ -98,7 +98,7 @@ class Eyepoints(NamedTuple):
 
     @property
     def has_target(self) -> np.ndarray:
-        """Mask (n,) that is True for shots of which any beamlet hits a surface."""
+        """Mask (n,), True for shots with a beamlet that hits a surface."""
         return np.isfinite(self.range)
 
     @property
@@ -408,7 +408,7 @@ def prepare_eyepoint_shots(
     surfaces: Sequence[SurfaceMaterial],
     effects: Collection[str] = DEFAULT_EFFECTS,
 ) -> Shots:
-    """Prepare for simulation the shots of given geometry (eyepoints), each of which hits a surface.
+    """Prepare shots with a given geometry (eyepoints) for simulation; each shot hits a surface.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def prepare_eyepoint_shots(
 def parameters_and_ground_of_eyepoints(
     eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[SurfaceMaterial]
 ) -> tuple[Parameters, RayTracedGround]:
-    """Convert geometry of shots (eyepoints) to the parameters and footprints that simulate them.
+    """Convert the geometry of shots (eyepoints) to parameters and footprints for simulation.
 
     Range, velocities, reflectance and reflectance law follow from the eyepoints and the surfaces. A
     beamlet that misses returns no light.
@@ -437,7 +437,7 @@ def parameters_and_ground_of_eyepoints(
     Parameters
     ----------
     eyepoints
-        Geometry of n shots, of which each hits a surface.
+        Geometry of n shots; each shot hits a surface.
     parameters
         Other parameters by dotted path, scalars.
     surfaces

@@ -391,7 +391,7 @@ def _fill_power_errors(powers, lattice, relative_errors):
     lattice
         Lattice of the beamlets (:class:`FoldedLattice`).
     relative_errors
-        (m,): the result, at most 1.
+        (m,): output array, at most 1.
     """
     beamlet, opposite_beamlet = lattice.beamlet, lattice.opposite_beamlet
     inverse_weight, density_change = lattice.inverse_weight, lattice.density_change

@@ -234,8 +234,8 @@ class NoiseFilter(NamedTuple):
     """Filter that makes the noise of adjacent bins from independent normal numbers."""
 
     weights: np.ndarray
-    """(bins, NOISE_FILTER_TAPS): weights with which each bin's noise is a sum of independent normal
-    numbers. The squares of a bin's weights sum to 1."""
+    """(bins, NOISE_FILTER_TAPS): weights of the independent normal numbers whose weighted sum is a
+    bin's noise. The squares of a bin's weights sum to 1."""
     first_number: np.ndarray
     """(bins,) int64: index of the first independent number that each bin uses, minus the index at
     the first bin."""
@@ -254,9 +254,9 @@ class NoiseScratch(NamedTuple):
     in_quadrature: np.ndarray
     """(k,): component, over sigma, of each bin's noise in quadrature with the signal."""
     number_in_phase: np.ndarray
-    """(k,): independent normal numbers of which ``in_phase`` is a filtered sum."""
+    """(k,): independent normal numbers from which the filter makes ``in_phase``."""
     number_in_quadrature: np.ndarray
-    """(k,): independent normal numbers of which ``in_quadrature`` is a filtered sum."""
+    """(k,): independent normal numbers from which the filter makes ``in_quadrature``."""
 
     @classmethod
     def allocate(cls, n_bins: int) -> "NoiseScratch":
@@ -336,7 +336,7 @@ neglected."""
 
 
 def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the probabilities of events in each segment, with which random numbers are compared.
+    """Return the probabilities of each segment's events, to compare random numbers with them.
 
     Segments are up, Doppler and down.
 
@@ -1038,7 +1038,7 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
     filter_rule
         :class:`NoiseFilter` of at least as many bins.
     noise
-        :class:`NoiseScratch` of at least as many bins, the result.
+        :class:`NoiseScratch` of at least as many bins, to which the noise is written.
 
     Notes
     -----

@@ -91,9 +91,10 @@ class CounterIncrements(NamedTuple):
 FIRST_BLOCK_NUMBER = np.int64(0)
 """Number of the first block (four random words) of a stream."""
 DRAW_INCREMENTS = CounterIncrements(draw=1, block=0)
-"""Increments with which columns hold the same block (four random words) of successive draws."""
+"""Counter increments for columns that hold the same block (four random words) of successive
+draws."""
 BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
-"""Increments with which columns hold successive blocks (four random words) of one draw."""
+"""Counter increments for columns that hold successive blocks (four random words) of one draw."""
 
 
 @njit(cache=True)
@@ -154,7 +155,7 @@ def fill_words(address, stream, block, increments, count, words):
     count
         Number of columns to fill.
     words
-        (4, >= count) uint64, in C order; the result.
+        (4, >= count) uint64, in C order: output array.
 
     Notes
     -----

@@ -77,8 +77,8 @@ SPECTRA_METHOD = "spectra"
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
 ]
-"""Rows in the arrays of counts, whose order is that of ``DRAW_COUNT_OUTPUTS``, with the numbers of
-detections. The rows are in the order of ``PD_OUTPUTS``."""
+"""Rows of arrays of counts that hold numbers of detections, in the order of ``PD_OUTPUTS``. The
+rows of such an array are in the order of ``DRAW_COUNT_OUTPUTS``."""
 
 
 class PriorDraws(NamedTuple):
@@ -275,7 +275,7 @@ def simulate_draws(
         Numbers of draws to count separately; each point then has their sum. Without them a point
         has as many draws as `error_budget` needs, in one count.
     batch
-        Number of draws of which a multiple is made between tests against `error_budget`.
+        Number of draws in a batch. Whole batches are made between tests against `error_budget`.
     limit
         Largest number of draws of a point without `batch_sizes`.
     error_budget

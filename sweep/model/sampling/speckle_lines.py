@@ -302,9 +302,9 @@ def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_vari
     first_bin
         (3,): number of the first bin in each segment; the others follow it.
     mean_power
-        (3, bins): the result, mean powers.
+        (3, bins): output array of mean powers.
     pseudo_variance
-        (3, bins): the second result, pseudo-variances over mean powers, which images of lines cause
+        (3, bins): output array of pseudo-variances over mean powers, which images of lines cause
         near DC and Nyquist (:mod:`sweep.model.detection.pseudo_variance`).
 
     Returns
@@ -384,7 +384,7 @@ def draw_bin_amplitudes(
     mean_power
         (3, bins): result of :func:`mean_bin_powers` for the same bins.
     amplitudes
-        (3, bins) complex; the result.
+        (3, bins) complex: output array.
 
     Notes
     -----
@@ -470,7 +470,7 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
     echo_centre, first_bin, mean_power
         Middle of the echo, first bin and mean powers, as in :func:`draw_bin_amplitudes`.
     factor
-        (rows, 3, bins) complex, with one row for each bin of all segments; the result. The
+        (rows, 3, bins) complex, with one row for each bin of all segments: output array. The
         amplitudes of the bins are the sum over its first rows, up to the rank, of the row times a
         circular Gaussian number of mean power 2.
 
@@ -568,7 +568,7 @@ def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
     factor, rank
         Results of :func:`factor_bin_covariance`.
     amplitudes
-        (3, bins) complex; the result, of mean power 1.
+        (3, bins) complex: output array, of mean power 1.
     """
     amplitudes[:] = 0.0
     key_0, key_1, draw = address

@@ -187,9 +187,9 @@ class PointParameters(NamedTuple):
     record_start: np.ndarray
     """Time from the start of a segment to the first sample of its record [s]."""
     up_carrier: np.ndarray
-    """Frequency at the start of the up segment [Hz], by which a delay makes a phase."""
+    """Frequency at the start of the up segment [Hz]; its product with a delay is a phase."""
     down_carrier: np.ndarray
-    """Frequency at the start of the down segment [Hz], by which a delay makes a phase."""
+    """Frequency at the start of the down segment [Hz]; its product with a delay is a phase."""
     noise_sigma: np.ndarray
     """Noise standard deviation per quadrature in a bin [V, summed over the record]."""
     threshold: np.ndarray
@@ -231,7 +231,7 @@ class SegmentParameters(NamedTuple):
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
+    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
     whitening_gain: np.ndarray
     """Factor on the signal's amplitude in the spectrum whose noise is whitened."""
     range_decrease: np.ndarray
@@ -274,7 +274,7 @@ class BeatParameters(NamedTuple):
     chirp_rate: float
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: float
-    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
+    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
     amplitude: float
     """Amplitude [V] of the beat of a line of relative amplitude 1, in the whitened spectrum."""
     detector_bandwidth: float
@@ -374,7 +374,7 @@ def compute_lines(
     layout
         :class:`SpectrumLayout`.
     lines
-        Result, :class:`LineArrays`.
+        Output, :class:`LineArrays`.
     inverse_gain_re, inverse_gain_im
         Scratch arrays, (lines,): the receiver's gain is 1 / (re + i im).
 
@@ -612,7 +612,7 @@ def replace_lines_by_nodes(lines, n_lines, n_nodes, middle, half_width, scratch,
     scratch
         :class:`LineScratch`.
     nodes
-        Result, :class:`LineArrays`.
+        Output, :class:`LineArrays`.
 
     Returns
     -------

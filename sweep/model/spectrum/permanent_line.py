@@ -233,7 +233,7 @@ def echo_magnitude_with_line(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return the magnitude of an echo that alone crosses the threshold as often as with the line.
+    """Return the |X| of a lone echo that crosses the threshold as often as the echo with the line.
 
     Parameters
     ----------

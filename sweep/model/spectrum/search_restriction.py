@@ -326,7 +326,7 @@ def _mark_searched_echoes(
     magnitudes
         (bins,): |X| without noise of adjacent bins.
     is_exempt
-        (bins,) bool: the result.
+        (bins,) bool: output array, True in the marked bins.
     first_bin
         Number of the first bin.
     threshold

@@ -322,7 +322,7 @@ def _evaluate_levels(
     speckle_table
         :class:`sweep.model.detection.echo_detection.SpeckleTable` of all points.
     pd_loss
-        (segments, m, levels): result, P_b - P_z.
+        (segments, m, levels): output array, P_b - P_z.
     exponents
         (segments, m, levels): -ln P(Z < z) of noise alone, to which that of leaked signal is added.
     """
