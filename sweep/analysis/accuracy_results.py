@@ -79,7 +79,7 @@ REQUIRED_SPEEDUP_OVER_FIXED, REQUIRED_SPEEDUP_OVER_THESIS = 1 / 1.1, 5.0
 The ratios are those of the best fixed setting, and of the thesis's method, to the adaptive setting.
 """
 
-THESIS_BEAMLETS = 109
+THESIS_BEAMLET_COUNT = 109
 """Number of beamlets that the thesis simulates."""
 
 MEDIAN_ROUNDS_MIN = 3
@@ -489,8 +489,8 @@ def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> lis
         if comparison.other
     )
     requirement_note = f"Requirement, at least {REQUIRED_SPEEDUP_OVER_THESIS:g}: {verdict_text}."
-    if beamlets != THESIS_BEAMLETS:
-        requirement_note = f"This scene has {beamlets} beamlets, the thesis {THESIS_BEAMLETS}."
+    if beamlets != THESIS_BEAMLET_COUNT:
+        requirement_note = f"This scene has {beamlets} beamlets, the thesis {THESIS_BEAMLET_COUNT}."
     statements = [
         f"The thesis's way is compared at its own error. {_speedup_sentences(comparisons)} "
         f"{requirement_note}"

@@ -116,13 +116,14 @@ class LineSpreadBins(NamedTuple):
 
     deviation: np.ndarray
     """(n,): largest standard deviation of line frequencies of any segment [bins of fs/L]."""
-    linear: np.ndarray
+    linear_spread: np.ndarray
     """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. If the target has
     a roughness, a further row holds twice the spread of the phase difference between segments
     [cycles].
     """
-    quadratic: np.ndarray
-    """(rows, n): magnitude of the quadratic spread c [bins of fs/L], with the rows of `linear`."""
+    quadratic_spread: np.ndarray
+    """(rows, n): magnitude of the quadratic spread c [bins of fs/L], with the rows of
+    `linear_spread`."""
 
     @property
     def smoothing_deviation(self) -> np.ndarray:
@@ -131,7 +132,9 @@ class LineSpreadBins(NamedTuple):
         With the linear spread s, the quadratic spread c and t <= 2 pi, |E exp(i t (s y + c y^2))|
         <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)).
         """
-        return np.asarray(self.linear / np.sqrt(1 + (4 * np.pi * self.quadratic) ** 2))
+        return np.asarray(
+            self.linear_spread / np.sqrt(1 + (4 * np.pi * self.quadratic_spread) ** 2)
+        )
 
 
 def split_with_beamlet_counts(
@@ -370,12 +373,12 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
         + bins_per_speed * velocity_moments.rms
         + zeros,
-        linear=abs(
+        linear_spread=abs(
             bins_per_speed * transverse_velocity * direction_sigma
             + chirp_slopes * bins_per_range * slope
         )
         + zeros,
-        quadratic=abs(
+        quadratic_spread=abs(
             bins_per_speed * radial_velocity * (direction_sigma / position_sigma) ** 2
             + chirp_slopes * bins_per_range
         )
@@ -396,16 +399,16 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
     # The factor 2 is for sums over records, in which the ends hardly count.
     slope = np.vstack(
         [
-            spread.linear,
-            2 * (last_start_bins * spread.linear[1] + carrier_difference_cycles * slope),
+            spread.linear_spread,
+            2 * (last_start_bins * spread.linear_spread[1] + carrier_difference_cycles * slope),
         ]
     )
     quadratic = np.vstack(
         [
-            spread.quadratic,
+            spread.quadratic_spread,
             2
             * (
-                last_start_bins * spread.quadratic[1]
+                last_start_bins * spread.quadratic_spread[1]
                 + carrier_difference_cycles * position_sigma**2 / 2
             ),
         ]
@@ -538,7 +541,10 @@ def _choose_node_lines(
         window_name
     )
     errors_along, errors_across = _quadrature_errors_by_curvature(window_name)
-    quadratic_max, linear_max = spread.quadratic.max(axis=0), spread.linear.max(axis=0)
+    quadratic_max, linear_max = (
+        spread.quadratic_spread.max(axis=0),
+        spread.linear_spread.max(axis=0),
+    )
     # If curvature alone spreads the lines, only the rules' error for squares counts.
     linear_deviation = spread.deviation * np.minimum(linear_max / quadratic_max, 1.0)
     largest_bin_power = largest_bin_powers[np.searchsorted(tabulated_spreads, spread.deviation)]
@@ -548,7 +554,7 @@ def _choose_node_lines(
         + errors_along[:, curvature_index] / largest_bin_power
     )
     error_across = np.zeros((NODE_COUNTS_ACROSS_SLOPE.size, quadratic_max.size))
-    for s, c in zip(spread.smoothing_deviation, spread.quadratic, strict=True):
+    for s, c in zip(spread.smoothing_deviation, spread.quadratic_spread, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.searchsorted(_CURVATURE_RATIOS, np.where(s > 0, c / s, np.inf))
             smoothed_error = _smoothed_errors_by_curvature()[:, ratio] * (
@@ -578,11 +584,14 @@ def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndar
     with np.errstate(divide="ignore", invalid="ignore"):
         density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
         smoothed_error = (
-            density * math.sqrt(np.pi / 2) * (spread.quadratic / spread.smoothing_deviation) ** 2
+            density
+            * math.sqrt(np.pi / 2)
+            * (spread.quadratic_spread / spread.smoothing_deviation) ** 2
         )
     lobe_shape = window_response(window_name, _WINDOW_SAMPLES, _WINDOW_SAMPLES)
     return np.asarray(
-        2 * np.fmin(lobe_shape.curvature_max * spread.quadratic**2, smoothed_error).max(axis=0)
+        2
+        * np.fmin(lobe_shape.curvature_max * spread.quadratic_spread**2, smoothed_error).max(axis=0)
     )
 
 
@@ -707,7 +716,7 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
     """Return a lower bound on the largest bin's power, over that of all lines at one bin's centre.
 
     `deviation` is the standard deviation of line frequencies [bins of fs/L]. See
-    :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for`.
+    :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for_spread`.
     """
     narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
     wide = (1 - 1 / _CHEBYSHEV_MULTIPLES**2) * lobe_shape.central_energy_min

@@ -322,10 +322,10 @@ EXTINCTION = Effect(
 
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(16)
-_CUT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
+_SPLIT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
 """Positions at which the backscatter integral is split between two rows of the extinction table.
 The unit is one e-folding of the extinction between these rows."""
-_CUT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
+_SPLIT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
 """Ranges at which the backscatter integral splits the path, in units of the near range (aperture
 diameter over full angle of the field of view)."""
 
@@ -381,7 +381,7 @@ def backscatter_integral(
     )
     inner_cuts = [
         np.clip(crossing_fraction, 0, 1) * target_range,
-        np.minimum(np.asarray(_CUT_RANGE_RATIOS) * near_range, target_range),
+        np.minimum(np.asarray(_SPLIT_RANGE_RATIOS) * near_range, target_range),
     ]
     cuts = np.sort(
         np.concatenate([np.zeros_like(target_range), *inner_cuts, target_range], axis=-1), axis=-1
@@ -410,7 +410,9 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
     rows = [*zip(profile.height, profile.extinction, strict=True)]
     for (z0, a0), (z1, a1) in itertools.pairwise(rows):
         e_foldings = abs(math.log(a1 / a0)) if a0 > 0 and a1 > 0 else 0.0
-        steps = [e_folding / e_foldings for e_folding in _CUT_E_FOLDINGS if e_folding < e_foldings]
+        steps = [
+            e_folding / e_foldings for e_folding in _SPLIT_E_FOLDINGS if e_folding < e_foldings
+        ]
         cuts += [z0 + step * (z1 - z0) if a1 < a0 else z1 - step * (z1 - z0) for step in steps]
         cuts.append(z1)
     return np.array(cuts)

@@ -78,7 +78,7 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
             log10_pfa_change=log10_pfa_change,
             leaking_bin_change_sigma=leaking_bin_change,
         )
-    power_min = points.power_without_missing(
+    power_min = points.power_min_with_missing_samples(
         points.peak_power_bounds[0]
         / (1 + 2 * points.phase_error_shift_bins / points.padding_factor)
     )

@@ -94,9 +94,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         return ErrorBound(
             magnitude_change=magnitude_change, probability_change=all_missing, **residual
         )
-    lone_change = np.where(points.may_cancel, 0.0, magnitude_change)
+    lone_change = np.where(points.amplitudes_may_cancel, 0.0, magnitude_change)
     summed_change = np.where(
-        points.may_cancel,
+        points.amplitudes_may_cancel,
         2 * missing.lost_fraction / points.window_response.scalloping_gain_min,
         points.image_bound,
     )

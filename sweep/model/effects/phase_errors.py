@@ -211,7 +211,7 @@ def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -
         mean_phase_bound(phase_bound, points.window),
     )
     near_change = 2 * phase_change / points.window_response.scalloping_gain_min
-    return np.where(points.may_cancel, near_change, points.image_bound * phase_anywhere)
+    return np.where(points.amplitudes_may_cancel, near_change, points.image_bound * phase_anywhere)
 
 
 def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
@@ -291,7 +291,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     shift_bins = 2 * mean_slope * points.padding_factor
     if not points.amplitudes_may_add:
         return ErrorBound(magnitude_change=magnitude_change, shift_bins=shift_bins)
-    lone_change = np.where(points.may_cancel, 0.0, magnitude_change)
+    lone_change = np.where(points.amplitudes_may_cancel, 0.0, magnitude_change)
     return ErrorBound(
         magnitude_change=lone_change,
         coherent_sum_change=coherent_phase_change(points, own_bound),

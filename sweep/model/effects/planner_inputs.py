@@ -314,7 +314,7 @@ class PlannerInputs(LinkBudget):
             response_max + np.minimum(step_sidelobe, self.missing_samples.lost_fraction)
         )
 
-    def power_without_missing(self, power: np.ndarray) -> np.ndarray:
+    def power_min_with_missing_samples(self, power: np.ndarray) -> np.ndarray:
         """Return a lower bound of the largest bin's power if the echo lacks samples of the record.
 
         ``power`` is the bound in a record that the echo fills. Both are relative to the power that
@@ -452,7 +452,7 @@ class PlannerInputs(LinkBudget):
         return self.adds_amplitudes or self.any_nonzero("target.roughness")
 
     @cached_property
-    def may_cancel(self) -> np.ndarray:
+    def amplitudes_may_cancel(self) -> np.ndarray:
         """True where amplitudes that add might nearly cancel."""
         if not self.amplitudes_may_add:
             return np.zeros_like(self.is_near_image)
@@ -464,9 +464,9 @@ class PlannerInputs(LinkBudget):
 
         Both are relative to the power that all lines together would have on one bin.
         """
-        return self.peak_power_bounds_for(self.line_spread)
+        return self.peak_power_bounds_for_spread(self.line_spread)
 
-    def peak_power_bounds_for(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
+    def peak_power_bounds_for_spread(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds on the largest bin's power for lines of a given spread.
 
         Parameters
@@ -545,7 +545,10 @@ class PlannerInputs(LinkBudget):
         for the mean m and the rms s of X, added to lines of rms S. c is due to the slope of the
         receiver's gain.
         """
-        response, power_min = self.window_response, self.peak_power_bounds_for(present_moments)[0]
+        response, power_min = (
+            self.window_response,
+            self.peak_power_bounds_for_spread(present_moments)[0],
+        )
         power_change = response.slope_max * (added_moments.mean + shift_bins)
         power_change = power_change + response.curvature_max * (
             present_moments.rms * added_moments.rms + added_moments.rms**2 / 2

@@ -167,7 +167,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     power_change = (
         points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins) + echo_change
     )
-    is_unknown = points.may_cancel & (points[_JITTER_PATH] > 0)
+    is_unknown = points.amplitudes_may_cancel & (points[_JITTER_PATH] > 0)
     coherent_change: np.ndarray | float = 0.0
     if points.amplitudes_may_add:  # the phase between line and image changes with range
         turned_cycles = points.carriers * points.target.delay * np.minimum(range_ratio, 1e6)

@@ -37,10 +37,10 @@ from sweep.model.preparation import Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
-_CUT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
+_SPLIT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
 """Voltages at which integrals over a quarter period of the sine are split, less full scale, in
 standard deviations of the noise. Between them the integrands are smooth."""
-_TINY = 1e-30
+_ZERO_AMPLITUDE_SUBSTITUTE_VOLTS = 1e-30
 """Positive voltage [V] that replaces an amplitude of 0 where a positive number is needed."""
 _UNLIMITED_VOLTAGE = 1e100
 """Full-scale voltage [V] of an ADC that never clips."""
@@ -92,9 +92,9 @@ def clipping_gains(
 
 def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return phases in a quarter period and weights whose sum is 1, (n, nodes) each."""
-    cut_phases = np.arcsin(np.clip((v + _CUT_DEVIATIONS * s) / a, 0.0, 1.0))
+    split_phases = np.arcsin(np.clip((v + _SPLIT_DEVIATIONS * s) / a, 0.0, 1.0))
     zeros = np.zeros(a.shape)
-    cuts = np.concatenate([zeros, cut_phases, zeros + math.pi / 2], axis=-1)
+    cuts = np.concatenate([zeros, split_phases, zeros + math.pi / 2], axis=-1)
     half_width = np.diff(cuts)[..., None] / 2
     phase = (cuts[..., :-1, None] + half_width) + half_width * _GAUSS_NODES
     weight = half_width * _GAUSS_WEIGHTS / (math.pi / 2)
@@ -149,7 +149,9 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     if not is_limited.any():
         return shots
     light_fraction = 0.5 if shots.complex_record else 1.0  # I and Q have half of the light each
-    amplitude = np.maximum(total_beat_amplitude(shots) * light_fraction, _TINY)
+    amplitude = np.maximum(
+        total_beat_amplitude(shots) * light_fraction, _ZERO_AMPLITUDE_SUBSTITUTE_VOLTS
+    )
     deviation = np.sqrt(shots.noise_variance * light_fraction)
     voltage_limit = np.where(is_limited, full_scale, _UNLIMITED_VOLTAGE)
     with np.errstate(over="ignore"):  # a denormal limit overflows the ratio

@@ -173,11 +173,11 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
                 is_near_image & (kappa < 1), 1.0, 1 - np.sqrt(kappa) + diffuse_change
             )
         )
-    may_cancel = points.may_cancel
+    amplitudes_may_cancel = points.amplitudes_may_cancel
     return ErrorBound(
-        magnitude_change=1 - np.sqrt(kappa) + np.where(may_cancel, 0.0, diffuse_change),
+        magnitude_change=1 - np.sqrt(kappa) + np.where(amplitudes_may_cancel, 0.0, diffuse_change),
         coherent_sum_change=np.where(
-            may_cancel,
+            amplitudes_may_cancel,
             math.sqrt(2) * diffuse_change / points.window_response.scalloping_gain_min,
             0.0,
         ),
@@ -187,7 +187,7 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
 _DECORRELATED_KAPPA_MAX = 1e-6
 """Limit on the fraction of the echo's power that keeps its phase, for footprints whose beamlets add
 as amplitudes. Below it the speckle may differ from segment to segment."""
-_TINY = 1e-300
+_ZERO_DIVISOR_SUBSTITUTE = 1e-300
 """Positive number that replaces a divisor of 0, such as the power of no light."""
 
 
@@ -240,7 +240,9 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
             is_decorrelated, np.asarray(carrier, float) * start, 0.0
         ) + np.zeros(shots.size)
         np.add(cycles, turned_cycles[:, None] * doppler, out=phase[segment_index])
-    power_ratio = (amplitude**2).sum(axis=1) / np.maximum((mean_amplitude**2).sum(axis=1), _TINY)
+    power_ratio = (amplitude**2).sum(axis=1) / np.maximum(
+        (mean_amplitude**2).sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE
+    )
     return replace(
         shots,
         footprint=shots.footprint._replace(
@@ -445,7 +447,9 @@ def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
         look_power[segment] = (window_transform(shots.window, line_distance) ** 2 * weight).sum(
             axis=-1
         )
-    return look_power / np.maximum(look_power.mean(axis=-1, keepdims=True), _TINY)
+    return look_power / np.maximum(
+        look_power.mean(axis=-1, keepdims=True), _ZERO_DIVISOR_SUBSTITUTE
+    )
 
 
 class BeamSpread(NamedTuple):
@@ -729,13 +733,13 @@ def _moments_by_surface(
     ``off_axis_surface`` (rows, beamlets) bool marks beamlets on another surface than the axis's, or
     is None.
     """
-    power_fraction = power / np.maximum(power.sum(axis=1), _TINY)[:, None]
+    power_fraction = power / np.maximum(power.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)[:, None]
     mean = (power_fraction * values).sum(axis=-1)
     centred = values - mean[:, :, None]
     if off_axis_surface is not None and off_axis_surface.any():
         for surface in (off_axis_surface, ~off_axis_surface):
             weight = np.where(surface, power_fraction, 0.0)
-            surface_power = np.maximum(weight.sum(axis=1), _TINY)
+            surface_power = np.maximum(weight.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)
             surface_mean = (weight * values).sum(axis=-1) / surface_power
             centred = np.where(surface, values - surface_mean[:, :, None], centred)
     covariance = (power_fraction * centred[:, None] * centred[None]).sum(axis=-1)
@@ -761,7 +765,7 @@ def _phase_moments(
 def _ray_traced_slopes(moments: BeamletMoments) -> BeamGradients:
     """Return the gradients of ray-traced ground along its steepest range, (n,) each."""
     deviation = np.sqrt(moments.covariance[1, 1])
-    doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _TINY)
+    doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _ZERO_DIVISOR_SUBSTITUTE)
     return BeamGradients(doppler_along, deviation, np.zeros(deviation.shape))
 
 

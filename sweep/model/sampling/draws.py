@@ -116,7 +116,7 @@ class CountInputs(NamedTuple):
     :func:`_draw_probabilities` is met; unused if noise is drawn."""
     any_two: np.ndarray
     """(m,) bool: True if a shot counts as detected by any two of its segments."""
-    mixing: np.ndarray
+    speckle_cholesky_factors: np.ndarray
     """(6, m): Cholesky factor of the correlation of speckle in the three segments
     (:meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`); (0, m)
     without speckle."""
@@ -160,7 +160,7 @@ def count_by_probability(
         pd_if_condition_fails=probabilities[1],
         pd_if_condition_holds=probabilities[2],
         any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
-        mixing=np.empty((0, n_rows)),
+        speckle_cholesky_factors=np.empty((0, n_rows)),
         ratio_row=np.zeros((3, n_rows), np.int64),
         line_grid=SpeckleLineGrid.empty(),
         line_centre=np.empty((0, 3)),
@@ -194,7 +194,7 @@ def count_in_noise(
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
     threshold_ratio, line_noise_ratio = threshold_and_line_noise_ratios(shots)
-    mixing = (
+    speckle_cholesky_factors = (
         np.empty((0, shots.size))
         if shots.speckle.segment_correlations is None
         else shots.speckle.segment_correlations.cholesky_factors()
@@ -212,7 +212,7 @@ def count_in_noise(
             pd_if_condition_fails=no_probabilities,
             pd_if_condition_holds=no_probabilities,
             any_two=np.full(indices.size, shots.any_two),
-            mixing=mixing[:, indices].copy(),
+            speckle_cholesky_factors=speckle_cholesky_factors[:, indices].copy(),
             ratio_row=speckle_table.ratio_row[:, indices].copy(),
             line_grid=line_grid.select(indices),
             line_centre=np.ascontiguousarray(
@@ -605,7 +605,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
     is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
     for j in range(draw_ranges.point_index.size):
         threshold_ratio, line_noise_ratio = inputs.threshold_ratio[j], inputs.line_noise_ratio[j]
-        in_speckle = inputs.mixing.shape[0] > 0
+        in_speckle = inputs.speckle_cholesky_factors.shape[0] > 0
         i, batch = draw_ranges.point_index[j], 0
         for first in range(draw_ranges.first_draw[j], draw_ranges.end_draw[j], _DRAWS_PER_STEP):
             n_draws = min(_DRAWS_PER_STEP, draw_ranges.end_draw[j] - first)
@@ -613,7 +613,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
             is_detected[:], has_alarm[:] = False, False
             for d in range(n_draws if in_speckle else 0):
                 one, amplitude_doppler, amplitude_down = speckle_amplitudes(
-                    address[:2], first + d, 0, inputs.mixing[:, j]
+                    address[:2], first + d, 0, inputs.speckle_cholesky_factors[:, j]
                 )
                 for component in range(2):
                     segment_amplitudes[0, component, d], segment_amplitudes[1, component, d] = (
@@ -811,12 +811,12 @@ def _mark_leakage_alarms(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def speckle_factors(key, draw, group, mixing):
+def speckle_factors(key, draw, group, speckle_cholesky_factors):
     """Return the factors that speckle puts on an echo's magnitudes in up, Doppler and down segment.
 
     Their mean square is 1. The arguments are those of :func:`speckle_amplitudes`.
     """
-    up, doppler, down = speckle_amplitudes(key, draw, group, mixing)
+    up, doppler, down = speckle_amplitudes(key, draw, group, speckle_cholesky_factors)
     return (
         math.hypot(up[0], up[1]),
         math.hypot(doppler[0], doppler[1]),
@@ -825,7 +825,7 @@ def speckle_factors(key, draw, group, mixing):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def speckle_amplitudes(key, draw, group, mixing):
+def speckle_amplitudes(key, draw, group, speckle_cholesky_factors):
     """Return the complex factors, of mean square 1, that speckle puts on an echo in each segment.
 
     Parameters
@@ -836,7 +836,7 @@ def speckle_amplitudes(key, draw, group, mixing):
         Number of the draw.
     group
         Number of the echo (group of adjacent bins).
-    mixing
+    speckle_cholesky_factors
         (6,): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`.
 
     Returns
@@ -856,7 +856,7 @@ def speckle_amplitudes(key, draw, group, mixing):
         down_from_doppler_re,
         down_from_doppler_im,
         down_own,
-    ) = mixing
+    ) = speckle_cholesky_factors
     doppler = (
         root_half * (doppler_from_up * a + doppler_own * c),
         root_half * (doppler_from_up * b + doppler_own * d),

@@ -168,9 +168,9 @@ class FarBins(NamedTuple):
 
     tangent: np.ndarray
     """tan(pi k / N) of each bin k, with the FFT size N."""
-    turn_re: np.ndarray
+    phasor_re: np.ndarray
     """cos(pi k L / N) of each bin k, with L samples and the FFT size N."""
-    turn_im: np.ndarray
+    phasor_im: np.ndarray
     """sin(pi k L / N) of each bin k, with L samples and the FFT size N."""
     cotangent: np.ndarray
     """Scratch: cot(pi (k - nu) / N) for a line at nu bins, with the FFT size N."""
@@ -527,11 +527,11 @@ def prepare_far_bins(first_bin, n_bins, layout, tangents, far_bins):
         k = k + 1 if k + 1 < fft_size else 0
     if fft_size == layout.record_length:
         for i in range(n_bins):
-            far_bins.turn_re[i], far_bins.turn_im[i] = -1.0 if (first_bin + i) & 1 else 1.0, 0.0
+            far_bins.phasor_re[i], far_bins.phasor_im[i] = -1.0 if (first_bin + i) & 1 else 1.0, 0.0
         return
     for i in range(n_bins):
         sine, cosine = sincos_cycles(0.5 * (first_bin + i) * layout.record_length / fft_size)
-        far_bins.turn_re[i], far_bins.turn_im[i] = cosine, sine
+        far_bins.phasor_re[i], far_bins.phasor_im[i] = cosine, sine
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -608,7 +608,7 @@ def add_line_by_record_ends(
         for i in range(begin, stop):
             p, q = far_bins.start_re[i], far_bins.start_im[i]
             r, s = far_bins.end_re[i], far_bins.end_im[i]
-            u, v = far_bins.turn_re[i], far_bins.turn_im[i]
+            u, v = far_bins.phasor_re[i], far_bins.phasor_im[i]
             u, v = u * u - v * v, 2.0 * u * v
             u, v = u * b_re - v * b_im, u * b_im + v * b_re
             field.re[shift + i] += a_re * (p * p + q * q + r * r + s * s) - 2.0 * (
@@ -620,7 +620,7 @@ def add_line_by_record_ends(
         u_im = a_re * far_bins.start_im[i] + a_im * far_bins.start_re[i]
         v_re = b_re * far_bins.end_re[i] - b_im * far_bins.end_im[i]
         v_im = b_re * far_bins.end_im[i] + b_im * far_bins.end_re[i]
-        c, s = far_bins.turn_re[i], far_bins.turn_im[i]
+        c, s = far_bins.phasor_re[i], far_bins.phasor_im[i]
         field.re[shift + i] += c * (u_re - v_re) - s * (u_im + v_im)
         field.im[shift + i] += c * (u_im - v_im) + s * (u_re + v_re)
 

@@ -978,7 +978,7 @@ def _fill_far_powers(
             far_bins.tangent[i] = (
                 direction * (tangent + tangent_shift) / (1.0 - tangent * tangent_shift)
             )
-            far_bins.turn_re[i], far_bins.turn_im[i] = 1.0, 0.0
+            far_bins.phasor_re[i], far_bins.phasor_im[i] = 1.0, 0.0
             field.re[i], field.im[i] = 0.0, 0.0
         distance_min = float(layout.clearance_bins)
         if image_pass == 1:  # images are as far from DC and Nyquist as the lines

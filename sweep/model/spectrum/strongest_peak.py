@@ -72,7 +72,7 @@ class SpanProbabilities(NamedTuple):
     """(segments, m): probability that the echo crosses the threshold but another peak is larger."""
     p_alarm: np.ndarray
     """(segments, m): probability that any bin outside the echo crosses the threshold."""
-    shared_gain: np.ndarray
+    shared_speckle_gain: np.ndarray
     """(m,): increase of the probability that both chirps report the echo's peak, due to the speckle
     that they share. It includes only cases in which bins outside the echo cross the threshold too.
     """
@@ -113,7 +113,7 @@ def strongest_peak_probabilities(
     dict of str to ndarray (n,)
         ``pd_``, ``miss_`` and ``p_wrong_range_`` of each segment and of the shot.
     """
-    pd_loss, p_alarm, shared_gain = (
+    pd_loss, p_alarm, shared_speckle_gain = (
         np.zeros((3, shots.size)),
         np.zeros((3, shots.size)),
         np.zeros(shots.size),
@@ -122,7 +122,7 @@ def strongest_peak_probabilities(
         probabilities = _span_probabilities(shots, spans, pd)
         pd_loss[:, spans.point_numbers] = probabilities.pd_loss
         p_alarm[:, spans.point_numbers] = probabilities.p_alarm
-        shared_gain[spans.point_numbers] = probabilities.shared_gain
+        shared_speckle_gain[spans.point_numbers] = probabilities.shared_speckle_gain
     pd_right, miss_right = np.maximum(pd - pd_loss, 0.0), np.minimum(miss + pd_loss, 1.0)
     p_wrong = np.minimum(p_alarm * miss + pd_loss, 1.0)
     results = {
@@ -131,7 +131,7 @@ def strongest_peak_probabilities(
         for s, segment in enumerate(waveform.SEGMENT_NAMES)
     }
     p_no_alarm = (1 - p_alarm[UP]) * (1 - p_alarm[DOWN])
-    p_both_right = pd_right[UP] * pd_right[DOWN] + shared_gain
+    p_both_right = pd_right[UP] * pd_right[DOWN] + shared_speckle_gain
     if shots.speckle.segment_correlations is not None:
         speckle_covariance = (
             shots.joint_detection_probability(pd[UP], pd[DOWN], (magnitude[UP], magnitude[DOWN]))
@@ -146,7 +146,7 @@ def strongest_peak_probabilities(
     return results | {
         "pd_shot": p_both_right,
         "miss_shot": np.minimum(miss_shot, 1.0),
-        "p_wrong_range_shot": np.maximum(p_reported_wrong - shared_gain, 0.0),
+        "p_wrong_range_shot": np.maximum(p_reported_wrong - shared_speckle_gain, 0.0),
     }
 
 
