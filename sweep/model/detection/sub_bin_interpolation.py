@@ -4,14 +4,12 @@ With the window's transform W at the spacing of the bins, a lone tone delta bins
 has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. The inversion depends on the
 window:
 
-- If the neighbours of a tone on a bin are strong (Hann, Hamming, wider windows), the magnitude
-ratio
-  (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it is delta / 2).
-  One step of least squares follows, weighted by the noise's covariance between the three bins. It
-  gives the least error that three magnitudes allow.
-- If the neighbours vanish (rectangular window), the larger one gives the side. The magnitude ratio
-is
-  larger / (centre + larger), which is delta itself for the rectangular window.
+- If the neighbours of a tone on a bin are strong (Hann, Hamming, wider windows), the
+  magnitude ratio (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it
+  is delta / 2). One step of least squares follows, weighted by the noise's covariance between the
+  three bins. It gives the least error that three magnitudes allow.
+- If the neighbours vanish (rectangular window), the larger one gives the side. The
+  magnitude ratio is larger / (centre + larger), which is delta itself for the rectangular window.
 
 The tables follow from the window's transform, so the position of a noise-free single tone is exact
 (1e-6 bins). Three things bias the estimate: other lines within the main lobe, the tone's image near
@@ -128,8 +126,8 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
     """Return the tables that give a peak's position from three magnitudes (cached).
 
     The tables hold for records with this window that are padded to `fft_size` samples. For a
-    flat-top window in a padded FFT, no magnitude ratio of the magnitudes rises with the offset of
-    the tone from the centre bin. The offset is then given as 0, with an error of half a bin.
+    flat-top window in a padded FFT, no ratio of the magnitudes rises with the offset of the tone
+    from the centre bin. The offset is then given as 0, with an error of half a bin.
     """
     offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
