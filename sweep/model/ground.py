@@ -76,7 +76,7 @@ class BeamletTable(NamedTuple):
     row_of_point: np.ndarray
     """(n,) int64: index of the row of each point."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of a beamlet minus that on the axis, over the latter."""
+    """(rows, beamlets): range of a beamlet minus that on the axis, over the range on the axis."""
     doppler_ratio_offset: np.ndarray
     """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis. v_r is the
     radial velocity.
@@ -188,7 +188,7 @@ class FlatGround:
             on the axis.
         delay_cycles : array_like
             Cycles per unit of relative range, (n,) or scalar; dR / R is the range minus that on the
-            axis, over the latter.
+            axis, over the range on the axis.
 
         Notes
         -----
@@ -350,7 +350,8 @@ class FootprintExtent(NamedTuple):
     total_echo_ratio: np.ndarray | float
     """Echo of all beamlets, over that of a single line on the beam's axis."""
     range_offsets: OffsetMoments
-    """Moments of the beamlets' relative range offsets: range minus the axis's, over the latter."""
+    """Moments of the beamlets' relative range offsets: range minus that on the axis, over the range
+    on the axis."""
     axis_surface_range_offsets: OffsetMoments
     """Moments of the relative range offsets of those beamlets on the same surface as the axis."""
     velocity_offsets: OffsetMoments

@@ -34,7 +34,8 @@ class FootprintLines(NamedTuple):
     row_of_point: np.ndarray
     """(n,) int64: index of each point's row in the arrays."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of a beamlet minus that on the beam's axis, over the latter."""
+    """(rows, beamlets): range of a beamlet minus that on the beam's axis, over the range on the
+    axis."""
     doppler_ratio_offset: np.ndarray
     """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the beam's axis. v_r is
     the radial velocity.

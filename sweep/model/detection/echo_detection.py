@@ -520,8 +520,8 @@ def joint_pd_in_speckle(
 
     An echo that any of its bins may detect is represented by M independent bins. Let p be the
     probability of detection of a segment. Each bin is detected with q = 1 - (1 - p)^(1/M), and is
-    correlated with one bin of the other segment. Both segments are missed with
-    (1 - q_1 - q_2 + J(q_1, q_2))^M. Both are thus detected with
+    correlated with one bin of the other segment. Both segments are missed with (1 - q_1 - q_2 +
+    J(q_1, q_2))^M. Both segments are thus detected with the probability
 
         p_1 p_2 + (1 - p_1) (1 - p_2) ((1 + (J - q_1 q_2) / ((1 - q_1) (1 - q_2)))^M - 1)
 
@@ -848,7 +848,8 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
     A single bin crosses with :func:`bin_crossing_tails`. The noise of neighbouring bins is
     correlated with the coefficient rho, in phase with a signal that keeps its phase from bin to bin
     as in a main lobe. Two neighbours are taken to cross jointly like two correlated normal numbers
-    that exceed s and t with the same probabilities. That is the product of these plus [1]_
+    that exceed s and t with the same probabilities. The joint probability is the product of the two
+    plus [1]_
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 

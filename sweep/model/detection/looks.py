@@ -748,7 +748,7 @@ class Looks(NamedTuple):
     def p_votes_first_only(
         self, p_first: np.ndarray, p_second: np.ndarray, p_both: np.ndarray
     ) -> np.ndarray:
-        """Return the probability that enough records cross in the first of two bins, not the other.
+        """Return the probability that enough records cross in the first bin, but not in the second.
 
         Parameters
         ----------

@@ -226,7 +226,7 @@ def _least_squares_weights(
     Returns
     -------
     weight, standard_error
-        (3, m) and (m,) [bins], the latter at |X| = sigma in the centre bin.
+        Weights (3, m), and standard errors (m,) [bins] at |X| = sigma in the centre bin.
 
     Notes
     -----

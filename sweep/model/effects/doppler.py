@@ -36,9 +36,9 @@ def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
     Notes
     -----
     The shift is 2 v_r / lambda, with the radial velocity v_r and the wavelength lambda. It changes
-    the receiver's gain and the line's position between two bins. Its size in bins counts as well,
-    as the velocity is measured by it. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is never
-    skipped.
+    the receiver's gain and the line's position between two bins. The shift in bins counts as well,
+    because the velocity is measured by the shift. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is
+    never skipped.
     """
     if not points.any_nonzero("target.radial_velocity"):
         return None

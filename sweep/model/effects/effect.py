@@ -169,7 +169,7 @@ class Effect:
     """
     defines_scene_if_off: bool = False
     """True if ``off`` is a rule of the scene, such as "all segments begin at one range", and not
-    the omission of something that is there: it then counts as no error."""
+    the omission of something that is there. ``off`` then counts as no error."""
     required_effects: tuple[str, ...] = ()
     """Names of effects that are simulated with this one, however small their own change is."""
 

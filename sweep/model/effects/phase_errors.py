@@ -323,7 +323,8 @@ def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarra
     position : ndarray (m,)
         Positions x in the record, -1..1.
     start, duration : ndarray
-        Start since the segment's start, and duration, of the record [s], (n,) or scalar.
+        Time from the segment's start to the record's start, and duration of the record [s], (n,) or
+        scalar.
 
     Returns
     -------
@@ -362,7 +363,8 @@ def range_walk_phase(
     radial_velocity : ndarray (n,)
         Radial velocity v_r [m/s].
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
     slide : ndarray or float
         Speed u - v_r [m/s] by which the range along the beam falls faster than at the radial
         velocity at the segment's start.
@@ -504,7 +506,8 @@ def acceleration_phase(
     range, radial_velocity, acceleration : ndarray (n,)
         Values at the segment's start [m, m/s, m/s^2].
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
 
     Returns
     -------
@@ -626,7 +629,8 @@ def error_table_phase(
     range, radial_velocity : ndarray (n,)
         Values at the segment's start [m, m/s].
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
 
     Returns
     -------
@@ -678,7 +682,8 @@ def chirp_nonlinearity_phase(
     periods : ndarray
         Number > 0 of periods of the sine over the sweep.
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
 
     Returns
     -------

@@ -122,7 +122,7 @@ class PlannerInputs(LinkBudget):
         return any(bool(self.parameters[path].any()) for path in paths)
 
     def _select_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
-        """Select the values of existing segments from those of up, Doppler and down."""
+        """Select the values of existing segments from values of up, Doppler and down."""
         named_values = zip(waveform.SEGMENT_NAMES, values_by_segment, strict=True)
         return [value for name, value in named_values if name in self.waveform.segment_order]
 

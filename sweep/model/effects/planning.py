@@ -51,8 +51,8 @@ class EffectPlan(NamedTuple):
     """(effects, tiles): change if the effect is omitted, 0..1. The largest change of pd, log10
     pfa or the relative |X| at any point of the tile, as in :func:`omission_errors`."""
     total_error: np.ndarray
-    """(tiles,): sum of the changes by omitted effects, plus :attr:`residual_error`. Only the latter
-    and effects that are off can make it exceed the tolerance."""
+    """(tiles,): sum of the changes due to omitted effects, plus :attr:`residual_error`. Only the
+    residual error, and effects that are off, can make the sum exceed the tolerance."""
     residual_error: np.ndarray
     """(tiles,): error, 0..1, of pd or the relative |X| due to what simulated effects neglect."""
     keeps_all_optional: np.ndarray
@@ -93,7 +93,7 @@ def plan_effects(
         the scene is omitted even if it is on. An effect that is off switches off the effects that
         are part of it.
     tolerance : float
-        Tolerated sum of the changes by all omitted effects, 0..1: of pd in the three segments
+        Tolerated sum of the changes due to all omitted effects, 0..1: of pd in the three segments
         together, of log10 of a probability of false alarm, or of a relative magnitude.
     effects : sequence of Effect
         Effects to choose from.

@@ -158,7 +158,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     -----
     Echo powers change by the cube of the ratio of ranges (1/R^2 and at most Lambert's cosine). A
     footprint whose phases follow its geometry may start or stop fading, and so may lines with their
-    images. Nothing is known of those.
+    images. No bound is known for these changes.
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None

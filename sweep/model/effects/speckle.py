@@ -75,7 +75,8 @@ def coherent_echo_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np
     ----------
     roughness : array_like
         Standard deviation sigma_h of the surface's height along the line of sight [m]. For a plane
-        it is that normal to it times the sine of the grazing angle; infinite for developed speckle.
+        it is the deviation of the height normal to the plane, times the sine of the grazing angle.
+        It is infinite for developed speckle.
     wavelength : array_like
         Wavelength lambda [m].
 
@@ -594,7 +595,7 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
 
 
 def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the optical frequency F of the echo at mid-record in each segment, and the time of it.
+    """Return the echo's optical frequency F at mid-record of each segment, and mid-record's time.
 
     The time is the centroid of the window over the samples that hold the echo. There the phase of a
     bin is that of the line, to first order in their distance.

@@ -145,7 +145,8 @@ class BeamletArrays(NamedTuple):
     """Range, Doppler ratio and amplitude of all beamlets, relative to the beam's axis."""
 
     relative_range_offset: np.ndarray
-    """(footprints, beamlets): range of the beamlet minus that on the axis, over the latter."""
+    """(footprints, beamlets): range of the beamlet minus that on the axis, over the range on the
+    axis."""
     doppler_ratio_offset: np.ndarray
     """(footprints, beamlets): Doppler ratio 2 v_r / c of the beamlet minus that on the axis."""
     relative_amplitude: np.ndarray
