@@ -78,7 +78,7 @@ def fill_crossing_series(threshold_ratio, series):
 
 @njit(cache=True, error_model="numpy")
 def _n_series_terms(x, y):
-    """Return how many terms the crossing series needs for an error of 1e-16 in its sum.
+    """Return the number of terms that the crossing series needs for an error of 1e-16.
 
     ``x`` is half the square of the largest amplitude, ``y`` half that of the threshold, x <= y.
     Both are in units of the noise per quadrature.
@@ -363,7 +363,9 @@ def exclude_bins_joining_echo(
 
 @njit(cache=True, error_model="numpy")
 def _count_joining_bins(probabilities, first_index, step, n_bins):
-    """Return how many bins next to an echo may join it by crossing the threshold, 1 .. ``n_bins``.
+    """Return the number of bins next to an echo that may join the echo, 1 .. ``n_bins``.
+
+    They join the echo if they cross the threshold.
 
     The bins start at ``first_index`` and go on by ``step``, 1 or -1. The count ends where all of
     them cross with a probability of at most :data:`JOINED_PROBABILITY_MIN`.

@@ -41,7 +41,7 @@ def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
 def alarm_equivalent_bins(
     parameters: Mapping[str, Any], pfa_in_bin: ArrayLike, segment: str = "up"
 ) -> np.ndarray:
-    """Return how many independent noise bins raise a false alarm as often as a segment's bins.
+    """Return the number of independent noise bins that alarm as often as a segment's bins.
 
     Parameters
     ----------

@@ -187,7 +187,7 @@ def lines_overlap_images(shots: Any) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def n_tabulated_bins(window: Window, fft_size: int) -> int:
-    """Return how many bins next to DC or Nyquist have a tabulated pseudo-variance."""
+    """Return the number of bins next to DC or Nyquist with a tabulated pseudo-variance."""
     last_bin = (_image_reach(window) + main_lobe_half_width(window) + 1) * fft_size / window.length
     return min(math.ceil(last_bin) + 1, fft_size // 4 + 1)
 

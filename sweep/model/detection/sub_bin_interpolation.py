@@ -53,8 +53,8 @@ _TONE_DEGREE = 32
 """Degree of the polynomial that gives a bin's complex value at -2 .. 2 bins from a tone."""
 
 _NEIGHBOUR_HEIGHT_MIN = 0.25
-"""Limit below which the position is found by TWO_BINS. It is the |X| of the neighbours of a tone on
-a bin, over the |X| of that bin."""
+"""Ratio of |X| of a neighbour to |X| of a bin on which a tone lies, below which positions are found
+by TWO_BINS."""
 
 THREE_BINS, TWO_BINS = 0, 1
 """Kinds of magnitude ratio from which a tone's position between bins is found. THREE_BINS uses the

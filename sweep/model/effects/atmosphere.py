@@ -37,8 +37,8 @@ from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
 
 _HEIGHT_DIFFERENCE_MIN = 1e-9
-"""Smallest difference of height [m] between the ends of a path. Level paths are given it, so that
-the mean extinction over height is defined."""
+"""Smallest difference of height [m] between the ends of a path. Paths that are more level count as
+having this difference, so that the mean extinction over height is defined."""
 
 
 class ExtinctionProfile(NamedTuple):

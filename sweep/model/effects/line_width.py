@@ -52,7 +52,7 @@ def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return how far from its centre a Gaussian laser line spreads light.
+    """Return the distance over which a Gaussian laser line spreads light from its centre.
 
     The distance is the shift of a :class:`PhaseErrorBound`. The result is None for other line
     shapes.

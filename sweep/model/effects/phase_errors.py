@@ -172,7 +172,9 @@ def phase_over_record(
 
 
 def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray:
-    """Return the largest change of any bin of a line relative to its peak.
+    """Return a bound on the change that a phase error causes in any bin of a line.
+
+    The change is relative to the line's peak.
 
     Parameters
     ----------
@@ -184,7 +186,7 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
     Returns
     -------
     ndarray
-        Mean of |phi| over the record, weighted with |w| / sum w for the window w.
+        Bound, the mean of |phi| over the record [rad], weighted with |w| / sum w for the window w.
     """
     moments = window_moments(window)
     total = phase_bound.non_polynomial * moments.magnitude_sum

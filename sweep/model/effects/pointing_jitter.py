@@ -139,7 +139,7 @@ def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndar
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return how far random deflections of the beam shift lines; None without jitter.
+    """Return the distance by which random deflections of the beam shift lines; None without them.
 
     The distance is the shift of a :class:`PhaseErrorBound`.
     """

@@ -38,8 +38,8 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
 _SPLIT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
-"""Voltages at which integrals over a quarter period of the sine are split, less full scale, in
-standard deviations of the noise. Between them the integrands are smooth."""
+"""Voltages minus full scale [standard deviations of the noise] at which integrals over a quarter
+period of the sine are split. Between these voltages the integrands are smooth."""
 _ZERO_AMPLITUDE_SUBSTITUTE_VOLTS = 1e-30
 """Positive voltage [V] that replaces an amplitude of 0 where a positive number is needed."""
 _UNLIMITED_VOLTAGE = 1e100

@@ -107,10 +107,10 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    Sets the start of each segment, that of the middle look with several looks. Adds the mean start
-    t_m of up- and down-chirp to the range walk's time. Sets the fraction S t_d / 2 of the optical
-    frequency at mid-chirp by which the beats underestimate the radial velocity, and the drift of
-    lines per look.
+    The effect sets the start of each segment; with several looks it is that of the middle look. It
+    adds the mean start t_m of up- and down-chirp to the range walk's time. It also sets the
+    fraction S t_d / 2 of the optical frequency at mid-chirp by which the beats underestimate the
+    radial velocity, and the drift of lines per look.
     """
     waveform, motion, looks = shots.waveform, shots.motion, shots.looks
     starts = waveform.segment_starts

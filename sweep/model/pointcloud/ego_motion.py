@@ -198,8 +198,8 @@ def ego_motion_of_beams(
 
     Notes
     -----
-    Let z be the vertical, R the range, and u the speed at which the range falls. Then
-    minus the slip is u - V.d = V.z / d.z - V.d + R d'.z / d.z.
+    Let z be the vertical, R the range, and u the speed at which the range falls. Then u = V.z / d.z
+    + R d'.z / d.z, and the slip is V.d - u.
     """
     closing_rate = _row_dot(acceleration, direction) + _row_dot(velocity, direction_rate)
     closing_speed = _row_dot(velocity, direction)

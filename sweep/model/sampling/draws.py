@@ -110,10 +110,10 @@ class CountInputs(NamedTuple):
     one."""
     pd_if_condition_fails: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
-    :func:`_draw_probabilities` is not met; unused if noise is drawn."""
+    :func:`_event_probabilities` is not met; unused if noise is drawn."""
     pd_if_condition_holds: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
-    :func:`_draw_probabilities` is met; unused if noise is drawn."""
+    :func:`_event_probabilities` is met; unused if noise is drawn."""
     any_two: np.ndarray
     """(m,) bool: True if a shot counts as detected by any two of its segments."""
     speckle_cholesky_factors: np.ndarray
@@ -150,7 +150,7 @@ def count_by_probability(
         (names, points, batches) int64, in the order of
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
-    n_rows, probabilities = draw_ranges.point_index.size, _draw_probabilities(outputs)
+    n_rows, probabilities = draw_ranges.point_index.size, _event_probabilities(outputs)
     no_filter = NoiseFilter(np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0)
     inputs = CountInputs(
         threshold_ratio=np.zeros(n_rows),
@@ -335,7 +335,7 @@ _REMAINDER_MIN = 1e-9
 neglected."""
 
 
-def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
+def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the probabilities of each segment's events, to compare random numbers with them.
 
     Segments are up, Doppler and down.

@@ -197,7 +197,7 @@ class Sampler(ABC):
         return interval_half_width(counts / n, interval)
 
     def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return by how much each point's largest half-width exceeds the tolerance, (points,).
+        """Return the excess of each point's largest half-width over the tolerance, (points,).
 
         The half-widths are those of the confidence intervals of detection probabilities. The result
         is at least 0.

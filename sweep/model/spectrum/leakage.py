@@ -509,11 +509,11 @@ def _mean_leakage_over_speckle(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates):
-    """Mark the bins that may join an echo by a crossing probability of 1, all others by 0.
+    """Set the crossing probability of bins that may join an echo to 1, and of all others to 0.
 
-    A bin joins an echo if it crosses the threshold next to it. The result is an upper bound of the
-    number of bins to be listed one by one: marked bins, the echo's bins next to them, and one for
-    each gap between them.
+    A bin joins an echo if it crosses the threshold next to the echo. The result is an upper bound
+    of the number of bins to be listed one by one: marked bins, the echo's bins next to them, and
+    one for each gap between them.
     """
     n_listed_max, gap_end = 0, first_index
     for i in range(first_index, end_index):
@@ -715,7 +715,7 @@ def _leakage_bound_of_span(n_bins, limits, span):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
-    """Compute the probability by which signal raises each bin's threshold crossing above noise's.
+    """Compute the increase of each bin's crossing probability that signal causes over noise alone.
 
     Bins of the echo are left out. Bins above the threshold, which bright speckle may contain, are
     outside the range of the series.

@@ -264,7 +264,7 @@ def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def _joint_excess(exponent_first, exponent_second, squared_correlation):
-    """Return by how much correlation raises the joint probability of two Rayleigh magnitudes.
+    """Return the increase of two Rayleigh magnitudes' joint probability due to correlation.
 
     Each magnitude has to exceed a level of its own. Alone, the first exceeds its level with the
     probability exp(-``exponent_first``), the second with exp(-``exponent_second``). The result is
@@ -377,7 +377,7 @@ def _evaluate_levels(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_joint_excess(up, down, squared_correlation, joint_excess):
-    """Compute by how much shared speckle raises the probability that both peaks are right.
+    """Compute the increase, due to shared speckle, of the probability that both peaks are right.
 
     Only combinations of levels count in which bins without the echo cross in either segment.
 
