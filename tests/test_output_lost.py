@@ -22,7 +22,7 @@ from sweep.cli import main
 from sweep.storage.locations import JOURNAL_DIR
 from sweep.tasks.engine import progress
 from sweep.tasks.engine.interrupts import InterruptHandler
-from sweep.tasks.engine.text_streams import ForgivingStream, PatientStream, is_terminal
+from sweep.tasks.engine.text_streams import ForgivingStream, StallTolerantStream, is_terminal
 from sweep.tasks.studies import store_summary
 
 SWEEP = [sys.executable, "-c", "from sweep.cli import main; main()"]
@@ -233,7 +233,7 @@ def test_a_stream_whose_reader_stops_takes_no_time_and_goes_on_with_it():
     reading, writing = os.pipe()
     room = fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, 4096)
     with open(writing, "w") as inside, open(reading, "rb") as reader:
-        stream = PatientStream(inside)
+        stream = StallTolerantStream(inside)
         print("first", file=stream, flush=True)
         assert os.read(reading, 100) == b"first\n"
         begun = time.monotonic()

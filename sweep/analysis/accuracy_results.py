@@ -79,7 +79,7 @@ REQUIRED_SPEEDUP_OVER_FIXED, REQUIRED_SPEEDUP_OVER_THESIS = 1 / 1.1, 5.0
 The ratios are those of the best fixed setting, and of the thesis's method, to the adaptive setting.
 """
 
-THESIS_BEAMLETS = 109
+THESIS_BEAMLET_COUNT = 109
 """Number of beamlets that the thesis simulates."""
 
 MEDIAN_ROUNDS_MIN = 3
@@ -119,7 +119,7 @@ class MeasuredSetting:
     magnitude_error: float
     """Largest relative error of the magnitude |X| of a bin at any point; nan if there is none."""
     leakage_error: float
-    """Largest error, over all points, of the probability of a false peak by window sidelobes.
+    """Largest error, over all points, of the probability of a false peak due to window sidelobes.
 
     It is nan if there is none. The tolerance does not limit it, because it jumps where a bin
     reaches the threshold.
@@ -150,7 +150,7 @@ class MeasuredSetting:
     def covers_leakage_error(self) -> bool:
         """True unless the setting is a closed form whose missing leakage exceeds its other errors.
 
-        Leakage is the probability of false peaks by window sidelobes.
+        Leakage is the probability of false peaks due to window sidelobes.
         """
         return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
             self.largest_error, NEGLIGIBLE_ERROR
@@ -163,8 +163,8 @@ class MeasuredSetting:
     def speedup_over(self, other: MeasuredSetting, extra_seconds: float = 0.0) -> float:
         """Return the time of another setting over the time of this one.
 
-        It is the median of the rounds of measurement, or the ratio of the fastest rounds if there
-        are few. ``extra_seconds`` is a time per point that is added to both [s].
+        The ratio is the median of the rounds of measurement, or the ratio of the fastest rounds if
+        there are few. ``extra_seconds`` is a time per point that is added to both [s].
         """
         if self.seconds_by_round.size < MEDIAN_ROUNDS_MIN:
             return (other.fastest_round_seconds + extra_seconds) / (
@@ -215,7 +215,7 @@ def drop_reference_setting(settings: Iterable[MeasuredSetting]) -> list[Measured
 
 
 def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
-    """Return the settings than which no other is both faster and more accurate, fastest first."""
+    """Return the settings that no other beats in both time and error, fastest first."""
     front_settings: list[MeasuredSetting] = []
     for setting in sorted(settings, key=lambda s: (s.fastest_round_seconds, s.largest_error)):
         if not front_settings or max(setting.largest_error, NEGLIGIBLE_ERROR) < max(
@@ -255,9 +255,9 @@ class SettingComparison(NamedTuple):
 
 
 def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
-    """Compare, for the error of each adaptive setting, the fastest adaptive and fixed settings.
+    """Compare the fastest adaptive with the fastest fixed setting, for each adaptive setting.
 
-    The errors of both are no larger than that error.
+    Neither of the two compared has a larger error than that setting.
     """
     adaptive_settings = select_settings_of_kinds(settings, ADAPTIVE_KIND)
     fixed_settings = [
@@ -365,7 +365,7 @@ def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]
 def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> list[str]:
     """Return sentences with the conclusions from a measurement of accuracy."""
     attributes = dataset.attrs
-    conclusions = [_as_written_sentence(dataset, settings)]
+    conclusions = [_as_written_setting_sentences(dataset, settings)]
     conclusions += _fixed_sentences(compare_adaptive_with_fixed(settings), attributes)
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
@@ -398,7 +398,7 @@ def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> T
     )
 
 
-def _as_written_sentence(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
+def _as_written_setting_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
     """Return the sentences on the spec as written: its time and error, and a faster setting."""
     (as_written,) = select_settings_of_kinds(settings, AS_WRITTEN_KIND)
     n_points, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
@@ -492,8 +492,8 @@ def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> lis
         if comparison.other
     )
     requirement_note = f"Requirement, at least {REQUIRED_SPEEDUP_OVER_THESIS:g}: {verdict_text}."
-    if beamlets != THESIS_BEAMLETS:
-        requirement_note = f"This scene has {beamlets} beamlets, the thesis {THESIS_BEAMLETS}."
+    if beamlets != THESIS_BEAMLET_COUNT:
+        requirement_note = f"This scene has {beamlets} beamlets, the thesis {THESIS_BEAMLET_COUNT}."
     statements = [
         f"The thesis's way is compared at its own error. {_speedup_sentences(comparisons)} "
         f"{requirement_note}"

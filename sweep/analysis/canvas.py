@@ -170,7 +170,10 @@ MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INC
 
 
 def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
-    """Draw a chart on a new sheet, with a heading, and a footnote at the end of its caption."""
+    """Draw a chart on a new sheet, with a heading above it and a caption below it.
+
+    ``footnote`` is the last sentence of the caption.
+    """
     drawn_sheet = (
         _draw_map_panels(chart, chart.colour_scale)
         if chart.colour_scale

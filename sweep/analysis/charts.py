@@ -61,7 +61,7 @@ class ChartLine:
     y: np.ndarray
     """Values (n,); nan where missing."""
     name: str = ""
-    """Name in the legend."""
+    """Name of the line in the legend."""
     style_index: int = 0
     """Number that selects the line's colour, dash and marker from the common lists."""
     low: np.ndarray | None = None
@@ -75,7 +75,7 @@ class ChartLine:
     line) or ``area`` (stacked on the areas before it).
     """
     points_per_value: int = 1
-    """Number of points of the study whose mean each value of the line is."""
+    """Number of points of the study that are averaged for each value of the line."""
     hover_texts: Sequence[str] = ()
     """Texts that a page shows when the reader points at a value of the line, one per value."""
 
@@ -112,8 +112,8 @@ class ColourScale:
 class Panel:
     """Panel of a chart: lines or a heat map over two axes.
 
-    It belongs to one choice of each facet, a property by which panels differ, such as the part of
-    the study.
+    The panel belongs to one choice of each facet, a property by which panels differ, such as the
+    part of the study.
     """
 
     facet_choices: Mapping[str, str]
@@ -150,7 +150,7 @@ class Chart:
     caption: Sequence[str]
     """Phrases of the caption."""
     panels: Sequence[Panel]
-    """Panels in order."""
+    """Panels in the order in which they are drawn."""
     facet_labels: Mapping[str, str] = field(default_factory=dict)
     """Labels of the controls with which a reader selects a panel.
 
@@ -288,8 +288,8 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
 def worst_statistic(variable: str) -> str:
     """Return which statistic of a cell is the worst value of a variable.
 
-    It is the lowest one for detection, the highest one for false alarms, and '' for other
-    variables.
+    The worst value is the lowest one for detection, the highest one for false alarms, and '' for
+    other variables.
     """
     if variable.startswith(("pd_", "snr_")):
         return CELL_LOWEST

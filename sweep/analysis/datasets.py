@@ -145,7 +145,7 @@ def _datasets_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
 
 
 def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset with its coordinates in memory, and their texts as NumPy strings."""
+    """Return a dataset with its coordinates in memory, and text coordinates as NumPy strings."""
     loaded = {name: array.compute() for name, array in dataset.coords.items()}
     return dataset.assign_coords({
         name: array.copy(data=np.array(array.values.tolist(), str))

@@ -71,7 +71,7 @@ class PointSelection:
     """Selection of points: all combinations of selected indices along a dataset's dimensions."""
 
     dataset: xr.Dataset
-    """Dataset of which points are selected."""
+    """Dataset whose points are selected."""
     dim_tables: Mapping[str, pandas.DataFrame]
     """Table for each dimension: rows are the selected indices, columns the coordinates along it."""
 
@@ -338,7 +338,7 @@ At shorter ranges the shot noise of the echo matters ([T] 4.2).
 
 @dataclass(frozen=True)
 class StudyCut:
-    """Part of a study along which one of range and grazing angle is fixed and the other varies."""
+    """Part of a study in which range is fixed and grazing angle varies, or the reverse."""
 
     name: str
     """Name of the cut: the value of the fixed coordinate, or 'all' for the complete study."""

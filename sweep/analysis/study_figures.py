@@ -244,8 +244,8 @@ def picture_source_text(study_id: str, figure_spec: GridFigure | SceneFigure) ->
 def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
     """Return the specs of a grid's default figures.
 
-    They are surfaces over two long axes, or otherwise slices along a zipped axis or the longest
-    one. A study whose axes have no numbers gets slices over categories, and tables.
+    The figures are surfaces over two long axes, or otherwise slices along a zipped axis or the
+    longest one. A study whose axes have no numbers gets slices over categories, and tables.
     """
     zipped_axes = [axis for axis in spec.axes if axis.is_zipped][:1]
     axes = zipped_axes or sorted(spec.axes, key=lambda axis: -axis.size)
@@ -296,7 +296,7 @@ DEFAULT_CLOUD_QUANTITIES = ("range", "radial_velocity")
 def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
     """Return the specs of a flight's default figures.
 
-    They show the point cloud of each scanner by range, with the flight path, and by radial
+    The figures show the point cloud of each scanner by range, with the flight path, and by radial
     velocity, and the navigation errors.
     """
     scanners = [str(name) for name in tree.attrs["scanners"]]

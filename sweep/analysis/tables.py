@@ -60,7 +60,7 @@ class TablePage:
     title: str
     """Title of the page."""
     page_tables: Sequence[PageTable]
-    """Tables in order."""
+    """Tables of the page, from top to bottom."""
     notes: Sequence[str]
     """Lines of text below the tables."""
     records: Sequence[dict[str, TableCell]]
@@ -248,8 +248,8 @@ TABLE_ROWS_MAX = 100
 def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, TableCell]]:
     """Return statistics of the leakage probabilities of each group of points, as part of a record.
 
-    They are mean and median of the probability of a false alarm by leakage in the up-chirp, by
-    leakage in the down-chirp, and by noise or leakage in both chirps.
+    The statistics are mean and median of the probability of a false alarm due to leakage in the
+    up-chirp, due to leakage in the down-chirp, and due to noise or leakage in both chirps.
     """
     dataset = groups[0].dataset
     dataset_with_shot = dataset.assign(
@@ -269,7 +269,7 @@ def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, TableCel
 def noise_only_reference(
     spec: GridSpec, setting_parameters: dict[str, Any]
 ) -> tuple[dict[str, TableCell], float]:
-    """Return the probabilities of false alarms by noise alone, in closed form and by the model.
+    """Return the probabilities of false alarms due to noise alone, in closed form and by the model.
 
     Parameters
     ----------
@@ -411,7 +411,7 @@ _LEAKAGE_COLUMNS = {
 }  # fmt: skip
 """Record key and number format of each column of the table of leakage, by column name.
 
-Leakage is a false alarm by the window's sidelobes.
+Leakage is a false alarm due to the window's sidelobes.
 """
 _THRESHOLD_COLUMNS = {
     "setting": ("setting", ""), "closed form": ("closed_form", ".6e"),
@@ -427,8 +427,8 @@ def false_alarm_page(
 ) -> TablePage:
     """Return a page with the false-alarm probabilities of a shot for each value of a coordinate.
 
-    It has the form of tables 4.3 to 4.5 of [T]. ``by`` is the name of the coordinate, ``printed``
-    are published values for comparison.
+    The page has the form of tables 4.3 to 4.5 of [T]. ``by`` is the name of the coordinate,
+    ``printed`` are published values for comparison.
     """
     records = false_alarm_records(points, spec, by=by, printed=printed)
     has_printed = any(record["printed"] == record["printed"] for record in records)
@@ -458,7 +458,7 @@ def threshold_page(
 ) -> TablePage:
     """Return a page with the probability of a false alarm in a bin, for each threshold.
 
-    It has the form of table 4.2 of [T]. ``by`` is the name of the threshold's coordinate,
+    The page has the form of table 4.2 of [T]. ``by`` is the name of the threshold's coordinate,
     ``printed`` are published values for comparison.
     """
     records: list[dict[str, TableCell]] = []

@@ -170,7 +170,7 @@ class GaussianBeam(NamedTuple):
 def is_single_mode(parameters: Parameters) -> bool:
     """Return True if the receiver detects light of a single spatial mode.
 
-    All points have to be of one category.
+    All points must have the same text parameters.
     """
     return (
         str(parameters[COUPLING_PATH]) == SINGLE_MODE
@@ -254,7 +254,7 @@ class FootprintAngles(NamedTuple):
 def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> FootprintAngles:
     """Compute the full 1/e^2 angles of the effective footprint, seen from the instrument.
 
-    All points have to be of one category.
+    All points must have the same text parameters.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
 def has_constant_divergence(parameters: Parameters) -> bool:
     """Return True if the footprint's width is the beam divergence times the range, as in [T].
 
-    All points have to be of one category.
+    All points must have the same text parameters.
     """
     return not (
         is_single_mode(parameters)
@@ -335,7 +335,7 @@ def range_loss_coefficients(
     Parameters
     ----------
     parameters : mapping
-        Parameters by dotted path, of points of one category.
+        Parameters by dotted path; all points have the same text parameters.
     range : array_like, optional
         Range R [m]; by default ``target.range``.
 
@@ -346,8 +346,9 @@ def range_loss_coefficients(
 
     Notes
     -----
-    Light collected by an aperture falls as (1 + x)^2. Light of a single mode falls as w_T^2 + w_L^2
-    grows.
+    The loss of light that an aperture collects is (1 + x)^2. The loss of light of a single mode is
+    proportional to w_T^2 + w_L^2, with the radii of the transmitted and of the oscillator's beam at
+    R (1 + x).
     """
     if not is_single_mode(parameters):
         return np.asarray(2.0), np.asarray(1.0)

@@ -116,12 +116,14 @@ class LineSpreadBins(NamedTuple):
 
     deviation: np.ndarray
     """(n,): largest standard deviation of line frequencies of any segment [bins of fs/L]."""
-    linear: np.ndarray
-    """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. Further rows are
-    that of the phase [cycles] by which segments differ.
+    linear_spread: np.ndarray
+    """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. If the target has
+    a roughness, a further row holds twice the spread of the phase difference between segments
+    [cycles].
     """
-    quadratic: np.ndarray
-    """(rows, n): magnitude of the quadratic spread c [bins of fs/L], with the rows of `linear`."""
+    quadratic_spread: np.ndarray
+    """(rows, n): magnitude of the quadratic spread c [bins of fs/L], with the rows of
+    `linear_spread`."""
 
     @property
     def smoothing_deviation(self) -> np.ndarray:
@@ -130,15 +132,18 @@ class LineSpreadBins(NamedTuple):
         With the linear spread s, the quadratic spread c and t <= 2 pi, |E exp(i t (s y + c y^2))|
         <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)).
         """
-        return np.asarray(self.linear / np.sqrt(1 + (4 * np.pi * self.quadratic) ** 2))
+        return np.asarray(
+            self.linear_spread / np.sqrt(1 + (4 * np.pi * self.quadratic_spread) ** 2)
+        )
 
 
 def split_with_beamlet_counts(
     parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points by category, and set the number of beamlets if it is not stated.
+    """Split points into categories, and choose the number of beamlets where none is stated.
 
-    The number then follows from the tolerance.
+    Points of a category share text parameters and array sizes. The chosen number follows from the
+    tolerance.
 
     Parameters
     ----------
@@ -147,7 +152,7 @@ def split_with_beamlet_counts(
     effects : collection of str
         Names of the effects to simulate; without ``footprint`` one beamlet is enough.
     further_paths : collection of str
-        Numeric parameters that points must share, as of
+        Numeric parameters that points must share, as in
         :func:`sweep.model.preparation.split_by_category`.
 
     Yields
@@ -184,7 +189,10 @@ def split_with_beamlet_counts(
 
 
 def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[int, str]:
-    """Return the largest number of beamlets of points of one category, and the pattern's name."""
+    """Return the largest number of beamlets of any point, and the name of their pattern.
+
+    All points share text parameters and array sizes.
+    """
     if beamlets_converge(parameters):
         return ErrorBudget.beamlets_max, "line"
     return ErrorBudget.thesis_beamlet_count, ground.beamlet_pattern(parameters)
@@ -193,7 +201,7 @@ def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[in
 def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) -> int:
     """Return the number of rays of each shot of a flight in the first of several casts.
 
-    It is used for flights whose number of rays follows from the tolerance.
+    This number is used for flights whose number of rays follows from the tolerance.
     """
     if not beamlets_converge(parameters):
         return error_budget.thesis_beamlet_count
@@ -213,7 +221,7 @@ def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -
     n_rays : int
         Number of rays of the last cast, one of `ErrorBudget.ray_counts`.
     error : ndarray (n,)
-        Estimated error, as of :func:`sweep.model.pointcloud.ray_error.estimate_ray_error`; nan
+        Estimated error, as in :func:`sweep.model.pointcloud.ray_error.estimate_ray_error`; nan
         where nothing is hit. It falls about as the reciprocal of the number of rays.
     error_budget : ErrorBudget
         Accuracy of the study.
@@ -259,7 +267,10 @@ def has_numerics_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
-    """Return True if the error of points of one category falls to 0 with more beamlets."""
+    """Return True if the error of points falls to 0 with more beamlets.
+
+    All points share text parameters.
+    """
     return ground.beamlets_add_as_powers(parameters) and str(parameters[PATTERN_PATH]) not in (
         "hexagonal",
         "sunflower",
@@ -274,7 +285,7 @@ def required_beamlets(
     Parameters
     ----------
     parameters : mapping
-        Parameters by dotted path, as arrays, of points of one category.
+        Parameters by dotted path, as arrays; all points share text parameters and array sizes.
     n_points : int
         Number of points n.
 
@@ -362,12 +373,12 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
         + bins_per_speed * velocity_moments.rms
         + zeros,
-        linear=abs(
+        linear_spread=abs(
             bins_per_speed * transverse_velocity * direction_sigma
             + chirp_slopes * bins_per_range * slope
         )
         + zeros,
-        quadratic=abs(
+        quadratic_spread=abs(
             bins_per_speed * radial_velocity * (direction_sigma / position_sigma) ** 2
             + chirp_slopes * bins_per_range
         )
@@ -388,16 +399,16 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
     # The factor 2 is for sums over records, in which the ends hardly count.
     slope = np.vstack(
         [
-            spread.linear,
-            2 * (last_start_bins * spread.linear[1] + carrier_difference_cycles * slope),
+            spread.linear_spread,
+            2 * (last_start_bins * spread.linear_spread[1] + carrier_difference_cycles * slope),
         ]
     )
     quadratic = np.vstack(
         [
-            spread.quadratic,
+            spread.quadratic_spread,
             2
             * (
-                last_start_bins * spread.quadratic[1]
+                last_start_bins * spread.quadratic_spread[1]
                 + carrier_difference_cycles * position_sigma**2 / 2
             ),
         ]
@@ -530,7 +541,10 @@ def _choose_node_lines(
         window_name
     )
     errors_along, errors_across = _quadrature_errors_by_curvature(window_name)
-    quadratic_max, linear_max = spread.quadratic.max(axis=0), spread.linear.max(axis=0)
+    quadratic_max, linear_max = (
+        spread.quadratic_spread.max(axis=0),
+        spread.linear_spread.max(axis=0),
+    )
     # If curvature alone spreads the lines, only the rules' error for squares counts.
     linear_deviation = spread.deviation * np.minimum(linear_max / quadratic_max, 1.0)
     largest_bin_power = largest_bin_powers[np.searchsorted(tabulated_spreads, spread.deviation)]
@@ -540,7 +554,7 @@ def _choose_node_lines(
         + errors_along[:, curvature_index] / largest_bin_power
     )
     error_across = np.zeros((NODE_COUNTS_ACROSS_SLOPE.size, quadratic_max.size))
-    for s, c in zip(spread.smoothing_deviation, spread.quadratic, strict=True):
+    for s, c in zip(spread.smoothing_deviation, spread.quadratic_spread, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.searchsorted(_CURVATURE_RATIOS, np.where(s > 0, c / s, np.inf))
             smoothed_error = _smoothed_errors_by_curvature()[:, ratio] * (
@@ -564,17 +578,20 @@ def _choose_node_lines(
 def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
     """Return the quadrature error of a single line of nodes due to curvature, (n,).
 
-    It is in units of the power of a bin on which a spectral line is centred. The factor 2 includes
-    the equal error along the slope with the fewest nodes.
+    The error is in units of the power of a bin on which a spectral line is centred. The factor 2
+    includes the equal error along the slope with the fewest nodes.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
         smoothed_error = (
-            density * math.sqrt(np.pi / 2) * (spread.quadratic / spread.smoothing_deviation) ** 2
+            density
+            * math.sqrt(np.pi / 2)
+            * (spread.quadratic_spread / spread.smoothing_deviation) ** 2
         )
     lobe_shape = window_response(window_name, _WINDOW_SAMPLES, _WINDOW_SAMPLES)
     return np.asarray(
-        2 * np.fmin(lobe_shape.curvature_max * spread.quadratic**2, smoothed_error).max(axis=0)
+        2
+        * np.fmin(lobe_shape.curvature_max * spread.quadratic_spread**2, smoothed_error).max(axis=0)
     )
 
 
@@ -600,7 +617,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     weight = _window_autocorrelation(window_name, lag)
     errors = np.empty((NODE_COUNTS.size, spreads.size + 1))
     for row, n_nodes in zip(errors, NODE_COUNTS.tolist(), strict=True):
-        row[:] = np.append(_substitute_error(spreads, n_nodes), np.inf)
+        row[:] = np.append(_node_spacing_as_error(spreads, n_nodes), np.inf)
         for i, spread in enumerate(spreads.tolist()):
             rule_error = (
                 weight * _quadrature_error_for_cosine(n_nodes, 2 * np.pi * spread * lag)
@@ -608,7 +625,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
             if rule_error > 1:
                 break  # wider spreads have larger errors
             row[i] = rule_error
-        row[-1] = _substitute_error(1e3, n_nodes)
+        row[-1] = _node_spacing_as_error(1e3, n_nodes)
     return (
         spreads,
         np.maximum.accumulate(errors, axis=1),
@@ -616,7 +633,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     )
 
 
-def _substitute_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
+def _node_spacing_as_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
     """Return the distance between nodes [bins], at least 1, in place of an unbounded error.
 
     More nodes are then preferred where no error has a bound.
@@ -644,14 +661,15 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
     def errors_of_rule(n_nodes: int) -> np.ndarray:
         """Return the errors of a quadrature with `n_nodes` nodes, (m + 1,).
 
-        They apply at _CURVATURES; the last one applies beyond the largest curvature.
+        The errors apply at _CURVATURES; the last one applies beyond the largest curvature.
         """
         rule_errors = (
             weight
             * np.interp(phase, _CURVATURE_PHASES, _quadrature_error_for_quadratic_phase(n_nodes))
         ).sum(axis=1)
         return np.append(
-            np.where(rule_errors < 1, rule_errors, _substitute_error(_CURVATURES, n_nodes)), 1e3
+            np.where(rule_errors < 1, rule_errors, _node_spacing_as_error(_CURVATURES, n_nodes)),
+            1e3,
         )
 
     along, across = NODE_COUNTS.tolist(), (2 * NODE_COUNTS_ACROSS_SLOPE).tolist()
@@ -698,7 +716,7 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
     """Return a lower bound on the largest bin's power, over that of all lines at one bin's centre.
 
     `deviation` is the standard deviation of line frequencies [bins of fs/L]. See
-    :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for`.
+    :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for_spread`.
     """
     narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
     wide = (1 - 1 / _CHEBYSHEV_MULTIPLES**2) * lobe_shape.central_energy_min
@@ -713,7 +731,7 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
 def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
     """Return the magnitude of a window's autocorrelation at lags [record lengths].
 
-    It is divided by the signed sum of the autocorrelation over all lags.
+    The magnitude is divided by the signed sum of the autocorrelation over all lags.
     """
     w = window_samples(window_name, _WINDOW_SAMPLES)
     r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _WINDOW_SAMPLES)) ** 2)[: _WINDOW_SAMPLES + 1]

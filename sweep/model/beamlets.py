@@ -147,7 +147,7 @@ def _hexagonal_lattice(n_points: int) -> np.ndarray:
 def lattice_radius(n_beamlets: int) -> float:
     """Return the radius of a hexagonal lattice before it is mapped to the beam's covariance.
 
-    It is in standard deviations of the beam.
+    The radius is in standard deviations of the beam.
     """
     return math.sqrt(
         PATTERN_RADIUS_SIGMA**2 + SQUARED_RADIUS_GROWTH * math.log(max(n_beamlets, 19) / 19)
@@ -167,7 +167,7 @@ def _sunflower_pattern(n_points: int) -> np.ndarray:
 def _product_quadrature(pattern: str, n_beamlets: int) -> tuple[np.ndarray, np.ndarray]:
     """Return beamlet directions and weights of a product of two quadratures.
 
-    One quadrature runs along the slope, the other across it. The results are as of
+    One quadrature runs along the slope, the other across it. The results are as in
     `place_beamlets`.
     """
     if pattern == "square":
@@ -207,7 +207,7 @@ def plane_footprint(
     beam_divergence : ndarray (n,)
         Full 1/e^2 angle of the beam [rad].
     n_beamlets, pattern
-        Number and pattern, as of :func:`place_beamlets`.
+        Number and pattern, as in :func:`place_beamlets`.
     radial_velocity, transverse_velocity : array_like
         Velocity along the beam, positive when closing, and across it, positive towards the near
         side of the plane [m/s].
@@ -261,7 +261,7 @@ def plane_footprint(
 class OffsetMoments(NamedTuple):
     """Moments of beamlets' offsets from the beam's axis in range or velocity.
 
-    They are weighted by echo power.
+    The moments are weighted by echo power.
     """
 
     mean: np.ndarray | float
@@ -295,7 +295,7 @@ NO_SPREAD = OffsetMoments(0.0, 0.0, 0.0)
 def pattern_radius(n_beamlets: int, pattern: str) -> float:
     """Return the largest angle between a beamlet and the axis [standard deviations of the beam].
 
-    `n_beamlets` and `pattern` are as of :func:`place_beamlets`.
+    `n_beamlets` and `pattern` are as in :func:`place_beamlets`.
     """
     directions, _ = place_beamlets(n_beamlets, pattern)
     return float(np.sqrt((directions**2).sum(axis=0)).max())
@@ -322,7 +322,7 @@ def plane_offset_moment_bounds(
     beam_divergence : array_like
         Full 1/e^2 angle of the positions [rad].
     n_beamlets, pattern
-        Number and pattern, as of :func:`place_beamlets`.
+        Number and pattern, as in :func:`place_beamlets`.
     direction_spread_angle : array_like, optional
         Full 1/e^2 angle of the directions along which velocities are seen [rad]; by default
         `beam_divergence`.
@@ -399,7 +399,7 @@ def plane_echo_ratio_bound(
     grazing_angle, beam_divergence : ndarray (n,)
         Angle between axis and plane, and full 1/e^2 angle of the beam [rad].
     n_beamlets, pattern
-        Number and pattern, as of :func:`place_beamlets`.
+        Number and pattern, as in :func:`place_beamlets`.
 
     Notes
     -----
@@ -432,8 +432,8 @@ def bins_per_velocity(
 
     Notes
     -----
-    2/c times the sum of the carrier and of twice the range's beat, which the Doppler ratio beta
-    scales.
+    The shift is (2 / c) (f + 2 f_R) over the bin width, with the carrier f and the range beat f_R =
+    2 S R / c of the chirp rate S and the range R.
     """
     doubled_range_beat = (
         np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)

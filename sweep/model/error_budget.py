@@ -76,9 +76,9 @@ class ErrorBudget:
     """
 
     leakage_error: ArrayLike = AUTOMATIC
-    """Tolerated probability of a false peak by the echo's signal in bins far from its lines. This
-    part of the leakage is then not evaluated. By default it is `leakage_fraction` of the tolerance.
-    With a smaller value more bins are evaluated.
+    """Tolerated probability of a false peak due to the echo's signal in bins far from its lines.
+    This part of the leakage is then not evaluated. By default it is `leakage_fraction` of the
+    tolerance. With a smaller value more bins are evaluated.
     """
 
     leakage_floor: ArrayLike = AUTOMATIC
@@ -140,9 +140,9 @@ class ErrorBudget:
     """
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
-    """Numbers of rays that may be cast for a shot. They are those of full shells of the lattice,
-    which are symmetric. Symmetry makes results on smooth ground a hundred times more exact. The
-    first number is the smallest from which an error can be estimated. Each ray costs some 80 ns."""
+    """Numbers of rays that may be cast for a shot. They fill whole shells of the lattice, which are
+    symmetric. Symmetry makes results on smooth ground a hundred times more exact. The first number
+    is the smallest from which an error can be estimated. Each ray costs some 80 ns."""
 
     rays_tolerance_min: float = 1e-6
     """Tolerance below which the number of rays per shot does not increase further."""
@@ -179,7 +179,7 @@ class ErrorBudget:
 
     @property
     def allowed_leakage(self) -> np.ndarray:
-        """Tolerated probability of a false peak by leaked signal that is not evaluated."""
+        """Tolerated probability of a false peak due to leaked signal that is not evaluated."""
         return self._stated_or_fraction(self.leakage_error, self.leakage_fraction)
 
     @property

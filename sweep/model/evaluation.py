@@ -111,7 +111,7 @@ def prepare_ray_traced_shots(
     Parameters
     ----------
     parameters : mapping
-        As of :func:`prepare_shots`. Ranges and radial velocities are those of the beam's centre;
+        As in :func:`prepare_shots`. Ranges and radial velocities are those of the beam's centre;
         grazing angle and reflectance law are not used.
     ground : RayTracedGround
         Footprints of the shots.
@@ -186,7 +186,7 @@ def evaluate(
     Parameters
     ----------
     parameters : mapping
-        As of :func:`prepare_shots`.
+        As in :func:`prepare_shots`.
     effects : collection of str
         Names of the effects to simulate.
     segment_evaluator : callable
@@ -410,7 +410,7 @@ def fit_peaks(
 def _false_alarm_probabilities(shots: Shots, n_exempt: np.ndarray) -> dict[str, np.ndarray]:
     """Compute the false-alarm probabilities of noise, and their decimal logarithms.
 
-    They refer to a bin, the up-chirp, both chirps and any segment of the shot.
+    The probabilities refer to a bin, the up-chirp, both chirps and any segment of the shot.
 
     Parameters
     ----------

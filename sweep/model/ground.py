@@ -76,7 +76,7 @@ class BeamletTable(NamedTuple):
     row_of_point: np.ndarray
     """(n,) int64: index of the row of each point."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of a beamlet minus that on the axis, over the latter."""
+    """(rows, beamlets): range of a beamlet minus that on the axis, over the range on the axis."""
     doppler_ratio_offset: np.ndarray
     """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis. v_r is the
     radial velocity.
@@ -90,7 +90,7 @@ class BeamletTable(NamedTuple):
 class BeamGradients(NamedTuple):
     """Changes of Doppler ratio, range and echo across a footprint.
 
-    They are per standard deviation of the beam, (n,) each.
+    The changes are per standard deviation of the beam, (n,) each.
     """
 
     doppler_ratio: np.ndarray
@@ -135,7 +135,7 @@ class _PlaneGeometry(NamedTuple):
 
 
 class FlatGround:
-    """Flat ground that the beams of one category of points meet.
+    """Flat ground that the beams of n points with the same text parameters meet.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ class FlatGround:
             on the axis.
         delay_cycles : array_like
             Cycles per unit of relative range, (n,) or scalar; dR / R is the range minus that on the
-            axis, over the latter.
+            axis, over the range on the axis.
 
         Notes
         -----
@@ -231,7 +231,7 @@ class FlatGround:
     def gradients(self) -> "BeamGradients":
         """Changes of Doppler ratio, range and echo towards the near side of the plane.
 
-        They are per standard deviation of the beam.
+        The changes are per standard deviation of the beam.
         """
         geometry = self._geometry
         range_gradient = (geometry.position_spread_angle / 4) / np.tan(geometry.grazing_angle)
@@ -251,7 +251,9 @@ class FlatGround:
         grazing_angles, angle_index = np.unique(self._geometry.grazing_angle, return_inverse=True)
         relative_echo = backscatter(self._reflectance_law, np.sin(grazing_angles))[:, None]
         zeros = np.zeros_like(relative_echo)
-        return BeamletTable(_row_indices(angle_index, n_points), zeros, zeros, relative_echo)
+        return BeamletTable(
+            _table_rows_of_points(angle_index, n_points), zeros, zeros, relative_echo
+        )
 
     @cached_property
     def beamlets(self) -> BeamletTable:
@@ -279,7 +281,7 @@ class FlatGround:
         relative_echo = weights * backscatter(self._reflectance_law, cos_incidence) / range_loss
         doppler_ratio_offset = np.where(weights > 0, 2 * closing_offset / SPEED_OF_LIGHT, 0.0)
         return BeamletTable(
-            _row_indices(geometry_of_point, self._n_points),
+            _table_rows_of_points(geometry_of_point, self._n_points),
             relative_range_offset,
             doppler_ratio_offset,
             relative_echo,
@@ -319,7 +321,7 @@ Ground = FlatGround | RayTracedGround
 def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
     """Return True if beamlets add as powers, False if as amplitudes.
 
-    All points have to be of one category.
+    All points must have the same text parameters.
     """
     incoherent = str(parameters["footprint.phases"]) == "incoherent"
     return incoherent and str(parameters["instrument.receiver.architecture"]) != "direct"
@@ -336,7 +338,7 @@ def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
     return "hexagonal" if beamlets_add_as_powers(parameters) else "sunflower"
 
 
-def _row_indices(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
+def _table_rows_of_points(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
     """Return the table row of each of n points, (n,) int64.
 
     ``row_of_point`` is (n,), or one row for all points.
@@ -352,7 +354,8 @@ class FootprintExtent(NamedTuple):
     total_echo_ratio: np.ndarray | float
     """Echo of all beamlets, over that of a single line on the beam's axis."""
     range_offsets: OffsetMoments
-    """Moments of the beamlets' relative range offsets: range minus the axis's, over the latter."""
+    """Moments of the beamlets' relative range offsets: range minus that on the axis, over the range
+    on the axis."""
     axis_surface_range_offsets: OffsetMoments
     """Moments of the relative range offsets of those beamlets on the same surface as the axis."""
     velocity_offsets: OffsetMoments
@@ -368,7 +371,7 @@ class FootprintExtent(NamedTuple):
     """
 
 
-def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
+def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
     """Compute the :class:`FootprintExtent` of footprints by ray tracing."""
     _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
     off_axis_surface = ground.off_axis_surface

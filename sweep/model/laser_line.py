@@ -211,7 +211,7 @@ def pedestal_power_under_line(
     Parameters
     ----------
     line_width, delay, duration : ndarray (n,)
-        As of :func:`pure_line_power_fraction`.
+        As in :func:`pure_line_power_fraction`.
     window : Window
         Window of the record.
 
@@ -302,7 +302,7 @@ def apparent_line_and_pedestal(
     Parameters
     ----------
     line_width, delay, duration : ndarray (n,)
-        As of :func:`pure_line_power_fraction`.
+        As in :func:`pure_line_power_fraction`.
     window : Window
         Window of the record.
     looks : int

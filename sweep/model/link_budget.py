@@ -96,12 +96,12 @@ class LineMotion(NamedTuple):
     look is one of several records of the same segment.
     """
     range_walk_time: np.ndarray | float = 0.0
-    """Time [s] from the start of the shot to the instant at which the target has the range that
-    beats measure.
+    """Time [s] from the start of the shot to the instant whose range the beats measure. The target
+    closes in this time.
     """
     velocity_drift_time: np.ndarray | float = 0.0
-    """Time [s] from the start of a segment to the instant at which the target has the velocity that
-    the segment's beat measures.
+    """Time [s] from the start of a segment to the instant whose velocity its beat measures. The
+    target accelerates in this time.
     """
     velocity_bias_fraction: np.ndarray | float = 0.0
     """Fraction of the radial velocity by which beats underestimate it."""
@@ -120,8 +120,7 @@ class WaveformSettings:
     :attr:`chirp_rate`. They are numbers, or arrays if points differ.
     """
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """Frequency at the start of each segment [Hz]. Times the echo's delay it gives the echo's phase
-    in cycles."""
+    """Frequency at the start of each segment [Hz]; its product with the echo's delay is a phase."""
     chirp_bandwidth: np.ndarray
     """Bandwidth of the up-chirp [Hz]."""
     chirp_duration: np.ndarray
@@ -186,7 +185,7 @@ class WaveformSettings:
     def look_period(self) -> np.ndarray:
         """Time [s] from the start of one look to that of the next.
 
-        It is the duration of all segments and gaps of the shot.
+        The time is the duration of all segments and gaps of the shot.
         """
         return len(self.segment_order) * (self.chirp_duration + self.segment_gap)
 
@@ -576,7 +575,8 @@ class LinkBudget:
     def tnr(self) -> np.ndarray:
         """Threshold-to-noise ratio, as set by the processing parameters.
 
-        It is the threshold over the standard deviation of a bin's magnitude with noise alone.
+        The ratio is the threshold over the standard deviation of a bin's magnitude with noise
+        alone.
         """
         return tnr_from_parameters(self.parameters)
 
@@ -620,7 +620,7 @@ def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the speed at which the range along the beam falls [m/s], (n,) or scalar.
 
-    It differs from the radial velocity if the beam slides over sloping ground.
+    This speed differs from the radial velocity if the beam slides over sloping ground.
 
     Notes
     -----

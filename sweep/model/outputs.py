@@ -234,15 +234,17 @@ RUNNING_SUM_OUTPUTS: dict[str, OutputVariable] = {
 """Output variable of the sums over draws of random effects, one row for each point. Later draws can
 be added to these sums."""
 
-IS_LOGARITHM = np.array([name.startswith("log10_") for name in GRID_OUTPUTS])
+OUTPUT_IS_LOGARITHM = np.array([name.startswith("log10_") for name in GRID_OUTPUTS])
 """(outputs,) bool: True for those of GRID_OUTPUTS that are logarithms."""
-KEEPS_SPREAD = IS_LOGARITHM | np.array(
+OUTPUT_HAS_SQUARED_DEVIATIONS = OUTPUT_IS_LOGARITHM | np.array(
     [f"{name}_error" in STANDARD_ERROR_OUTPUTS for name in GRID_OUTPUTS]
 )
 """(outputs,) bool: True for those of GRID_OUTPUTS whose squared deviations from the mean are summed
 over draws."""
 
-N_RUNNING_SUMS = len(GRID_OUTPUTS) + int(KEEPS_SPREAD.sum()) + int(IS_LOGARITHM.sum())
+N_RUNNING_SUMS = (
+    len(GRID_OUTPUTS) + int(OUTPUT_HAS_SQUARED_DEVIATIONS.sum()) + int(OUTPUT_IS_LOGARITHM.sum())
+)
 """Number of values in a row of running sums. The row contains what further draws need in addition
 to the stored means: numbers of values, sums of squared deviations, and the largest logarithms."""
 

@@ -84,7 +84,7 @@ def receiver_noise(
     architecture : str
         One of :data:`ARCHITECTURES`.
     receiver : mapping
-        Parameters, as of :func:`receiver_parameters`, (n,) or scalars.
+        Parameters, as in :func:`receiver_parameters`, (n,) or scalars.
     samples_iq : bool
         True for two receivers that sample I and Q. The variances are then those of a real record
         whose bins have the same noise.

@@ -34,7 +34,8 @@ class FootprintLines(NamedTuple):
     row_of_point: np.ndarray
     """(n,) int64: index of each point's row in the arrays."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of a beamlet minus that on the beam's axis, over the latter."""
+    """(rows, beamlets): range of a beamlet minus that on the beam's axis, over the range on the
+    axis."""
     doppler_ratio_offset: np.ndarray
     """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the beam's axis. v_r is
     the radial velocity.
@@ -134,7 +135,7 @@ class ErrorTolerances(NamedTuple):
     beamlets.
     """
     leakage_probability: np.ndarray
-    """Probability of false alarms by leaked signal far from the lines that may be neglected."""
+    """Probability of false alarms due to leaked signal far from the lines that may be neglected."""
     leakage_floor: np.ndarray
     """Leaked signal in a bin, over the noise sigma, below which the bin counts as noise alone. The
     value :data:`sweep.model.error_budget.AUTOMATIC` means that it follows from

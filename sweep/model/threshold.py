@@ -112,7 +112,7 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
     noise_bins = tuple(_noise_bins(parameters, segment) for segment in segments)
     if band_bins is None and log_pfa.ndim == 0:
         return _common_threshold_ratio(float(log_pfa), looks, noise_bins) / RAYLEIGH_DEVIATION
-    return solve_threshold_ratio(log_pfa, _log_pfa_law(looks, noise_bins)) / RAYLEIGH_DEVIATION
+    return solve_threshold_ratio(log_pfa, _log_pfa_function(looks, noise_bins)) / RAYLEIGH_DEVIATION
 
 
 class NoiseBins(NamedTuple):
@@ -142,10 +142,10 @@ def _common_threshold_ratio(
     ``log_pfa`` is the natural logarithm of the probability that noise raises an alarm in any
     segment.
     """
-    return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_law(looks, noise_bins))
+    return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_function(looks, noise_bins))
 
 
-def _log_pfa_law(
+def _log_pfa_function(
     looks: Looks, noise_bins: Sequence[NoiseBins]
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that gives the log probability of a false alarm in any segment.

@@ -91,7 +91,7 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
     shots : Shots
         Prepared shots of n points.
     with_range_walk : bool
-        As of :func:`time_domain_spectrum`.
+        As in :func:`time_domain_spectrum`.
 
     Returns
     -------
@@ -156,7 +156,7 @@ def analytic_record(
     point, segment, beamlet : int
         Indices of the point, the segment and the beamlet.
     with_range_walk, with_acceleration : bool
-        As of :func:`time_domain_spectrum`.
+        As in :func:`time_domain_spectrum`.
 
     Returns
     -------
@@ -208,7 +208,7 @@ def analytic_record(
     if not with_range_walk:
         chirp_phase = start_delay * (delay_change - t)
     cycles = -carrier * delay_change + chirp_slope * chirp_rate * chirp_phase
-    start_phase = _start_phase(
+    start_phase = _start_phase_cycles(
         chirp_slope, carrier, chirp_rate, axis_range, range_offset, range_decrease
     )
     beat = carrier * doppler_ratio - chirp_slope * chirp_rate * start_delay * (1 + doppler_ratio)
@@ -231,7 +231,7 @@ def analytic_record(
     return np.asarray(record)
 
 
-def _start_phase(
+def _start_phase_cycles(
     chirp_slope: float,
     carrier: float,
     chirp_rate: float,
@@ -241,9 +241,9 @@ def _start_phase(
 ) -> float:
     """Compute the phase of a beamlet's beat at the segment's start [cycles], in exact fractions.
 
-    It is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is ``carrier``,
-    s ``chirp_slope``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR ``range_offset`` and
-    decrease ``range_decrease``.
+    The phase is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is
+    ``carrier``, s ``chirp_slope``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR
+    ``range_offset`` and decrease ``range_decrease``.
     """
     delay = Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease)
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)

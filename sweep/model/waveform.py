@@ -55,7 +55,7 @@ TWO_BEAT_ASSUMPTION_PATH = "instrument.processing.two_beats"
 """Parameter path of the assumption that gives range and velocity from two beats of unknown sign. It
 is one of `TWO_BEAT_ASSUMPTIONS`."""
 PEAKS_PATH = "instrument.processing.peaks"
-"""Parameter path of which peaks a segment reports, one of `REPORTED_PEAKS`."""
+"""Parameter path of the choice of peaks that a segment reports, one of `REPORTED_PEAKS`."""
 ALL_PEAKS, STRONGEST_PEAK = REPORTED_PEAKS = ("all", "strongest")
 """Names of the peaks that a segment reports: all above the threshold, or the strongest alone."""
 FAR_TARGET, FAST_TARGET = TWO_BEAT_ASSUMPTIONS = ("far", "fast")
@@ -100,9 +100,10 @@ class WaveformSegment(NamedTuple):
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
+    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
     includes_leakage: bool
-    """True if leakage, false alarms by the echo's signal far from its line, is evaluated here."""
+    """True if leakage, false alarms due to the echo's signal far from its line, is evaluated
+    here."""
     range_decrease: np.ndarray | float
     """Decrease of the target's range from the start of the shot to that of the segment [m]."""
     doppler_ratio: np.ndarray | float
@@ -147,7 +148,7 @@ def carrier_frequencies(
     architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray,
     bandwidth: np.ndarray, chirp_slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the frequency at the start of each segment, by which a delay makes a phase [Hz].
+    """Return the frequency at the start of each segment [Hz]; times a delay it is a phase.
 
     Parameters
     ----------
@@ -287,8 +288,8 @@ this counts as inside."""
 def record_length(parameters: Mapping[str, Any]) -> np.ndarray:
     """Return the number of samples in the record, (n,) int64, for parameters by dotted path.
 
-    It is the FFT size, or the number of samples between the acquisition delay and the chirp's end,
-    if that is smaller.
+    The number is the FFT size, or the number of samples between the acquisition delay and the
+    chirp's end, if that is smaller.
     """
     time_left = (
         parameters["instrument.chirp.duration"]
@@ -339,8 +340,9 @@ def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray
 
 
 FOLD_PENALTY_BINS = 4.0
-"""Advantage [bins] of interpretations of the peaks in which no peak is folded at Nyquist. One with
-a fold is chosen only if its mismatch of the third peak is smaller by more than this."""
+"""Penalty [bins] of interpretations of the peaks in which a peak is folded at Nyquist. Such an
+interpretation is chosen only if its mismatch of the third peak is smaller by more than the
+penalty."""
 
 N_READINGS = 16
 """Number of interpretations (readings) of peaks of unknown sign. They differ in which peaks are
@@ -415,7 +417,7 @@ def range_velocity_of_beats(  # type: ignore[no-untyped-def]  # of arrays, or co
     Parameters
     ----------
     f_d, f_r : float or ndarray
-        Signed Doppler frequency and range beat [Hz], as of :func:`beats_of_reading`.
+        Signed Doppler frequency and range beat [Hz], as in :func:`beats_of_reading`.
     carrier, bandwidth, duration : float or ndarray
         Carrier of the up-chirp [Hz], bandwidth [Hz] and duration [s] of a chirp.
 
@@ -634,7 +636,7 @@ def range_velocity_response(
     beats : ndarray (k, n)
         Changes of the signed beats [Hz].
     weights, carriers, chirp_rates : ndarray (k, n)
-        As of :func:`fit_range_velocity`.
+        As in :func:`fit_range_velocity`.
 
     Returns
     -------

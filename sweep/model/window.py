@@ -93,7 +93,7 @@ class Window:
         return tuple(map(float, weights / weights.sum()))
 
     def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
-        """Return how wide a group of lines may be for J equivalent lines to represent it.
+        """Return the largest width of a group of lines that J equivalent lines can represent.
 
         The widths are half-widths times pi [rad]. The result is that of
         :func:`sweep.model.spectrum.lines.node_phase_limits`, for the tolerances of sums of
@@ -112,7 +112,7 @@ class Window:
     def equivalent_noise_bandwidth(self) -> float:
         """Equivalent noise bandwidth [bins of fs/L].
 
-        It is L times the sum of squared samples, over the squared sum of samples.
+        The bandwidth is L times the sum of squared samples, over the squared sum of samples.
         """
         return self.length * self.energy / self.sum**2
 

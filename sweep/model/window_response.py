@@ -252,7 +252,7 @@ def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampl
 def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tabulate bounds of :func:`missing_sample_bounds` by number of missing samples, (L + 1,) each.
 
-    They are the lost fraction, and the factors by the variation of missing and of remaining
+    The bounds are the lost fraction, and the factors by the variation of missing and of remaining
     samples.
     """
     w = window_samples(window.name, window.length)

@@ -172,14 +172,15 @@ def join_facets(facets_list: Sequence[Facets]) -> Facets:
     )
 
 
-_REPAIR_TEXT_BY_COUNT = {
+_REPAIR_TEXT_BY_REPORT_FIELD = {
     "n_non_finite_faces": "{} faces without data dropped",
     "n_degenerate_faces": "{} faces without area dropped",
     "n_duplicate_faces": "{} duplicate faces dropped",
     "n_merged_vertices": "{} coincident vertices merged",
     "n_unreferenced_vertices": "{} unused vertices dropped",
 }
-"""Texts about repairs of a mesh, with a place for the number, by field of `MeshCleaningReport`."""
+"""Templates of texts about repairs of a mesh, each for one number of `MeshCleaningReport`, by the
+name of its field."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,8 @@ class MeshCleaningReport:
     def summary(self) -> str:
         """Return one line of text: numbers of faces and vertices before cleaning, and repairs."""
         counts = [
-            (template, getattr(self, name)) for name, template in _REPAIR_TEXT_BY_COUNT.items()
+            (template, getattr(self, name))
+            for name, template in _REPAIR_TEXT_BY_REPORT_FIELD.items()
         ]
         repairs = [template.format(count) for template, count in counts if count]
         input_text = f"{self.n_faces:,} faces on {self.n_vertices:,} vertices"
@@ -400,12 +402,12 @@ def _read_polygon_facets(path: Path) -> tuple[list[Facets], str | None]:
 
 
 def _read_triangle_facets(path: Path) -> tuple[list[Facets], str | None]:
-    """Read the parts of a file of triangles.
+    """Read the meshes of a glTF or STL file.
 
     Returns
     -------
     facets : list of Facets
-        Facets of each part, in the coordinates of the file.
+        Facets of each mesh of the file's scene, in the coordinates of the file.
     unit : str or None
         Unit of length that the file states.
     """

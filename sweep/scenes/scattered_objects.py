@@ -633,7 +633,10 @@ def draw_tree_clump(
             raise ValueError(f"a tree at ({x:.1f}, {y:.1f}) m would stand beside the ground")
         foot_position = np.array([x, y, z]) - terrain.origin
         size_factor = 1 + tree.variation * generator.uniform(-1.0, 1.0)
-        for facets in (trunk_facets(tree, size_factor), crown_facets(generator, tree, size_factor)):
+        for facets in (
+            trunk_facets(tree, size_factor),
+            draw_crown_leaves(generator, tree, size_factor),
+        ):
             parts.append(
                 Facets(
                     facets.vertices + foot_position, facets.faces, facets.surface, terrain.origin
@@ -699,7 +702,7 @@ def trunk_facets(tree: MeanTreeDimensions, size_factor: float = 1.0) -> Facets:
     )
 
 
-def crown_facets(
+def draw_crown_leaves(
     generator: np.random.Generator, tree: MeanTreeDimensions, size_factor: float = 1.0
 ) -> Facets:
     """Draw the leaves of a tree whose foot is at the origin.

@@ -332,7 +332,7 @@ class NumericRule(Rule):
 
     @property
     def bound_texts(self) -> dict[str, str]:
-        """Text of each bound that is set, by the name of its field, such as ``at_least``."""
+        """Texts of the bounds that are set, by kind of bound, such as ``at_least``."""
         bound_texts = {name: getattr(self, name) for name in _BOUND_KINDS}
         return {
             name: bound_text for name, bound_text in bound_texts.items() if bound_text is not None

@@ -312,8 +312,8 @@ def objects_match_digest(
 ) -> bool:
     """Tell whether stored objects have the expected digest.
 
-    A mismatch in an object store is checked by a second read. ``bytes_max``, and errors, are as in
-    :func:`stored_objects_digest`.
+    A mismatch in an object store is confirmed by a second read. ``bytes_max``, and the errors that
+    are raised, are those of :func:`stored_objects_digest`.
     """
     matches = stored_objects_digest(path, object_names, bytes_max) == expected_digest
     return matches or (

@@ -61,7 +61,7 @@ from sweep.tasks.engine.study_store import (
     refuse_other_versions,
     refuse_to_replace,
     remove_store,
-    sync_to_disk,
+    sync_file_system,
 )
 from sweep.tasks.studies import study_loading
 from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world
@@ -489,7 +489,7 @@ def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
     staging_path = staging_path_for(final_path)
     with raise_as_store_error(f"{staging_path} can't take the place of {final_path}"):
         if durable:
-            sync_to_disk(staging_path)
+            sync_file_system(staging_path)
         replace_path(staging_path, final_path)
         remove_predecessors_from_recipe(
             final_path

@@ -24,7 +24,7 @@ from sweep.model.outputs import (
     SHOT_STATISTIC_VARIABLES,
     SHOT_VARIABLES,
 )
-from sweep.model.pointcloud.eyepoints import observe_eyepoints
+from sweep.model.pointcloud.eyepoints import compute_eyepoints
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
     index = np.array([3, 77, 130, 311])
     for name in spec.scanners:
         found = read_eyepoints(scene_store, tree[name].to_dataset(), index)
-        cast = observe_eyepoints(
+        cast = compute_eyepoints(
             index,
             flight=spec.build_flight(),
             scanner=spec.scan_pattern(name),

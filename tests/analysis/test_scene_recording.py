@@ -159,8 +159,8 @@ def test_a_place_is_the_first_that_fits_and_says_what_it_left_open(spec):
         find_axis_position(spec, {}),
         find_axis_position(spec, {"power": ["1 W", "1000 mW"]}),
     )
-    assert (first.axis_indices, first.open_axes) == ({"power": 0}, ("power",))
-    assert (strong.axis_indices, strong.open_axes) == ({"power": 1}, ())
+    assert (first.axis_indices, first.undetermined_axes) == ({"power": 0}, ("power",))
+    assert (strong.axis_indices, strong.undetermined_axes) == ({"power": 1}, ())
     assert strong.label == "power 1000 mW"
     assert parameters_at(spec, strong.axis_indices)["instrument.laser.power"] == 1.0
     assert parameters_at(spec, first.axis_indices)["instrument.laser.power"] == pytest.approx(

@@ -487,7 +487,7 @@ def set_up_store(arena: ChaosStudy, command: str, undisturbed: Path, rng: random
             content[len(content) * 2 // 3] ^= 4
             (arena.store / name).write_bytes(content)
     if arena.disk:
-        study_store.sync_to_disk(arena.store)
+        study_store.sync_file_system(arena.store)
 
 
 def plan_kills(

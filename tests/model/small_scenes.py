@@ -5,7 +5,7 @@ import numpy as np
 from sweep.model.geometry.body_motion import ConstantAcceleration, FixedAttitude, MovingBody
 from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.geometry.scanner import fixed_beams
-from sweep.model.pointcloud.eyepoints import observe_eyepoints
+from sweep.model.pointcloud.eyepoints import compute_eyepoints
 from sweep.scenes.meshes import clean_mesh
 
 LEVEL_ATTITUDE = 1.0, 0.0, 0.0, 0.0
@@ -38,7 +38,7 @@ def observe_shots(
     """Eyepoints of shots over plates, 19 beamlets of 50 urad unless said otherwise."""
     meshes = [level_plate()] if bodies is None else bodies
     body_motion = keywords.pop("body_motion", None)
-    return observe_eyepoints(
+    return compute_eyepoints(
         np.asarray(index),
         flight=flight,
         scanner=scanner or fixed_beams(beams, rate=1.0),

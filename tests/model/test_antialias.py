@@ -170,13 +170,13 @@ def test_a_leaked_line_passes_the_filter_at_its_own_frequency(table_4_1):
 
 def test_skirts_at_an_echo_are_whitened_as_the_echo_is(table_4_1, monkeypatch):
     """Their share of it is that of a spectrum that is not whitened; a bin's density is 1 % off."""
-    shares, raised = [], permanent_line.equivalent_echo_magnitude
+    shares, raised = [], permanent_line.echo_magnitude_with_line
 
     def seen(magnitudes, skirts, **given):
         shares.append(skirts[magnitudes.argmax()] / magnitudes.max())
         return raised(magnitudes, skirts, **given)
 
-    monkeypatch.setattr(permanent_line, "equivalent_echo_magnitude", seen)
+    monkeypatch.setattr(permanent_line, "echo_magnitude_with_line", seen)
     leak = {"instrument.telescope.leak_path": 3.0, "instrument.telescope.isolation": 1e6}
     for shape in ("receiver", "white"):
         scene = scene_of(table_4_1, 280e6) | leak | {"instrument.receiver.noise_shape": shape}

@@ -15,7 +15,7 @@ from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.geometry.scanner import fixed_beams
 from sweep.model.ground import FlatGround
-from sweep.model.pointcloud.eyepoints import observe_eyepoints, prepare_eyepoint_shots
+from sweep.model.pointcloud.eyepoints import compute_eyepoints, prepare_eyepoint_shots
 
 WAVELENGTH = 1550e-9
 SIDE, NUMBER = 0.12, 512
@@ -192,7 +192,7 @@ def test_a_flight_sees_a_plane_as_a_grid_does(table_4_1):
         radial_velocity=60.0,
     ) | {beam.WAIST_PATH: 5e-3, beam.FOCUS_PATH: 70.0}  # fmt: skip
     path = straight_flight(position=(0.0, 0.0, 40.0), velocity=(36.0, 0.0, -48.0))
-    eyepoints = observe_eyepoints(
+    eyepoints = compute_eyepoints(
         np.array([0]),
         flight=path,
         scanner=fixed_beams(np.array([[0.6, 0.0, -0.8]]), rate=1.0),
@@ -220,7 +220,7 @@ def test_leaves_before_the_focus_dim_and_shine_as_the_overlap_says(table_4_1):
         | {beam.WAIST_PATH: 8e-3, beam.FOCUS_PATH: 50.0}
     )
     leaf = level_plate(x=(0.0, 10.0), height=39.0, surface=1)
-    eyepoints = observe_eyepoints(
+    eyepoints = compute_eyepoints(
         np.array([0]),
         flight=straight_flight(position=(-1e-4, 0.0, 50.0)),
         scanner=fixed_beams(np.array([[0.0, 0.0, -1.0]]), rate=1.0),

@@ -11,7 +11,7 @@ from sweep.model.geometry.body_motion import ConstantAcceleration, MovingBody, S
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.geometry.scanner import LineScan, cone_directions, corner_directions, fixed_beams
-from sweep.model.pointcloud.eyepoints import observe_eyepoints, prepare_eyepoint_shots
+from sweep.model.pointcloud.eyepoints import compute_eyepoints, prepare_eyepoint_shots
 
 GROUND = SurfaceMaterial("ground", 0.1, "lambert")
 
@@ -172,7 +172,7 @@ MOTIONS = {
 def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
     """Central differences over 0.1 ms to either side, on level ground or on moving."""
     flight, scanner = MOTIONS[name]
-    seen = observe_eyepoints(
+    seen = compute_eyepoints(
         np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=RayCaster([level_plate()]),
         beam_divergence=50e-6, n_beamlets=7, body_motions=None if body is None else [_body(body)],
     )  # fmt: skip

@@ -112,9 +112,9 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     steady[0] = peak * np.exp(-(((np.arange(bins) - rng.uniform(3, 5)) / rng.uniform(0.7, 3)) ** 2))
     steady[1] = rng.uniform(3.0, 9.0) * rng.uniform(0.7, 1.0, bins)
     steady[2, 1:] = rng.uniform(-0.6, 0.6, bins - 1)
-    given_mode = echo_detection.GivenMode(*steady, np.zeros(bins))
+    bins_given_mode = echo_detection.BinsGivenMode(*steady, np.zeros(bins))
     run = echo_detection.EchoBins(steady[0], echo, 100)
-    told = echo_detection._mean_over_mode_power(given_mode, run, False, 1024)
+    told = echo_detection._mean_over_mode_power(bins_given_mode, run, False, 1024)
 
     ratio = steady[1] / steady[0]
     first = np.min(np.maximum(steady[1] - echo_detection._THRESHOLD_REACH_SIGMA, 0.0) / steady[0])
@@ -128,7 +128,7 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     weight = 0.5 * (last - first) * echo_detection._GAUSS_WEIGHTS * 2 * z * np.exp(-z * z)
     z, weight = np.append(0.6 * first, z), np.append(-np.expm1(-first * first), weight)
     of_nodes = [
-        echo_detection._pd_and_miss_given_mode(given_mode, one, run, False, 1024, np.inf, 0.0)
+        echo_detection._pd_and_miss_given_mode(bins_given_mode, one, run, False, 1024, np.inf, 0.0)
         for one in z
     ]
     found, missed = (weight * np.array(of_nodes).T).sum(axis=1)

@@ -7,7 +7,7 @@ from sweep.model.geometry.body_motion import ConstantAcceleration, MovingBody, N
 from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.geometry.scanner import cone_directions, fixed_beams
 from sweep.model.outputs import BEAMLET_VARIABLES, SHOT_VARIABLES
-from sweep.model.pointcloud.eyepoints import observe_eyepoints
+from sweep.model.pointcloud.eyepoints import compute_eyepoints
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays, eyepoints_to_arrays
 from sweep.scenes.meshes import clean_mesh
 
@@ -18,7 +18,7 @@ def eyepoints():
     corners = 30.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     ground = clean_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
     path = ConstantAcceleration((0.0, 0.0, 100.0), (10.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
-    return observe_eyepoints(
+    return compute_eyepoints(
         np.arange(24),
         flight=MovingBody(path, NadirAttitude()),
         scanner=fixed_beams(cone_directions(3, half_angle=0.2), rate=2.0),

@@ -309,7 +309,7 @@ def covered(facets, x, y):
 
 
 def test_a_crown_has_the_leaf_area_of_its_index():
-    leaves = scattered_objects.crown_facets(np.random.default_rng(1), TREE)
+    leaves = scattered_objects.draw_crown_leaves(np.random.default_rng(1), TREE)
     outline = math.pi * TREE.crown_diameter**2 / 4
     leaf_area = triangle_areas(leaves.vertices, leaves.faces).sum()
     assert leaf_area == pytest.approx(TREE.leaf_area_index * outline, rel=1e-3)  # whole leaves
@@ -318,7 +318,7 @@ def test_a_crown_has_the_leaf_area_of_its_index():
 
 def test_leaves_face_every_way():
     """The mean projection of a unit leaf area is 1/2 along every axis (G of a sphere)."""
-    leaves = scattered_objects.crown_facets(np.random.default_rng(2), TREE)
+    leaves = scattered_objects.draw_crown_leaves(np.random.default_rng(2), TREE)
     a, b, c = leaves.vertices[leaves.faces[::2].T]
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -335,7 +335,7 @@ def test_gaps_in_a_crown_follow_beers_law():
     density = tree.number_of_leaves * tree.leaf_area / (4 / 3 * math.pi * a**2 * depth / 2)
     rays, crowns, gaps, expected = 60, 8, 0, 0.0
     for _ in range(crowns):
-        leaves = scattered_objects.crown_facets(generator, tree)
+        leaves = scattered_objects.draw_crown_leaves(generator, tree)
         r, turn = a / 3 * np.sqrt(generator.random(rays)), 2 * math.pi * generator.random(rays)
         gaps += (~covered(leaves, r * np.cos(turn), r * np.sin(turn))).sum()
         expected += np.exp(-0.5 * density * depth * np.sqrt(1 - (r / a) ** 2)).sum()
@@ -347,7 +347,7 @@ def test_gaps_in_a_crown_follow_beers_law():
 
 
 def test_leaf_centres_fill_the_crowns_ellipsoid_evenly():
-    leaves = scattered_objects.crown_facets(np.random.default_rng(4), TREE)
+    leaves = scattered_objects.draw_crown_leaves(np.random.default_rng(4), TREE)
     centres = leaves.vertices.reshape(-1, 4, 3).mean(axis=1)
     half = np.array([TREE.crown_diameter, TREE.crown_diameter, TREE.height - TREE.crown_base]) / 2
     ball = (centres - [0, 0, (TREE.height + TREE.crown_base) / 2]) / half

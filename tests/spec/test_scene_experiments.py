@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sweep.model.pointcloud.eyepoints import observe_eyepoints
+from sweep.model.pointcloud.eyepoints import compute_eyepoints
 from sweep.spec import SceneSpec, SpecError, load
 from sweep.spec.yaml_document import read_document
 
@@ -24,7 +24,7 @@ def flown(name):
     spec = load(EXPERIMENTS / f"{name}.yaml")
     world = spec.build_scene()
     return spec, {
-        scanner: observe_eyepoints(
+        scanner: compute_eyepoints(
             np.arange(spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)),
             flight=spec.build_flight(),
             scanner=spec.scan_pattern(scanner),

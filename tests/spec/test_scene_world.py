@@ -18,7 +18,7 @@ from base_scene_spec import (
 )
 
 from sweep.model.geometry.ray_casting import Pose
-from sweep.model.pointcloud.eyepoints import observe_eyepoints
+from sweep.model.pointcloud.eyepoints import compute_eyepoints
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import SceneSpec
 
@@ -33,7 +33,7 @@ def built(mapping, base="."):
 
 def seen(spec, world, name="three"):
     """Eyepoints of a whole flight."""
-    return observe_eyepoints(
+    return compute_eyepoints(
         np.arange(spec.number_of_cycles(name) * spec.shots_per_cycle(name)),
         flight=spec.build_flight(),
         scanner=spec.scan_pattern(name),

@@ -196,9 +196,11 @@ def test_a_durable_study_is_the_same_and_has_its_disk_synced_before_its_receipts
     from sweep.tasks.engine import study_store
 
     path, at = tmp_path / "small.zarr", []
-    sync = study_store.sync_to_disk
+    sync = study_store.sync_file_system
     monkeypatch.setattr(
-        study_store, "sync_to_disk", lambda place: (sync(place), at.append(receipt_blocks(path)))
+        study_store,
+        "sync_file_system",
+        lambda place: (sync(place), at.append(receipt_blocks(path))),
     )
     assert run_serially(small_spec(), path, scheduler="none", durable=True).complete
     assert file_digests(path) == file_digests(undisturbed)
@@ -215,6 +217,6 @@ def test_what_cannot_be_synced_is_not_committed(undisturbed, tmp_path, monkeypat
     def broken(place):
         raise OSError(5, "Input/output error", str(place))
 
-    monkeypatch.setattr(study_store, "sync_to_disk", broken)
+    monkeypatch.setattr(study_store, "sync_file_system", broken)
     outcome = resume(path, progress=False, scheduler="none", durable=True)
     assert outcome.blocks_computed == 0 and "Input/output error" in outcome.stop_reason

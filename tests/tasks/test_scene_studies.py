@@ -155,7 +155,7 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
         "sweep.tasks.studies.study_warnings.issue_study_warnings", lambda study, say: None
     )
     monkeypatch.setattr(
-        "sweep.model.pointcloud.eyepoints.observe_eyepoints", lambda *a, **k: looks.append(a)
+        "sweep.model.pointcloud.eyepoints.compute_eyepoints", lambda *a, **k: looks.append(a)
     )
     outcome = run_serially(other, tmp_path / "darker.zarr")
     assert outcome.complete and outcome.rays_by_scanner == {"three": 0, "line": 0} and not looks

@@ -78,8 +78,8 @@ def compute_differences(
 ) -> xr.Dataset:
     """Return the differences of variables, other minus ours, at the points of both datasets.
 
-    For ``bounded_variables`` the result also has the largest allowed differences, and whether they
-    are kept: `NAME_allowed` and `NAME_agrees`.
+    For ``bounded_variables`` the result also has the largest allowed difference, `NAME_allowed`,
+    and whether the difference is no larger, `NAME_agrees`.
     """
     matched_ours, matched_other = _restrict_to_common_points(ours, other)
     result = xr.Dataset(
@@ -115,8 +115,8 @@ def study_title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
 def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
     """Return an upper bound of the error of a probability of detection.
 
-    It is the sum of the half-width by random draws and the errors by skipped effects and few
-    beamlets.
+    The bound is the sum of the half-width of random draws and the errors due to skipped effects and
+    few beamlets.
     """
     error_bounds = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
              if n in dataset]  # fmt: skip
@@ -584,7 +584,7 @@ def _exceedance_lines(
 ) -> list[ChartLine]:
     """Return two lines over the difference of pd.
 
-    They are the shares of points whose difference is larger, and whose allowed difference is
+    The lines are the shares of points whose difference is larger, and whose allowed difference is
     larger.
     """
     is_finite = np.isfinite(differences[name].values)

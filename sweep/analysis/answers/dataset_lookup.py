@@ -35,7 +35,7 @@ _STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
 JOINED_SPECS_ATTRIBUTE = "specs"
 """Name of the attribute of a join of studies with their specs and variable names.
 
-Its value is JSON, by study id.
+The value of the attribute is JSON text, by study id.
 """
 
 

@@ -27,7 +27,7 @@ LIMIT_REASON_MEANINGS = "found never_reached never_lost not_computed"
 """Names of the outcomes of a limit search, for the CF attribute `flag_meanings`."""
 
 _PD_PLUS_MISS_ERROR_MAX = 1e-6
-"""Largest deviation from 1, by rounding and averaging, of pd plus the probability of a miss."""
+"""Largest deviation of pd plus the probability of a miss from 1, due to rounding and averaging."""
 
 _NORMAL_DEVIATE_MAX = 38.0
 """Largest magnitude of a normal deviate, which stands for a pd of 0 or 1.
@@ -40,7 +40,7 @@ one corresponds to a probability near the smallest positive float.
 def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
     """Return the normal deviate z of a probability of detection pd.
 
-    It is defined by pd = Phi(z), with the normal distribution function Phi.
+    The deviate is defined by pd = Phi(z), with the normal distribution function Phi.
 
     Parameters
     ----------
@@ -158,14 +158,21 @@ def limit(
 def maximum_range(
     dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
 ) -> xr.Dataset:
-    """Return the maximum range at which pd reaches a level, as :func:`limit` does."""
+    """Return the largest range at which the probability of detection is at least ``pd``.
+
+    The result is that of :func:`limit` along the range.
+    """
     return limit(dataset, "target.range", pd, segment=segment)
 
 
 def minimum_grazing_angle(
     dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
 ) -> xr.Dataset:
-    """Return the minimum grazing angle at which pd reaches a level, as :func:`limit` does."""
+    """Return the smallest grazing angle at which the probability of detection is at least ``pd``.
+
+    The result is that of :func:`limit` along the grazing angle, from the largest angle
+    downwards.
+    """
     return limit(dataset, "target.grazing_angle", pd, segment=segment, from_highest=True)
 
 

@@ -226,11 +226,11 @@ def pfa_both_chirps_with_leakage(
     Parameters
     ----------
     pfa_segment
-        Probability of a false alarm by noise in the up-chirp.
+        Probability of a false alarm due to noise in the up-chirp.
     pfa_both_chirps
-        Probability of a false alarm by noise in both chirps.
+        Probability of a false alarm due to noise in both chirps.
     p_leakage_up, p_leakage_down
-        Probability of a false alarm by leakage in the up-chirp and in the down-chirp.
+        Probability of a false alarm due to leakage in the up-chirp and in the down-chirp.
 
     Notes
     -----
@@ -505,8 +505,9 @@ def _threshold_crossing_probability(
 ) -> np.ndarray:
     """Return the probability that a bin with a steady signal exceeds the threshold.
 
-    It is the Marcum function Q_1, or its equivalent for several looks. Signal and threshold are
-    relative to the noise per quadrature. The result is nan if one of them is not finite.
+    The probability is the Marcum function Q_1, or its equivalent for several looks. Signal and
+    threshold are relative to the noise per quadrature. The result is nan if one of them is not
+    finite.
     """
     is_finite = np.isfinite(signal_ratio) & np.isfinite(threshold_ratio)
     probability = looks.pd_and_miss_steady(

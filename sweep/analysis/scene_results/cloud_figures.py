@@ -202,7 +202,7 @@ class ObliqueView:
     def _projected_box(self, azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower left and upper right corner of the projected box.
 
-        They are fractions of matplotlib's square axes, (2,) each.
+        The corners are fractions of matplotlib's square axes, (2,) each.
         """
         trial_sheet = PictureSheet(
             _TRIAL_SHEET_SIDE_INCHES, _TRIAL_SHEET_SIDE_INCHES, title="", caption=""

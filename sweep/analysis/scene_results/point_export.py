@@ -466,7 +466,7 @@ def _find_request_mistakes(
         remedy = suggest_similar_name(ranges, (INTERPOLATED_RANGES, QUANTISED_RANGES))
         mistakes.append(Mistake("ranges", problem, ranges, remedy))
     for axis in results.spec.axes:
-        if axis.name in axis_position.open_axes:  # the request leaves several values
+        if axis.name in axis_position.undetermined_axes:  # the request leaves several values
             axis_parameter = axis.parameters[0]
             value_list = ", ".join(
                 labels.format_quantity(v, axis_parameter.units)

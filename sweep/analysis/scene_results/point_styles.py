@@ -79,7 +79,7 @@ class CategoryColours:
 
     @property
     def colour_by_number(self) -> dict[int, str]:
-        """Colour of each category by its number, as far as there are colours."""
+        """Colour of each category by its number, for as many categories as there are colours."""
         named_numbers = [number for number in self.label_by_number if number >= 0]
         return dict(zip(named_numbers, canvas.LINE_COLOURS, strict=False))
 

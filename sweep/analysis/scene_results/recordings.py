@@ -80,7 +80,7 @@ LOG_QUANTITIES = ("pfa_up", "pfa_down")
 """Quantities that are shown on a logarithmic scale: probabilities of false alarms."""
 
 POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Bits of a point's flags that say of which kind the point is, by the name of the kind.
+"""Bit of a point's flags for each kind of point, by the name of the kind.
 
 Each point has exactly one of these bits.
 """
@@ -91,7 +91,7 @@ class Quantity:
     """Description of a quantity that each shot, or each point, has."""
 
     long_name: str
-    """Name in labels."""
+    """Name of the quantity in labels of figures."""
     units: str
     """Units of the stored values."""
     is_per_point: bool
@@ -428,7 +428,7 @@ class AxisPosition:
     """Index along each axis, by the axis's name."""
     label: str
     """Coordinates of the position, as text."""
-    open_axes: tuple[str, ...]
+    undetermined_axes: tuple[str, ...]
     """Names of the axes along which the request leaves several values to choose from."""
 
     def open_recording(self, tree: xr.DataTree, scanner: str) -> Recording:
@@ -474,8 +474,10 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
     if mistakes:
         raise SpecError(mistakes)
     axis_indices = {name: int(np.argmax(is_wanted)) for name, is_wanted in allowed_by_axis.items()}
-    open_axes = tuple(name for name, is_wanted in allowed_by_axis.items() if is_wanted.sum() > 1)
-    return AxisPosition(axis_indices, _axis_position_label(spec, axis_indices), open_axes)
+    undetermined_axes = tuple(
+        name for name, is_wanted in allowed_by_axis.items() if is_wanted.sum() > 1
+    )
+    return AxisPosition(axis_indices, _axis_position_label(spec, axis_indices), undetermined_axes)
 
 
 def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:

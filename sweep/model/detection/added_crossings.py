@@ -78,7 +78,7 @@ def fill_crossing_series(threshold_ratio, series):
 
 @njit(cache=True, error_model="numpy")
 def _n_series_terms(x, y):
-    """Return how many terms the crossing series needs for an error of 1e-16 in its sum.
+    """Return the number of terms that the crossing series needs for an error of 1e-16.
 
     ``x`` is half the square of the largest amplitude, ``y`` half that of the threshold, x <= y.
     Both are in units of the noise per quadrature.
@@ -106,7 +106,7 @@ def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabil
     series
         Result of :func:`fill_crossing_series` for this threshold.
     probabilities
-        (n_bins + 7,): the result; the last seven elements are scratch.
+        (n_bins + 7,): output array; the last seven elements are scratch.
     """
     y = 0.5 * threshold_ratio * threshold_ratio
     if y > SERIES_Y_MAX:
@@ -310,7 +310,7 @@ def exclude_bins_joining_echo(
     Parameters
     ----------
     probabilities
-        (bins,): probability that leaked signal makes each bin cross; the result.
+        (bins,): probability that leaked signal makes each bin cross; changed in place.
     first_index, end_index
         Index of the first bin to process, and of the bin after the last.
     magnitudes
@@ -324,46 +324,48 @@ def exclude_bins_joining_echo(
     sidelobe_correlation
         Correlation of neighbouring bins' noise components in phase with the signal.
     """
-    stretch_end = first_index
-    while stretch_end < end_index:
-        stretch_begin = stretch_end
-        while stretch_end < end_index and not is_exempt[stretch_end]:
-            stretch_end += 1
-        n_bins = stretch_end - stretch_begin
+    gap_end = first_index
+    while gap_end < end_index:
+        gap_begin = gap_end
+        while gap_end < end_index and not is_exempt[gap_end]:
+            gap_end += 1
+        n_bins = gap_end - gap_begin
         n_joining_below, n_joining_above, p_join_below, p_join_above = 0, 0, 0.0, 0.0
-        if n_bins > 0 and stretch_begin > first_index and probabilities[stretch_begin] > 0.0:
-            n_joining_below = _count_joining_bins(probabilities, stretch_begin, 1, n_bins)
+        if n_bins > 0 and gap_begin > first_index and probabilities[gap_begin] > 0.0:
+            n_joining_below = _count_joining_bins(probabilities, gap_begin, 1, n_bins)
             p_join_below = edge_crossing_probability(
-                magnitudes[stretch_begin - 1] / noise_sigma,
-                magnitudes[stretch_begin] / noise_sigma,
+                magnitudes[gap_begin - 1] / noise_sigma,
+                magnitudes[gap_begin] / noise_sigma,
                 threshold / noise_sigma,
                 sidelobe_correlation,
             )
-        if n_bins > 0 and stretch_end < end_index and probabilities[stretch_end - 1] > 0.0:
-            n_joining_above = _count_joining_bins(probabilities, stretch_end - 1, -1, n_bins)
+        if n_bins > 0 and gap_end < end_index and probabilities[gap_end - 1] > 0.0:
+            n_joining_above = _count_joining_bins(probabilities, gap_end - 1, -1, n_bins)
             p_join_above = edge_crossing_probability(
-                magnitudes[stretch_end] / noise_sigma,
-                magnitudes[stretch_end - 1] / noise_sigma,
+                magnitudes[gap_end] / noise_sigma,
+                magnitudes[gap_end - 1] / noise_sigma,
                 threshold / noise_sigma,
                 sidelobe_correlation,
             )
         if n_joining_below + n_joining_above > n_bins:
             _fill_further_group_probability(
-                probabilities, stretch_begin, 1, n_bins, p_join_below, p_join_above
+                probabilities, gap_begin, 1, n_bins, p_join_below, p_join_above
             )
         else:
             _fill_further_group_probability(
-                probabilities, stretch_begin, 1, n_joining_below, p_join_below, 0.0
+                probabilities, gap_begin, 1, n_joining_below, p_join_below, 0.0
             )
             _fill_further_group_probability(
-                probabilities, stretch_end - 1, -1, n_joining_above, p_join_above, 0.0
+                probabilities, gap_end - 1, -1, n_joining_above, p_join_above, 0.0
             )
-        stretch_end += 1
+        gap_end += 1
 
 
 @njit(cache=True, error_model="numpy")
 def _count_joining_bins(probabilities, first_index, step, n_bins):
-    """Return how many bins next to an echo may join it by crossing the threshold, 1 .. ``n_bins``.
+    """Return the number of bins next to an echo that may join the echo, 1 .. ``n_bins``.
+
+    They join the echo if they cross the threshold.
 
     The bins start at ``first_index`` and go on by ``step``, 1 or -1. The count ends where all of
     them cross with a probability of at most :data:`JOINED_PROBABILITY_MIN`.

@@ -103,10 +103,10 @@ def alarm_equivalent_bins(
 def _equivalent_bins_per_bin(
     threshold_ratio: np.ndarray, correlation: float, looks: Looks
 ) -> np.ndarray:
-    """Return by how many independent bins each further adjacent bin counts, 0..1.
+    """Return the number of independent bins, 0..1, for which each further adjacent bin counts.
 
-    It is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and h that of a bin whose
-    neighbour does not cross.
+    The number is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and h that of a
+    bin whose neighbour does not cross.
     """
     from sweep.model.detection.marcum import marcum_q1
 

@@ -147,7 +147,7 @@ def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
     Parameters
     ----------
     kind, training, rank
-        As of :func:`cfar_crossing_probability`.
+        As in :func:`cfar_crossing_probability`.
     pfa : float
         Probability of a false alarm in a bin of noise alone.
 

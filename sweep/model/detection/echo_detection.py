@@ -67,8 +67,8 @@ def negligible_signal_ratio(
     Parameters
     ----------
     leakage_probability
-        (n,): tolerated error of the probability of a false peak by leaked signal, summed over all
-        bins that count as noise alone.
+        (n,): tolerated error of the probability of a false peak due to leaked signal, summed over
+        all bins that count as noise alone.
     threshold_ratio
         (n,): threshold b [sigma].
     n_bins
@@ -85,8 +85,8 @@ def negligible_signal_ratio(
 
         x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
 
-    to the probability of a false peak by leaked signal (:mod:`sweep.model.spectrum.leakage`). The
-    last factor is taken at a b = 1, the largest product that is returned.
+    to the probability of a false peak due to leaked signal (:mod:`sweep.model.spectrum.leakage`).
+    The last factor is taken at a b = 1, the largest product that is returned.
     """
     y = 0.5 * np.square(threshold_ratio)
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
@@ -161,7 +161,7 @@ class EchoSpans(NamedTuple):
     """(bins,) bool: True in bins that belong to an echo, and so can raise no false alarm."""
 
 
-class GivenMode(NamedTuple):
+class BinsGivenMode(NamedTuple):
     """Parameters of an echo's bins given the complex amplitude z of its strongest speckle mode.
 
     A speckle mode is a part of the echo that fades with one amplitude in all bins. All fields are
@@ -329,8 +329,8 @@ def bin_threshold_at(bin_thresholds, point):
 def echo_half_width(rule, pedestal_reach_bins):
     """Return the half-width [bins] of an echo about its lines.
 
-    It is the larger of the half-widths of the main lobe and of the phase-noise pedestal. ``rule``
-    is a :class:`DetectionRule`.
+    The half-width is the larger of the half-widths of the main lobe and of the phase-noise
+    pedestal. ``rule`` is a :class:`DetectionRule`.
     """
     return max(rule.lobe_half_width, int(pedestal_reach_bins))
 
@@ -399,7 +399,7 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
     bin_threshold
         :class:`BinThreshold`.
     pedestal_ratios
-        (bins,): the result.
+        (bins,): output array.
     """
     largest = 0.0
     noise_power = bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
@@ -520,8 +520,8 @@ def joint_pd_in_speckle(
 
     An echo that any of its bins may detect is represented by M independent bins. Let p be the
     probability of detection of a segment. Each bin is detected with q = 1 - (1 - p)^(1/M), and is
-    correlated with one bin of the other segment. Both segments are missed with
-    (1 - q_1 - q_2 + J(q_1, q_2))^M. Both are thus detected with
+    correlated with one bin of the other segment. Both segments are missed with (1 - q_1 - q_2 +
+    J(q_1, q_2))^M. Both segments are thus detected with the probability
 
         p_1 p_2 + (1 - p_1) (1 - p_2) ((1 + (J - q_1 q_2) / ((1 - q_1) (1 - q_2)))^M - 1)
 
@@ -654,7 +654,7 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
     threshold
         Threshold on |X|.
     is_exempt
-        Result, bool: True in bins that belong to an echo, and so can raise no false alarm.
+        Output array, bool: True in bins that belong to an echo, and so can raise no false alarm.
     lobe_half_width
         Half-width [bins] of an echo about its lines if any bin of the echo may detect it, else 0.
 
@@ -822,12 +822,12 @@ def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_s
     root mean square |X| of the bin's signal [V], ``bin_`` its number.
     """
     noise = bin_threshold.noise_without_pedestal
-    given_mode = _zero_given_mode(1)
-    given_mode.signal[:] = magnitude / noise
-    given_mode.threshold[:] = bin_threshold.threshold / noise
-    given_mode.pedestal[:] = (bin_threshold.line_noise / noise) ** 2 - 1.0
+    bins_given_mode = _zero_bins_given_mode(1)
+    bins_given_mode.signal[:] = magnitude / noise
+    bins_given_mode.threshold[:] = bin_threshold.threshold / noise
+    bins_given_mode.pedestal[:] = (bin_threshold.line_noise / noise) ** 2 - 1.0
     echo = EchoBins(np.full(1, magnitude), np.ones(1, np.bool_), bin_)
-    return _mean_over_mode_phase(given_mode, echo, rule, bin_speckle)
+    return _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -848,7 +848,8 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
     A single bin crosses with :func:`bin_crossing_tails`. The noise of neighbouring bins is
     correlated with the coefficient rho, in phase with a signal that keeps its phase from bin to bin
     as in a main lobe. Two neighbours are taken to cross jointly like two correlated normal numbers
-    that exceed s and t with the same probabilities. That is the product of these plus [1]_
+    that exceed s and t with the same probabilities. The joint probability is the product of the two
+    plus [1]_
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
@@ -892,23 +893,23 @@ def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
     more than that. In each bin :func:`fill_pedestal_ratios` tells how much it adds to the noise.
     """
     n_bins = echo.magnitude.size
-    pedestal_ratios, given_mode = np.empty(n_bins), _zero_given_mode(n_bins)
+    pedestal_ratios, bins_given_mode = np.empty(n_bins), _zero_bins_given_mode(n_bins)
     fill_pedestal_ratios(echo.magnitude, echo.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
         noise = bin_threshold.noise_without_pedestal * math.sqrt(1.0 + pedestal_ratios[k])
-        given_mode.signal[k] = echo.magnitude[k] / noise
-        given_mode.threshold[k] = bin_threshold.threshold / noise
-        given_mode.correlation[k] = rule.noise_correlation
+        bins_given_mode.signal[k] = echo.magnitude[k] / noise
+        bins_given_mode.threshold[k] = bin_threshold.threshold / noise
+        bins_given_mode.correlation[k] = rule.noise_correlation
     return _pd_and_miss_given_mode(
-        given_mode, 1.0, echo, rule.real_noise_at_ends, rule.fft_size, np.inf, 0.0
+        bins_given_mode, 1.0, echo, rule.real_noise_at_ends, rule.fft_size, np.inf, 0.0
     )
 
 
 @njit(cache=True, error_model="numpy")
-def _zero_given_mode(n_bins):
-    """Return a :class:`GivenMode` for ``n_bins`` bins, all of whose fields are zero."""
+def _zero_bins_given_mode(n_bins):
+    """Return a :class:`BinsGivenMode` for ``n_bins`` bins, all of whose fields are zero."""
     rows = np.zeros((5, n_bins))  # one allocation instead of five
-    return GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    return BinsGivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1028,37 +1029,34 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     DC and Nyquist the mode's power depends on the phase of z as 1 + q_k cos t, with the
     pseudo-variance ratio q_k of bin k and t uniform (:mod:`sweep.model.detection.pseudo_variance`).
 
-    Stretches of adjacent echo bins fade independently of each other if they hold a bin of at least
-    half the largest magnitude. Weaker stretches belong to the strong stretch below. Errors of these
-    approximations: docs/physics.md.
+    Runs of adjacent echo bins fade independently of each other if they hold a bin of at least half
+    the largest magnitude. A weaker run fades with the strong run below it. docs/physics.md states
+    the errors of these approximations.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     largest = 0.0
     for i in range(magnitude.size):
         largest = max(largest, magnitude[i] if is_echo[i] else 0.0)
-    pd, miss, n_stretches = 0.0, 1.0, 0
-    stretch_begin, i = np.int64(0), np.int64(0)  # numba would compile anew for literals 0
+    pd, miss, run_begin, i, n_runs = 0.0, 1.0, 0, 0, 0
     while i < magnitude.size:
         echo_begin, has_strong_bin = i, False
         while i < magnitude.size and is_echo[i]:
             has_strong_bin |= magnitude[i] >= 0.5 * largest
             i += 1
         if has_strong_bin:
-            if n_stretches > 0:
-                stretch = _pd_and_miss_of_stretch(
-                    echo, stretch_begin, echo_begin, rule, bin_threshold, bin_speckle
+            if n_runs > 0:
+                bin_run = _pd_and_miss_of_run(
+                    echo, run_begin, echo_begin, rule, bin_threshold, bin_speckle
                 )
-                pd, miss, stretch_begin = (
-                    pd + miss * stretch.pd,
-                    miss * stretch.miss,
+                pd, miss, run_begin = (
+                    pd + miss * bin_run.pd,
+                    miss * bin_run.miss,
                     echo_begin,
                 )
-            n_stretches += 1
+            n_runs += 1
         i += 1
-    stretch = _pd_and_miss_of_stretch(
-        echo, stretch_begin, magnitude.size, rule, bin_threshold, bin_speckle
-    )
-    return Detection(pd + miss * stretch.pd, miss * stretch.miss)
+    bin_run = _pd_and_miss_of_run(echo, run_begin, magnitude.size, rule, bin_threshold, bin_speckle)
+    return Detection(pd + miss * bin_run.pd, miss * bin_run.miss)
 
 
 _GAUSS_ORDER = 7
@@ -1079,11 +1077,11 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
 
 
 @njit(cache=True, error_model="numpy")
-def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
-    """Return the :class:`Detection` of one stretch of an echo in developed speckle.
+def _pd_and_miss_of_run(echo, begin, end, rule, bin_threshold, bin_speckle):
+    """Return the :class:`Detection` of a run of bins of an echo in developed speckle.
 
-    A stretch is a run of adjacent bins that fade together, bins begin .. end - 1 of ``echo``
-    (:func:`pd_and_miss_in_speckle`).
+    The adjacent bins of the run fade together (:func:`pd_and_miss_in_speckle`). They are bins begin
+    .. end - 1 of ``echo``.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     nyquist_bin = rule.fft_size // 2 if rule.real_record_in_speckle else 0
@@ -1106,12 +1104,12 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
     cell = locate_in_mode_table(mode_table, bin_speckle.line_deviation_bins, asymmetry)
     noise_power = 2.0 * bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
     n_bins = end - begin
-    stretch = EchoBins(magnitude[begin:end], is_echo[begin:end], echo.first_bin + begin)
-    # Not by _zero_given_mode: a call and zeros cost 6 % of the time of an echo.
+    bin_run = EchoBins(magnitude[begin:end], is_echo[begin:end], echo.first_bin + begin)
+    # Not by _zero_bins_given_mode: a call and zeros cost 6 % of the time of an echo.
     rows, pedestal_ratios = np.empty((5, n_bins)), np.empty(n_bins)
-    given_mode = GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    bins_given_mode = BinsGivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
     previous_fraction, previous_inverse_noise = 0.0, 0.0
-    fill_pedestal_ratios(stretch.magnitude, stretch.is_echo, bin_threshold, pedestal_ratios)
+    fill_pedestal_ratios(bin_run.magnitude, bin_run.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
         i = begin + k
         signal_power, pedestal_power = magnitude[i] * magnitude[i], noise_power * pedestal_ratios[k]
@@ -1125,10 +1123,10 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
         )
         other_power = (1.0 - mode_fraction) * (signal_power + pedestal_power) + noise_power
         inverse_noise = math.sqrt(2.0 / other_power)
-        given_mode.pedestal[k] = mode_fraction * pedestal_power / other_power
-        given_mode.signal[k] = inverse_noise * math.sqrt(mode_fraction * signal_power)
-        given_mode.threshold[k] = inverse_noise * bin_threshold.threshold
-        given_mode.correlation[k] = 0.0
+        bins_given_mode.pedestal[k] = mode_fraction * pedestal_power / other_power
+        bins_given_mode.signal[k] = inverse_noise * math.sqrt(mode_fraction * signal_power)
+        bins_given_mode.threshold[k] = inverse_noise * bin_threshold.threshold
+        bins_given_mode.correlation[k] = 0.0
         if k > 0 and is_echo[i] and is_echo[i - 1]:
             neighbour_correlation = interpolate_mode_table(
                 mode_table.neighbour_correlation, cell, i - strongest
@@ -1141,45 +1139,45 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
             noise_covariance += noise_power * math.copysign(
                 rule.noise_correlation, neighbour_correlation
             )
-            given_mode.correlation[k] = min(
+            bins_given_mode.correlation[k] = min(
                 max(0.5 * noise_covariance * inverse_noise * previous_inverse_noise, -0.999), 0.999
             )
         previous_fraction, previous_inverse_noise = mode_fraction, inverse_noise
         # The power of the other modes depends on the phase too, except in bins 0 and N/2.
-        bin_, other_modes_power = stretch.first_bin + k, (1.0 - mode_fraction) * magnitude[i] ** 2
-        given_mode.other_echo_fraction[k] = 0.0
+        bin_, other_modes_power = bin_run.first_bin + k, (1.0 - mode_fraction) * magnitude[i] ** 2
+        bins_given_mode.other_echo_fraction[k] = 0.0
         if bin_ != 0 and bin_ != nyquist_bin:
-            given_mode.other_echo_fraction[k] = other_modes_power / (
+            bins_given_mode.other_echo_fraction[k] = other_modes_power / (
                 other_modes_power + noise_power
             )
-    return _mean_over_mode_phase(given_mode, stretch, rule, bin_speckle)
+    return _mean_over_mode_phase(bins_given_mode, bin_run, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mean_over_mode_phase(given_mode, echo, rule, bin_speckle):
+def _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle):
     """Return the mean :class:`Detection` over the power of the strongest speckle mode.
 
     Near DC and Nyquist of a real record it is also the mean over the mode's phase.
     """
     if bin_speckle.pseudo_variance_ratio.size == 0:
-        return _mean_over_mode_power(given_mode, echo, rule.real_noise_at_ends, rule.fft_size)
-    return _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle)
+        return _mean_over_mode_power(bins_given_mode, echo, rule.real_noise_at_ends, rule.fft_size)
+    return _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
+def _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
     """Return the mean :class:`Detection` over power and phase t of the strongest speckle mode.
 
-    This is for bins near DC and Nyquist. Let q be the ratio E[X^2] / E[|X|^2] of a bin X. At the
-    phase t the power of all modes in the bin is 1 + q cos t times the mean over t.
+    The result applies to bins near DC and Nyquist. Let q be the ratio E[X^2] / E[|X|^2] of a bin X.
+    At the phase t the power of all modes in the bin is 1 + q cos t times the mean over t.
     """
     pd, miss, n_bins = 0.0, 0.0, echo.is_echo.size
-    given_phase = GivenMode(
+    given_phase = BinsGivenMode(
         np.empty(n_bins),
         np.empty(n_bins),
-        given_mode.correlation,
+        bins_given_mode.correlation,
         np.empty(n_bins),
-        given_mode.other_echo_fraction,
+        bins_given_mode.other_echo_fraction,
     )
     for node in range(N_PHASE_NODES):
         for k in range(n_bins):
@@ -1188,12 +1186,14 @@ def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
             )
             power_factor = max(1.0 + ratio * PHASE_COSINES[node], 0.0)
             inverse_noise = 1.0 / math.sqrt(
-                1.0 + (power_factor - 1.0) * given_mode.other_echo_fraction[k]
+                1.0 + (power_factor - 1.0) * bins_given_mode.other_echo_fraction[k]
             )
-            given_phase.signal[k] = given_mode.signal[k] * math.sqrt(power_factor) * inverse_noise
-            given_phase.threshold[k] = given_mode.threshold[k] * inverse_noise
+            given_phase.signal[k] = (
+                bins_given_mode.signal[k] * math.sqrt(power_factor) * inverse_noise
+            )
+            given_phase.threshold[k] = bins_given_mode.threshold[k] * inverse_noise
             given_phase.pedestal[k] = (
-                given_mode.pedestal[k] * power_factor * inverse_noise * inverse_noise
+                bins_given_mode.pedestal[k] * power_factor * inverse_noise * inverse_noise
             )
         at_phase = _mean_over_mode_power(given_phase, echo, rule.real_noise_at_ends, rule.fft_size)
         pd, miss = pd + at_phase.pd / N_PHASE_NODES, miss + at_phase.miss / N_PHASE_NODES
@@ -1201,16 +1201,16 @@ def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
+def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
     """Return the mean :class:`Detection` over the power of the strongest speckle mode.
 
     The mode has the amplitude z in all bins. The signal of a bin is |z| times
-    ``given_mode.signal``. The density of |z| at z is 2 z e^(-z^2).
+    ``bins_given_mode.signal``. The density of |z| at z is 2 z e^(-z^2).
 
     Parameters
     ----------
-    given_mode, echo
-        :class:`GivenMode` and :class:`EchoBins`.
+    bins_given_mode, echo
+        :class:`BinsGivenMode` and :class:`EchoBins`.
     real_noise_at_ends, fft_size
         Fields of :class:`DetectionRule`.
     """
@@ -1218,21 +1218,24 @@ def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
     z_first = z_last = z_middle = _MODE_MAGNITUDE_MAX
     pedestal_ratio_max, strongest_index = 0.0, -1
     for k in range(is_echo.size):
-        pedestal_ratio_max = max(pedestal_ratio_max, given_mode.pedestal[k])
-        if is_echo[k] and given_mode.signal[k] > 0.0:
-            pedestal_reach = _THRESHOLD_REACH_SIGMA * math.sqrt(given_mode.pedestal[k])
-            if given_mode.threshold[k] < z_middle * given_mode.signal[k]:
-                z_middle, strongest_index = given_mode.threshold[k] / given_mode.signal[k], k
+        pedestal_ratio_max = max(pedestal_ratio_max, bins_given_mode.pedestal[k])
+        if is_echo[k] and bins_given_mode.signal[k] > 0.0:
+            pedestal_reach = _THRESHOLD_REACH_SIGMA * math.sqrt(bins_given_mode.pedestal[k])
+            if bins_given_mode.threshold[k] < z_middle * bins_given_mode.signal[k]:
+                z_middle, strongest_index = (
+                    bins_given_mode.threshold[k] / bins_given_mode.signal[k],
+                    k,
+                )
             z_first = min(
                 z_first,
-                max(given_mode.threshold[k] - _THRESHOLD_REACH_SIGMA, 0.0)
-                / (given_mode.signal[k] + pedestal_reach),
+                max(bins_given_mode.threshold[k] - _THRESHOLD_REACH_SIGMA, 0.0)
+                / (bins_given_mode.signal[k] + pedestal_reach),
             )
-            if given_mode.signal[k] > pedestal_reach:
+            if bins_given_mode.signal[k] > pedestal_reach:
                 z_last = min(
                     z_last,
-                    (given_mode.threshold[k] + _THRESHOLD_REACH_SIGMA)
-                    / (given_mode.signal[k] - pedestal_reach),
+                    (bins_given_mode.threshold[k] + _THRESHOLD_REACH_SIGMA)
+                    / (bins_given_mode.signal[k] - pedestal_reach),
                 )
     z_last = min(z_last, math.sqrt(z_middle * z_middle + 10.0))  # 5e-5 of the mean lies beyond
     interval_ends = (z_first, z_last, z_last)
@@ -1257,11 +1260,11 @@ def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
                 math.inf
                 if pedestal_ratio_max > 0.0
                 else _squared_reach_given_mode(
-                    z, given_mode, strongest_index, is_real, negligible_probability
+                    z, bins_given_mode, strongest_index, is_real, negligible_probability
                 )
             )
             at_z = _pd_and_miss_given_mode(
-                given_mode,
+                bins_given_mode,
                 z,
                 echo,
                 real_noise_at_ends,
@@ -1279,11 +1282,11 @@ def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
             math.inf
             if pedestal_ratio_max > 0.0
             else _squared_reach_given_mode(
-                0.6 * z_first, given_mode, strongest_index, is_real, negligible_probability
+                0.6 * z_first, bins_given_mode, strongest_index, is_real, negligible_probability
             )
         )
         at_z = _pd_and_miss_given_mode(
-            given_mode,
+            bins_given_mode,
             0.6 * z_first,
             echo,
             real_noise_at_ends,
@@ -1297,7 +1300,7 @@ def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligible_probability):
+def _squared_reach_given_mode(z, bins_given_mode, strongest_index, is_real, negligible_probability):
     """Return the squared distance [sigma^2] below the threshold beyond which bins are negligible.
 
     The threshold b and signals are in units of sigma, the noise per quadrature. A bin of signal
@@ -1309,8 +1312,8 @@ def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligibl
     ----------
     z
         Magnitude of the strongest speckle mode.
-    given_mode
-        :class:`GivenMode`.
+    bins_given_mode
+        :class:`BinsGivenMode`.
     strongest_index
         Index of the bin that crosses at the smallest z; negative if there is none.
     is_real
@@ -1321,7 +1324,8 @@ def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligibl
     if not negligible_probability > 0.0 or strongest_index < 0:
         return math.inf
     excess_ratio = max(
-        given_mode.signal[strongest_index] * z - given_mode.threshold[strongest_index], 0.0
+        bins_given_mode.signal[strongest_index] * z - bins_given_mode.threshold[strongest_index],
+        0.0,
     )
     return -2.0 * math.log(negligible_probability) - excess_ratio * excess_ratio * (
         0.5 if is_real else 1.0
@@ -1330,7 +1334,7 @@ def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligibl
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _pd_and_miss_given_mode(
-    given_mode, z, echo, real_noise_at_ends, fft_size, squared_reach, negligible_probability
+    bins_given_mode, z, echo, real_noise_at_ends, fft_size, squared_reach, negligible_probability
 ):
     """Return the :class:`Detection` by any bin given the magnitude z of the strongest speckle mode.
 
@@ -1343,8 +1347,8 @@ def _pd_and_miss_given_mode(
 
     Parameters
     ----------
-    given_mode, z, echo
-        :class:`GivenMode`, magnitude of the mode, and :class:`EchoBins`.
+    bins_given_mode, z, echo
+        :class:`BinsGivenMode`, magnitude of the mode, and :class:`EchoBins`.
     real_noise_at_ends, fft_size
         Fields of :class:`DetectionRule`.
     squared_reach
@@ -1358,16 +1362,16 @@ def _pd_and_miss_given_mode(
         if not is_echo[k]:
             previous_p_stay = -1.0
             continue
-        scale = 1.0 / math.sqrt(1.0 + given_mode.pedestal[k] * z * z)
-        signal = given_mode.signal[k] * z * scale
-        distance_below = given_mode.threshold[k] * scale - signal
+        scale = 1.0 / math.sqrt(1.0 + bins_given_mode.pedestal[k] * z * z)
+        signal = bins_given_mode.signal[k] * z * scale
+        distance_below = bins_given_mode.threshold[k] * scale - signal
         is_real = is_real_bin(echo.first_bin + k, real_noise_at_ends, fft_size)
         if distance_below > 0.0 and distance_below * distance_below > (
             2.0 * squared_reach if is_real else squared_reach
         ):
             previous_p_stay = -1.0
             continue
-        tails = bin_crossing_tails(signal, given_mode.threshold[k] * scale, is_real)
+        tails = bin_crossing_tails(signal, bins_given_mode.threshold[k] * scale, is_real)
         p_cross, p_stay = tails.above, tails.below
         if not p_stay > 0.0:
             return Detection(1.0, 0.0)
@@ -1377,7 +1381,7 @@ def _pd_and_miss_given_mode(
             continue
         deviate = _normal_deviate_of_tails(tails)
         conditional_cross, conditional_stay = p_cross, p_stay
-        correlation = given_mode.correlation[k]
+        correlation = bins_given_mode.correlation[k]
         if previous_p_stay > 0.0 and correlation != 0.0:
             correlation = (
                 correlation * correlation + correlation * signal * previous_signal
@@ -1490,7 +1494,7 @@ class SpectrumDetections(NamedTuple):
     n_exempt: np.ndarray
     """(m,): number of bins that belong to the echo and so can raise no false alarm."""
     leakage: np.ndarray
-    """(m,): zeros in place of the probability of a false peak by leaked signal, which is not
+    """(m,): zeros in place of the probability of a false peak due to leaked signal, which is not
     evaluated here."""
 
 

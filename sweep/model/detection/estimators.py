@@ -92,8 +92,8 @@ SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
 _TABLE_STEPS = 512
 """Number of steps per bin in tables over the offset, -1..1 bin, of a tone from a bin."""
 _NEIGHBOUR_HEIGHT_MIN = 0.25
-"""Limit below which the neighbours of a tone on a bin count as vanishing. It is the |X| of a
-neighbour over that of the bin."""
+"""Ratio of |X| of a neighbour to |X| of a bin on which a tone lies, below which the neighbours
+count as vanishing."""
 _CENTROID_REACH_CELLS = 2
 """Number of resolution cells on either side of the peak over which the centroid is taken. A cell is
 the sample rate over the number of samples in the record."""
@@ -240,7 +240,7 @@ def _three_bins_about_middle(
 def _parabola_vertex(values: np.ndarray) -> np.ndarray:
     """Return the vertex, -1/2..1/2 from the middle, of parabolas through values (m, 3).
 
-    It is 0 where the parabola has no maximum.
+    The vertex is 0 where the parabola has no maximum.
     """
     below, middle, above = values.T
     curvature = 2 * middle - below - above

@@ -24,14 +24,15 @@ N_PHASE_NODES = 8
 are t_j = pi (j + 1/2) / N_PHASE_NODES."""
 
 PHASE_COSINES = np.cos(np.pi * (np.arange(N_PHASE_NODES) + 0.5) / N_PHASE_NODES)
-"""Cosines of the N_PHASE_NODES phases pi (j + 1/2) / N_PHASE_NODES over which is averaged."""
+"""Cosines of the phases pi (j + 1/2) / N_PHASE_NODES, the nodes of averages over a speckle
+phase."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pseudo_variance_ratio_at(bin_, nyquist_bin, ratios):
     """Return the pseudo-variance ratio q = E[X^2] / E[|X|^2] of a bin with the amplitude X.
 
-    It is 0 for a circular X, as in bins far from DC and Nyquist.
+    The ratio is 0 for a circular X, as in bins far from DC and Nyquist.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ class JointTailRule(NamedTuple):
     or 0 for independent numbers."""
     weight: np.ndarray
     """(k,): quadrature weights of the nodes u, divided by 2 pi."""
-    exponent: np.ndarray
+    exponent_factor: np.ndarray
     """(k,): factor 1 / (2 cos^2 u) of the integrand's exponent at the nodes u."""
 
 
@@ -66,7 +66,7 @@ def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
             - 2.0 * deviate * previous_deviate * joint_tail_rule.sine[k]
         )
         excess += joint_tail_rule.weight[k] * math.exp(
-            -quadratic_form * joint_tail_rule.exponent[k]
+            -quadratic_form * joint_tail_rule.exponent_factor[k]
         )
     return excess
 
@@ -75,7 +75,7 @@ def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
 def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
     """Compute :func:`joint_tail_excess` for a given ``correlation``, with 4 quadrature nodes.
 
-    It is less precise than the 12 nodes of a :class:`JointTailRule`, and needs none.
+    The result is less precise than the 12 nodes of a :class:`JointTailRule`, and needs none.
     """
     excess, half_angle = 0.0, 0.5 * math.asin(correlation)
     for j in range(_JOINT_TAIL_NODES.size):

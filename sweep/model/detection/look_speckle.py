@@ -51,8 +51,8 @@ MATRIX_LOOKS_MAX = 64
 number of looks at a larger spacing."""
 
 GAMMA_SHAPE_MIN = 32.0
-"""Limit for treating the looks' mean power as a gamma variable. It applies to more than
-MATRIX_LOOKS_MAX looks, if they equal more than this number of looks of independent speckle."""
+"""Effective number of looks of independent speckle above which the looks' mean power is treated as
+a gamma variable. This applies only to more than MATRIX_LOOKS_MAX looks."""
 
 SPECKLE_LATTICE_SIZE = 2048
 """Number of fixed realisations of the speckle of all looks. The probability that enough looks cross
@@ -162,7 +162,8 @@ class LookSpeckle(NamedTuple):
 
 
 _POWER_FRACTION_MIN = 1e-7
-"""Fraction of the looks' power below which an eigenvalue of the covariance is neglected."""
+"""Smallest fraction of all looks' power for which an eigenvalue of the covariance of their speckle
+is kept."""
 
 
 def look_covariances(
@@ -176,7 +177,7 @@ def look_covariances(
     Parameters
     ----------
     correlation_by_lag, look_power
-        (..., N): as of :class:`LookSpeckle`.
+        (..., N): as in :class:`LookSpeckle`.
     looks_max
         Largest number k of rows. More looks are represented by this number of looks, at
         :func:`representative_look_positions`.
@@ -216,7 +217,7 @@ def phase_rotated_look_covariances(
     Parameters
     ----------
     correlation_by_lag, look_power
-        (m, N): as of :class:`LookSpeckle`.
+        (m, N): as in :class:`LookSpeckle`.
     cycles_per_look
         (m,): rotation of the line's phase from one look to the next [cycles].
     """
@@ -346,9 +347,9 @@ def _saddle_point(
 def speckle_lattice(n_looks: int) -> np.ndarray:
     """Return fixed realisations of the speckle amplitudes of N looks of independent speckle.
 
-    They are (SPECKLE_LATTICE_SIZE, N) complex. A Kronecker lattice of the roots of primes is
-    transformed to circular Gaussian numbers. These are standardised to mean 0 and the unit
-    covariance matrix.
+    The realisations are (SPECKLE_LATTICE_SIZE, N) complex. A Kronecker lattice of the roots of
+    primes is transformed to circular Gaussian numbers. These are standardised to mean 0 and the
+    unit covariance matrix.
     """
     primes = [2]
     while len(primes) < 2 * n_looks:
@@ -368,14 +369,14 @@ def speckle_lattice(n_looks: int) -> np.ndarray:
 def correlated_speckle_magnitudes(speckle, covariance_root):
     """Return the magnitudes of the correlated speckle of N looks in m realisations, (m, N).
 
-    They are |A z|, with the matrix A and independent amplitudes z.
+    The magnitudes are |A z|, with the matrix A and independent amplitudes z.
 
     Parameters
     ----------
     speckle
         (m, k) complex: m realisations of independent amplitudes z.
     covariance_root
-        (N, k) complex: A, as of :meth:`LookSpeckle.covariance_root`.
+        (N, k) complex: A, as in :meth:`LookSpeckle.covariance_root`.
     """
     magnitude = np.empty((speckle.shape[0], covariance_root.shape[0]))
     for i in range(speckle.shape[0]):

@@ -148,7 +148,7 @@ class Looks(NamedTuple):
     def amplitude_gain_max(self) -> float:
         """Upper bound of the gain in signal over noise that combining the looks can bring.
 
-        It is that of the amplitude: sqrt(N) for N looks whose powers or crossings are combined,
+        The gain is one of amplitude: sqrt(N) for N looks whose powers or crossings are combined,
         else 1.
         """
         return math.sqrt(self.number) if self.is_noncoherent else 1.0
@@ -423,9 +423,9 @@ class Looks(NamedTuple):
         noncentral chi-square variable.
 
         Common speckle: with a correlation of 1 the joint probability is the mean over the speckle
-        of the product of both probabilities. With a smaller correlation the segments have a
-        fraction of the covariance at correlation 1: that which two Rayleigh magnitudes of the same
-        probabilities have. Partially correlated looks are treated likewise
+        of the product of both probabilities. With a smaller correlation the segments' covariance is
+        a fraction of that at correlation 1. The fraction is that of two Rayleigh magnitudes with
+        the same probabilities. Partially correlated looks are treated likewise
         (:mod:`sweep.model.detection.look_speckle`).
         """
         from scipy import stats
@@ -462,7 +462,7 @@ class Looks(NamedTuple):
             covariance = (pd_first * pd_second * weight).sum(
                 axis=-1
             ) - mean_pd_first * mean_pd_second
-            shared_fraction = self._shared_fraction(p, q, correlation, look_speckle)
+            shared_fraction = self._shared_covariance_fraction(p, q, correlation, look_speckle)
             return np.where(
                 is_defined,
                 np.clip(p * q + shared_fraction * covariance, 0.0, np.minimum(p, q)),
@@ -509,17 +509,17 @@ class Looks(NamedTuple):
             is_defined, np.minimum((p_cross * weight).sum(axis=-1), np.minimum(p, q)), np.nan
         )
 
-    def _shared_fraction(
+    def _shared_covariance_fraction(
         self,
         p: np.ndarray,
         q: np.ndarray,
         correlation: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> np.ndarray:
-        """Return the covariance of two segments' detections, relative to equal speckle, 0..1.
+        """Return the covariance of two segments' detections over that for equal speckle, 0..1.
 
-        It is divided by the covariance that the detections would have if both segments had the same
-        speckle.
+        The fraction is 1 if both segments have the same speckle, and 0 if their speckle is
+        independent.
 
         Parameters
         ----------
@@ -546,7 +546,7 @@ class Looks(NamedTuple):
         return np.asarray(inverse_looks * fraction + (1 - inverse_looks) * np.square(correlation))
 
     def _effective_looks(self, look_speckle: "LookSpeckle | None") -> np.ndarray | float:
-        """Return how many looks of independent speckle fade as little as all looks together."""
+        """Return the effective number of looks: that of independent looks that fade equally."""
         if look_speckle is not None:
             return np.asarray(look_speckle.effective_looks.mean(axis=0))
         return float(self.number if self.has_independent_speckle else 1)
@@ -597,7 +597,9 @@ class Looks(NamedTuple):
         pd_by_signal, weight = self.pd_given_speckle(a, threshold_ratio, look_speckle)
         up_doppler, up_down, doppler_down = (
             np.maximum(
-                self._shared_fraction(p[i], p[j], np.minimum(correlations[k], 1.0), look_speckle),
+                self._shared_covariance_fraction(
+                    p[i], p[j], np.minimum(correlations[k], 1.0), look_speckle
+                ),
                 1e-12,
             )
             for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)))
@@ -630,7 +632,7 @@ class Looks(NamedTuple):
     def log_pfa(self, threshold_ratio: np.ndarray) -> np.ndarray:
         """Return the natural logarithm of the probability that a bin of noise alone is detected.
 
-        It is precise even where the probability itself underflows.
+        The logarithm is precise even where the probability itself underflows.
 
         Parameters
         ----------
@@ -673,7 +675,7 @@ class Looks(NamedTuple):
     def decisive_magnitude(self, magnitudes: np.ndarray) -> np.ndarray:
         """Return the magnitude that reaches the threshold if and only if the looks detect the bin.
 
-        It is the root of the mean power, or the M-th largest |X| for M votes.
+        The magnitude is the root of the mean power, or the M-th largest |X| for M votes.
 
         Parameters
         ----------
@@ -746,7 +748,7 @@ class Looks(NamedTuple):
     def p_votes_first_only(
         self, p_first: np.ndarray, p_second: np.ndarray, p_both: np.ndarray
     ) -> np.ndarray:
-        """Return the probability that enough records cross in the first of two bins, not the other.
+        """Return the probability that enough records cross in the first bin, but not in the second.
 
         Parameters
         ----------
@@ -805,7 +807,7 @@ class Looks(NamedTuple):
     ) -> np.ndarray:
         """Return the signal amplitude below which bins may count as noise alone, (n,).
 
-        It is in units of the noise per quadrature of one record. Parameters are those of
+        The amplitude is in units of the noise per quadrature of one record. Parameters are those of
         :func:`sweep.model.detection.echo_detection.negligible_signal_ratio`.
         """
         # At small signals the added probability is proportional to the signal's power.
@@ -921,9 +923,9 @@ SINGLE_LOOK = Looks()
 def coherent_gain(
     looks: Looks, *, acceleration: np.ndarray, carrier: np.ndarray, look_period: np.ndarray
 ) -> np.ndarray:
-    """Return how much an accelerated target's amplitude falls when looks are added coherently.
+    """Return the factor by which acceleration reduces the amplitude of coherently added looks.
 
-    It is the amplitude of the mean over all looks, relative to that of one look.
+    The factor is the amplitude of the mean over all looks, relative to the amplitude of one look.
 
     Parameters
     ----------
@@ -953,18 +955,19 @@ def coherent_gain(
 
 
 def solve_threshold_ratio(
-    log_pfa: np.ndarray, log_pfa_law: Callable[[np.ndarray], np.ndarray]
+    log_pfa: np.ndarray, log_pfa_of_threshold: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
     """Return the threshold (n,) at which noise is detected with a given probability pfa.
 
-    It is found by bisection, in units of the noise per quadrature. ``log_pfa_law`` is the
-    decreasing function from the threshold to ln(pfa). ``log_pfa`` (n,) are the given ln(pfa).
+    The threshold is found by bisection, in units of the noise per quadrature.
+    ``log_pfa_of_threshold`` is the decreasing function from the threshold to ln(pfa). ``log_pfa``
+    (n,) are the given ln(pfa).
     """
     # n bins raise an alarm at least as often as one, and at most n times as often.
     low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
     for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
-        is_above = log_pfa_law(middle) > log_pfa
+        is_above = log_pfa_of_threshold(middle) > log_pfa
         low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
     return 0.5 * (low + high)
 
@@ -1127,8 +1130,8 @@ def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _added_crossing_table(looks: Looks, threshold_ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the table that :meth:`Looks.added_crossing_probability` interpolates.
 
-    It holds ln(signal), and ln of the probability that the signal makes a bin cross where noise
-    alone does not.
+    The table holds ln(signal), and ln of the probability that the signal makes a bin cross where
+    noise alone does not.
     """
     signal = np.geomspace(1e-3 / math.sqrt(looks.number), threshold_ratio + 1.0, 300)
     noise = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio]))

@@ -257,8 +257,8 @@ def log_at_least_one_probability(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
 def log_either_probability(log_p_first: np.ndarray, log_p_second: np.ndarray) -> np.ndarray:
     """Return the natural logarithm of the probability of at least one of two independent events.
 
-    It is ln(p + q (1 - p)), where ``log_p_first`` is ln p and ``log_p_second`` is ln q. The result
-    is -inf where both probabilities are 0.
+    The result is ln(p + q (1 - p)), where ``log_p_first`` is ln p and ``log_p_second`` is ln q. The
+    result is -inf where both probabilities are 0.
     """
     with np.errstate(divide="ignore"):
         return np.minimum(

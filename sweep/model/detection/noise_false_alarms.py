@@ -41,7 +41,7 @@ def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
 def alarm_equivalent_bins(
     parameters: Mapping[str, Any], pfa_in_bin: ArrayLike, segment: str = "up"
 ) -> np.ndarray:
-    """Return how many independent noise bins raise a false alarm as often as a segment's bins.
+    """Return the number of independent noise bins that alarm as often as a segment's bins.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def alarm_equivalent_bins(
 def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:
     """Return the probability of a false alarm in any of ``n_bins`` independent bins of noise.
 
-    It is 1 - (1 - p)^n_bins, with p = ``pfa_in_bin``.
+    The probability is 1 - (1 - p)^n_bins, with p = ``pfa_in_bin``.
     """
     with np.errstate(divide="ignore"):
         return np.asarray(-np.expm1(np.asarray(n_bins) * np.log1p(-np.asarray(pfa_in_bin))))
@@ -70,8 +70,8 @@ def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:
 def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
     """Return the relative excess e of the noise variance that explains a bin's false alarms.
 
-    It solves exp(-x / (1 + e)) = ``probability``, with x = (4 - pi)/4 ``tnr``^2. The result is nan
-    unless 0 < ``probability`` < 1.
+    The excess solves exp(-x / (1 + e)) = ``probability``, with x = (4 - pi)/4 ``tnr``^2. The result
+    is nan unless 0 < ``probability`` < 1.
     """
     if not 0.0 < probability < 1.0:
         return math.nan
@@ -81,8 +81,9 @@ def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
 def variance_excess_from_shot_pfa(probability: float, tnr: float, n_bins: float) -> float:
     """Return the relative excess e of the noise variance that explains a shot's false alarms.
 
-    It solves (1 - (1 - exp(-x / (1 + e)))^N)^2 = ``probability``, with x = (4 - pi)/4 ``tnr``^2
-    and N = ``n_bins`` in each of two segments. The result is nan unless 0 < ``probability`` < 1.
+    The excess solves (1 - (1 - exp(-x / (1 + e)))^N)^2 = ``probability``, with x = (4 - pi)/4
+    ``tnr``^2 and N = ``n_bins`` in each of two segments. The result is nan unless 0 <
+    ``probability`` < 1.
     """
     if not 0.0 < probability < 1.0:
         return math.nan

@@ -116,24 +116,24 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
 def mean_over_phases(
     phase_factors: np.ndarray,
     pd_by_segment: tuple[np.ndarray, ...],
-    joint_law: Callable[..., tuple[np.ndarray, ...]],
+    joint_pd_function: Callable[..., tuple[np.ndarray, ...]],
 ) -> tuple[np.ndarray, ...]:
     """Average a joint probability of detection over the phases of the segments' noncircular echoes.
 
     Parameters
     ----------
     phase_factors
-        (segments, n, N_PHASE_NODES): relative echo power at the phase nodes, as of
+        (segments, n, N_PHASE_NODES): relative echo power at the phase nodes, as in
         :class:`SignalPseudoVariance`.
     pd_by_segment
         (..., n) for each segment: probability that it is detected.
-    joint_law
+    joint_pd_function
         Function from the segments' probabilities to arrays (..., n), for circular echoes.
 
     Returns
     -------
     tuple of numpy.ndarray
-        Mean over the phases of each result of ``joint_law``, (..., n).
+        Mean over the phases of each result of ``joint_pd_function``, (..., n).
 
     Notes
     -----
@@ -147,7 +147,7 @@ def mean_over_phases(
     sums: list[np.ndarray] = []
     for j in range(N_PHASE_NODES):
         # No two segments have the same order of phases.
-        results = joint_law(
+        results = joint_pd_function(
             *(
                 segment_pd[(1 + 2 * s) * j % N_PHASE_NODES]
                 for s, segment_pd in enumerate(pd_at_phases)
@@ -160,8 +160,8 @@ def mean_over_phases(
 def _pd_at_phases(mean_pd: np.ndarray, phase_factors: np.ndarray) -> np.ndarray:
     """Return probabilities of detection at all speckle phases, (N_PHASE_NODES, ..., n).
 
-    They are exp(-A / f), with the relative echo power f at each phase. A is found by bisection so
-    that the mean over the phases is ``mean_pd`` (..., n).
+    The probabilities are exp(-A / f), with the relative echo power f at each phase. A is found by
+    bisection so that the mean over the phases is ``mean_pd`` (..., n).
     """
     phase_factors = phase_factors.T.reshape(N_PHASE_NODES, *[1] * (mean_pd.ndim - 1), -1)
     is_defined = np.isfinite(mean_pd)
@@ -187,7 +187,7 @@ def lines_overlap_images(shots: Any) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def n_tabulated_bins(window: Window, fft_size: int) -> int:
-    """Return how many bins next to DC or Nyquist have a tabulated pseudo-variance."""
+    """Return the number of bins next to DC or Nyquist with a tabulated pseudo-variance."""
     last_bin = (_image_reach(window) + main_lobe_half_width(window) + 1) * fft_size / window.length
     return min(math.ceil(last_bin) + 1, fft_size // 4 + 1)
 
@@ -196,7 +196,8 @@ def n_tabulated_bins(window: Window, fft_size: int) -> int:
 def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
     """Return the pseudo-variance ratio E[n^2] / E[|n|^2] of white noise n by bin, (bins,).
 
-    It is W2(2k) / W2(0) for bins k = 0, 1, .. from DC, with the transform W2 of the squared window.
+    The ratio is W2(2k) / W2(0) for bins k = 0, 1, .. from DC, with the transform W2 of the squared
+    window.
     """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
@@ -219,8 +220,8 @@ def _image_reach(window: Window) -> float:
 
 
 _POWER_FRACTION_MIN = 1e-7
-"""Limit below which an eigenvalue of the covariance of the looks' echo amplitudes is neglected. It
-is a fraction of the power of all looks."""
+"""Smallest fraction of all looks' power for which an eigenvalue of the covariance of their echo
+amplitudes is kept."""
 
 
 def multilook_pd_and_miss_near_ends(

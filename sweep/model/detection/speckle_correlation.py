@@ -79,8 +79,8 @@ class LineGradients(NamedTuple):
 class LinePairGradients(NamedTuple):
     """Gradients across the beam of the lines of two segments, arrays (n,).
 
-    They are along the coordinate y across the beam in which the lines spread most. The unit of
-    frequency is fs/L, the sample rate over the number of samples in the record.
+    The gradients are along the coordinate y across the beam in which the lines spread most. The
+    unit of frequency is fs/L, the sample rate over the number of samples in the record.
     """
 
     bin_distance: tuple[np.ndarray, np.ndarray]
@@ -120,9 +120,9 @@ class LinePairGradients(NamedTuple):
 def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
     """Return the correlation of the speckle in the strongest bins of two segments, (n,) complex.
 
-    It is mu of equation (3) of the module's description. If the phase varies too fast across the
-    beam for the quadrature, the result is |mu| for a Gaussian window transform of the same
-    half-width, which is close to 0.
+    The correlation is mu of equation (3) of the module's description. If the phase varies too fast
+    across the beam for the quadrature, the result is |mu| for a Gaussian window transform of the
+    same half-width, which is close to 0.
     """
     from sweep.model.detection.speckle_correlation_integral import (
         fill_peak_bin_correlation,  # a compiler is slow to import
@@ -216,7 +216,8 @@ def centroid_delay(window: Window) -> np.ndarray:
 def _half_maximum_distance(window: Window) -> float:
     """Return the distance at which a window's normalised transform falls to 1/2.
 
-    It is in units of the sample rate over the number of samples, at most 2 TRANSFORM_REACH_BINS.
+    The distance is in units of the sample rate over the number of samples, at most 2
+    TRANSFORM_REACH_BINS.
     """
     distances, transform = transform_table(window)
     is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as in Hann's of two

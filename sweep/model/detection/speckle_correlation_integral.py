@@ -26,7 +26,7 @@ def fill_peak_bin_correlation(
 ):
     """Fill ``correlation`` with the speckle correlation of two segments at the given points.
 
-    It is mu of equation (3) of :mod:`sweep.model.detection.speckle_correlation`.
+    The correlation is mu of equation (3) of :mod:`sweep.model.detection.speckle_correlation`.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def fill_peak_bin_correlation(
     nodes, weights
         Quadrature on -1 .. 1.
     correlation
-        (n,) complex: the result.
+        (n,) complex: output array.
     """
     node_power, previous_half_interval = np.empty(nodes.size), -1.0
     for point in point_indices:

@@ -1,4 +1,4 @@
-"""Table of the rates of false alarms by leaked signal, for many powers of developed speckle.
+"""Table of the rates of false alarms due to leaked signal, for many powers of developed speckle.
 
 Leaked signal of amplitude a, over the noise per quadrature sigma, makes its bin cross the threshold
 b with a probability c in addition to noise (:mod:`sweep.model.detection.added_crossings`). The rate
@@ -26,10 +26,10 @@ SPECKLE_POWER_MAX = 16.0
 """Largest speckle power (mean 1) in averages over the fading of leaked signal. A fraction e^-16 of
 all speckle exceeds it."""
 N_SPECKLE_OCTAVES = 9
-"""Number of octaves of speckle power, below SPECKLE_POWER_MAX, for which the false alarms by leaked
-signal are computed."""
+"""Number of octaves of speckle power, below SPECKLE_POWER_MAX, for which the false alarms due to
+leaked signal are computed."""
 POWERS_PER_OCTAVE_MAX = 2
-"""Largest number of speckle powers per octave at which the false alarms by leaked signal are
+"""Largest number of speckle powers per octave at which the false alarms due to leaked signal are
 computed."""
 
 N_SPECKLE_POWERS = POWERS_PER_OCTAVE_MAX * N_SPECKLE_OCTAVES + 2
@@ -39,8 +39,8 @@ SIMD vectors."""
 TABULATED_SPECKLE_POWERS = SPECKLE_POWER_MAX * 2.0 ** (
     -np.arange(N_SPECKLE_POWERS - 1, -1, -1) / POWERS_PER_OCTAVE_MAX
 )
-"""(N_SPECKLE_POWERS,): speckle powers (mean 1), in rising order, at which false alarms by leaked
-signal are computed."""
+"""(N_SPECKLE_POWERS,): speckle powers (mean 1), in rising order, at which false alarms due to
+leaked signal are computed."""
 
 INTERPOLATION_POINTS = 6
 """Number of adjacent table entries from which a rate is interpolated."""
@@ -68,7 +68,7 @@ _ENTRIES_PER_POWER_MIN, _ENTRIES_PER_POWER_MAX = 4, 256
 
 
 class SpeckleCrossingRates(NamedTuple):
-    """Table of the relative rate of threshold crossings by leaked signal, for one threshold.
+    """Table of the relative rate of threshold crossings due to leaked signal, for one threshold.
 
     The relative rate rho is the rate -ln(1 - c) over the squared amplitude. c is the probability
     that the signal makes a bin cross where noise alone does not. Amplitudes are over the noise per
@@ -96,7 +96,7 @@ def empty_crossing_rates():
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def tabulate_crossing_rates(threshold_ratio, crossing_series):
-    """Tabulate the relative rate of threshold crossings by leaked signal, for one threshold.
+    """Tabulate the relative rate of threshold crossings due to leaked signal, for one threshold.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def tabulate_crossing_rates(threshold_ratio, crossing_series):
 def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
     """Add a bin's crossing rates at all speckle powers to sums over bins.
 
-    Each rate -ln(1 - c), with the crossing probability c by leaked signal, is divided by the
+    Each rate -ln(1 - c), with the crossing probability c due to leaked signal, is divided by the
     speckle power and multiplied by the bin's weight.
 
     Parameters
@@ -231,7 +231,7 @@ def rate_at_brightest_speckle(squared_ratio, rate_table):
 
     c is the probability that leaked signal makes the bin cross the threshold.
 
-    ``squared_ratio`` and ``rate_table`` are as of :func:`add_rates_by_power`.
+    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_power`.
     """
     table_position = (
         0.5 * math.log(squared_ratio)

@@ -37,7 +37,7 @@ N_OFFSETS = 9
 """Number of tabulated positions of an echo's centre relative to the nearest bin. They are evenly
 spaced over -1/2 .. 1/2 FFT bin."""
 
-_STAND_IN_LENGTH = 1024
+_TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the window with which tables are computed in place of longer windows of the
 same shape."""
 _POWER_ITERATIONS = 80
@@ -98,7 +98,9 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
         main_lobe_half_width(record_window),
     )
     if record_window.name in COSINE_SUM_COEFFICIENTS:
-        record_window = get_window(record_window.name, min(record_window.length, _STAND_IN_LENGTH))
+        record_window = get_window(
+            record_window.name, min(record_window.length, _TABLE_WINDOW_SAMPLES)
+        )
     deviations = LINE_DEVIATIONS * max(1.0, lobe_half_width / 2)
     half_bins = math.ceil(
         (lobe_half_width + 2 * _TABLE_DEVIATION_MAX * max(1.0, lobe_half_width / 2))
@@ -202,9 +204,9 @@ def _strongest_mode(
 def power_asymmetry(below, middle, above):
     """Return the relative difference of the powers above and below the strongest bin, -1..1.
 
-    It is (P_above - P_below) / (P_above + P_below). Arguments are the |X| of three adjacent bins.
-    The sign shows on which side of the bin the echo's centre lies. The result is 0 if both
-    neighbours are faint.
+    The difference is (P_above - P_below) / (P_above + P_below). Arguments are the |X| of three
+    adjacent bins. The sign shows on which side of the bin the echo's centre lies. The result is 0
+    if both neighbours are faint.
     """
     neighbour_power = below * below + above * above
     if not neighbour_power > 1e-6 * middle * middle:

@@ -4,12 +4,12 @@ With the window's transform W at the spacing of the bins, a lone tone delta bins
 has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. The inversion depends on the
 window:
 
-- If the neighbours of a tone on a bin are strong (Hann, Hamming, wider windows), the measure
-  (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it is delta / 2).
-  One step of least squares follows, weighted by the noise's covariance between the three bins. It
-  gives the least error that three magnitudes allow.
-- If the neighbours vanish (rectangular window), the larger one gives the side. The measure is
-  larger / (centre + larger), which is delta itself for the rectangular window.
+- If the neighbours of a tone on a bin are strong (Hann, Hamming, wider windows), the
+  magnitude ratio (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it
+  is delta / 2). One step of least squares follows, weighted by the noise's covariance between the
+  three bins. It gives the least error that three magnitudes allow.
+- If the neighbours vanish (rectangular window), the larger one gives the side. The
+  magnitude ratio is larger / (centre + larger), which is delta itself for the rectangular window.
 
 The tables follow from the window's transform, so the position of a noise-free single tone is exact
 (1e-6 bins). Three things bias the estimate: other lines within the main lobe, the tone's image near
@@ -53,12 +53,12 @@ _TONE_DEGREE = 32
 """Degree of the polynomial that gives a bin's complex value at -2 .. 2 bins from a tone."""
 
 _NEIGHBOUR_HEIGHT_MIN = 0.25
-"""Limit below which the position is found by TWO_BINS. It is the |X| of the neighbours of a tone on
-a bin, over the |X| of that bin."""
+"""Ratio of |X| of a neighbour to |X| of a bin on which a tone lies, below which positions are found
+by TWO_BINS."""
 
 THREE_BINS, TWO_BINS = 0, 1
-"""Kinds of measure from which a tone's position between bins is found. THREE_BINS uses the |X| of
-three bins, TWO_BINS that of the centre bin and its larger neighbour."""
+"""Kinds of magnitude ratio from which a tone's position between bins is found. THREE_BINS uses the
+|X| of three bins, TWO_BINS that of the centre bin and its larger neighbour."""
 
 
 class Interpolator(NamedTuple):
@@ -67,16 +67,17 @@ class Interpolator(NamedTuple):
     m is the number of tabulated positions in 0 .. 1 bin.
     """
 
-    measure_kind: int
-    """Kind of measure, THREE_BINS or TWO_BINS: how many bins give the position of a tone."""
-    measure_at_centre: float
-    """Value of the measure (a ratio of the bins' |X|) for a tone on the centre bin."""
-    measure_step: float
-    """Spacing of the values of the measure (a ratio of the bins' |X|) at which ``offset`` is
+    magnitude_ratio_kind: int
+    """Kind of the magnitude ratio from which a tone's position follows, THREE_BINS or TWO_BINS:
+    number of bins whose |X| enter the ratio."""
+    magnitude_ratio_at_centre: float
+    """Magnitude ratio (a ratio of the bins' |X|) for a tone on the centre bin."""
+    magnitude_ratio_step: float
+    """Spacing of the magnitude ratios (ratios of the bins' |X|) at which ``offset`` is
     tabulated."""
     offset: np.ndarray
-    """(m,): distance of the tone from the centre bin [bins], 0 .. 1. The measure (a ratio of |X|)
-    rises from ``measure_at_centre`` by ``measure_step``."""
+    """(m,): distance of the tone from the centre bin [bins], 0 .. 1. The magnitude ratio rises from
+    ``magnitude_ratio_at_centre`` by ``magnitude_ratio_step``."""
     weight: np.ndarray
     """(3, m): least-squares weights of the |X| of the smaller neighbour, the centre bin and the
     larger neighbour, each over that of the centre bin. They are tabulated over the tone's distance
@@ -101,7 +102,7 @@ class Interpolator(NamedTuple):
 def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, float]:
     """Return the noise correlations of two bins that are one bin apart, and two bins apart.
 
-    They are those of the noise components in phase with the main lobe of a tone.
+    The correlations are those of the noise components in phase with the main lobe of a tone.
     """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
@@ -124,15 +125,15 @@ def sidelobe_correlation(window: Window, fft_size: int) -> float:
 def interpolator(window: Window, fft_size: int) -> Interpolator:
     """Return the tables that give a peak's position from three magnitudes (cached).
 
-    They hold for records with this window that are padded to `fft_size` samples. For a flat-top
-    window in a padded FFT, no measure of the magnitudes rises with the offset of the tone from the
-    centre bin. The offset is then given as 0, with an error of half a bin.
+    The tables hold for records with this window that are padded to `fft_size` samples. For a
+    flat-top window in a padded FFT, no ratio of the magnitudes rises with the offset of the tone
+    from the centre bin. The offset is then given as 0, with an error of half a bin.
     """
     offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
     neighbours_vanish = tone_magnitudes[2, 0] < _NEIGHBOUR_HEIGHT_MIN * tone_magnitudes[1, 0]
     below, centre, above = tone_magnitudes
-    measures = (
+    magnitude_ratios = (
         above / (centre + above)
         if neighbours_vanish
         else (above - below) / (tone_magnitudes.sum(0) + centre)
@@ -141,15 +142,15 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
     weight, error = _least_squares_weights(
         tone_magnitudes, offset, correlation_1, correlation_2, two_bins=bool(neighbours_vanish)
     )
-    if not (np.diff(measures[: _TABLE_INTERVALS // 2 + 1]) > 0).all():
+    if not (np.diff(magnitude_ratios[: _TABLE_INTERVALS // 2 + 1]) > 0).all():
         weight, error, offset = 0 * weight, np.full_like(error, 1e30), 0 * offset
-    measures = np.maximum.accumulate(measures)
-    even_measures = np.linspace(measures[0], measures[-1], _TABLE_INTERVALS + 1)
+    magnitude_ratios = np.maximum.accumulate(magnitude_ratios)
+    even_ratios = np.linspace(magnitude_ratios[0], magnitude_ratios[-1], _TABLE_INTERVALS + 1)
     interpolation = Interpolator(
-        measure_kind=TWO_BINS if neighbours_vanish else THREE_BINS,
-        measure_at_centre=float(measures[0]),
-        measure_step=max(float(even_measures[1] - even_measures[0]), 1e-12),
-        offset=np.interp(even_measures, measures, offset),
+        magnitude_ratio_kind=TWO_BINS if neighbours_vanish else THREE_BINS,
+        magnitude_ratio_at_centre=float(magnitude_ratios[0]),
+        magnitude_ratio_step=max(float(even_ratios[1] - even_ratios[0]), 1e-12),
+        offset=np.interp(even_ratios, magnitude_ratios, offset),
         weight=0 * weight if neighbours_vanish else weight,
         error_at_sigma=error,
         noise_mixing=_noise_mixing(correlation_1, correlation_2),
@@ -164,7 +165,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
 def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
     """Return exp(-2 pi i cycles n) for n = 0 .. ``n_values`` - 1.
 
-    They are products of about 2 sqrt(n_values) exponentials.
+    The exponentials are products of about 2 sqrt(n_values) exponentials.
     """
     step = math.isqrt(n_values) + 1
     angle = -2j * np.pi * cycles * np.arange(step)
@@ -225,7 +226,7 @@ def _least_squares_weights(
     Returns
     -------
     weight, standard_error
-        (3, m) and (m,) [bins], the latter at |X| = sigma in the centre bin.
+        Weights (3, m), and standard errors (m,) [bins] at |X| = sigma in the centre bin.
 
     Notes
     -----
@@ -257,9 +258,9 @@ def _least_squares_weights(
 def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpolator) -> np.ndarray:
     """Return the error of a position over the variance of the lines' narrow Gaussian spread, (m,).
 
-    It is tabulated over the distance of the lines' mean from the centre bin [1/bins]. Three lines
-    of weights 1/6, 2/3, 1/6 represent the spread. Their moments up to the fifth are those of a
-    Gaussian.
+    The error is tabulated over the distance of the lines' mean from the centre bin [1/bins]. Three
+    lines of weights 1/6, 2/3, 1/6 represent the spread. Their moments up to the fifth are those of
+    a Gaussian.
     """
     positions = np.linspace(0.0, 1.0, _N_SPREAD_POSITIONS)
     power = np.zeros((3, _N_SPREAD_POSITIONS))
@@ -305,14 +306,16 @@ def estimate_sub_bin_offset(below, centre, above, interpolation):
     larger, smaller = max(below, above), min(below, above)
     if not larger > 0.0:
         return 0.0
-    if interpolation.measure_kind == THREE_BINS:
-        measure = (larger - smaller) / (smaller + 2.0 * centre + larger)
+    if interpolation.magnitude_ratio_kind == THREE_BINS:
+        magnitude_ratio = (larger - smaller) / (smaller + 2.0 * centre + larger)
     else:
-        measure = larger / (centre + larger)
+        magnitude_ratio = larger / (centre + larger)
     offset = _interpolate_table(
-        offsets, (measure - interpolation.measure_at_centre) / interpolation.measure_step
+        offsets,
+        (magnitude_ratio - interpolation.magnitude_ratio_at_centre)
+        / interpolation.magnitude_ratio_step,
     )
-    if interpolation.measure_kind == THREE_BINS and centre > 0.0:
+    if interpolation.magnitude_ratio_kind == THREE_BINS and centre > 0.0:
         table_index = offset * (offsets.size - 1)
         smaller_weight, centre_weight, larger_weight = (
             interpolation.weight[0],
@@ -510,7 +513,7 @@ def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.nda
         weight = derivatives * phase
         variance = np.einsum("jk,kl,jl->j", weight.conj(), noise_covariance, weight).real
         error = np.sqrt(np.maximum(variance, 0.0)) / slope
-        if interpolation.measure_kind == TWO_BINS:
+        if interpolation.magnitude_ratio_kind == TWO_BINS:
             # On a bin either neighbour may be the larger one.
             error[0] = error[1]
         # The error factor is relative to the standard error at the uncorrected position.

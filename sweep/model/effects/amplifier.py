@@ -54,7 +54,8 @@ SENT_LIGHT, SENT_AND_OSCILLATOR_LIGHT = "sent", "sent and local oscillator"
 def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the power density of an amplifier's spontaneous emission in one polarisation [W/Hz].
 
-    It is n_sp (G - 1) h nu, with the inversion factor n_sp, the gain G and the photon energy h nu.
+    The density is n_sp (G - 1) h nu, with the inversion factor n_sp, the gain G and the photon
+    energy h nu.
 
     >>> given = {_INVERSION_PATH: 1.0, _GAIN_PATH: 1001.0, LASER_PREFIX + "wavelength": 1550e-9}
     >>> f"{spontaneous_emission_density(given):.3g}"

@@ -37,14 +37,15 @@ from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
 
 _HEIGHT_DIFFERENCE_MIN = 1e-9
-"""Smallest difference of height [m] between the ends of a path. Level paths are given it, so that
-the mean extinction over height is defined."""
+"""Smallest difference of height [m] between the ends of a path. Paths that are more level count as
+having this difference, so that the mean extinction over height is defined."""
 
 
 class ExtinctionProfile(NamedTuple):
     """Extinction coefficient of the air, tabulated over height above the ground.
 
-    It is exponential between two heights, constant below the first, and 0 above the last.
+    The coefficient is exponential between two heights, constant below the first, and 0 above the
+    last.
     """
 
     height: tuple[float, ...]
@@ -190,7 +191,7 @@ def _mean_extinction(
 def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:
     """Return the extinction profile of points that share all text parameters.
 
-    None without an atmosphere.
+    The result is None without an atmosphere.
     """
     name = str(parameters["atmosphere.profile"])
     surface_extinction, depth = (
@@ -247,7 +248,7 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
 
 
 def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the changes that omitting extinction makes to the echo and to the shot noise.
+    """Return bounds on the changes of the echo and of shot noise if extinction is omitted.
 
     The shot noise is that of light from the target.
     """
@@ -321,10 +322,10 @@ EXTINCTION = Effect(
 
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(16)
-_CUT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
+_SPLIT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
 """Positions at which the backscatter integral is split between two rows of the extinction table.
 The unit is one e-folding of the extinction between these rows."""
-_CUT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
+_SPLIT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
 """Ranges at which the backscatter integral splits the path, in units of the near range (aperture
 diameter over full angle of the field of view)."""
 
@@ -344,7 +345,7 @@ def backscatter_integral(
     profile : ExtinctionProfile
         Extinction alpha over height.
     start_height, end_height, range : array_like
-        Heights of the path's ends and its length R [m], as of :func:`optical_depth`.
+        Heights of the path's ends and its length R [m], as in :func:`optical_depth`.
     near_range : array_like
         r_0 = D/Theta [m]: diameter of the aperture over full angle of the field of view.
 
@@ -380,7 +381,7 @@ def backscatter_integral(
     )
     inner_cuts = [
         np.clip(crossing_fraction, 0, 1) * target_range,
-        np.minimum(np.asarray(_CUT_RANGE_RATIOS) * near_range, target_range),
+        np.minimum(np.asarray(_SPLIT_RANGE_RATIOS) * near_range, target_range),
     ]
     cuts = np.sort(
         np.concatenate([np.zeros_like(target_range), *inner_cuts, target_range], axis=-1), axis=-1
@@ -409,7 +410,9 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
     rows = [*zip(profile.height, profile.extinction, strict=True)]
     for (z0, a0), (z1, a1) in itertools.pairwise(rows):
         e_foldings = abs(math.log(a1 / a0)) if a0 > 0 and a1 > 0 else 0.0
-        steps = [e_folding / e_foldings for e_folding in _CUT_E_FOLDINGS if e_folding < e_foldings]
+        steps = [
+            e_folding / e_foldings for e_folding in _SPLIT_E_FOLDINGS if e_folding < e_foldings
+        ]
         cuts += [z0 + step * (z1 - z0) if a1 < a0 else z1 - step * (z1 - z0) for step in steps]
         cuts.append(z1)
     return np.array(cuts)
@@ -418,7 +421,7 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
 def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
     """Return the power [W] of light that the air returns to the detector.
 
-    It follows from :func:`backscatter_integral`.
+    The power follows from :func:`backscatter_integral`.
     """
     collected_power = parameters[LASER_PREFIX + "power"] * aperture_area(
         beam.receiving_aperture_and_angle(parameters)[0]
@@ -430,9 +433,9 @@ def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndar
 def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     """Add the shot noise of backscattered light.
 
-    The beat of this light with the local oscillator is neglected. The grains that scatter it keep
-    changing, and its beat is spread over the bins from the nearest range to the target's range.
-    [T 3.3.1] counts backscatter as noise as well.
+    The beat of this light with the local oscillator is neglected. This light comes from grains that
+    change all the time, and is spread over the bins from the nearest range to the target's. [T
+    3.3.1] counts backscatter as noise as well.
     """
     parameters = context.parameters
     profile = extinction_profile(parameters)
@@ -452,11 +455,11 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
 
 
 def backscatter_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the shot noise of backscattered light, over the receiver's noise.
+    """Return a bound on the shot noise of backscattered light, over the receiver's noise.
 
-    The threshold is set on the noise with it. The bound is the smaller of two. The first takes the
-    path as filled with the air of its lower end, without extinction. The second returns all light
-    that is lost on the path from the beam's near end.
+    The threshold is set on noise that includes this shot noise. The bound is the smaller of two.
+    The first takes the path as filled with the air of its lower end, without extinction. The second
+    returns all light that is lost on the path from the beam's near end.
     """
     parameters = points.parameters
     profile = extinction_profile(parameters)

@@ -89,7 +89,7 @@ DEFAULT_EFFECTS = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",
     "signal_shot_noise", "solar_background", "image", "leakage",
 )  # fmt: skip
-"""Names of the effects that the model's functions simulate by default. They are those of ideal
+"""Names of the effects that the model's functions simulate by default. These effects make ideal
 lines and their noise."""
 
 SEPARATE_BATCHES_MASK = np.uint32(
@@ -113,7 +113,7 @@ def unpack_effect_flags(flags: int) -> tuple[str, ...]:
 def effect_flag_attributes() -> dict[str, Any]:
     """Return attributes of a store's variable that name the bits of effect flags.
 
-    They follow the CF conventions.
+    The attributes follow the CF conventions.
     """
     return {
         "units": "1",

@@ -31,14 +31,14 @@ counts as an error of 1, so that the effect is always simulated."""
 
 
 def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if the Doppler shift of all lines is omitted.
+    """Return a bound on the change of the largest bin if the lines' Doppler shift is omitted.
 
     Notes
     -----
     The shift is 2 v_r / lambda, with the radial velocity v_r and the wavelength lambda. It changes
-    the receiver's gain and the line's position between two bins. Its size in bins counts as well,
-    as the velocity is measured by it. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is never
-    skipped.
+    the receiver's gain and the line's position between two bins. The shift in bins counts as well,
+    because the velocity is measured by the shift. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is
+    never skipped.
     """
     if not points.any_nonzero("target.radial_velocity"):
         return None
@@ -48,7 +48,7 @@ def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBound:
-    """Bound the change of the largest bin by a common shift of all lines.
+    """Return a bound on the change of the largest bin due to a common shift of all lines.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ DOPPLER = Effect(
 
 
 def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if velocities are taken as equal over the footprint.
+    """Return a bound on the change of the largest bin if all beamlets have one velocity.
 
     Notes
     -----

@@ -169,7 +169,7 @@ class Effect:
     """
     defines_scene_if_off: bool = False
     """True if ``off`` is a rule of the scene, such as "all segments begin at one range", and not
-    the omission of something that is there: it then counts as no error."""
+    the omission of something that is there. ``off`` then counts as no error."""
     required_effects: tuple[str, ...] = ()
     """Names of effects that are simulated with this one, however small their own change is."""
 
@@ -190,5 +190,8 @@ class Effect:
 
 
 def add_noise_sources(shots: Shots, **variances: np.ndarray) -> Shots:
-    """Return shots with additional noise sources, given as variances at the ADC [V^2] by name."""
+    """Return shots with additional noise sources.
+
+    ``variances`` are noise variances at the ADC [V^2], by name of the source.
+    """
     return replace(shots, noise=shots.noise.with_sources(**variances))

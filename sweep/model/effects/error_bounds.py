@@ -44,10 +44,10 @@ class ErrorBound(NamedTuple):
 
 
 class PhaseErrorBound(NamedTuple):
-    """Bound of the phase error that an effect adds to lines over the record.
+    """Upper bound on the phase error that an effect adds to lines over the record.
 
-    It is a polynomial in the position x in the record, -1..1, with a remainder; or a shift of
-    frequencies. Values are by segment, or scalars.
+    The bound is a polynomial in the position x in the record, -1..1, with a remainder; or a shift
+    of frequencies. Values are by segment, or scalars.
     """
 
     coefficients: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)

@@ -23,7 +23,7 @@ from sweep.model.preparation import Shots
 def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
     """Return moments of the lines' offsets [FFT bins] from the line on the beam's axis.
 
-    They are due to the ranges of beamlets on the surface that the axis meets.
+    The offsets are due to the ranges of beamlets on the surface that the axis meets.
     """
     return points.footprint_extent.axis_surface_range_offsets.scaled_by(
         points.bins_per_relative_range
@@ -31,7 +31,7 @@ def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
 
 
 def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if the echo is one line on the beam's axis.
+    """Return a bound on the change of the largest bin if the echo is one line on the axis.
 
     Notes
     -----
@@ -104,9 +104,9 @@ FOOTPRINT = Effect(
 
 
 def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin that the optical phases of beamlets cause.
+    """Return a bound on the change of the largest bin due to optical phases of beamlets.
 
-    Phases may amplify lines or cancel them.
+    Lines with these phases may cancel or amplify each other.
 
     Notes
     -----
@@ -125,7 +125,7 @@ def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_footprint_phase(shots: Shots, context: EffectContext) -> Shots:
-    """Let the lines of beamlets add as complex amplitudes instead of powers.
+    """Add the lines of beamlets as complex amplitudes instead of powers.
 
     This applies if the spec states that the optical phases follow the surface. Otherwise the shots
     are returned unchanged.
@@ -153,9 +153,10 @@ FOOTPRINT_PHASE = Effect(
 
 
 def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if all surfaces are taken at the range of the axis's.
+    """Return a bound on the change of the largest bin if all surfaces are at one range.
 
-    None if all power is on the surface that the beam's axis meets.
+    The common range is the one on the beam's axis. The result is None if all power is on the
+    surface that the axis meets.
 
     Notes
     -----
@@ -177,7 +178,7 @@ def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
     line_distance_bins = (
         points.footprint_extent.off_axis_range_offset_max * points.bins_per_relative_range
     )
-    power_min = points.peak_power_bounds_for(axis_surface_spread(points))[0]
+    power_min = points.peak_power_bounds_for_spread(axis_surface_spread(points))[0]
     gain_ratio_max = np.minimum(
         np.exp(np.minimum(points.gain_slope_max * line_distance_bins, 50.0)),
         1 / points.transfer_gain**2,

@@ -57,7 +57,9 @@ bins are neglected."""
 
 
 def image_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if images are omitted; complex records have none.
+    """Return a bound on the change of the largest bin if images are omitted.
+
+    Complex records have no images.
 
     Notes
     -----
@@ -76,7 +78,7 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
             log10_pfa_change=log10_pfa_change,
             leaking_bin_change_sigma=leaking_bin_change,
         )
-    power_min = points.power_without_missing(
+    power_min = points.power_min_with_missing_samples(
         points.peak_power_bounds[0]
         / (1 + 2 * points.phase_error_shift_bins / points.padding_factor)
     )
@@ -98,13 +100,13 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
-    """Bound the change that images make to false peaks by leaked signal, if lines add as powers.
+    """Return a bound on the change of leaked signal's false peaks due to images.
 
-    It is the change of one bin at the threshold, or of all bins, whichever is larger. For small
-    amplitudes a, bins cross with probabilities of y e^-y a^2 / 2, with y = b^2 / 2 and the
-    threshold b, all over the noise per quadrature. Images fall at least as the inverse distance
-    from ``bins_to_image`` on. All bins together thus have ``bins_to_image`` times the a^2 of the
-    nearest.
+    Lines add as powers. The bound is that on the change of one bin at the threshold, or of all
+    bins, whichever is larger. For small amplitudes a, bins cross with probabilities of y e^-y a^2 /
+    2, with y = b^2 / 2 and the threshold b, all over the noise per quadrature. Images fall at least
+    as the inverse distance from ``bins_to_image`` on. All bins together thus have ``bins_to_image``
+    times the a^2 of the nearest.
     """
     image_ratio = (
         points.line_signal_ratio
@@ -124,7 +126,7 @@ def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
 
 
 def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
-    """Bound the change of log10 of a shot's false-alarm probability by images.
+    """Return a bound on the change of log10 of a shot's false-alarm probability due to images.
 
     Images move bins across the threshold, which then count as part of an echo or no longer do. The
     bound is that of the expected number of such bins, and at least of one. It is 0 if fewer than
@@ -199,8 +201,8 @@ IMAGE = Effect(
 
 
 _TABULATED_REACH_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
-"""Largest shifts of light from its line [bins], for each of which there is a table of leakage
-bounds."""
+"""Largest shifts of light from its line [bins]. There is a table of leakage bounds for each of
+them."""
 _ROWS_PER_OCTAVE, _OCTAVE_MIN, _OCTAVE_MAX = 2, -8, 30
 """Rows of tables of leakage bounds: number per octave, and first and last octave, of the magnitude
 of all lines over the threshold."""
@@ -216,10 +218,10 @@ DC and Nyquist the factor is 2."""
 
 
 def leakage_bound(points: PlannerInputs) -> ErrorBound:
-    """Bound the probability that leaked signal raises an additional group in any segment.
+    """Return a bound on the probability that leaked signal raises an additional group.
 
-    A group is a run of adjacent bins above the threshold. Leaked signal is the signal in bins that
-    stay below the threshold without noise.
+    The group may be in any segment. A group is a run of adjacent bins above the threshold. Leaked
+    signal is the signal in bins that stay below the threshold without noise.
     """
     threshold_ratio, is_near_image = points.threshold_ratio, points.is_near_image
     ratio_to_threshold = (
@@ -254,7 +256,7 @@ def leakage_bound(points: PlannerInputs) -> ErrorBound:
 def _leakage_probability(
     points: PlannerInputs, window_name: str, ratio_to_threshold: np.ndarray, reach_bins: np.ndarray
 ) -> np.ndarray:
-    """Bound the probability of leakage in all segments together, for the sidelobes of one window.
+    """Return a bound on the probability of leakage in all segments, by one window's sidelobes.
 
     Parameters
     ----------
@@ -365,7 +367,7 @@ def leakage_table(
 def _added_crossing_probability(
     signal: np.ndarray, threshold_ratio: float, noise_crossing: float, looks: Looks
 ) -> np.ndarray:
-    """Return by how much a signal raises a bin's probability to cross the threshold."""
+    """Return the increase of a bin's probability to cross the threshold that a signal causes."""
     crossing = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio)).pd
     return np.maximum(crossing - noise_crossing, 0.0) / max(1 - noise_crossing, 1e-12)
 

@@ -22,8 +22,8 @@ from sweep.model.preparation import Shots
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the changes of the echo and of its shot noise if the offset of the axes is omitted.
 
-    None if the axes of transmitted and received beam coincide, or if all light in the aperture
-    mixes.
+    The result is None if the axes of transmitted and received beam coincide, or if all light in the
+    aperture mixes.
     """
     paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH
     if not (beam.is_single_mode(points.parameters) and points.any_nonzero(*paths)):

@@ -52,9 +52,10 @@ def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return how far from a line's centre a Gaussian laser line spreads light.
+    """Return the distance over which a Gaussian laser line spreads light from its centre.
 
-    It is given as the shift of a :class:`PhaseErrorBound`. None for other line shapes.
+    The distance is the shift of a :class:`PhaseErrorBound`. The result is None for other line
+    shapes.
     """
     if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
         return None
@@ -64,7 +65,7 @@ def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the detecting bins if the line width is omitted.
+    """Return a bound on the change of the detecting bins if the line width is omitted.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     moments, line_deviation = window_moments(points.window), _line_deviation_window_bins(points)
     spread_loss = np.minimum((2 * np.pi * line_deviation) ** 2 * moments.position_variance, 1.0)
     smear_factor = 1 + 2 * points.phase_error_shift_bins / points.padding_factor
-    power_min = points.power_without_missing(
+    power_min = points.power_min_with_missing_samples(
         points.peak_power_bounds[0] / np.where(points.is_near_image, 2.0, 1.01) / smear_factor
     )
     magnitude_change = magnitude_change_from_power(
@@ -108,15 +109,15 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         points, PhaseErrorBound((half_reach, 0.0, 0.0, 0.0), constant=half_reach)
     )
     return ErrorBound(
-        magnitude_change=np.where(points.may_cancel, 0.0, magnitude_change),
+        magnitude_change=np.where(points.amplitudes_may_cancel, 0.0, magnitude_change),
         coherent_sum_change=coherent_change,
     )
 
 
 def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
-    """Bound the changes if the width of a Lorentzian laser line is omitted.
+    """Return bounds on the changes if the width of a Lorentzian laser line is omitted.
 
-    They are the power that the pure line loses, and the pedestal of noise around it.
+    The changes are the power that the pure line loses, and the pedestal of noise around it.
     """
     line_width, delay = points[_WIDTH_PATH], np.minimum(points.target.delay, points.record.duration)
     coherent_fraction = pure_line_power_fraction(
@@ -136,7 +137,9 @@ def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
     )
 
 
-def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _line_fraction_and_pedestal(
+    shots: Shots, timing: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the power fraction that a laser's pure line keeps, and the pedestal of phase noise.
 
     Both are those of the samples of the record that hold the echo.
@@ -161,7 +164,7 @@ def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.nda
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Give the beat a Gaussian line; or attenuate the pure line and add a pedestal of noise.
+    """Apply the laser's line: a Gaussian shape, or a weaker pure line and a pedestal of noise.
 
     Notes
     -----
@@ -192,7 +195,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
             f"{np.min(shots.record.duration):.3g} s, and this one takes {np.max(delay):.3g} s: "
             "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
         )
-    line_fraction, in_phase_pedestal = _apparent_lines(shots, timing)
+    line_fraction, in_phase_pedestal = _line_fraction_and_pedestal(shots, timing)
     line_power = (shots.link_scales.beat_amplitude / 2) ** 2 * shots.total_relative_echo
     side_pedestal = pedestal_power_under_line(window=shots.window, **timing)
     if shots.echo_record.n_samples_before is not None:

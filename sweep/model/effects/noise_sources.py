@@ -223,7 +223,7 @@ def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np
 def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the variance of the local oscillator's intensity noise over that of the receiver's.
 
-    It is exact, not a bound. The threshold is set on the noise with it.
+    The variance is exact, not a bound. The threshold is set on noise that includes this source.
     """
     if points.waveform.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
@@ -283,8 +283,9 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the noise of the ADC's rounding over the receiver's noise, without clipping.
 
     Rounding noise is white, and is compared with the density of the receiver's noise at the line.
-    The threshold is set on the noise with it. A whitened spectrum has its lines divided by the root
-    of the noise density: of both noises with the effect, of the receiver's alone without it.
+    The threshold is set on noise that includes this source. A whitened spectrum has its lines
+    divided by the root of the noise density: of both noises with the effect, of the receiver's
+    alone without it.
     """
     if not points.any_nonzero(_BITS_PATH):
         return None
@@ -303,7 +304,7 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
     """Add the ADC's rounding noise, if a number of bits is stated.
 
-    It is white, of the variance lsb^2/12 for steps of lsb [V].
+    The noise is white, of the variance lsb^2/12 for steps of lsb [V].
 
     Notes
     -----

@@ -55,9 +55,9 @@ opposite frequency far away, are added to it."""
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of results if records are taken as full although the echo arrives late.
+    """Return a bound on the change of results if late echoes are taken to fill their records.
 
-    None if no samples lack the echo.
+    A late echo arrives after its record has begun. The result is None if no samples lack the echo.
     """
     missing = points.missing_samples
     if missing is None:
@@ -94,9 +94,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         return ErrorBound(
             magnitude_change=magnitude_change, probability_change=all_missing, **residual
         )
-    lone_change = np.where(points.may_cancel, 0.0, magnitude_change)
+    lone_change = np.where(points.amplitudes_may_cancel, 0.0, magnitude_change)
     summed_change = np.where(
-        points.may_cancel,
+        points.amplitudes_may_cancel,
         2 * missing.lost_fraction / points.window_response.scalloping_gain_min,
         points.image_bound,
     )
@@ -110,9 +110,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def residual_bound(points: PlannerInputs) -> np.ndarray:
-    """Bound the error because one number of missing samples serves all beamlets and looks.
+    """Return a bound on the error of one number of missing samples for all beamlets and looks.
 
-    It is the number of samples before the echo on the beam's axis, in the middle look.
+    The number used is that of the samples before the echo on the beam's axis, in the middle look.
 
     Returns
     -------

@@ -172,7 +172,9 @@ def phase_over_record(
 
 
 def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray:
-    """Return the largest change of any bin of a line relative to its peak.
+    """Return a bound on the change that a phase error causes in any bin of a line.
+
+    The change is relative to the line's peak.
 
     Parameters
     ----------
@@ -184,7 +186,7 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
     Returns
     -------
     ndarray
-        Mean of |phi| over the record, weighted with |w| / sum w for the window w.
+        Bound, the mean of |phi| over the record [rad], weighted with |w| / sum w for the window w.
     """
     moments = window_moments(window)
     total = phase_bound.non_polynomial * moments.magnitude_sum
@@ -196,8 +198,8 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
 def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
     """Return the change that a phase error makes to sums of lines and images as amplitudes.
 
-    It is :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters to lines
-    next to their images, and to a line to which a distant image is added.
+    The change is :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters
+    to lines next to their images, and to a line to which a distant image is added.
     """
     moments = window_moments(points.window)
     phase_anywhere = np.minimum(
@@ -211,11 +213,13 @@ def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -
         mean_phase_bound(phase_bound, points.window),
     )
     near_change = 2 * phase_change / points.window_response.scalloping_gain_min
-    return np.where(points.may_cancel, near_change, points.image_bound * phase_anywhere)
+    return np.where(points.amplitudes_may_cancel, near_change, points.image_bound * phase_anywhere)
 
 
 def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
-    """Bound the change if one of the phase errors is omitted, whichever of the others are present.
+    """Return a bound on the change of results if one of the phase errors is omitted.
+
+    The bound holds whichever of the other phase errors are present.
 
     Parameters
     ----------
@@ -289,7 +293,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     shift_bins = 2 * mean_slope * points.padding_factor
     if not points.amplitudes_may_add:
         return ErrorBound(magnitude_change=magnitude_change, shift_bins=shift_bins)
-    lone_change = np.where(points.may_cancel, 0.0, magnitude_change)
+    lone_change = np.where(points.amplitudes_may_cancel, 0.0, magnitude_change)
     return ErrorBound(
         magnitude_change=lone_change,
         coherent_sum_change=coherent_phase_change(points, own_bound),
@@ -321,7 +325,8 @@ def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarra
     position : ndarray (m,)
         Positions x in the record, -1..1.
     start, duration : ndarray
-        Start since the segment's start, and duration, of the record [s], (n,) or scalar.
+        Time from the segment's start to the record's start, and duration of the record [s], (n,) or
+        scalar.
 
     Returns
     -------
@@ -360,7 +365,8 @@ def range_walk_phase(
     radial_velocity : ndarray (n,)
         Radial velocity v_r [m/s].
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
     slide : ndarray or float
         Speed u - v_r [m/s] by which the range along the beam falls faster than at the radial
         velocity at the segment's start.
@@ -384,7 +390,7 @@ def range_walk_phase(
 def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Return the bound of the phase that range walk adds over the record.
 
-    Range walk is the drift of the beat as the range changes. None without it.
+    Range walk is the drift of the beat as the range changes. The result is None without it.
     """
     doppler_ratio_growth = points.stack_segments(
         *(
@@ -403,7 +409,7 @@ def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
-    """Let the beats of the two chirps drift over the record, as the range falls.
+    """Make the beats of the two chirps drift over the record, as the range falls.
 
     Notes
     -----
@@ -502,7 +508,8 @@ def acceleration_phase(
     range, radial_velocity, acceleration : ndarray (n,)
         Values at the segment's start [m, m/s, m/s^2].
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
 
     Returns
     -------
@@ -535,10 +542,10 @@ def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if the target's acceleration is omitted.
+    """Return a bound on the change of the largest bin if acceleration is omitted.
 
-    It makes lines drift within a record and from look to look (record of each segment). The loss of
-    looks that are added in amplitude is exact.
+    The target's acceleration makes lines drift within a record and from look to look (record of
+    each segment). The loss of looks that are added in amplitude is exact.
     """
     bound = phase_omission_bound(points, "acceleration")
     if bound is None or points.looks.n_coherent == 1:
@@ -551,7 +558,7 @@ def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
-    """Let the Doppler frequency drift over the record of every segment, as the target accelerates.
+    """Make the Doppler frequency drift over all records, as the target accelerates.
 
     The loss that it causes in looks that are added in amplitude is included.
     """
@@ -624,7 +631,8 @@ def error_table_phase(
     range, radial_velocity : ndarray (n,)
         Values at the segment's start [m, m/s].
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
 
     Returns
     -------
@@ -676,7 +684,8 @@ def chirp_nonlinearity_phase(
     periods : ndarray
         Number > 0 of periods of the sine over the sweep.
     start, duration : ndarray
-        Start since the segment's start, and duration, of the echo's record [s].
+        Time from the segment's start to the start of the echo's record, and duration of the record
+        [s].
 
     Returns
     -------
@@ -709,8 +718,8 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
     """Return the bound of the phase that the sweep's frequency error adds over the record.
 
     Quadratic and cubic errors are polynomials in the position in the record. A sine, and a table's
-    departure from the middle of its range of values, are taken at their largest. None without an
-    error.
+    departure from the middle of its range of values, are taken at their largest. The result is None
+    without an error.
     """
     table_text = points.option(ERROR_TABLE_PATH)
     if not points.any_nonzero(*_ERROR_PEAK_PATHS):
@@ -765,7 +774,7 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
 
 
 def _error_table_phase_bound(points: PlannerInputs, table: SweepFrequencyError) -> PhaseErrorBound:
-    """Bound the phase that a measured frequency error of the sweep adds over the record.
+    """Return a bound on the phase that a measured error of the sweep adds over the record.
 
     The phase is about minus the echo's delay times the error. It is bounded by the middle of the
     error's range of values, the largest departure from it, and the error's derivative.

@@ -122,7 +122,7 @@ class PlannerInputs(LinkBudget):
         return any(bool(self.parameters[path].any()) for path in paths)
 
     def _select_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
-        """Select the values of existing segments from those of up, Doppler and down."""
+        """Select the values of existing segments from values of up, Doppler and down."""
         named_values = zip(waveform.SEGMENT_NAMES, values_by_segment, strict=True)
         return [value for name, value in named_values if name in self.waveform.segment_order]
 
@@ -167,8 +167,8 @@ class PlannerInputs(LinkBudget):
     def noise_maximum_ratio(self) -> float | None:
         """Level that the noise of all bins together exceeds with a probability of at most 0.001.
 
-        It is a level of |X| over the noise per quadrature. None if segments report all peaks that
-        cross the threshold.
+        The level is one of |X| over the noise per quadrature. It is None if segments report all
+        peaks that cross the threshold.
         """
         if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
@@ -300,7 +300,7 @@ class PlannerInputs(LinkBudget):
     def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest relative magnitude of a bin at least ``distance`` [bins] from a line.
 
-        It is relative to the line's peak in a record that the echo fills.
+        The magnitude is relative to the line's peak in a record that the echo fills.
         """
         response_max = self.window_response.sidelobe_max(distance)
         if self.missing_samples is None:
@@ -314,7 +314,7 @@ class PlannerInputs(LinkBudget):
             response_max + np.minimum(step_sidelobe, self.missing_samples.lost_fraction)
         )
 
-    def power_without_missing(self, power: np.ndarray) -> np.ndarray:
+    def power_min_with_missing_samples(self, power: np.ndarray) -> np.ndarray:
         """Return a lower bound of the largest bin's power if the echo lacks samples of the record.
 
         ``power`` is the bound in a record that the echo fills. Both are relative to the power that
@@ -353,7 +353,7 @@ class PlannerInputs(LinkBudget):
     def line_signal_ratio(self) -> np.ndarray:
         """|X| of the line on the beam's axis if it lay on a bin, over the noise per quadrature.
 
-        By segment.
+        There is a value for each segment.
         """
         receiver_filter, noise = self.receiver_filter, self.noise
         # Where an anti-alias filter passes almost no noise, the ADC's noise remains.
@@ -369,7 +369,7 @@ class PlannerInputs(LinkBudget):
     def peak_ratio(self) -> np.ndarray:
         """|X| in the largest bin of the line on the beam's axis, over the noise per quadrature.
 
-        By segment.
+        There is a value for each segment.
         """
         return self.line_signal_ratio * self.window_response.scalloping_gain(self.bin_offset)
 
@@ -406,7 +406,7 @@ class PlannerInputs(LinkBudget):
     def line_spread(self) -> OffsetMoments:
         """Bounds of the moments of offsets [FFT bins] of beamlets' lines from the axis's.
 
-        They include offsets due to both range and radial velocity.
+        The bounds include offsets due to both range and radial velocity.
         """
         return self.range_spread.sum_bound(self.velocity_spread)
 
@@ -420,7 +420,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def phase_error_shift_bins(self) -> np.ndarray | float:
-        """Largest shift in frequency of a line's light by phase errors over the record [bins]."""
+        """Largest frequency shift of light from its line that phase errors cause [bins]."""
         return self.total_phase_error_bound.shift_window_bins * self.padding_factor
 
     @cached_property
@@ -437,7 +437,7 @@ class PlannerInputs(LinkBudget):
     def image_bound(self) -> np.ndarray:
         """Largest |X| that images (at negative frequencies) can add to the largest bin.
 
-        It is relative to the |X| of all lines in phase.
+        The result is relative to the |X| of all lines in phase.
         """
         smear_factor = 1 + 2 * self.phase_error_shift_bins / self.padding_factor
         gain_rise = np.exp(np.minimum(self.gain_slope_max * self.line_spread.extreme, 50.0))
@@ -452,7 +452,7 @@ class PlannerInputs(LinkBudget):
         return self.adds_amplitudes or self.any_nonzero("target.roughness")
 
     @cached_property
-    def may_cancel(self) -> np.ndarray:
+    def amplitudes_may_cancel(self) -> np.ndarray:
         """True where amplitudes that add might nearly cancel."""
         if not self.amplitudes_may_add:
             return np.zeros_like(self.is_near_image)
@@ -464,10 +464,10 @@ class PlannerInputs(LinkBudget):
 
         Both are relative to the power that all lines together would have on one bin.
         """
-        return self.peak_power_bounds_for(self.line_spread)
+        return self.peak_power_bounds_for_spread(self.line_spread)
 
-    def peak_power_bounds_for(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
-        """Bound the largest bin's power for lines of a given spread.
+    def peak_power_bounds_for_spread(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
+        """Return bounds on the largest bin's power for lines of a given spread.
 
         Parameters
         ----------
@@ -523,7 +523,7 @@ class PlannerInputs(LinkBudget):
         present_moments: OffsetMoments,
         shift_bins: np.ndarray | float = 0.0,
     ):
-        """Bound the relative change of the largest bin's power as lines move or spread further.
+        """Return a bound on the relative change of the largest bin's power as lines move or spread.
 
         Parameters
         ----------
@@ -545,7 +545,10 @@ class PlannerInputs(LinkBudget):
         for the mean m and the rms s of X, added to lines of rms S. c is due to the slope of the
         receiver's gain.
         """
-        response, power_min = self.window_response, self.peak_power_bounds_for(present_moments)[0]
+        response, power_min = (
+            self.window_response,
+            self.peak_power_bounds_for_spread(present_moments)[0],
+        )
         power_change = response.slope_max * (added_moments.mean + shift_bins)
         power_change = power_change + response.curvature_max * (
             present_moments.rms * added_moments.rms + added_moments.rms**2 / 2
@@ -558,10 +561,11 @@ class PlannerInputs(LinkBudget):
         return image_factor * np.exp(np.minimum(gain_exponent, 50.0)) * power_change / power_min
 
     def coherent_sum_bound(self, shift_bins: np.ndarray | float) -> np.ndarray:
-        """Bound the relative change of a sum of amplitudes whose lines move by ``shift_bins``.
+        """Return a bound on the relative change of a sum of amplitudes whose lines move.
 
-        It is relative to the sum in phase. It follows from the derivatives of the window's
-        transform and of the receiver's gain, and from the phases at mid-record of line and image.
+        Lines move by ``shift_bins``. The change is relative to the sum in phase. Its bound follows
+        from the derivatives of the window's transform and of the receiver's gain, and from the
+        phases at mid-record of line and image.
         """
         phase_per_bin = (
             2

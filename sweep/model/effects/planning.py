@@ -49,10 +49,10 @@ class EffectPlan(NamedTuple):
     """(effects, tiles) bool: True if the effect is simulated."""
     omission_error: np.ndarray
     """(effects, tiles): change if the effect is omitted, 0..1. The largest change of pd, log10
-    pfa or the relative |X| at any point of the tile, as of :func:`omission_errors`."""
+    pfa or the relative |X| at any point of the tile, as in :func:`omission_errors`."""
     total_error: np.ndarray
-    """(tiles,): sum of the changes by omitted effects, plus :attr:`residual_error`. Only the latter
-    and effects that are off can make it exceed the tolerance."""
+    """(tiles,): sum of the changes due to omitted effects, plus :attr:`residual_error`. Only the
+    residual error, and effects that are off, can make the sum exceed the tolerance."""
     residual_error: np.ndarray
     """(tiles,): error, 0..1, of pd or the relative |X| due to what simulated effects neglect."""
     keeps_all_optional: np.ndarray
@@ -93,7 +93,7 @@ def plan_effects(
         the scene is omitted even if it is on. An effect that is off switches off the effects that
         are part of it.
     tolerance : float
-        Tolerated sum of the changes by all omitted effects, 0..1: of pd in the three segments
+        Tolerated sum of the changes due to all omitted effects, 0..1: of pd in the three segments
         together, of log10 of a probability of false alarm, or of a relative magnitude.
     effects : sequence of Effect
         Effects to choose from.
@@ -177,8 +177,8 @@ def error_bounds(
 def _forced_modes(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[str, str]:
     """Return ``on`` or ``off`` by name of each effect that is not planned by its error bound.
 
-    Its own mode in the spec decides, or that of its parent or child. A child is an effect that is
-    part of another, the parent.
+    The mode is the effect's own in the spec, or follows from the mode of its parent or child. A
+    child is an effect that is part of another, the parent.
     """
     forced_modes = {name: mode for name, mode in modes.items() if mode != "auto"}
     for name, parent in _child_parent_pairs(effects):
@@ -323,9 +323,10 @@ def omission_errors(
 def residual_errors(
     bounds: Mapping[str, ErrorBound], points: PlannerInputs
 ) -> dict[str, np.ndarray]:
-    """Bound the error of pd or relative |X| that simulated effects leave, by name of the effect.
+    """Return bounds on the error of pd or relative |X| that simulated effects leave, by name.
 
-    pd is the probability of detection. Effects without such an error are left out.
+    The names are those of effects. pd is the probability of detection. Effects without such an
+    error are left out.
     """
     residuals = {
         name: bound.residual_magnitude_change
@@ -370,7 +371,7 @@ def signal_ratio_bounds(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a lower and an upper bound of |X| in the largest bin over the noise per quadrature.
 
-    They hold whichever of the effects are simulated.
+    The bounds hold whichever of the effects are simulated.
     """
     signal_ratio_min = signal_ratio_max = points.peak_ratio * points.looks.amplitude_gain_max
     coherent_change: np.ndarray | float = 0.0

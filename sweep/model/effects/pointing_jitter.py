@@ -103,10 +103,10 @@ def perturb_geometry(
     )
 
 
-def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
+def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest relative change of range, and shift of lines [bins], by beam deflections.
 
-    They hold in all draws but a fraction :data:`RARE_DRAW_PROBABILITY`, and for the lowest beamlets
+    Both hold in all draws but a fraction :data:`RARE_DRAW_PROBABILITY`, and for the lowest beamlets
     too. The change of range is infinite if a beamlet may pass over the horizon.
     """
     turn_max = points[_JITTER_PATH] * math.sqrt(2 * math.log(1 / RARE_DRAW_PROBABILITY))
@@ -139,32 +139,35 @@ def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return how far random deflections of the beam shift lines; None without jitter.
+    """Return the distance by which random deflections of the beam shift lines; None without them.
 
-    It is given as the shift of a :class:`PhaseErrorBound`.
+    The distance is the shift of a :class:`PhaseErrorBound`.
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None
-    return PhaseErrorBound(extra_shift_window_bins=_largest_turn(points)[1] / points.padding_factor)
+    return PhaseErrorBound(
+        extra_shift_window_bins=_largest_range_change_and_line_shift(points)[1]
+        / points.padding_factor
+    )
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change if jitter is omitted, in all but rare draws.
+    """Return a bound on the change of results if jitter is omitted, in all but rare draws.
 
     Notes
     -----
     Echo powers change by the cube of the ratio of ranges (1/R^2 and at most Lambert's cosine). A
     footprint whose phases follow its geometry may start or stop fading, and so may lines with their
-    images. Nothing is known of those.
+    images. No bound is known for these changes.
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None
-    range_ratio, shift_bins = _largest_turn(points)
+    range_ratio, shift_bins = _largest_range_change_and_line_shift(points)
     echo_change = 3 * range_ratio * (1 + range_ratio) ** 2
     power_change = (
         points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins) + echo_change
     )
-    is_unknown = points.may_cancel & (points[_JITTER_PATH] > 0)
+    is_unknown = points.amplitudes_may_cancel & (points[_JITTER_PATH] > 0)
     coherent_change: np.ndarray | float = 0.0
     if points.amplitudes_may_add:  # the phase between line and image changes with range
         turned_cycles = points.carriers * points.target.delay * np.minimum(range_ratio, 1e6)

@@ -37,10 +37,10 @@ from sweep.model.preparation import Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
-_CUT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
-"""Voltages at which integrals over a quarter period of the sine are split, less full scale, in
-standard deviations of the noise. Between them the integrands are smooth."""
-_TINY = 1e-30
+_SPLIT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
+"""Voltages minus full scale [standard deviations of the noise] at which integrals over a quarter
+period of the sine are split. Between these voltages the integrands are smooth."""
+_ZERO_AMPLITUDE_SUBSTITUTE_VOLTS = 1e-30
 """Positive voltage [V] that replaces an amplitude of 0 where a positive number is needed."""
 _UNLIMITED_VOLTAGE = 1e100
 """Full-scale voltage [V] of an ADC that never clips."""
@@ -61,7 +61,7 @@ class ClippingGains(NamedTuple):
 def clipping_gains(
     *, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike
 ) -> ClippingGains:
-    """Compute the gains of line and noise by clipping.
+    """Compute the factors by which clipping reduces a line and the noise.
 
     Parameters
     ----------
@@ -92,9 +92,9 @@ def clipping_gains(
 
 def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return phases in a quarter period and weights whose sum is 1, (n, nodes) each."""
-    cut_phases = np.arcsin(np.clip((v + _CUT_DEVIATIONS * s) / a, 0.0, 1.0))
+    split_phases = np.arcsin(np.clip((v + _SPLIT_DEVIATIONS * s) / a, 0.0, 1.0))
     zeros = np.zeros(a.shape)
-    cuts = np.concatenate([zeros, cut_phases, zeros + math.pi / 2], axis=-1)
+    cuts = np.concatenate([zeros, split_phases, zeros + math.pi / 2], axis=-1)
     half_width = np.diff(cuts)[..., None] / 2
     phase = (cuts[..., :-1, None] + half_width) + half_width * _GAUSS_NODES
     weight = half_width * _GAUSS_WEIGHTS / (math.pi / 2)
@@ -103,7 +103,7 @@ def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray
 
 
 def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean loss of x + n by clipping, x >= 0, and the variance that remains.
+    """Return the mean that x + n loses when it is clipped, and its remaining variance; x >= 0.
 
     In units of s, with a = (V - x)/s and b = (-V - x)/s, clipped noise is a above a, and b below b.
     The mean loss above is f(a) - a Q(a), and likewise below.
@@ -149,7 +149,9 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     if not is_limited.any():
         return shots
     light_fraction = 0.5 if shots.complex_record else 1.0  # I and Q have half of the light each
-    amplitude = np.maximum(total_beat_amplitude(shots) * light_fraction, _TINY)
+    amplitude = np.maximum(
+        total_beat_amplitude(shots) * light_fraction, _ZERO_AMPLITUDE_SUBSTITUTE_VOLTS
+    )
     deviation = np.sqrt(shots.noise_variance * light_fraction)
     voltage_limit = np.where(is_limited, full_scale, _UNLIMITED_VOLTAGE)
     with np.errstate(over="ignore"):  # a denormal limit overflows the ratio
@@ -171,7 +173,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 def total_beat_amplitude(shots: Shots) -> np.ndarray:
     """Return the amplitude at the ADC [V] of a sine with the power of all lines, (n,).
 
-    The receiver's gain is taken at the lowest beat frequency of all segments, where it is largest.
+    The amplitude is that of the existing segment with the lowest beat frequency, which passes the
+    receiver best.
     """
     beat_inputs = {
         "chirp_rate": shots.waveform.chirp_rate, "range": shots.range,
@@ -193,7 +196,9 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change if clipping is omitted, whatever else adds noise or attenuates the echo.
+    """Return a bound on the change of results if clipping is omitted.
+
+    The bound holds whatever else adds noise or attenuates the echo.
 
     Notes
     -----

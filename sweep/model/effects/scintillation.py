@@ -42,35 +42,37 @@ _DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
 """Exponents of two factors in the Rytov variance's integral over the path, by kind of wave. The
 factors are the distance to the receiver and the distance to the source."""
 _LARGE_EDDY_COEFFICIENTS = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
-"""Coefficients, by kind of wave, of two terms in the log variance by large eddies. The first term
-is the aperture's, the second that of the strength of turbulence."""
+"""Coefficients, by kind of wave, of two terms in the log variance due to large eddies. The first
+term is the aperture's, the second that of the strength of turbulence."""
 
 
 class TurbulenceProfile(NamedTuple):
     """Structure constant C_n^2 of the air's refractive index over height above the ground.
 
-    It is the sum of a uniform part and of the three terms of Hufnagel and Valley's model.
+    The structure constant is the sum of a uniform part and of the three terms of Hufnagel and
+    Valley's model.
     """
 
     uniform: float = 0.0
     """Part of C_n^2 that is the same at all heights [m^(-2/3)]. If the other fields are 0, it is
     C_n^2."""
     surface_layer: float = 0.0
-    """Hufnagel and Valley's A, the value on the ground [m^(-2/3)]: 1.7e-14; it falls by e over 100
-    m."""
+    """Coefficient A of Hufnagel and Valley's surface layer [m^(-2/3)]: C_n^2 of the layer on the
+    ground, 1.7e-14 in the 5/7 model. It falls by the factor e over a height of 100 m."""
     wind_speed: float = 0.0
-    """Hufnagel and Valley's rms wind speed aloft [m/s]: 21."""
+    """Rms wind speed at high altitude in Hufnagel and Valley's model [m/s]; 21 in the 5/7 model."""
     mid_altitude: float = 0.0
-    """Hufnagel and Valley's coefficient at middle altitudes [m^(-2/3)]: 2.7e-16; it falls by e over
-    1500 m."""
+    """Coefficient of Hufnagel and Valley's term for middle altitudes [m^(-2/3)], 2.7e-16 in the 5/7
+    model. The term falls by the factor e over a height of 1500 m."""
 
 
 HUFNAGEL_VALLEY = TurbulenceProfile(surface_layer=1.7e-14, wind_speed=21.0, mid_altitude=2.7e-16)
-"""The 5/7 model: at 0.5 um 5 cm of coherence and 7 urad of isoplanatic angle [Valley 1980]."""
+"""Hufnagel and Valley's 5/7 model of turbulence [Valley 1980]. At a wavelength of 0.5 um its
+coherence length is 5 cm, and its isoplanatic angle 7 urad."""
 
 
 class LogIrradianceVariances(NamedTuple):
-    """Variances of the logarithm of the irradiance by large and by small eddies, (n,) each."""
+    """Variances of the logarithm of the irradiance due to large and small eddies, (n,) each."""
 
     large_eddies: np.ndarray
     """(n,): variance of the logarithm of the irradiance factor that large eddies cause."""
@@ -187,7 +189,7 @@ def log_irradiance_variances(
     Returns
     -------
     LogIrradianceVariances
-        Log variances by large and by small eddies, (n,) each.
+        Log variances due to large and due to small eddies, (n,) each.
 
     Notes
     -----
@@ -312,10 +314,7 @@ _DISTRIBUTION_PATH = "atmosphere.scintillation_law"
 
 
 def turbulence_profile(parameters: Mapping[str, np.ndarray]) -> TurbulenceProfile | None:
-    """Return the strength of turbulence over height, Cn^2; None in still air.
-
-    All points have the same text parameters (one category).
-    """
+    """Return the turbulence over height; None in still air. All points share text parameters."""
     name = str(parameters[_TURBULENCE_PATH])
     if name == "uniform":
         return TurbulenceProfile(uniform=float(parameters[_STRUCTURE_CONSTANT_PATH]))
@@ -364,7 +363,7 @@ def two_way_log_variances(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of mean probabilities if scintillation is omitted.
+    """Return a bound on the change of mean probabilities if scintillation is omitted.
 
     Notes
     -----

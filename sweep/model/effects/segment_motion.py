@@ -74,7 +74,7 @@ def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin if all segments begin at one range and velocity.
+    """Return a bound on the change of the largest bin if segments share range and velocity.
 
     Phases of lines that add are included. A line meets its image at the phase of its new position.
     Beamlets with velocities of their own turn against each other.
@@ -103,14 +103,14 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Let the segments start one after the other, while the target moves.
+    """Start the segments one after the other, while the target moves.
 
     Notes
     -----
-    Sets the start of each segment, that of the middle look with several looks. Adds the mean start
-    t_m of up- and down-chirp to the range walk's time. Sets the fraction S t_d / 2 of the optical
-    frequency at mid-chirp by which the beats underestimate the radial velocity, and the drift of
-    lines per look.
+    The effect sets the start of each segment; with several looks it is that of the middle look. It
+    adds the mean start t_m of up- and down-chirp to the range walk's time. It also sets the
+    fraction S t_d / 2 of the optical frequency at mid-chirp by which the beats underestimate the
+    radial velocity, and the drift of lines per look.
     """
     waveform, motion, looks = shots.waveform, shots.motion, shots.looks
     starts = waveform.segment_starts

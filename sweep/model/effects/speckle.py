@@ -75,7 +75,8 @@ def coherent_echo_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np
     ----------
     roughness : array_like
         Standard deviation sigma_h of the surface's height along the line of sight [m]. For a plane
-        it is that normal to it times the sine of the grazing angle; infinite for developed speckle.
+        it is the deviation of the height normal to the plane, times the sine of the grazing angle.
+        It is infinite for developed speckle.
     wavelength : array_like
         Wavelength lambda [m].
 
@@ -149,7 +150,9 @@ def draw_speckle_factors(
 
 
 def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the output change if speckle is omitted, in all but 1e-6 of draws; None if inactive.
+    """Return a bound on the change of results if speckle is omitted; None if it is absent.
+
+    The bound holds in all draws but a fraction of 1e-6.
 
     Notes
     -----
@@ -171,11 +174,11 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
                 is_near_image & (kappa < 1), 1.0, 1 - np.sqrt(kappa) + diffuse_change
             )
         )
-    may_cancel = points.may_cancel
+    amplitudes_may_cancel = points.amplitudes_may_cancel
     return ErrorBound(
-        magnitude_change=1 - np.sqrt(kappa) + np.where(may_cancel, 0.0, diffuse_change),
+        magnitude_change=1 - np.sqrt(kappa) + np.where(amplitudes_may_cancel, 0.0, diffuse_change),
         coherent_sum_change=np.where(
-            may_cancel,
+            amplitudes_may_cancel,
             math.sqrt(2) * diffuse_change / points.window_response.scalloping_gain_min,
             0.0,
         ),
@@ -185,7 +188,7 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
 _DECORRELATED_KAPPA_MAX = 1e-6
 """Limit on the fraction of the echo's power that keeps its phase, for footprints whose beamlets add
 as amplitudes. Below it the speckle may differ from segment to segment."""
-_TINY = 1e-300
+_ZERO_DIVISOR_SUBSTITUTE = 1e-300
 """Positive number that replaces a divisor of 0, such as the power of no light."""
 
 
@@ -238,7 +241,9 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
             is_decorrelated, np.asarray(carrier, float) * start, 0.0
         ) + np.zeros(shots.size)
         np.add(cycles, turned_cycles[:, None] * doppler, out=phase[segment_index])
-    power_ratio = (amplitude**2).sum(axis=1) / np.maximum((mean_amplitude**2).sum(axis=1), _TINY)
+    power_ratio = (amplitude**2).sum(axis=1) / np.maximum(
+        (mean_amplitude**2).sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE
+    )
     return replace(
         shots,
         footprint=shots.footprint._replace(
@@ -417,7 +422,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
 def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
     """Return each look's power in the strongest bin over the mean of looks, (3, n, looks).
 
-    It differs between looks because lines drift out of the bin.
+    The power differs between looks because lines drift out of the bin.
     """
     n_looks = shots.looks.number
     look_power = np.ones((3, shots.size, n_looks))
@@ -443,7 +448,9 @@ def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
         look_power[segment] = (window_transform(shots.window, line_distance) ** 2 * weight).sum(
             axis=-1
         )
-    return look_power / np.maximum(look_power.mean(axis=-1, keepdims=True), _TINY)
+    return look_power / np.maximum(
+        look_power.mean(axis=-1, keepdims=True), _ZERO_DIVISOR_SUBSTITUTE
+    )
 
 
 class BeamSpread(NamedTuple):
@@ -588,7 +595,7 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
 
 
 def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the optical frequency F of the echo at mid-record in each segment, and the time of it.
+    """Return the echo's optical frequency F at mid-record of each segment, and mid-record's time.
 
     The time is the centroid of the window over the samples that hold the echo. There the phase of a
     bin is that of the line, to first order in their distance.
@@ -656,9 +663,9 @@ def _strongest_bins_with_images(
 ) -> np.ndarray:
     """Return the strongest bins of echoes at given positions, signed and unfolded [bins], (n,).
 
-    It is the nearest bin, unless a line near DC or Nyquist of a real record overlaps with its
-    image: of bins 0 and 1, bin 0 then has the light of both. ``line_deviation_bins`` is the
-    standard deviation of the lines.
+    The strongest bin is the nearest bin, unless a line near DC or Nyquist of a real record overlaps
+    with its image: of bins 0 and 1, bin 0 then has the light of both. ``line_deviation_bins`` is
+    the standard deviation of the lines.
     """
     nearest_bins = np.rint(line_positions)
     if not shots.real_fft_size or not shots.images.are_summed:
@@ -727,13 +734,13 @@ def _moments_by_surface(
     ``off_axis_surface`` (rows, beamlets) bool marks beamlets on another surface than the axis's, or
     is None.
     """
-    power_fraction = power / np.maximum(power.sum(axis=1), _TINY)[:, None]
+    power_fraction = power / np.maximum(power.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)[:, None]
     mean = (power_fraction * values).sum(axis=-1)
     centred = values - mean[:, :, None]
     if off_axis_surface is not None and off_axis_surface.any():
         for surface in (off_axis_surface, ~off_axis_surface):
             weight = np.where(surface, power_fraction, 0.0)
-            surface_power = np.maximum(weight.sum(axis=1), _TINY)
+            surface_power = np.maximum(weight.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)
             surface_mean = (weight * values).sum(axis=-1) / surface_power
             centred = np.where(surface, values - surface_mean[:, :, None], centred)
     covariance = (power_fraction * centred[:, None] * centred[None]).sum(axis=-1)
@@ -759,7 +766,7 @@ def _phase_moments(
 def _ray_traced_slopes(moments: BeamletMoments) -> BeamGradients:
     """Return the gradients of ray-traced ground along its steepest range, (n,) each."""
     deviation = np.sqrt(moments.covariance[1, 1])
-    doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _TINY)
+    doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _ZERO_DIVISOR_SUBSTITUTE)
     return BeamGradients(doppler_along, deviation, np.zeros(deviation.shape))
 
 

@@ -42,7 +42,8 @@ class SweepFrequencyError(NamedTuple):
 
         Notes
         -----
-        Gauss-Legendre quadrature is exact for the series and does not cancel for close times.
+        Gauss-Legendre quadrature is exact for the Chebyshev series. Its result keeps its relative
+        precision if the two times are close.
         """
         half_span = (self.last_time - self.first_time) / 2
         start_position, end_position = (

@@ -348,7 +348,7 @@ class Waypoints:
     times: FloatSequence
     """(n,): ascending times at which positions are given [s], at least two."""
     positions: Sequence[Sequence[float]] | np.ndarray
-    """(n, 3): positions of the point at ``times`` [m]."""
+    """(n, 3): given positions of the moving point at ``times`` [m]."""
     is_smooth: bool = True
     """True to connect the positions by a cubic spline, whose velocity and acceleration are
     continuous (a line or a parabola through two or three points). False to connect them by straight

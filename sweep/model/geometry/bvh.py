@@ -140,7 +140,7 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
 def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return twice the centres of triangles' bounding boxes, (m, 3) float32 [m].
 
-    Triangles are sorted into leaves by them.
+    Triangles are sorted into leaves by these centres.
     """
     centres = np.empty((len(faces), 3), np.float32)
     for begin in range(0, len(faces), _TRIANGLES_PER_BATCH):  # in batches, to save memory
@@ -476,8 +476,8 @@ def _traverse_tree(
 def _prepare_bundle(directions, shears, box_test):
     """Compute the constants of a bundle's box and triangle tests, and return its axis.
 
-    The axis (0, 1 or 2) is that along which the component of every direction is largest; -1 if the
-    directions differ in it.
+    The axis (0, 1 or 2) is that along which the component of every direction is largest; -1 if this
+    axis differs between directions.
 
     Parameters
     ----------

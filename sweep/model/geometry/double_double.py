@@ -45,7 +45,7 @@ def _two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
 def quick_two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
     """Return the rounded sum of float64 numbers and its exact rounding error.
 
-    It is valid only if abs(a) >= abs(b).
+    The result is valid only if abs(a) >= abs(b).
     """
     total = a + b
     return DoubleDouble(total, b - (total - a))

@@ -173,9 +173,9 @@ def plane_distances(
     Parameters
     ----------
     corners : ndarray (3, 3, n)
-        Corners of the facets [m], as of :func:`facet_normals`.
+        Corners of the facets [m], as in :func:`facet_normals`.
     facet_normal : DoubleDouble (3, n)
-        Normals of the facets, as of :func:`facet_normals`.
+        Normals of the facets, as in :func:`facet_normals`.
     plane_height : DoubleDouble (n,)
         Scalar product of each normal with the vector from the ray's origin to the facet's first
         corner.

@@ -47,8 +47,8 @@ class BundleHits(NamedTuple):
     range: np.ndarray
     """(n,) float64: range of the reference beamlet [m]; inf if all beamlets miss."""
     reference_beamlet: np.ndarray
-    """(n,) int64: index of the first beamlet that hits a body, to whose range others are relative;
-    -1 if all miss."""
+    """(n,) int64: index of the first beamlet that hits a body; -1 if all miss. Ranges of other
+    beamlets are relative to the range of this one."""
     normal: np.ndarray
     """(n, 3) float64: unit normal of the surface that the reference beamlet hits, on the side of
     the ray's origin; nan if all beamlets miss."""

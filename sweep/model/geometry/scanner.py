@@ -24,7 +24,7 @@ of the same seed."""
 def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
     """Return unit vectors of beams evenly spaced on a cone around nadir, (n_beams, 3).
 
-    They are in the body frame.
+    The vectors are in the body frame.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.nda
     Parameters
     ----------
     element_angles : sequence of float
-        Angles of the n elements of each axis [rad], as of :func:`stacked_angles`.
+        Angles of the n elements of each axis [rad], as in :func:`stacked_angles`.
 
     Returns
     -------
@@ -370,7 +370,7 @@ class LineScan:
     def sweep_rate(self, times: np.ndarray) -> np.ndarray:
         """Return the time derivative of the sweep angle at times [s], in rad/s.
 
-        At a turning point of the mirror it is that after the turn.
+        At a turning point of the mirror, the rate after the turn is returned.
         """
         lines_scanned = np.asarray(times, float) * self.line_rate
         if self.wave == "sine":

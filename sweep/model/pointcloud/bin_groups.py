@@ -137,7 +137,7 @@ def find_groups_in_spans(
     spans
         Spans of bins of some of the points.
     bin_rows, bin_groups
-        Arrays of :func:`allocate_bin_groups` for all points; the result.
+        Arrays of :func:`allocate_bin_groups` for all points, in which the groups are written.
     """
     pd = bin_groups.pd
     nyquist_bin = 0 if shots.complex_record else shots.fft_size // 2
@@ -245,9 +245,9 @@ def _fill_groups(
     speckle_table
         :attr:`sweep.model.preparation.Shots.speckle_table`.
     bin_rows
-        (3, n, 3, groups) int64, in rows STRONGEST_ROW, FIRST_ROW and LAST_ROW; a result.
+        (3, n, 3, groups) int64, in rows STRONGEST_ROW, FIRST_ROW and LAST_ROW: output array.
     neighbour_magnitudes, pd
-        Results, as in :class:`BinGroups`.
+        Output arrays, as in :class:`BinGroups`.
     """
     for j in range(point_numbers.size):
         i = point_numbers[j]
@@ -308,8 +308,8 @@ def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
 def _list_groups(magnitude, is_echo, peak_index, threshold, bin_rows):
     """List the strongest groups of adjacent bins at or above the threshold; return their number.
 
-    ``bin_rows`` (3, groups), the result, holds indices in ``magnitude``. Groups whose strongest bin
-    is not ``is_echo`` are leaked signal, and omitted. If ``is_echo`` is empty, none is omitted.
+    The output array ``bin_rows`` (3, groups) holds indices in ``magnitude``. Groups whose strongest
+    bin is not ``is_echo`` are leaked signal, and omitted. If ``is_echo`` is empty, none is omitted.
     """
     if not magnitude[peak_index] >= threshold:
         bin_rows[:, 0] = peak_index

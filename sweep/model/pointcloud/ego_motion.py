@@ -96,9 +96,9 @@ class EgoMotion(NamedTuple):
     """(n, 3): derivative of ``slip_per_slope``, which is at range 0, with respect to the range
     [(m/s)/m]."""
     slip_per_target_speed: np.ndarray
-    """Ratio of two standard deviations: of the slip by motion of the surface, and of one component
-    of the surface's velocity. The slip is the closing speed minus the speed at which the range
-    falls."""
+    """Ratio of two standard deviations: that of the slip due to motion of the surface, and that of
+    one component of the surface's velocity. The slip is the closing speed minus the speed at which
+    the range falls."""
     turn_rate: np.ndarray
     """Angular speed at which the beam's direction turns [rad/s]."""
     priors: MotionPriors
@@ -124,12 +124,12 @@ class EgoMotion(NamedTuple):
     def approach_speed_at(self, distance: np.ndarray) -> np.ndarray:
         """Return the speed [m/s] at which the range to level ground at rest falls.
 
-        It depends on the range: ``distance`` (n, ...) holds ranges [m] of each beam.
+        The speed depends on the range: ``distance`` (n, ...) holds ranges [m] of each beam.
         """
         return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
 
     def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:
-        """Return the standard deviation [m/s] of the slip at ranges (n, ...) [m], by the priors.
+        """Return the standard deviation [m/s] of the slip at ranges (n, ...) [m] that priors imply.
 
         The slip is the closing speed minus the speed at which the range falls.
 
@@ -198,8 +198,8 @@ def ego_motion_of_beams(
 
     Notes
     -----
-    Let z be the vertical, R the range, and u the speed at which the range falls. Then
-    minus the slip is u - V.d = V.z / d.z - V.d + R d'.z / d.z.
+    Let z be the vertical, R the range, and u the speed at which the range falls. Then u = V.z / d.z
+    + R d'.z / d.z, and the slip is V.d - u.
     """
     closing_rate = _row_dot(acceleration, direction) + _row_dot(velocity, direction_rate)
     closing_speed = _row_dot(velocity, direction)

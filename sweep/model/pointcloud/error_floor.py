@@ -61,7 +61,7 @@ class ErrorFloor(NamedTuple):
     wavelength: float = 0.0
     """Standard deviation of the relative error of the known wavelength."""
     vibration: float = 0.0
-    """Standard deviation of the component of the instrument's velocity along the beam by vibration
+    """Standard deviation of the velocity along the beam that vibration of the instrument causes
     [m/s]."""
     range_noise: float = 0.0
     """Standard deviation of an additional error of each measured range [m]."""
@@ -70,12 +70,12 @@ class ErrorFloor(NamedTuple):
     def velocity_scale_error(self) -> float:
         """Standard deviation of the relative error common to all velocities of a draw.
 
-        It combines the errors of clock and wavelength.
+        The standard deviation combines the errors of clock and wavelength.
         """
         return float(np.hypot(self.clock, self.wavelength))
 
     def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
-        """Return the standard errors of radial velocities [m/s] by the instrument's own errors.
+        """Return the standard errors of radial velocities [m/s] due to the instrument's errors.
 
         `radial_velocity` and `speed_across` are the instrument's velocity along and across the beam
         [m/s].
@@ -183,7 +183,7 @@ def apply_error_floor(
 def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed: int) -> np.ndarray:
     """Draw two standard normal random numbers for each beam and draw, (beams, draws, 2).
 
-    They are the beam's pointing errors on two axes, in standard deviations.
+    The numbers are the beam's pointing errors on two axes, in standard deviations.
     """
     keys = np.repeat(
         point_keys(beam_numbers[:, None], domain=KEY_DOMAIN, seed=seed), draw_numbers.size, axis=0

@@ -79,8 +79,8 @@ class Eyepoints(NamedTuple):
     """(n,): speed at which the reference beamlet's range falls [m/s]; nan for a shot that hits
     nothing."""
     turn_rate: np.ndarray
-    """(n,): angular speed at which the reference beamlet's direction turns [rad/s], by scanner and
-    platform."""
+    """(n,): angular speed at which scanner and platform turn the direction of the reference beamlet
+    [rad/s]."""
     direction_rate: np.ndarray
     """(n, 3): time derivative of the commanded ``direction`` [1/s]."""
     platform_acceleration: np.ndarray
@@ -98,7 +98,7 @@ class Eyepoints(NamedTuple):
 
     @property
     def has_target(self) -> np.ndarray:
-        """Mask (n,) that is True for shots of which any beamlet hits a surface."""
+        """Mask (n,), True for shots with a beamlet that hits a surface."""
         return np.isfinite(self.range)
 
     @property
@@ -119,7 +119,7 @@ class Eyepoints(NamedTuple):
         return Eyepoints._make([*(values[selection] for values in self[:-1]), self.weight])
 
 
-def observe_eyepoints(
+def compute_eyepoints(
     shot_numbers: np.ndarray,
     *,
     flight: MovingBody,
@@ -408,7 +408,7 @@ def prepare_eyepoint_shots(
     surfaces: Sequence[SurfaceMaterial],
     effects: Collection[str] = DEFAULT_EFFECTS,
 ) -> Shots:
-    """Prepare for simulation the shots of given geometry (eyepoints), each of which hits a surface.
+    """Prepare shots with a given geometry (eyepoints) for simulation; each shot hits a surface.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def prepare_eyepoint_shots(
 def parameters_and_ground_of_eyepoints(
     eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[SurfaceMaterial]
 ) -> tuple[Parameters, RayTracedGround]:
-    """Convert geometry of shots (eyepoints) to the parameters and footprints that simulate them.
+    """Convert the geometry of shots (eyepoints) to parameters and footprints for simulation.
 
     Range, velocities, reflectance and reflectance law follow from the eyepoints and the surfaces. A
     beamlet that misses returns no light.
@@ -437,7 +437,7 @@ def parameters_and_ground_of_eyepoints(
     Parameters
     ----------
     eyepoints
-        Geometry of n shots, of which each hits a surface.
+        Geometry of n shots; each shot hits a surface.
     parameters
         Other parameters by dotted path, scalars.
     surfaces

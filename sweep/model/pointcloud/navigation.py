@@ -80,7 +80,7 @@ _INTERPOLATION_ERROR_MIN = 1e-6
 """Smallest standard error of a value interpolated between bins, as a fraction of the standard error
 of the value by whole bins."""
 
-_ONE_SIGMA_PROBABILITY = 0.8413447460685429
+_BELOW_ONE_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal random number is below its mean plus one standard deviation."""
 
 _ROUNDING_ERROR = 1e-14
@@ -327,7 +327,7 @@ def _ground_points(
     direction: np.ndarray, distance: np.ndarray, standard_error: np.ndarray,
     offset: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:  # fmt: skip
-    """Return the points of the ground that beams measure, with cycles along the last axis.
+    """Return the ground points that b beams of each of n cycles measure.
 
     Parameters
     ----------
@@ -337,8 +337,8 @@ def _ground_points(
     Returns
     -------
     ground_points : ndarray (3, b, n)
-        Ground points [m]. n is the product of the leading dimensions. Cycles come last, because
-        NumPy is fast along the last axis.
+        Ground points [m]. Cycles lie along the last axis, along which NumPy is fast. Their number n
+        is the product of the leading dimensions.
     directions : ndarray (3, b, n)
         Directions of the beams.
     errors : ndarray (b, n)
@@ -379,7 +379,9 @@ def _covariance_scale(
     """
     n_residual_degrees = np.maximum(residual_degrees, 1)
     scale = (
-        chi_square / n_residual_degrees * stdtrit(n_residual_degrees, _ONE_SIGMA_PROBABILITY) ** 2
+        chi_square
+        / n_residual_degrees
+        * stdtrit(n_residual_degrees, _BELOW_ONE_SIGMA_PROBABILITY) ** 2
     )
     return np.where(_residuals_contradict(chi_square, degrees_of_freedom), scale, 1.0)
 
@@ -538,7 +540,7 @@ def _solve_without_false_beams(
     test_level: float | None,
     leading_shape: tuple[int, ...],
 ) -> NavigationSolution:
-    """Fit n cycles of b beams, and exclude a beam that contradicts the others.
+    """Fit a velocity or altitude to each of n cycles, without a beam that contradicts the others.
 
     Parameters
     ----------
@@ -551,7 +553,7 @@ def _solve_without_false_beams(
         Probability with which the test for a false beam rejects a cycle of true beams; None for no
         test.
     leading_shape
-        Leading dimensions of the result; their product is n.
+        Dimensions into which the n cycles of the result are reshaped; their product is n.
 
     Notes
     -----
@@ -617,7 +619,7 @@ def solve_navigation(
         Probability with which the test for one false beam rejects a cycle of true beams; None or 0
         for no test.
     pointing_jitter
-        Standard deviation of each angle of the pointing by jitter [rad].
+        Standard deviation of the pointing jitter about each axis [rad].
     error_floor
         Standard deviations of the instrument's errors that do not depend on the echo.
     motion_priors
@@ -648,7 +650,7 @@ def solve_navigation(
             motion_priors,
         )
         solutions = _solve_cycles(
-            beam_motion.by_cycle(shots_per_cycle),
+            beam_motion.reshape_by_cycle(shots_per_cycle),
             _select_beams(point_arrays, shot_slice, shots_per_cycle, error_floor, known_motion),
             {"test_level": test_level or None},
             {"slope": ground_slope, "relief": relief},
@@ -688,7 +690,7 @@ class BeamMotion(NamedTuple):
     acceleration: np.ndarray
     """(..., 3): acceleration of the instrument in the world's frame [m/s^2]."""
 
-    def by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
+    def reshape_by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
         """Reshape the arrays (n, 3) of n shots to (cycles, beams, 3)."""
         return BeamMotion(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
 
@@ -702,8 +704,8 @@ def _select_beams(
 ) -> dict[str, np.ndarray]:
     """Select the measured point of each shot and draw that navigation uses.
 
-    It is the first point that a Doppler peak confirms and whose value and standard error are
-    finite.
+    That point is the first point that a Doppler peak confirms and whose value and standard error
+    are finite.
 
     Parameters
     ----------
@@ -723,11 +725,11 @@ def _select_beams(
     dict of str to ndarray
         Arrays (cycles, draws, beams), nan for a shot without such a point. The slip is the closing
         speed minus the speed at which the range falls. Standard errors exclude errors common to all
-        beams and errors by an unknown slip. The names are ``range`` and ``radial_velocity``, and
-        both with ``_standard_error``; ``radial_velocity_slip_error``, the error by an unknown slip
-        [m/s]; ``velocity_per_slip``; ``delay``, the time from the shot's start to that of the beats
-        [s]; ``range_then``, the range at that time [m]. If pointing has an error, ``position``
-        (cycles, draws, beams, 3) [m].
+        beams and errors due to an unknown slip. The names are ``range`` and ``radial_velocity``,
+        and both with ``_standard_error``; ``radial_velocity_slip_error``, the error due to an
+        unknown slip [m/s]; ``velocity_per_slip``; ``delay``, the time from the shot's start to that
+        of the beats [s]; ``range_then``, the range at that time [m]. If pointing has an error,
+        ``position`` (cycles, draws, beams, 3) [m].
     """
     flags = point_arrays["flags"][shot_slice]
     values_by_name: dict[str, np.ndarray] = {}
@@ -789,11 +791,11 @@ def _solve_cycles(
     beam_motion
         Motion of the instrument and its beams, (cycles, beams, 3).
     beams
-        Measurements, as of :func:`_select_beams`.
+        Measurements, as in :func:`_select_beams`.
     test_arguments, ground_arguments
         Arguments ``test_level``, and ``slope`` and ``relief``, of :func:`solve_altitude`.
     pointing_jitter
-        Standard deviation of each angle of the pointing by jitter [rad].
+        Standard deviation of the pointing jitter about each axis [rad].
     error_floor
         Standard deviations of the instrument's errors that do not depend on the echo.
 
@@ -916,11 +918,11 @@ def _add_pointing_errors(
     offset
         (cycles, 1, beams, 3): position of the instrument relative to that at the first shot [m].
     beams
-        Measurements, as of :func:`_select_beams`.
+        Measurements, as in :func:`_select_beams`.
     ground_arguments
         Arguments ``slope`` and ``relief`` of :func:`ground_gradient`.
     pointing_jitter
-        Standard deviation of each angle of the pointing by jitter [rad]. It adds to both errors.
+        Standard deviation of the pointing jitter about each axis [rad]. It adds to both errors.
     pointing
         Standard deviation of a beam's known direction [rad]. It adds to the error of the range. The
         error of the velocity already includes it.

@@ -92,8 +92,8 @@ def simulate_cloud(
         Names of effects, and bit masks, as for
         :func:`sweep.model.evaluation.prepare_ray_traced_shots`.
     estimates_ray_error
-        True to estimate ``beamlets_error``, the error of probabilities and peaks by too few rays.
-        For this the beamlets must add in power. If False, it is nan.
+        True to estimate ``beamlets_error``, the error of probabilities and peaks due to too few
+        rays. For this the beamlets must add in power. If False, it is nan.
     motion_priors
         Prior standard deviations of motion that the instrument does not measure; standard errors
         include them.

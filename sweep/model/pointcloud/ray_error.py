@@ -67,8 +67,8 @@ _UNAFFECTED_DISTANCE_SIGMA = 15.0
 magnitude's error changes no probability. The density there is e^-112 of the largest."""
 
 _PROBABILITY_CHANGE_MIN = 1e-9
-"""Smallest effect on a result for which the error of a shot by too few rays is computed. It is a
-bound on the change of a probability of detection, or a relative change of a peak's magnitude."""
+"""Smallest effect on a result for which the error of a shot due to too few rays is computed. It is
+a bound on the change of a probability of detection, or a relative change of a peak's magnitude."""
 
 
 class FoldedLattice(NamedTuple):
@@ -104,7 +104,7 @@ class FoldedLattice(NamedTuple):
 def estimate_ray_error(
     shots: Shots, beamlet_table: BeamletTable, peak_bins: np.ndarray, magnitude: np.ndarray
 ) -> np.ndarray:
-    """Estimate the error of the results of shots by sampling the beam with too few rays.
+    """Estimate the error of the results of shots that is due to too few rays per beam.
 
     The estimate (n,), 0..1, is the larger of two errors. The first is that of the probabilities of
     detection, summed over the segments. The second is that of a peak's magnitude, relative to the
@@ -343,7 +343,7 @@ def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
 def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> np.ndarray:
     """Return the values (k, h) of k even polynomials at h positions.
 
-    They are orthonormal with the given weights.
+    The polynomials are orthonormal with the given weights.
 
     Parameters
     ----------
@@ -380,7 +380,7 @@ def _main_lobe_table(window_name: str) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_power_errors(powers, lattice, relative_errors):
-    """Compute the relative errors of the powers of m bins by sampling the beam with too few rays.
+    """Compute the relative errors of the powers of m bins that are due to too few rays per beam.
 
     The module's description derives them.
 
@@ -391,7 +391,7 @@ def _fill_power_errors(powers, lattice, relative_errors):
     lattice
         Lattice of the beamlets (:class:`FoldedLattice`).
     relative_errors
-        (m,): the result, at most 1.
+        (m,): output array, at most 1.
     """
     beamlet, opposite_beamlet = lattice.beamlet, lattice.opposite_beamlet
     inverse_weight, density_change = lattice.inverse_weight, lattice.density_change

@@ -72,8 +72,6 @@ def draw_spectra_returns(
 ) -> Returns:
     """Draw returns (measured points) from full noisy spectra by a detector and an estimator.
 
-    Parameters name the detector and the estimator.
-
     Parameters
     ----------
     shots
@@ -83,8 +81,8 @@ def draw_spectra_returns(
     keys
         (n, 2) uint64: random key of each shot.
     parameters
-        Scalars by dotted path; missing ones have the values of
-        :data:`sweep.model.detection.estimators.SPECTRUM_METHOD_DEFAULTS`.
+        Scalars by dotted path, among them the names of the detector and of the estimator. Missing
+        ones have the values of :data:`sweep.model.detection.estimators.SPECTRUM_METHOD_DEFAULTS`.
     methods
         Detectors and estimators by name.
     first_draw, draws

@@ -1,7 +1,7 @@
 """Random draws of shots: count detections and false alarms, batch by batch.
 
 Two methods agree in the mean. ``probabilities`` is the method of [T 3.3.2]. It compares uniform
-random numbers with pd and with the probability of a false alarm by noise and leakage together.
+random numbers with pd and with the probability of a false alarm due to noise and leakage together.
 ``noise`` adds complex Gaussian noise to the bins of the echo, in each look, correlated between bins
 as window and padding make it. The other bins hold noise alone. Their largest magnitude follows from
 the order statistic of an equivalent number of independent bins, which has the same probability of a
@@ -108,15 +108,15 @@ class CountInputs(NamedTuple):
     pfa: np.ndarray
     """(3, m): probability of a false alarm in those bins of each segment that are not drawn one by
     one."""
-    pd_without_condition: np.ndarray
+    pd_if_condition_fails: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
-    :func:`_draw_probabilities` is not met; unused if noise is drawn."""
-    pd_with_condition: np.ndarray
+    :func:`_event_probabilities` is not met; unused if noise is drawn."""
+    pd_if_condition_holds: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
-    :func:`_draw_probabilities` is met; unused if noise is drawn."""
+    :func:`_event_probabilities` is met; unused if noise is drawn."""
     any_two: np.ndarray
     """(m,) bool: True if a shot counts as detected by any two of its segments."""
-    mixing: np.ndarray
+    speckle_cholesky_factors: np.ndarray
     """(6, m): Cholesky factor of the correlation of speckle in the three segments
     (:meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`); (0, m)
     without speckle."""
@@ -150,17 +150,17 @@ def count_by_probability(
         (names, points, batches) int64, in the order of
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
-    n_rows, probabilities = draw_ranges.point_index.size, _draw_probabilities(outputs)
+    n_rows, probabilities = draw_ranges.point_index.size, _event_probabilities(outputs)
     no_filter = NoiseFilter(np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0)
     inputs = CountInputs(
         threshold_ratio=np.zeros(n_rows),
         line_noise_ratio=np.zeros(n_rows),
         bin_thresholds=BinThresholds(*np.zeros((7, n_rows))),
         pfa=probabilities[0],
-        pd_without_condition=probabilities[1],
-        pd_with_condition=probabilities[2],
+        pd_if_condition_fails=probabilities[1],
+        pd_if_condition_holds=probabilities[2],
         any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
-        mixing=np.empty((0, n_rows)),
+        speckle_cholesky_factors=np.empty((0, n_rows)),
         ratio_row=np.zeros((3, n_rows), np.int64),
         line_grid=SpeckleLineGrid.empty(),
         line_centre=np.empty((0, 3)),
@@ -194,7 +194,7 @@ def count_in_noise(
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
     threshold_ratio, line_noise_ratio = threshold_and_line_noise_ratios(shots)
-    mixing = (
+    speckle_cholesky_factors = (
         np.empty((0, shots.size))
         if shots.speckle.segment_correlations is None
         else shots.speckle.segment_correlations.cholesky_factors()
@@ -209,10 +209,10 @@ def count_in_noise(
             line_noise_ratio=line_noise_ratio[indices],
             bin_thresholds=shots.bin_thresholds.select(indices),
             pfa=np.ascontiguousarray(pfa_elsewhere),
-            pd_without_condition=no_probabilities,
-            pd_with_condition=no_probabilities,
+            pd_if_condition_fails=no_probabilities,
+            pd_if_condition_holds=no_probabilities,
             any_two=np.full(indices.size, shots.any_two),
-            mixing=mixing[:, indices].copy(),
+            speckle_cholesky_factors=speckle_cholesky_factors[:, indices].copy(),
             ratio_row=speckle_table.ratio_row[:, indices].copy(),
             line_grid=line_grid.select(indices),
             line_centre=np.ascontiguousarray(
@@ -234,8 +234,8 @@ class NoiseFilter(NamedTuple):
     """Filter that makes the noise of adjacent bins from independent normal numbers."""
 
     weights: np.ndarray
-    """(bins, NOISE_FILTER_TAPS): weights with which each bin's noise is a sum of independent normal
-    numbers. The squares of a bin's weights sum to 1."""
+    """(bins, NOISE_FILTER_TAPS): weights of the independent normal numbers whose weighted sum is a
+    bin's noise. The squares of a bin's weights sum to 1."""
     first_number: np.ndarray
     """(bins,) int64: index of the first independent number that each bin uses, minus the index at
     the first bin."""
@@ -254,9 +254,9 @@ class NoiseScratch(NamedTuple):
     in_quadrature: np.ndarray
     """(k,): component, over sigma, of each bin's noise in quadrature with the signal."""
     number_in_phase: np.ndarray
-    """(k,): independent normal numbers of which ``in_phase`` is a filtered sum."""
+    """(k,): independent normal numbers from which the filter makes ``in_phase``."""
     number_in_quadrature: np.ndarray
-    """(k,): independent normal numbers of which ``in_quadrature`` is a filtered sum."""
+    """(k,): independent normal numbers from which the filter makes ``in_quadrature``."""
 
     @classmethod
     def allocate(cls, n_bins: int) -> "NoiseScratch":
@@ -304,9 +304,9 @@ independent number for each bin."""
 def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
     """Return the triangular matrix (k, k) that makes the noise of k adjacent bins from k numbers.
 
-    It is the Cholesky factor of the covariance that a filter of :func:`make_echo_noise_filter`
-    gives, for at most ROOT_BINS_MAX bins. Frequency 0 and Nyquist, where the noise is real, need
-    :func:`draw_bin_noise` instead.
+    The matrix is the Cholesky factor of the covariance that a filter of
+    :func:`make_echo_noise_filter` gives, for at most ROOT_BINS_MAX bins. Frequency 0 and Nyquist,
+    where the noise is real, need :func:`draw_bin_noise` instead.
     """
     weights, start = filter_rule.weights, filter_rule.first_number
     n_bins = min(weights.shape[0], ROOT_BINS_MAX)
@@ -335,8 +335,8 @@ _REMAINDER_MIN = 1e-9
 neglected."""
 
 
-def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the probabilities of events in each segment, with which random numbers are compared.
+def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the probabilities of each segment's events, to compare random numbers with them.
 
     Segments are up, Doppler and down.
 
@@ -436,8 +436,8 @@ class NoiselessSpectra(NamedTuple):
     peak_index: np.ndarray
     """(m, 3) int64: number of the bin with the largest magnitude, counted from ``first_bin``."""
     peak_ratio: np.ndarray
-    """(m, 3): largest |X| of the segment's bins over sigma, the noise of a bin per quadrature; nan
-    for a segment that does not exist."""
+    """(m, 3): largest |X| / sigma in the segment's bins; nan for a segment that does not exist.
+    sigma is the noise of a bin per quadrature."""
     has_real_noise: np.ndarray
     """(m, 3) bool: True if the noise in the bin with the largest magnitude is real, as at frequency
     0 (DC) and Nyquist."""
@@ -446,8 +446,8 @@ class NoiselessSpectra(NamedTuple):
     n_bins: np.ndarray
     """(m, 3) int64: number of the segment's bins in ``bin_ratios`` and ``is_echo``."""
     bin_ratios: np.ndarray
-    """(bins,): |X| over sigma, the noise of a bin per quadrature, of the bins of all points and
-    segments."""
+    """(bins,): |X| / sigma in the bins of all points and segments. sigma is the noise of a bin per
+    quadrature."""
     is_echo: np.ndarray
     """(bins,) bool: True for bins that belong to an echo, of the bins of all points and segments.
     """
@@ -461,7 +461,8 @@ class NoiselessSpectra(NamedTuple):
     """(leaked,) int64: numbers, from ``first_bin``, of the bins with signal leaked from an echo.
     With noise they may raise a false alarm."""
     leaked_ratio: np.ndarray
-    """(leaked,): |X| of the bins of leaked signal over sigma, the noise of a bin per quadrature."""
+    """(leaked,): |X| / sigma in the bins that hold leaked signal. sigma is the noise of a bin per
+    quadrature."""
     exempt_neighbour_ratio: np.ndarray
     """(leaked,): |X| over sigma of the adjacent bin that belongs to an echo, and so cannot raise a
     false alarm; 0 if no adjacent bin does."""
@@ -604,7 +605,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
     is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
     for j in range(draw_ranges.point_index.size):
         threshold_ratio, line_noise_ratio = inputs.threshold_ratio[j], inputs.line_noise_ratio[j]
-        in_speckle = inputs.mixing.shape[0] > 0
+        in_speckle = inputs.speckle_cholesky_factors.shape[0] > 0
         i, batch = draw_ranges.point_index[j], 0
         for first in range(draw_ranges.first_draw[j], draw_ranges.end_draw[j], _DRAWS_PER_STEP):
             n_draws = min(_DRAWS_PER_STEP, draw_ranges.end_draw[j] - first)
@@ -612,7 +613,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
             is_detected[:], has_alarm[:] = False, False
             for d in range(n_draws if in_speckle else 0):
                 one, amplitude_doppler, amplitude_down = speckle_amplitudes(
-                    address[:2], first + d, 0, inputs.mixing[:, j]
+                    address[:2], first + d, 0, inputs.speckle_cholesky_factors[:, j]
                 )
                 for component in range(2):
                     segment_amplitudes[0, component, d], segment_amplitudes[1, component, d] = (
@@ -677,7 +678,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                         address, stream, peak_index, crossing, random_words, is_detected[s]
                     )
                 else:
-                    pd_pair = inputs.pd_without_condition[s, j], inputs.pd_with_condition[s, j]
+                    pd_pair = inputs.pd_if_condition_fails[s, j], inputs.pd_if_condition_holds[s, j]
                     one = is_detected[0] if s == 2 else is_detected[0] ^ is_detected[2]
                     _mark_random_events(
                         address, STREAM_DETECTION[s], pd_pair, one, random_words, is_detected[s]
@@ -749,7 +750,7 @@ def _mark_leakage_alarms(
     sidelobe_correlation
         Correlation of the noise of neighbouring bins in phase with the signal.
     magnitude_factors
-        (draws,): factors on magnitudes by speckle.
+        (draws,): factors that speckle puts on magnitudes.
     random_words
         (4, draws) uint64: scratch for random numbers.
     has_alarm
@@ -810,12 +811,12 @@ def _mark_leakage_alarms(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def speckle_factors(key, draw, group, mixing):
-    """Return the factors by speckle on an echo's magnitudes in up, Doppler and down segment.
+def speckle_factors(key, draw, group, speckle_cholesky_factors):
+    """Return the factors that speckle puts on an echo's magnitudes in up, Doppler and down segment.
 
     Their mean square is 1. The arguments are those of :func:`speckle_amplitudes`.
     """
-    up, doppler, down = speckle_amplitudes(key, draw, group, mixing)
+    up, doppler, down = speckle_amplitudes(key, draw, group, speckle_cholesky_factors)
     return (
         math.hypot(up[0], up[1]),
         math.hypot(doppler[0], doppler[1]),
@@ -824,8 +825,8 @@ def speckle_factors(key, draw, group, mixing):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def speckle_amplitudes(key, draw, group, mixing):
-    """Return the complex factors by speckle on an echo in the three segments, of mean square 1.
+def speckle_amplitudes(key, draw, group, speckle_cholesky_factors):
+    """Return the complex factors, of mean square 1, that speckle puts on an echo in each segment.
 
     Parameters
     ----------
@@ -835,7 +836,7 @@ def speckle_amplitudes(key, draw, group, mixing):
         Number of the draw.
     group
         Number of the echo (group of adjacent bins).
-    mixing
+    speckle_cholesky_factors
         (6,): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`.
 
     Returns
@@ -855,7 +856,7 @@ def speckle_amplitudes(key, draw, group, mixing):
         down_from_doppler_re,
         down_from_doppler_im,
         down_own,
-    ) = mixing
+    ) = speckle_cholesky_factors
     doppler = (
         root_half * (doppler_from_up * a + doppler_own * c),
         root_half * (doppler_from_up * b + doppler_own * d),
@@ -1037,7 +1038,7 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
     filter_rule
         :class:`NoiseFilter` of at least as many bins.
     noise
-        :class:`NoiseScratch` of at least as many bins, the result.
+        :class:`NoiseScratch` of at least as many bins, to which the noise is written.
 
     Notes
     -----
@@ -1154,8 +1155,8 @@ def largest_noise_magnitude(n_bins, probability, n_looks):
 def gamma_upper_quantile(order, probability):
     """Return the x that a Gamma variable exceeds with a given probability.
 
-    It solves Q(n, x) = ``probability``, with the regularised upper incomplete Gamma function Q. The
-    order n is an integer; the scale is 1.
+    The quantile x solves Q(n, x) = ``probability``, with the regularised upper incomplete Gamma
+    function Q. The order n is an integer; the scale is 1.
     """
     low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(probability, 1e-300)))
     for _ in range(60):

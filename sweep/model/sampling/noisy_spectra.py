@@ -331,7 +331,7 @@ def _exempt_bin_mask(
 ) -> np.ndarray:
     """Return a mask (bins,) of the bins of a segment that cannot raise a false alarm.
 
-    They are the bins of the echo, and bins of signal at or above the threshold with their
+    These bins are the bins of the echo, and bins of signal at or above the threshold with their
     neighbours.
 
     Parameters
@@ -399,8 +399,8 @@ def centre_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarr
 def _interpolate_tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> float:
     """Return the position of a peak between bins, as a fractional index.
 
-    It is that of a pure tone whose magnitudes equal those about the peak. ``magnitude`` (bins,) is
-    |X|, and ``peak_index`` the index of its largest bin.
+    The position is that of a pure tone whose magnitudes equal those about the peak. ``magnitude``
+    (bins,) is |X|, and ``peak_index`` the index of its largest bin.
     """
     last_index = magnitude.size - 1
     if shots.complex_record:
@@ -441,7 +441,7 @@ def record_spectrum(shots: Shots, record: np.ndarray) -> np.ndarray:
 def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
     """Return the quantities of a point on which its phase noise depends, by name.
 
-    They are the ``line_width`` of the laser [Hz], the ``delay`` of the echo [s] and the
+    The quantities are the ``line_width`` of the laser [Hz], the ``delay`` of the echo [s] and the
     ``duration`` of the record [s].
     """
     return {
@@ -798,7 +798,7 @@ class PointSpectra(NamedTuple):
     key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[SegmentSignal | None, ...]
-    """Noiseless signal of each segment, as of ``shots``; None for a segment that does not exist."""
+    """Noiseless signal of each segment, as in ``shots``; None for a segment that does not exist."""
     look_shots: list[Shots]
     """Prepared shots at the time of each look (record of each segment), while the target moves."""
     settings: SpectrumSettings
@@ -864,8 +864,8 @@ class SegmentDetections(NamedTuple):
     """(m,): estimated position minus the largest bin of the detected group of adjacent flagged bins
     [bins]."""
     peak_power: np.ndarray
-    """(m,): |X|^2 [V^2] from which errors by speckle are computed. It is that of the bin which is
-    strongest without noise. It is at least the smaller of two values: the power of the peak, and
+    """(m,): |X|^2 [V^2] from which errors due to speckle are computed. It belongs to the bin that
+    is strongest without noise. It is at least the smaller of two values: the power of the peak, and
     the squared threshold."""
 
 
@@ -1143,7 +1143,8 @@ def count_detections(
 def _bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.ndarray:
     """Return the smallest standard deviations of range [m] and velocity [m/s] by draw, (2, m).
 
-    They are bounds for the segments that are detected in a draw, ``is_detected`` (3, m).
+    The standard deviations are bounds for the segments that are detected in a draw, ``is_detected``
+    (3, m).
     """
     bounds = np.empty((2, is_detected.shape[1]))
     bounds[...] = np.reshape(measurement_bound(point_spectra), (2, 1))
@@ -1159,7 +1160,7 @@ def _bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.
 def _wander_variances(
     point_spectra: PointSpectra, detections: Sequence[SegmentDetections], is_detected: np.ndarray
 ) -> np.ndarray:
-    """Return the mean square errors by speckle of range [m^2] and velocity [m^2/s^2], (2, m).
+    """Return the mean square errors of range [m^2] and velocity [m^2/s^2] due to speckle, (2, m).
 
     `detections` are those of each segment, and `is_detected` (3, m) says which count.
     """

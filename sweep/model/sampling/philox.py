@@ -29,7 +29,7 @@ STREAM_DETECTION = (1, 3, 2)
 probabilities of detection."""
 STREAM_FALSE_ALARM = (4, 6, 5)
 """Stream numbers, for up, Doppler and down segment, of the random numbers that decide on false
-alarms by noise and choose their bins."""
+alarms due to noise and choose their bins."""
 STREAM_NOISE = (7, 9, 8)
 """Stream numbers, for up, Doppler and down segment, of the noise in the bins of echoes and of
 leaked signal."""
@@ -41,9 +41,9 @@ STREAM_FOOTPRINT_PHASE = 13
 STREAM_SPECKLE = 14
 """Stream number of the random complex amplitudes of developed speckle."""
 STREAM_POINTING_JITTER = 16
-"""Stream number of the random pointing of the beam by jitter."""
+"""Stream number of the beam's random pointing jitter."""
 STREAM_SCINTILLATION = 17
-"""Stream number of the random intensity of the echo by turbulence (scintillation)."""
+"""Stream number of the random intensity that turbulence gives the echo (scintillation)."""
 STREAM_RECORD_NOISE = (18, 20, 19)
 """Stream numbers, for up, Doppler and down segment, of the noise in the samples of a record."""
 STREAM_LASER_PHASE = (21, 23, 22)
@@ -51,7 +51,7 @@ STREAM_LASER_PHASE = (21, 23, 22)
 STREAM_ERROR_FLOOR = 24
 """Stream number of an instrument's random errors that do not depend on the echo."""
 STREAM_LEAKAGE = (25, 27, 26)
-"""Stream numbers, for up, Doppler and down segment, of false peaks by leaked signal."""
+"""Stream numbers, for up, Doppler and down segment, of false peaks due to leaked signal."""
 
 _MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _MULTIPLIER_0, _MULTIPLIER_1 = (np.uint64(m) for m in _MULTIPLIERS)
@@ -91,13 +91,10 @@ class CounterIncrements(NamedTuple):
 FIRST_BLOCK_NUMBER = np.int64(0)
 """Number of the first block (four random words) of a stream."""
 DRAW_INCREMENTS = CounterIncrements(draw=1, block=0)
-"""Increments from column to column of a table of random words: the draw grows by 1.
-
-All columns hold the same block (four random words) of the stream."""
+"""Counter increments for columns that hold the same block (four random words) of successive
+draws."""
 BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
-"""Increments from column to column of a table of random words: the block grows by 1.
-
-All columns hold words of the same draw. A block is four random words."""
+"""Counter increments for columns that hold successive blocks (four random words) of one draw."""
 
 
 @njit(cache=True)
@@ -158,7 +155,7 @@ def fill_words(address, stream, block, increments, count, words):
     count
         Number of columns to fill.
     words
-        (4, >= count) uint64, in C order; the result.
+        (4, >= count) uint64, in C order: output array.
 
     Notes
     -----
@@ -201,8 +198,8 @@ def to_normals(word0, word1):
 def uniform(key0, key1, draw, stream, index):
     """Return one uniform random number: number ``index`` of a stream in a draw.
 
-    It is between 2^-53 and 1 - 2^-53. An event of a probability below 2^-53 = 1.1e-16 never happens
-    in a comparison with it.
+    The number is between 2^-53 and 1 - 2^-53. An event of a probability below 2^-53 = 1.1e-16 never
+    happens in a comparison with it.
     """
     return to_uniform(four_words(key0, key1, draw, stream, index >> 2)[index & 3])
 
@@ -211,7 +208,7 @@ def uniform(key0, key1, draw, stream, index):
 def normal_pair(key0, key1, draw, stream, index):
     """Return two standard normal random numbers: pair number ``index`` of a stream in a draw.
 
-    They are made from the uniform numbers ``2 index`` and ``2 index + 1``.
+    The two numbers are made from the uniform numbers ``2 index`` and ``2 index + 1``.
     """
     words = four_words(key0, key1, draw, stream, index >> 1)
     return to_normals(words[2], words[3]) if index & 1 else to_normals(words[0], words[1])

@@ -24,8 +24,8 @@ from sweep.model.evaluation import apply_effects, select_effects, use_beamlet_ve
 from sweep.model.ground import FlatGround
 from sweep.model.outputs import (
     GRID_OUTPUTS,
-    IS_LOGARITHM,
-    KEEPS_SPREAD,
+    OUTPUT_HAS_SQUARED_DEVIATIONS,
+    OUTPUT_IS_LOGARITHM,
     RUNNING_SUMS,
     STANDARD_ERROR_OUTPUTS,
 )
@@ -110,7 +110,7 @@ def iter_realisations(
 def _realise_batch(
     parameters: dict[str, np.ndarray], effects: Collection[str], draw_keys: DrawAddresses
 ) -> Shots:
-    """Return prepared shots, with all effects, for m draws of points of one category.
+    """Return prepared shots, with all effects, for m draws of points that share text parameters.
 
     ``draw_keys`` holds the random key of each point and the number of each draw. Points of one
     category share all settings that are words or sizes.
@@ -209,7 +209,11 @@ class RunningMeans:
 
         The result is (n, N_RUNNING_SUMS).
         """
-        arrays = self.n_values, self.squared_deviations[KEEPS_SPREAD], self.mean[IS_LOGARITHM]
+        arrays = (
+            self.n_values,
+            self.squared_deviations[OUTPUT_HAS_SQUARED_DEVIATIONS],
+            self.mean[OUTPUT_IS_LOGARITHM],
+        )
         return np.concatenate(arrays).T
 
     def resume(self, results: Mapping[str, np.ndarray]) -> None:
@@ -218,14 +222,14 @@ class RunningMeans:
         `results` are those of :meth:`results` by name, with the array of :meth:`running_sums` as
         RUNNING_SUMS. Points without draws have zeros there.
         """
-        split_rows = np.cumsum([len(self.names), KEEPS_SPREAD.sum()])
+        split_rows = np.cumsum([len(self.names), OUTPUT_HAS_SQUARED_DEVIATIONS.sum()])
         n_values, squared_deviations, largest_logarithms = np.split(
             results[RUNNING_SUMS].T, split_rows
         )
         self.n_values[...] = n_values
-        self.squared_deviations[KEEPS_SPREAD] = squared_deviations
+        self.squared_deviations[OUTPUT_HAS_SQUARED_DEVIATIONS] = squared_deviations
         mean = np.array([results[name] for name in self.names])
-        mean[IS_LOGARITHM] = largest_logarithms
+        mean[OUTPUT_IS_LOGARITHM] = largest_logarithms
         self.mean[...] = np.where(n_values > 0, mean, self.mean)
 
     def state(self) -> np.ndarray:

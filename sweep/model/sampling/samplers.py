@@ -77,8 +77,8 @@ SPECTRA_METHOD = "spectra"
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
 ]
-"""Rows in the arrays of counts, whose order is that of ``DRAW_COUNT_OUTPUTS``, with the numbers of
-detections. The rows are in the order of ``PD_OUTPUTS``."""
+"""Rows of arrays of counts that hold numbers of detections, in the order of ``PD_OUTPUTS``. The
+rows of such an array are in the order of ``DRAW_COUNT_OUTPUTS``."""
 
 
 class PriorDraws(NamedTuple):
@@ -167,9 +167,10 @@ class Sampler(ABC):
 
     @abstractmethod
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name.
+        """Return the results of all draws by name: outputs, standard errors and half-widths, (n,).
 
-        The running sums that further draws need are included, (n, columns).
+        Half-widths are those of confidence intervals. The running sums that further draws need are
+        included, (n, columns).
         """
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
@@ -186,7 +187,7 @@ class Sampler(ABC):
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return half-widths of the confidence intervals of fractions of detections, (4, points).
 
-        They follow from the counts of draws alone. Rows are in the order of PD_OUTPUTS.
+        The half-widths follow from the counts of draws alone. Rows are in the order of PD_OUTPUTS.
         """
         counts, n = self.n_detected()[:, point_indices], self.n_draws[point_indices]
         confidence = error_budget.select(point_indices, self.n_draws.size).confidence
@@ -196,7 +197,7 @@ class Sampler(ABC):
         return interval_half_width(counts / n, interval)
 
     def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return by how much each point's largest half-width exceeds the tolerance, (points,).
+        """Return the excess of each point's largest half-width over the tolerance, (points,).
 
         The half-widths are those of the confidence intervals of detection probabilities. The result
         is at least 0.
@@ -222,7 +223,7 @@ class Sampler(ABC):
 def never_stop() -> bool:
     """Return False, so that drawing goes on until all draws are made.
 
-    It is the default of ``should_stop``.
+    This function is the default of ``should_stop``.
     """
     return False
 
@@ -274,7 +275,7 @@ def simulate_draws(
         Numbers of draws to count separately; each point then has their sum. Without them a point
         has as many draws as `error_budget` needs, in one count.
     batch
-        Number of draws of which a multiple is made between tests against `error_budget`.
+        Number of draws in a batch. Whole batches are made between tests against `error_budget`.
     limit
         Largest number of draws of a point without `batch_sizes`.
     error_budget
@@ -442,7 +443,7 @@ class DetectionSampler(Sampler):
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name."""
+        """Return the results of all draws by name, as in :meth:`Sampler.results`."""
         if self._running_means is None:
             outputs = self._outputs | zero_standard_errors(self._outputs)
         else:
@@ -572,7 +573,7 @@ class SpectraSampler(Sampler):
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name."""
+        """Return the results of all draws by name, as in :meth:`Sampler.results`."""
         values, statistics = self._value_means, self._statistic_means.results()
         n, mean, squared_deviations, error = (
             dict(zip(AVERAGED_VALUE_NAMES, part, strict=True))

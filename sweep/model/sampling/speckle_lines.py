@@ -282,7 +282,7 @@ def interpolate_transform(distance, grid):
 def nearest_image_position(position, nyquist_bin):
     """Return the position [bins] of a line's mirror image at frequency 0 or Nyquist.
 
-    It is the image at whichever of the two is nearer.
+    The image is the one at whichever of the two is nearer.
     """
     return -position if position < 0.5 * nyquist_bin else 2.0 * nyquist_bin - position
 
@@ -302,9 +302,9 @@ def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_vari
     first_bin
         (3,): number of the first bin in each segment; the others follow it.
     mean_power
-        (3, bins): the result, mean powers.
+        (3, bins): output array of mean powers.
     pseudo_variance
-        (3, bins): the second result, pseudo-variances over mean powers, which images of lines cause
+        (3, bins): output array of pseudo-variances over mean powers, which images of lines cause
         near DC and Nyquist (:mod:`sweep.model.detection.pseudo_variance`).
 
     Returns
@@ -367,7 +367,7 @@ def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_vari
 def draw_bin_amplitudes(
     address, echo_number, grid, point, echo_centre, first_bin, mean_power, amplitudes
 ):
-    """Draw the complex amplitudes by speckle of an echo's bins, as sums over its lines.
+    """Draw the complex speckle amplitudes of an echo's bins, as sums over its lines.
 
     The amplitudes have mean power 1.
 
@@ -384,7 +384,7 @@ def draw_bin_amplitudes(
     mean_power
         (3, bins): result of :func:`mean_bin_powers` for the same bins.
     amplitudes
-        (3, bins) complex; the result.
+        (3, bins) complex: output array.
 
     Notes
     -----
@@ -456,7 +456,9 @@ _RESIDUAL_POWER_MAX = 1e-8
 
 @njit(cache=True, error_model="numpy")
 def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, factor):
-    """Factor the covariance of the speckle amplitudes of an echo's bins, and return its rank.
+    """Compute a factor of the covariance of an echo's speckle amplitudes; return its rank.
+
+    The amplitudes are those of the echo's bins.
 
     Draws by the factor (:func:`draw_factored_amplitudes`) have the distribution of those by
     :func:`draw_bin_amplitudes`, and take fewer random numbers.
@@ -468,7 +470,7 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
     echo_centre, first_bin, mean_power
         Middle of the echo, first bin and mean powers, as in :func:`draw_bin_amplitudes`.
     factor
-        (rows, 3, bins) complex, with one row for each bin of all segments; the result. The
+        (rows, 3, bins) complex, with one row for each bin of all segments: output array. The
         amplitudes of the bins are the sum over its first rows, up to the rank, of the row times a
         circular Gaussian number of mean power 2.
 
@@ -557,7 +559,7 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
-    """Draw the complex amplitudes by speckle of an echo's bins, by a factor of their covariance.
+    """Draw the complex speckle amplitudes of an echo's bins by a factor of their covariance.
 
     Parameters
     ----------
@@ -566,7 +568,7 @@ def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
     factor, rank
         Results of :func:`factor_bin_covariance`.
     amplitudes
-        (3, bins) complex; the result, of mean power 1.
+        (3, bins) complex: output array, of mean power 1.
     """
     amplitudes[:] = 0.0
     key_0, key_1, draw = address
@@ -600,7 +602,7 @@ def draw_segment_bin_amplitudes(
     draws: np.ndarray,
     echo_number: int = 0,
 ) -> np.ndarray:
-    """Draw the complex amplitudes by speckle of adjacent bins of an echo in one segment.
+    """Draw the complex speckle amplitudes of adjacent bins of an echo in one segment.
 
     The amplitudes have mean power 1.
 
@@ -777,7 +779,7 @@ _RELATIVE_POWER_MIN = 1e-14
 class _LineTable(NamedTuple):
     """Lines of one point in one segment, (lines,) each.
 
-    They are in the order in which :func:`draw_bin_amplitudes` draws their amplitudes.
+    The lines are in the order in which :func:`draw_bin_amplitudes` draws their amplitudes.
     """
 
     offset: np.ndarray
@@ -811,7 +813,7 @@ def _line_table(line_grid: SpeckleLineGrid, point: int, segment: int) -> _LineTa
 def _draw_line_amplitudes(address, first_number, amplitudes):
     """Fill ``amplitudes`` with circular complex Gaussian numbers of mean power 2.
 
-    They follow from the pairs of normal numbers of the stream of speckle, from the pair
+    The numbers follow from the pairs of normal numbers of the stream of speckle, from the pair
     ``first_number`` on, in the draw of ``address``
     (:class:`sweep.model.sampling.philox.DrawAddress`).
     """
@@ -990,7 +992,7 @@ def position_error_moments(
     shots: "Shots",
     pairs: tuple[tuple[int, int], ...] = SEGMENT_PAIRS_WITH_SELF,
 ) -> np.ndarray:
-    """Return the second moments E[e_i e_j] of errors of peak positions by speckle [bins^2].
+    """Return the second moments E[e_i e_j] of peak position errors due to speckle [bins^2].
 
     e_i is the error in segment i.
 
@@ -1014,7 +1016,7 @@ def position_error_moments(
     Notes
     -----
     An error is the sum of two parts: the wander, by equation (3) and :func:`wander_covariance`, and
-    the error by the shape of the peak (:class:`PeakShapeErrors`). The real part of the complex
+    the error due to the shape of the peak (:class:`PeakShapeErrors`). The real part of the complex
     variance V of :class:`PeakShapeErrors` has the mean b^2 and the variance b^4 (v / q^2 + v^2 /
     q^4). Here b is the spread of the lines [bins], q^2 the peak's power over its mean, and v the
     echo fraction. If only the strongest bin is tested, the wander's deviation is divided by sqrt(1
@@ -1091,7 +1093,7 @@ class PeakShapeErrors(NamedTuple):
     """
 
     imaginary_shift_error: np.ndarray
-    """Mean error of the peak position [bins] by the imaginary part of the complex shift s."""
+    """Mean error of the peak position [bins] due to the imaginary part of the complex shift s."""
     error_per_variance: np.ndarray
     """Error of the peak position [bins] per Re V [bins^2], the real part of the lines' complex
     variance."""
@@ -1125,7 +1127,7 @@ class PeakShapeErrors(NamedTuple):
 def _peak_shape_error_table(
     window: Window, fft_size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate errors of peak positions by deformed peaks, by the peak's offset from its bin.
+    """Tabulate errors of the positions of deformed peaks over a peak's offset from its bin.
 
     Returns
     -------

@@ -8,14 +8,14 @@ from sweep.model.preparation import Shots
 from sweep.model.sampling.speckle_lines import SpecklePeaks, folding_signs, position_error_moments
 
 NEGATIVE_LOG_PD_MAX = 700.0
-"""Largest -ln(pd) that is used, with the probability of detection pd. Smaller probabilities count
-as e^-700."""
+"""Upper limit of -ln(pd), where pd is the probability of detection. A smaller pd counts as
+e^-700."""
 
 
 def wander_variance(
     shots: Shots, point_indices: np.ndarray, peaks: SpecklePeaks, is_detected: np.ndarray
 ) -> np.ndarray:
-    """Return the mean square errors by speckle of range and velocity of m measurements, (2, m).
+    """Return the mean square errors of m ranges and velocities due to speckle, (2, m).
 
     Parameters
     ----------
@@ -66,9 +66,9 @@ def wander_variance(
 
 
 def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.ndarray:
-    """Return the mean square errors by speckle of range and velocity of n points, (2, n).
+    """Return the mean square errors of range and velocity at n points due to speckle, (2, n).
 
-    They are averages over detected echoes.
+    The means are over detected echoes.
 
     Parameters
     ----------

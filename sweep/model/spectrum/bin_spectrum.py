@@ -95,7 +95,7 @@ class LineBundle(NamedTuple):
     """
 
 
-class SeenLines(NamedTuple):
+class VisibleLineRange(NamedTuple):
     """Lowest and highest bin at which lines appear in a spectrum.
 
     A spectrum that folds frequencies shows them within 0 .. N/2, where N is the FFT size.
@@ -168,9 +168,9 @@ class FarBins(NamedTuple):
 
     tangent: np.ndarray
     """tan(pi k / N) of each bin k, with the FFT size N."""
-    turn_re: np.ndarray
+    phasor_re: np.ndarray
     """cos(pi k L / N) of each bin k, with L samples and the FFT size N."""
-    turn_im: np.ndarray
+    phasor_im: np.ndarray
     """sin(pi k L / N) of each bin k, with L samples and the FFT size N."""
     cotangent: np.ndarray
     """Scratch: cot(pi (k - nu) / N) for a line at nu bins, with the FFT size N."""
@@ -224,10 +224,10 @@ class SpanArrays(NamedTuple):
     """
 
 
-class IntegralPoints(NamedTuple):
+class LeakageQuadrature(NamedTuple):
     """Quadrature points of an integral over bins far from the lines, which gives their leakage.
 
-    Leakage is the probability of false alarms by the echo's signal.
+    Leakage is the probability of false alarms due to the echo's signal.
     """
 
     cotangent: np.ndarray
@@ -265,7 +265,7 @@ class SpectrumWorkspace(NamedTuple):
     """Scratch: squared magnitude averaged over shifts, in the computed bins around the lines."""
     span: SpanArrays
     """Magnitudes and crossing probabilities in the computed bins around the lines."""
-    integral: IntegralPoints
+    leakage_quadrature: LeakageQuadrature
     """Quadrature points of the integral over bins outside ``span``, which gives their leakage."""
 
 
@@ -320,7 +320,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
         imaginary_part=next(rows),
         mean_square=next(rows),
         span=SpanArrays(next(rows), np.empty(width, np.bool_), *next_rows(2)),
-        integral=IntegralPoints(*next_rows(5)),
+        leakage_quadrature=LeakageQuadrature(*next_rows(5)),
     )
 
 
@@ -335,9 +335,9 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
     lines, last_line_bin = field.lines, math.floor(bundle.highest_position)
     table_reach = layout.table_bins + LINE_BATCH_BINS
     for batch_bin in range(math.floor(bundle.lowest_position), last_line_bin + 1, LINE_BATCH_BINS):
-        lap_min = -((table_reach + batch_bin - first_bin) // fft_size)
-        lap_max = (first_bin + n_bins - batch_bin + table_reach) // fft_size
-        if lap_min > lap_max:  # the table holds none of these bins
+        n_periods_min = -((table_reach + batch_bin - first_bin) // fft_size)
+        n_periods_max = (first_bin + n_bins - batch_bin + table_reach) // fft_size
+        if n_periods_min > n_periods_max:  # the table holds none of these bins
             continue
         n_cells = min(LINE_BATCH_BINS, last_line_bin + 1 - batch_bin) * cells_per_bin + KERNEL_CELLS
         for c in range(n_cells + ZERO_WEIGHT_CELLS):
@@ -348,8 +348,8 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
                 _spread_line(
                     cell_position, lines.re[line], lines.im[line], field.cell_re, field.cell_im
                 )
-        for lap in range(lap_min, lap_max + 1):
-            _add_cells(first_bin, n_bins, batch_bin, n_cells, lap, shape, layout, field)
+        for n_periods in range(n_periods_min, n_periods_max + 1):
+            _add_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -369,38 +369,38 @@ def _spread_line(cell_position, re, im, cell_re, cell_im):
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def _first_bin_in_table(batch_bin, lap, layout):
+def _first_bin_in_table(batch_bin, n_periods, layout):
     """Return the first bin that the tables of all lines in the interval at ``batch_bin`` contain.
 
-    ``lap`` is the number of FFT lengths by which the periodic spectrum is shifted.
+    ``n_periods`` is the number of FFT lengths by which the periodic spectrum is shifted.
     """
     return (
-        batch_bin + lap * layout.fft_size + LINE_BATCH_BINS + LINE_BATCH_EDGE_BINS
+        batch_bin + n_periods * layout.fft_size + LINE_BATCH_BINS + LINE_BATCH_EDGE_BINS
     ) - layout.table_bins
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def _end_bin_in_table(batch_bin, lap, layout):
+def _end_bin_in_table(batch_bin, n_periods, layout):
     """Return the bin after the last one that the tables of all lines in an interval contain.
 
-    ``batch_bin`` is the first bin of the interval. ``lap`` is the number of FFT lengths by which
-    the periodic spectrum is shifted.
+    ``batch_bin`` is the first bin of the interval. ``n_periods`` is the number of FFT lengths by
+    which the periodic spectrum is shifted.
     """
-    return batch_bin + lap * layout.fft_size - LINE_BATCH_EDGE_BINS + layout.table_bins
+    return batch_bin + n_periods * layout.fft_size - LINE_BATCH_EDGE_BINS + layout.table_bins
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def _add_cells(first_bin, n_bins, batch_bin, n_cells, lap, shape, layout, field):
+def _add_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field):
     """Add the spectrum of the cells of one interval of lines to ``field``.
 
     The first cell lies KERNEL_CELLS / 2 - 1 cells below ``batch_bin``, the interval's first bin.
     """
     cells_per_bin, adds_powers = layout.cells_per_bin, layout.adds_powers
     n_columns = shape.table_re.size // cells_per_bin
-    sign = -1.0 if lap & 1 and layout.record_length & 1 and not adds_powers else 1.0
-    low = max(first_bin, _first_bin_in_table(batch_bin, lap, layout))
-    high = min(first_bin + n_bins, _end_bin_in_table(batch_bin, lap, layout))
-    begin_bin = batch_bin + lap * layout.fft_size - layout.table_bins
+    sign = -1.0 if n_periods & 1 and layout.record_length & 1 and not adds_powers else 1.0
+    low = max(first_bin, _first_bin_in_table(batch_bin, n_periods, layout))
+    high = min(first_bin + n_bins, _end_bin_in_table(batch_bin, n_periods, layout))
+    begin_bin = batch_bin + n_periods * layout.fft_size - layout.table_bins
     if not layout.holds_all_bins and low >= high:
         return
     for c in range(n_cells):
@@ -528,11 +528,11 @@ def prepare_far_bins(first_bin, n_bins, layout, tangents, far_bins):
         k = k + 1 if k + 1 < fft_size else 0
     if fft_size == layout.record_length:
         for i in range(n_bins):
-            far_bins.turn_re[i], far_bins.turn_im[i] = -1.0 if (first_bin + i) & 1 else 1.0, 0.0
+            far_bins.phasor_re[i], far_bins.phasor_im[i] = -1.0 if (first_bin + i) & 1 else 1.0, 0.0
         return
     for i in range(n_bins):
         sine, cosine = sincos_cycles(0.5 * (first_bin + i) * layout.record_length / fft_size)
-        far_bins.turn_re[i], far_bins.turn_im[i] = cosine, sine
+        far_bins.phasor_re[i], far_bins.phasor_im[i] = cosine, sine
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -609,7 +609,7 @@ def add_line_by_record_ends(
         for i in range(begin, stop):
             p, q = far_bins.start_re[i], far_bins.start_im[i]
             r, s = far_bins.end_re[i], far_bins.end_im[i]
-            u, v = far_bins.turn_re[i], far_bins.turn_im[i]
+            u, v = far_bins.phasor_re[i], far_bins.phasor_im[i]
             u, v = u * u - v * v, 2.0 * u * v
             u, v = u * b_re - v * b_im, u * b_im + v * b_re
             field.re[shift + i] += a_re * (p * p + q * q + r * r + s * s) - 2.0 * (
@@ -621,7 +621,7 @@ def add_line_by_record_ends(
         u_im = a_re * far_bins.start_im[i] + a_im * far_bins.start_re[i]
         v_re = b_re * far_bins.end_re[i] - b_im * far_bins.end_im[i]
         v_im = b_re * far_bins.end_im[i] + b_im * far_bins.end_re[i]
-        c, s = far_bins.turn_re[i], far_bins.turn_im[i]
+        c, s = far_bins.phasor_re[i], far_bins.phasor_im[i]
         field.re[shift + i] += c * (u_re - v_re) - s * (u_im + v_im)
         field.im[shift + i] += c * (u_im - v_im) + s * (u_re + v_re)
 
@@ -683,9 +683,9 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
     current, end_bin = first_bin, first_bin + n_bins
     while current < end_bin:
         stop, is_in_part_of_table = min(current + FAR_BINS_PER_BATCH, end_bin), False
-        for lap in range(-1, 2):
-            low = _first_bin_in_table(first_batch_bin, lap, layout)
-            high = _end_bin_in_table(last_batch_bin, lap, layout)
+        for n_periods in range(-1, 2):
+            low = _first_bin_in_table(first_batch_bin, n_periods, layout)
+            high = _end_bin_in_table(last_batch_bin, n_periods, layout)
             is_in_part_of_table |= low <= current < high
             stop = (
                 min(stop, low) if low > current else (min(stop, high) if high > current else stop)
@@ -715,9 +715,9 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
                     * LINE_BATCH_BINS
                 )
                 start = current
-                for lap in range(-1, 3):
-                    table_begin = _first_bin_in_table(batch_bin, lap, layout)
-                    until = min(table_begin, stop) if lap < 2 else stop
+                for n_periods in range(-1, 3):
+                    table_begin = _first_bin_in_table(batch_bin, n_periods, layout)
+                    until = min(table_begin, stop) if n_periods < 2 else stop
                     if start < until:
                         add_line_by_record_ends(
                             start - current,
@@ -730,7 +730,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
                             layout,
                             field,
                         )
-                    start = max(start, _end_bin_in_table(batch_bin, lap, layout))
+                    start = max(start, _end_bin_in_table(batch_bin, n_periods, layout))
         current = stop
 
 
@@ -880,27 +880,27 @@ def is_mirrored(origin_bin, lowest_position, highest_position, spectrum_type):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def seen_lines(origin_bin, lowest_position, highest_position, layout):
-    """Return the :class:`SeenLines`, the bins from DC at which lines appear in the spectrum.
+def visible_line_range(origin_bin, lowest_position, highest_position, layout):
+    """Return the :class:`VisibleLineRange`, the bins from DC at which lines appear in the spectrum.
 
     The given positions are counted from ``origin_bin`` [bins].
     """
     if is_mirrored(origin_bin, lowest_position, highest_position, layout.spectrum_type):
-        return SeenLines(-origin_bin - highest_position, -origin_bin - lowest_position)
-    return SeenLines(origin_bin + lowest_position, origin_bin + highest_position)
+        return VisibleLineRange(-origin_bin - highest_position, -origin_bin - lowest_position)
+    return VisibleLineRange(origin_bin + lowest_position, origin_bin + highest_position)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def bins_around_lines(margin_bins, seen, layout):
+def bins_around_lines(margin_bins, visible_range, layout):
     """Return the :class:`BinRange` from ``margin_bins`` below the lines to as many bins above.
 
-    ``seen`` is the :class:`SeenLines`. If the margin extends beyond DC or Nyquist, the part beyond
-    is folded back.
+    ``visible_range`` is the :class:`VisibleLineRange`. If the margin extends beyond DC or Nyquist,
+    the part beyond is folded back.
     """
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     margin_bins = min(margin_bins, 2.0 * fft_size)
-    first_bin = math.floor(seen.lowest_position - margin_bins)
-    last_bin = math.ceil(seen.highest_position + margin_bins)
+    first_bin = math.floor(visible_range.lowest_position - margin_bins)
+    last_bin = math.ceil(visible_range.highest_position + margin_bins)
     if layout.spectrum_type == COMPLEX_RECORD:
         if last_bin - first_bin >= fft_size:
             first_bin = (first_bin + last_bin + 1 - fft_size) // 2
@@ -913,14 +913,14 @@ def bins_around_lines(margin_bins, seen, layout):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def distance_below_level_with_images(level, weight_sum, seen, envelope, layout):
+def distance_below_level_with_images(level, weight_sum, visible_range, envelope, layout):
     """Return the distance [bins] beyond which the spectrum of lines and images is below ``level``.
 
-    Parameters are those of :func:`distance_below_level`, with the :class:`SeenLines`.
+    Parameters are those of :func:`distance_below_level`, with the :class:`VisibleLineRange`.
     """
     if layout.spectrum_type == REAL_WITH_IMAGES:
         image_distance = min(
-            seen.lowest_position, 0.5 * layout.fft_size - seen.highest_position
+            visible_range.lowest_position, 0.5 * layout.fft_size - visible_range.highest_position
         )  # no bin is nearer to an image
         level_fraction = (
             0.5 if image_distance < distance_below_level(0.1 * level, weight_sum, envelope) else 0.9
@@ -980,14 +980,14 @@ def detect_in_span(
     shift_min, shift_max = 0.0, 0.0
     for m in range(shifts.offset.size):
         shift_min, shift_max = min(shift_min, shifts.offset[m]), max(shift_max, shifts.offset[m])
-    seen = seen_lines(
+    visible_range = visible_line_range(
         bundle.origin_bin,
         bundle.lowest_position + shift_min,
         bundle.highest_position + shift_max,
         layout,
     )
     margin_bins = distance_below_level_with_images(
-        lowest_level, weight_sum, seen, shape.envelope, layout
+        lowest_level, weight_sum, visible_range, shape.envelope, layout
     )
     if not lowest_level > 0.0:
         margin_bins = np.inf
@@ -1005,14 +1005,14 @@ def detect_in_span(
         )
         margin_bins = max(
             distance_below_level_with_images(
-                lowest_level, far_weight, seen, shape.envelope, layout
+                lowest_level, far_weight, visible_range, shape.envelope, layout
             ),
             2.0 * layout.clearance_bins,
         )
     negligible_ratio = negligible_magnitude / max(weight_sum, 1e-300)
     margin_bins = max(margin_bins, 2.0 * lobe_half_width)  # main lobes of bins of half the largest
     while True:
-        bins = bins_around_lines(margin_bins, seen, layout)
+        bins = bins_around_lines(margin_bins, visible_range, layout)
         n_bins = bins.last_bin - bins.first_bin + 1
         compute_magnitudes(
             bins.first_bin,
@@ -1032,7 +1032,7 @@ def detect_in_span(
         if largest >= lowest_level or n_bins >= n_bins_max:
             return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0)
         margin_needed = distance_below_level_with_images(
-            largest, weight_sum, seen, shape.envelope, layout
+            largest, weight_sum, visible_range, shape.envelope, layout
         )
         if margin_needed <= margin_bins:
             return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0)

@@ -1,6 +1,6 @@
 """Detection and leakage of a segment, where all bins count but few are computed.
 
-Leakage is the probability of false alarms by the echo's signal far from its lines.
+Leakage is the probability of false alarms due to the echo's signal far from its lines.
 
 A span, the adjacent bins around the lines, is computed bin by bin. It contains all bins that may
 cross the threshold, and as many more as it takes for the leaked signal to become smooth. Beyond the
@@ -67,8 +67,8 @@ from sweep.model.spectrum.bin_spectrum import (
     envelope_index,
     far_line_weight,
     is_mirrored,
-    seen_lines,
     tangent_at,
+    visible_line_range,
 )
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
@@ -78,7 +78,8 @@ side of that end."""
 
 END_CORRECTION_ERROR_MAX = 1e-7
 """Largest accepted value of the last end correction of the integral over bins, relative to the
-whole leakage. Leakage is the probability of false alarms by the echo's signal far from its lines.
+whole leakage. Leakage is the probability of false alarms due to the echo's signal far from its
+lines.
 """
 
 GAUSS_POINTS_MAX = 200
@@ -90,13 +91,13 @@ are NumPy booleans, because numba would compile the function anew for Python's."
 
 OCTAVE_STEP_LEAKAGE_MAX = 0.5
 """Leakage of the brightest speckle up to which one speckle power per octave is enough. Leakage is
-the probability of false alarms by the echo's signal far from its lines."""
+the probability of false alarms due to the echo's signal far from its lines."""
 RATE_MIN = 1e-30
-"""Lower limit of the bins' summed rate of false alarms by leaked signal. Smaller sums count as this
-value. The probability of at least one false alarm is 1 - exp(-sum)."""
+"""Lower limit of the bins' summed rate of false alarms due to leaked signal. Smaller sums count as
+this value. The probability of at least one false alarm is 1 - exp(-sum)."""
 CERTAIN_LEAKAGE_RATE = 34.5
-"""Upper limit of the bins' summed rate of false alarms by leaked signal. Larger sums count as this
-value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
+"""Upper limit of the bins' summed rate of false alarms due to leaked signal. Larger sums count as
+this value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
 
 _SPECKLE_INTEGRATION_STEPS = 160
 _RELATIVE_ROOT_POWERS = np.arange(1, _SPECKLE_INTEGRATION_STEPS + 1) / _SPECKLE_INTEGRATION_STEPS
@@ -137,20 +138,20 @@ class LeakageLimits(NamedTuple):
     """Correlation coefficient of the noise of adjacent bins, in phase with a line's sidelobes."""
 
 
-class SettledLeakage(NamedTuple):
+class LeakageResult(NamedTuple):
     """Leakage of the computed bins around the lines and of all bins beyond them.
 
-    It is valid only if enough bins around the lines are computed.
+    The result is valid only if enough bins around the lines are computed.
     """
 
     leakage: float
     """Probability that the echo's signal far from its lines raises at least one false alarm."""
-    is_settled: bool
+    is_valid: bool
     """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
 
 
-class FarLineBounds(NamedTuple):
-    """Bounds on the spectrum of a line of amplitude 1, at all distances from a given one on."""
+class EnvelopeTail(NamedTuple):
+    """Bounds on a line's spectrum at all distances above a given one. The line has amplitude 1."""
 
     magnitude: float
     """Largest magnitude of the line's spectrum."""
@@ -161,7 +162,7 @@ class FarLineBounds(NamedTuple):
 class NearEndCorrection(NamedTuple):
     """Correction of a sum over bins that is computed as an integral (Euler-Maclaurin).
 
-    It applies at the integral's end near the lines, on one side of them.
+    The correction applies at the integral's end near the lines, on one side of them.
     """
 
     correction: float
@@ -190,9 +191,9 @@ def detect_with_leakage(
 ):
     """Compute the bins around a segment's lines, the detection, and the leakage of all bins.
 
-    Leakage is the probability of false alarms by the echo's signal far from its lines. Parameters
-    and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`, with these
-    differences.
+    Leakage is the probability of false alarms due to the echo's signal far from its lines.
+    Parameters and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`,
+    with these differences.
 
     Parameters
     ----------
@@ -224,19 +225,21 @@ def detect_with_leakage(
     nyquist_bin, clearance, far_weight = layout.fft_size // 2, layout.clearance_bins, weight_sum
     if lobe_half_width > clearance // 2:  # an echo whose pedestal reaches far
         clearance += lobe_half_width
-    seen = seen_lines(bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout)
+    visible_range = visible_line_range(
+        bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout
+    )
     image_distance = (
-        max(min(seen.lowest_position, nyquist_bin - seen.highest_position), 0.0)
+        max(min(visible_range.lowest_position, nyquist_bin - visible_range.highest_position), 0.0)
         if layout.spectrum_type == REAL_WITH_IMAGES
         else math.inf
     )
     distance_min = crossing_distance = max(
         distance_below_level_with_images(
-            brightest_limits.threshold, weight_sum, seen, envelope, layout
+            brightest_limits.threshold, weight_sum, visible_range, envelope, layout
         ),
         float(clearance),
     )
-    tolerance_left = limits.tolerance - _far_false_alarm_bound(
+    tolerance_left = limits.tolerance - _far_leakage_bound(
         far_weight, distance_min, image_distance, brightest_limits, envelope
     )
     if tolerance_left < 0.0 or crossing_distance > clearance:
@@ -248,25 +251,25 @@ def detect_with_leakage(
         )
         crossing_distance = max(
             distance_below_level_with_images(
-                brightest_limits.threshold, far_weight, seen, envelope, layout
+                brightest_limits.threshold, far_weight, visible_range, envelope, layout
             ),
             float(clearance),
         )
         distance_min = min(crossing_distance, float(clearance + nyquist_bin))
-        tolerance_left = limits.tolerance - _far_false_alarm_bound(
+        tolerance_left = limits.tolerance - _far_leakage_bound(
             far_weight, distance_min, image_distance, brightest_limits, envelope
         )
         while (
             tolerance_left < 0.0 and distance_min < layout.table_bins
         ):  # bins of the table take less time than an integral
             distance_min = min(1.25 * distance_min, float(layout.table_bins))
-            tolerance_left = limits.tolerance - _far_false_alarm_bound(
+            tolerance_left = limits.tolerance - _far_leakage_bound(
                 far_weight, distance_min, image_distance, brightest_limits, envelope
             )
     # Wide enough if the integral may be left out, else a first guess.
     is_integral_negligible = tolerance_left >= 0.0
     near_bins = bins_around_lines(
-        distance_min if is_integral_negligible else float(clearance), seen, layout
+        distance_min if is_integral_negligible else float(clearance), visible_range, layout
     )
     extra_bins = ZERO
     if not is_integral_negligible:
@@ -312,10 +315,10 @@ def detect_with_leakage(
                     n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates
                 )
             return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, leakage)
-        result = _leakage_of_span_and_far_bins(
+        result = _leakage_of_all_bins(
             DetectedSpan(first_bin, n_bins, peak_index, n_exempt, 0.0),
             bundle,
-            seen,
+            visible_range,
             limits,
             speckle_power_max,
             shape,
@@ -325,7 +328,7 @@ def detect_with_leakage(
             crossing_series,
             speckle_rates,
         )
-        if result.is_settled:
+        if result.is_valid:
             return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, result.leakage)
         extra_bins *= 2
 
@@ -334,7 +337,7 @@ def detect_with_leakage(
 def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates):
     """Return the leakage of the computed bins around the lines, or its mean over speckle.
 
-    Leakage is the probability of false alarms by the echo's signal. The mean is taken over
+    Leakage is the probability of false alarms due to the echo's signal. The mean is taken over
     developed speckle if ``speckle_power_max`` is above 1.
     """
     if speckle_power_max > 1.0:
@@ -344,7 +347,7 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def leakage_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_series):
-    """Return the probability of a false peak by leaked signal in the bins of a span.
+    """Return the probability of a false peak that leaked signal raises in the bins of a span.
 
     A span is the computed bins around a segment's lines. Magnitudes below
     ``negligible_signal_ratio`` times the noise sigma are set to 0, except those of the echo.
@@ -413,7 +416,7 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
-    """Return the probability of a false peak by leaked signal, averaged over speckle.
+    """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
     The bins are the computed ones around a segment's lines (a span).
     """
@@ -426,9 +429,10 @@ def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
 def _mean_leakage_over_speckle(
     first_index, end_index, limits, span, speckle_rates, relative_rates_of_far_bins
 ):
-    """Return the mean probability, over speckle, of a false peak by leaked signal.
+    """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
-    The bins are some of a span, the computed bins around the lines, and all bins beyond it.
+    The bins are some of those of a span (the computed bins around the lines), and all bins beyond
+    the span.
 
     Parameters
     ----------
@@ -507,28 +511,28 @@ def _mean_leakage_over_speckle(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates):
-    """Mark the bins that may join an echo by a crossing probability of 1, all others by 0.
+    """Set the crossing probability of bins that may join an echo to 1, and of all others to 0.
 
-    A bin joins an echo if it crosses the threshold next to it. The result is an upper bound of the
-    number of bins to be listed one by one: marked bins, the echo's bins next to them, and one for
-    each gap between them.
+    A bin joins an echo if it crosses the threshold next to the echo. The result is an upper bound
+    of the number of bins to be listed one by one: marked bins, the echo's bins next to them, and
+    one for each gap between them.
     """
-    n_listed_max, stretch_end = 0, first_index
+    n_listed_max, gap_end = 0, first_index
     for i in range(first_index, end_index):
         span.crossing_probability[i] = 0.0
-    while stretch_end < end_index:
-        stretch_begin = stretch_end
-        while stretch_end < end_index and not span.is_exempt[stretch_end]:
-            stretch_end += 1
-        if stretch_end > stretch_begin and stretch_begin > first_index:
+    while gap_end < end_index:
+        gap_begin = gap_end
+        while gap_end < end_index and not span.is_exempt[gap_end]:
+            gap_end += 1
+        if gap_end > gap_begin and gap_begin > first_index:
             n_listed_max += 2 + _mark_bins_that_may_all_cross(
-                stretch_begin, 1, stretch_end - stretch_begin, noise_sigma, span, speckle_rates
+                gap_begin, 1, gap_end - gap_begin, noise_sigma, span, speckle_rates
             )
-        if stretch_end > stretch_begin and stretch_end < end_index:
+        if gap_end > gap_begin and gap_end < end_index:
             n_listed_max += 2 + _mark_bins_that_may_all_cross(
-                stretch_end - 1, -1, stretch_end - stretch_begin, noise_sigma, span, speckle_rates
+                gap_end - 1, -1, gap_end - gap_begin, noise_sigma, span, speckle_rates
             )
-        stretch_end += 1
+        gap_end += 1
     return n_listed_max
 
 
@@ -626,8 +630,8 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _far_false_alarm_bound(weight_sum, distance_min, image_distance, limits, envelope):
-    """Bound the probability of false alarms by leaked signal in all bins far from the lines.
+def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelope):
+    """Return a bound on the probability of false alarms due to leaked signal far from the lines.
 
     The bins are ``distance_min`` or more bins away from the lines.
 
@@ -661,10 +665,10 @@ def _far_false_alarm_bound(weight_sum, distance_min, image_distance, limits, env
     """
     weight_ratio, b = weight_sum / limits.noise_sigma, limits.threshold / limits.noise_sigma
     y = 0.5 * b * b
-    far_bounds = _far_line_bounds(distance_min, envelope)
+    far_bounds = _envelope_tail(distance_min, envelope)
     nearest_envelope, square_sum = far_bounds.magnitude, far_bounds.square_sum
     if image_distance < math.inf:
-        image = _far_line_bounds(max(distance_min, image_distance), envelope)
+        image = _envelope_tail(max(distance_min, image_distance), envelope)
         image_square_sum = image.square_sum + (
             max(image_distance - distance_min, 0.0) * image.magnitude * image.magnitude
         )
@@ -680,23 +684,23 @@ def _far_false_alarm_bound(weight_sum, distance_min, image_distance, limits, env
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _far_line_bounds(distance_min, envelope):
-    """Return the :class:`FarLineBounds` of a line from a distance of ``distance_min`` bins on."""
+def _envelope_tail(distance_min, envelope):
+    """Return bounds on a line's spectrum at ``distance_min`` bins or farther, `EnvelopeTail`."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
-    return FarLineBounds(magnitude, magnitude * magnitude + envelope.square_integral[index])
+    return EnvelopeTail(magnitude, magnitude * magnitude + envelope.square_integral[index])
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_bound_of_span(n_bins, limits, span):
-    """Bound the leakage of computed bins from their magnitudes; inf if a bin is too strong.
+    """Return a bound on the leakage of computed bins; inf if a bin is too strong.
 
-    Leakage is the probability of false alarms by the echo's signal. With x = a^2/2 and y = b^2/2,
-    of the signal a and the threshold b over the noise sigma, Q_1 is convex in x up to y - 2. Q_1 is
-    the Marcum function. The reason is I_2(z) / I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z = a b.
-    Relative to the strongest bin each bin then adds at most the ratio of their powers. The
-    strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2 allows for the probability that
-    noise alone stays below the threshold, at least 1 - e^-2.
+    The bound follows from the bins' magnitudes. Leakage is the probability of false alarms due to
+    the echo's signal. With x = a^2/2 and y = b^2/2, of the signal a and the threshold b over the
+    noise sigma, Q_1 is convex in x up to y - 2. Q_1 is the Marcum function. The reason is I_2(z) /
+    I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z = a b. Relative to the strongest bin each bin then adds
+    at most the ratio of their powers. The strongest bin adds at most e^{-(b - a)^2 / 2}. The factor
+    1.2 allows for the probability that noise alone stays below the threshold, at least 1 - e^-2.
     """
     largest, square_sum = 0.0, 0.0
     for i in range(n_bins):
@@ -713,7 +717,7 @@ def _leakage_bound_of_span(n_bins, limits, span):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
-    """Compute the probability by which signal raises each bin's threshold crossing above noise's.
+    """Compute the increase of each bin's crossing probability that signal causes over noise alone.
 
     Bins of the echo are left out. Bins above the threshold, which bright speckle may contain, are
     outside the range of the series.
@@ -747,8 +751,8 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
     The leakage integral covers the bins beyond them. The number is a heuristic. It depends on the
     threshold, on the smoothness of the false-alarm rate, and on 3/4 of ``line_extent``, the extent
     of the lines [bins]. It is a multiple of 8. :func:`detect_with_leakage` doubles it until
-    :func:`_leakage_of_span_and_far_bins` is accurate. ``crossing_distance`` is the distance from
-    the lines [bins] up to which signal alone may cross the threshold.
+    :func:`_leakage_of_all_bins` is accurate. ``crossing_distance`` is the distance from the
+    lines [bins] up to which signal alone may cross the threshold.
     """
     clearance = layout.clearance_bins
     edge_signal = envelope.magnitude[clearance] * weight_sum / limits.noise_sigma
@@ -765,10 +769,10 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def _leakage_of_span_and_far_bins(
+def _leakage_of_all_bins(
     detected,
     bundle,
-    seen,
+    visible_range,
     limits,
     speckle_power_max,
     shape,
@@ -778,27 +782,29 @@ def _leakage_of_span_and_far_bins(
     crossing_series,
     speckle_rates,
 ):
-    """Compute the :class:`SettledLeakage` of the bins around the lines and of all other bins.
+    """Compute the :class:`LeakageResult` of the bins around the lines and of all other bins.
 
     Parameters are those of :func:`detect_with_leakage`, with the :class:`DetectedSpan` and the
-    :class:`sweep.model.spectrum.bin_spectrum.SeenLines`. If the echo is in developed speckle, the
-    leakage is the mean over the speckle.
+    :class:`sweep.model.spectrum.bin_spectrum.VisibleLineRange`. If the echo is in developed
+    speckle, the leakage is the mean over the speckle.
     """
-    span, integral = workspace.span, workspace.integral
+    span, integral = workspace.span, workspace.leakage_quadrature
     first_bin, n_bins, peak_index = detected.first_bin, detected.n_bins, detected.peak_index
     noise_sigma, threshold = limits.noise_sigma, limits.threshold
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     threshold_ratio, scale = threshold / noise_sigma, 0.5 / (noise_sigma * noise_sigma)
     goes_on_below, goes_on_above = first_bin > 0, first_bin + n_bins - 1 < nyquist_bin
     if not goes_on_below and not goes_on_above:
-        return SettledLeakage(
+        return LeakageResult(
             _leakage_of_span(
                 n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates
             ),
             True,
         )
     _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
-    centre_bin = abs(math.floor(0.5 * (seen.lowest_position + seen.highest_position) + 0.5))
+    centre_bin = abs(
+        math.floor(0.5 * (visible_range.lowest_position + visible_range.highest_position) + 0.5)
+    )
     centre_bin = fft_size - centre_bin if centre_bin > nyquist_bin else centre_bin
     far_rate, last_terms, n_points = 0.0, 0.0, ZERO
     for side in (-1, 1):
@@ -806,7 +812,7 @@ def _leakage_of_span_and_far_bins(
             continue
         near_end = _near_end_correction(side, n_bins, span)
         if not near_end.exists:
-            return SettledLeakage(0.0, False)
+            return LeakageResult(0.0, False)
         far_rate += near_end.correction
         last_terms += near_end.last_term
         end_distance = (
@@ -876,10 +882,10 @@ def _leakage_of_span_and_far_bins(
         largest_far_half_square <= half_square_max
         and last_terms <= END_CORRECTION_ERROR_MAX * (span_leakage + far_rate)
     ):
-        return SettledLeakage(0.0, False)
+        return LeakageResult(0.0, False)
     if speckle_power_max > 1.0:
-        return SettledLeakage(
-            _mean_leakage_of_span_and_far_bins(
+        return LeakageResult(
+            _mean_leakage_of_all_bins(
                 n_bins,
                 n_points,
                 limits,
@@ -891,11 +897,11 @@ def _leakage_of_span_and_far_bins(
             ),
             True,
         )
-    return SettledLeakage(span_leakage - (1.0 - span_leakage) * math.expm1(-far_rate), True)
+    return LeakageResult(span_leakage - (1.0 - span_leakage) * math.expm1(-far_rate), True)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_leakage_of_span_and_far_bins(
+def _mean_leakage_of_all_bins(
     n_bins, n_points, limits, goes_on_below, goes_on_above, span, integral, speckle_rates
 ):
     """Return the mean leakage over developed speckle of computed bins and of the integral's bins.
@@ -953,12 +959,12 @@ def _fill_far_powers(
 ):
     """Compute the squared magnitude of the spectrum at the leakage integral's points.
 
-    The result goes to ``workspace.integral.half_square``.
-    The relative error is exp(-``log_accuracy``). ``workspace.integral.cotangent`` contains tan(pi q
-    / N) of each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there
-    are fewer lines than equivalent lines needed, the lines are summed exactly.
+    The result is written to ``workspace.leakage_quadrature.half_square``. The relative error is
+    exp(-``log_accuracy``). ``workspace.leakage_quadrature.cotangent`` contains tan(pi q / N) of
+    each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there are
+    fewer lines than equivalent lines needed, the lines are summed exactly.
     """
-    field, integral = workspace.field, workspace.integral
+    field, integral = workspace.field, workspace.leakage_quadrature
     far_bins = field.far_bins
     is_mirror_image = is_mirrored(
         bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout.spectrum_type
@@ -974,7 +980,7 @@ def _fill_far_powers(
             far_bins.tangent[i] = (
                 direction * (tangent + tangent_shift) / (1.0 - tangent * tangent_shift)
             )
-            far_bins.turn_re[i], far_bins.turn_im[i] = 1.0, 0.0
+            far_bins.phasor_re[i], far_bins.phasor_im[i] = 1.0, 0.0
             field.re[i], field.im[i] = 0.0, 0.0
         distance_min = float(layout.clearance_bins)
         if image_pass == 1:  # images are as far from DC and Nyquist as the lines

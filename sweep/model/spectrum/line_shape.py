@@ -909,7 +909,7 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
     coefficient_matrix
         :func:`chebyshev_coefficient_matrix`.
     modes
-        Result, :class:`ShapeModes` for up to nodes / 2 modes. ``n_modes`` is 0 if more are needed.
+        Output, :class:`ShapeModes` for up to nodes / 2 modes. ``n_modes`` is 0 if more are needed.
     """
     n_nodes = coefficient_matrix.shape[0]
     coefficients_re, coefficients_im = np.empty(n_nodes), np.empty(n_nodes)
@@ -945,7 +945,7 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
 def build_line_shape(segment, shape_index, previous_index, modes, tables, shape):
     """Compute one segment's line shape, the spectrum of a line of amplitude 1.
 
-    It is a sum of Chebyshev modes, or a copy of a table of all bins.
+    The line shape is a sum of Chebyshev modes, or a copy of a table of all bins.
 
     Parameters
     ----------
@@ -960,7 +960,7 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
     tables
         :class:`LineShapeTables`.
     shape
-        Result, :class:`LineShape` of the segment.
+        Output, :class:`LineShape` of the segment.
 
     Notes
     -----

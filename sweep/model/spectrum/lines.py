@@ -145,7 +145,8 @@ class BeamletArrays(NamedTuple):
     """Range, Doppler ratio and amplitude of all beamlets, relative to the beam's axis."""
 
     relative_range_offset: np.ndarray
-    """(footprints, beamlets): range of the beamlet minus that on the axis, over the latter."""
+    """(footprints, beamlets): range of the beamlet minus that on the axis, over the range on the
+    axis."""
     doppler_ratio_offset: np.ndarray
     """(footprints, beamlets): Doppler ratio 2 v_r / c of the beamlet minus that on the axis."""
     relative_amplitude: np.ndarray
@@ -187,9 +188,9 @@ class PointParameters(NamedTuple):
     record_start: np.ndarray
     """Time from the start of a segment to the first sample of its record [s]."""
     up_carrier: np.ndarray
-    """Frequency at the start of the up segment [Hz], by which a delay makes a phase."""
+    """Frequency at the start of the up segment [Hz]; its product with a delay is a phase."""
     down_carrier: np.ndarray
-    """Frequency at the start of the down segment [Hz], by which a delay makes a phase."""
+    """Frequency at the start of the down segment [Hz]; its product with a delay is a phase."""
     noise_sigma: np.ndarray
     """Noise standard deviation per quadrature in a bin [V, summed over the record]."""
     threshold: np.ndarray
@@ -206,7 +207,8 @@ class PointParameters(NamedTuple):
     """Error of a bin's magnitude over ``noise_sigma`` that approximations of the lines may cause.
     """
     image_gain: np.ndarray
-    """Amplitude of a line's image by I/Q imbalance, over that of the line; 0 if there is none."""
+    """Amplitude of the image that I/Q imbalance makes of a line, over that of the line; 0 if there
+    is no image."""
     side_noise: np.ndarray
     """Noise standard deviation per quadrature in bins next to the lines [V, summed over the
     record]. It includes the whole phase-noise pedestal of the laser.
@@ -230,7 +232,7 @@ class SegmentParameters(NamedTuple):
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
+    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
     whitening_gain: np.ndarray
     """Factor on the signal's amplitude in the spectrum whose noise is whitened."""
     range_decrease: np.ndarray
@@ -273,7 +275,7 @@ class BeatParameters(NamedTuple):
     chirp_rate: float
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: float
-    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
+    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
     amplitude: float
     """Amplitude [V] of the beat of a line of relative amplitude 1, in the whitened spectrum."""
     detector_bandwidth: float
@@ -335,11 +337,13 @@ def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...])
 
 
 def _truncation_bound(log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Bound the remainder of a Chebyshev series after J terms, (tolerances, J), for ln z < ln 2 J.
+    """Return a bound on the remainder of a Chebyshev series after J terms, (tolerances, J).
 
-    The series represents exp(i z x t) at the position x of a line, -1 .. 1, and the time t in the
-    record. J_m is the Bessel function. The remainder is the weighted mean over t of 2 sum_{m >= J}
-    |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m! exp(-x^2 / (4 m + 4)).
+    The bound holds for ln z < ln 2 J. The series represents exp(i z x t) at the position x of a
+    line, -1
+    .. 1, and the time t in the record. J_m is the Bessel function. The remainder is the weighted
+    mean over t of 2 sum_{m >= J} |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m! exp(-x^2
+    / (4 m + 4)).
     """
     phase_span, weighted_sum = np.exp(log_z), np.zeros(log_z.shape)
     for record_position, weight in zip(np.linspace(0, 1, weights.size), weights, strict=True):
@@ -371,7 +375,7 @@ def compute_lines(
     layout
         :class:`SpectrumLayout`.
     lines
-        Result, :class:`LineArrays`.
+        Output, :class:`LineArrays`.
     inverse_gain_re, inverse_gain_im
         Scratch arrays, (lines,): the receiver's gain is 1 / (re + i im).
 
@@ -609,7 +613,7 @@ def replace_lines_by_nodes(lines, n_lines, n_nodes, middle, half_width, scratch,
     scratch
         :class:`LineScratch`.
     nodes
-        Result, :class:`LineArrays`.
+        Output, :class:`LineArrays`.
 
     Returns
     -------

@@ -298,9 +298,9 @@ def _deposit_lines(
         Weights of Lagrange interpolation among the cells over which each line is spread; of size 1
         if a line goes into the nearest cell.
     centre_bin
-        (m,): result, bin in the middle of each grid, 0 .. N/2.
+        (m,): output array, bin in the middle of each grid, 0 .. N/2.
     grid
-        (m, cells, 2 or 1): result, real and imaginary parts, or powers.
+        (m, cells, 2 or 1): output array, real and imaginary parts, or powers.
     """
     n_beamlets, n_cells = beamlets.relative_range_offset.shape[1], grid.shape[1]
     n_lines = 2 * n_beamlets if image else n_beamlets

@@ -226,7 +226,7 @@ def line_bin_masks(
     return is_masked, is_searched, is_searched & ~is_masked & (magnitude_max >= floor * noise_sigma)
 
 
-def equivalent_echo_magnitude(
+def echo_magnitude_with_line(
     echo_magnitude: np.ndarray,
     line_rms: np.ndarray,
     *,
@@ -234,9 +234,7 @@ def equivalent_echo_magnitude(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return the magnitude of one echo that replaces an echo together with the permanent line.
-
-    An echo of this magnitude alone crosses the threshold as often as the given echo with the line.
+    """Return the |X| of a lone echo that crosses the threshold as often as the echo with the line.
 
     Parameters
     ----------
@@ -279,7 +277,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
     shots : Shots
         Prepared shots.
     bin_spans : BinSpans
-        Spectra around the echoes, as of :func:`sweep.model.spectrum.segment_spectra.iter_spans`.
+        Spectra around the echoes, as in :func:`sweep.model.spectrum.segment_spectra.iter_spans`.
 
     Returns
     -------
@@ -331,7 +329,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
             shots, int(bin_spans.point_numbers[i]), segment_index, peak_frequency
         )
         skirt_rms = np.where(is_masked[bins], 0.0, skirt_half_amplitude * line.magnitude_rms[bins])
-        equivalent_magnitudes = equivalent_echo_magnitude(
+        equivalent_magnitudes = echo_magnitude_with_line(
             bin_spans.magnitudes[bin_slice],
             skirt_rms,
             noise_sigma=line_noise_sigma[i],

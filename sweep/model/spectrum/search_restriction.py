@@ -126,13 +126,13 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
     Returns
     -------
     numpy.ndarray
-        0 .. N/2; -N/2 .. N/2 of complex records. For lines that drift within the record, by range
-        walk and acceleration, the position is that in the middle of the record.
+        0 .. N/2; -N/2 .. N/2 of complex records. For lines that drift within the record, due to
+        range walk and acceleration, the position is that in the middle of the record.
     """
 
     def by_point(values: np.ndarray | float) -> np.ndarray:
         """Return values of the points as a column (m, 1)."""
-        return as_columns(shots, values)[points]
+        return append_trailing_axes(shots, values)[points]
 
     hertz_per_metre = by_point(shots.waveform.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
     axis_range_beat = hertz_per_metre * by_point(shots.range)
@@ -196,7 +196,7 @@ def _fold_to_bins(shots: Any, cycles_per_sample: np.ndarray) -> np.ndarray:
     return np.asarray(positions if shots.complex_record else abs(positions))
 
 
-def as_columns(shots: Any, values: np.ndarray | float, n_trailing: int = 1) -> np.ndarray:
+def append_trailing_axes(shots: Any, values: np.ndarray | float, n_trailing: int = 1) -> np.ndarray:
     """Broadcast ``values`` to all n points and append ``n_trailing`` dimensions of size 1."""
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * n_trailing)
 
@@ -248,7 +248,8 @@ def _restrict_spans(
     n_exempt
         (segments, m): number of exempt bins; the result for spans that are cut.
     leakage
-        (segments, m): probability of a false peak by leakage; the result for spans that are cut.
+        (segments, m): probability of a false peak due to leakage; the result for spans that are
+        cut.
     """
     first_bin, n_bins, peak_index, span_starts = (
         spans.first_bin,
@@ -303,7 +304,7 @@ def _restrict_spans(
             )
             n_exempt[s, j] = is_exempt.sum()
             if evaluates_leakage[s]:
-                leakage[s, j] = span_leakage(
+                leakage[s, j] = span_leakage_probability(
                     magnitudes,
                     is_exempt,
                     threshold,
@@ -325,7 +326,7 @@ def _mark_searched_echoes(
     magnitudes
         (bins,): |X| without noise of adjacent bins.
     is_exempt
-        (bins,) bool: the result.
+        (bins,) bool: output array, True in the marked bins.
     first_bin
         Number of the first bin.
     threshold
@@ -360,7 +361,7 @@ def _mark_searched_echoes(
 
 
 @njit(cache=True, error_model="numpy")
-def span_leakage(
+def span_leakage_probability(
     magnitudes,
     is_exempt,
     alarm_threshold,

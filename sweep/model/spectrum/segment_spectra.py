@@ -94,16 +94,16 @@ SPAN_BINS_PER_BATCH = 1 << 21
 range of bins around a segment's lines."""
 
 THRESHOLD_RATIO_STEP = 1e-7
-"""Step to which the threshold over the noise sigma is rounded. Rates of false alarms by leaked
+"""Step to which the threshold over the noise sigma is rounded. Rates of false alarms due to leaked
 signal in developed speckle are tabulated per rounded threshold."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Names of the values that :func:`evaluate_segments` returns for each segment's spectrum."""
 
 NO_LEAKAGE, LEAKAGE_BY_INTEGRAL, LEAKAGE_BIN_BY_BIN = range(3)
-"""Methods for the probability of false alarms by leaked signal. The first computes none. The second
-counts all bins of the spectrum, with an integral over bins far from the lines. The third counts
-only the computed bins that exceed a level."""
+"""Methods for the probability of false alarms due to leaked signal. The first computes none. The
+second counts all bins of the spectrum, with an integral over bins far from the lines. The third
+counts only the computed bins that exceed a level."""
 
 
 SPAN_DOES_NOT_FIT = np.int64(-1)
@@ -204,8 +204,8 @@ class EvaluationSettings(NamedTuple):
     segment_exists: np.ndarray
     """(segments,) bool: true if the up, Doppler or down segment exists."""
     leakage_methods: np.ndarray
-    """(segments,): method for the probability of false alarms by leaked signal. It is NO_LEAKAGE,
-    LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN.
+    """(segments,): method for the probability of false alarms due to leaked signal. It is
+    NO_LEAKAGE, LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN.
     """
     window_sum: float
     """Sum of the window's samples, the peak of its transform."""
@@ -224,7 +224,7 @@ class EvaluationSettings(NamedTuple):
 
 
 def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
-    """Compute detection and false alarms by leaked signal in each segment's spectrum.
+    """Compute detection and false alarms due to leaked signal in each segment's spectrum.
 
     Parameters
     ----------
@@ -813,8 +813,8 @@ def _evaluate_batch(
 def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
     """Return the table that gives the number of equivalent lines for a group of points.
 
-    It is that of :func:`sweep.model.spectrum.lines.node_phase_limits`. For late echoes it assumes a
-    window whose whole weight is at the record's end.
+    The table is that of :func:`sweep.model.spectrum.lines.node_phase_limits`. For late echoes it
+    assumes a window whose whole weight is at the record's end.
     """
     if not group.is_late:
         return shots.window.node_phase_limits(shots.footprint.adds_powers)

@@ -40,7 +40,7 @@ from sweep.model.detection.echo_detection import (
     pd_and_miss,
 )
 from sweep.model.detection.marcum import marcum_q1_tails
-from sweep.model.spectrum.search_restriction import span_leakage
+from sweep.model.spectrum.search_restriction import span_leakage_probability
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 GAUSS_ORDER = 4
@@ -72,9 +72,9 @@ class SpanProbabilities(NamedTuple):
     """(segments, m): probability that the echo crosses the threshold but another peak is larger."""
     p_alarm: np.ndarray
     """(segments, m): probability that any bin outside the echo crosses the threshold."""
-    shared_gain: np.ndarray
-    """(m,): increase by shared speckle of the probability that both chirps report the echo's peak.
-    It includes only cases in which bins outside the echo cross the threshold too.
+    shared_speckle_gain: np.ndarray
+    """(m,): increase of the probability that both chirps report the echo's peak, due to the speckle
+    that they share. It includes only cases in which bins outside the echo cross the threshold too.
     """
 
 
@@ -113,7 +113,7 @@ def strongest_peak_probabilities(
     dict of str to ndarray (n,)
         ``pd_``, ``miss_`` and ``p_wrong_range_`` of each segment and of the shot.
     """
-    pd_loss, p_alarm, shared_gain = (
+    pd_loss, p_alarm, shared_speckle_gain = (
         np.zeros((3, shots.size)),
         np.zeros((3, shots.size)),
         np.zeros(shots.size),
@@ -122,7 +122,7 @@ def strongest_peak_probabilities(
         probabilities = _span_probabilities(shots, spans, pd)
         pd_loss[:, spans.point_numbers] = probabilities.pd_loss
         p_alarm[:, spans.point_numbers] = probabilities.p_alarm
-        shared_gain[spans.point_numbers] = probabilities.shared_gain
+        shared_speckle_gain[spans.point_numbers] = probabilities.shared_speckle_gain
     pd_right, miss_right = np.maximum(pd - pd_loss, 0.0), np.minimum(miss + pd_loss, 1.0)
     p_wrong = np.minimum(p_alarm * miss + pd_loss, 1.0)
     results = {
@@ -131,7 +131,7 @@ def strongest_peak_probabilities(
         for s, segment in enumerate(waveform.SEGMENT_NAMES)
     }
     p_no_alarm = (1 - p_alarm[UP]) * (1 - p_alarm[DOWN])
-    p_both_right = pd_right[UP] * pd_right[DOWN] + shared_gain
+    p_both_right = pd_right[UP] * pd_right[DOWN] + shared_speckle_gain
     if shots.speckle.segment_correlations is not None:
         speckle_covariance = (
             shots.joint_detection_probability(pd[UP], pd[DOWN], (magnitude[UP], magnitude[DOWN]))
@@ -146,7 +146,7 @@ def strongest_peak_probabilities(
     return results | {
         "pd_shot": p_both_right,
         "miss_shot": np.minimum(miss_shot, 1.0),
-        "p_wrong_range_shot": np.maximum(p_reported_wrong - shared_gain, 0.0),
+        "p_wrong_range_shot": np.maximum(p_reported_wrong - shared_speckle_gain, 0.0),
     }
 
 
@@ -264,7 +264,7 @@ def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def _joint_excess(exponent_first, exponent_second, squared_correlation):
-    """Return by how much correlation raises the joint probability of two Rayleigh magnitudes.
+    """Return the increase of two Rayleigh magnitudes' joint probability due to correlation.
 
     Each magnitude has to exceed a level of its own. Alone, the first exceeds its level with the
     probability exp(-``exponent_first``), the second with exp(-``exponent_second``). The result is
@@ -322,7 +322,7 @@ def _evaluate_levels(
     speckle_table
         :class:`sweep.model.detection.echo_detection.SpeckleTable` of all points.
     pd_loss
-        (segments, m, levels): result, P_b - P_z.
+        (segments, m, levels): output array, P_b - P_z.
     exponents
         (segments, m, levels): -ln P(Z < z) of noise alone, to which that of leaked signal is added.
     """
@@ -362,7 +362,7 @@ def _evaluate_levels(
                         loss_at_level = at_level.miss - at_threshold.miss
                     pd_loss[s, j, k] = max(loss_at_level, 0.0)
                 if includes_leakage:
-                    p_leak = span_leakage(
+                    p_leak = span_leakage_probability(
                         magnitudes,
                         is_echo,
                         level,
@@ -377,7 +377,7 @@ def _evaluate_levels(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_joint_excess(up, down, squared_correlation, joint_excess):
-    """Compute by how much shared speckle raises the probability that both peaks are right.
+    """Compute the increase, due to shared speckle, of the probability that both peaks are right.
 
     Only combinations of levels count in which bins without the echo cross in either segment.
 

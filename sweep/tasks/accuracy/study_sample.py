@@ -428,9 +428,9 @@ class GridSample(StudySample):
     def _points_computed_next(
         self, setting: AccuracySetting, point_index: int, n_points: int
     ) -> np.ndarray:
-        """Return a point and those that follow it in its block.
+        """Return a point and the ``n_points`` - 1 points of its block that are computed next.
 
-        After the block's last point its first one follows.
+        The block's first point follows its last.
         """
         grid = self.study_with_setting(setting).grid
         (block,), (local_index,) = (

@@ -23,7 +23,7 @@ from sweep.spec.cluster_config import (
 )
 from sweep.tasks.engine.deploy import kubernetes, local_ssh
 from sweep.tasks.engine.progress import ClusterError
-from sweep.tasks.engine.text_streams import make_dask_logs_patient
+from sweep.tasks.engine.text_streams import make_dask_logs_stall_tolerant
 
 if TYPE_CHECKING:
     from distributed import Client, Security
@@ -58,7 +58,7 @@ def connect_cluster(
     """
     from distributed import Client
 
-    make_dask_logs_patient()
+    make_dask_logs_stall_tolerant()
     if isinstance(cluster, ExistingSchedulerConfig):
         with _connect_client(cluster.address, cluster) as client:
             say(f"scheduler {cluster.address}: dashboard {client.dashboard_link}")
@@ -94,7 +94,7 @@ def connect_cluster(
 
 
 def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:
-    """Return the least and the largest number of workers, both limited to `max_workers`."""
+    """Return a cluster's least and largest number of workers, both limited to `max_workers`."""
     requested = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
     return WorkerBounds(*(min(n_workers, max(1, max_workers)) for n_workers in requested))
 

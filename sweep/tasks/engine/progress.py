@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 from sweep.messages import EscapedTextError, counted, escape_unprintable
 from sweep.regular_files import RefusedFileError
 from sweep.storage.store_format import StoreError as StoreError
-from sweep.tasks.engine.text_streams import PatientStream, is_terminal
+from sweep.tasks.engine.text_streams import StallTolerantStream, is_terminal
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -55,9 +55,9 @@ class SchedulerLostError(Exception):
 
 @contextmanager
 def raise_as_store_error(problem: str) -> Iterator[None]:
-    """Turn errors of the disk or of an object store into a StoreError.
+    """Context manager: raise errors of the disk or of an object store as a StoreError.
 
-    Its message begins with `problem`.
+    The message of the StoreError begins with `problem`.
     """
     try:
         yield
@@ -239,7 +239,7 @@ class ProgressLines(_CountingProgress):
     def __init__(self) -> None:
         super().__init__()
         self._printed_at = time.monotonic()
-        self._stream = PatientStream(sys.stderr)
+        self._stream = StallTolerantStream(sys.stderr)
 
     def _show_state(self, *, is_start: bool = False) -> None:
         if is_start or time.monotonic() - self._printed_at >= PROGRESS_LINE_INTERVAL_SECONDS:
@@ -276,7 +276,7 @@ class ProgressBar(_CountingProgress):
         from rich.table import Column
 
         super().__init__()
-        self.console = Console(file=cast("IO[str]", PatientStream(sys.stderr)))
+        self.console = Console(file=cast("IO[str]", StallTolerantStream(sys.stderr)))
 
         def text_column(text: str) -> TextColumn:
             return TextColumn(text, table_column=Column())  # wrapped, not truncated

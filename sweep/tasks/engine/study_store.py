@@ -124,7 +124,7 @@ def create_store(
                         error.errno, os_error_reason(error, draft_path), str(draft_path)
                     ) from error
                 if durable:
-                    sync_to_disk(draft_path)
+                    sync_file_system(draft_path)
         else:
             with tempfile.TemporaryDirectory() as temporary_folder:
                 _build_store(Path(temporary_folder) / store_path.name, template, recipe)
@@ -318,8 +318,8 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
     return content + google_crc32c.value(content).to_bytes(4, "little")
 
 
-class StoredBlock(NamedTuple):
-    """Digest and size [bytes] of a block as it is stored."""
+class BlockDigest(NamedTuple):
+    """Digest and size [bytes] of a stored block."""
 
     digest: str  # digest of the bytes and their paths, by `contents_digest`
     n_bytes: int  # size as stored
@@ -331,8 +331,8 @@ class BlockWriter:
     def __init__(self, store_path: str | Location, study: BlockStudy) -> None:
         self.store_path, self.study = parse_location(store_path), study
 
-    def write(self, block: int, results: Mapping[str, np.ndarray]) -> StoredBlock:
-        """Write all chunks of one block; raise ValueError if the results don't match its arrays."""
+    def write(self, block: int, results: Mapping[str, np.ndarray]) -> BlockDigest:
+        """Write all chunks of one block; ValueError if the results don't match its arrays."""
         positions = self.study.chunk_positions(block)
         if results.keys() != positions.keys():
             mismatched_names = sorted(results.keys() ^ positions.keys())
@@ -363,7 +363,7 @@ class BlockWriter:
 
         with translate_errors(self.store_path):
             chunk_contents = map_concurrently(self.store_path, write_chunk, positions)
-        return StoredBlock(
+        return BlockDigest(
             contents_digest(chunk_contents), sum(len(content) for _, content in chunk_contents)
         )
 
@@ -401,7 +401,7 @@ def chunk_name(array_name: str, position: tuple[int, ...]) -> str:
     return "/".join([array_name, "c", *map(str, position)])
 
 
-def sync_to_disk(store_path: Location) -> None:
+def sync_file_system(store_path: Location) -> None:
     """Write the operating system's cache of the store's file system to disk.
 
     OSError is raised if the disk fails. One call syncs the whole file system, which costs as much

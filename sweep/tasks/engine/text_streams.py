@@ -115,7 +115,7 @@ class ForgivingStream(io.TextIOBase):
                 os.close(null_descriptor)
 
 
-class PatientStream(ForgivingStream):
+class StallTolerantStream(ForgivingStream):
     """Text stream whose reader may stop for a while, as a terminal does after Ctrl-S.
 
     A thread writes to the descriptor of the inner stream. A flush waits for the thread for at most
@@ -192,26 +192,26 @@ class PatientStream(ForgivingStream):
                 self._waiting_texts.task_done()
 
 
-def make_dask_logs_patient() -> None:
+def make_dask_logs_stall_tolerant() -> None:
     """Replace the streams of Dask's log handlers, so that no message waits for a stopped terminal.
 
     Dask logs from its event loops. A loop that waits answers neither workers nor clients.
     """
-    streams: dict[int, PatientStream] = {}
+    streams: dict[int, StallTolerantStream] = {}
     for name, logger in [*logging.root.manager.loggerDict.items()]:
         if name.partition(".")[0] not in DASK_LOGGERS or not isinstance(logger, logging.Logger):
             continue
         for handler in logger.handlers:
             if not isinstance(handler, logging.StreamHandler):
                 continue
-            if isinstance(handler.stream, PatientStream):
+            if isinstance(handler.stream, StallTolerantStream):
                 continue
             try:
                 descriptor = int(handler.stream.fileno())
             except (AttributeError, OSError, ValueError, TypeError):
                 continue
             if descriptor in STANDARD_DESCRIPTORS:
-                stream = streams.setdefault(descriptor, PatientStream(handler.stream))
+                stream = streams.setdefault(descriptor, StallTolerantStream(handler.stream))
                 # Not by setStream, which flushes the old stream first.
                 handler.stream = stream
 

@@ -206,7 +206,7 @@ def _run_blocks(
                 raise
             task_result.failures.append(make_failure(block, error))
     if settings.durable and (receipts or task_result.checkpoint_points_by_block):
-        study_store.sync_to_disk(writer.store_path)
+        study_store.sync_file_system(writer.store_path)
     task_result.receipts = receipts
 
 

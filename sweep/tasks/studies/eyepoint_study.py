@@ -218,10 +218,10 @@ class EyepointStudy(BlockStudy):
         Eyepoints are the geometry of the shots, as the rays have found it. All rays are cast
         together.
         """
-        from sweep.model.pointcloud.eyepoints import observe_eyepoints
+        from sweep.model.pointcloud.eyepoints import compute_eyepoints
 
         world = self.world
-        return observe_eyepoints(
+        return compute_eyepoints(
             shot_numbers,
             caster=world.caster,
             body_motions=world.body_motions,
@@ -249,7 +249,7 @@ class EyepointStudy(BlockStudy):
 
     @cached_property
     def _observation_arguments(self) -> dict[str, Any]:
-        """Arguments of :func:`observe_eyepoints` for the instrument and its flight."""
+        """Arguments of :func:`compute_eyepoints` for the instrument and its flight."""
         return {
             "flight": self.spec.build_flight(),
             "scanner": self.spec.scan_pattern(self.scanner),

@@ -84,7 +84,7 @@ class FlightCoverage(NamedTuple):
 
 @lru_cache(maxsize=1)
 def sample_coverage(spec: SceneSpec) -> FlightCoverage:
-    """Cast sampled shots of each scanner. Return their hits; the last result is cached."""
+    """Cast the rays of sampled shots of each scanner, and return where they hit (cached)."""
     world, flight = build_world(spec), spec.build_flight()
     times = np.linspace(flight.start, flight.stop, _N_SAMPLED_TIMES)
     positions = flight.state(times).position

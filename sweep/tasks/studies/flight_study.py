@@ -21,7 +21,7 @@ from sweep.model.effects.catalogue import (
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.ground import extent_of_ray_traced_ground
+from sweep.model.ground import ray_traced_footprint_extent
 from sweep.model.outputs import (
     BEAMLET_VARIABLES,
     CYCLE_VARIABLES,
@@ -664,7 +664,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
-        """Standard deviations of instrument errors that do not decrease with a stronger echo."""
+        """Standard deviations of those instrument errors that a stronger echo does not reduce."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
         floor_section = self.spec.error_floor
@@ -808,7 +808,7 @@ def plan_shot_effects(
         hitting_eyepoints, PARAMETER_DEFAULTS | dict(parameters), surfaces
     )
     points = PlannerInputs(
-        shots, extent_of_ray_traced_ground(ground), has_rotating_body=has_rotating_bodies
+        shots, ray_traced_footprint_extent(ground), has_rotating_body=has_rotating_bodies
     )
 
     def max_per_tile(values: np.ndarray) -> np.ndarray:

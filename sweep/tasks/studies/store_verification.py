@@ -499,7 +499,7 @@ def pack_store(
             with write_path_atomically(output) as draft_path:
                 draft_path.mkdir()
                 _write_packed_store(store_path, draft_path, study, listener)
-                study_store.sync_to_disk(
+                study_store.sync_file_system(
                     draft_path
                 )  # otherwise a power failure may leave the name without the values
         else:

@@ -431,7 +431,7 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
     Returns
     -------
     EffectsTable
-        Where each effect is simulated, the largest change by it, and its cost.
+        Where each effect is simulated, the largest change that it causes, and its cost.
     """
     if isinstance(study, GridStudy):
         return _grid_effects_table(study, costs)

@@ -122,7 +122,7 @@ def test_an_echo_that_fades_beside_a_line_crosses_as_drawn(own, line):
     echo = own * np.sqrt(0.5) * (normal[0] + 1j * normal[1])
     phase = np.exp(2j * np.pi * rng.random(number))
     crosses = np.mean(np.abs(echo + line * phase + normal[2] + 1j * normal[3]) >= level)
-    m = permanent_line.equivalent_echo_magnitude(
+    m = permanent_line.echo_magnitude_with_line(
         np.array([own]), np.array([line]), noise_sigma=1.0, threshold=level, in_speckle=True
     )[0]
     law = np.exp(-(level**2) / (2 + m**2))
@@ -166,7 +166,7 @@ def test_a_steady_echo_beside_a_line_crosses_nearly_as_drawn():
     phase = np.exp(2j * np.pi * rng.random(number))
     noise = rng.normal(size=number) + 1j * rng.normal(size=number)
     crosses = np.mean(np.abs(own + line * phase + noise) >= level)
-    m = permanent_line.equivalent_echo_magnitude(
+    m = permanent_line.echo_magnitude_with_line(
         np.array([own]), np.array([line]), noise_sigma=1.0, threshold=level, in_speckle=False
     )
     # Powers add, in place of the mean of the crossings over the phase: within 0.03.

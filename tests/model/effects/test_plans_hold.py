@@ -15,7 +15,7 @@ from random_planner_points import (
 from sweep.model import evaluation
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.evaluation import evaluate_segments, prepare_ray_traced_shots
-from sweep.model.ground import BeamletTable, RayTracedGround, extent_of_ray_traced_ground
+from sweep.model.ground import BeamletTable, RayTracedGround, ray_traced_footprint_extent
 
 POINTS = 30
 CHOICE = [effect for effect in EFFECTS if effect.name in DEFAULT_EFFECTS]
@@ -236,7 +236,7 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
         ground = RayTracedGround(footprints, beside)
         made, still = (
             plan_points(
-                planner_inputs(parameters, extent_of_ray_traced_ground(ground)),
+                planner_inputs(parameters, ray_traced_footprint_extent(ground)),
                 modes,
                 0.05,
                 CHOICE,
@@ -269,7 +269,7 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
 def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
     footprints, _ = cast_scene(np.random.default_rng(1), 4, 7, 0.0)
     parameters = PARAMETER_DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
-    seen = extent_of_ray_traced_ground(RayTracedGround(footprints))
+    seen = ray_traced_footprint_extent(RayTracedGround(footprints))
     turning, still = (
         plan_points(planner_inputs(parameters, seen, has_rotating_body=turns), {}, 0.5,
                 [effect for effect in EFFECTS if effect.name == "rotation"])

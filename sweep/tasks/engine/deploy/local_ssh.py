@@ -266,9 +266,9 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Return Dask's specification of the workers on each machine, by the machine's name.
+    """Return one Dask worker specification for each machine, by the machine's name.
 
-    The workers are distributed evenly over the machines.
+    It starts all workers of the machine. The workers are distributed evenly over the machines.
     """
     from distributed.deploy.ssh import Worker
 
