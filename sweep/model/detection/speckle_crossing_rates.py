@@ -63,6 +63,9 @@ interpolated rho then has a relative error of 4e-6."""
 _CERTAIN_MARGIN_SIGMA = 9.0
 """Excess of amplitude over threshold beyond which a bin's rate is set to CERTAIN_CROSSING_RATE, in
 units of the noise per quadrature."""
+_TABULATED_THRESHOLD_RATIO_MIN = 1e-3
+"""Smallest threshold over the noise per quadrature of which rates are tabulated. Smaller ones
+count as this one."""
 _ENTRIES_PER_POWER_MIN, _ENTRIES_PER_POWER_MAX = 4, 256
 """Smallest and largest number of table entries between two speckle powers."""
 
@@ -82,35 +85,43 @@ class SpeckleCrossingRates(NamedTuple):
     position_max: float
     """Largest table position (fractional entry number) of a bin's amplitude at the faintest speckle
     power. From larger positions the rate at the brightest speckle would lie outside the table."""
+    entries_per_power: int
+    """Number p of entries between two successive speckle powers."""
     relative_rates: np.ndarray
-    """(p + 5, columns): relative rates, with p entries between two speckle powers. Entry number
-    p c + r is in row r and column c. The powers of a bin are thus adjacent in a row, and the six
-    entries of an interpolation are in six successive rows."""
+    """(p + 5 or more, columns): relative rates. Entry number p c + r is in row r and column c. The
+    powers of a bin are thus adjacent in a row, and the six entries of an interpolation are in six
+    successive rows."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def empty_crossing_rates():
-    """Return a :class:`SpeckleCrossingRates` without entries."""
-    return SpeckleCrossingRates(0.0, 1.0, 0.0, np.empty((0, 0)))
+class RateTableGrid(NamedTuple):
+    """Amplitudes of a table's entries, and the size of the table."""
+
+    log_amplitude_first: float
+    """ln(amplitude) of the first entry; amplitudes are over the noise per quadrature."""
+    log_amplitude_step: float
+    """Difference of ln(amplitude) between successive entries."""
+    entries_per_power: int
+    """Number of entries between two successive speckle powers."""
+    n_columns: int
+    """Number of columns of the table; it has ``entries_per_power`` entries per column."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def tabulate_crossing_rates(threshold_ratio, crossing_series):
-    """Tabulate the relative rate of threshold crossings due to leaked signal, for one threshold.
+class RateTableArrays(NamedTuple):
+    """Memory for the table of one threshold, and for its computation."""
 
-    Parameters
-    ----------
-    threshold_ratio
-        Threshold over the noise per quadrature.
-    crossing_series
-        Result of :func:`sweep.model.detection.added_crossings.fill_crossing_series` for this
-        threshold.
+    squared_amplitudes: np.ndarray
+    """(entries,): squared amplitude of each entry, over the noise power per quadrature."""
+    half_squares: np.ndarray
+    """(entries + 8,): half of the squared amplitudes."""
+    rates: np.ndarray
+    """(entries + 8,): relative rate of each entry."""
+    relative_rates: np.ndarray
+    """(rows, columns): the table."""
 
-    Returns
-    -------
-    SpeckleCrossingRates
-    """
-    threshold_ratio = max(threshold_ratio, 1e-3)
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _rate_table_grid(threshold_ratio):
+    """Return the :class:`RateTableGrid` for a threshold over the noise per quadrature."""
     # The slope of ln(rate) over ln(a) is a (b - a), and rates below e^-30 are negligible.
     steepness = min(0.25 * threshold_ratio * threshold_ratio, 7.7 * threshold_ratio) + 1.0
     entries_per_power = int(_LOG_AMPLITUDE_PER_POWER * steepness / _LOG_RATE_STEP_MAX) + 1
@@ -125,18 +136,80 @@ def tabulate_crossing_rates(threshold_ratio, crossing_series):
         math.log(threshold_ratio + _CERTAIN_MARGIN_SIGMA) - log_amplitude_first, 0.0
     )
     n_columns = int(log_amplitude_span / _LOG_AMPLITUDE_PER_POWER) + N_SPECKLE_POWERS + 3
+    return RateTableGrid(log_amplitude_first, log_amplitude_step, entries_per_power, n_columns)
+
+
+def allocate_rate_table(threshold_ratios: np.ndarray) -> RateTableArrays:
+    """Allocate memory that suffices for the table of any of some thresholds, one at a time.
+
+    ``threshold_ratios`` (n,) are thresholds over the noise per quadrature; n may be 0.
+    """
+    entries_per_power, n_columns = _table_size_max(np.ascontiguousarray(threshold_ratios, float))
     n_entries = entries_per_power * n_columns
-    squared_amplitudes, rates, half_squares = (
+    return RateTableArrays(
         np.empty(n_entries),
-        np.zeros(n_entries + 8),
         np.empty(n_entries + 8),
+        np.empty(n_entries + 8),
+        np.empty((entries_per_power + INTERPOLATION_POINTS - 1, n_columns)),
     )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _table_size_max(threshold_ratios):
+    """Return the most entries per power and columns that the tables of some thresholds need."""
+    entries_per_power, n_columns = 0, 0
+    for threshold_ratio in threshold_ratios:
+        grid = _rate_table_grid(max(threshold_ratio, _TABULATED_THRESHOLD_RATIO_MIN))
+        entries_per_power = max(entries_per_power, grid.entries_per_power)
+        n_columns = max(n_columns, grid.n_columns)
+    return entries_per_power, n_columns
+
+
+def tabulate_crossing_rates(
+    threshold_ratio: float, crossing_series: np.ndarray
+) -> SpeckleCrossingRates:
+    """Tabulate the relative rate of threshold crossings due to leaked signal, for one threshold.
+
+    Parameters
+    ----------
+    threshold_ratio
+        Threshold over the noise per quadrature.
+    crossing_series
+        Result of :func:`sweep.model.detection.added_crossings.fill_crossing_series` for this
+        threshold.
+
+    Returns
+    -------
+    SpeckleCrossingRates
+    """
+    arrays = allocate_rate_table(np.array([threshold_ratio]))
+    grid = fill_rate_table(threshold_ratio, crossing_series, arrays)
+    return rate_table(grid, arrays)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def fill_rate_table(threshold_ratio, crossing_series, arrays):
+    """Compute the rates of :func:`tabulate_crossing_rates` into ``arrays``.
+
+    ``arrays`` is :class:`RateTableArrays`, large enough for this threshold. The result is the
+    :class:`RateTableGrid`.
+    """
+    threshold_ratio = max(threshold_ratio, _TABULATED_THRESHOLD_RATIO_MIN)
+    grid = _rate_table_grid(threshold_ratio)
+    squared_amplitudes, half_squares, rates = (
+        arrays.squared_amplitudes,
+        arrays.half_squares,
+        arrays.rates,
+    )
+    n_entries = grid.entries_per_power * grid.n_columns
     n_below_threshold = 0
     for k in range(n_entries):
-        amplitude = math.exp(log_amplitude_first + log_amplitude_step * k)
+        amplitude = math.exp(grid.log_amplitude_first + grid.log_amplitude_step * k)
         squared_amplitudes[k] = amplitude * amplitude
         half_squares[k] = 0.5 * squared_amplitudes[k]
         n_below_threshold += amplitude < threshold_ratio
+    for k in range(n_entries + 8):
+        rates[k] = 0.0
     p_noise_stay = -math.expm1(-0.5 * threshold_ratio * threshold_ratio)
     fill_added_crossings(half_squares, n_below_threshold, threshold_ratio, crossing_series, rates)
     for k in range(n_entries):
@@ -152,17 +225,26 @@ def tabulate_crossing_rates(threshold_ratio, crossing_series):
             )
             rate = min(-math.log(max(p_signal_stay, 1e-300)), CERTAIN_CROSSING_RATE)
         rates[k] = rate / squared_amplitudes[k]
-    relative_rates = np.empty((entries_per_power + INTERPOLATION_POINTS - 1, n_columns))
-    for row in range(entries_per_power + INTERPOLATION_POINTS - 1):
-        for column in range(n_columns):
-            relative_rates[row, column] = rates[
-                min(entries_per_power * column + row, n_entries - 1)
+    for row in range(grid.entries_per_power + INTERPOLATION_POINTS - 1):
+        for column in range(grid.n_columns):
+            arrays.relative_rates[row, column] = rates[
+                min(grid.entries_per_power * column + row, n_entries - 1)
             ]
+    return grid
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def rate_table(grid, arrays):
+    """Return the :class:`SpeckleCrossingRates` in arrays that :func:`fill_rate_table` has filled.
+
+    ``grid`` is the result of that function.
+    """
     return SpeckleCrossingRates(
-        log_amplitude_first,
-        log_amplitude_step,
-        float((n_columns - N_SPECKLE_POWERS - 1) * entries_per_power),
-        relative_rates,
+        grid.log_amplitude_first,
+        grid.log_amplitude_step,
+        float((grid.n_columns - N_SPECKLE_POWERS - 1) * grid.entries_per_power),
+        grid.entries_per_power,
+        arrays.relative_rates,
     )
 
 
@@ -195,7 +277,7 @@ def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
         rate_table.relative_rates,
         table_position - math.floor(table_position),
     )
-    entries_per_power = np.uint64(relative_rates.shape[0] - (INTERPOLATION_POINTS - 1))
+    entries_per_power = np.uint64(rate_table.entries_per_power)
     column = first_entry // entries_per_power
     row = first_entry - column * entries_per_power
     # Lagrange's polynomial through six entries.
@@ -243,7 +325,7 @@ def rate_at_brightest_speckle(squared_ratio, rate_table):
     )
     first_entry, entries_per_power = (
         int(table_position),
-        rate_table.relative_rates.shape[0] - (INTERPOLATION_POINTS - 1),
+        rate_table.entries_per_power,
     )
     fraction, power_column = table_position - first_entry, N_SPECKLE_POWERS - 1
     rate_at_entry = rate_table.relative_rates[

@@ -37,8 +37,10 @@ from sweep.model.detection.echo_detection import (
 )
 from sweep.model.detection.looks import DRIFT_POSITIONS_MAX
 from sweep.model.detection.speckle_crossing_rates import (
-    empty_crossing_rates,
-    tabulate_crossing_rates,
+    RateTableGrid,
+    allocate_rate_table,
+    fill_rate_table,
+    rate_table,
 )
 from sweep.model.ground import distinct_rows
 from sweep.model.laser_line import gaussian_frequency_shifts
@@ -771,8 +773,9 @@ def _evaluate_batch(
         is_exempt=np.empty(n_kept, np.bool_),
         peak_is_searched=np.ones(shape, np.bool_),
     )
+    parameters = point_parameters(point_table)
     n_done = _evaluate_points(
-        point_parameters(point_table),
+        parameters,
         segment_parameters(point_table),
         lowest_levels,
         beamlet_arrays(shots.beamlet_table),
@@ -796,6 +799,11 @@ def _evaluate_batch(
         line_shape.allocate_line_shapes(tables, segments),
         allocate_workspace(width),
         np.empty(SERIES_TERMS_MAX),
+        allocate_rate_table(
+            _rounded_threshold_ratios(parameters.threshold[points], parameters.noise_sigma[points])
+            if shots.detection_rule.in_speckle and leakage_method != NO_LEAKAGE
+            else np.empty(0)
+        ),
         spans,
     )
     if n_done == n_points:
@@ -1232,7 +1240,21 @@ def _evaluate_segment(
     return next_start
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
+def _rounded_threshold_ratio(threshold_ratio):
+    """Round a threshold over the noise, so that one table serves thresholds that hardly differ.
+
+    Shot noise of the echo's light makes them differ.
+    """
+    return math.floor(threshold_ratio / THRESHOLD_RATIO_STEP + 0.5) * THRESHOLD_RATIO_STEP
+
+
+def _rounded_threshold_ratios(threshold: np.ndarray, noise_sigma: np.ndarray) -> np.ndarray:
+    """Return the thresholds over the noise, (n,), as :func:`_evaluate_points` rounds them."""
+    return np.floor(threshold / noise_sigma / THRESHOLD_RATIO_STEP + 0.5) * THRESHOLD_RATIO_STEP
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
 def _evaluate_points(
     parameters,
     parameters_by_segment,
@@ -1247,6 +1269,7 @@ def _evaluate_points(
     shapes,
     workspace,
     crossing_series,
+    rate_arrays,
     spans,
 ):
     """Compute the bins around the lines of m points (spans), as many as fit into memory.
@@ -1283,12 +1306,14 @@ def _evaluate_points(
         :class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`, overwritten.
     crossing_series
         (SERIES_TERMS_MAX,): scratch.
+    rate_arrays
+        :class:`sweep.model.detection.speckle_crossing_rates.RateTableArrays`, overwritten.
     spans
         :class:`BinSpans` of the m points in ``spans.point_numbers``; the other fields are results.
         If ``spans.magnitudes`` is empty, no magnitudes are stored.
     """
     next_start, rule = np.int64(0), settings.rule
-    speckle_rates = empty_crossing_rates()
+    rate_grid = RateTableGrid(0.0, 1.0, np.int64(0), np.int64(0))
     previous_ratio, built_index = -1.0, np.int64(-1)  # numba would compile anew for a literal -1
     for i in range(spans.point_numbers.size):
         point = spans.point_numbers[i]
@@ -1298,15 +1323,13 @@ def _evaluate_points(
             )
             built_index = shape_index[i]
         threshold_ratio = parameters.threshold[point] / parameters.noise_sigma[point]
-        if rule.in_speckle:  # one table serves thresholds that differ by light's shot noise
-            threshold_ratio = (
-                math.floor(threshold_ratio / THRESHOLD_RATIO_STEP + 0.5) * THRESHOLD_RATIO_STEP
-            )
+        if rule.in_speckle:
+            threshold_ratio = _rounded_threshold_ratio(threshold_ratio)
         if settings.leakage_methods.any() and threshold_ratio != previous_ratio:
             previous_ratio = threshold_ratio
             fill_crossing_series(previous_ratio, crossing_series)
             if rule.in_speckle:
-                speckle_rates = tabulate_crossing_rates(previous_ratio, crossing_series)
+                rate_grid = fill_rate_table(previous_ratio, crossing_series, rate_arrays)
         for s in range(settings.segment_exists.size):
             if settings.segment_exists[s]:
                 next_start = _evaluate_segment(
@@ -1327,7 +1350,7 @@ def _evaluate_points(
                     bin_speckle_at(settings.speckle_table, s, point),
                     workspace,
                     crossing_series,
-                    speckle_rates,
+                    rate_table(rate_grid, rate_arrays),
                     spans,
                 )
                 if next_start == SPAN_DOES_NOT_FIT:
