@@ -137,7 +137,9 @@ def test_any_two_of_three_that_fade(snr, near):
     over = near**4  # of Gaussian footprints
     fading = SegmentCorrelations(*np.array([[near + 0j], [over + 0j], [near + 0j]]))
     key, mixing = (np.uint64(3), np.uint64(5)), fading.cholesky_factors()[:, 0]
-    factors = np.array([speckle_factors(key, draw, 0, mixing) for draw in np.arange(number)]).T
+    factors = np.array(
+        [speckle_factors(philox.DrawAddress(*key, draw), 0, mixing) for draw in np.arange(number)]
+    ).T
     rng = np.random.default_rng(5)
     real, imaginary = rng.normal(size=(2, 3, number))
     hit = np.hypot(np.sqrt(2 * snr)[:, None] * factors + real, imaginary) >= level

@@ -23,6 +23,7 @@ from sweep.model.pointcloud import leaked_peaks as leaked
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.sampling.philox import DrawAddress
 from sweep.model.spectrum import permanent_line
 from sweep.model.window import get_window
 
@@ -183,18 +184,19 @@ def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
     signal = {places.get(a, a): n for a, n in amplitudes.items()}
     bins = np.repeat(list(signal), list(signal.values()))
     levels, law = leaked._distinct_thresholds(np.full(2, level))
-    rates, scale = leaked._log_rates(SINGLE_LOOK, levels)
-    stretch = np.zeros((2, 3, 2), np.int64)
-    stretch[1, 2] = 0, bins.size  # the other point and segments have none
+    table = leaked._tabulate_log_rates(SINGLE_LOOK, float(levels[0]))
+    ends = np.zeros((2, 3), np.int64)
+    ends[1, 2] = bins.size  # the other point and segments have none
     leaks = leaked.LeakageBins.empty(2)._replace(
-        bin_slice=stretch,
+        bins_end=ends,
         bins=np.arange(bins.size),
         log_amplitude=np.log(bins),
         group=np.zeros(bins.size, np.int64),
         exempt_neighbour=np.zeros(bins.size),
         threshold_index=law,
-        log_rates=rates,
-        log_amplitude_grid=scale,
+        log_rates=table.log_rates[None],
+        first_log_amplitude=np.array([table.first_log_amplitude]),
+        log_amplitude_step=np.array([table.log_amplitude_step]),
         threshold_ratio=levels,
         rate_sum=np.full((2, 3), sum(n * _rate(a, level) for a, n in signal.items())),
     )
@@ -219,7 +221,7 @@ def _raised(leaks, level, draws, *, fading=None, room=3):
         ratios[:] = 0.0
         factors = np.ones((1, 3)) if fading is None else np.full((1, 3), fading[d])
         number = leaked.draw_leaked_peaks(
-            (key[0], key[1], d), (0, 0), leaks, factors, level, 1, tables, bins, ratios
+            DrawAddress(*key, d), 0, 0, leaks, factors, level, 1, tables, bins, ratios
         )
         found.append((bins[:number].copy(), ratios[:number].copy()))
     return found
@@ -248,7 +250,7 @@ def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1
     found = list_bin_groups(shots)
     ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
     level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
-    stretch = slice(*leaks.bin_slice[0, 0])
+    stretch = slice(leaks.bins_begin[0, 0], leaks.bins_end[0, 0])
     bins, signal = leaks.bins[stretch], np.exp(leaks.log_amplitude[stretch])
     loud = signal > 0.5  # the rest crosses once in 1e15
     bins, signal = bins[loud], signal[loud]
@@ -280,7 +282,7 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
     level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
     scale, line = permanent_line.line_of_point(shots, 0, 0)
-    bins = leaks.line_bins[slice(*leaks.line_slice[0, 0])]
+    bins = leaks.line_bins[leaks.line_begin[0, 0] : leaks.line_end[0, 0]]
     one, other = scale / shots.bin_noise_sigma[0] * line.transforms[:, bins]
     turn = np.exp(2j * np.pi * random.random(draws))[:, None]
     noise = random.standard_normal((draws, 2 * bins.size)).view(complex)
@@ -290,7 +292,7 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     assert (places >= 0).mean() > 0.1
     assert _difference(places, own) < _allowed(draws, draws)
     # Noise alone raises nothing where the line is masked.
-    hidden = leaks.excluded_bins[slice(*leaks.excluded_slice[0, 0])]
+    hidden = leaks.excluded_bins[leaks.excluded_begin[0, 0] : leaks.excluded_end[0, 0]]
     assert (scale * line.magnitude_max[hidden] >= 0.8 * shots.threshold[0]).all() and hidden.size
     assert not set(hidden) & set(bins)
 
@@ -318,7 +320,8 @@ def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, ta
         listed, leaked.iter_leakage_bins(shots, apart, np.arange(shots.size)), strict=True
     ):
         assert (part == same).all()
-        assert (leaks.bin_slice == others.bin_slice).all() and (leaks.bins == others.bins).all()
+        for name in ("bins_begin", "bins_end", "bins"):
+            assert (getattr(leaks, name) == getattr(others, name)).all()
         assert (leaks.group == others.group).all() and (
             leaks.exempt_neighbour_side == others.exempt_neighbour_side
         ).all()
@@ -346,11 +349,11 @@ def test_rates_stay_below_their_bounds_at_every_octave_of_speckle(table_4_1):
     ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
     for octave in range(leaked.N_BOUND_POWERS):
         for j, s in np.ndindex(leaks.rate_sum.shape):
-            bins = slice(*leaks.bin_slice[j, s])
+            bins = slice(leaks.bins_begin[j, s], leaks.bins_end[j, s])
             amplitudes = leaks.log_amplitude[bins] + 0.5 * octave * math.log(2.0)
             law = leaks.threshold_index[j]
-            whole = sum(
-                leaked._crossing_rate(a, leaks.log_rates[law], leaks.log_amplitude_grid[law])
-                for a in amplitudes
+            table = leaked.RateTable(
+                leaks.log_rates[law], leaks.first_log_amplitude[law], leaks.log_amplitude_step[law]
             )
+            whole = sum(leaked._crossing_rate(a, table) for a in amplitudes)
             assert whole <= leaks.rate_sum_bounds[j, s, octave] <= 1.3 * whole

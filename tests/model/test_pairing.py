@@ -11,6 +11,8 @@ from shot_helpers import prepare_single_category
 from sweep.model import waveform
 from sweep.model.pointcloud.pairing import (
     CONFIRMATION_TOLERANCE_BINS,
+    DopplerPrediction,
+    PeakPairs,
     find_confirming_peak,
     pair_peaks,
 )
@@ -20,7 +22,7 @@ N, FS = 2**17, 600e6
 WIDTH = FS / N
 OPTICS = {"carrier": 299792458.0 / 1550e-9, "bandwidth": 1e9, "duration": 500e-6}
 _SHARE = 0.5 * OPTICS["carrier"] / (OPTICS["carrier"] + OPTICS["bandwidth"] / 2)
-AT_START = np.array([_SHARE, _SHARE, 0.0])
+AT_START = DopplerPrediction(_SHARE, _SHARE, 0.0)
 
 
 def _beats(target_range, radial_velocity):
@@ -43,9 +45,9 @@ def _pair(up, doppler, down, tolerance=CONFIRMATION_TOLERANCE_BINS, assumed=wave
     """(confirmed, [(up, doppler, down, code)])."""
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
     room = max(lists[0].size, lists[2].size, 1)
-    pairs = np.full((room, 4), -9)
+    pairs = PeakPairs.allocate(room)
     confirmed, number = pair_peaks(*lists, AT_START, float(N), 0.0, assumed, tolerance, pairs)
-    return confirmed, [tuple(map(int, p)) for p in pairs[:number]]
+    return confirmed, [tuple(map(int, p)) for p in zip(*pairs, strict=True)][:number]
 
 
 def _reported(up, down, code):
@@ -84,7 +86,7 @@ def test_signed_beats_of_any_slope_confirm_each_other_at_any_range(table_4_1, do
     shots = prepare_single_category(scene)
     signed, third = (
         DrawConfig.from_shots(shots, 0, False).down_beat_sign,
-        np.array(_doppler_prediction(shots), float),
+        DopplerPrediction(*map(float, _doppler_prediction(shots))),
     )
     f_r, f_d, size = far * 4096.0, 700.0, 4096.0
     # carriers differ by 5e-6, and Doppler shifts with them by less than a hundredth of a bin

@@ -26,13 +26,14 @@ from sweep.model.pointcloud.pairing import (
     SIDELOBE_FLAG,
     TRUE_FLAG,
     UNCONFIRMED_FLAG,
+    DopplerPrediction,
 )
 from sweep.model.pointcloud.returns import (
-    BIN_COLUMN,
-    RATIO_COLUMN,
     DrawConfig,
     DrawInputs,
     DrawWorkspace,
+    Peak,
+    PeakLists,
     beamlet_line_positions,
     draw_free_bin,
     draw_returns,
@@ -42,6 +43,7 @@ from sweep.model.pointcloud.returns import (
     largest_noise_magnitude,
 )
 from sweep.model.sampling.draws import NoiseFilter, NoiselessSpectra
+from sweep.model.sampling.philox import DrawAddress
 from sweep.model.sampling.samplers import simulate_draws
 from sweep.model.sampling.speckle_lines import SpeckleLineGrid
 from sweep.model.window import get_window, window_samples
@@ -272,7 +274,7 @@ def test_false_peaks_fall_on_every_free_bin_alike():
         free = sorted(set(range(1, half + 1)) - taken - set(BARRED.tolist()))
         chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
         places, counts = np.unique(
-            [draw_free_bin(u, bins, BARRED, (1, half), 2 * half, False) for u in chances],
+            [draw_free_bin(u, *bins, BARRED, 1, half, 2 * half, False) for u in chances],
             return_counts=True,
         )
         assert places.tolist() == free
@@ -297,7 +299,10 @@ NO_LINES = SpeckleLineGrid(
 
 
 def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
-    """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
+    """Draws of the up-chirp segment of one point: from number to strongest peak, or None.
+
+    `magnitude` is |X| of the bin below the strongest, of the strongest, and of that above.
+    """
     rule = NoiseFilter(np.empty((0, 17)), np.empty(0, np.int64), 0)
     how = DrawConfig(
         0,
@@ -317,25 +322,48 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
         False,
         0,
     )
+    noise_sigma, threshold_ratio, line_noise_ratio = np.array(levels)[:, None]
+    below, strongest, above = magnitude
     known = DrawInputs(
-        np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
-        np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), *np.array(levels)[:, None],
-        BinThresholds(*np.zeros((7, 1))), np.full((1, 3), alarm), np.ones((1, 2)),
-        np.ones((1, 2, 1)),
-        np.tile([1, half], (1, 3, 1)), NO_LINES, *np.zeros((3, 1, 3, 1)), np.ones((1, 3, 1)),
-        np.zeros((1, 6)), np.zeros((1, 3, 1, 0), complex),
-    )  # fmt: skip
+        strongest_bin=np.full((1, 3, 1), centre),
+        first_bin=np.full((1, 3, 1), centre),
+        last_bin=np.full((1, 3, 1), centre),
+        pd=np.ones((1, 3, 1)),
+        magnitude_below=np.full((1, 3, 1), below),
+        magnitude=np.full((1, 3, 1), strongest),
+        magnitude_above=np.full((1, 3, 1), above),
+        line_deviation_bins=np.zeros((1, 3, 1)),
+        line_positions=np.zeros((1, 3, 1)),
+        beamlet_amplitude=np.ones((1, 1)),
+        noise_sigma=noise_sigma,
+        threshold_ratio=threshold_ratio,
+        line_noise_ratio=line_noise_ratio,
+        bin_thresholds=BinThresholds(*np.zeros((7, 1))),
+        pfa_noise=np.full((1, 3), alarm),
+        doppler_prediction=DopplerPrediction(*np.ones((3, 1))),
+        down_pd_if_up_missed=np.ones((1, 1)),
+        down_pd_if_up_detected=np.ones((1, 1)),
+        first_searched_bin=np.full((1, 3), 1),
+        last_searched_bin=np.full((1, 3), half),
+        line_grid=NO_LINES,
+        line_centre=np.zeros((1, 3, 1)),
+        echo_fraction=np.zeros((1, 3, 1)),
+        wander_deviation=np.zeros((1, 3, 1)),
+        n_independent_bins=np.ones((1, 3, 1)),
+        speckle_cholesky_factors=np.zeros((1, 6)),
+        look_covariance_root=np.zeros((1, 3, 1, 0), complex),
+    )
     seen = NoiselessSpectra.empty(1)._replace(
         first_bin=np.full((1, 3), low), n_noise_bins=np.full((1, 3), others)
     )
-    peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
+    lists = PeakLists.allocate(2)
     (key,) = make_point_keys(1)
 
     def drawn(number):
-        address = key[0], key[1], number
-        count = draw_segment_peaks(
-            address,
-            (0, 0),
+        draw_segment_peaks(
+            DrawAddress(*key, number),
+            0,
+            0,
             how,
             known,
             seen,
@@ -344,11 +372,10 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
             empty_group_speckle(1),
             tables,
             DrawWorkspace.allocate(3, 1),
-            peaks,
-            which,
+            lists,
             np.zeros(1, bool),
         )
-        return peaks[0].copy() if count else None
+        return Peak(*(values[0, 0] for values in lists.peaks)) if lists.n_peaks[0] else None
 
     return drawn
 
@@ -369,15 +396,16 @@ def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
         others=n,
         alarm=-np.expm1(n * np.log1p(-one)),
     )
-    drawn = np.array([peak for peak in map(noise, range(4000)) if peak is not None])
+    drawn = [peak for peak in map(noise, range(4000)) if peak is not None]
     quiet = stats.rayleigh.cdf(beta) ** n
     assert abs(len(drawn) - 4000 * (1 - quiet)) < 5 * np.sqrt(4000 * quiet) + 1
 
     def largest(x):
         return (stats.rayleigh.cdf(x) ** n - quiet) / (1 - quiet)
 
-    assert stats.kstest(drawn[:, RATIO_COLUMN], largest).pvalue > 1e-6
-    assert stats.kstest(drawn[:, BIN_COLUMN], stats.uniform(0.5, half).cdf).pvalue > 1e-6
+    ratios, bins = [peak.magnitude_ratio for peak in drawn], [peak.bin for peak in drawn]
+    assert stats.kstest(ratios, largest).pvalue > 1e-6
+    assert stats.kstest(bins, stats.uniform(0.5, half).cdf).pvalue > 1e-6
 
 
 def test_noise_moves_the_largest_bin_as_often_as_in_the_time_domain():
@@ -396,7 +424,7 @@ def test_noise_moves_the_largest_bin_as_often_as_in_the_time_domain():
     noise = _up_in_noise(
         16, np.abs(tone @ basis), (sigma, 5.0, 1.0), interpolator(shape, length), 32, low=14
     )
-    moved = sum(noise(d)[BIN_COLUMN] == 17 for d in range(DRAWS))
+    moved = sum(noise(d).bin == 17 for d in range(DRAWS))
     assert 0.1 < expected < 0.4
     assert abs(moved / DRAWS - expected) < 5 * np.sqrt(2 * expected * (1 - expected) / DRAWS)
 
@@ -509,20 +537,19 @@ def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
 
 def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
     lines = np.array([[10.0, 11.0, 50.0], [5.0, 5.0, 5.0], [30.0, 31.0, 70.0]])
-    bins = np.array([  # strongest, first and last of two groups in each segment
-        [[10, 10], [9, 9], [12, 12]], [[5, 5], [4, 4], [6, 6]], [[30, 70], [29, 69], [32, 71]],
-    ])  # fmt: skip
-    nowhere = bins + np.array([0, 0, 20])[:, None, None]
+    # First and last bin of two groups in each segment.
+    bins = np.array([[[9, 9], [4, 4], [29, 69]], [[12, 12], [6, 6], [32, 71]]])
+    nowhere = bins + np.array([0, 0, 20])[:, None]
     centres, all_three = np.array([10.9, 5.0, 31.2]), np.zeros(3, np.int8)
     lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
-    assert judge_return(all_three, centres, bins, lines, lit) == (TRUE_FLAG, 1)
-    assert judge_return(all_three, centres, bins, lines, dim) == (TRUE_FLAG, 0)
+    assert judge_return(all_three, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
+    assert judge_return(all_three, centres, *bins, lines, dim) == (TRUE_FLAG, 0)
     apart = np.array([0, 0, 1], np.int8)
-    assert judge_return(apart, centres, bins, lines, lit) == (MISPAIRED_FLAG, -1)
-    assert judge_return(all_three, centres, nowhere, lines, lit) == (SIDELOBE_FLAG, -1)
+    assert judge_return(apart, centres, *bins, lines, lit) == (MISPAIRED_FLAG, -1)
+    assert judge_return(all_three, centres, *nowhere, lines, lit) == (SIDELOBE_FLAG, -1)
     no_doppler, noise = np.array([0, -2, 0], np.int8), np.array([0, 0, -1], np.int8)
-    assert judge_return(no_doppler, centres, bins, lines, lit) == (TRUE_FLAG, 1)
-    assert judge_return(noise, centres, bins, lines, lit) == (FALSE_ALARM_FLAG, -1)
+    assert judge_return(no_doppler, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
+    assert judge_return(noise, centres, *bins, lines, lit) == (FALSE_ALARM_FLAG, -1)
 
 
 def _only(found, present):

@@ -188,12 +188,15 @@ NONE = np.empty(0, np.int64)
 
 @pytest.mark.parametrize("signed", [False, True])
 def test_false_peaks_fall_on_every_free_bin_of_the_band_alike(signed):
-    bins = np.full((3, 2), -1)
+    strongest, lowest, highest = bins = np.full((3, 2), -1)
     bins[:, 0] = 20, 19, 22  # the bins beside a group are not free either
     first, last = (-30, 40) if signed else (5, 40)
     expected = [k for k in range(first, last + 1) if not 18 <= k <= 23]
     chances = (np.arange(100 * len(expected)) + 0.5) / (100 * len(expected))
     if signed:
         bins[:, 0] += 2 * 512  # runs of complex records count from further on
-    found = [draw_free_bin(u, bins, NONE, (first, last), 512, signed) for u in chances]
+    found = [
+        draw_free_bin(u, strongest, lowest, highest, NONE, first, last, 512, signed)
+        for u in chances
+    ]
     assert found == np.repeat(expected, 100).tolist()

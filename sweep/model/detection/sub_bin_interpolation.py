@@ -61,6 +61,39 @@ THREE_BINS, TWO_BINS = 0, 1
 |X| of three bins, TWO_BINS that of the centre bin and its larger neighbour."""
 
 
+class NoiseMixing(NamedTuple):
+    """Cholesky factors of the noise covariance of three adjacent bins.
+
+    Let z0, z1, z2 be independent standard normal numbers. The noise in one quadrature is z0 in the
+    centre bin, ``from_centre`` z0 + ``above_own`` z1 in the bin above, and ``from_centre`` z0 +
+    ``below_from_above`` z1 + ``below_own`` z2 in the bin below.
+    """
+
+    from_centre: float
+    """Factor of the centre bin's number in the noise of either neighbour."""
+    above_own: float
+    """Factor of the upper bin's own number in its noise."""
+    below_from_above: float
+    """Factor of the upper bin's number in the noise of the lower bin."""
+    below_own: float
+    """Factor of the lower bin's own number in its noise."""
+
+
+class NeighbourWeights(NamedTuple):
+    """Least-squares weights of the |X| of three bins in the position of a tone.
+
+    They are tabulated over the tone's distance from the centre bin, (m,) each. |X| is that over the
+    |X| of the centre bin. If only two bins give the position, all weights are 0.
+    """
+
+    smaller: np.ndarray
+    """(m,): weight [bins] of the |X| of the smaller neighbour of the centre bin."""
+    centre: np.ndarray
+    """(m,): weight [bins] of the |X| of the centre bin."""
+    larger: np.ndarray
+    """(m,): weight [bins] of the |X| of the larger neighbour of the centre bin."""
+
+
 class Interpolator(NamedTuple):
     """Tables of a window and FFT size that convert three magnitudes to a position between bins.
 
@@ -76,19 +109,15 @@ class Interpolator(NamedTuple):
     """Spacing of the magnitude ratios (ratios of the bins' |X|) at which ``offset`` is
     tabulated."""
     offset: np.ndarray
-    """(m,): distance of the tone from the centre bin [bins], 0 .. 1. The magnitude ratio rises from
-    ``magnitude_ratio_at_centre`` by ``magnitude_ratio_step``."""
-    weight: np.ndarray
-    """(3, m): least-squares weights of the |X| of the smaller neighbour, the centre bin and the
-    larger neighbour, each over that of the centre bin. They are tabulated over the tone's distance
-    from the centre bin. Zero for TWO_BINS."""
+    """(m,): distance of the tone from the centre bin [bins], 0 .. 1. The magnitude ratio
+    rises from ``magnitude_ratio_at_centre`` by ``magnitude_ratio_step``."""
+    weights: NeighbourWeights
+    """(m,) in each field: weights by which the |X| of the three bins correct the position."""
     error_at_sigma: np.ndarray
     """(m,): standard error of the position [bins], by the tone's distance from the centre bin. It
     holds if the centre bin's |X| equals the noise per quadrature, and falls as 1/|X|."""
-    noise_mixing: tuple[float, float, float, float]
-    """Cholesky factors m0 .. m3 of the noise covariance of three adjacent bins. Let z0, z1, z2 be
-    independent standard normal numbers. The noise in one quadrature is z0 in the centre bin,
-    m0 z0 + m1 z1 above and m0 z0 + m2 z1 + m3 z2 below."""
+    noise_mixing: NoiseMixing
+    """Factors that make the noise of three adjacent bins from independent normal numbers."""
     sidelobe_correlation: float
     """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Of N
     successive sidelobe bins, L change sign from one to the next. N is the FFT size, L the number of
@@ -131,8 +160,8 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
     """
     offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
-    neighbours_vanish = tone_magnitudes[2, 0] < _NEIGHBOUR_HEIGHT_MIN * tone_magnitudes[1, 0]
     below, centre, above = tone_magnitudes
+    neighbours_vanish = above[0] < _NEIGHBOUR_HEIGHT_MIN * centre[0]
     magnitude_ratios = (
         above / (centre + above)
         if neighbours_vanish
@@ -151,7 +180,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         magnitude_ratio_at_centre=float(magnitude_ratios[0]),
         magnitude_ratio_step=max(float(even_ratios[1] - even_ratios[0]), 1e-12),
         offset=np.interp(even_ratios, magnitude_ratios, offset),
-        weight=0 * weight if neighbours_vanish else weight,
+        weights=NeighbourWeights(*(0 * weight if neighbours_vanish else weight)),
         error_at_sigma=error,
         noise_mixing=_noise_mixing(correlation_1, correlation_2),
         sidelobe_correlation=sidelobe_correlation(window, fft_size),
@@ -225,8 +254,11 @@ def _least_squares_weights(
 
     Returns
     -------
-    weight, standard_error
-        Weights (3, m), and standard errors (m,) [bins] at |X| = sigma in the centre bin.
+    weight : ndarray (3, m)
+        Weights [bins] of the |X| of the bin below, the centre bin and the bin above, each over that
+        of the centre bin.
+    standard_error : ndarray (m,)
+        Standard error [bins] at |X| = sigma in the centre bin.
 
     Notes
     -----
@@ -275,19 +307,18 @@ def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpola
     return np.interp(table_positions, positions, np.abs(estimates - positions)) / _SPREAD_BINS**2
 
 
-def _noise_mixing(correlation_1: float, correlation_2: float) -> tuple[float, float, float, float]:
-    """Return the Cholesky factors m0 .. m3 of the noise covariance of three adjacent bins.
+def _noise_mixing(correlation_1: float, correlation_2: float) -> NoiseMixing:
+    """Return the Cholesky factors of the noise covariance of three adjacent bins.
 
-    The order is the centre bin, the bin above and the bin below, as in
-    :attr:`Interpolator.noise_mixing`.
+    The arguments are the correlations of the noise of bins one and two apart.
     """
     above_own = math.sqrt(max(1 - correlation_1**2, 0.0))
     below_from_above = (correlation_2 - correlation_1**2) / above_own if above_own > 0 else 0.0
-    return (
-        correlation_1,
-        above_own,
-        below_from_above,
-        math.sqrt(max(1 - correlation_1**2 - below_from_above**2, 0.0)),
+    return NoiseMixing(
+        from_centre=correlation_1,
+        above_own=above_own,
+        below_from_above=below_from_above,
+        below_own=math.sqrt(max(1 - correlation_1**2 - below_from_above**2, 0.0)),
     )
 
 
@@ -317,17 +348,14 @@ def estimate_sub_bin_offset(below, centre, above, interpolation):
     )
     if interpolation.magnitude_ratio_kind == THREE_BINS and centre > 0.0:
         table_index = offset * (offsets.size - 1)
-        smaller_weight, centre_weight, larger_weight = (
-            interpolation.weight[0],
-            interpolation.weight[1],
-            interpolation.weight[2],
-        )
+        weights = interpolation.weights
         correction = smaller * _interpolate_table(
-            smaller_weight, table_index
-        ) + larger * _interpolate_table(larger_weight, table_index)
+            weights.smaller, table_index
+        ) + larger * _interpolate_table(weights.larger, table_index)
         offset = min(
             max(
-                offset + _interpolate_table(centre_weight, table_index) + correction / centre, -1.0
+                offset + _interpolate_table(weights.centre, table_index) + correction / centre,
+                -1.0,
             ),
             1.0,
         )

@@ -88,21 +88,36 @@ _LINE_FRACTION_WITH_IMAGE_MIN = 0.9
 opposite frequency far away, are added to it."""
 
 
+class MomentsByPower(NamedTuple):
+    """Moments of the powers x^1 .. x^4 of the position x in the record, -1..1."""
+
+    linear: float
+    """Moment of x."""
+    quadratic: float
+    """Moment of x^2."""
+    cubic: float
+    """Moment of x^3."""
+    quartic: float
+    """Moment of x^4."""
+
+
 class WindowMoments(NamedTuple):
     """Means under a window w of powers 1..4 of the position x in the record, -1..1.
 
     The mean < > is the sum weighted with |w| / sum w.
     """
 
-    mean_absolute: tuple[float, ...]
+    mean_absolute: MomentsByPower
     """Means of |x^k| for k = 1, 3, and of |x^k - <x^k>| for k = 2, 4. x is the position in the
     record, -1..1, and < > the mean weighted by the window."""
-    root_mean_square: tuple[float, ...]
+    root_mean_square: MomentsByPower
     """Root mean squares of x^k about its mean for k = 2, 4, and 0 for k = 1, 3. x is the position
     in the record, -1..1; means are weighted by the window."""
-    linear_slope: tuple[float, ...]
+    linear_slope: MomentsByPower
     """Slopes of the best straight line to x^k, k = 1 .. 4, with the position x in the record,
-    -1..1. They are 0 for even k. The fifth is the largest for any function within -1..1."""
+    -1..1. They are 0 for even k."""
+    linear_slope_max: float
+    """Largest slope of the best straight line to any function of x with values in -1..1."""
     magnitude_sum: float
     """Sum of the window's magnitudes |w| over the sum of its values w, >= 1."""
     first_weight: float
@@ -118,7 +133,7 @@ def window_moments(window: Window) -> WindowMoments:
     node = (2 * np.arange(_N_NODES) + 1) / _N_NODES - 1
     w = window_samples(window.name, window.length)
     sample_position = 2 * np.arange(window.length + 1) / window.length - 1
-    window_at_nodes = np.interp(node, sample_position, np.append(w, w[0]))
+    window_at_nodes = np.interp(node, sample_position, np.append(w, w[:1]))
     weight = np.abs(window_at_nodes) / window_at_nodes.sum()
     magnitude_sum, second_moment = float(weight.sum()), float((node * node * weight).sum())
     mean_absolute, root_mean_square, linear_slope = [], [], []
@@ -129,16 +144,15 @@ def window_moments(window: Window) -> WindowMoments:
             power = power - (power * weight).sum() / magnitude_sum
         mean_absolute.append(float((abs(power) * weight).sum()))
         root_mean_square.append(float(np.sqrt((power**2 * weight).sum())) if k % 2 == 0 else 0.0)
-    linear_slope.append(mean_absolute[0] / second_moment)
-    first_weight = abs(window.first_value) / window.sum
-    position_variance = second_moment / 4 / magnitude_sum
+    mean_absolute_by_power = MomentsByPower(*mean_absolute)
     return WindowMoments(
-        tuple(mean_absolute),
-        tuple(root_mean_square),
-        tuple(linear_slope),
-        magnitude_sum,
-        first_weight,
-        position_variance,
+        mean_absolute=mean_absolute_by_power,
+        root_mean_square=MomentsByPower(*root_mean_square),
+        linear_slope=MomentsByPower(*linear_slope),
+        linear_slope_max=mean_absolute_by_power.linear / second_moment,
+        magnitude_sum=magnitude_sum,
+        first_weight=abs(window.first_value) / window.sum,
+        position_variance=second_moment / 4 / magnitude_sum,
     )
 
 
@@ -168,7 +182,8 @@ def phase_over_record(
                 polynomial[k]
                 + math.comb(j, k) * record_middle ** (j - k) * half_duration**k * coefficient
             )
-    return PhaseErrorBound(tuple(np.abs(c) for c in polynomial[1:]), constant=np.abs(polynomial[0]))
+    constant, *coefficients = (np.abs(coefficient) for coefficient in polynomial)
+    return PhaseErrorBound(tuple(coefficients), constant=constant)
 
 
 def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray:
@@ -243,15 +258,15 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     non_polynomial = _RADIANS_PER_CYCLE * own_bound.non_polynomial
     odd_phase = non_polynomial * moments.magnitude_sum
     odd_phase = odd_phase + _RADIANS_PER_CYCLE * (
-        linear * moments.mean_absolute[0] + cubic * moments.mean_absolute[2]
+        linear * moments.mean_absolute.linear + cubic * moments.mean_absolute.cubic
     )
     even_phase = non_polynomial * moments.magnitude_sum
     even_phase = even_phase + _RADIANS_PER_CYCLE * (
-        quadratic * moments.mean_absolute[1] + quartic * moments.mean_absolute[3]
+        quadratic * moments.mean_absolute.quadratic + quartic * moments.mean_absolute.quartic
     )
     even_root_mean_square = non_polynomial * math.sqrt(moments.magnitude_sum)
     even_root_mean_square = even_root_mean_square + _RADIANS_PER_CYCLE * (
-        quadratic * moments.root_mean_square[1] + quartic * moments.root_mean_square[3]
+        quadratic * moments.root_mean_square.quadratic + quartic * moments.root_mean_square.quartic
     )
     turned_by_others: np.ndarray | float = 0.0
     others_phase: np.ndarray | float = 0.0
@@ -274,8 +289,9 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
         + turned_by_others
     )
     b = np.minimum(even_phase, moments.magnitude_sum) + turned_by_others
+    peak_power_min, _ = points.peak_power_bounds
     power_min = (
-        points.peak_power_bounds[0]
+        peak_power_min
         / np.where(points.is_near_image, 2.0, 1.01)
         / (1 + other_bounds.extra_shift_window_bins)
     )
@@ -283,10 +299,8 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     magnitude_change = np.where(
         c > 0, (a + b * moments.first_weight / c) / c + 0.5 * (b / c) ** 2, np.inf
     )
-    mean_slope = non_polynomial / _RADIANS_PER_CYCLE * moments.linear_slope[4]
-    for coefficient, linear_slope in zip(
-        own_bound.coefficients, moments.linear_slope, strict=False
-    ):
+    mean_slope = non_polynomial / _RADIANS_PER_CYCLE * moments.linear_slope_max
+    for coefficient, linear_slope in zip(own_bound.coefficients, moments.linear_slope, strict=True):
         mean_slope = mean_slope + coefficient * linear_slope
     if missing is not None:
         mean_slope = mean_slope + missing.centroid_bound * (2 * quadratic + 3 * cubic + 4 * quartic)
@@ -550,8 +564,9 @@ def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
     bound = phase_omission_bound(points, "acceleration")
     if bound is None or points.looks.n_coherent == 1:
         return bound
+    up_carrier, *_ = points.carriers
     gain = coherent_gain(
-        points.looks, acceleration=points.target.acceleration, carrier=points.carriers[0],
+        points.looks, acceleration=points.target.acceleration, carrier=up_carrier,
         look_period=points.waveform.look_period,
     )  # fmt: skip
     return bound._replace(magnitude_change=bound.magnitude_change + 1 - gain)
@@ -563,8 +578,9 @@ def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
     The loss that it causes in looks that are added in amplitude is included.
     """
     if shots.looks.n_coherent > 1:
+        up_carrier, _, _ = shots.waveform.carriers
         gain = coherent_gain(
-            shots.looks, acceleration=shots.target.acceleration, carrier=shots.waveform.carriers[0],
+            shots.looks, acceleration=shots.target.acceleration, carrier=up_carrier,
             look_period=shots.waveform.look_period,
         )  # fmt: skip
         shots = replace(shots, link_scales=shots.link_scales.scale_echo(amplitude_factor=gain))
@@ -734,32 +750,44 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
         points.record.acquisition_delay + half_duration,
         2 / points[CHIRP_PREFIX + "duration"],
     )
-    delay = [
+    # Polynomials in the position in the record, lowest power first: delay, the step by it along the
+    # sweep, and the middle of this step.
+    middle_delay, delay_slope = (
         points.target.delay - points.target.doppler_ratio * record_middle,
         -points.target.doppler_ratio * half_duration,
-    ]
-    step = [-chirp_rates * position_per_second * part for part in delay]
+    )
+    delay = [middle_delay, delay_slope]
+    middle_step, step_slope = (-chirp_rates * position_per_second * part for part in delay)
+    step = [middle_step, step_slope]
     sweep_position = [
-        chirp_rates * (position_per_second * record_middle - 1) + 0.5 * step[0],
-        chirp_rates * position_per_second * half_duration + 0.5 * step[1],
+        chirp_rates * (position_per_second * record_middle - 1) + 0.5 * middle_step,
+        chirp_rates * position_per_second * half_duration + 0.5 * step_slope,
     ]
     squared_position, squared_step = (
         _polynomial_product(sweep_position, sweep_position),
         _polynomial_product(step, step),
     )
-    mean_error = [
+    constant_error, *quadratic_error = (
         quadratic * (2 * a + b / 6) for a, b in zip(squared_position, squared_step, strict=True)
+    )
+    constant_factor, *cubic_factor = (
+        4 * a + b for a, b in zip(squared_position, squared_step, strict=True)
+    )
+    cubic_error = [
+        cubic * part
+        for part in _polynomial_product(sweep_position, [constant_factor - 3, *cubic_factor])
     ]
-    mean_error[0] = mean_error[0] - quadratic
-    cubic_factor = [4 * a + b for a, b in zip(squared_position, squared_step, strict=True)]
-    cubic_factor[0] = cubic_factor[0] - 3
-    cubic_error = [cubic * part for part in _polynomial_product(sweep_position, cubic_factor)]
-    mean_error = [a + b for a, b in zip([*mean_error, np.zeros(())], cubic_error, strict=True)]
+    mean_error = [
+        a + b
+        for a, b in zip(
+            [constant_error - quadratic, *quadratic_error, np.zeros(())], cubic_error, strict=True
+        )
+    ]
     slope_magnitude = np.abs(chirp_rates)
     constant, *coefficients = (
         slope_magnitude * np.abs(part) for part in _polynomial_product(delay, mean_error)
     )
-    sine_phase = slope_magnitude * (np.abs(delay[0]) + np.abs(delay[1])) * np.abs(sinusoidal)
+    sine_phase = slope_magnitude * (np.abs(middle_delay) + np.abs(delay_slope)) * np.abs(sinusoidal)
     sine_phase_slope = 2 * np.pi * points[_ERROR_PERIODS_PATH] * position_per_second * half_duration
     phase_bound = PhaseErrorBound(
         tuple(coefficients), sine_phase, constant, sine_phase * sine_phase_slope

@@ -147,9 +147,11 @@ class LeakageBins(NamedTuple):
     law is the table of rates for one threshold. sigma is the noise of a bin per quadrature.
     """
 
-    bin_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of each segment's bins in the arrays from ``bins`` to
+    bins_begin: np.ndarray
+    """(m, 3) int64: index of each segment's first bin in the arrays from ``bins`` to
     ``exempt_neighbour_side``."""
+    bins_end: np.ndarray
+    """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1."""
     bins: np.ndarray
     """(bins,) int64: numbers of the bins with signal leaked from an echo, as
     ``BinGroups.strongest_bin`` numbers bins."""
@@ -172,9 +174,11 @@ class LeakageBins(NamedTuple):
     mean_probability_sum: np.ndarray
     """(m, 3): sum over a segment's bins of the probability, averaged over speckle, that leaked
     signal lifts the bin above the threshold; nan if not computed."""
-    line_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of each segment's bins in ``line_bins`` and
-    ``line_log_amplitude``."""
+    line_begin: np.ndarray
+    """(m, 3) int64: index of each segment's first bin in ``line_bins`` and ``line_log_amplitude``.
+    """
+    line_end: np.ndarray
+    """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1."""
     line_bins: np.ndarray
     """(line bins,) int64: numbers of the bins that the line of light leaked in the circulator may
     lift above the threshold."""
@@ -185,8 +189,10 @@ class LeakageBins(NamedTuple):
     """(m, 3): sum over ``line_bins`` of the rates -ln(1 - c), with c the probability that the line
     of leaked light lifts a bin above the threshold. It is the largest sum of all phases of the
     line."""
-    excluded_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of each segment's bins in ``excluded_bins``."""
+    excluded_begin: np.ndarray
+    """(m, 3) int64: index of each segment's first bin in ``excluded_bins``."""
+    excluded_end: np.ndarray
+    """(m, 3) int64: index of each segment's last bin in ``excluded_bins``, plus 1."""
     excluded_bins: np.ndarray
     """(excluded,) int64: numbers of the bins in which no false peak of noise alone is drawn."""
     threshold_index: np.ndarray
@@ -195,8 +201,10 @@ class LeakageBins(NamedTuple):
     log_rates: np.ndarray
     """(laws, N_RATES): ln of the rate -ln(1 - c) at evenly spaced ln(|X| / sigma), for each
     threshold. c is the probability that signal lifts a bin above the threshold."""
-    log_amplitude_grid: np.ndarray
-    """(laws, 2): first ln(|X| / sigma) at which ``log_rates`` is tabulated, and the step."""
+    first_log_amplitude: np.ndarray
+    """(laws,): smallest ln(|X| / sigma) at which ``log_rates`` is tabulated."""
+    log_amplitude_step: np.ndarray
+    """(laws,): difference of successive ln(|X| / sigma) at which ``log_rates`` is tabulated."""
     threshold_ratio: np.ndarray
     """(laws,): threshold [sigma] for one record that is equivalent to the combination of all looks
     (records of a segment)."""
@@ -210,33 +218,37 @@ class LeakageBins(NamedTuple):
     @classmethod
     def empty(cls, n_points: int) -> "LeakageBins":
         """Return a record without bins of leaked signal, for ``n_points`` points."""
-        no_slices, no_bins, sum_shape = (
-            np.zeros((n_points, 3, 2), np.int64),
+        no_indices, no_bins, sum_shape = (
+            np.zeros((n_points, 3), np.int64),
             np.empty(0, np.int64),
             (n_points, 3),
         )
         return cls(
-            no_slices,
-            no_bins,
-            np.empty(0),
-            no_bins,
-            np.empty(0),
-            no_bins,
-            np.zeros(sum_shape),
-            np.zeros((*sum_shape, N_BOUND_POWERS)),
-            np.full(sum_shape, np.nan),
-            no_slices,
-            no_bins,
-            np.empty((N_PHASES, 0)),
-            np.zeros(sum_shape),
-            no_slices,
-            no_bins,
-            np.zeros(n_points, np.int64),
-            np.zeros((1, 1)),
-            np.zeros((1, 2)),
-            np.zeros(1),
-            1.0,
-            0.0,
+            bins_begin=no_indices,
+            bins_end=no_indices,
+            bins=no_bins,
+            log_amplitude=np.empty(0),
+            group=no_bins,
+            exempt_neighbour=np.empty(0),
+            exempt_neighbour_side=no_bins,
+            rate_sum=np.zeros(sum_shape),
+            rate_sum_bounds=np.zeros((*sum_shape, N_BOUND_POWERS)),
+            mean_probability_sum=np.full(sum_shape, np.nan),
+            line_begin=no_indices,
+            line_end=no_indices,
+            line_bins=no_bins,
+            line_log_amplitude=np.empty((N_PHASES, 0)),
+            line_rate_sum=np.zeros(sum_shape),
+            excluded_begin=no_indices,
+            excluded_end=no_indices,
+            excluded_bins=no_bins,
+            threshold_index=np.zeros(n_points, np.int64),
+            log_rates=np.zeros((1, 1)),
+            first_log_amplitude=np.zeros(1),
+            log_amplitude_step=np.zeros(1),
+            threshold_ratio=np.zeros(1),
+            amplitude_gain_max=1.0,
+            sidelobe_correlation=0.0,
         )
 
     def select(self, points: np.ndarray) -> "LeakageBins":
@@ -245,13 +257,16 @@ class LeakageBins(NamedTuple):
         Arrays of bins are shared with this record, not copied.
         """
         by_point = (
-            "bin_slice",
+            "bins_begin",
+            "bins_end",
             "rate_sum",
             "rate_sum_bounds",
             "mean_probability_sum",
-            "line_slice",
+            "line_begin",
+            "line_end",
             "line_rate_sum",
-            "excluded_slice",
+            "excluded_begin",
+            "excluded_end",
             "threshold_index",
         )
         return self._replace(**{name: getattr(self, name)[points] for name in by_point})
@@ -264,6 +279,17 @@ class LeakageBins(NamedTuple):
         leakage = np.empty(self.rate_sum.shape)
         _average_leakage(self, leakage)
         return leakage
+
+
+class _LeakedBins(NamedTuple):
+    """Bins of leaked signal in the spectra of a batch of points, (bins,) each."""
+
+    number: np.ndarray
+    """(bins,) int64: number of the bin."""
+    batch_index: np.ndarray
+    """(bins,) int64: index of the point in the batch."""
+    segment: np.ndarray
+    """(bins,) int64: 0 up, 1 Doppler, 2 down."""
 
 
 def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
@@ -282,9 +308,9 @@ def fading_group_of_bins(
     It is the group whose strongest bin is nearest. ``points`` are the indices of the points of
     ``spectra``. Bins of a complex record are periodic.
     """
-    bins, batch_index, segment = _leaked_bins(spectra)
-    group_bins = groups.strongest_bin[points[batch_index], segment]
-    distance = np.abs(bins[:, None] - group_bins)
+    bins = _leaked_bins(spectra)
+    group_bins = groups.strongest_bin[points[bins.batch_index], bins.segment]
+    distance = np.abs(bins.number[:, None] - group_bins)
     if shots.complex_record:
         distance = np.minimum(distance % shots.fft_size, -distance % shots.fft_size)
     return np.where(group_bins < 0, np.iinfo(np.int64).max, distance).argmin(axis=1)
@@ -300,8 +326,9 @@ def bins_without_noise_peaks(
     """
     return LeakageBins.empty(points.size)._replace(
         group=fading_group_of_bins(shots, groups, points, spectra),
-        excluded_slice=spectra.leaked_slice,
-        excluded_bins=_leaked_bins(spectra)[0],
+        excluded_begin=spectra.leaked_begin,
+        excluded_end=spectra.leaked_end,
+        excluded_bins=_leaked_bins(spectra).number,
     )
 
 
@@ -323,8 +350,9 @@ def iter_leakage_bins(
                 shots, batch, spectra, fading_group
             )
             leakage_bins = leakage_bins._replace(
-                bin_slice=spectra.leaked_slice,
-                bins=_leaked_bins(spectra)[0],
+                bins_begin=spectra.leaked_begin,
+                bins_end=spectra.leaked_end,
+                bins=_leaked_bins(spectra).number,
                 log_amplitude=np.log(spectra.leaked_ratio),
                 group=fading_group,
                 exempt_neighbour=spectra.exempt_neighbour_ratio,
@@ -381,7 +409,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
     )
     bins, group, exempt_neighbour_side = np.empty((3, n_bins.sum()), np.int64)
     log_amplitude, exempt_neighbour = np.empty((2, bins.size))
-    bin_slice = np.empty((spans.point_numbers.size, 3, 2), np.int64)
+    bins_begin, bins_end = np.empty((2, spans.point_numbers.size, 3), np.int64)
     n_listed = _fill_leakage_bins(
         spans.point_numbers,
         first_bin,
@@ -395,7 +423,8 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         np.array(_leaking_signal_ratio_min(shots)),
         np.ascontiguousarray(groups.strongest_bin),
         shots.fft_size if shots.complex_record else 0,
-        bin_slice,
+        bins_begin,
+        bins_end,
         bins,
         log_amplitude,
         group,
@@ -403,7 +432,8 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         exempt_neighbour_side,
     )
     leakage_bins = LeakageBins.empty(spans.point_numbers.size)._replace(
-        bin_slice=bin_slice,
+        bins_begin=bins_begin,
+        bins_end=bins_end,
         bins=bins[:n_listed],
         log_amplitude=log_amplitude[:n_listed],
         group=group[:n_listed],
@@ -427,7 +457,8 @@ def _fill_leakage_bins(
     signal_ratio_min,
     group_bins,
     circle_bins,
-    bin_slice,
+    bins_begin,
+    bins_end,
     bins,
     log_amplitude,
     group,
@@ -451,14 +482,14 @@ def _fill_leakage_bins(
         (n, 3, groups): strongest bins of groups, -1 for none.
     circle_bins
         Number of bins of a complex record, else 0.
-    bin_slice, bins, log_amplitude, group, exempt_neighbour, exempt_neighbour_side
+    bins_begin, bins_end, bins, log_amplitude, group, exempt_neighbour, exempt_neighbour_side
         Results, as in :class:`LeakageBins`.
     """
     n_listed = 0
     for j in range(point_numbers.size):
         i = point_numbers[j]
         for s in range(3):
-            bin_slice[j, s, 0] = n_listed
+            bins_begin[j, s] = n_listed
             span_begin = span_start[s, j]
             for index_in_span in range(n_bins[s, j]):
                 flat_index = span_begin + index_in_span
@@ -493,7 +524,7 @@ def _fill_leakage_bins(
                 )
                 exempt_neighbour_side[n_listed] = 1 if ratio_above >= ratio_below else -1
                 n_listed += 1
-            bin_slice[j, s, 1] = n_listed
+            bins_end[j, s] = n_listed
     return n_listed
 
 
@@ -512,20 +543,36 @@ def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins)
         _tabulate_rates(shots.looks, float(threshold_ratio), in_speckle)
         for threshold_ratio in threshold_ratios
     ]
-    log_rates, log_amplitude_grid, linear_rates, mean_probabilities = (
-        np.array([table[field_index] for table in tables]).reshape(threshold_ratios.size, -1)
-        for field_index in range(4)
-    )
     leakage_bins = leakage_bins._replace(
         threshold_index=threshold_index,
-        log_rates=log_rates,
-        log_amplitude_grid=log_amplitude_grid,
+        log_rates=np.array([table.log_rates for table in tables]),
+        first_log_amplitude=np.array([table.first_log_amplitude for table in tables]),
+        log_amplitude_step=np.array([table.log_amplitude_step for table in tables]),
         threshold_ratio=shots.looks.equivalent_threshold_ratio(threshold_ratios),
         amplitude_gain_max=float(shots.looks.amplitude_gain_max),
         sidelobe_correlation=shots.detection_rule.sidelobe_correlation,
     )
-    _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities)
+    _fill_rate_sums(
+        leakage_bins,
+        np.array([table.linear_rates for table in tables]),
+        np.array([table.mean_probabilities for table in tables]),
+    )
     return leakage_bins
+
+
+class RateTable(NamedTuple):
+    """Table of the rates of bins at one threshold, for compiled code.
+
+    The rate is -ln(1 - c), with c the probability that signal lifts a bin above the threshold.
+    sigma is the noise of a bin per quadrature.
+    """
+
+    log_rates: np.ndarray
+    """(N_RATES,): ln of the rate at evenly spaced ln(|X| / sigma) of the signal."""
+    first_log_amplitude: float
+    """Smallest ln(|X| / sigma) in the table."""
+    log_amplitude_step: float
+    """Difference of successive ln(|X| / sigma) in the table."""
 
 
 class RateTables(NamedTuple):
@@ -538,8 +585,10 @@ class RateTables(NamedTuple):
     log_rates: np.ndarray
     """(N_RATES,): ln of the rate -ln(1 - c), with c the probability that signal lifts a bin above
     the threshold."""
-    log_amplitude_grid: np.ndarray
-    """(2,): first ln(|X| / sigma) of the tables, and the step."""
+    first_log_amplitude: float
+    """Smallest ln(|X| / sigma) in the tables."""
+    log_amplitude_step: float
+    """Difference of successive ln(|X| / sigma) in the tables."""
     linear_rates: np.ndarray
     """(N_RATES,): rate -ln(1 - c), with c the probability that signal lifts a bin above the
     threshold."""
@@ -554,45 +603,49 @@ def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> R
 
     Means over speckle are included if ``in_speckle``.
     """
-    log_rates, log_amplitude_grid = _log_rates(looks, np.array([threshold_ratio]))
+    rate_table = _tabulate_log_rates(looks, threshold_ratio)
     mean_probabilities = np.empty(0)
     if in_speckle:
         coarse_means, coarse_positions = (
             np.empty(N_RATES // MEAN_TABLE_STRIDE + 1),
             np.arange(N_RATES) / MEAN_TABLE_STRIDE,
         )
-        _fill_mean_probabilities(log_rates[0], log_amplitude_grid[0], coarse_means)
+        _fill_mean_probabilities(rate_table, coarse_means)
         log_means = np.log(np.maximum(coarse_means, 1e-300))
         mean_probabilities = np.exp(
             CubicSpline(np.arange(coarse_means.size), log_means)(coarse_positions)
         )
-    return RateTables(log_rates[0], log_amplitude_grid[0], np.exp(log_rates[0]), mean_probabilities)
+    return RateTables(
+        *rate_table,
+        linear_rates=np.exp(rate_table.log_rates),
+        mean_probabilities=mean_probabilities,
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_mean_probabilities(log_rates, log_amplitude_grid, mean_probabilities):
+def _fill_mean_probabilities(rate_table, mean_probabilities):
     """Compute the probability, averaged over speckle, that signal lifts a bin above the threshold.
 
-    The signal amplitudes are every MEAN_TABLE_STRIDE-th of the table of rates.
+    The signal amplitudes are every MEAN_TABLE_STRIDE-th of ``rate_table``, a :class:`RateTable`.
     """
-    quadrature = _make_speckle_quadrature(log_rates, log_amplitude_grid)
+    quadrature = _make_speckle_quadrature(rate_table)
     rate_sums = np.empty(quadrature.weights.size)
     for k in range(mean_probabilities.size):
         rate_sums[:] = 0.0
         _add_rates_at_nodes(
-            log_amplitude_grid[0] + k * MEAN_TABLE_STRIDE * log_amplitude_grid[1],
-            log_amplitude_grid,
+            rate_table.first_log_amplitude + k * MEAN_TABLE_STRIDE * rate_table.log_amplitude_step,
+            rate_table,
             quadrature,
             rate_sums,
         )
         mean_probabilities[k] = _mean_leakage_from_rate_sums(rate_sums, quadrature.weights)
 
 
-def _leaked_bins(spectra: NoiselessSpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return bin number, point (index in the batch) and segment of each bin of leaked signal."""
-    n_bins = np.diff(spectra.leaked_slice.reshape(-1, 2)).ravel()
+def _leaked_bins(spectra: NoiselessSpectra) -> _LeakedBins:
+    """Return number, point and segment of each bin of leaked signal."""
+    n_bins = (spectra.leaked_end - spectra.leaked_begin).ravel()
     span = np.repeat(np.arange(n_bins.size), n_bins)
-    return spectra.first_bin.ravel()[span] + spectra.leaked_index, span // 3, span % 3
+    return _LeakedBins(spectra.first_bin.ravel()[span] + spectra.leaked_index, span // 3, span % 3)
 
 
 def _mask_leaked_light(
@@ -604,14 +657,12 @@ def _mask_leaked_light(
     :class:`LeakageBins` with the fields ``line_*`` and ``excluded_*`` only.
     """
     is_kept = np.ones(spectra.leaked_index.size, bool)
-    slices = np.zeros((3, batch.size, 3, 2), np.int64)  # slices of leaked, raised and masked bins
+    n_kept, n_raised, n_masked = np.zeros((3, batch.size, 3), np.int64)
     raised_bins, masked_bins, line_amplitudes = [], [], [np.empty((N_PHASES, 0))]
     phase_factors = np.exp(1j * np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES)[:, None]
-    slice_ends = np.zeros(3, np.int64)
     for j, i in enumerate(batch.tolist()):
         deviation = float(np.broadcast_to(shots.bin_noise_sigma, shots.size)[i])
         for s in range(3):
-            slices[:, j, s] = slice_ends[:, None]
             if not shots.has_segment[s]:
                 continue
             line_scale, line = line_of_point(shots, i, s)
@@ -622,23 +673,25 @@ def _mask_leaked_light(
             is_masked, _, may_raise = line_bin_masks(
                 shots, i, line, half_amplitude=line_scale, echo_bins=echo_bins
             )
-            leaked_slice = slice(*spectra.leaked_slice[j, s])
-            bin_numbers = first_bin + spectra.leaked_index[leaked_slice]
-            is_kept[leaked_slice] = ~is_masked[
+            leaked = slice(spectra.leaked_begin[j, s], spectra.leaked_end[j, s])
+            bin_numbers = first_bin + spectra.leaked_index[leaked]
+            is_kept[leaked] = ~is_masked[
                 bin_numbers % shots.fft_size if shots.complex_record else bin_numbers
             ]
             raised_bins.append(np.flatnonzero(may_raise))
             masked_bins.append(np.flatnonzero(is_masked))
             term, image_term = (line_scale / deviation) * line.transforms[:, raised_bins[-1]]
             line_amplitudes.append(np.abs(term * phase_factors + image_term * phase_factors.conj()))
-            slice_ends += np.array(
-                [is_kept[leaked_slice].sum(), raised_bins[-1].size, masked_bins[-1].size]
-            )
-            slices[:, j, s, 1] = slice_ends
+            n_kept[j, s] = is_kept[leaked].sum()
+            n_raised[j, s], n_masked[j, s] = raised_bins[-1].size, masked_bins[-1].size
+    kept_end, raised_end, masked_end = (
+        np.cumsum(number).reshape(number.shape) for number in (n_kept, n_raised, n_masked)
+    )
     no_bins = np.empty(0, np.int64)
     return (
         spectra._replace(
-            leaked_slice=slices[0],
+            leaked_begin=kept_end - n_kept,
+            leaked_end=kept_end,
             leaked_index=spectra.leaked_index[is_kept],
             leaked_ratio=spectra.leaked_ratio[is_kept],
             exempt_neighbour_ratio=spectra.exempt_neighbour_ratio[is_kept],
@@ -646,10 +699,12 @@ def _mask_leaked_light(
         ),
         group[is_kept],
         LeakageBins.empty(batch.size)._replace(
-            line_slice=slices[1],
+            line_begin=raised_end - n_raised,
+            line_end=raised_end,
             line_bins=np.concatenate([no_bins, *raised_bins]),
             line_log_amplitude=np.concatenate(line_amplitudes, axis=1),
-            excluded_slice=slices[2],
+            excluded_begin=masked_end - n_masked,
+            excluded_end=masked_end,
             excluded_bins=np.concatenate([no_bins, *masked_bins]),
         ),
     )
@@ -664,63 +719,59 @@ def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.nd
     return distinct_ratios, threshold_index.ravel().astype(np.int64)
 
 
-def _log_rates(looks: Looks, threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate ``log_rates`` and ``log_amplitude_grid`` of :class:`LeakageBins`.
+def _tabulate_log_rates(looks: Looks, threshold_ratio: float) -> RateTable:
+    """Tabulate the rates of bins at a threshold [sigma].
 
-    ``threshold_ratio`` (laws,) holds the thresholds [sigma]. Several looks (records) count as they
-    are combined.
+    Several looks (records) count as they are combined.
     """
-    log_rates, log_amplitude_grid = (
-        np.empty((threshold_ratio.size, N_RATES)),
-        np.empty((threshold_ratio.size, 2)),
-    )
-    _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid)
+    log_rates = np.empty(N_RATES)
+    first_log_amplitude, log_amplitude_step = _fill_log_rates(threshold_ratio, log_rates)
     if looks.is_noncoherent:
-        for j in range(threshold_ratio.size):
-            amplitudes = np.exp(
-                log_amplitude_grid[j, 0] + log_amplitude_grid[j, 1] * np.arange(N_RATES)
-            )
-            added_probability = np.minimum(
-                looks.added_crossing_probability(amplitudes, float(threshold_ratio[j])), 1 - 1e-16
-            )
-            log_rates[j] = np.log(np.maximum(-np.log1p(-added_probability), 1e-300))
-    return log_rates, log_amplitude_grid
+        amplitudes = np.exp(first_log_amplitude + log_amplitude_step * np.arange(N_RATES))
+        added_probability = np.minimum(
+            looks.added_crossing_probability(amplitudes, threshold_ratio), 1 - 1e-16
+        )
+        log_rates[:] = np.log(np.maximum(-np.log1p(-added_probability), 1e-300))
+    return RateTable(log_rates, first_log_amplitude, log_amplitude_step)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid):
-    """Compute ``log_rates`` (laws, N_RATES) and ``log_amplitude_grid`` (laws, 2) for a single look.
+def _fill_log_rates(threshold_ratio, log_rates):
+    """Compute the table of ``log_rates`` (N_RATES,) for a single look (record of each segment).
 
-    A look is one record of each segment. ``threshold_ratio`` (laws,) holds the thresholds [sigma].
+    ``threshold_ratio`` is the threshold [sigma]. The smallest ln(|X| / sigma) of the table and the
+    step are returned.
     """
-    for j in range(threshold_ratio.size):
-        ratio = threshold_ratio[j]
-        log_amplitude_grid[j, 0] = math.log(TABLE_AMPLITUDE_MIN_SIGMA)
-        log_amplitude_grid[j, 1] = (
-            math.log(ratio + CERTAIN_MARGIN_SIGMA) - log_amplitude_grid[j, 0]
-        ) / (N_RATES - 1)
-        p_noise_stay = -math.expm1(-0.5 * ratio * ratio)
-        for k in range(N_RATES):
-            amplitude, rate = math.exp(log_amplitude_grid[j, 0] + log_amplitude_grid[j, 1] * k), 0.0
-            if p_noise_stay > 0.0 and amplitude < ratio:
-                rate = -math.log1p(-marcum_q1_excess(amplitude, ratio) / p_noise_stay)
-            elif p_noise_stay > 0.0:
-                rate = -math.log(
-                    max(marcum_q1_tails(amplitude, ratio).below, 1e-300) / p_noise_stay
-                )
-            log_rates[j, k] = math.log(max(rate, 1e-300))
+    first_log_amplitude = math.log(TABLE_AMPLITUDE_MIN_SIGMA)
+    log_amplitude_step = (
+        math.log(threshold_ratio + CERTAIN_MARGIN_SIGMA) - first_log_amplitude
+    ) / (N_RATES - 1)
+    p_noise_stay = -math.expm1(-0.5 * threshold_ratio * threshold_ratio)
+    for k in range(N_RATES):
+        amplitude, rate = math.exp(first_log_amplitude + log_amplitude_step * k), 0.0
+        if p_noise_stay > 0.0 and amplitude < threshold_ratio:
+            rate = -math.log1p(-marcum_q1_excess(amplitude, threshold_ratio) / p_noise_stay)
+        elif p_noise_stay > 0.0:
+            rate = -math.log(
+                max(marcum_q1_tails(amplitude, threshold_ratio).below, 1e-300) / p_noise_stay
+            )
+        log_rates[k] = math.log(max(rate, 1e-300))
+    return first_log_amplitude, log_amplitude_step
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _crossing_rate(log_amplitude, log_rates, log_amplitude_grid):
+def _crossing_rate(log_amplitude, rate_table):
     """Return the rate -ln(1 - c) of a bin by interpolation, with c its probability of crossing.
 
-    ``log_amplitude`` is ln(|X| / sigma). ``log_rates`` are tabulated at ``log_amplitude_grid``.
-    Below the table the rate is proportional to the amplitude squared.
+    ``log_amplitude`` is ln(|X| / sigma), and ``rate_table`` a :class:`RateTable`. Below the table
+    the rate is proportional to the amplitude squared.
     """
-    table_position = (log_amplitude - log_amplitude_grid[0]) / log_amplitude_grid[1]
+    log_rates = rate_table.log_rates
+    table_position = (
+        log_amplitude - rate_table.first_log_amplitude
+    ) / rate_table.log_amplitude_step
     if table_position <= 0.0:
-        return math.exp(log_rates[0] + 2.0 * (log_amplitude - log_amplitude_grid[0]))
+        return math.exp(log_rates[0] + 2.0 * (log_amplitude - rate_table.first_log_amplitude))
     k = int(table_position)
     if k >= log_rates.size - 1:
         return math.exp(log_rates[log_rates.size - 1])
@@ -736,46 +787,48 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
     ``line_log_amplitude`` is converted from amplitudes to logarithms. ``linear_rates`` and
     ``mean_probabilities`` (laws, N_RATES) are those of :class:`RateTables`.
     """
-    for k_power_or_phase in range(leakage_bins.line_log_amplitude.shape[0]):
+    for phase in range(leakage_bins.line_log_amplitude.shape[0]):
         for k in range(leakage_bins.line_log_amplitude.shape[1]):
-            leakage_bins.line_log_amplitude[k_power_or_phase, k] = math.log(
-                max(leakage_bins.line_log_amplitude[k_power_or_phase, k], 1e-300)
+            leakage_bins.line_log_amplitude[phase, k] = math.log(
+                max(leakage_bins.line_log_amplitude[phase, k], 1e-300)
             )
     for j in range(leakage_bins.rate_sum.shape[0]):
-        log_rates, log_amplitude_grid = (
-            leakage_bins.log_rates[leakage_bins.threshold_index[j]],
-            leakage_bins.log_amplitude_grid[leakage_bins.threshold_index[j]],
+        threshold_index = leakage_bins.threshold_index[j]
+        rate_table = RateTable(
+            leakage_bins.log_rates[threshold_index],
+            leakage_bins.first_log_amplitude[threshold_index],
+            leakage_bins.log_amplitude_step[threshold_index],
         )
-        steps_per_power_doubling = math.ceil(0.5 * math.log(2.0) / log_amplitude_grid[1])
+        steps_per_power_doubling = math.ceil(0.5 * math.log(2.0) / rate_table.log_amplitude_step)
         for s in range(3):
             rate_sums, mean_probability_sum = leakage_bins.rate_sum_bounds[j, s], 0.0
             rate_sums[:] = 0.0
-            for k in range(leakage_bins.bin_slice[j, s, 0], leakage_bins.bin_slice[j, s, 1]):
+            for k in range(leakage_bins.bins_begin[j, s], leakage_bins.bins_end[j, s]):
+                log_amplitude_above_first = (
+                    leakage_bins.log_amplitude[k] - rate_table.first_log_amplitude
+                )
                 power_fraction, table_position = (
                     1.0,
-                    (leakage_bins.log_amplitude[k] - log_amplitude_grid[0]) / log_amplitude_grid[1],
+                    log_amplitude_above_first / rate_table.log_amplitude_step,
                 )
                 if table_position < 0.0:  # rate proportional to the amplitude squared
-                    power_fraction, table_position = (
-                        math.exp(2.0 * (leakage_bins.log_amplitude[k] - log_amplitude_grid[0])),
-                        0.0,
-                    )
+                    power_fraction, table_position = math.exp(2.0 * log_amplitude_above_first), 0.0
                 table_index = min(int(table_position), N_RATES - 2)
-                for k_power_or_phase in range(N_BOUND_POWERS):
-                    rate_sums[k_power_or_phase] += (
+                for doublings in range(N_BOUND_POWERS):
+                    rate_sums[doublings] += (
                         power_fraction
                         * linear_rates[
-                            leakage_bins.threshold_index[j],
+                            threshold_index,
                             min(
-                                table_index + 1 + k_power_or_phase * steps_per_power_doubling,
+                                table_index + 1 + doublings * steps_per_power_doubling,
                                 N_RATES - 1,
                             ),
                         ]
                     )
                 if mean_probabilities.shape[1] > 0:
                     mean_at_index, mean_at_next = (
-                        mean_probabilities[leakage_bins.threshold_index[j], table_index],
-                        mean_probabilities[leakage_bins.threshold_index[j], table_index + 1],
+                        mean_probabilities[threshold_index, table_index],
+                        mean_probabilities[threshold_index, table_index + 1],
                     )
                     mean_probability_sum += power_fraction * (
                         mean_at_index
@@ -784,13 +837,11 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
             leakage_bins.rate_sum[j, s], leakage_bins.line_rate_sum[j, s] = rate_sums[0], 0.0
             if mean_probabilities.shape[1] > 0:
                 leakage_bins.mean_probability_sum[j, s] = mean_probability_sum
-            for k_power_or_phase in range(leakage_bins.line_log_amplitude.shape[0]):
+            for phase in range(leakage_bins.line_log_amplitude.shape[0]):
                 phase_sum = 0.0
-                for k in range(leakage_bins.line_slice[j, s, 0], leakage_bins.line_slice[j, s, 1]):
+                for k in range(leakage_bins.line_begin[j, s], leakage_bins.line_end[j, s]):
                     phase_sum += _crossing_rate(
-                        leakage_bins.line_log_amplitude[k_power_or_phase, k],
-                        log_rates,
-                        log_amplitude_grid,
+                        leakage_bins.line_log_amplitude[phase, k], rate_table
                     )
                 leakage_bins.line_rate_sum[j, s] = max(leakage_bins.line_rate_sum[j, s], phase_sum)
 
@@ -820,9 +871,13 @@ class SpeckleQuadrature(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _make_speckle_quadrature(log_rates, log_amplitude_grid):
-    """Return the trapezoidal rule for means over speckle, for one table of rates."""
-    log_amplitude_step, log_rate_step_max = log_amplitude_grid[1], 0.0
+def _make_speckle_quadrature(rate_table):
+    """Return the trapezoidal rule for means over speckle, for one :class:`RateTable`."""
+    log_rates, log_amplitude_step, log_rate_step_max = (
+        rate_table.log_rates,
+        rate_table.log_amplitude_step,
+        0.0,
+    )
     for k in range(1, log_rates.size):
         if log_rates[k] < 1.0:  # at higher rates a bin crosses at almost any power
             log_rate_step_max = max(log_rate_step_max, log_rates[k] - log_rates[k - 1])
@@ -849,30 +904,27 @@ def _make_speckle_quadrature(log_rates, log_amplitude_grid):
     for k in range(interleaved_rates.size):
         table_position = float(k - n_below_mean * node_stride - 1)
         rate = _crossing_rate(
-            log_amplitude_grid[0] + table_position * log_amplitude_step,
-            log_rates,
-            log_amplitude_grid,
+            rate_table.first_log_amplitude + table_position * log_amplitude_step, rate_table
         )
         interleaved_rates[k % node_stride * n_columns + k // node_stride] = rate
     return SpeckleQuadrature(node_stride, n_below_mean, weights, interleaved_rates)
 
 
 @njit(cache=True, error_model="numpy")
-def _add_rates_at_nodes(log_amplitude, log_amplitude_grid, quadrature, rate_sums):
+def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
     """Add the rates -ln(1 - c) of a bin at the nodes of speckle power to ``rate_sums``.
 
-    ``log_amplitude`` is ln(|X| / sigma) at mean power. Only the last nodes, as many as
-    ``rate_sums`` has, are evaluated. Rates are interpolated by cubic polynomials.
+    ``log_amplitude`` is ln(|X| / sigma) at mean power, and ``rate_table`` the table of which
+    ``quadrature`` is made. Only the last nodes, as many as ``rate_sums`` has, are evaluated. Rates
+    are interpolated by cubic polynomials.
     """
+    log_amplitude_above_first = log_amplitude - rate_table.first_log_amplitude
     power_fraction, table_position = (
         1.0,
-        (log_amplitude - log_amplitude_grid[0]) / log_amplitude_grid[1],
+        log_amplitude_above_first / rate_table.log_amplitude_step,
     )
     if table_position < 0.0:  # rate proportional to the amplitude squared
-        power_fraction, table_position = (
-            math.exp(2.0 * (log_amplitude - log_amplitude_grid[0])),
-            0.0,
-        )
+        power_fraction, table_position = math.exp(2.0 * log_amplitude_above_first), 0.0
     n_columns = quadrature.interleaved_rates.size // quadrature.node_stride
     table_index = int(
         min(
@@ -939,7 +991,15 @@ def _mean_leakage_from_rate_sums(rate_sums, weights):
 
 @njit(cache=True, error_model="numpy")
 def _evaluate_joining_bins(
-    bin_index, bin_slice, leakage_bins, threshold_index, quadrature, is_evaluated, joining_rates
+    bin_index,
+    bins_begin,
+    bins_end,
+    leakage_bins,
+    threshold_index,
+    rate_table,
+    quadrature,
+    is_evaluated,
+    joining_rates,
 ):
     """Compute the rates of false peaks in leaked bins next to an echo, unless they join the echo.
 
@@ -949,14 +1009,14 @@ def _evaluate_joining_bins(
     ----------
     bin_index
         Index of the bin in ``leakage_bins.bins``.
-    bin_slice
-        Begin and end of the segment's bins.
+    bins_begin, bins_end
+        Index of the segment's first bin, and of its last bin plus 1.
     leakage_bins
         :class:`LeakageBins` of the batch.
     threshold_index
         Index of the law in ``leakage_bins.log_rates``.
-    quadrature
-        :class:`SpeckleQuadrature` of this law.
+    rate_table, quadrature
+        :class:`RateTable` and :class:`SpeckleQuadrature` of this law.
     is_evaluated
         (bins,) bool: True for bins that were evaluated before.
     joining_rates
@@ -968,15 +1028,10 @@ def _evaluate_joining_bins(
     int
         Index of the last of these bins.
     """
-    log_rates, log_amplitude_grid, step = (
-        leakage_bins.log_rates[threshold_index],
-        leakage_bins.log_amplitude_grid[threshold_index],
-        -leakage_bins.exempt_neighbour_side[bin_index],
-    )
-    n_nodes = joining_rates.size
+    n_nodes, step = joining_rates.size, -leakage_bins.exempt_neighbour_side[bin_index]
     end_index = bin_index + step
     while (
-        bin_slice[0] <= end_index < bin_slice[1]
+        bins_begin <= end_index < bins_end
         and leakage_bins.bins[end_index] - leakage_bins.bins[bin_index] == end_index - bin_index
     ):
         bright_log_amplitude = (
@@ -984,8 +1039,7 @@ def _evaluate_joining_bins(
         )  # amplitude in bright speckle
         if (
             abs(end_index - bin_index) > 1
-            and _crossing_rate(bright_log_amplitude, log_rates, log_amplitude_grid)
-            < JOINING_RATE_MIN
+            and _crossing_rate(bright_log_amplitude, rate_table) < JOINING_RATE_MIN
         ):
             break
         if (
@@ -998,18 +1052,14 @@ def _evaluate_joining_bins(
     bin_rates, p_any_after_quiet, p_any = np.empty(n_nodes), np.zeros(n_nodes), np.zeros(n_nodes)
     for j in range(end_index - step, bin_index, -step):
         bin_rates[:] = 0.0
-        _add_rates_at_nodes(
-            leakage_bins.log_amplitude[j], log_amplitude_grid, quadrature, bin_rates
-        )
+        _add_rates_at_nodes(leakage_bins.log_amplitude[j], rate_table, quadrature, bin_rates)
         for i in range(n_nodes):
             p_cross = _crossing_probability(bin_rates[i])
             p_any_after_quiet[i] = p_cross * p_any_after_quiet[i] + (1.0 - p_cross) * p_any[i]
             p_any[i] = p_cross + (1.0 - p_cross) * p_any[i]
     bin_rates[:] = 0.0
-    _add_rates_at_nodes(
-        leakage_bins.log_amplitude[bin_index], log_amplitude_grid, quadrature, bin_rates
-    )
-    log_power_step = 2.0 * quadrature.node_stride * log_amplitude_grid[1]
+    _add_rates_at_nodes(leakage_bins.log_amplitude[bin_index], rate_table, quadrature, bin_rates)
+    log_power_step = 2.0 * quadrature.node_stride * rate_table.log_amplitude_step
     nodes_per_step = max(int(EDGE_LOG_POWER_STEP / log_power_step), 1)
     mean_power_node = n_nodes - quadrature.weights.size + quadrature.n_below_mean
     first_edge_node = max(mean_power_node - int(EDGE_LOG_POWER_DEPTH / log_power_step), 0)
@@ -1057,10 +1107,11 @@ def _average_leakage(leakage_bins, leakage_probability):
     """
     is_evaluated = np.zeros(leakage_bins.bins.size, np.bool_)
     no_quadrature = SpeckleQuadrature(1, 0, np.empty(0), np.empty(0))
-    for threshold_index in range(leakage_bins.log_amplitude_grid.shape[0]):
-        log_rates, log_amplitude_grid = (
+    for threshold_index in range(leakage_bins.first_log_amplitude.size):
+        rate_table = RateTable(
             leakage_bins.log_rates[threshold_index],
-            leakage_bins.log_amplitude_grid[threshold_index],
+            leakage_bins.first_log_amplitude[threshold_index],
+            leakage_bins.log_amplitude_step[threshold_index],
         )
         needs_quadrature = False
         for j in range(leakage_probability.shape[0]):
@@ -1071,15 +1122,15 @@ def _average_leakage(leakage_bins, leakage_probability):
                 )
         quadrature, node_scratch, faint_first_node = no_quadrature, np.empty((2, 0)), 0
         if needs_quadrature:
-            quadrature = _make_speckle_quadrature(log_rates, log_amplitude_grid)
+            quadrature = _make_speckle_quadrature(rate_table)
             node_scratch = np.empty((2, quadrature.weights.size))
-            log_power_step = 2.0 * quadrature.node_stride * log_amplitude_grid[1]
+            log_power_step = 2.0 * quadrature.node_stride * rate_table.log_amplitude_step
             faint_first_node = int((LOG_POWER_MIN_FAINT - LOG_POWER_MIN) / log_power_step)
         for j in range(leakage_probability.shape[0]):
             if leakage_bins.threshold_index[j] != threshold_index:
                 continue
             for s in range(3):
-                begin, end = leakage_bins.bin_slice[j, s]
+                begin, end = leakage_bins.bins_begin[j, s], leakage_bins.bins_end[j, s]
                 first_node = (
                     faint_first_node if leakage_bins.rate_sum[j, s] <= FAINT_RATE_SUM_MAX else 0
                 )
@@ -1102,9 +1153,11 @@ def _average_leakage(leakage_bins, leakage_probability):
                         ):
                             last_joined = _evaluate_joining_bins(
                                 k,
-                                (begin, end),
+                                begin,
+                                end,
                                 leakage_bins,
                                 threshold_index,
+                                rate_table,
                                 quadrature,
                                 is_evaluated,
                                 joining_rates,
@@ -1114,10 +1167,7 @@ def _average_leakage(leakage_bins, leakage_probability):
                     for k in range(begin, end):
                         if leakage_bins.group[k] == group and not is_evaluated[k]:
                             _add_rates_at_nodes(
-                                leakage_bins.log_amplitude[k],
-                                log_amplitude_grid,
-                                quadrature,
-                                rate_sums,
+                                leakage_bins.log_amplitude[k], rate_table, quadrature, rate_sums
                             )
                     p_leakage += _mean_leakage_from_rate_sums(rate_sums, quadrature.weights) * (
                         1.0 - p_leakage
@@ -1125,25 +1175,22 @@ def _average_leakage(leakage_bins, leakage_probability):
                 n_phases, p_line_alarm = leakage_bins.line_log_amplitude.shape[0], 0.0
                 for phase in range(n_phases):
                     rate_sum = 0.0
-                    for k in range(
-                        leakage_bins.line_slice[j, s, 0], leakage_bins.line_slice[j, s, 1]
-                    ):
+                    for k in range(leakage_bins.line_begin[j, s], leakage_bins.line_end[j, s]):
                         rate_sum += _crossing_rate(
-                            leakage_bins.line_log_amplitude[phase, k], log_rates, log_amplitude_grid
+                            leakage_bins.line_log_amplitude[phase, k], rate_table
                         )
                     p_line_alarm -= math.expm1(-rate_sum) / n_phases
                 leakage_probability[j, s] = p_leakage + p_line_alarm * (1.0 - p_leakage)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def insert_peak(peak, peak_bins, peak_ratios, n_peaks):
+def insert_peak(bin_number, ratio, peak_bins, peak_ratios, n_peaks):
     """Insert a peak into a list sorted by strength, and return the new number of peaks.
 
-    ``peak`` holds the bin and |X| / sigma. A bin of -1 is ignored. If the list is full, its weakest
-    peak is dropped.
+    The peak has |X| / sigma = ``ratio`` in bin ``bin_number``, which is ignored if it is -1. If the
+    list is full, its weakest peak is dropped.
     """
-    bin_, ratio = peak
-    if bin_ < 0:
+    if bin_number < 0:
         return n_peaks
     rank = n_peaks
     while rank > 0 and peak_ratios[rank - 1] < ratio:
@@ -1153,14 +1200,15 @@ def insert_peak(peak, peak_bins, peak_ratios, n_peaks):
     n_peaks = min(n_peaks + 1, peak_bins.size)
     for k in range(n_peaks - 1, rank, -1):
         peak_bins[k], peak_ratios[k] = peak_bins[k - 1], peak_ratios[k - 1]
-    peak_bins[rank], peak_ratios[rank] = bin_, ratio
+    peak_bins[rank], peak_ratios[rank] = bin_number, ratio
     return n_peaks
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_leaked_peaks(
     address,
-    point_and_segment,
+    point,
+    segment,
     leakage_bins,
     fading_factors,
     threshold_ratio,
@@ -1174,9 +1222,9 @@ def draw_leaked_peaks(
     Parameters
     ----------
     address
-        Key of the point (two uint64) and number of the draw.
-    point_and_segment
-        Point and segment.
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment
+        Index of the point in ``leakage_bins``, and segment.
     leakage_bins
         :class:`LeakageBins` of the batch.
     fading_factors
@@ -1196,57 +1244,66 @@ def draw_leaked_peaks(
     int
         Number of peaks in the list.
     """
-    (a, b, draw), (i, s) = address, point_and_segment
-    log_rates, log_amplitude_grid = (
-        leakage_bins.log_rates[leakage_bins.threshold_index[i]],
-        leakage_bins.log_amplitude_grid[leakage_bins.threshold_index[i]],
+    key_0, key_1, draw = address
+    threshold_index = leakage_bins.threshold_index[point]
+    rate_table = RateTable(
+        leakage_bins.log_rates[threshold_index],
+        leakage_bins.first_log_amplitude[threshold_index],
+        leakage_bins.log_amplitude_step[threshold_index],
     )
     speckle_power_max, bound_index, rate_sum_bound = 0.0, 0, np.inf
     for group_index in range(fading_factors.shape[0]):
         speckle_power_max = max(
-            speckle_power_max, fading_factors[group_index, s] * fading_factors[group_index, s]
+            speckle_power_max,
+            fading_factors[group_index, segment] * fading_factors[group_index, segment],
         )
     while bound_index < N_BOUND_POWERS and speckle_power_max > float(1 << bound_index):
         bound_index += 1
     if bound_index < N_BOUND_POWERS:
-        rate_sum_bound = leakage_bins.rate_sum_bounds[i, s, bound_index]
+        rate_sum_bound = leakage_bins.rate_sum_bounds[point, segment, bound_index]
     n_peaks = 0
     if rate_sum_bound > 0.0:
         n_peaks = _draw_raised_bins(
             address,
-            s,
+            segment,
             0,
-            leakage_bins.bin_slice[i, s],
+            leakage_bins.bins_begin[point, segment],
+            leakage_bins.bins_end[point, segment],
             leakage_bins.bins,
             leakage_bins.log_amplitude,
             leakage_bins.group,
             leakage_bins.exempt_neighbour,
-            fading_factors[:, s],
+            fading_factors[:, segment],
             rate_sum_bound,
-            log_rates,
-            log_amplitude_grid,
-            (threshold_ratio, n_looks, interpolation.sidelobe_correlation),
+            rate_table,
+            threshold_ratio,
+            n_looks,
+            interpolation.sidelobe_correlation,
             peak_bins,
             peak_ratios,
             n_peaks,
         )
-    if leakage_bins.line_rate_sum[i, s] > 0.0:
-        uniform_phase = philox.uniform(a, b, draw, philox.STREAM_LEAKAGE[s], LINE_RANDOM_OFFSET)
+    if leakage_bins.line_rate_sum[point, segment] > 0.0:
+        uniform_phase = philox.uniform(
+            key_0, key_1, draw, philox.STREAM_LEAKAGE[segment], LINE_RANDOM_OFFSET
+        )
         phase = int(uniform_phase * leakage_bins.line_log_amplitude.shape[0])
         n_peaks = _draw_raised_bins(
             address,
-            s,
+            segment,
             LINE_RANDOM_OFFSET + 1,
-            leakage_bins.line_slice[i, s],
+            leakage_bins.line_begin[point, segment],
+            leakage_bins.line_end[point, segment],
             leakage_bins.line_bins,
             leakage_bins.line_log_amplitude[phase],
             leakage_bins.group[:0],
             leakage_bins.exempt_neighbour[:0],
-            fading_factors[:, s],
-            leakage_bins.line_rate_sum[i, s],
-            log_rates,
-            log_amplitude_grid,
-            (threshold_ratio, n_looks, 0.0),
+            fading_factors[:, segment],
+            leakage_bins.line_rate_sum[point, segment],
+            rate_table,
+            threshold_ratio,
+            n_looks,
+            0.0,
             peak_bins,
             peak_ratios,
             n_peaks,
@@ -1259,16 +1316,18 @@ def _draw_raised_bins(
     address,
     segment,
     first_random,
-    bin_slice,
+    bins_begin,
+    bins_end,
     bins,
     log_amplitude,
     group,
     exempt_neighbour,
     fading_factors,
     rate_sum,
-    log_rates,
-    log_amplitude_grid,
-    threshold_looks_correlation,
+    rate_table,
+    threshold_ratio,
+    n_looks,
+    noise_correlation,
     peak_bins,
     peak_ratios,
     n_peaks,
@@ -1281,31 +1340,30 @@ def _draw_raised_bins(
     Parameters
     ----------
     address, segment
-        Key of the point (two uint64) and number of the draw; segment.
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`), and segment.
     first_random
         Index of the first random number of the segment's stream.
-    bin_slice, bins, log_amplitude
-        Begin and end of the bins in the arrays; numbers of the bins; ln(|X| / sigma).
+    bins_begin, bins_end
+        Index of the segment's first bin in the arrays, and of its last bin plus 1.
+    bins, log_amplitude
+        Numbers of the bins, and ln(|X| / sigma).
     group, exempt_neighbour
         Fields of :class:`LeakageBins`; empty for bins that do not fade and join no echo.
     fading_factors
         (groups,): factors on the echoes' magnitudes by speckle.
     rate_sum
         Upper bound on the sum of the rates of all bins in this draw.
-    log_rates, log_amplitude_grid
-        Table of rates.
-    threshold_looks_correlation
+    rate_table
+        :class:`RateTable` of the threshold.
+    threshold_ratio, n_looks, noise_correlation
         Threshold [sigma], number of looks, and correlation of neighbours' noise.
     peak_bins, peak_ratios, n_peaks
         List of peaks, as in :func:`insert_peak`.
     """
-    (a, b, draw), stream, (threshold_ratio, n_looks, correlation) = (
-        address,
-        philox.STREAM_LEAKAGE[segment],
-        threshold_looks_correlation,
-    )
-    remainder = math.sqrt(1.0 - correlation * correlation)
-    probability = philox.uniform(a, b, draw, stream, first_random)
+    key_0, key_1, draw = address
+    stream = philox.STREAM_LEAKAGE[segment]
+    remainder = math.sqrt(1.0 - noise_correlation * noise_correlation)
+    probability = philox.uniform(key_0, key_1, draw, stream, first_random)
     if probability > rate_sum:  # then -ln(1 - probability) is larger, too
         return n_peaks
     exponent_left = -math.log1p(-probability)
@@ -1314,26 +1372,29 @@ def _draw_raised_bins(
     root_looks = math.sqrt(float(n_looks))
     scaled_threshold = threshold_ratio * root_looks
     previous_bin, peak_bin, peak_ratio, is_echo = np.int64(-2), np.int64(-1), 0.0, False
-    for k in range(bin_slice[0], bin_slice[1]):
+    for k in range(bins_begin, bins_end):
         fading_factor = fading_factors[group[k]] if group.size > 0 else 1.0
         log_amplitude_k = log_amplitude[k] + math.log(fading_factor)
-        exponent_left -= _crossing_rate(log_amplitude_k, log_rates, log_amplitude_grid)
+        exponent_left -= _crossing_rate(log_amplitude_k, rate_table)
         if exponent_left > 0.0:
             continue
         if bins[k] != previous_bin + 1:
             n_peaks = insert_peak(
-                (np.int64(-1) if is_echo else peak_bin, peak_ratio), peak_bins, peak_ratios, n_peaks
+                np.int64(-1) if is_echo else peak_bin, peak_ratio, peak_bins, peak_ratios, n_peaks
             )
             peak_bin, peak_ratio, is_echo = np.int64(-1), 0.0, False
         previous_bin, signal = bins[k], math.exp(log_amplitude_k) * root_looks
         probability = philox.uniform(
-            a, b, draw, stream, first_random + 1
+            key_0, key_1, draw, stream, first_random + 1
         ) * _added_crossing_probability(signal, scaled_threshold)
         if (
             exempt_neighbour.size > 0 and exempt_neighbour[k] > 0.0
         ):  # its noise is correlated with that of this bin
-            re, im = philox.normal_pair(a, b, draw, stream, EDGE_RANDOM_OFFSET + k - bin_slice[0])
-            echo_bin_in_phase = exempt_neighbour[k] * fading_factor * root_looks + correlation * (
+            re, im = philox.normal_pair(
+                key_0, key_1, draw, stream, EDGE_RANDOM_OFFSET + k - bins_begin
+            )
+            echo_bin_signal = exempt_neighbour[k] * fading_factor * root_looks
+            echo_bin_in_phase = echo_bin_signal + noise_correlation * (
                 _raised_magnitude(signal, scaled_threshold, probability) - signal
             )
             is_echo |= (
@@ -1351,9 +1412,9 @@ def _draw_raised_bins(
                 _raised_magnitude(signal, scaled_threshold, probability) / root_looks,
             )
         first_random += 2
-        exponent_left = -math.log1p(-philox.uniform(a, b, draw, stream, first_random))
+        exponent_left = -math.log1p(-philox.uniform(key_0, key_1, draw, stream, first_random))
     return insert_peak(
-        (np.int64(-1) if is_echo else peak_bin, peak_ratio), peak_bins, peak_ratios, n_peaks
+        np.int64(-1) if is_echo else peak_bin, peak_ratio, peak_bins, peak_ratios, n_peaks
     )
 
 

@@ -38,7 +38,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.pointcloud.bin_groups import FIRST_ROW, LAST_ROW
 from sweep.model.waveform import (
     FOLD_PENALTY_BINS,
     N_READINGS,
@@ -112,9 +111,46 @@ NO_PEAK = -2
 """Group number that stands for a missing peak: no Doppler peak confirms the return, or the segment
 does not exist."""
 
-UP_COLUMN, DOPPLER_COLUMN, DOWN_COLUMN, READING_COLUMN = range(4)
-"""Columns of the pairs that :func:`pair_peaks` returns. They are the index of the up peak, of the
-Doppler peak (-1 if unconfirmed) and of the down peak, and the reading of the beats."""
+
+class DopplerPrediction(NamedTuple):
+    """Coefficients that predict the Doppler beat from the up and the down beat.
+
+    The fields are arrays (n,) of n points, or numbers of one point.
+    """
+
+    up_coefficient: np.ndarray | float
+    """Derivative of the predicted Doppler beat with respect to the up beat."""
+    down_coefficient: np.ndarray | float
+    """Derivative of the predicted Doppler beat with respect to the down beat."""
+    motion_mismatch: np.ndarray | float
+    """Largest shift of the Doppler beat by the instrument's motion between the segments [bins]. It
+    is added to the tolerance of the prediction."""
+
+    def select(self, indices: np.ndarray) -> "DopplerPrediction":
+        """Return the coefficients of the points with the given indices."""
+        return DopplerPrediction(*(np.asarray(values)[indices] for values in self))
+
+
+class PeakPairs(NamedTuple):
+    """Pairs of an up and a down peak of one draw, (pairs,) each.
+
+    Peaks have indices in the list of their segment.
+    """
+
+    up: np.ndarray
+    """(pairs,) int64: index of the up peak."""
+    doppler: np.ndarray
+    """(pairs,) int64: index of the Doppler peak that confirms the pair; -1 for none."""
+    down: np.ndarray
+    """(pairs,) int64: index of the down peak."""
+    reading: np.ndarray
+    """(pairs,) int64: number of the way to read the beats as range and velocity
+    (:func:`sweep.model.waveform.beats_of_reading`)."""
+
+    @classmethod
+    def allocate(cls, pairs_max: int) -> "PeakPairs":
+        """Allocate arrays for at most ``pairs_max`` pairs."""
+        return cls(*np.empty((4, pairs_max), np.int64))
 
 
 class ConfirmingPeak(NamedTuple):
@@ -160,17 +196,19 @@ def pair_peaks(
     two_beat_reading
         Reading (way to interpret the beats) of pairs that no Doppler peak confirms.
     pairs
-        (>= min(ups, downs), 4) int64; the result, with the columns UP_COLUMN to READING_COLUMN.
-        Confirmed pairs come first, in the order of the up peaks.
+        :class:`PeakPairs` for at least min(ups, downs) pairs; the result. Confirmed pairs come
+        first, in the order of the up peaks.
     """
     if up.size == 1 and down.size == 1:  # fast path for the most frequent case
         confirming_peak = find_confirming_peak(
             up[0], doppler, down[0], doppler_prediction, fft_size, down_beat_sign, tolerance
         )
         if math.isfinite(confirming_peak.cost):
-            pairs[0, UP_COLUMN], pairs[0, DOWN_COLUMN] = 0, 0
-            pairs[0, DOPPLER_COLUMN] = confirming_peak.doppler_index
-            pairs[0, READING_COLUMN] = confirming_peak.reading
+            pairs.up[0], pairs.down[0] = 0, 0
+            pairs.doppler[0], pairs.reading[0] = (
+                confirming_peak.doppler_index,
+                confirming_peak.reading,
+            )
             return 1, 1
     cost = np.empty((up.size, down.size))
     doppler_of_pair = np.empty((up.size, down.size), np.int64)
@@ -185,9 +223,9 @@ def pair_peaks(
     for i in range(up.size):
         j = down_of_up[i]
         if j >= 0:
-            pairs[n_pairs, UP_COLUMN], pairs[n_pairs, DOWN_COLUMN] = i, j
-            pairs[n_pairs, DOPPLER_COLUMN] = doppler_of_pair[i, j]
-            pairs[n_pairs, READING_COLUMN] = reading_of_pair[i, j]
+            pairs.up[n_pairs], pairs.down[n_pairs] = i, j
+            pairs.doppler[n_pairs] = doppler_of_pair[i, j]
+            pairs.reading[n_pairs] = reading_of_pair[i, j]
             n_pairs += 1
     n_confirmed, j = n_pairs, 0
     for i in range(up.size):
@@ -205,9 +243,8 @@ def pair_peaks(
                 down_beat_sign,
                 chance_tolerance,
             ).reading
-            pairs[n_pairs, UP_COLUMN], pairs[n_pairs, DOWN_COLUMN] = i, j
-            pairs[n_pairs, DOPPLER_COLUMN] = -1
-            pairs[n_pairs, READING_COLUMN] = reading if reading >= 0 else two_beat_reading
+            pairs.up[n_pairs], pairs.doppler[n_pairs], pairs.down[n_pairs] = i, -1, j
+            pairs.reading[n_pairs] = reading if reading >= 0 else two_beat_reading
             n_pairs, j = n_pairs + 1, j + 1
     return n_confirmed, n_pairs
 
@@ -228,9 +265,7 @@ def find_confirming_peak(
     doppler
         (k,): positions of the Doppler peaks [bins].
     doppler_prediction
-        (3,): coefficients of the up beat and of the down beat in the predicted Doppler beat, and a
-        mismatch [bins]. The mismatch is the shift of the Doppler beat by the instrument's motion
-        between the segments. It is added to the tolerance.
+        :class:`DopplerPrediction` of the point.
     fft_size
         FFT size N.
     down_beat_sign
@@ -245,8 +280,8 @@ def find_confirming_peak(
         The peak of least cost within the tolerance.
     """
     least_cost, doppler_index, best_reading = np.inf, -1, -1
-    up_coefficient, down_coefficient, motion_change = doppler_prediction
-    tolerance += motion_change
+    up_coefficient, down_coefficient, motion_mismatch = doppler_prediction
+    tolerance += motion_mismatch
     for k in range(doppler.size):
         for reading in range(
             SIGNED_READING if down_beat_sign else 0,
@@ -336,7 +371,7 @@ def _match_pairs(cost):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitude):
+def judge_return(groups, positions, first_bin, last_bin, line_positions, beamlet_amplitude):
     """Compare a return's peaks with the truth; return its flag and the nearest beamlet.
 
     Range and velocity, to which the peaks are converted, are not compared here.
@@ -345,9 +380,11 @@ def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitud
     ----------
     groups, positions
         (3,): number of the group and position [bins] of the peak in each segment.
-    group_bins, line_positions, beamlet_amplitude
-        Fields of :class:`sweep.model.pointcloud.returns.DrawInputs` for one point. Beamlets of
-        amplitude 0 do not count.
+    first_bin, last_bin
+        (3, groups): first and last bin of the groups in each segment.
+    line_positions, beamlet_amplitude
+        (3, beamlets) [bins] and (beamlets,): position of each beamlet's line in each segment, and
+        amplitude of its echo. Beamlets of amplitude 0 do not count.
 
     Returns
     -------
@@ -369,9 +406,7 @@ def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitud
             if group < 0:
                 held_segments |= 1 << s
             elif (
-                group_bins[s, FIRST_ROW, group] - 1.0
-                <= line_positions[s, beamlet]
-                <= group_bins[s, LAST_ROW, group] + 1.0
+                first_bin[s, group] - 1.0 <= line_positions[s, beamlet] <= last_bin[s, group] + 1.0
             ):
                 held_segments |= 1 << s
                 distance += abs(line_positions[s, beamlet] - positions[s])

@@ -74,7 +74,7 @@ from sweep.model.detection.sub_bin_interpolation import (
     sub_bin_standard_error,
 )
 from sweep.model.evaluation import fit_peaks
-from sweep.model.pointcloud.bin_groups import FIRST_ROW, LAST_ROW, STRONGEST_ROW, BinGroups
+from sweep.model.pointcloud.bin_groups import BinGroups
 from sweep.model.pointcloud.ego_motion import EgoMotion
 from sweep.model.pointcloud.leaked_peaks import (
     LeakageBins,
@@ -91,6 +91,8 @@ from sweep.model.pointcloud.pairing import (
     NO_PEAK,
     TRUE_FLAG,
     UNCONFIRMED_FLAG,
+    DopplerPrediction,
+    PeakPairs,
     judge_return,
     pair_peaks,
 )
@@ -129,17 +131,80 @@ from sweep.model.sampling.speckle_lines import (
 )
 from sweep.model.spectrum.search_restriction import beamlet_line_positions
 
-BIN_COLUMN, POSITION_COLUMN, ERROR_COLUMN, RATIO_COLUMN = range(4)
-"""Columns of the array of a peak: whole bin; position between bins [bins]; standard error of the
-position by noise [bins]; |X| over sigma, the noise of a bin per quadrature."""
-
-
 DRAWN_INDEPENDENT_BINS_MAX = 32.0
 """Largest equivalent number of independent bins that are drawn for an echo in developed speckle."""
+
+ROUNDING_VARIANCE = 1 / 12
+"""Variance of the error by which a position is rounded to whole bins [bins^2]."""
 
 CORRELATED_LOOKS_MAX = 32
 """Largest number of looks (records of a segment) for which partly correlated speckle is drawn look
 by look. For more looks one drawn amplitude is compared with the probability of detection."""
+
+
+class Peak(NamedTuple):
+    """Peak of one segment in one draw."""
+
+    bin: float
+    """Number of the largest bin."""
+    position: float
+    """Position between bins [bins]."""
+    position_error: float
+    """Standard error of ``position`` by noise and by the spread of lines [bins]."""
+    magnitude_ratio: float
+    """|X| of the largest bin over sigma, the noise of a bin per quadrature."""
+
+
+UNDETECTED_PEAK = Peak(math.nan, math.nan, math.nan, math.nan)
+"""Peak of an echo that is not detected."""
+
+
+class Peaks(NamedTuple):
+    """Peaks of segments in arrays of equal shape; nan for no peak."""
+
+    bin: np.ndarray
+    """(...): number of the largest bin."""
+    position: np.ndarray
+    """(...): position between bins [bins]."""
+    position_error: np.ndarray
+    """(...): standard error of ``position`` by noise and by the spread of lines [bins]."""
+    magnitude_ratio: np.ndarray
+    """(...): |X| of the largest bin over sigma, the noise of a bin per quadrature."""
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> "Peaks":
+        """Return arrays of a given shape without peaks."""
+        return cls(*(np.full(shape, np.nan) for _ in cls._fields))
+
+    def select(self, indices: np.ndarray) -> "Peaks":
+        """Return the peaks with the given indices, or where a mask is True."""
+        return Peaks(*(values[indices] for values in self))
+
+    @property
+    def offset(self) -> np.ndarray:
+        """Position minus the number of the largest bin [bins], (...)."""
+        return self.position - self.bin
+
+
+class PeakLists(NamedTuple):
+    """Peaks of the three segments in one draw, as they are detected."""
+
+    peaks: Peaks
+    """(3, peaks) in each field: peaks of the up, Doppler and down segment."""
+    group: np.ndarray
+    """(3, peaks) int64: index of the group of adjacent bins to which each peak belongs, or
+    FALSE_PEAK."""
+    n_peaks: np.ndarray
+    """(3,) int64: number of peaks of each segment."""
+
+    @classmethod
+    def allocate(cls, peaks_max: int) -> "PeakLists":
+        """Allocate lists for at most ``peaks_max`` peaks of each segment, without peaks."""
+        return cls(
+            Peaks.empty((3, peaks_max)),
+            np.empty((3, peaks_max), np.int64),
+            np.zeros(3, np.int64),
+        )
 
 
 class Returns(NamedTuple):
@@ -248,6 +313,7 @@ def draw_returns(
         interpolator(shots.window, shots.fft_size),
     )
     window_bins = int(2 * inputs.line_grid.peak_search_bins.max(initial=0) + 1)
+    _, _, groups_max = bin_groups.strongest_bin.shape
     noise_roots: dict[int, np.ndarray] = {}
     for indices, spectra, part_leakage_bins in _iter_spectra(
         shots, bin_groups, in_noise, known_leakage_bins
@@ -257,7 +323,7 @@ def draw_returns(
             pfa_noise=at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins)
         )
         filter_rule = make_echo_noise_filter(shots, spectra, 0 if in_noise else window_bins)
-        n_noise_bins = filter_rule.weights.shape[0]
+        n_noise_bins = len(filter_rule.weights)
         if n_noise_bins not in noise_roots:
             noise_roots[n_noise_bins] = noise_covariance_root(filter_rule)
         part_config = config._replace(
@@ -283,10 +349,10 @@ def draw_returns(
             )
         n_filter_bins = max(
             window_bins,
-            part_config.end_noise_filter.weights.shape[0],
+            len(part_config.end_noise_filter.weights),
             int(spectra.n_bins.max(initial=0)),
         )
-        workspace = DrawWorkspace.allocate(n_filter_bins, bin_groups.strongest_bin.shape[2])
+        workspace = DrawWorkspace.allocate(n_filter_bins, groups_max)
         _draw_points(
             keys[indices],
             np.ascontiguousarray(indices, np.int64),
@@ -296,6 +362,8 @@ def draw_returns(
             part_leakage_bins,
             interpolation,
             workspace,
+            PeakLists.allocate(groups_max + 1),
+            PeakPairs.allocate(groups_max + 1),
             drawn_peaks,
         )
     return measure_returns(shots, inputs, drawn_peaks, motion)
@@ -405,10 +473,12 @@ class DrawConfig(NamedTuple):
             else waveform.FAR_READING
         )
         down_beat_sign = 0.0
+        _, has_doppler, _ = shots.has_segment
+        _, _, down_slope = shots.waveform.chirp_slopes
         if shots.complex_record:
             two_beat_reading, down_beat_sign = (
                 waveform.SIGNED_READING,
-                math.copysign(1.0, 1.0 - shots.waveform.chirp_slopes[2]),
+                math.copysign(1.0, 1.0 - down_slope),
             )
         votes = shots.looks.votes if shots.looks.combine == COMBINE_BINARY else 0
         if shots.speckle.look_speckle is not None and shots.looks.number > CORRELATED_LOOKS_MAX:
@@ -417,7 +487,7 @@ class DrawConfig(NamedTuple):
             int(first_draw),
             in_noise,
             shots.footprint.adds_powers,
-            bool(shots.has_segment[1]),
+            bool(has_doppler),
             shots.fft_size // 2,
             down_beat_sign,
             two_beat_reading,
@@ -441,15 +511,21 @@ class DrawInputs(NamedTuple):
     noise. sigma is the noise of a bin per quadrature.
     """
 
-    group_bins: np.ndarray
-    """(n, 3 segments, 3 rows, groups) int64: bins of the groups of adjacent bins above the
-    threshold; -1 for none. The rows are STRONGEST_ROW, FIRST_ROW and LAST_ROW."""
+    strongest_bin: np.ndarray
+    """(n, 3, groups) int64: number of the group's strongest bin; -1 for no group."""
+    first_bin: np.ndarray
+    """(n, 3, groups) int64: number of the group's first (lowest) bin; -1 for no group."""
+    last_bin: np.ndarray
+    """(n, 3, groups) int64: number of the group's last (highest) bin; -1 for no group."""
     pd: np.ndarray
     """(n, 3, groups): probability that a segment detects the group (adjacent bins above the
     threshold)."""
-    group_magnitudes: np.ndarray
-    """(n, 3, groups, 3): noiseless |X| [V] of the bin below the group's strongest bin, of that bin,
-    and of the bin above it."""
+    magnitude_below: np.ndarray
+    """(n, 3, groups): noiseless |X| of the bin below the group's strongest bin [V]."""
+    magnitude: np.ndarray
+    """(n, 3, groups): noiseless |X| of the group's strongest bin [V]."""
+    magnitude_above: np.ndarray
+    """(n, 3, groups): noiseless |X| of the bin above the group's strongest bin [V]."""
     line_deviation_bins: np.ndarray
     """(n, 3, groups): standard deviation, weighted by power, of the positions of the beamlets'
     lines in a group of adjacent bins [bins]."""
@@ -472,14 +548,18 @@ class DrawInputs(NamedTuple):
     (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa_noise: np.ndarray
     """(n, 3): probability that noise alone raises a false alarm in a segment."""
-    doppler_prediction: np.ndarray
-    """(n, 3): coefficients of the up and down beat in the predicted Doppler beat, and the effect of
-    known motion on it [bins] (:func:`sweep.model.pointcloud.pairing.find_confirming_peak`)."""
-    down_pd_given_up: np.ndarray
-    """(n, 2, groups): probability that the down segment detects a group. Index 0 holds if the up
-    segment misses the group of the same number, index 1 if it detects it."""
-    searched_range: np.ndarray
-    """(n, 3, 2) int64: first and last bin in which noise alone may raise a false peak."""
+    doppler_prediction: DopplerPrediction
+    """(n,) in each field: coefficients that predict the Doppler beat from the up and down beat."""
+    down_pd_if_up_missed: np.ndarray
+    """(n, groups): probability that the down segment detects a group, if the up segment misses the
+    group of the same number."""
+    down_pd_if_up_detected: np.ndarray
+    """(n, groups): probability that the down segment detects a group, if the up segment detects the
+    group of the same number."""
+    first_searched_bin: np.ndarray
+    """(n, 3) int64: first bin in which noise alone may raise a false peak."""
+    last_searched_bin: np.ndarray
+    """(n, 3) int64: last bin in which noise alone may raise a false peak."""
     line_grid: SpeckleLineGrid
     """Lines that represent the footprints in developed speckle; without speckle a grid of no
     points."""
@@ -507,7 +587,9 @@ class DrawInputs(NamedTuple):
         """Return the quantities of the points with the given indices."""
         return DrawInputs(
             *(
-                v.select(indices) if isinstance(v, (SpeckleLineGrid, BinThresholds)) else v[indices]
+                v.select(indices)
+                if isinstance(v, (SpeckleLineGrid, BinThresholds, DopplerPrediction))
+                else v[indices]
                 for v in self
             )  # type: ignore[arg-type]
         )
@@ -553,9 +635,9 @@ class DrawWorkspace(NamedTuple):
 class DrawnPeaks(NamedTuple):
     """Peaks of n points, drawn and paired into returns (measured points)."""
 
-    peaks: np.ndarray
-    """(n, draws, returns, 3, 4): up, Doppler and down peak of each return; nan for none. The
-    columns are BIN_COLUMN to RATIO_COLUMN."""
+    peaks: Peaks
+    """(n, draws, returns, 3) in each field: up, Doppler and down peak of each return; nan for none.
+    """
     reading: np.ndarray
     """(n, draws, returns) int64: number of the reading, the way to interpret the beats as range and
     velocity, for chirp slopes 1, 0 and -1; -1 without a return."""
@@ -574,7 +656,7 @@ class DrawnPeaks(NamedTuple):
         """Return arrays without returns, for ``draws`` draws of shots with these groups of bins."""
         n, _, groups_max = bin_groups.strongest_bin.shape
         return cls(
-            np.full((n, draws, groups_max, 3, 4), np.nan),
+            Peaks.empty((n, draws, groups_max, 3)),
             np.full((n, draws, groups_max), -1),
             np.full((n, draws, groups_max, 3), NO_PEAK, np.int8),
             np.zeros((n, draws, groups_max), np.uint8),
@@ -587,9 +669,8 @@ class ListedReturns(NamedTuple):
 
     point: np.ndarray
     """(m,) int64: index of the shot to which each return belongs."""
-    peaks: np.ndarray
-    """(m, 3, 4): up, Doppler and down peak of each return; nan for none. The columns are BIN_COLUMN
-    to RATIO_COLUMN."""
+    peaks: Peaks
+    """(m, 3) in each field: up, Doppler and down peak of each return; nan for none."""
     reading: np.ndarray
     """(m,) int64: number of the reading, the way to interpret the beats as range and velocity, for
     chirp slopes 1, 0 and -1."""
@@ -602,6 +683,20 @@ class ListedReturns(NamedTuple):
     beamlet: np.ndarray
     """(m,) int32: index of the beamlet whose surface a true or misread return measures; -1 for
     other returns."""
+
+    @classmethod
+    def from_drawn_peaks(cls, drawn_peaks: DrawnPeaks) -> "ListedReturns":
+        """List the returns of all points and draws, in this order."""
+        is_return = drawn_peaks.flags > 0
+        point, _, _ = np.nonzero(is_return)
+        return cls(
+            point=point,
+            peaks=drawn_peaks.peaks.select(is_return),
+            reading=drawn_peaks.reading[is_return],
+            group=drawn_peaks.group[is_return],
+            flags=drawn_peaks.flags[is_return],
+            beamlet=drawn_peaks.beamlet[is_return],
+        )
 
 
 def make_draw_inputs(
@@ -621,9 +716,6 @@ def make_draw_inputs(
     if shots.complex_record:
         apart = (line_positions - bin_groups.strongest_bin[:, :, :1]) / shots.fft_size
         line_positions = line_positions - shots.fft_size * np.floor(apart + 0.5)
-    group_bins = np.stack(
-        [bin_groups.strongest_bin, bin_groups.first_bin, bin_groups.last_bin], axis=2
-    )
     apart = line_positions[:, :, None] - bin_groups.strongest_bin[..., None]
     is_in_group = (line_positions[:, :, None] >= bin_groups.first_bin[..., None] - 1) & (
         line_positions[:, :, None] <= bin_groups.last_bin[..., None] + 1
@@ -636,33 +728,49 @@ def make_draw_inputs(
         pd_up.T, pd_down.T, (bin_groups.magnitude[:, 0].T, bin_groups.magnitude[:, 2].T)
     ).T
     down_pd = down_pd_given_up(pd_up, pd_down, pd_both)
+    magnitude_below, magnitude, magnitude_above = np.ascontiguousarray(
+        np.moveaxis(bin_groups.neighbour_magnitudes, -1, 0)
+    )
+    first_searched_bin, last_searched_bin = _searched_bins(shots)
+    echo_fraction, wander_deviation, n_independent_bins = _speckle_draw_inputs(shots, bin_groups)
+    threshold_ratio, line_noise_ratio = threshold_and_line_noise_ratios(shots)
     mean_offset = (weight * apart).sum(axis=-1) / total
     mean_square = (weight * apart**2).sum(axis=-1) / total
     line_deviation = np.sqrt(np.maximum(mean_square - mean_offset**2, 0.0))
     if shots.speckle.segment_correlations is not None:  # drawn lines include their spread
         line_deviation *= 0.0
     return DrawInputs(
-        group_bins,
-        bin_groups.pd,
-        bin_groups.neighbour_magnitudes,
-        line_deviation,
-        line_positions,
-        beamlet_amplitude,
-        np.array(np.broadcast_to(shots.bin_noise_sigma, shots.size)),
-        *threshold_and_line_noise_ratios(shots),
-        shots.bin_thresholds,
-        np.zeros(bin_groups.leakage.shape),
-        np.stack(
-            [np.broadcast_to(part, shots.size) for part in _doppler_prediction(shots, motion)],
-            axis=1,
+        strongest_bin=bin_groups.strongest_bin,
+        first_bin=bin_groups.first_bin,
+        last_bin=bin_groups.last_bin,
+        pd=bin_groups.pd,
+        magnitude_below=magnitude_below,
+        magnitude=magnitude,
+        magnitude_above=magnitude_above,
+        line_deviation_bins=line_deviation,
+        line_positions=line_positions,
+        beamlet_amplitude=beamlet_amplitude,
+        noise_sigma=np.array(np.broadcast_to(shots.bin_noise_sigma, shots.size)),
+        threshold_ratio=threshold_ratio,
+        line_noise_ratio=line_noise_ratio,
+        bin_thresholds=shots.bin_thresholds,
+        pfa_noise=np.zeros(bin_groups.leakage.shape),
+        doppler_prediction=DopplerPrediction(
+            *(np.array(np.broadcast_to(v, shots.size)) for v in _doppler_prediction(shots, motion))
         ),
-        np.ascontiguousarray(np.moveaxis(down_pd, 0, 1)),
-        _searched_ranges(shots),
-        speckle_line_grid(shots),
-        np.where(bin_groups.strongest_bin < 0, np.nan, bin_groups.strongest_bin + mean_offset),
-        *_speckle_draw_inputs(shots, bin_groups),
-        _segment_cholesky_factors(shots),
-        _look_covariance_roots(shots),
+        down_pd_if_up_missed=np.ascontiguousarray(down_pd.up_missed),
+        down_pd_if_up_detected=np.ascontiguousarray(down_pd.up_detected),
+        first_searched_bin=first_searched_bin,
+        last_searched_bin=last_searched_bin,
+        line_grid=speckle_line_grid(shots),
+        line_centre=np.where(
+            bin_groups.strongest_bin < 0, np.nan, bin_groups.strongest_bin + mean_offset
+        ),
+        echo_fraction=echo_fraction,
+        wander_deviation=wander_deviation,
+        n_independent_bins=n_independent_bins,
+        speckle_cholesky_factors=_segment_cholesky_factors(shots),
+        look_covariance_root=_look_covariance_roots(shots),
     )
 
 
@@ -758,12 +866,10 @@ def _speckle_draw_inputs(
     )
 
 
-def _doppler_prediction(
-    shots: Shots, motion: EgoMotion | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return two coefficients, of the up and the down beat, that predict the Doppler beat.
+def _doppler_prediction(shots: Shots, motion: EgoMotion | None = None) -> DopplerPrediction:
+    """Return the coefficients that predict the Doppler beat from the up and the down beat.
 
-    The third value is the mismatch of that prediction [bins] by the instrument's known motion.
+    The mismatch of the prediction is that by the instrument's known motion.
     """
     _, doppler, down = shots.waveform.chirp_slopes
     up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.waveform.carriers)
@@ -771,17 +877,21 @@ def _doppler_prediction(
     up_share = (doppler * at_down - down * at_doppler) / determinant
     down_share = (at_doppler - doppler * up_carrier) / determinant
     if motion is None:
-        return up_share, down_share, np.zeros(())
+        return DopplerPrediction(up_share, down_share, np.zeros(()))
     known_motion = (motion.acceleration, motion.slip_at(shots.range))
     mismatch = sum(
-        abs((up_share * beats[0] + down_share * beats[2] - beats[1]) * moved)
-        for beats, moved in zip(_beat_change_by_motion(shots), known_motion, strict=True)
+        abs((up_share * up_beat + down_share * down_beat - doppler_beat) * known_value)
+        for (up_beat, doppler_beat, down_beat), known_value in zip(
+            _beat_change_by_motion(shots), known_motion, strict=True
+        )
     )
-    return up_share, down_share, np.asarray(mismatch * shots.fft_size / shots.sample_rate)
+    return DopplerPrediction(
+        up_share, down_share, np.asarray(mismatch * shots.fft_size / shots.sample_rate)
+    )
 
 
-def _searched_ranges(shots: Shots) -> np.ndarray:
-    """Return the first and last bin in which noise alone may raise a false peak, (n, 3, 2).
+def _searched_bins(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first and the last bin in which noise alone may raise a false peak, (n, 3) each.
 
     N is the FFT size. For a complex record the bins are 0..N - 1. For a real record they are those
     whose noise is circular: all but a few next to frequency 0 and Nyquist, or 1..N/2 if noise is
@@ -789,38 +899,43 @@ def _searched_ranges(shots: Shots) -> np.ndarray:
     """
     first_searched, nyquist_bin = shots.first_searched_bin, shots.fft_size // 2
     last_searched = nyquist_bin - first_searched if shots.real_fft_size else nyquist_bin
-    bounds = np.empty((shots.size, 3, 2), np.int64)
-    bounds[:] = (0, shots.fft_size - 1) if shots.complex_record else (first_searched, last_searched)
+    first_bins, last_bins = np.empty((2, shots.size, 3), np.int64)
+    first_bins[:], last_bins[:] = (
+        (0, shots.fft_size - 1) if shots.complex_record else (first_searched, last_searched)
+    )
     if shots.detection_settings.search_band is not None:
         first, number = (
             shots.detection_settings.search_band[:, 0].T,
             shots.detection_settings.search_band[:, 1].T,
         )
         if shots.complex_record:
-            bounds[..., 0], bounds[..., 1] = first, first + number - 1
+            first_bins[:], last_bins[:] = first, first + number - 1
         else:
-            bounds[..., 0] = np.maximum(first, first_searched)
-            bounds[..., 1] = np.minimum(first + number - 1, nyquist_bin - first_searched)
-    return bounds
+            first_bins[:] = np.maximum(first, first_searched)
+            last_bins[:] = np.minimum(first + number - 1, nyquist_bin - first_searched)
+    return first_bins, last_bins
+
+
+class MeasuredValues(NamedTuple):
+    """Range and radial velocity of m returns, with errors."""
+
+    range: np.ndarray
+    """(m,): range of each return [m]."""
+    radial_velocity: np.ndarray
+    """(m,): radial velocity of each return [m/s]."""
+    range_error: np.ndarray
+    """(m,): standard error by noise of ``range`` [m]."""
+    velocity_error: np.ndarray
+    """(m,): standard error by noise of ``radial_velocity`` [m/s]."""
 
 
 class Measurements(NamedTuple):
-    """Range and radial velocity of m returns, with errors.
+    """Range and radial velocity of m returns, by whole bins and by positions between bins."""
 
-    The last axis of arrays (m, 2) has BIN_COLUMN, by whole bins, and POSITION_COLUMN, by positions
-    between bins.
-    """
-
-    range: np.ndarray
-    """(m, 2): range of each return [m], by whole bins and by positions between bins."""
-    radial_velocity: np.ndarray
-    """(m, 2): radial velocity of each return [m/s], by whole bins and by positions between bins."""
-    range_error: np.ndarray
-    """(m, 2): standard error by noise of ``range`` [m], by whole bins and by positions between
-    bins."""
-    velocity_error: np.ndarray
-    """(m, 2): standard error by noise of ``radial_velocity`` [m/s], by whole bins and by positions
-    between bins."""
+    by_bin: MeasuredValues
+    """(m,) in each field: values computed from the whole bins of the peaks."""
+    interpolated: MeasuredValues
+    """(m,) in each field: values computed from positions of the peaks between bins."""
     range_per_half_bin: np.ndarray
     """(m,): difference of range that shifts the beats of the chirps by half a bin [m]."""
     velocity_per_half_bin: np.ndarray
@@ -860,9 +975,7 @@ def measure_returns(
     is_return = drawn_peaks.flags > 0  # few of the entries
     returns = Returns.empty(is_return.shape)
     if is_return.any():
-        listed_returns = ListedReturns(
-            np.nonzero(is_return)[0], *(column[is_return] for column in drawn_peaks)
-        )
+        listed_returns = ListedReturns.from_drawn_peaks(drawn_peaks)
         measured_columns = _measure_listed_returns(
             shots, inputs, listed_returns, motion, from_three_bins
         )
@@ -892,15 +1005,15 @@ def _measure_listed_returns(
         )
     wander_covariance = _wander_covariance(shots, inputs, listed_returns)
     if wander_covariance is not None:
-        peaks = listed_returns.peaks.copy()
         wander_variance = np.diagonal(wander_covariance, axis1=-2, axis2=-1)
-        peaks[..., ERROR_COLUMN] = np.sqrt(peaks[..., ERROR_COLUMN] ** 2 + wander_variance)
-        listed_returns = listed_returns._replace(peaks=peaks)
+        listed_returns = listed_returns._replace(
+            peaks=listed_returns.peaks._replace(
+                position_error=np.sqrt(listed_returns.peaks.position_error**2 + wander_variance)
+            )
+        )
     measurements = measure(shots, listed_returns, wander_covariance)
     group = np.maximum(listed_returns.group, 0)
-    group_widths = (inputs.group_bins[:, :, LAST_ROW] - inputs.group_bins[:, :, FIRST_ROW])[
-        point[:, None], np.arange(3), group
-    ]
+    group_widths = (inputs.last_bin - inputs.first_bin)[point[:, None], np.arange(3), group]
     tolerance_half_bins = 2 * (
         4 + np.where(listed_returns.group >= 0, group_widths, 0).sum(axis=-1)
     )  # number of half bins
@@ -913,60 +1026,54 @@ def _measure_listed_returns(
         at_returns(shots.target.radial_velocity)
         + SPEED_OF_LIGHT / 2 * shots.footprint.doppler_ratio_offset[footprint_row, beamlet]
     )
-    range_error = measurements.range[:, POSITION_COLUMN] - measurements.range_bias - true_range
+    by_bin, interpolated = measurements.by_bin, measurements.interpolated
+    range_error = interpolated.range - measurements.range_bias - true_range
     is_right = abs(range_error) <= tolerance_half_bins * measurements.range_per_half_bin
     is_right &= (
-        abs(measurements.radial_velocity[:, POSITION_COLUMN] - true_velocity)
+        abs(interpolated.radial_velocity - true_velocity)
         <= tolerance_half_bins * measurements.velocity_per_half_bin
     )
     up_group, doppler_group, down_group = listed_returns.group.T
     is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK)
-    pd = inputs.pd[point, 0, group[:, 0]] * inputs.down_pd_given_up[point, 1, group[:, 2]]
+    up_index, _, down_index = group.T
+    pd = inputs.pd[point, 0, up_index] * inputs.down_pd_if_up_detected[point, down_index]
     is_misread = (listed_returns.flags & TRUE_FLAG > 0) & ~is_right
-    uncorrected = (
-        measurements.range[:, POSITION_COLUMN].copy(),
-        measurements.radial_velocity[:, POSITION_COLUMN].copy(),
-    )
+    up_ratio, _, down_ratio = listed_returns.peaks.magnitude_ratio.T
+    uncorrected = interpolated
     if not uses_fit:  # refer to the shot's start by the measured velocity
-        measurements.radial_velocity[:, POSITION_COLUMN] *= 1 + at_returns(
-            shots.motion.velocity_bias_fraction
+        velocity = interpolated.radial_velocity * (
+            1 + at_returns(shots.motion.velocity_bias_fraction)
         )
-        measurements.range[:, POSITION_COLUMN] += measurements.radial_velocity[
-            :, POSITION_COLUMN
-        ] * at_returns(shots.motion.range_walk_time)
-    per_slip: tuple[np.ndarray | float, np.ndarray | float] = 0.0, 0.0
+        interpolated = interpolated._replace(
+            radial_velocity=velocity,
+            range=interpolated.range + velocity * at_returns(shots.motion.range_walk_time),
+        )
+    per_slip = ShiftsByMotion(np.zeros(()), np.zeros(()))
     if motion is not None:
-        per_slip = _apply_motion_correction(shots, listed_returns, measurements, motion)
-    for values, errors, uncorrected_values in zip(
-        (measurements.range, measurements.radial_velocity),
-        (measurements.range_error, measurements.velocity_error),
-        uncorrected,
-        strict=True,
-    ):  # values by whole bins stay uncorrected; add the correction to their errors
-        errors[:, BIN_COLUMN] = np.hypot(
-            errors[:, BIN_COLUMN], values[:, POSITION_COLUMN] - uncorrected_values
+        by_bin, interpolated, per_slip = _correct_for_motion(
+            shots, listed_returns, by_bin, interpolated, motion
         )
     return Returns(
-        measurements.range[:, BIN_COLUMN],
-        measurements.range[:, POSITION_COLUMN],
-        measurements.radial_velocity[:, BIN_COLUMN],
-        measurements.radial_velocity[:, POSITION_COLUMN],
-        measurements.range_error[:, BIN_COLUMN],
-        measurements.range_error[:, POSITION_COLUMN],
-        measurements.velocity_error[:, BIN_COLUMN],
-        measurements.velocity_error[:, POSITION_COLUMN],
-        np.minimum(
-            listed_returns.peaks[:, 0, RATIO_COLUMN], listed_returns.peaks[:, 2, RATIO_COLUMN]
-        )
-        ** 2
-        / 2,
-        np.where(is_signal, pd, np.nan),
-        np.where(
+        range=by_bin.range,
+        range_interpolated=interpolated.range,
+        radial_velocity=by_bin.radial_velocity,
+        radial_velocity_interpolated=interpolated.radial_velocity,
+        # Values by whole bins stay uncorrected; the correction is added to their errors.
+        range_standard_error=np.hypot(by_bin.range_error, interpolated.range - uncorrected.range),
+        range_interpolated_standard_error=interpolated.range_error,
+        radial_velocity_standard_error=np.hypot(
+            by_bin.velocity_error, interpolated.radial_velocity - uncorrected.radial_velocity
+        ),
+        radial_velocity_interpolated_standard_error=interpolated.velocity_error,
+        snr=np.minimum(up_ratio, down_ratio) ** 2 / 2,
+        pd=np.where(is_signal, pd, np.nan),
+        flags=np.where(
             is_misread, listed_returns.flags ^ (TRUE_FLAG | MISREAD_FLAG), listed_returns.flags
         ),
-        listed_returns.beamlet,
-        np.maximum(listed_returns.group, FALSE_PEAK),
-        *(np.broadcast_to(change, point.shape) for change in per_slip),
+        beamlet=listed_returns.beamlet,
+        group=np.maximum(listed_returns.group, FALSE_PEAK),
+        range_per_slip=np.broadcast_to(per_slip.range, point.shape),
+        radial_velocity_per_slip=np.broadcast_to(per_slip.radial_velocity, point.shape),
     )
 
 
@@ -986,10 +1093,11 @@ def _wander_covariance(
     if line_gradients is None:
         return None
     covariance = np.zeros((*listed_returns.group.shape, 3))
-    is_echo = (listed_returns.group >= 0).any(axis=-1)
+    is_echo = np.asarray((listed_returns.group >= 0).any(axis=-1))
     point, group, peaks = (
-        column[is_echo]
-        for column in (listed_returns.point, listed_returns.group, listed_returns.peaks)
+        listed_returns.point[is_echo],
+        listed_returns.group[is_echo],
+        listed_returns.peaks.select(is_echo),
     )
     segment, point_column = np.arange(3), point[:, None]
     present = np.where(group >= 0, 1.0, np.nan)
@@ -998,22 +1106,17 @@ def _wander_covariance(
         np.broadcast_to(v, shots.size)[point_column]
         for v in (shots.bin_noise_sigma, shots.line_noise_sigma)
     )
-    signal_power = (
-        inputs.group_magnitudes[point_column, segment, group_index, 1] / noise_sigma
-    ) ** 2
+    signal_power = (inputs.magnitude[point_column, segment, group_index] / noise_sigma) ** 2
     mean_power = signal_power + 2 * (line_sigma / noise_sigma) ** 2
-    offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
+    offset = peaks.offset
     if (
         shots.detection_settings.echo_bins == "peak_bin"
     ):  # the position is relative to the group's strongest bin
-        bin_shift = (
-            peaks[..., BIN_COLUMN]
-            - inputs.group_bins[point_column, segment, STRONGEST_ROW, group_index]
-        )
+        bin_shift = peaks.bin - inputs.strongest_bin[point_column, segment, group_index]
         if shots.complex_record:
             bin_shift = bin_shift - shots.fft_size * np.rint(bin_shift / shots.fft_size)
         offset = offset + np.where(np.abs(bin_shift) <= 1, bin_shift, 0.0)
-    relative_power = present * peaks[..., RATIO_COLUMN] ** 2 / mean_power
+    relative_power = present * peaks.magnitude_ratio**2 / mean_power
     speckle_peaks = SpecklePeaks(
         offset, folding_signs(shots)[point], relative_power, signal_power / mean_power
     )
@@ -1052,13 +1155,17 @@ def _add_drift_errors(
             for rate in shots.frequency_drift_rates
         ]
     )
-    peaks = listed_returns.peaks.copy()
-    offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
+    offset, position_error = (
+        listed_returns.peaks.offset,
+        listed_returns.peaks.position_error.copy(),
+    )
     has_peak = np.isfinite(offset)
     drift_of_peak = drift_bins.T[listed_returns.point][has_peak]
     drift_errors = drift_error(offset[has_peak], drift_of_peak, shots.window, shots.fft_size)
-    peaks[has_peak, ERROR_COLUMN] = np.hypot(peaks[has_peak, ERROR_COLUMN], drift_errors)
-    return listed_returns._replace(peaks=peaks)
+    position_error[has_peak] = np.hypot(position_error[has_peak], drift_errors)
+    return listed_returns._replace(
+        peaks=listed_returns.peaks._replace(position_error=position_error)
+    )
 
 
 _POSITION_ERROR_MAX_BINS = 0.5
@@ -1075,66 +1182,97 @@ def _correct_late_echoes(
     exceeds half a bin, because a position is always within one.
     """
     at_returns = partial(_values_at, shots, listed_returns.point)
-    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[:, BIN_COLUMN])
-    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.radial_velocity[:, BIN_COLUMN])
+    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_bin.range)
+    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_bin.radial_velocity)
     n_missing = waveform.count_samples_before_echo(
         delay=delay, doppler_ratio=beta, record_start=at_returns(shots.record.acquisition_delay),
         sample_rate=at_returns(shots.sample_rate), length=shots.window.length,
     )  # fmt: skip
-    peaks = listed_returns.peaks.copy()
-    offset = np.nan_to_num(peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN])
+    peaks = listed_returns.peaks
+    offset = np.nan_to_num(peaks.offset)
     correction = late_echo_correction(offset, n_missing[:, None], shots.window, shots.fft_size)
-    peaks[..., POSITION_COLUMN] += correction.shift
     widened_errors = np.minimum(
-        peaks[..., ERROR_COLUMN] * correction.error_factor, _POSITION_ERROR_MAX_BINS
+        peaks.position_error * correction.error_factor, _POSITION_ERROR_MAX_BINS
     )
-    peaks[..., ERROR_COLUMN] = np.where(
+    position_error = np.where(
         correction.error_factor > 1,
-        np.maximum(widened_errors, peaks[..., ERROR_COLUMN]),
+        np.maximum(widened_errors, peaks.position_error),
         widened_errors,
     )
-    return listed_returns._replace(peaks=peaks)
+    return listed_returns._replace(
+        peaks=peaks._replace(
+            position=peaks.position + correction.shift, position_error=position_error
+        )
+    )
 
 
-def _apply_motion_correction(
-    shots: Shots, listed_returns: ListedReturns, measurements: Measurements, motion: EgoMotion
-) -> tuple[np.ndarray, np.ndarray]:
-    """Correct interpolated ranges and velocities for the instrument's known motion, in place.
+class ShiftsByMotion(NamedTuple):
+    """Shifts of measured range and velocity by motion that the beats hide."""
+
+    range: np.ndarray
+    """(m,): shift of the range [m] by one unit of the motion."""
+    radial_velocity: np.ndarray
+    """(m,): shift of the radial velocity [m/s] by one unit of the motion."""
+
+
+class MotionCorrection(NamedTuple):
+    """Measured values of m returns after the correction for the instrument's known motion."""
+
+    by_bin: MeasuredValues
+    """(m,) in each field: values computed from whole bins. Their errors alone are changed."""
+    interpolated: MeasuredValues
+    """(m,) in each field: values computed from positions between bins."""
+    per_slip: ShiftsByMotion
+    """(m,) in each field: shifts by a slip of 1 m/s. The slip is the closing speed minus the speed
+    at which the range falls."""
+
+
+def _correct_for_motion(
+    shots: Shots,
+    listed_returns: ListedReturns,
+    by_bin: MeasuredValues,
+    interpolated: MeasuredValues,
+    motion: EgoMotion,
+) -> MotionCorrection:
+    """Correct interpolated ranges and velocities for the instrument's known motion.
 
     The standard deviation by unknown motion is added to the standard errors
-    (:mod:`sweep.model.pointcloud.ego_motion`). Returns the shifts (m,) of range [s] and of velocity
-    by a slip of 1 m/s. The slip is the closing speed minus the speed at which the range falls.
+    (:mod:`sweep.model.pointcloud.ego_motion`).
     """
     motion = motion.select(listed_returns.point)
     per_acceleration, per_slip = _response_to_motion(shots, listed_returns)
-    known_slip = motion.slip_at(measurements.range[:, POSITION_COLUMN])
-    values_by = zip(
-        (measurements.range, measurements.radial_velocity), per_slip, per_acceleration, strict=True
+    known_slip = motion.slip_at(interpolated.range)
+    interpolated = interpolated._replace(
+        range=interpolated.range
+        - (per_slip.range * known_slip + per_acceleration.range * motion.acceleration),
+        radial_velocity=interpolated.radial_velocity
+        - (
+            per_slip.radial_velocity * known_slip
+            + per_acceleration.radial_velocity * motion.acceleration
+        ),
     )
-    for values, by_slip, by_acceleration in values_by:
-        values[:, POSITION_COLUMN] -= by_slip * known_slip + by_acceleration * motion.acceleration
-    slip_error = motion.slip_standard_error(measurements.range[:, POSITION_COLUMN])
-    errors_by = zip(
-        (measurements.range_error, measurements.velocity_error),
-        per_slip,
-        per_acceleration,
-        strict=True,
+    slip_error = motion.slip_standard_error(interpolated.range)
+    unknown_range, unknown_velocity = (
+        np.hypot(by_slip * slip_error, by_acceleration * motion.acceleration_standard_error)
+        for by_slip, by_acceleration in zip(per_slip, per_acceleration, strict=True)
     )
-    for errors, by_slip, by_acceleration in errors_by:
-        unknown_error = np.hypot(
-            by_slip * slip_error, by_acceleration * motion.acceleration_standard_error
+    by_bin, interpolated = (
+        values._replace(
+            range_error=np.hypot(values.range_error, unknown_range),
+            velocity_error=np.hypot(values.velocity_error, unknown_velocity),
         )
-        errors[:] = np.hypot(errors, unknown_error[:, None])
-    return per_slip
+        for values in (by_bin, interpolated)
+    )
+    return MotionCorrection(by_bin, interpolated, per_slip)
 
 
 def _response_to_motion(
     shots: Shots, listed_returns: ListedReturns
-) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return the shifts of measured range [m] and velocity [m/s] by motion that the beats hide.
+) -> tuple[ShiftsByMotion, ShiftsByMotion]:
+    """Return the shifts of measured range and velocity by motion that the beats hide.
 
-    The first pair of arrays (m,) is for an acceleration of 1 m/s^2, the second for a slip of 1 m/s.
-    The slip is the radial velocity minus the speed at which the range falls.
+    The first shifts are by an acceleration of 1 m/s^2, the second by a slip of 1 m/s. The slip is
+    the radial velocity minus the speed at which the range falls.
     """
     carriers, chirp_rates = shots.beat_coefficients
     by_acceleration, by_slip = _beat_change_by_motion(shots)
@@ -1146,21 +1284,23 @@ def _response_to_motion(
         point_index = slice(None)
         weights = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates
     else:
-        peak_errors = listed_returns.peaks[:, :, ERROR_COLUMN].T
+        peak_errors = listed_returns.peaks.position_error.T
         weights = np.where(np.isfinite(peak_errors), 1 / peak_errors**2, 0.0)
     per_acceleration, per_slip = (
-        tuple(
-            responses[point] if isinstance(point_index, slice) else responses
-            for responses in waveform.range_velocity_response(
-                beats[:, point_index],
-                weights=weights,
-                carriers=carriers[:, point_index],
-                chirp_rates=chirp_rates[:, point_index],
+        ShiftsByMotion(
+            *(
+                responses[point] if isinstance(point_index, slice) else responses
+                for responses in waveform.range_velocity_response(
+                    beats[:, point_index],
+                    weights=weights,
+                    carriers=carriers[:, point_index],
+                    chirp_rates=chirp_rates[:, point_index],
+                )
             )
         )
         for beats in (by_acceleration, by_slip)
     )
-    return per_acceleration, per_slip  # type: ignore[return-value]  # pairs
+    return per_acceleration, per_slip
 
 
 def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
@@ -1168,7 +1308,7 @@ def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
 
     The slip is the radial velocity minus the speed at which the range falls.
     """
-    chirp_rates = shots.beat_coefficients[1]
+    _, chirp_rates = shots.beat_coefficients
     starts = np.array([np.broadcast_to(start, shots.size) for start in shots.motion.segment_starts])
     middle_time = shots.record_middle_time
     two_over_c = 2 / SPEED_OF_LIGHT
@@ -1196,54 +1336,57 @@ def _measure_by_reading(
     the variance of the range, and adds to that of the velocity.
     """
     at_returns = partial(_values_at, shots, listed_returns.point)
+    up_carrier, _, _ = shots.waveform.carriers
     carrier, bandwidth, duration, sample_rate = (
         at_returns(values)
         for values in (
-            shots.waveform.carriers[0],
+            up_carrier,
             shots.waveform.chirp_bandwidth,
             shots.waveform.chirp_duration,
             shots.sample_rate,
         )
     )
     bin_width, chirp_rate = sample_rate / shots.fft_size, bandwidth / duration
-    up, down = (
-        listed_returns.peaks[:, side, : POSITION_COLUMN + 1] * bin_width[:, None] for side in (0, 2)
-    )
-    f_d, f_r = np.full((2, *up.shape), np.nan)
-    for reading in np.unique(listed_returns.reading):
-        has_reading = listed_returns.reading == reading
-        f_d[has_reading], f_r[has_reading] = waveform.beats_of_reading(
-            reading, up[has_reading], down[has_reading], sample_rate[has_reading, None]
+
+    def convert_peaks(peak_positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Convert the peaks of returns, at ``peak_positions`` (m, 3), to range and velocity."""
+        up, _, down = peak_positions.T * bin_width
+        f_d, f_r = np.full((2, up.size), np.nan)
+        for reading in np.unique(listed_returns.reading):
+            has_reading = listed_returns.reading == reading
+            f_d[has_reading], f_r[has_reading] = waveform.beats_of_reading(
+                reading, up[has_reading], down[has_reading], sample_rate[has_reading]
+            )
+        measured_range, measured_velocity = waveform.range_velocity_of_beats(
+            f_d, f_r, carrier, bandwidth, duration
         )
-    measured_range, measured_velocity = waveform.range_velocity_of_beats(
-        f_d, f_r, carrier[:, None], bandwidth[:, None], duration[:, None]
-    )
+        return measured_range, measured_velocity
+
     range_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / chirp_rate
     velocity_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / (carrier + bandwidth / 2)
-    up_error, _, down_error = listed_returns.peaks[:, :, ERROR_COLUMN].T
+    up_error, _, down_error = listed_returns.peaks.position_error.T
     variance = up_error**2 + down_error**2
     covariance = 0.0 if wander_covariance is None else 2 * wander_covariance[:, 0, 2]
     range_variance, velocity_variance = (
         np.maximum(variance + v, 0.0) for v in (-covariance, covariance)
     )
-    range_error, velocity_error = (
-        np.sqrt(np.stack([value + 1 / 6, value], axis=-1))
-        for value in (range_variance, velocity_variance)
+    by_bin, interpolated = (
+        MeasuredValues(
+            *convert_peaks(peak_positions),
+            range_error=range_per_half_bin * np.sqrt(range_variance + rounding_variance),
+            velocity_error=velocity_per_half_bin * np.sqrt(velocity_variance + rounding_variance),
+        )
+        for peak_positions, rounding_variance in (
+            (listed_returns.peaks.bin, 2 * ROUNDING_VARIANCE),
+            (listed_returns.peaks.position, 0.0),
+        )
     )
     # Up and down beat give the range at the mean of their starts, plus a term by acceleration.
     up_start, down_start = (at_returns(shots.motion.segment_starts[s]) for s in (0, 2))
     range_bias = carrier / chirp_rate * at_returns(shots.target.acceleration)
     range_bias = 0.5 * (down_start - up_start) * range_bias
     range_bias -= 0.5 * (down_start + up_start) * at_returns(shots.target.approach_speed)
-    return Measurements(
-        measured_range,
-        measured_velocity,
-        range_per_half_bin[:, None] * range_error,
-        velocity_per_half_bin[:, None] * velocity_error,
-        range_per_half_bin,
-        velocity_per_half_bin,
-        range_bias,
-    )
+    return Measurements(by_bin, interpolated, range_per_half_bin, velocity_per_half_bin, range_bias)
 
 
 def _measure_by_fit(
@@ -1254,8 +1397,8 @@ def _measure_by_fit(
     bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
     carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.waveform.carriers]
     chirp_rate = np.broadcast_to(shots.waveform.chirp_rate, shots.size)
-    peaks = np.moveaxis(listed_returns.peaks, 1, 0)
-    is_finite = np.isfinite(peaks[..., ERROR_COLUMN])
+    position_error = listed_returns.peaks.position_error.T
+    is_finite = np.isfinite(position_error)
 
     def deviations_by_errors(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
         """Return the standard deviations of range and velocity by errors (3, m) of beats [bins]."""
@@ -1271,33 +1414,29 @@ def _measure_by_fit(
             radial_velocity=shots.target.radial_velocity[points],
         )
 
-    results_by_column = []
-    for column in (BIN_COLUMN, POSITION_COLUMN):
-        errors = np.where(is_finite, peaks[..., ERROR_COLUMN], np.inf)
-        errors = np.hypot(errors, math.sqrt(1 / 12) if column == BIN_COLUMN else 0.0)
-        fitted = fit_peaks(shots, peaks[..., column] * bin_width[point], 1 / errors**2, point)
+    def fit_peak_positions(peak_positions: np.ndarray, rounding_variance: float) -> MeasuredValues:
+        """Fit range and velocity to the peaks of returns, at ``peak_positions`` (m, 3) [bins]."""
+        errors = np.where(is_finite, position_error, np.inf)
+        errors = np.hypot(errors, math.sqrt(rounding_variance))
+        fitted = fit_peaks(shots, peak_positions.T * bin_width[point], 1 / errors**2, point)
         deviations = deviations_by_errors(errors, point)
         if wander_covariance is not None:
             beat_covariance = wander_covariance * (bin_width[point] ** 2)[:, None, None]
             deviations = _add_wander_covariance(
                 shots, deviations, beat_covariance, 1 / errors**2, point
             )
-        results_by_column.append((*fitted, *deviations))
-    measured_range, measured_velocity, range_error, velocity_error = (
-        np.stack(pair, axis=-1) for pair in zip(*results_by_column, strict=True)
-    )
+        return MeasuredValues(*fitted, *deviations)
+
     segments = np.array(shots.has_segment)[:, None]
     half_bin_deviation = deviations_by_errors(
         np.where(segments, np.sqrt(0.5), np.inf) + 0 * bin_width, np.arange(shots.size)
     )
     return Measurements(
-        measured_range,
-        measured_velocity,
-        range_error,
-        velocity_error,
-        half_bin_deviation[0][point],
-        half_bin_deviation[1][point],
-        0.0,
+        by_bin=fit_peak_positions(listed_returns.peaks.bin, ROUNDING_VARIANCE),
+        interpolated=fit_peak_positions(listed_returns.peaks.position, 0.0),
+        range_per_half_bin=half_bin_deviation.range[point],
+        velocity_per_half_bin=half_bin_deviation.radial_velocity[point],
+        range_bias=0.0,
     )
 
 
@@ -1338,7 +1477,17 @@ def _add_wander_covariance(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_points(
-    keys, rows, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
+    keys,
+    rows,
+    config,
+    inputs,
+    spectra,
+    leakage_bins,
+    interpolation,
+    workspace,
+    peak_lists,
+    pairs,
+    drawn_peaks,
 ):
     """Draw the peaks of all segments, draws and points, and pair them into returns.
 
@@ -1352,29 +1501,29 @@ def _draw_points(
         Settings, and quantities, noiseless spectra and bins of leaked signal of the m points.
     interpolation
         Interpolator of the window.
-    workspace
-        Scratch.
+    workspace, peak_lists, pairs
+        Scratch: :class:`DrawWorkspace`, :class:`PeakLists` and
+        :class:`sweep.model.pointcloud.pairing.PeakPairs`.
     drawn_peaks
-        Result, for these and other points.
+        :class:`DrawnPeaks` of these and other points, the result.
     """
     _, draws, returns_max = drawn_peaks.flags.shape
-    peaks, peak_groups = np.zeros((3, returns_max + 1, 4)), np.empty((3, returns_max + 1), np.int64)
-    n_peaks, pairs = np.empty(3, np.int64), np.empty((returns_max + 1, 4), np.int64)
     is_up_detected, speckle_factors = np.zeros(returns_max, np.bool_), np.ones((returns_max, 3))
-    in_speckle = inputs.line_grid.line_shift.shape[0] > 0
+    in_speckle = len(inputs.line_grid.line_shift) > 0
     speckle = empty_group_speckle(returns_max)
     for i in range(rows.size):
         if in_speckle:
             speckle = prepare_group_speckle(i, config, inputs, spectra)
         for d in range(draws):
-            address = keys[i, 0], keys[i, 1], config.first_draw + d
+            address = philox.DrawAddress(keys[i, 0], keys[i, 1], config.first_draw + d)
             if in_speckle:
                 draw_group_speckle(address, i, inputs, speckle, speckle_factors)
             for s in range(3):
                 if s != 1 or config.has_doppler:
-                    n_peaks[s] = draw_segment_peaks(
+                    draw_segment_peaks(
                         address,
-                        (i, s),
+                        i,
+                        s,
                         config,
                         inputs,
                         spectra,
@@ -1383,19 +1532,11 @@ def _draw_points(
                         speckle,
                         interpolation,
                         workspace,
-                        peaks[s],
-                        peak_groups[s],
+                        peak_lists,
                         is_up_detected,
                     )
             pair_into_returns(
-                i,
-                (rows[i], d),
-                config,
-                inputs,
-                (peaks, peak_groups, n_peaks),
-                pairs,
-                workspace,
-                drawn_peaks,
+                i, rows[i], d, config, inputs, peak_lists, pairs, workspace, drawn_peaks
             )
 
 
@@ -1444,50 +1585,49 @@ def empty_group_speckle(groups_max):
     no_independent = np.zeros((0, 3, 0), np.complex128)
     factor_rank = np.zeros(groups_max, np.int64)
     return GroupSpeckle(
-        bins,
-        bins,
-        powers,
-        powers,
-        powers,
-        no_amplitudes,
-        factor_rank,
-        no_amplitudes,
-        no_independent,
-        powers,
+        first_bin=bins,
+        n_bins=bins,
+        mean_power=powers,
+        pseudo_variance_ratio=powers,
+        rms_ratio=powers,
+        amplitudes=no_amplitudes,
+        factor_rank=factor_rank,
+        factor=no_amplitudes,
+        independent_amplitudes=no_independent,
+        detection_weights=powers,
     )
 
 
 @njit(cache=True, error_model="numpy")
-def prepare_group_speckle(i, config, inputs, spectra):
+def prepare_group_speckle(point, config, inputs, spectra):
     """Return the bins of a point's echoes for which speckle is drawn, with their mean powers."""
-    groups_max, n_bins_max = inputs.group_bins.shape[3], 0
+    (_, _, groups_max), n_bins_max = inputs.strongest_bin.shape, 0
     first_bin, n_bins = np.zeros((groups_max, 3), np.int64), np.zeros((groups_max, 3), np.int64)
     for g in range(groups_max):
         for s in range(3):
-            strongest_bin = inputs.group_bins[i, s, STRONGEST_ROW, g]
+            strongest_bin = inputs.strongest_bin[point, s, g]
             if strongest_bin < 0:
                 continue
             if config.in_noise and config.lobe_half_width > 0:
-                span_first_bin, span_start = spectra.first_bin[i, s], spectra.bins_start[i, s]
-                span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[i, s]]
-                group_ends = (
-                    inputs.group_bins[i, s, FIRST_ROW, g] - span_first_bin,
-                    inputs.group_bins[i, s, LAST_ROW, g] - span_first_bin,
+                span_first_bin, span_start = (
+                    spectra.first_bin[point, s],
+                    spectra.bins_start[point, s],
                 )
+                span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[point, s]]
                 lobe_half_width = max(
-                    config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[i])
+                    config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[point])
                 )
                 begin, end = echo_bounds(
                     span_ratios,
-                    group_ends[0],
-                    group_ends[1],
-                    inputs.threshold_ratio[i],
+                    inputs.first_bin[point, s, g] - span_first_bin,
+                    inputs.last_bin[point, s, g] - span_first_bin,
+                    inputs.threshold_ratio[point],
                     lobe_half_width,
                 )
                 first_bin[g, s], n_bins[g, s] = span_first_bin + begin, end - begin + 1
             else:
-                first_bin[g, s] = strongest_bin - inputs.line_grid.peak_search_bins[i]
-                n_bins[g, s] = 2 * inputs.line_grid.peak_search_bins[i] + 1
+                first_bin[g, s] = strongest_bin - inputs.line_grid.peak_search_bins[point]
+                n_bins[g, s] = 2 * inputs.line_grid.peak_search_bins[point] + 1
             n_bins_max = max(n_bins_max, n_bins[g, s])
     mean_power, pseudo_variance_ratio = (
         np.zeros((groups_max, 3, n_bins_max)),
@@ -1504,8 +1644,8 @@ def prepare_group_speckle(i, config, inputs, spectra):
             continue
         has_images = mean_bin_powers(
             inputs.line_grid,
-            i,
-            inputs.line_centre[i, :, g],
+            point,
+            inputs.line_centre[point, :, g],
             first_bin[g],
             mean_power[g],
             pseudo_variance_ratio[g],
@@ -1513,16 +1653,15 @@ def prepare_group_speckle(i, config, inputs, spectra):
         if rows_max > 0 and not has_images:
             factor_rank[g] = factor_bin_covariance(
                 inputs.line_grid,
-                i,
-                inputs.line_centre[i, :, g],
+                point,
+                inputs.line_centre[point, :, g],
                 first_bin[g],
                 mean_power[g],
                 factor[g],
             )
     amplitudes = np.zeros((groups_max, n_looks, 3, n_bins_max), np.complex128)
-    independent_amplitudes = np.zeros(
-        (inputs.look_covariance_root.shape[3], 3, n_bins_max), np.complex128
-    )
+    _, _, _, n_independent_sets = inputs.look_covariance_root.shape
+    independent_amplitudes = np.zeros((n_independent_sets, 3, n_bins_max), np.complex128)
     rms_ratio, detection_weights = (
         np.zeros((groups_max, 3, n_bins_max)),
         np.zeros((groups_max, 3, n_bins_max)),
@@ -1532,8 +1671,9 @@ def prepare_group_speckle(i, config, inputs, spectra):
             if n_bins[g, s] == 0 or config.in_noise:
                 continue
             fill_detection_weights(
-                i,
-                (g, s),
+                point,
+                s,
+                g,
                 config,
                 inputs,
                 first_bin,
@@ -1543,33 +1683,36 @@ def prepare_group_speckle(i, config, inputs, spectra):
                 detection_weights[g, s],
             )
             strongest_index, noise_sigma = (
-                inputs.group_bins[i, s, STRONGEST_ROW, g] - first_bin[g, s],
-                inputs.noise_sigma[i],
+                inputs.strongest_bin[point, s, g] - first_bin[g, s],
+                inputs.noise_sigma[point],
             )
-            magnitudes = inputs.group_magnitudes[i, s, g]
             for k in range(n_bins[g, s]):
-                if abs(k - strongest_index) <= 1:
-                    rms_ratio[g, s, k] = magnitudes[1 + k - strongest_index] / noise_sigma
-                else:
+                magnitude = inputs.magnitude[point, s, g]
+                if k == strongest_index - 1:
+                    magnitude = inputs.magnitude_below[point, s, g]
+                elif k == strongest_index + 1:
+                    magnitude = inputs.magnitude_above[point, s, g]
+                rms_ratio[g, s, k] = magnitude / noise_sigma
+                if abs(k - strongest_index) > 1:
                     relative_power = mean_power[g, s, k] / mean_power[g, s, strongest_index]
-                    rms_ratio[g, s, k] = magnitudes[1] / noise_sigma * math.sqrt(relative_power)
+                    rms_ratio[g, s, k] *= math.sqrt(relative_power)
     return GroupSpeckle(
-        first_bin,
-        n_bins,
-        mean_power,
-        pseudo_variance_ratio,
-        rms_ratio,
-        amplitudes,
-        factor_rank,
-        factor,
-        independent_amplitudes,
-        detection_weights,
+        first_bin=first_bin,
+        n_bins=n_bins,
+        mean_power=mean_power,
+        pseudo_variance_ratio=pseudo_variance_ratio,
+        rms_ratio=rms_ratio,
+        amplitudes=amplitudes,
+        factor_rank=factor_rank,
+        factor=factor,
+        independent_amplitudes=independent_amplitudes,
+        detection_weights=detection_weights,
     )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fill_detection_weights(
-    point, group_and_segment, config, inputs, first_bin, mean_power, factor_rank, factor, weights
+    point, segment, group, config, inputs, first_bin, mean_power, factor_rank, factor, weights
 ):
     """Compute the weights (bins,) of an echo's bins in the amplitude that decides on its detection.
 
@@ -1577,11 +1720,8 @@ def fill_detection_weights(
     as a lone line in the middle of the echo would fill them. The amplitudes of two segments then
     have the same correlation as in the middle of the echo.
     """
-    group, segment = group_and_segment
     weights[:] = 0.0
-    weights[inputs.group_bins[point, segment, STRONGEST_ROW, group] - first_bin[group, segment]] = (
-        1.0
-    )
+    weights[inputs.strongest_bin[point, segment, group] - first_bin[group, segment]] = 1.0
     if config.lobe_half_width == 0 or factor_rank[group] == 0:
         return
     weighted_power = 0.0
@@ -1599,21 +1739,22 @@ def fill_detection_weights(
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
+def draw_group_speckle(address, point, inputs, speckle, speckle_factors):
     """Draw the speckle of a point's echoes, and set factors on their magnitudes.
 
     ``speckle_factors`` (groups, 3), a result, has one row for each echo (group of adjacent bins)
     and one column for each segment. The complex amplitudes are written into ``speckle``.
     """
-    for g in range(speckle.n_bins.shape[0]):
+    n_groups, n_looks, _, _ = speckle.amplitudes.shape
+    n_independent_sets = len(speckle.independent_amplitudes)
+    for g in range(n_groups):
         speckle_factors[g] = 1.0
         if speckle.n_bins[g].max() == 0:
             continue
-        n_independent_sets = speckle.independent_amplitudes.shape[0]
-        for look in range(
-            n_independent_sets if n_independent_sets > 0 else speckle.amplitudes.shape[1]
-        ):
-            own = address[0], address[1], address[2] + look * LOOK_DRAW_STRIDE
+        for look in range(n_independent_sets if n_independent_sets > 0 else n_looks):
+            look_address = philox.DrawAddress(
+                address.key_0, address.key_1, address.draw + look * LOOK_DRAW_STRIDE
+            )
             amplitudes = (
                 speckle.independent_amplitudes[look]
                 if n_independent_sets > 0
@@ -1621,16 +1762,16 @@ def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
             )
             if speckle.factor_rank[g] > 0:
                 draw_factored_amplitudes(
-                    own, g, speckle.factor[g], speckle.factor_rank[g], amplitudes
+                    look_address, g, speckle.factor[g], speckle.factor_rank[g], amplitudes
                 )
             else:
                 draw_bin_amplitudes(
-                    own, g, inputs.line_grid, i, inputs.line_centre[i, :, g], speckle.first_bin[g],
-                    speckle.mean_power[g], amplitudes,
+                    look_address, g, inputs.line_grid, point, inputs.line_centre[point, :, g],
+                    speckle.first_bin[g], speckle.mean_power[g], amplitudes,
                 )  # fmt: skip
         if n_independent_sets > 0:
             mix_look_amplitudes(
-                inputs.look_covariance_root[i],
+                inputs.look_covariance_root[point],
                 speckle.independent_amplitudes,
                 speckle.amplitudes[g],
             )
@@ -1638,16 +1779,17 @@ def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
             if speckle.n_bins[g, s] == 0:
                 continue
             strongest_index, power_sum = (
-                inputs.group_bins[i, s, STRONGEST_ROW, g] - speckle.first_bin[g, s],
+                inputs.strongest_bin[point, s, g] - speckle.first_bin[g, s],
                 0.0,
             )
-            for look in range(speckle.amplitudes.shape[1]):
-                own = speckle.amplitudes[g, look, s]
+            for look in range(n_looks):
+                amplitudes = speckle.amplitudes[g, look, s]
+                strongest_amplitude = amplitudes[strongest_index]
                 for k in range(speckle.n_bins[g, s]):
                     if not speckle.mean_power[g, s, k] > 0.0:  # no line reaches it
-                        own[k] = own[strongest_index]
-                power_sum += own[strongest_index].real ** 2 + own[strongest_index].imag ** 2
-            speckle_factors[g, s] = math.sqrt(power_sum / speckle.amplitudes.shape[1])
+                        amplitudes[k] = strongest_amplitude
+                power_sum += strongest_amplitude.real**2 + strongest_amplitude.imag**2
+            speckle_factors[g, s] = math.sqrt(power_sum / n_looks)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1657,10 +1799,11 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
     Independent amplitudes are (sets, 3, bins) complex, those of the looks (looks, 3, bins).
     """
     look_amplitudes[:] = 0.0
-    for look in range(look_amplitudes.shape[0]):
+    n_sets, _, n_bins = independent_amplitudes.shape
+    for look in range(len(look_amplitudes)):
         for s in range(3):
-            for set_index in range(independent_amplitudes.shape[0]):
-                for bin_ in range(independent_amplitudes.shape[2]):
+            for set_index in range(n_sets):
+                for bin_ in range(n_bins):
                     look_amplitudes[look, s, bin_] += (
                         covariance_root[s, look, set_index]
                         * independent_amplitudes[set_index, s, bin_]
@@ -1668,33 +1811,42 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def pair_into_returns(i, row_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
+def pair_into_returns(point, row, draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
     """Pair the peaks of one point and draw into returns, and compare each return with the truth.
 
     Parameters
     ----------
-    i
+    point
         Index of the point in ``inputs``.
-    row_and_draw
+    row, draw
         Index of the point, and index of the draw, in ``drawn_peaks``.
     config, inputs
         Settings, and quantities of the points.
     peak_lists
-        Peaks (3, groups + 1, 4), their groups (3, groups + 1), and their numbers (3,).
+        :class:`PeakLists` of the draw.
     pairs
-        (groups + 1, 4) int64: scratch for :func:`sweep.model.pointcloud.pairing.pair_peaks`.
+        :class:`sweep.model.pointcloud.pairing.PeakPairs`: scratch.
     workspace
         Scratch.
     drawn_peaks
         Result.
     """
-    (row, d), (peaks, peak_groups, n_peaks) = row_and_draw, peak_lists
+    peaks = peak_lists.peaks
+    n_up, n_doppler, n_down = (
+        peak_lists.n_peaks[0],
+        peak_lists.n_peaks[1],
+        peak_lists.n_peaks[2],
+    )
     if config.has_doppler:
         n_confirmed, n_pairs = pair_peaks(
-            peaks[0, : n_peaks[0], POSITION_COLUMN],
-            peaks[1, : n_peaks[1], POSITION_COLUMN],
-            peaks[2, : n_peaks[2], POSITION_COLUMN],
-            inputs.doppler_prediction[i],
+            peaks.position[0, :n_up],
+            peaks.position[1, :n_doppler],
+            peaks.position[2, :n_down],
+            DopplerPrediction(
+                inputs.doppler_prediction.up_coefficient[point],
+                inputs.doppler_prediction.down_coefficient[point],
+                inputs.doppler_prediction.motion_mismatch[point],
+            ),
             2.0 * config.nyquist_bin,
             config.down_beat_sign,
             config.two_beat_reading,
@@ -1702,56 +1854,52 @@ def pair_into_returns(i, row_and_draw, config, inputs, peak_lists, pairs, worksp
             pairs,
         )
     else:
-        n_confirmed = n_pairs = min(n_peaks[0], n_peaks[2])
+        n_confirmed = n_pairs = min(n_up, n_down)
         for r in range(n_pairs):
-            pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3] = r, -1, r, config.two_beat_reading
-    for r in range(min(n_pairs, drawn_peaks.flags.shape[2])):
-        up_index, doppler_index, down_index, drawn_peaks.reading[row, d, r] = pairs[r]
-        peak_group_row, positions = drawn_peaks.group[row, d, r], workspace.peak_positions
-        positions[1] = 0.0
-        peak_group_row[0], peak_group_row[2] = peak_groups[0, up_index], peak_groups[2, down_index]
-        positions[0], positions[2] = (
-            peaks[0, up_index, POSITION_COLUMN],
-            peaks[2, down_index, POSITION_COLUMN],
-        )
-        if doppler_index >= 0:
-            peak_group_row[1], positions[1] = (
-                peak_groups[1, doppler_index],
-                peaks[1, doppler_index, POSITION_COLUMN],
-            )
+            pairs.up[r], pairs.doppler[r], pairs.down[r] = r, -1, r
+            pairs.reading[r] = config.two_beat_reading
+    _, _, returns_max = drawn_peaks.flags.shape
+    for r in range(min(n_pairs, returns_max)):
+        drawn_peaks.reading[row, draw, r] = pairs.reading[r]
+        group, positions = drawn_peaks.group[row, draw, r], workspace.peak_positions
+        peak_of_segment = pairs.up[r], pairs.doppler[r], pairs.down[r]
         for s in range(3):
-            if (
-                peak_group_row[s] >= 0 and inputs.line_grid.line_shift.shape[0] > 0
-            ):  # position of the echo, without its wander by speckle
-                positions[s] = inputs.line_centre[i, s, peak_group_row[s]]
-        for s in range(3):  # a complex record's groups may be multiples of N from their peaks
-            if config.down_beat_sign != 0.0 and peak_group_row[s] >= 0:
-                bin_distance = (
-                    inputs.group_bins[i, s, STRONGEST_ROW, peak_group_row[s]] - positions[s]
-                )
+            k = peak_of_segment[s]
+            if k < 0:  # no Doppler peak
+                positions[s] = 0.0
+                continue
+            group[s], positions[s] = peak_lists.group[s, k], peaks.position[s, k]
+            drawn_peaks.peaks.bin[row, draw, r, s] = peaks.bin[s, k]
+            drawn_peaks.peaks.position[row, draw, r, s] = peaks.position[s, k]
+            drawn_peaks.peaks.position_error[row, draw, r, s] = peaks.position_error[s, k]
+            drawn_peaks.peaks.magnitude_ratio[row, draw, r, s] = peaks.magnitude_ratio[s, k]
+            if group[s] < 0:
+                continue
+            if len(inputs.line_grid.line_shift) > 0:  # without the echo's wander by speckle
+                positions[s] = inputs.line_centre[point, s, group[s]]
+            if config.down_beat_sign != 0.0:  # groups may be multiples of N from their peaks
+                bin_distance = inputs.strongest_bin[point, s, group[s]] - positions[s]
                 positions[s] += (
                     2
                     * config.nyquist_bin
                     * math.floor(bin_distance / (2 * config.nyquist_bin) + 0.5)
                 )
-        peak_rows = drawn_peaks.peaks[row, d, r]
-        for f in range(4):  # slices would compile an error message about shapes
-            peak_rows[0, f], peak_rows[2, f] = peaks[0, up_index, f], peaks[2, down_index, f]
-            peak_rows[1, f] = peaks[1, doppler_index, f] if doppler_index >= 0 else np.nan
-        flag, drawn_peaks.beamlet[row, d, r] = judge_return(
-            peak_group_row,
+        flag, drawn_peaks.beamlet[row, draw, r] = judge_return(
+            group,
             positions,
-            inputs.group_bins[i],
-            inputs.line_positions[i],
-            inputs.beamlet_amplitude[i],
+            inputs.first_bin[point],
+            inputs.last_bin[point],
+            inputs.line_positions[point],
+            inputs.beamlet_amplitude[point],
         )
-        drawn_peaks.flags[row, d, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
+        drawn_peaks.flags[row, draw, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_segment_peaks(
     address,
-    point_and_segment,
+    point,
+    segment,
     config,
     inputs,
     spectra,
@@ -1760,18 +1908,17 @@ def draw_segment_peaks(
     speckle,
     interpolation,
     workspace,
-    peaks,
-    peak_groups,
+    peak_lists,
     is_up_detected,
 ):
-    """Draw the peaks of one segment in one draw, and return their number.
+    """Draw the peaks of one segment in one draw.
 
     Parameters
     ----------
     address
-        Key of the point (two uint64) and number of the draw.
-    point_and_segment
-        Point and segment.
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment
+        Index of the point, and segment.
     config, inputs, spectra, leakage_bins
         Settings, quantities of the points, noiseless spectra, and bins of leaked signal.
     speckle_factors
@@ -1782,23 +1929,27 @@ def draw_segment_peaks(
         Interpolator of the window.
     workspace
         Scratch.
-    peaks, peak_groups
-        Results: (groups + 1, 4) peaks, and (groups + 1,) their groups or FALSE_PEAK.
+    peak_lists
+        :class:`PeakLists`, the result: those of this segment are set.
     is_up_detected
         (groups,) bool: True for groups detected in the up segment. The up segment is drawn first
         and sets this array.
     """
-    (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
-    line_noise_ratio = inputs.line_noise_ratio[i]
-    group_bins, n_peaks = inputs.group_bins[i, s], 0
-    for g in range(group_bins.shape[1]):
-        if group_bins[STRONGEST_ROW, g] < 0:
+    key_0, key_1, draw = address
+    noise_sigma, threshold_ratio = inputs.noise_sigma[point], inputs.threshold_ratio[point]
+    line_noise_ratio, strongest_bins = (
+        inputs.line_noise_ratio[point],
+        inputs.strongest_bin[point, segment],
+    )
+    n_peaks = 0
+    for g in range(strongest_bins.size):
+        if strongest_bins[g] < 0:
             break
         if config.in_noise and config.lobe_half_width > 0:
-            is_detected = draw_all_bins(
+            is_detected, peak = draw_all_bins(
                 address,
-                point_and_segment,
+                point,
+                segment,
                 g,
                 config,
                 inputs,
@@ -1806,12 +1957,12 @@ def draw_segment_peaks(
                 speckle,
                 interpolation,
                 workspace,
-                peaks[n_peaks],
             )
         elif config.in_noise:
-            is_detected = draw_peak_bin(
+            is_detected, peak = draw_peak_bin(
                 address,
-                point_and_segment,
+                point,
+                segment,
                 g,
                 config,
                 inputs,
@@ -1819,62 +1970,51 @@ def draw_segment_peaks(
                 speckle,
                 interpolation,
                 workspace,
-                peaks[n_peaks],
             )
-        elif speckle.n_bins[g, s] > 0:
-            is_detected = detect_in_speckle(
-                address,
-                point_and_segment,
-                g,
-                config,
-                inputs,
-                speckle,
-                interpolation,
-                workspace,
-                peaks[n_peaks],
+        elif speckle.n_bins[g, segment] > 0:
+            is_detected, peak = detect_in_speckle(
+                address, point, segment, g, config, inputs, speckle, interpolation, workspace
             )
         else:
-            chance = (
-                inputs.down_pd_given_up[i, 1 if is_up_detected[g] else 0, g]
-                if s == 2
-                else inputs.pd[i, s, g]
-            )
-            uniform = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g)
-            is_detected = uniform < chance
+            pd = inputs.pd[point, segment, g]
+            if segment == 2 and is_up_detected[g]:
+                pd = inputs.down_pd_if_up_detected[point, g]
+            elif segment == 2:
+                pd = inputs.down_pd_if_up_missed[point, g]
+            uniform = philox.uniform(key_0, key_1, draw, philox.STREAM_DETECTION[segment], g)
+            is_detected, peak = uniform < pd, UNDETECTED_PEAK
             if is_detected:
-                magnitudes, line_deviation = (
-                    inputs.group_magnitudes[i, s, g],
-                    inputs.line_deviation_bins[i, s, g],
-                )
                 offset, ratio = (
                     estimate_sub_bin_offset(
-                        magnitudes[0], magnitudes[1], magnitudes[2], interpolation
+                        inputs.magnitude_below[point, segment, g],
+                        inputs.magnitude[point, segment, g],
+                        inputs.magnitude_above[point, segment, g],
+                        interpolation,
                     ),
-                    magnitudes[1] / noise_sigma,
+                    inputs.magnitude[point, segment, g] / noise_sigma,
                 )
                 error = sub_bin_standard_error(
                     offset, ratio / line_noise_ratio, interpolation
                 ) / math.sqrt(config.n_looks)
                 # Add the power of the pedestal under the lines.
                 ratio = math.sqrt(ratio * ratio + 2.0 * (line_noise_ratio * line_noise_ratio - 1.0))
-                normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
-                position = group_bins[STRONGEST_ROW, g] + offset + error * normal
-                store_peak(
-                    peaks[n_peaks],
-                    group_bins[STRONGEST_ROW, g],
-                    position,
+                normal, _ = philox.normal_pair(key_0, key_1, draw, philox.STREAM_NOISE[segment], g)
+                peak = fold_peak(
+                    strongest_bins[g],
+                    strongest_bins[g] + offset + error * normal,
                     error,
                     ratio,
-                    line_deviation,
+                    inputs.line_deviation_bins[point, segment, g],
                     config,
                     interpolation,
                 )
-        if s == 0:
+        if segment == 0:
             is_up_detected[g] = is_detected
         if is_detected:
-            peak_groups[n_peaks] = g
+            store_peak(peak, g, segment, n_peaks, peak_lists)
             n_peaks += 1
-    n_free = peaks.shape[0] - n_peaks
+    _, n_peaks_max = peak_lists.group.shape
+    n_free = n_peaks_max - n_peaks
     false_bins, false_ratios, n_false = (
         workspace.false_bins[:n_free],
         workspace.false_ratios[:n_free],
@@ -1884,10 +2024,11 @@ def draw_segment_peaks(
     if config.in_noise:
         n_false = list_noisy_leaked_peaks(
             address,
-            point_and_segment,
+            point,
+            segment,
             spectra,
             leakage_bins,
-            speckle_factors[:, s],
+            speckle_factors[:, segment],
             threshold_ratio,
             interpolation,
             false_bins,
@@ -1896,7 +2037,8 @@ def draw_segment_peaks(
     else:
         n_false = draw_leaked_peaks(
             address,
-            point_and_segment,
+            point,
+            segment,
             leakage_bins,
             speckle_factors,
             threshold_ratio,
@@ -1905,51 +2047,58 @@ def draw_segment_peaks(
             false_bins,
             false_ratios,
         )
-    stream = philox.STREAM_NOISE_MAXIMUM[s] if config.in_noise else philox.STREAM_FALSE_ALARM[s]
-    random_words = philox.four_words(a, b, draw, stream, philox.FIRST_BLOCK_NUMBER)
-    chance = philox.to_uniform(random_words[0])
-    if chance < inputs.pfa_noise[i, s]:
+    stream = (
+        philox.STREAM_NOISE_MAXIMUM[segment]
+        if config.in_noise
+        else philox.STREAM_FALSE_ALARM[segment]
+    )
+    alarm_word, bin_word, _, _ = philox.four_words(
+        key_0, key_1, draw, stream, philox.FIRST_BLOCK_NUMBER
+    )
+    uniform = philox.to_uniform(alarm_word)
+    if uniform < inputs.pfa_noise[point, segment]:
         ratio = max(
-            largest_noise_magnitude(spectra.n_noise_bins[i, s], chance, config.n_looks),
+            largest_noise_magnitude(spectra.n_noise_bins[point, segment], uniform, config.n_looks),
             threshold_ratio,
         )
-        searched_range = inputs.searched_range[i, s, 0], inputs.searched_range[i, s, 1]
         excluded_bins = leakage_bins.excluded_bins[
-            leakage_bins.excluded_slice[i, s, 0] : leakage_bins.excluded_slice[i, s, 1]
+            leakage_bins.excluded_begin[point, segment] : leakage_bins.excluded_end[point, segment]
         ]
-        chance = philox.to_uniform(random_words[1])
         false_bin = draw_free_bin(
-            chance,
-            group_bins,
+            philox.to_uniform(bin_word),
+            strongest_bins,
+            inputs.first_bin[point, segment],
+            inputs.last_bin[point, segment],
             excluded_bins,
-            searched_range,
+            inputs.first_searched_bin[point, segment],
+            inputs.last_searched_bin[point, segment],
             2 * config.nyquist_bin,
             config.down_beat_sign,
         )
-        n_false = insert_peak((false_bin, ratio), false_bins, false_ratios, n_false)
+        n_false = insert_peak(false_bin, ratio, false_bins, false_ratios, n_false)
     for n in range(n_false):
         error = sub_bin_standard_error(0.0, false_ratios[n], interpolation) / math.sqrt(
             config.n_looks
         )
-        store_peak(
-            peaks[n_peaks],
+        peak = fold_peak(
             false_bins[n],
-            false_bins[n],
+            float(false_bins[n]),
             error,
             false_ratios[n],
             0.0,
             config,
             interpolation,
         )
-        peak_groups[n_peaks] = FALSE_PEAK
+        store_peak(peak, FALSE_PEAK, segment, n_peaks, peak_lists)
         n_peaks += 1
-    return n_peaks
+    peak_lists.n_peaks[segment] = n_peaks
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def list_noisy_leaked_peaks(
     address,
-    point_and_segment,
+    point,
+    segment,
     spectra,
     leakage_bins,
     speckle_factors,
@@ -1965,28 +2114,30 @@ def list_noisy_leaked_peaks(
     factors on the groups' magnitudes. ``bins`` and ``ratios``, the results, are the bins and |X| /
     sigma of the peaks.
     """
-    (a, b, draw), (i, s) = address, point_and_segment
+    key_0, key_1, draw = address
     n_peaks, previous_bin, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
     correlation, is_echo = interpolation.sidelobe_correlation, False
     independent_part = math.sqrt(1.0 - correlation * correlation)
-    for n in range(spectra.leaked_slice[i, s, 0], spectra.leaked_slice[i, s, 1]):
-        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], spectra.leaked_index[n])
+    for n in range(spectra.leaked_begin[point, segment], spectra.leaked_end[point, segment]):
+        re, im = philox.normal_pair(
+            key_0, key_1, draw, philox.STREAM_NOISE[segment], spectra.leaked_index[n]
+        )
         speckle_factor = speckle_factors[leakage_bins.group[n]]
         ratio = math.hypot(spectra.leaked_ratio[n] * speckle_factor + re, im)
         if ratio < threshold_ratio:
             continue
-        bin_number = spectra.first_bin[i, s] + spectra.leaked_index[n]
+        bin_number = spectra.first_bin[point, segment] + spectra.leaked_index[n]
         if bin_number != previous_bin + 1:
-            n_peaks = insert_peak(
-                (np.int64(-1) if is_echo else peak, largest), bins, ratios, n_peaks
-            )
+            n_peaks = insert_peak(np.int64(-1) if is_echo else peak, largest, bins, ratios, n_peaks)
             peak, largest, is_echo = np.int64(-1), 0.0, False
         previous_bin = bin_number
         if ratio > largest:
             peak, largest = bin_number, ratio
         if spectra.exempt_neighbour_ratio[n] > 0.0:
             neighbour_index = spectra.leaked_index[n] + spectra.exempt_neighbour_side[n]
-            re_own, im_own = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], neighbour_index)
+            re_own, im_own = philox.normal_pair(
+                key_0, key_1, draw, philox.STREAM_NOISE[segment], neighbour_index
+            )
             in_phase = (
                 spectra.exempt_neighbour_ratio[n] * speckle_factor
                 + correlation * re
@@ -1996,59 +2147,74 @@ def list_noisy_leaked_peaks(
                 math.hypot(in_phase, correlation * im + independent_part * im_own)
                 >= threshold_ratio
             )
-    return insert_peak((np.int64(-1) if is_echo else peak, largest), bins, ratios, n_peaks)
+    return insert_peak(np.int64(-1) if is_echo else peak, largest, bins, ratios, n_peaks)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_peak_bin(
-    address,
-    point_and_segment,
-    group,
-    config,
-    inputs,
-    spectra,
-    speckle,
-    interpolation,
-    workspace,
-    peak,
+    address, point, segment, group, config, inputs, spectra, speckle, interpolation, workspace
 ):
-    """Add noise to an echo's strongest bin; if it reaches the threshold, set the peak.
+    """Add noise to an echo's strongest bin, and detect the echo if that reaches the threshold.
 
-    Returns True if it does.
+    Parameters
+    ----------
+    address
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment, group
+        Indices of the point, the segment and the echo (group of adjacent bins).
+    config, inputs, spectra, speckle, interpolation, workspace
+        Arguments of :func:`draw_segment_peaks`.
+
+    Returns
+    -------
+    is_detected : bool
+        True if the echo is detected.
+    peak : Peak
+        Its peak; UNDETECTED_PEAK if it is not detected.
     """
-    (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
-    line_noise_ratio = inputs.line_noise_ratio[i]
-    strongest_bin, stream = inputs.group_bins[i, s, STRONGEST_ROW, group], philox.STREAM_NOISE[s]
-    k = strongest_bin - spectra.first_bin[i, s]
-    re, im = philox.normal_pair(a, b, draw, stream, k)
+    key_0, key_1, draw = address
+    noise_sigma, threshold_ratio = inputs.noise_sigma[point], inputs.threshold_ratio[point]
+    line_noise_ratio = inputs.line_noise_ratio[point]
+    strongest_bin, stream = (
+        inputs.strongest_bin[point, segment, group],
+        philox.STREAM_NOISE[segment],
+    )
+    k = strongest_bin - spectra.first_bin[point, segment]
+    re, im = philox.normal_pair(key_0, key_1, draw, stream, k)
     is_real = is_real_bin(strongest_bin, config.real_fft_size > 0, config.real_fft_size)
     if is_real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * line_noise_ratio, im * line_noise_ratio
-    group_magnitudes = inputs.group_magnitudes[i, s, group]
-    near_end = speckle.n_bins[group, s] > 0 and is_near_end(strongest_bin - 1, 3, config)
+    near_end = speckle.n_bins[group, segment] > 0 and is_near_end(strongest_bin - 1, 3, config)
     noise = workspace.noise
     if near_end:
         draw_noise_near_end(
-            (a, b, draw, stream),
+            address,
+            stream,
             ECHO_NOISE_FIRST_INDEX * (1 + group),
-            (strongest_bin - 1, 3),
+            strongest_bin - 1,
+            3,
             config,
             noise,
         )
         re, im = line_noise_ratio * noise.in_phase[1], line_noise_ratio * noise.in_quadrature[1]
-    amplitude = speckled_amplitude(group_magnitudes[1] / noise_sigma, speckle, group, s, 1)
+    amplitude = speckled_amplitude(
+        inputs.magnitude[point, segment, group] / noise_sigma, speckle, group, segment, 1
+    )
     if (amplitude.real + re) ** 2 + (amplitude.imag + im) ** 2 < threshold_ratio * threshold_ratio:
-        return False
+        return False, UNDETECTED_PEAK
     # Neighbours are exempt from false alarms, so the random numbers of their bins are unused.
-    re_below, im_below = philox.normal_pair(a, b, draw, stream, k - 1 if k > 0 else k + 2)
-    re_above, im_above = philox.normal_pair(a, b, draw, stream, k + 1)
+    re_below, im_below = philox.normal_pair(key_0, key_1, draw, stream, k - 1 if k > 0 else k + 2)
+    re_above, im_above = philox.normal_pair(key_0, key_1, draw, stream, k + 1)
     re_below, im_below = re_below * line_noise_ratio, im_below * line_noise_ratio
     re_above, im_above = re_above * line_noise_ratio, im_above * line_noise_ratio
     from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
-    amplitude_below = speckled_amplitude(group_magnitudes[0] / noise_sigma, speckle, group, s, 0)
-    amplitude_above = speckled_amplitude(group_magnitudes[2] / noise_sigma, speckle, group, s, 2)
+    amplitude_below = speckled_amplitude(
+        inputs.magnitude_below[point, segment, group] / noise_sigma, speckle, group, segment, 0
+    )
+    amplitude_above = speckled_amplitude(
+        inputs.magnitude_above[point, segment, group] / noise_sigma, speckle, group, segment, 2
+    )
     below_ratio = math.hypot(
         amplitude_below.real
         + (from_centre * re + below_from_above * re_above + below_own * re_below),
@@ -2075,17 +2241,15 @@ def draw_peak_bin(
         sub_bin_standard_error(offset, centre_ratio / line_noise_ratio, interpolation),
         max(below_ratio, centre_ratio, above_ratio),
     )
-    store_peak(
-        peak,
+    return True, fold_peak(
         strongest_bin + peak_shift,
         strongest_bin + offset,
         error,
         ratio,
-        inputs.line_deviation_bins[i, s, group],
+        inputs.line_deviation_bins[point, segment, group],
         config,
         interpolation,
     )
-    return True
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -2098,11 +2262,11 @@ def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def detect_in_speckle(
-    address, point_and_segment, group, config, inputs, speckle, interpolation, workspace, peak
+    address, point, segment, group, config, inputs, speckle, interpolation, workspace
 ):
-    """Draw an echo in developed speckle; return True and set its peak if it is detected.
+    """Draw an echo in developed speckle; return True if it is detected, and its :class:`Peak`.
 
-    The bins of the echo are a group of adjacent bins.
+    The arguments and results are those of :func:`draw_peak_bin`.
 
     The group's amplitude is a complex Gaussian number: echo plus noise, with ``echo_fraction`` of
     the mean power in the echo. The group is detected if its power exceeds the level that is
@@ -2112,50 +2276,56 @@ def detect_in_speckle(
     independent bins is detected by any of as many amplitudes, the first of which is the drawn one.
     Several looks detect by the powers of their strongest bins.
     """
-    (a, b, draw), (i, s) = address, point_and_segment
-    threshold_ratio, line_noise_ratio = inputs.threshold_ratio[i], inputs.line_noise_ratio[i]
+    threshold_ratio, line_noise_ratio = (
+        inputs.threshold_ratio[point],
+        inputs.line_noise_ratio[point],
+    )
     strongest_bin, first_bin = (
-        inputs.group_bins[i, s, STRONGEST_ROW, group],
-        speckle.first_bin[group, s],
+        inputs.strongest_bin[point, segment, group],
+        speckle.first_bin[group, segment],
     )
     strongest_index, n_bins, pd = (
         strongest_bin - first_bin,
-        speckle.n_bins[group, s],
-        inputs.pd[i, s, group],
+        speckle.n_bins[group, segment],
+        inputs.pd[point, segment, group],
     )
-    n_independent_bins = inputs.n_independent_bins[i, s, group]
+    n_independent_bins = inputs.n_independent_bins[point, segment, group]
     if n_independent_bins > 1.0:
         pd = -math.expm1(math.log1p(-pd) / n_independent_bins)
     echo_fraction, is_noncircular = (
-        inputs.echo_fraction[i, s, group],
+        inputs.echo_fraction[point, segment, group],
         is_near_end(first_bin, n_bins, config),
     )
     if not pd > 0.0:
-        return False
+        return False, UNDETECTED_PEAK
+    _, n_speckle_looks, _, _ = speckle.amplitudes.shape
     power, noise = workspace.bin_power[:n_bins], workspace.noise
     power[:] = 0.0
     in_phase, in_quadrature, n_votes = 0.0, 0.0, 0
     echo_weight, noise_weight = math.sqrt(echo_fraction), math.sqrt(0.5 * (1.0 - echo_fraction))
     for look in range(config.n_looks):
-        look_draw = draw + look * LOOK_DRAW_STRIDE
-        address_of_noise = a, b, look_draw, philox.STREAM_NOISE[s]
+        look_address = philox.DrawAddress(
+            address.key_0, address.key_1, address.draw + look * LOOK_DRAW_STRIDE
+        )
         if n_bins == 3 and not is_noncircular:
-            draw_three_bin_noise(address_of_noise, 3 * group, interpolation, noise)
+            draw_three_bin_noise(
+                look_address, philox.STREAM_NOISE[segment], 3 * group, interpolation, noise
+            )
         else:
             draw_adjacent_noise(
-                address_of_noise,
+                look_address,
+                philox.STREAM_NOISE[segment],
                 ECHO_NOISE_FIRST_INDEX * (1 + group),
-                (first_bin, n_bins),
+                first_bin,
+                n_bins,
                 config,
                 noise,
             )
-        bin_amplitudes = speckle.amplitudes[
-            group, look if speckle.amplitudes.shape[1] > 1 else 0, s
-        ]
+        bin_amplitudes = speckle.amplitudes[group, look if n_speckle_looks > 1 else 0, segment]
         for k in range(n_bins):
             magnitude_ratio, bin_weight = (
-                speckle.rms_ratio[group, s, k],
-                echo_weight * speckle.detection_weights[group, s, k],
+                speckle.rms_ratio[group, segment, k],
+                echo_weight * speckle.detection_weights[group, segment, k],
             )
             re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * noise.in_phase[k]
             im = (
@@ -2182,7 +2352,7 @@ def detect_in_speckle(
         )
     elif is_noncircular:
         mean_pseudo_variance = (
-            echo_fraction * speckle.pseudo_variance_ratio[group, s, strongest_index]
+            echo_fraction * speckle.pseudo_variance_ratio[group, segment, strongest_index]
         )
         mean_pseudo_variance += (1.0 - echo_fraction) * pseudo_variance_ratio_at(
             abs(strongest_bin), config.nyquist_bin, config.noise_pseudo_variance_ratio
@@ -2193,9 +2363,9 @@ def detect_in_speckle(
     else:
         is_detected = math.exp(-(in_phase * in_phase + in_quadrature * in_quadrature)) < pd
         if not is_detected and n_independent_bins > 1.0:
-            is_detected = is_detected_by_other_bin(address, (i, s), group, inputs, pd)
+            is_detected = is_detected_by_other_bin(address, point, segment, group, inputs, pd)
     if not is_detected:
-        return False
+        return False, UNDETECTED_PEAK
     peak_index = strongest_index
     if n_bins > 3:
         for k in range(1, n_bins - 1):
@@ -2212,8 +2382,7 @@ def detect_in_speckle(
         offset, peak_magnitude / line_noise_ratio, interpolation
     ) / math.sqrt(config.n_looks)
     ratio = max(below, peak_magnitude, above, threshold_ratio)
-    store_peak(
-        peak,
+    return True, fold_peak(
         first_bin + peak_index + peak_shift,
         first_bin + peak_index + offset,
         error,
@@ -2222,7 +2391,6 @@ def detect_in_speckle(
         config,
         interpolation,
     )
-    return True
 
 
 _OTHER_BINS_RANDOM_OFFSET = 1 << 22
@@ -2231,26 +2399,26 @@ strongest. Each echo has a range of indices."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_bin_pd):
+def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_pd):
     """Return True if an echo is detected by an independent bin other than its strongest bin.
 
     ``single_bin_pd`` is the probability of detection of one bin. The last of the bins is a fraction
     of one.
     """
-    (a, b, draw), (i, s) = address, point_and_segment
+    key_0, key_1, draw = address
     n_bins_left, echo_fraction = (
-        inputs.n_independent_bins[i, s, group] - 1.0,
-        inputs.echo_fraction[i, s, group],
+        inputs.n_independent_bins[point, segment, group] - 1.0,
+        inputs.echo_fraction[point, segment, group],
     )
     random_index = _OTHER_BINS_RANDOM_OFFSET + group * int(DRAWN_INDEPENDENT_BINS_MAX)
     while n_bins_left > 1e-6:
         speckle_amplitude = speckle_amplitudes(
-            (a, b), draw, random_index, inputs.speckle_cholesky_factors[i]
-        )[s]
-        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], random_index)
+            address, random_index, inputs.speckle_cholesky_factors[point]
+        )[segment]
+        re, im = philox.normal_pair(key_0, key_1, draw, philox.STREAM_NOISE[segment], random_index)
         noise_weight, echo_weight = math.sqrt(0.5 * (1.0 - echo_fraction)), math.sqrt(echo_fraction)
-        power = (echo_weight * speckle_amplitude[0] + noise_weight * re) ** 2 + (
-            echo_weight * speckle_amplitude[1] + noise_weight * im
+        power = (echo_weight * speckle_amplitude.real + noise_weight * re) ** 2 + (
+            echo_weight * speckle_amplitude.imag + noise_weight * im
         ) ** 2
         if math.exp(-power) < (
             single_bin_pd
@@ -2263,16 +2431,16 @@ def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_b
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_adjacent_noise(address, first_index, first_and_count, config, noise):
+def draw_adjacent_noise(address, stream, first_index, first_bin, n_bins, config, noise):
     """Draw the noise of adjacent bins over sigma, the standard deviation per quadrature.
 
     Parameters
     ----------
-    address
-        Key (two uint64), draw and stream.
+    address, stream
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`), and stream.
     first_index
         Stream index of the first pair of independent numbers.
-    first_and_count
+    first_bin, n_bins
         First bin, and number of bins.
     config
         Settings with the filters.
@@ -2280,16 +2448,15 @@ def draw_adjacent_noise(address, first_index, first_and_count, config, noise):
         :class:`sweep.model.sampling.draws.NoiseScratch`, the result. It has at least as many bins;
         for bins near DC or Nyquist as many as ``config.end_noise_filter``.
     """
-    first_bin, n_bins = first_and_count
     touches_end = config.real_fft_size > 0 and (
         first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_fft_size
     )
     if is_near_end(first_bin, n_bins, config):
-        draw_noise_near_end(address, first_index, first_and_count, config, noise)
-    elif n_bins <= config.noise_root.shape[0] and not touches_end:
-        draw_bin_noise_by_root(address, first_index, n_bins, config.noise_root, noise)
+        draw_noise_near_end(address, stream, first_index, first_bin, n_bins, config, noise)
+    elif n_bins <= len(config.noise_root) and not touches_end:
+        draw_bin_noise_by_root(address, stream, first_index, n_bins, config.noise_root, noise)
     else:
-        draw_bin_noise(address, first_index, first_bin, n_bins, config.noise_filter, noise)
+        draw_bin_noise(address, stream, first_index, first_bin, n_bins, config.noise_filter, noise)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -2302,13 +2469,12 @@ def is_near_end(first_bin, n_bins, config):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_noise_near_end(address, first_index, first_and_count, config, noise):
+def draw_noise_near_end(address, stream, first_index, first_bin, n_bins, config, noise):
     """Draw the noise of adjacent bins near frequency 0 (DC) or Nyquist.
 
     The arguments are those of :func:`draw_adjacent_noise`. Bins beyond either end are complex
     conjugates of their mirror images.
     """
-    first_bin, n_bins = first_and_count
     last_bin = first_bin + n_bins - 1
     drawn_first, drawn_last = 0, max(last_bin, -first_bin)
     if first_bin >= config.noise_pseudo_variance_ratio.size:
@@ -2318,6 +2484,7 @@ def draw_noise_near_end(address, first_index, first_and_count, config, noise):
         )
     draw_bin_noise(
         address,
+        stream,
         first_index,
         drawn_first,
         drawn_last - drawn_first + 1,
@@ -2335,13 +2502,13 @@ def draw_noise_near_end(address, first_index, first_and_count, config, noise):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_three_bin_noise(address, first_index, interpolation, noise):
+def draw_three_bin_noise(address, stream, first_index, interpolation, noise):
     """Draw the noise of three adjacent bins over sigma, the standard deviation per quadrature.
 
     Parameters
     ----------
-    address
-        Key of the point (two uint64), number of the draw, and stream.
+    address, stream
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`), and stream.
     first_index
         Stream index of the first pair of independent numbers.
     interpolation
@@ -2351,18 +2518,23 @@ def draw_three_bin_noise(address, first_index, interpolation, noise):
     """
     noise_re, noise_im = noise.in_phase, noise.in_quadrature
     from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
-    a, b, draw, stream = address
-    # Each four words make two of the pairs.
-    words = philox.four_words(a, b, draw, stream, first_index >> 1)
-    next_words = philox.four_words(a, b, draw, stream, (first_index >> 1) + 1)
+    key_0, key_1, draw = address
+    block = first_index >> 1
+    # Each block of four words makes two pairs, of which the first has an even index.
+    even_radius, even_angle, odd_radius, odd_angle = philox.four_words(
+        key_0, key_1, draw, stream, block
+    )
+    next_even_radius, next_even_angle, next_odd_radius, next_odd_angle = philox.four_words(
+        key_0, key_1, draw, stream, block + 1
+    )
     if first_index & 1:
-        re, im = philox.to_normals(words[2], words[3])
-        re_above, im_above = philox.to_normals(next_words[0], next_words[1])
-        re_below, im_below = philox.to_normals(next_words[2], next_words[3])
+        re, im = philox.to_normals(odd_radius, odd_angle)
+        re_above, im_above = philox.to_normals(next_even_radius, next_even_angle)
+        re_below, im_below = philox.to_normals(next_odd_radius, next_odd_angle)
     else:
-        re, im = philox.to_normals(words[0], words[1])
-        re_above, im_above = philox.to_normals(words[2], words[3])
-        re_below, im_below = philox.to_normals(next_words[0], next_words[1])
+        re, im = philox.to_normals(even_radius, even_angle)
+        re_above, im_above = philox.to_normals(odd_radius, odd_angle)
+        re_below, im_below = philox.to_normals(next_even_radius, next_even_angle)
     noise_re[0] = from_centre * re + below_from_above * re_above + below_own * re_below
     noise_im[0] = from_centre * im + below_from_above * im_above + below_own * im_below
     noise_re[1], noise_im[1] = re, im
@@ -2374,36 +2546,30 @@ def draw_three_bin_noise(address, first_index, interpolation, noise):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_all_bins(
-    address,
-    point_and_segment,
-    group,
-    config,
-    inputs,
-    spectra,
-    speckle,
-    interpolation,
-    workspace,
-    peak,
+    address, point, segment, group, config, inputs, spectra, speckle, interpolation, workspace
 ):
-    """Add noise to all bins of an echo; if any reaches the threshold, set the peak.
+    """Add noise to all bins of an echo, and detect the echo if any reaches the threshold.
 
-    Returns True if one does. The peak is the largest of these bins.
+    The arguments and results are those of :func:`draw_peak_bin`. The peak is the largest of these
+    bins.
     """
-    (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
-    line_noise_ratio = inputs.line_noise_ratio[i]
-    span_first_bin, span_start = spectra.first_bin[i, s], spectra.bins_start[i, s]
-    span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[i, s]]
+    noise_sigma, threshold_ratio = inputs.noise_sigma[point], inputs.threshold_ratio[point]
+    line_noise_ratio = inputs.line_noise_ratio[point]
+    span_first_bin, span_start = (
+        spectra.first_bin[point, segment],
+        spectra.bins_start[point, segment],
+    )
+    span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[point, segment]]
     first_index, last_index = (
-        inputs.group_bins[i, s, FIRST_ROW, group] - span_first_bin,
-        inputs.group_bins[i, s, LAST_ROW, group] - span_first_bin,
+        inputs.first_bin[point, segment, group] - span_first_bin,
+        inputs.last_bin[point, segment, group] - span_first_bin,
     )
     first_index, last_index = echo_bounds(
         span_ratios,
         first_index,
         last_index,
         threshold_ratio,
-        max(config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[i])),
+        max(config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[point])),
     )
     n_bins, peak_index = last_index - first_index + 1, 0
     pedestal_power, noise = workspace.pedestal_power[:n_bins], workspace.noise
@@ -2413,19 +2579,17 @@ def draw_all_bins(
         magnitudes = workspace.bin_power[:n_bins]
         for k in range(n_bins):
             magnitudes[k] = noise_sigma * span_ratios[first_index + k]
-        bin_threshold = bin_threshold_at(inputs.bin_thresholds, i)
+        bin_threshold = bin_threshold_at(inputs.bin_thresholds, point)
         fill_pedestal_ratios(magnitudes, workspace.all_echo[:n_bins], bin_threshold, pedestal_power)
-    address_of_noise, first_number = (
-        (a, b, draw, philox.STREAM_NOISE[s]),
-        ECHO_NOISE_FIRST_INDEX * (1 + group),
-    )
-    if speckle.n_bins[group, s] > 0:
+    stream, first_number = philox.STREAM_NOISE[segment], ECHO_NOISE_FIRST_INDEX * (1 + group)
+    if speckle.n_bins[group, segment] > 0:
         draw_adjacent_noise(
-            address_of_noise, first_number, (span_first_bin + first_index, n_bins), config, noise
+            address, stream, first_number, span_first_bin + first_index, n_bins, config, noise
         )
     else:
         draw_bin_noise(
-            address_of_noise,
+            address,
+            stream,
             first_number,
             span_first_bin + first_index,
             n_bins,
@@ -2434,11 +2598,13 @@ def draw_all_bins(
         )
     for k in range(n_bins):
         amplitude, noise_deviation = (
-            speckled_amplitude(span_ratios[first_index + k], speckle, group, s, k),
+            speckled_amplitude(span_ratios[first_index + k], speckle, group, segment, k),
             1.0,
         )
         if pedestal_power[k] > 0.0:  # the pedestal fades as the lines do
-            power = pedestal_power[k] * abs(speckled_amplitude(1.0, speckle, group, s, k)) ** 2
+            power = (
+                pedestal_power[k] * abs(speckled_amplitude(1.0, speckle, group, segment, k)) ** 2
+            )
             noise_deviation = math.sqrt(1.0 + power)
         re, im = (
             amplitude.real + noise_deviation * noise.in_phase[k],
@@ -2446,9 +2612,9 @@ def draw_all_bins(
         )
         ratios[k] = math.hypot(re, im)
         peak_index = k if ratios[k] > ratios[peak_index] else peak_index
-    peak_ratio, line_deviation = ratios[peak_index], inputs.line_deviation_bins[i, s, group]
+    peak_ratio = ratios[peak_index]
     if peak_ratio < threshold_ratio:
-        return False
+        return False, UNDETECTED_PEAK
     below_ratio = ratios[peak_index - 1] if peak_index > 0 else 0.0
     above_ratio = ratios[peak_index + 1] if peak_index + 1 < n_bins else 0.0
     offset, peak_bin = (
@@ -2456,69 +2622,99 @@ def draw_all_bins(
         span_first_bin + first_index + peak_index,
     )
     error = sub_bin_standard_error(offset, peak_ratio / line_noise_ratio, interpolation)
-    store_peak(
-        peak, peak_bin, peak_bin + offset, error, peak_ratio, line_deviation, config, interpolation
+    return True, fold_peak(
+        peak_bin,
+        peak_bin + offset,
+        error,
+        peak_ratio,
+        inputs.line_deviation_bins[point, segment, group],
+        config,
+        interpolation,
     )
-    return True
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def store_peak(peak, bin_number, position, error, ratio, line_deviation, config, interpolation):
-    """Write the columns of a peak, mirrored into 0..N/2 if it is beyond DC or Nyquist.
+def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, interpolation):
+    """Return a peak, mirrored into 0..N/2 if it is beyond DC or Nyquist.
 
-    N is the FFT size.
-
-    A peak of a complex record wraps from N/2 to -N/2. The error by the spread of lines
-    (`line_deviation`, [bins]) is added to the `error` by noise.
+    N is the FFT size. A peak of a complex record wraps from N/2 to -N/2. The error by the spread of
+    lines (`line_deviation`, [bins]) is added to `noise_error`, that by noise [bins].
     """
     fft_size = 2 * config.nyquist_bin
     if config.down_beat_sign:
         wrap_shift = fft_size * math.floor((bin_number + config.nyquist_bin) / fft_size)
-        peak[BIN_COLUMN], peak[POSITION_COLUMN] = bin_number - wrap_shift, position - wrap_shift
+        folded_bin, folded_position = float(bin_number - wrap_shift), position - wrap_shift
     else:
-        bin_number, position = abs(bin_number), abs(position)
-        peak[BIN_COLUMN] = fft_size - bin_number if bin_number > config.nyquist_bin else bin_number
-        peak[POSITION_COLUMN] = fft_size - position if position > config.nyquist_bin else position
+        folded_bin, folded_position = float(abs(bin_number)), abs(position)
+        if folded_bin > config.nyquist_bin:
+            folded_bin = fft_size - folded_bin
+        if folded_position > config.nyquist_bin:
+            folded_position = fft_size - folded_position
     line_error = line_spread_error(
-        peak[POSITION_COLUMN] - peak[BIN_COLUMN],
+        folded_position - folded_bin,
         line_deviation,
         config.adds_powers or not config.has_doppler,
         interpolation,
     )
-    peak[ERROR_COLUMN], peak[RATIO_COLUMN] = math.hypot(error, line_error), ratio
+    return Peak(folded_bin, folded_position, math.hypot(noise_error, line_error), ratio)
+
+
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+def store_peak(peak, group, segment, index, peak_lists):
+    """Store a peak of a group (or FALSE_PEAK) as number ``index`` of a segment's list."""
+    peaks = peak_lists.peaks
+    peaks.bin[segment, index], peaks.position[segment, index] = peak.bin, peak.position
+    peaks.position_error[segment, index] = peak.position_error
+    peaks.magnitude_ratio[segment, index] = peak.magnitude_ratio
+    peak_lists.group[segment, index] = group
 
 
 @njit(cache=True, error_model="numpy")
 def draw_free_bin(
-    uniform_number, group_bins, excluded_bins, searched_range, fft_size, down_beat_sign
+    uniform_number,
+    strongest_bins,
+    first_bins,
+    last_bins,
+    excluded_bins,
+    first_searched_bin,
+    last_searched_bin,
+    fft_size,
+    down_beat_sign,
 ):
     """Draw the bin of a false peak of noise, uniformly from those outside of all echoes.
 
-    Echoes are the groups of bins in ``group_bins`` and their neighbours. Bins of ``excluded_bins``
-    are not drawn either. The bin is between the first and last of ``searched_range``, inclusive.
-    Bins of a complex record, of N = ``fft_size`` bins, are periodic.
+    Parameters
+    ----------
+    uniform_number
+        Random number, 0..1.
+    strongest_bins, first_bins, last_bins
+        (groups,) int64: strongest, first and last bin of each echo (group of adjacent bins). An
+        echo includes one bin on either side. Groups end at the first negative strongest bin.
+    excluded_bins
+        (excluded,) int64: other bins that are not drawn.
+    first_searched_bin, last_searched_bin
+        First and last bin that may be drawn.
+    fft_size
+        FFT size N.
+    down_beat_sign
+        0 for a real record. Other values are for a complex record, whose bins are periodic in N.
     """
-    first, last = searched_range
-    n_groups = 0
-    while n_groups < group_bins.shape[1] and group_bins[STRONGEST_ROW, n_groups] >= 0:
+    first, last, n_groups = first_searched_bin, last_searched_bin, 0
+    while n_groups < strongest_bins.size and strongest_bins[n_groups] >= 0:
         n_groups += 1
-    group_spans, n_free, span_end = np.empty((n_groups, 2), np.int64), last - first + 1, first
+    begins, ends = np.empty(n_groups, np.int64), np.empty(n_groups, np.int64)
+    n_free, span_end = last - first + 1, first
     for g in range(n_groups):  # insert into disjoint spans in rising order
-        wrap_shift = (
-            (group_bins[STRONGEST_ROW, g] - first) // fft_size * fft_size if down_beat_sign else 0
-        )
+        wrap_shift = (strongest_bins[g] - first) // fft_size * fft_size if down_beat_sign else 0
         k = g
-        while k > 0 and group_spans[k - 1, 0] > group_bins[FIRST_ROW, g] - wrap_shift:
-            group_spans[k, 0], group_spans[k, 1] = group_spans[k - 1, 0], group_spans[k - 1, 1]
+        while k > 0 and begins[k - 1] > first_bins[g] - wrap_shift:
+            begins[k], ends[k] = begins[k - 1], ends[k - 1]
             k -= 1
-        group_spans[k, 0], group_spans[k, 1] = (
-            group_bins[FIRST_ROW, g] - wrap_shift,
-            group_bins[LAST_ROW, g] - wrap_shift,
-        )
+        begins[k], ends[k] = first_bins[g] - wrap_shift, last_bins[g] - wrap_shift
     for g in range(n_groups):
-        group_spans[g, 0] = max(group_spans[g, 0] - 1, span_end)
-        span_end = max(min(group_spans[g, 1] + 2, last + 1), group_spans[g, 0])
-        group_spans[g, 1], n_free = span_end, n_free - (span_end - group_spans[g, 0])
+        begins[g] = max(begins[g] - 1, span_end)
+        span_end = max(min(ends[g] + 2, last + 1), begins[g])
+        ends[g], n_free = span_end, n_free - (span_end - begins[g])
     excluded_elsewhere = np.empty(
         excluded_bins.size, np.int64
     )  # excluded bins that are searched and in no group
@@ -2529,7 +2725,7 @@ def draw_free_bin(
         )
         is_skipped = bin_number < first or bin_number > last
         for g in range(n_groups):
-            is_skipped |= group_spans[g, 0] <= bin_number < group_spans[g, 1]
+            is_skipped |= begins[g] <= bin_number < ends[g]
         if not is_skipped:
             excluded_elsewhere[n_excluded] = bin_number
             n_excluded += 1
@@ -2539,8 +2735,8 @@ def draw_free_bin(
     while n_passed != n_passed_before:  # until no more excluded bins lie below
         n_passed_before, bin_number = n_passed, first + rank + n_passed
         for g in range(n_groups):
-            if bin_number >= group_spans[g, 0]:
-                bin_number += group_spans[g, 1] - group_spans[g, 0]
+            if bin_number >= begins[g]:
+                bin_number += ends[g] - begins[g]
         n_passed = 0
         for k in range(n_excluded):
             n_passed += excluded_elsewhere[k] <= bin_number

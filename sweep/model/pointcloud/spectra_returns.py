@@ -32,12 +32,15 @@ from sweep.model.detection.estimators import ESTIMATOR_PREFIX, PEAK_BIN, SPECTRU
 from sweep.model.detection.sub_bin_interpolation import interpolator, sub_bin_standard_error
 from sweep.model.pointcloud.bin_groups import BinGroups
 from sweep.model.pointcloud.ego_motion import EgoMotion
-from sweep.model.pointcloud.pairing import FALSE_PEAK
+from sweep.model.pointcloud.pairing import FALSE_PEAK, PeakPairs
 from sweep.model.pointcloud.returns import (
+    ROUNDING_VARIANCE,
     DrawConfig,
     DrawnPeaks,
     DrawWorkspace,
+    PeakLists,
     Returns,
+    fold_peak,
     make_draw_inputs,
     measure_returns,
     pair_into_returns,
@@ -90,10 +93,8 @@ def draw_spectra_returns(
     motion
         Known motion of the instrument; with None, range and velocity are not corrected for motion.
     """
-    method_parameters, groups_max = (
-        {**SPECTRUM_METHOD_DEFAULTS, **parameters},
-        bin_groups.strongest_bin.shape[2],
-    )
+    method_parameters = {**SPECTRUM_METHOD_DEFAULTS, **parameters}
+    _, _, groups_max = bin_groups.strongest_bin.shape
     inputs, drawn_peaks = (
         make_draw_inputs(shots, bin_groups, motion),
         DrawnPeaks.empty(bin_groups, draws),
@@ -102,15 +103,17 @@ def draw_spectra_returns(
         DrawConfig.from_shots(shots, first_draw, True),
         interpolator(shots.window, shots.fft_size),
     )
-    peaks, peak_groups = np.zeros((3, groups_max + 1, 4)), np.empty((3, groups_max + 1), np.int64)
-    pairs, root_n_looks = np.empty((groups_max + 1, 4), np.int64), math.sqrt(shots.looks.number)
+    peak_lists, pairs = PeakLists.allocate(groups_max + 1), PeakPairs.allocate(groups_max + 1)
+    root_n_looks = math.sqrt(shots.looks.number)
     workspace = DrawWorkspace.allocate(0, groups_max)
     zero_index, peaks_max = (
         zero_frequency_index(shots),
         1 if shots.detection_settings.reported_peaks == STRONGEST_PEAK else groups_max + 1,
     )
     rounding_error = (
-        math.sqrt(1 / 12) if str(method_parameters[ESTIMATOR_PREFIX + "kind"]) == PEAK_BIN else 0.0
+        math.sqrt(ROUNDING_VARIANCE)
+        if str(method_parameters[ESTIMATOR_PREFIX + "kind"]) == PEAK_BIN
+        else 0.0
     )
     for point in range(shots.size):
         point_spectra = prepare_point_spectra(
@@ -128,7 +131,7 @@ def draw_spectra_returns(
             for s, signal in enumerate(point_spectra.signals)
         ]
         for d in range(draws):
-            n_peaks = np.zeros(3, np.int64)
+            peak_lists.n_peaks[:] = 0
             for s, signal in enumerate(point_spectra.signals):
                 if signal is None:
                     continue
@@ -157,27 +160,19 @@ def draw_spectra_returns(
                         else 0.0
                     )
                     error = math.hypot(error, rounding_error)
-                    bin_and_position = bin_ - zero_index, position - zero_index
-                    store_peak(
-                        peaks[s, k],
-                        *bin_and_position,
+                    peak = fold_peak(
+                        bin_ - zero_index,
+                        position - zero_index,
                         error,
                         ratio,
                         line_deviation,
                         config,
                         interpolation,
                     )
-                    peak_groups[s, k] = echo_of_peak[k]
-                n_peaks[s] = bins.size
+                    store_peak(peak, echo_of_peak[k], s, k, peak_lists)
+                peak_lists.n_peaks[s] = bins.size
             pair_into_returns(
-                point,
-                (point, d),
-                config,
-                inputs,
-                (peaks, peak_groups, n_peaks),
-                pairs,
-                workspace,
-                drawn_peaks,
+                point, point, d, config, inputs, peak_lists, pairs, workspace, drawn_peaks
             )
     return measure_returns(shots, inputs, drawn_peaks, motion, from_three_bins=False)
 

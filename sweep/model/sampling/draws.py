@@ -38,6 +38,7 @@ from sweep.model.sampling.philox import (
     STREAM_FALSE_ALARM,
     STREAM_NOISE,
     STREAM_NOISE_MAXIMUM,
+    DrawAddress,
 )
 from sweep.model.sampling.speckle_lines import (
     FACTORED_BINS_MAX,
@@ -110,10 +111,10 @@ class CountInputs(NamedTuple):
     one."""
     pd_if_condition_fails: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
-    :func:`_event_probabilities` is not met; unused if noise is drawn."""
+    :class:`EventProbabilities` is not met; unused if noise is drawn."""
     pd_if_condition_holds: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
-    :func:`_event_probabilities` is met; unused if noise is drawn."""
+    :class:`EventProbabilities` is met; unused if noise is drawn."""
     any_two: np.ndarray
     """(m,) bool: True if a shot counts as detected by any two of its segments."""
     speckle_cholesky_factors: np.ndarray
@@ -127,6 +128,86 @@ class CountInputs(NamedTuple):
     """Lines that represent the footprints in developed speckle."""
     line_centre: np.ndarray
     """(m, 3): mean position of the lines of each segment's echo [bins]; (0, 3) without speckle."""
+
+
+class DrawCounts(NamedTuple):
+    """Numbers of draws with an event, (points, batches) int64 each.
+
+    The fields have the order of :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`.
+    """
+
+    up_detections: np.ndarray
+    """Number of draws with a detection in the up segment."""
+    down_detections: np.ndarray
+    """Number of draws with a detection in the down segment."""
+    doppler_detections: np.ndarray
+    """Number of draws with a detection in the Doppler segment."""
+    shot_detections: np.ndarray
+    """Number of draws with a detection of the shot: in up and down segment, or in any two segments
+    if these detect the point (``CountInputs.any_two``)."""
+    up_alarms: np.ndarray
+    """Number of draws with a false alarm in the up segment."""
+    down_alarms: np.ndarray
+    """Number of draws with a false alarm in the down segment."""
+    joint_alarms: np.ndarray
+    """Number of draws with a false alarm in both the up and the down segment."""
+
+
+class EventProbabilities(NamedTuple):
+    """Probabilities of events in each segment, with which random numbers are compared.
+
+    Each is (3, n), by segment: up, Doppler, down. A detection in the down segment has the condition
+    that the up segment detects. One in the Doppler segment has the condition that exactly one of
+    the other two detects, so that the Doppler segment decides whether any two do. The up segment
+    has no condition.
+    """
+
+    alarm: np.ndarray
+    """(3, n): probability of a false alarm by noise and leaked signal; 0 for Doppler segments."""
+    pd_if_condition_fails: np.ndarray
+    """(3, n): probability of a detection if the condition is not met."""
+    pd_if_condition_holds: np.ndarray
+    """(3, n): probability of a detection if the condition is met."""
+
+
+class DownPd(NamedTuple):
+    """Probabilities of detection in the down segment, given the result in the up segment."""
+
+    up_missed: np.ndarray
+    """(...): probability without a detection in the up segment."""
+    up_detected: np.ndarray
+    """(...): probability with a detection in the up segment."""
+
+
+class SegmentAmplitudes(NamedTuple):
+    """Complex factors by speckle on an echo in the three segments, of mean square 1."""
+
+    up: complex
+    """Factor on the echo's complex amplitude in the up segment."""
+    doppler: complex
+    """Factor on the echo's complex amplitude in the Doppler segment."""
+    down: complex
+    """Factor on the echo's complex amplitude in the down segment."""
+
+
+class BinInNoise(NamedTuple):
+    """Signal of one bin in several draws, and the noise that is added to it.
+
+    sigma is the noise of a bin without signal per quadrature.
+    """
+
+    magnitude_ratio: float
+    """|X| of the bin without noise and speckle, over sigma."""
+    deviation_in_phase: float
+    """Standard deviation, over sigma, of the noise in phase with the signal."""
+    deviation_in_quadrature: float
+    """Standard deviation, over sigma, of the noise in quadrature with the signal."""
+    squared_threshold_ratio: float
+    """Square of the threshold over sigma."""
+    factor_in_phase: np.ndarray
+    """(draws,): real part of the factor by speckle on the signal."""
+    factor_in_quadrature: np.ndarray
+    """(draws,): imaginary part of the factor by speckle on the signal."""
 
 
 def count_by_probability(
@@ -156,9 +237,9 @@ def count_by_probability(
         threshold_ratio=np.zeros(n_rows),
         line_noise_ratio=np.zeros(n_rows),
         bin_thresholds=BinThresholds(*np.zeros((7, n_rows))),
-        pfa=probabilities[0],
-        pd_if_condition_fails=probabilities[1],
-        pd_if_condition_holds=probabilities[2],
+        pfa=probabilities.alarm,
+        pd_if_condition_fails=probabilities.pd_if_condition_fails,
+        pd_if_condition_holds=probabilities.pd_if_condition_holds,
         any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
         speckle_cholesky_factors=np.empty((0, n_rows)),
         ratio_row=np.zeros((3, n_rows), np.int64),
@@ -171,7 +252,7 @@ def count_by_probability(
         CountConfig(False, no_filter, 0.0, np.zeros((1, 0)), 0),
         inputs,
         NoiselessSpectra.empty(n_rows),
-        counts,
+        DrawCounts(*counts),
     )
 
 
@@ -227,7 +308,7 @@ def count_in_noise(
             shots.fft_size // 2,
         )
         part_ranges = DrawRanges(*(column[indices] for column in draw_ranges))
-        _count_draws(part_ranges, batch_edges, config, inputs, spectra, counts)
+        _count_draws(part_ranges, batch_edges, config, inputs, spectra, DrawCounts(*counts))
 
 
 class NoiseFilter(NamedTuple):
@@ -335,25 +416,14 @@ _REMAINDER_MIN = 1e-9
 neglected."""
 
 
-def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the probabilities of each segment's events, to compare random numbers with them.
-
-    Segments are up, Doppler and down.
-
-    Returns
-    -------
-    ndarray (3, 3, n)
-        First index 0: probability of a false alarm. Index 1 and 2: probability of a detection
-        without and with a condition. For the down segment the condition is a detection in the up
-        segment. For the Doppler segment it is a detection in exactly one of the other two, which
-        then decides whether any two detect. The up segment has no condition.
-    """
+def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilities:
+    """Return the probabilities of detections and false alarms that the outputs of points imply."""
     pd_up, pd_down, pd_shot = (
         np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot")
     )
     stated_both = outputs.get(PD_BOTH_CHIRPS, np.full(pd_up.shape, np.nan))
     both = np.where(np.isfinite(stated_both), stated_both, pd_shot)
-    down_without_up, down_with_up = down_pd_given_up(pd_up, pd_down, both)
+    down_pd = down_pd_given_up(pd_up, pd_down, both)
     pd_doppler = np.nan_to_num(outputs["pd_doppler"])
     pd_of_exactly_one, pd_added_by_doppler, detects_any_two = (
         pd_up + pd_down - 2 * both,
@@ -380,13 +450,14 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
     )
     alarm_up = 1 - (1 - pfa_noise_up) * (1 - outputs["p_leakage_up"])
     alarm_down = 1 - (1 - pfa_noise_down) * (1 - outputs["p_leakage_down"])
-    alarms = alarm_up, np.zeros_like(alarm_up), alarm_down
-    return np.array(
-        [alarms, (pd_up, doppler_otherwise, down_without_up), (pd_up, doppler_if_one, down_with_up)]
+    return EventProbabilities(
+        alarm=np.array([alarm_up, np.zeros_like(alarm_up), alarm_down]),
+        pd_if_condition_fails=np.array([pd_up, doppler_otherwise, down_pd.up_missed]),
+        pd_if_condition_holds=np.array([pd_up, doppler_if_one, down_pd.up_detected]),
     )
 
 
-def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> np.ndarray:
+def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> DownPd:
     """Return the probability of detection in the down segment, given the result in the up segment.
 
     Parameters
@@ -396,7 +467,7 @@ def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
 
     Returns
     -------
-    ndarray (2, ...)
+    DownPd
         Without a detection in the up segment (pd_down - pd_both) / (1 - pd_up), with one pd_both /
         pd_up.
     """
@@ -404,9 +475,7 @@ def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
         without_up = np.where(
             pd_up < 1, np.clip((pd_down - pd_both) / (1 - pd_up), 0.0, 1.0), pd_down
         )
-        return np.stack(
-            [without_up, np.where(pd_up > 0, np.minimum(pd_both / pd_up, 1.0), pd_down)]
-        )
+        return DownPd(without_up, np.where(pd_up > 0, np.minimum(pd_both / pd_up, 1.0), pd_down))
 
 
 def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
@@ -415,8 +484,10 @@ def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarra
     sigma is the noise per quadrature of a bin without signal.
     """
     ratios = np.stack([shots.threshold, shots.line_noise_sigma]) / shots.bin_noise_sigma
-    ratios = np.ascontiguousarray(np.broadcast_to(ratios, (2, shots.size)))
-    return ratios[0], ratios[1]
+    threshold_ratio, line_noise_ratio = np.ascontiguousarray(
+        np.broadcast_to(ratios, (2, shots.size))
+    )
+    return threshold_ratio, line_noise_ratio
 
 
 ECHO_NOISE_FIRST_INDEX = 1 << 24
@@ -454,9 +525,12 @@ class NoiselessSpectra(NamedTuple):
     n_noise_bins: np.ndarray
     """(m, 3): equivalent number of independent bins that hold noise alone and may raise a false
     alarm."""
-    leaked_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of each segment's bins in the arrays ``leaked_*`` and
-    ``exempt_neighbour_*``. They are equal in segments without leaked signal."""
+    leaked_begin: np.ndarray
+    """(m, 3) int64: index of each segment's first bin in ``leaked_index``, ``leaked_ratio`` and the
+    arrays ``exempt_neighbour_*``."""
+    leaked_end: np.ndarray
+    """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1; equal to
+    ``leaked_begin`` without leaked signal."""
     leaked_index: np.ndarray
     """(leaked,) int64: numbers, from ``first_bin``, of the bins with signal leaked from an echo.
     With noise they may raise a false alarm."""
@@ -472,24 +546,28 @@ class NoiselessSpectra(NamedTuple):
 
     @classmethod
     def empty(cls, n_points: int) -> "NoiselessSpectra":
-        """Return spectra without bins, for draws that compare random numbers with probabilities."""
-        zeros, empty_slices = (
+        """Return a record without bins, for draws that compare numbers with probabilities."""
+        zeros, no_numbers, no_values = (
             np.zeros((n_points, 3), np.int64),
-            np.zeros((n_points, 3, 2), np.int64),
+            np.empty(0, np.int64),
+            np.empty(0),
         )
-        nans, no_bins = np.full((n_points, 3), np.nan), np.zeros((n_points, 3))
-        numbers, values = np.empty(0, np.int64), np.empty(0)
-        no_bin_arrays = zeros, zeros, values, np.empty(0, np.bool_)
-        no_leaked = numbers, values, values, numbers
         return cls(
-            zeros,
-            zeros,
-            nans,
-            np.zeros((n_points, 3), np.bool_),
-            *no_bin_arrays,
-            no_bins,
-            empty_slices,
-            *no_leaked,
+            first_bin=zeros,
+            peak_index=zeros,
+            peak_ratio=np.full((n_points, 3), np.nan),
+            has_real_noise=np.zeros((n_points, 3), np.bool_),
+            bins_start=zeros,
+            n_bins=zeros,
+            bin_ratios=no_values,
+            is_echo=np.empty(0, np.bool_),
+            n_noise_bins=np.zeros((n_points, 3)),
+            leaked_begin=zeros,
+            leaked_end=zeros,
+            leaked_index=no_numbers,
+            leaked_ratio=no_values,
+            exempt_neighbour_ratio=no_values,
+            exempt_neighbour_side=no_numbers,
         )
 
 
@@ -557,7 +635,8 @@ def iter_noiseless_spectra(
             bin_ratios=ratio,
             is_echo=spans.is_exempt[flat_index],
             n_noise_bins=np.maximum(n_noise_bins, 0.0),
-            leaked_slice=np.stack([leaked_end - n_leaked, leaked_end], axis=2),
+            leaked_begin=leaked_end - n_leaked,
+            leaked_end=leaked_end,
             leaked_index=index_in_span[is_leaked],
             leaked_ratio=ratio[is_leaked],
             exempt_neighbour_ratio=np.maximum(below, above)[is_leaked],
@@ -585,8 +664,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
     spectra
         :class:`NoiselessSpectra` of the rows.
     counts
-        (names, points, batches) int64, in the order of
-        :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
+        :class:`DrawCounts` of the points; the counts are added to it.
     """
     n_filter_bins, n_taps = config.noise_filter.weights.shape
     noise = NoiseScratch(
@@ -596,11 +674,12 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
         np.empty(n_filter_bins + n_taps),
     )
     random_words = np.empty((4, _DRAWS_PER_STEP), np.uint64)
-    segment_factors, segment_amplitudes = (
-        np.ones((3, _DRAWS_PER_STEP)),
-        np.zeros((3, 2, _DRAWS_PER_STEP)),
+    segment_factors = np.ones((3, _DRAWS_PER_STEP))
+    factors_in_phase, factors_in_quadrature = (
+        np.zeros((3, _DRAWS_PER_STEP)),
+        np.zeros((3, _DRAWS_PER_STEP)),
     )
-    along, across = np.ones(_DRAWS_PER_STEP), np.zeros(_DRAWS_PER_STEP)
+    factor_in_phase, factor_in_quadrature = np.ones(_DRAWS_PER_STEP), np.zeros(_DRAWS_PER_STEP)
     no_amplitudes = np.zeros((3, 0, 0), np.complex128)
     is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
     for j in range(draw_ranges.point_index.size):
@@ -609,26 +688,30 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
         i, batch = draw_ranges.point_index[j], 0
         for first in range(draw_ranges.first_draw[j], draw_ranges.end_draw[j], _DRAWS_PER_STEP):
             n_draws = min(_DRAWS_PER_STEP, draw_ranges.end_draw[j] - first)
-            address = draw_ranges.keys[j, 0], draw_ranges.keys[j, 1], first, n_draws
+            address = DrawAddress(draw_ranges.keys[j, 0], draw_ranges.keys[j, 1], first)
             is_detected[:], has_alarm[:] = False, False
             for d in range(n_draws if in_speckle else 0):
-                one, amplitude_doppler, amplitude_down = speckle_amplitudes(
-                    address[:2], first + d, 0, inputs.speckle_cholesky_factors[:, j]
+                amplitudes = speckle_amplitudes(
+                    DrawAddress(address.key_0, address.key_1, first + d),
+                    0,
+                    inputs.speckle_cholesky_factors[:, j],
                 )
-                for component in range(2):
-                    segment_amplitudes[0, component, d], segment_amplitudes[1, component, d] = (
-                        one[component],
-                        amplitude_doppler[component],
-                    )
-                    segment_amplitudes[2, component, d] = amplitude_down[component]
                 for s in range(3):
+                    factors_in_phase[s, d] = amplitudes[s].real
+                    factors_in_quadrature[s, d] = amplitudes[s].imag
                     segment_factors[s, d] = math.hypot(
-                        segment_amplitudes[s, 0, d], segment_amplitudes[s, 1, d]
+                        factors_in_phase[s, d], factors_in_quadrature[s, d]
                     )
             echo_amplitudes = no_amplitudes
             if in_speckle and n_filter_bins > 0:
                 echo_amplitudes = _draw_echo_amplitudes(
-                    address, j, spectra, inputs.line_grid, inputs.line_centre, segment_factors
+                    address,
+                    n_draws,
+                    j,
+                    spectra,
+                    inputs.line_grid,
+                    inputs.line_centre,
+                    segment_factors,
                 )
             for s in (0, 2, 1):
                 stream, peak_ratio, peak_index = (
@@ -643,7 +726,9 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                 if config.in_noise and n_filter_bins > 0:
                     _mark_any_bin_crossings(
                         address,
-                        (j, s),
+                        n_draws,
+                        j,
+                        s,
                         spectra,
                         config.noise_filter,
                         bin_threshold_at(inputs.bin_thresholds, j),
@@ -652,53 +737,72 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                         is_detected[s],
                     )
                 elif config.in_noise:
-                    noise_deviations = line_noise_ratio, line_noise_ratio
+                    deviation_in_phase = deviation_in_quadrature = line_noise_ratio
                     if spectra.has_real_noise[j, s]:
-                        noise_deviations = math.sqrt(2.0) * line_noise_ratio, 0.0
-                    along[:], across[:] = segment_factors[s], 0.0
+                        deviation_in_phase = math.sqrt(2.0) * line_noise_ratio
+                        deviation_in_quadrature = 0.0
+                    factor_in_phase[:], factor_in_quadrature[:] = segment_factors[s], 0.0
                     if ratio_row > 0:
                         bin_pseudo_variance = pseudo_variance_ratio_at(
                             spectra.first_bin[j, s] + peak_index,
                             config.nyquist_bin,
                             pseudo_variance_ratios,
                         )
-                        along[:] = math.sqrt(1.0 + bin_pseudo_variance) * segment_amplitudes[s, 0]
-                        across[:] = (
-                            math.sqrt(max(1.0 - bin_pseudo_variance, 0.0))
-                            * segment_amplitudes[s, 1]
+                        factor_in_phase[:] = (
+                            math.sqrt(1.0 + bin_pseudo_variance) * factors_in_phase[s]
                         )
-                    crossing = (
+                        factor_in_quadrature[:] = (
+                            math.sqrt(max(1.0 - bin_pseudo_variance, 0.0))
+                            * factors_in_quadrature[s]
+                        )
+                    peak_bin = BinInNoise(
                         peak_ratio,
-                        noise_deviations,
+                        deviation_in_phase,
+                        deviation_in_quadrature,
                         threshold_ratio * threshold_ratio,
-                        along,
-                        across,
+                        factor_in_phase,
+                        factor_in_quadrature,
                     )
                     _mark_crossings(
-                        address, stream, peak_index, crossing, random_words, is_detected[s]
+                        address,
+                        n_draws,
+                        stream,
+                        peak_index,
+                        peak_bin,
+                        random_words,
+                        is_detected[s],
                     )
                 else:
-                    pd_pair = inputs.pd_if_condition_fails[s, j], inputs.pd_if_condition_holds[s, j]
-                    one = is_detected[0] if s == 2 else is_detected[0] ^ is_detected[2]
+                    condition = is_detected[0] if s == 2 else is_detected[0] ^ is_detected[2]
                     _mark_random_events(
-                        address, STREAM_DETECTION[s], pd_pair, one, random_words, is_detected[s]
+                        address,
+                        n_draws,
+                        STREAM_DETECTION[s],
+                        inputs.pd_if_condition_fails[s, j],
+                        inputs.pd_if_condition_holds[s, j],
+                        condition,
+                        random_words,
+                        is_detected[s],
                     )
                 if inputs.pfa[s, j] > 0.0:
                     alarm_stream = (
                         STREAM_NOISE_MAXIMUM[s] if config.in_noise else STREAM_FALSE_ALARM[s]
                     )
-                    alarm_pair = inputs.pfa[s, j], inputs.pfa[s, j]
                     _mark_random_events(
                         address,
+                        n_draws,
                         alarm_stream,
-                        alarm_pair,
+                        inputs.pfa[s, j],
+                        inputs.pfa[s, j],
                         is_detected[0],
                         random_words,
                         has_alarm[s],
                     )
                 _mark_leakage_alarms(
                     address,
-                    (j, s),
+                    n_draws,
+                    j,
+                    s,
                     spectra,
                     threshold_ratio,
                     config.sidelobe_correlation,
@@ -709,22 +813,27 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
             for d in range(n_draws):
                 while first + d >= batch_edges[batch + 1]:
                     batch += 1
-                counts[0, i, batch] += is_detected[0, d]
-                counts[1, i, batch] += is_detected[2, d]
-                counts[2, i, batch] += is_detected[1, d]
-                by_doppler = (
-                    inputs.any_two[j] & is_detected[1, d] & (is_detected[0, d] | is_detected[2, d])
+                up_detects, doppler_detects, down_detects = (
+                    is_detected[0, d],
+                    is_detected[1, d],
+                    is_detected[2, d],
                 )
-                counts[3, i, batch] += (is_detected[0, d] & is_detected[2, d]) | by_doppler
-                counts[4, i, batch] += has_alarm[0, d]
-                counts[5, i, batch] += has_alarm[2, d]
-                counts[6, i, batch] += has_alarm[0, d] & has_alarm[2, d]
+                by_doppler = inputs.any_two[j] & doppler_detects & (up_detects | down_detects)
+                counts.up_detections[i, batch] += up_detects
+                counts.down_detections[i, batch] += down_detects
+                counts.doppler_detections[i, batch] += doppler_detects
+                counts.shot_detections[i, batch] += (up_detects & down_detects) | by_doppler
+                counts.up_alarms[i, batch] += has_alarm[0, d]
+                counts.down_alarms[i, batch] += has_alarm[2, d]
+                counts.joint_alarms[i, batch] += has_alarm[0, d] & has_alarm[2, d]
 
 
 @njit(cache=True, error_model="numpy")
 def _mark_leakage_alarms(
     address,
-    point_and_segment,
+    n_draws,
+    point,
+    segment,
     spectra,
     threshold_ratio,
     sidelobe_correlation,
@@ -739,10 +848,11 @@ def _mark_leakage_alarms(
 
     Parameters
     ----------
-    address
-        Key (two uint64), first draw, and number of draws.
-    point_and_segment
-        Point and segment.
+    address, n_draws
+        Address of the first draw (:class:`sweep.model.sampling.philox.DrawAddress`), and number of
+        draws.
+    point, segment
+        Index of the point in ``spectra``, and segment.
     spectra
         :class:`NoiselessSpectra`.
     threshold_ratio
@@ -756,10 +866,11 @@ def _mark_leakage_alarms(
     has_alarm
         (draws,) bool: set to True in draws with a false alarm.
     """
-    stream, n_draws = STREAM_NOISE[point_and_segment[1]], address[3]
+    key_0, key_1, first_draw = address
+    stream = STREAM_NOISE[segment]
     independent_part = math.sqrt(1.0 - sidelobe_correlation * sidelobe_correlation)
     zeros, joins_echo = np.zeros(n_draws), np.zeros(n_draws, np.bool_)
-    begin, end = spectra.leaked_slice[point_and_segment]
+    begin, end = spectra.leaked_begin[point, segment], spectra.leaked_end[point, segment]
     # A group that begins or ends next to an echo belongs to the echo as a whole. So an alarm
     # is pending until its group ends.
     is_pending, is_crossing = np.zeros(n_draws, np.bool_), np.empty(n_draws, np.bool_)
@@ -772,15 +883,22 @@ def _mark_leakage_alarms(
                 has_alarm[d] |= is_pending[d]
                 is_pending[d] = joins_echo[d] = False
         is_crossing[:] = False
-        crossing = (
+        bin_in_noise = BinInNoise(
             spectra.leaked_ratio[leaked_bin],
-            (1.0, 1.0),
+            1.0,
+            1.0,
             threshold_ratio * threshold_ratio,
             magnitude_factors,
             zeros,
         )
         _mark_crossings(
-            address, stream, spectra.leaked_index[leaked_bin], crossing, random_words, is_crossing
+            address,
+            n_draws,
+            stream,
+            spectra.leaked_index[leaked_bin],
+            bin_in_noise,
+            random_words,
+            is_crossing,
         )
         for d in range(n_draws):
             if not is_crossing[d]:
@@ -788,15 +906,14 @@ def _mark_leakage_alarms(
                 is_pending[d] = joins_echo[d] = False
                 continue
             if spectra.exempt_neighbour_ratio[leaked_bin] > 0.0:
-                draw_number = address[2] + d
                 re, im = philox.normal_pair(
-                    address[0], address[1], draw_number, stream, spectra.leaked_index[leaked_bin]
+                    key_0, key_1, first_draw + d, stream, spectra.leaked_index[leaked_bin]
                 )
                 edge_index = (
                     spectra.leaked_index[leaked_bin] + spectra.exempt_neighbour_side[leaked_bin]
                 )
                 re_edge, im_edge = philox.normal_pair(
-                    address[0], address[1], draw_number, stream, edge_index
+                    key_0, key_1, first_draw + d, stream, edge_index
                 )
                 in_phase = (
                     spectra.exempt_neighbour_ratio[leaked_bin] * magnitude_factors[d]
@@ -811,29 +928,27 @@ def _mark_leakage_alarms(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def speckle_factors(key, draw, group, speckle_cholesky_factors):
-    """Return the factors that speckle puts on an echo's magnitudes in up, Doppler and down segment.
+def speckle_factors(address, group, mixing):
+    """Return the factors by speckle on an echo's magnitudes in up, Doppler and down segment.
 
     Their mean square is 1. The arguments are those of :func:`speckle_amplitudes`.
     """
-    up, doppler, down = speckle_amplitudes(key, draw, group, speckle_cholesky_factors)
+    up, doppler, down = speckle_amplitudes(address, group, mixing)
     return (
-        math.hypot(up[0], up[1]),
-        math.hypot(doppler[0], doppler[1]),
-        math.hypot(down[0], down[1]),
+        math.hypot(up.real, up.imag),
+        math.hypot(doppler.real, doppler.imag),
+        math.hypot(down.real, down.imag),
     )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def speckle_amplitudes(key, draw, group, speckle_cholesky_factors):
-    """Return the complex factors, of mean square 1, that speckle puts on an echo in each segment.
+def speckle_amplitudes(address, group, mixing):
+    """Return the complex factors by speckle on an echo in the three segments, of mean square 1.
 
     Parameters
     ----------
-    key
-        Random key of the point, two uint64.
-    draw
-        Number of the draw.
+    address
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
     group
         Number of the echo (group of adjacent bins).
     speckle_cholesky_factors
@@ -841,14 +956,14 @@ def speckle_amplitudes(key, draw, group, speckle_cholesky_factors):
 
     Returns
     -------
-    tuple
-        Real and imaginary part in the up, Doppler and down segment. They are mixtures of three
-        independent circular normal amplitudes of the echo.
+    SegmentAmplitudes
+        Mixtures of three independent circular normal amplitudes of the echo.
     """
+    key_0, key_1, draw = address
     stream, root_half = philox.STREAM_SPECKLE, math.sqrt(0.5)
-    a, b = philox.normal_pair(key[0], key[1], draw, stream, 3 * group)
-    c, d = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 1)
-    e, f = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 2)
+    re_0, im_0 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group)
+    re_1, im_1 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group + 1)
+    re_2, im_2 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group + 2)
     (
         doppler_from_up,
         doppler_own,
@@ -856,45 +971,60 @@ def speckle_amplitudes(key, draw, group, speckle_cholesky_factors):
         down_from_doppler_re,
         down_from_doppler_im,
         down_own,
-    ) = speckle_cholesky_factors
-    doppler = (
-        root_half * (doppler_from_up * a + doppler_own * c),
-        root_half * (doppler_from_up * b + doppler_own * d),
-    )
+    ) = mixing
+    doppler_re = doppler_from_up * re_0 + doppler_own * re_1
+    doppler_im = doppler_from_up * im_0 + doppler_own * im_1
     down_re = (
-        down_from_up * a + (down_from_doppler_re * c - down_from_doppler_im * d) + down_own * e
+        down_from_up * re_0
+        + (down_from_doppler_re * re_1 - down_from_doppler_im * im_1)
+        + down_own * re_2
     )
     down_im = (
-        down_from_up * b + (down_from_doppler_re * d + down_from_doppler_im * c) + down_own * f
+        down_from_up * im_0
+        + (down_from_doppler_re * im_1 + down_from_doppler_im * re_1)
+        + down_own * im_2
     )
-    return (root_half * a, root_half * b), doppler, (root_half * down_re, root_half * down_im)
+    return SegmentAmplitudes(
+        complex(root_half * re_0, root_half * im_0),
+        complex(root_half * doppler_re, root_half * doppler_im),
+        complex(root_half * down_re, root_half * down_im),
+    )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mark_random_events(address, stream, probabilities, condition, random_words, is_marked):
+def _mark_random_events(
+    address,
+    n_draws,
+    stream,
+    probability_otherwise,
+    probability_if_condition,
+    condition,
+    random_words,
+    is_marked,
+):
     """Mark draws in which a random number is below the probability of an event.
 
-    `address` holds key, first draw and number of draws. A draw has the second of the
-    `probabilities` if its `condition` is True, else the first. `condition` may be the same array as
-    `is_marked`.
+    `address` is that of the first of `n_draws` draws. The probability is
+    `probability_if_condition` in draws in which `condition` (draws,) is True, else
+    `probability_otherwise`. `condition` may be the same array as `is_marked`.
     """
     philox.fill_words(
-        address[:3],
+        address,
         stream,
         philox.FIRST_BLOCK_NUMBER,
         philox.DRAW_INCREMENTS,
-        address[3],
+        n_draws,
         random_words,
     )
-    for d in range(address[3]):
-        probability = probabilities[1] if condition[d] else probabilities[0]
+    for d in range(n_draws):
+        probability = probability_if_condition if condition[d] else probability_otherwise
         is_marked[d] |= philox.to_uniform(random_words[0, d]) < probability
 
 
 @njit(cache=True, error_model="numpy")
-def _echo_end_indices(point_and_segment, spectra):
+def _echo_end_indices(point, segment, spectra):
     """Return the numbers of the first and last bin of an echo; the last is -1 without an echo."""
-    bins_start, n_bins = spectra.bins_start[point_and_segment], spectra.n_bins[point_and_segment]
+    bins_start, n_bins = spectra.bins_start[point, segment], spectra.n_bins[point, segment]
     first_index, last_index = 0, n_bins - 1
     while first_index < n_bins and not spectra.is_echo[bins_start + first_index]:
         first_index += 1
@@ -904,19 +1034,20 @@ def _echo_end_indices(point_and_segment, spectra):
 
 
 @njit(cache=True, error_model="numpy")
-def _draw_echo_amplitudes(address, row, spectra, line_grid, line_centres, segment_factors):
+def _draw_echo_amplitudes(address, n_draws, row, spectra, line_grid, line_centres, segment_factors):
     """Draw the complex factors (3, draws, bins) of developed speckle on an echo's bins.
 
     The first axis is the segment. The factors have mean power 1 and follow from the lines of the
     footprint. Bins that no line reaches have the factor of the strongest bin. ``segment_factors``
-    (3, draws) is set to the magnitude of the strongest bin's factor. ``line_grid`` and
-    ``line_centres`` are those of :class:`CountInputs`.
+    (3, draws) is set to the magnitude of the strongest bin's factor. ``address`` is that of the
+    first of ``n_draws`` draws. ``line_grid`` and ``line_centres`` are those of
+    :class:`CountInputs`.
     """
     line_centre = line_centres[row].copy()
     first_bin, n_bins_max = np.zeros(3, np.int64), 0
     first_index = np.zeros(3, np.int64)
     for s in range(3):
-        begin_index, end_index = _echo_end_indices((row, s), spectra)
+        begin_index, end_index = _echo_end_indices(row, s, spectra)
         first_bin[s], first_index[s] = spectra.first_bin[row, s] + begin_index, begin_index
         n_bins_max = max(n_bins_max, end_index - begin_index + 1)
         if end_index < begin_index:
@@ -934,11 +1065,11 @@ def _draw_echo_amplitudes(address, row, spectra, line_grid, line_centres, segmen
             line_grid, row, line_centre, first_bin, mean_power, factor
         )
     amplitudes, drawn_amplitudes = (
-        np.zeros((3, address[3], n_bins_max), np.complex128),
+        np.zeros((3, n_draws, n_bins_max), np.complex128),
         np.zeros((3, n_bins_max), np.complex128),
     )
-    for d in range(address[3]):
-        address_of_draw = address[0], address[1], address[2] + d
+    for d in range(n_draws):
+        address_of_draw = DrawAddress(address.key_0, address.key_1, address.draw + d)
         if factor_rank > 0:
             draw_factored_amplitudes(address_of_draw, 0, factor, factor_rank, drawn_amplitudes)
         else:
@@ -969,7 +1100,9 @@ def _draw_echo_amplitudes(address, row, spectra, line_grid, line_centres, segmen
 @njit(cache=True, error_model="numpy")
 def _mark_any_bin_crossings(
     address,
-    point_and_segment,
+    n_draws,
+    point,
+    segment,
     spectra,
     filter_rule,
     bin_threshold,
@@ -979,16 +1112,17 @@ def _mark_any_bin_crossings(
 ):
     """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
 
-    ``bin_threshold`` is the :class:`sweep.model.detection.echo_detection.BinThreshold` of the
-    point. ``echo_amplitudes`` (draws, bins) are the complex amplitudes of the echo's bins, with no
-    bins if the echo does not fade. The phase-noise pedestal fades with the echo's bins.
+    ``address`` is that of the first of ``n_draws`` draws, and ``bin_threshold`` the
+    :class:`sweep.model.detection.echo_detection.BinThreshold` of the point. ``echo_amplitudes``
+    (draws, bins) are the complex amplitudes of the echo's bins, with no bins if the echo does not
+    fade. The phase-noise pedestal fades with the echo's bins.
     """
-    begin, n_bins = spectra.bins_start[point_and_segment], spectra.n_bins[point_and_segment]
+    begin, n_bins = spectra.bins_start[point, segment], spectra.n_bins[point, segment]
     bin_ratios, is_echo = (
         spectra.bin_ratios[begin : begin + n_bins],
         spectra.is_echo[begin : begin + n_bins],
     )
-    first_index, last_index = _echo_end_indices(point_and_segment, spectra)
+    first_index, last_index = _echo_end_indices(point, segment, spectra)
     if last_index < 0:
         return
     threshold_ratio = bin_threshold.threshold / bin_threshold.noise_without_pedestal
@@ -998,12 +1132,12 @@ def _mark_any_bin_crossings(
         or bin_threshold.line_noise > bin_threshold.noise_without_pedestal
     ):
         fill_pedestal_ratios(bin_ratios, is_echo, bin_threshold, pedestal_power)
-    for d in range(address[3]):
-        noise_address = address[0], address[1], address[2] + d, STREAM_NOISE[point_and_segment[1]]
+    for d in range(n_draws):
         draw_bin_noise(
-            noise_address,
+            DrawAddress(address.key_0, address.key_1, address.draw + d),
+            STREAM_NOISE[segment],
             ECHO_NOISE_FIRST_INDEX,
-            spectra.first_bin[point_and_segment] + first_index,
+            spectra.first_bin[point, segment] + first_index,
             last_index - first_index + 1,
             filter_rule,
             noise,
@@ -1024,13 +1158,13 @@ def _mark_any_bin_crossings(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
+def draw_bin_noise(address, stream, first_index, first_bin, n_bins, filter_rule, noise):
     """Draw the noise of adjacent bins over sigma, correlated by window and zero padding.
 
     Parameters
     ----------
-    address
-        Key of the point (two uint64), number of the draw, and stream.
+    address, stream
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`), and stream.
     first_index
         Stream index of the first pair of independent numbers.
     first_bin, n_bins
@@ -1045,6 +1179,7 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
     sigma is the standard deviation of a bin's noise per quadrature. At DC and Nyquist of a real
     record the noise is real, and bins on either side are complex conjugates.
     """
+    key_0, key_1, draw = address
     weights, start = filter_rule.weights, filter_rule.first_number
     real_fft_size = filter_rule.real_fft_size
     n_taps = weights.shape[1]
@@ -1054,7 +1189,7 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
     is_symmetric = is_from_nyquist or (real_fft_size > 0 and first_bin == 0)
     first_number = 0 if is_symmetric else start[0]
     for j in range(start[n_bins - 1] + n_taps - first_number):
-        re, im = philox.normal_pair(address[0], address[1], address[2], address[3], first_index + j)
+        re, im = philox.normal_pair(key_0, key_1, draw, stream, first_index + j)
         if is_symmetric and j == 0:
             re, im = math.sqrt(2.0) * re, 0.0
         noise.number_in_phase[j], noise.number_in_quadrature[j] = re, im
@@ -1070,13 +1205,13 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
+def draw_bin_noise_by_root(address, stream, first_index, n_bins, root, noise):
     """Draw the noise of adjacent bins in units of sigma, by a Cholesky factor of its covariance.
 
     Parameters
     ----------
-    address
-        Key of the point (two uint64), number of the draw, and stream.
+    address, stream
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`), and stream.
     first_index
         Stream index of the first pair of independent numbers; even.
     n_bins
@@ -1090,14 +1225,17 @@ def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
     -----
     sigma is the standard deviation of a bin's noise per quadrature.
     """
+    key_0, key_1, draw = address
     re_numbers, im_numbers = noise.number_in_phase, noise.number_in_quadrature
     for k in range(0, n_bins, 2):
-        words = philox.four_words(
-            address[0], address[1], address[2], address[3], (first_index + k) >> 1
+        radius_word, angle_word, next_radius_word, next_angle_word = philox.four_words(
+            key_0, key_1, draw, stream, (first_index + k) >> 1
         )
-        re_numbers[k], im_numbers[k] = philox.to_normals(words[0], words[1])
+        re_numbers[k], im_numbers[k] = philox.to_normals(radius_word, angle_word)
         if k + 1 < n_bins:
-            re_numbers[k + 1], im_numbers[k + 1] = philox.to_normals(words[2], words[3])
+            re_numbers[k + 1], im_numbers[k + 1] = philox.to_normals(
+                next_radius_word, next_angle_word
+            )
     for k in range(n_bins):
         re, im = 0.0, 0.0
         for j in range(k + 1):
@@ -1107,25 +1245,27 @@ def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mark_crossings(address, stream, pair_index, crossing, random_words, is_marked):
+def _mark_crossings(address, n_draws, stream, pair_index, bin_in_noise, random_words, is_marked):
     """Mark the draws in which signal plus noise of one bin reaches the threshold.
 
-    ``pair_index`` is the stream index of the pair of numbers that make the noise. ``crossing``
-    holds |X| / sigma; the noise's deviations in phase and in quadrature; the square of the
-    threshold; and factors (draws,) on |X| in phase and in quadrature.
+    ``address`` is that of the first of ``n_draws`` draws. ``pair_index`` is the stream index of the
+    pair of numbers that make the noise. ``bin_in_noise`` is a :class:`BinInNoise`.
     """
-    ratio, noise_deviation, threshold, along, across = crossing
     philox.fill_words(
-        address[:3], stream, pair_index >> 1, philox.DRAW_INCREMENTS, address[3], random_words
+        address, stream, pair_index >> 1, philox.DRAW_INCREMENTS, n_draws, random_words
     )
     lane = 2 * (pair_index & 1)
-    for d in range(address[3]):
+    for d in range(n_draws):
         re, im = philox.to_normals(random_words[lane, d], random_words[lane + 1, d])
-        re, im = (
-            ratio * along[d] + re * noise_deviation[0],
-            ratio * across[d] + im * noise_deviation[1],
+        re = (
+            bin_in_noise.magnitude_ratio * bin_in_noise.factor_in_phase[d]
+            + re * bin_in_noise.deviation_in_phase
         )
-        is_marked[d] |= re**2 + im**2 >= threshold
+        im = (
+            bin_in_noise.magnitude_ratio * bin_in_noise.factor_in_quadrature[d]
+            + im * bin_in_noise.deviation_in_quadrature
+        )
+        is_marked[d] |= re**2 + im**2 >= bin_in_noise.squared_threshold_ratio
 
 
 @njit(cache=True, error_model="numpy")

@@ -75,6 +75,7 @@ from sweep.model.laser_line import (
     phase_walk,
 )
 from sweep.model.preparation import Parameters, Shots
+from sweep.model.sampling.draws import DrawCounts
 from sweep.model.sampling.philox import (
     STREAM_LASER_PHASE,
     STREAM_RECORD_NOISE,
@@ -1107,20 +1108,18 @@ def count_detections(
     is_detected = np.array([f.is_detected for f in detections])
     alarm_up, alarm_down = up.n_false_groups > 0, down.n_false_groups > 0
     shot_detected = up.is_detected & down.is_detected
-    is_resolved = shot_detected & (doppler.is_detected | (point_spectra.signals[1] is None))
+    _, doppler_signal, _ = point_spectra.signals
+    is_resolved = shot_detected & (doppler.is_detected | (doppler_signal is None))
     if point_spectra.shots.any_two:
         shot_detected = is_resolved = is_detected.sum(axis=0) >= 2
-    counts = np.array(
-        [
-            up.is_detected,
-            down.is_detected,
-            doppler.is_detected,
-            shot_detected,
-            alarm_up,
-            alarm_down,
-            alarm_up & alarm_down,
-        ],
-        np.int64,
+    events = DrawCounts(
+        up_detections=up.is_detected,
+        down_detections=down.is_detected,
+        doppler_detections=doppler.is_detected,
+        shot_detections=shot_detected,
+        up_alarms=alarm_up,
+        down_alarms=alarm_down,
+        joint_alarms=alarm_up & alarm_down,
     )
     n_false_bins, n_false_groups = (
         sum(f.n_false_bins for f in detections),
@@ -1135,7 +1134,7 @@ def count_detections(
         np.where(is_resolved, error, np.nan)
         for error in _measurement_errors(point_spectra, detections, is_detected)
     ]
-    return counts, np.array(
+    return np.array(events, np.int64), np.array(
         [n_false_bins / max(n_searched, 1), n_false_groups, *errors, *squared_bounds]
     )
 
@@ -1255,10 +1254,11 @@ def _measurement_errors(
     shots, point = point_spectra.shots, point_spectra.point
     bin_width = point_spectra.settings.sample_rate / point_spectra.settings.fft_size
     up_carrier, _, _ = shots.waveform.carriers
+    _, has_doppler, _ = shots.has_segment
     up, doppler, down = (segment.frequency * bin_width for segment in detections)
     measured = waveform.resolve_range_velocity(
         up=up,
-        doppler=doppler if shots.has_segment[1] else None,
+        doppler=doppler if has_doppler else None,
         down=down,
         carrier=_value_at(up_carrier, point),
         bandwidth=_value_at(shots.waveform.chirp_bandwidth, point),

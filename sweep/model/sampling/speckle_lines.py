@@ -152,7 +152,7 @@ class SpeckleLineGrid(NamedTuple):
 
     def select(self, points: np.ndarray) -> "SpeckleLineGrid":
         """Return the lines of the points with the given indices."""
-        if not self.line_shift.shape[0]:
+        if not len(self.line_shift):
             return self
         return self._replace(
             line_shift=self.line_shift[points],
@@ -627,6 +627,7 @@ def draw_segment_bin_amplitudes(
         (m, bins) complex.
     """
     (segment,) = np.flatnonzero(np.isfinite(echo_centre))
+    key_0, key_1 = key
     first_bins = np.full(3, first_bin)
     mean_power = np.empty((3, n_bins))
     mean_bin_powers(grid, point, echo_centre, first_bins, mean_power, np.empty((3, n_bins)))
@@ -634,7 +635,7 @@ def draw_segment_bin_amplitudes(
     drawn_amplitudes = np.empty((draws.size, n_bins), complex)
     for row, draw in enumerate(draws):
         draw_bin_amplitudes(
-            philox.DrawAddress(key[0], key[1], draw),
+            philox.DrawAddress(key_0, key_1, draw),
             echo_number,
             grid,
             point,
@@ -757,9 +758,10 @@ class FootprintRecord(NamedTuple):
         `key` (2,) uint64 is the random key of the point. The random numbers are those of
         :func:`draw_bin_amplitudes`.
         """
+        key_0, key_1 = key
         line_amplitudes = np.empty(len(self.series_coefficients), complex)
         _draw_line_amplitudes(
-            philox.DrawAddress(key[0], key[1], np.int64(draw_number)),
+            philox.DrawAddress(key_0, key_1, np.int64(draw_number)),
             ECHO_NUMBER_STRIDE * (1 + echo_number),
             line_amplitudes,
         )
@@ -940,9 +942,11 @@ def wander_covariance(
     shift_first, shift_second = gradients.line_shift[:, first], gradients.line_shift[:, second]
     phase_difference = gradients.phase[:, second] - gradients.phase[:, first]
     squared_phase = (phase_difference * phase_difference).sum(axis=-1)
-    rho = np.exp(-0.5 * squared_phase) * np.sqrt(echo_fraction[0] * echo_fraction[1])
+    fraction_first, fraction_second = echo_fraction
+    power_first, power_second = relative_power
+    rho = np.exp(-0.5 * squared_phase) * np.sqrt(fraction_first * fraction_second)
     remainder = np.maximum(1 - rho * rho, 1e-12)
-    magnitude_product = np.sqrt(relative_power[0] * relative_power[1])
+    magnitude_product = np.sqrt(power_first * power_second)
     # Beyond these limits the ratio equals its limits to float64.
     concentration = np.clip(2 * rho * magnitude_product / remainder, 1e-12, 1e7)
     mean_cosine = special.i1e(concentration) / special.i0e(concentration)

@@ -222,7 +222,9 @@ def test_drawn_factors_have_the_correlations(near):
     far = 0.1 - 0.4j if near != 1.0 else 1.0
     fading = SegmentCorrelations(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
     key, mixing = (np.uint64(3), np.uint64(4)), fading.cholesky_factors()[:, 0]
-    found = [speckle_factors(key, draw, 0, mixing) for draw in np.arange(number)]
+    found = [
+        speckle_factors(philox.DrawAddress(*key, draw), 0, mixing) for draw in np.arange(number)
+    ]
     power = np.array(found).T ** 2
     assert power.mean(axis=1) == pytest.approx(np.ones(3), abs=5 / np.sqrt(number))
     pairs = np.corrcoef(power)[[0, 1, 0], [1, 2, 2]]  # of powers, |mu|^2
