@@ -53,6 +53,10 @@ from sweep.kernel_cache import njit
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.bin_noise import noise_filter
+from sweep.model.detection.detection_probability import (
+    joint_detection_probability,
+    mean_detection_equivalent_bins,
+)
 from sweep.model.detection.echo_detection import (
     BinThresholds,
     bin_threshold_at,
@@ -632,8 +636,8 @@ def make_draw_inputs(
     total = weight.sum(axis=-1)
     total[total == 0] = 1.0
     pd_up, pd_down = bin_groups.pd[:, 0], bin_groups.pd[:, 2]
-    pd_both = shots.joint_detection_probability(
-        pd_up.T, pd_down.T, (bin_groups.magnitude[:, 0].T, bin_groups.magnitude[:, 2].T)
+    pd_both = joint_detection_probability(
+        shots, pd_up.T, pd_down.T, (bin_groups.magnitude[:, 0].T, bin_groups.magnitude[:, 2].T)
     ).T
     down_pd = down_pd_given_up(pd_up, pd_down, pd_both)
     mean_offset = (weight * apart).sum(axis=-1) / total
@@ -692,8 +696,7 @@ def _n_independent_bins(
 ) -> np.ndarray:
     """Return the equivalent number of independent bins that detect each echo, (n, 3, groups).
 
-    For the chirps it is that of :meth:`sweep.model.preparation.Shots.joint_detection_probability`;
-    near DC and Nyquist it is 1.
+    For the chirps it is that of :func:`joint_detection_probability`; near DC and Nyquist it is 1.
     """
     n_independent = np.ones(bin_groups.pd.shape)
     if shots.detection_settings.echo_bins == "peak_bin":
@@ -702,7 +705,7 @@ def _n_independent_bins(
         pd_by_segment = tuple(bin_groups.pd[:, s].T for s in segments)
         magnitudes_by_segment = tuple(bin_groups.magnitude[:, s].T for s in segments)
         n_equivalent = np.asarray(
-            shots.detection_equivalent_bins(pd_by_segment, magnitudes_by_segment)
+            mean_detection_equivalent_bins(shots, pd_by_segment, magnitudes_by_segment)
         ).T
         for s in segments:
             n_independent[:, s] = n_equivalent
