@@ -105,8 +105,8 @@ class ErrorBudget:
 
     beamlets_fraction: float = 0.25
     """Fraction of the tolerance for the number of beamlets, if that number follows from the
-    tolerance. It is included in `effects_fraction`. Half of it costs one more step of `NODE_COUNTS`
-    at most points.
+    tolerance. It is included in `effects_fraction`. Half of it costs one more step of
+    `NODE_COUNTS_ALONG_SLOPE` at most points.
     """
 
     lines_fraction: float = 1.0

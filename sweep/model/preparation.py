@@ -26,9 +26,9 @@ from sweep.model.ground import Ground
 from sweep.model.laser_line import LaserLine
 from sweep.model.link_budget import (
     PROCESSING_PREFIX,
+    EchoScales,
     LineMotion,
     LinkBudget,
-    LinkScales,
     NoiseBudget,
     ReceiverFilter,
     RecordSettings,
@@ -61,7 +61,7 @@ BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
 """Parameter path of the error of the detection probability due to the number of beamlets. It is
 present if that number follows from the tolerance."""
 
-CHIRP_SLOPE_PATHS = waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH
+CHIRP_SLOPE_PATHS = waveform.DOPPLER_SEGMENT_SLOPE_PATH, waveform.DOWN_SEGMENT_SLOPE_PATH
 """Parameter paths of the chirp rates of Doppler segment and down-chirp, over that of the up-chirp.
 """
 CATEGORY_PATHS = (
@@ -106,8 +106,10 @@ class Shots:
     """Range and velocity of the target on the beam's axis at the shot's start, (n,) each. Lines use
     the Doppler ratio of :attr:`motion` instead.
     """
-    link_scales: LinkScales
-    """Echo power and beat amplitude for a relative echo of 1/sr."""
+    echo_scales: EchoScales
+    """Echo power on the detector [W] and beat amplitude at the ADC [V] of a target with a relative
+    echo of 1/sr, (n,) or scalars.
+    """
     receiver_noise: ReceiverNoise
     """Noise at the ADC: variances of the receiver's own sources [V^2], and variances per noise
     current in the detector [V^2/A^2] and per power of light [V^2/W].
@@ -133,7 +135,7 @@ class Shots:
     speckle: EchoSpeckle = EchoSpeckle()  # noqa: RUF009
     """Speckle of an echo that fades; none by default."""
     permanent_line: PermanentLine | None = None
-    """Beat of other light than the echo's that is in every record; None without it."""
+    """Line of light other than the echo's, which is in every record; None if there is none."""
 
     @property
     def range(self) -> np.ndarray:
@@ -250,7 +252,7 @@ class Shots:
     @property
     def echo_power(self) -> np.ndarray:
         """Echo power on the detector [W], (n,)."""
-        return self.link_scales.echo_power * self.total_relative_echo
+        return self.echo_scales.echo_power * self.total_relative_echo
 
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
@@ -582,7 +584,7 @@ class Shots:
             self.range,
             self.motion.doppler_ratio,
             self.waveform.chirp_rate,
-            self.link_scales.beat_amplitude,
+            self.echo_scales.beat_amplitude,
             self.receiver_filter.detector_bandwidth,
             self.receiver_filter.amplifier_bandwidth,
             self.sample_rate,
@@ -637,7 +639,7 @@ class Shots:
     def detection_rule(self) -> "DetectionRule":
         """Rule by which the bins of one record detect an echo."""
         from sweep.model.detection.echo_detection import DetectionRule
-        from sweep.model.detection.joint_tail import joint_tail_rule
+        from sweep.model.detection.joint_tail import joint_tail_quadrature
         from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
         from sweep.model.detection.speckle_modes import NO_MODES, mode_table
         from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
@@ -665,7 +667,7 @@ class Shots:
             in_speckle=in_speckle,
             noise_correlation=self.noise_bin_correlation,
             real_record_in_speckle=real_record_in_speckle,
-            joint_tail_rule=joint_tail_rule(self.noise_bin_correlation),
+            neighbour_crossing_quadrature=joint_tail_quadrature(self.noise_bin_correlation),
             noise_pseudo_variance_ratio=noise_ratio,
             mode_table=modes,
             sidelobe_correlation=sidelobe_correlation(self.window, self.fft_size),
@@ -847,7 +849,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
             range=budget.target.range + zeros,
             radial_velocity=budget.target.radial_velocity + zeros,
         ),
-        link_scales=budget.link_scales,
+        echo_scales=budget.echo_scales,
         receiver_noise=budget.receiver_noise,
         noise=budget.noise,
         footprint=FootprintLines(
@@ -878,20 +880,20 @@ _POINT_FIELD_LABELS = {
     "target.radial_velocity": "radial velocity",
     "target.acceleration": "acceleration",
     "motion.doppler_ratio": "Doppler shift",
-    "link_scales.echo_power": "echo's power",
-    "link_scales.beat_amplitude": "beat's amplitude",
+    "echo_scales.echo_power": "echo's power",
+    "echo_scales.beat_amplitude": "beat's amplitude",
     "bin_noise_sigma": "noise",
     "threshold": "threshold",
 }
-"""Fields of `Shots`, with one value per point, that have to be finite, and their names in messages.
-"""
+"""Fields of `Shots` that must be finite, with one value for each point. Keys are dotted paths to
+them, and values their names in error messages."""
 _BEAMLET_FIELD_LABELS = {
     "footprint.relative_range_offset": "beamlets' ranges",
     "footprint.doppler_ratio_offset": "beamlets' velocities",
     "footprint.relative_amplitude": "beamlets' echoes",
 }
-"""Fields of `Shots`, with one value per beamlet, that have to be finite, and their names in
-messages."""
+"""Fields of `Shots` that must be finite, with one value for each beamlet. Keys are dotted paths to
+them, and values their names in error messages."""
 
 
 def require_finite(shots: Shots) -> None:

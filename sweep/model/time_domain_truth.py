@@ -219,7 +219,7 @@ def analytic_record(
         amplifier_bandwidth=_value_at(shots.receiver_filter.amplifier_bandwidth, point),
     )
     amplitude = (
-        _value_at(shots.link_scales.beat_amplitude, point)
+        _value_at(shots.echo_scales.beat_amplitude, point)
         * shots.footprint.relative_amplitude[shots.footprint.row_of_point[point], beamlet]
     )
     amplitude = amplitude * shots.whitening_gain[segment][point]

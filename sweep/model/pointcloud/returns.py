@@ -90,9 +90,9 @@ from sweep.model.pointcloud.leaked_peaks import (
 )
 from sweep.model.pointcloud.pairing import (
     CONFIRMATION_TOLERANCE_BINS,
-    FALSE_PEAK,
+    FALSE_PEAK_GROUP,
     MISREAD_FLAG,
-    NO_PEAK,
+    NO_PEAK_GROUP,
     TRUE_FLAG,
     UNCONFIRMED_FLAG,
     judge_return,
@@ -201,7 +201,7 @@ class Returns(NamedTuple):
         arrays: dict[str, np.ndarray] = {
             "flags": np.zeros(shape, np.uint8),
             "beamlet": np.full(shape, -1, np.int32),
-            "group": np.full((*shape, 3), FALSE_PEAK, np.int8),
+            "group": np.full((*shape, 3), FALSE_PEAK_GROUP, np.int8),
         }
         return cls(
             **{
@@ -565,7 +565,7 @@ class DrawnPeaks(NamedTuple):
     velocity, for chirp slopes 1, 0 and -1; -1 without a return."""
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group of adjacent bins to which the up, Doppler and
-    down peak belong, or FALSE_PEAK or NO_PEAK."""
+    down peak belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
     flags: np.ndarray
     """(n, draws, returns) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
@@ -580,7 +580,7 @@ class DrawnPeaks(NamedTuple):
         return cls(
             np.full((n, draws, groups_max, 3, 4), np.nan),
             np.full((n, draws, groups_max), -1),
-            np.full((n, draws, groups_max, 3), NO_PEAK, np.int8),
+            np.full((n, draws, groups_max, 3), NO_PEAK_GROUP, np.int8),
             np.zeros((n, draws, groups_max), np.uint8),
             np.full((n, draws, groups_max), -1, np.int32),
         )
@@ -599,7 +599,7 @@ class ListedReturns(NamedTuple):
     chirp slopes 1, 0 and -1."""
     group: np.ndarray
     """(m, 3) int8: index of the group of adjacent bins to which the up, Doppler and down peak
-    belong, or FALSE_PEAK or NO_PEAK."""
+    belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
     flags: np.ndarray
     """(m,) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`)."""
@@ -923,7 +923,7 @@ def _measure_listed_returns(
         <= tolerance_half_bins * measurements.velocity_per_half_bin
     )
     up_group, doppler_group, down_group = listed_returns.group.T
-    is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK)
+    is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK_GROUP)
     pd = inputs.pd[point, 0, group[:, 0]] * inputs.down_pd_given_up[point, 1, group[:, 2]]
     is_misread = (listed_returns.flags & TRUE_FLAG > 0) & ~is_right
     uncorrected = (
@@ -968,7 +968,7 @@ def _measure_listed_returns(
             is_misread, listed_returns.flags ^ (TRUE_FLAG | MISREAD_FLAG), listed_returns.flags
         ),
         listed_returns.beamlet,
-        np.maximum(listed_returns.group, FALSE_PEAK),
+        np.maximum(listed_returns.group, FALSE_PEAK_GROUP),
         *(np.broadcast_to(change, point.shape) for change in per_slip),
     )
 
@@ -1786,7 +1786,7 @@ def draw_segment_peaks(
     workspace
         Scratch.
     peaks, peak_groups
-        Results: (groups + 1, 4) peaks, and (groups + 1,) their groups or FALSE_PEAK.
+        Results: (groups + 1, 4) peaks, and (groups + 1,) their groups or FALSE_PEAK_GROUP.
     is_up_detected
         (groups,) bool: True for groups detected in the up segment. The up segment is drawn first
         and sets this array.
@@ -1944,7 +1944,7 @@ def draw_segment_peaks(
             config,
             interpolation,
         )
-        peak_groups[n_peaks] = FALSE_PEAK
+        peak_groups[n_peaks] = FALSE_PEAK_GROUP
         n_peaks += 1
     return n_peaks
 
