@@ -107,7 +107,9 @@ def explain_printed_alarm(tnr, printed_pfa, our_pfa):
     """Explain the difference between a printed false-alarm probability of a bin and ours."""
     digits = len(f"{printed_pfa:e}".partition("e")[0].rstrip("0").replace(".", ""))
     if float(f"{our_pfa:.{digits - 1}e}") == printed_pfa:
-        return f"the same in {labels.counted(digits, 'digit')}, which is all that is printed"
+        return (
+            f"the same in {labels.number_with_noun(digits, 'digit')}, which is all that is printed"
+        )
     if abs(printed_pfa / 10 / our_pfa - 1) < PRINTING_SLIP_TOLERANCE:
         percent_off = 100 * (printed_pfa / 10 / our_pfa - 1)
         return (

@@ -54,12 +54,12 @@ def escape_to_one_line(text: object) -> str:
     return escape_unprintable(str(text).replace("\n", "\\n").replace("\t", "\\t"))
 
 
-def counted(number: int, thing: str) -> str:
+def number_with_noun(number: int, thing: str) -> str:
     """Return a number with a noun, in the plural unless the number is 1.
 
     Examples
     --------
-    >>> counted(1, "shot"), counted(1200, "shot")
+    >>> number_with_noun(1, "shot"), number_with_noun(1200, "shot")
     ('1 shot', '1,200 shots')
     """
     return f"{number:,} {thing}{'' if number == 1 else 's'}"

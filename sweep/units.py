@@ -114,10 +114,13 @@ _BASE_UNIT_CONVERSIONS: dict[str, tuple[Fraction, dict[str, int]]] = {
 """Factor to pint's root units, and exponents of the root units, of each unit known without pint."""
 _PREFIX_EXPONENTS = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
 """Power of ten of each metric prefix."""
-UNITS_KNOWN_WITHOUT_PINT = frozenset(_BASE_UNIT_CONVERSIONS) | {
+BUILT_IN_UNITS = frozenset(_BASE_UNIT_CONVERSIONS) | {
     prefix + base for prefix in _PREFIX_EXPONENTS for base in _BASE_UNIT_CONVERSIONS
 }
-"""Units that are known without pint; factors and root units equal those of pint."""
+"""Units that this module converts without the library pint.
+
+Their factors and root units equal those of pint.
+"""
 
 
 class QuantityError(ValueError):
@@ -456,7 +459,7 @@ def _root_unit_conversion(
     name: str,
 ) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
     """Return factor, offset and dimension of a unit in pint's root units; None if it is unknown."""
-    if name in UNITS_KNOWN_WITHOUT_PINT:
+    if name in BUILT_IN_UNITS:
         base = name if name in _BASE_UNIT_CONVERSIONS else name[1:]
         factor, powers = _BASE_UNIT_CONVERSIONS[base]
         factor *= Fraction(10) ** (

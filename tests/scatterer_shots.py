@@ -109,7 +109,7 @@ def segment_amplitudes(facet: Facet, shots) -> dict[str, float]:
             amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,
         )
         echo_amplitude = (
-            shots.link_scales.beat_amplitude * np.sqrt(shots.total_relative_echo) * np.abs(gain)
+            shots.echo_scales.beat_amplitude * np.sqrt(shots.total_relative_echo) * np.abs(gain)
         )
         amplitude_by_segment[segment] = first_value(
             echo_amplitude * shots.whitening_gain[SEGMENTS.index(segment)]

@@ -21,7 +21,12 @@ from sweep.model.sampling.draws import (
     count_in_noise,
     speckle_factors,
 )
-from sweep.model.waveform import ANY_TWO, DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH, SHOT_DETECTION_PATH
+from sweep.model.waveform import (
+    ANY_TWO,
+    DOPPLER_SEGMENT_SLOPE_PATH,
+    DOWN_SEGMENT_SLOPE_PATH,
+    SHOT_DETECTION_PATH,
+)
 from sweep.spec import GridSpec, SpecError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -278,7 +283,11 @@ def test_lists_that_do_not_tell_range_and_velocity_are_refused(chirp, processing
 
 def test_lines_of_any_slope_are_those_of_the_record(table_4_1):
     """Sampled in time, and transformed: |X| of the peak, of every segment."""
-    p = table_4_1() | {DOPPLER_SLOPE_PATH: 0.3, DOWN_SLOPE_PATH: 0.75, "target.range": 411.0}
+    p = table_4_1() | {
+        DOPPLER_SEGMENT_SLOPE_PATH: 0.3,
+        DOWN_SEGMENT_SLOPE_PATH: 0.75,
+        "target.range": 411.0,
+    }
     p |= {"instrument.processing.fft_size": 4096, "instrument.chirp.duration": 1e-4}
     shots = prepared(p, ("doppler", "footprint"))
     found, true = (

@@ -207,7 +207,7 @@ def test_importing_the_package_and_its_units_leaves_pint_alone():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("name", sorted(units.UNITS_KNOWN_WITHOUT_PINT))
+@pytest.mark.parametrize("name", sorted(units.BUILT_IN_UNITS))
 def test_usual_units_are_exactly_pints(name):
     assert units._root_unit_conversion(name) == units.root_unit_conversion_by_pint(name)
 

@@ -19,10 +19,11 @@ from matplotlib.figure import Figure as Sheet
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from sweep.analysis import canvas, labels
-from sweep.analysis.datasets import ACCURACY_KIND, read_attributes_of_kind
+from sweep.analysis.datasets import read_attributes_of_kind
 from sweep.analysis.tables import PageTable, TablePage
+from sweep.model.error_budget import THESIS_BEAMLET_COUNT
 from sweep.storage.locations import Location, derived_files_dir
-from sweep.storage.store_format import OPEN_ZARR_KWARGS
+from sweep.storage.store_format import ACCURACY_STORE_KIND, OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
 
 TABULATED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
@@ -78,9 +79,6 @@ REQUIRED_SPEEDUP_OVER_FIXED, REQUIRED_SPEEDUP_OVER_THESIS = 1 / 1.1, 5.0
 
 The ratios are those of the best fixed setting, and of the thesis's method, to the adaptive setting.
 """
-
-THESIS_BEAMLET_COUNT = 109
-"""Number of beamlets that the thesis simulates."""
 
 MEDIAN_ROUNDS_MIN = 3
 """Least number of rounds of measurement for speed-ups to be medians over the rounds.
@@ -728,17 +726,17 @@ def _sheet_caption(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> 
     mark_meaning = "the largest" if error_quantile == 1 else f"that of {100 * error_quantile:.0f} %"
     phrases = [
         f"mark: {mark_meaning} of "
-        f"{labels.counted(attributes['points'], attributes['unit'][:-1])}; "
+        f"{labels.number_with_noun(attributes['points'], attributes['unit'][:-1])}; "
         f"bar and dot: 90 % and half of them, in pd alone; {NEGLIGIBLE_ERROR:g} and less at the "
         "foot",
-        f"best of {labels.counted(dataset.sizes['round'], 'round')}; "
+        f"best of {labels.number_with_noun(dataset.sizes['round'], 'round')}; "
         f"reference: {attributes['reference']}",
     ]
     if attributes["truth_points"]:
         difference_text = format_error(attributes["truth_pd_difference"])
         phrases.append(
-            f"time domain at {labels.counted(attributes['truth_points'], 'point')}: within "
-            f"{difference_text} of it"
+            f"time domain at {labels.number_with_noun(attributes['truth_points'], 'point')}: "
+            f"within {difference_text} of it"
         )
     phrases.append(f"study {attributes['study_id'][:8]}, model {attributes['model_version']}")
     return labels.join_sentences(phrases)
@@ -749,7 +747,7 @@ def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetti
 
     Raise NotAStoreError if the store is of another kind.
     """
-    study_id = read_attributes_of_kind(store, ACCURACY_KIND)["study_id"]
+    study_id = read_attributes_of_kind(store, ACCURACY_STORE_KIND)["study_id"]
     with xr.open_zarr(open_verified_store(store, study_id), **OPEN_ZARR_KWARGS) as dataset:
         loaded = dataset.load()
     return loaded, read_settings(loaded)

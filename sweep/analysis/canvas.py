@@ -203,10 +203,10 @@ def _draw_map_panels(chart: Chart, colour_scale: ColourScale) -> Sheet:
         _draw_map(panel_axes, norm, panel)
         panel_axes.set_title(panel.title, size=10)
         if i + n_columns >= len(chart.panels):
-            panel_axes.set_xlabel(panel.x.label)
+            panel_axes.set_xlabel(panel.x_axis.label)
             panel_axes.tick_params(labelbottom=True)
         if i % n_columns == 0:
-            panel_axes.set_ylabel(panel.y.label)
+            panel_axes.set_ylabel(panel.y_axis.label)
     maps_sheet.colorbar(
         ScalarMappable(norm, colour_map()),
         ax=axes_list,
@@ -256,7 +256,10 @@ def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
     """Draw the heat map of a panel, with contours and axes."""
     heat_map, mesh_edges = panel.heat_map, []
     assert heat_map is not None
-    for axis_name, values, axis in (("x", heat_map.x, panel.x), ("y", heat_map.y, panel.y)):
+    for axis_name, values, axis in (
+        ("x", heat_map.x, panel.x_axis),
+        ("y", heat_map.y, panel.y_axis),
+    ):
         if axis.kind == CATEGORY_SCALE:
             axes.set(
                 **{f"{axis_name}ticks": np.arange(values.size), f"{axis_name}ticklabels": values}
@@ -267,8 +270,8 @@ def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
     axes.pcolormesh(*mesh_edges, values, norm=norm, cmap=colour_map(), rasterized=True)
     if len(heat_map.contour_levels) and min(values.shape) > 1 and values.count():
         _draw_contours(axes, heat_map, values)
-    _set_axis(axes, "x", panel.x)
-    _set_axis(axes, "y", panel.y)
+    _set_axis(axes, "x", panel.x_axis)
+    _set_axis(axes, "y", panel.y_axis)
     axes.set_facecolor(MISSING_VALUE_COLOUR)
 
 
@@ -328,7 +331,7 @@ def _draw_line_panels(chart: Chart) -> Sheet:
         if is_split
         else HIGH_LINE_PANEL_INCHES
     )
-    share_y_axis = len({panel.y for panel in drawn_panels}) == 1
+    share_y_axis = len({panel.y_axis for panel in drawn_panels}) == 1
     n_columns = max(panels_per_row)
     lines_sheet, axes_list = sheet_with_axes(
         width * n_columns + 1.9 * bool(chart.panels_per_row),
@@ -351,11 +354,11 @@ def _draw_line_panels(chart: Chart) -> Sheet:
             labelbottom=not has_panel_below, labelsize=8 if chart.panels_per_row else None
         )
         if not has_panel_below:
-            axes.set_xlabel(panel.x.label)
+            axes.set_xlabel(panel.x_axis.label)
         if not share_y_axis:
-            axes.set_ylabel(panel.y.label, size=9)
+            axes.set_ylabel(panel.y_axis.label, size=9)
     if share_y_axis:
-        lines_sheet.supylabel(textwrap.fill(drawn_panels[0].y.label, 44), fontsize=10)
+        lines_sheet.supylabel(textwrap.fill(drawn_panels[0].y_axis.label, 44), fontsize=10)
     if not is_split:
         _draw_legend(lines_sheet, axes_list)
     return lines_sheet
@@ -395,11 +398,11 @@ def _draw_line_panel(axes: Axes, panel: Panel) -> None:
     has_stated = any(line.style == "stated" for line in panel.lines)
     for line in panel.lines:
         _draw_line(axes, line, solid=has_stated or line.points_per_value > 1)
-    _set_axis(axes, "x", panel.x)
-    _set_axis(axes, "y", panel.y)
-    if panel.x.kind != CATEGORY_SCALE:
+    _set_axis(axes, "x", panel.x_axis)
+    _set_axis(axes, "y", panel.y_axis)
+    if panel.x_axis.kind != CATEGORY_SCALE:
         axes.margins(x=0.0 if max(line.x.size for line in panel.lines) > 1 else 0.05)
-    if panel.y.kind != LOG_SCALE:
+    if panel.y_axis.kind != LOG_SCALE:
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 5))
     axes.grid(True)
     axes.set_axisbelow(True)

@@ -121,9 +121,9 @@ class Panel:
 
     A facet is a property by which panels differ, such as the part of the study.
     """
-    x: ChartAxis
+    x_axis: ChartAxis
     """Horizontal axis."""
-    y: ChartAxis
+    y_axis: ChartAxis
     """Vertical axis."""
     lines: Sequence[ChartLine] = ()
     """Lines of the panel."""
@@ -325,7 +325,7 @@ def split_into_parts(
 
 def omission_remark(n_omitted: int) -> str:
     """Return a caption phrase with the number of omitted values; '' if none is omitted."""
-    return f"{labels.counted(n_omitted, 'further value')} not shown" if n_omitted else ""
+    return f"{labels.number_with_noun(n_omitted, 'further value')} not shown" if n_omitted else ""
 
 
 def surface_chart(

@@ -22,12 +22,16 @@ from sweep.analysis.answers import (
 )
 from sweep.analysis.answers.dataset_lookup import STUDY_ID_NAME, study_marker_name
 from sweep.messages import suggested_call
-from sweep.model.outputs import RUNNING_SUMS
+from sweep.model.outputs import DRAW_BATCH_DIM, RUNNING_SUMS
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
 from sweep.storage.locations import JOURNAL_DIR, Location, parse_location
 from sweep.storage.store_format import (
+    ACCURACY_STORE_KIND,
+    EYEPOINTS_STORE_KIND,
+    GRID_STORE_KIND,
     OPEN_ZARR_KWARGS,
+    SCENE_STORE_KIND,
     TERRAIN_MAP_GROUP,
     NotAStoreError,
     format_software_versions,
@@ -35,9 +39,6 @@ from sweep.storage.store_format import (
     read_receipt_totals,
 )
 from sweep.storage.verified_store import open_verified_store
-
-DRAW_BATCH_DIM = "batch"
-"""Name of the array dimension in a store along which draws are counted in batches."""
 
 READ_CHUNK_VALUES_MAX = 2**20
 """Largest number of array values in a Dask chunk.
@@ -52,14 +53,13 @@ READ_SHOTS_MAX = 8192
 MISSING_COUNT = -1
 """Value that stands in a store for a count that is not computed yet."""
 
-GRID_KIND, SCENE_KIND, ACCURACY_KIND = "grid", "scene", "accuracy"
-"""Kinds of stores."""
-
 _DESCRIPTION_BY_KIND = {
-    GRID_KIND: "a grid of points: sweep.open() opens it",
-    SCENE_KIND: "a scene's point clouds: sweep.open_scene() opens it",
-    ACCURACY_KIND: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
-    "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
+    GRID_STORE_KIND: "a grid of points: sweep.open() opens it",
+    SCENE_STORE_KIND: "a scene's point clouds: sweep.open_scene() opens it",
+    ACCURACY_STORE_KIND: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
+    EYEPOINTS_STORE_KIND: (
+        "the eyepoints of a flight, which point clouds are made of: open one of those"
+    ),
 }
 """Descriptions of the kinds of stores, with the function that opens each."""
 
@@ -116,7 +116,7 @@ def open(
     if isinstance(path, Sequence | Mapping) and not isinstance(path, str):
         return provenance.join_designs(_datasets_by_title([open(store) for store in path]), dim)
     path = parse_location(path)
-    attributes = read_attributes_of_kind(path, GRID_KIND)
+    attributes = read_attributes_of_kind(path, GRID_STORE_KIND)
     require_intact_coordinates(path)
     dataset = xr.open_zarr(
         open_verified_store(path, attributes["study_id"]), chunks=None, **OPEN_ZARR_KWARGS
@@ -203,7 +203,7 @@ def open_scene_tree(store_path: Location, chunks: dict[str, int] | None = None) 
 
     With ``chunks=None`` no Dask array is made: values are read when an array is sliced.
     """
-    attributes = read_attributes_of_kind(store_path, SCENE_KIND)
+    attributes = read_attributes_of_kind(store_path, SCENE_STORE_KIND)
     require_intact_coordinates(store_path)
     store = open_verified_store(store_path, attributes["study_id"])
     whole_tree = xr.open_datatree(store, engine="zarr", chunks=chunks, **OPEN_ZARR_KWARGS)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import counted as counted
+from sweep.messages import number_with_noun as number_with_noun
 
 KILOMETRE_DISPLAY_MIN = 1000.0
 """Median of the distances on an axis above which they are shown in km [m]."""

@@ -13,13 +13,8 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import accuracy_results, canvas, charts, labels, tables
-from sweep.analysis.datasets import (
-    ACCURACY_KIND,
-    SCENE_KIND,
-    open_scene_tree,
-    read_attributes_of_kind,
-)
 from sweep.analysis.datasets import open as open_store
+from sweep.analysis.datasets import open_scene_tree, read_attributes_of_kind
 from sweep.analysis.scene_results import cloud_figures
 from sweep.analysis.scene_results.cloud_figures import HeightMap
 from sweep.analysis.scene_results.navigation_errors import (
@@ -67,6 +62,7 @@ from sweep.spec.figure_sections import (
     ShotSpectraFigure,
 )
 from sweep.storage.locations import Location, derived_files_dir, parse_location
+from sweep.storage.store_format import ACCURACY_STORE_KIND, SCENE_STORE_KIND
 
 SURFACE_AXIS_VALUES_MIN = 8
 """Least number of values of an axis for a default figure to be a surface over this axis."""
@@ -196,7 +192,7 @@ def draw_figures(
     store = parse_location(store_path)
     attributes = read_attributes_of_kind(store)
     kind = attributes["kind"]
-    if kind == ACCURACY_KIND:
+    if kind == ACCURACY_STORE_KIND:
         return accuracy_results.write_sheet_and_tables(
             store, None if directory is None else Path(directory), picture_format
         )
@@ -204,7 +200,7 @@ def draw_figures(
     directory = (
         derived_files_dir(store) / f"{stem}-figures" if directory is None else Path(directory)
     )
-    if kind == SCENE_KIND:
+    if kind == SCENE_STORE_KIND:
         results: Any = SceneResults.from_store(store)
     else:
         results = GridResults.from_store(store)

@@ -19,7 +19,7 @@ from sweep.cli.terminal import (
     print_table,
     shorten_path,
 )
-from sweep.messages import counted, escape_to_one_line, shell_command
+from sweep.messages import escape_to_one_line, number_with_noun, shell_command
 from sweep.storage.locations import Location, derived_files_dir, file_sizes_below
 
 if TYPE_CHECKING:
@@ -56,10 +56,12 @@ def status(store: Location) -> None:
         if store_status.points_in_unfinished_blocks
         else ""
     )
-    draws_text = f", {counted(store_status.draws_done, 'draw')}" if store_status.draws_done else ""
+    draws_text = (
+        f", {number_with_noun(store_status.draws_done, 'draw')}" if store_status.draws_done else ""
+    )
     echo_wrapped(
         f"{store_status.points_done:,} of {store_status.points:,} {store_status.points_noun}, "
-        f"{store_status.blocks_done:,} of {counted(store_status.blocks, 'block')}"
+        f"{store_status.blocks_done:,} of {number_with_noun(store_status.blocks, 'block')}"
         f"{points_begun_text}{draws_text}, {decimal(store_status.bytes_stored)} stored"
     )
     if store_status.points_per_second:
@@ -67,7 +69,8 @@ def status(store: Location) -> None:
             f"{float(f'{store_status.points_per_second:.3g}'):,.12g} {store_status.points_noun}/s"
         )
         click.echo(
-            f"{rate_text} in the last run, by {counted(store_status.workers_in_last_run, 'worker')}"
+            f"{rate_text} in the last run, by "
+            f"{number_with_noun(store_status.workers_in_last_run, 'worker')}"
         )
     if store_status.is_lock_holder_alive and store_status.lock_holder:
         echo_wrapped(
@@ -177,7 +180,7 @@ def finalize(store: Location, output: Location | None) -> None:
     )
     file_sizes = file_sizes_below(packed_store)
     click.echo(
-        f"{shorten_path(packed_store)}: {counted(len(file_sizes), 'file')}, "
+        f"{shorten_path(packed_store)}: {number_with_noun(len(file_sizes), 'file')}, "
         f"{decimal(sum(file_sizes.values()))}"
     )
 
@@ -201,8 +204,8 @@ def _print_verify_report(report: VerificationReport) -> None:
         )
     if report.blocks:
         echo_wrapped(
-            f"{store}: {report.undamaged_blocks:,} of {counted(report.blocks, 'block')} committed "
-            "and undamaged"
+            f"{store}: {report.undamaged_blocks:,} of {number_with_noun(report.blocks, 'block')} "
+            "committed and undamaged"
         )
 
 
@@ -317,9 +320,12 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
 def _open_store(path: Location) -> OpenedStore:
     """Open a store: a dataset for a grid, a data tree for a flight."""
-    from sweep.analysis.datasets import SCENE_KIND, open_scene, read_attributes_of_kind
     from sweep.analysis.datasets import open as open_grid
+    from sweep.analysis.datasets import open_scene, read_attributes_of_kind
+    from sweep.storage.store_format import SCENE_STORE_KIND
 
     return (
-        open_scene(path) if read_attributes_of_kind(path)["kind"] == SCENE_KIND else open_grid(path)
+        open_scene(path)
+        if read_attributes_of_kind(path)["kind"] == SCENE_STORE_KIND
+        else open_grid(path)
     )

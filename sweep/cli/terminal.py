@@ -19,9 +19,9 @@ from rich.filesize import decimal
 from sweep.messages import (
     EXIT_INCOMPLETE,
     EXIT_MISTAKE,
-    counted,
     escape_to_one_line,
     escape_unprintable,
+    number_with_noun,
     shell_command,
 )
 from sweep.storage.locations import Location, parse_location
@@ -323,11 +323,13 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
         except Exception as error:  # without the tables the study is still computed
             echo_wrapped(f"no table of the results: {_error_text(error)}", err=True)
     for scanner, rays in outcome.rays_by_scanner.items():
-        rays_text = f"{counted(rays, 'ray')} cast" if rays else "eyepoints were there, no ray cast"
+        rays_text = (
+            f"{number_with_noun(rays, 'ray')} cast" if rays else "eyepoints were there, no ray cast"
+        )
         click.echo(f"{scanner}: {rays_text}")
     echo_wrapped(
         f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.points_noun}, "
-        f"computed {outcome.blocks_computed:,} of {counted(outcome.blocks, 'block')} "
+        f"computed {outcome.blocks_computed:,} of {number_with_noun(outcome.blocks, 'block')} "
         f"in {duration_text(outcome.seconds)}"
     )
     if outcome.complete:
@@ -343,7 +345,8 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
         outcome.stop_reason or f"{n_failed:,} failed; {shell_command('status', store)}  tells why"
     )
     click.echo(
-        f"Incomplete, {blocks_left:,} of {counted(outcome.blocks, 'block')} left: {reason}.",
+        f"Incomplete, {blocks_left:,} of {number_with_noun(outcome.blocks, 'block')} left: "
+        f"{reason}.",
         err=True,
     )
     if blocks_left > n_failed:
@@ -617,7 +620,7 @@ def plan_rows(
     else:
         yield from _scene_plan_rows(spec, study_plan)
         yield "blocks", f"{study_plan.n_blocks:,}"
-    yield "chunks", counted(study_plan.n_chunks, "file")
+    yield "chunks", number_with_noun(study_plan.n_chunks, "file")
     yield "bytes", f"{decimal(study_plan.nbytes)} before compression"
     if reason := unchecked_beamlets_reason(spec):
         yield "not checked", reason
@@ -628,7 +631,7 @@ def plan_rows(
     yield (
         "time",
         f"{bound_text} {duration_text(study_plan.wall_seconds)} on "
-        f"{counted(study_plan.n_workers, computing_unit)}",
+        f"{number_with_noun(study_plan.n_workers, computing_unit)}",
     )
     memory_share = " a worker" if study_plan.has_workers else ""
     yield "memory", f"about {decimal(study_plan.memory_bytes)}{memory_share}"
@@ -656,12 +659,12 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
     for scanner_plan in study_plan.scanners:
         yield (
             scanner_plan.name,
-            f"{counted(scanner_plan.n_cycles, 'cycle')}, "
-            f"{counted(scanner_plan.n_shots, 'shot')}, "
+            f"{number_with_noun(scanner_plan.n_cycles, 'cycle')}, "
+            f"{number_with_noun(scanner_plan.n_shots, 'shot')}, "
             + (
                 "eyepoints are there already"
                 if scanner_plan.has_eyepoints
-                else f"{counted(scanner_plan.n_rays, 'ray')} at "
+                else f"{number_with_noun(scanner_plan.n_rays, 'ray')} at "
                 f"{1e6 * scanner_plan.seconds_per_ray:.3g} us on one core"
             ),
         )

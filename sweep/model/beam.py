@@ -473,7 +473,7 @@ def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.nda
     return np.asarray(np.exp(-2 * axis_offset(parameters, range) ** 2 / squared_radii))
 
 
-_UNTRUNCATED_FILL_MAX = 0.25
+_UNTRUNCATED_FILL_RATIO_MAX = 0.25
 """Ratio of beam radius to aperture radius up to which truncation by the aperture is neglected. Up
 to this ratio truncation takes at most 5e-7 of the echo."""
 _TABLE_MIDDLE_PHASE = 4.0
@@ -518,13 +518,13 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
     fill_ratio, rim_phase = np.broadcast_arrays(
         np.asarray(fill_ratio, float), np.abs(np.asarray(defocus_phase, float))
     )
-    if not (fill_ratio > _UNTRUNCATED_FILL_MAX).any():
+    if not (fill_ratio > _UNTRUNCATED_FILL_RATIO_MAX).any():
         return np.ones(fill_ratio.shape)
     rim_phase = np.minimum(rim_phase, _RIM_PHASE_MAX)
     efficiency = _truncation_table().ev(
         np.minimum(fill_ratio, 1.0), 1 / (1 + rim_phase / _TABLE_MIDDLE_PHASE)
     )
-    return np.where(fill_ratio > _UNTRUNCATED_FILL_MAX, efficiency, 1.0)
+    return np.where(fill_ratio > _UNTRUNCATED_FILL_RATIO_MAX, efficiency, 1.0)
 
 
 @lru_cache(maxsize=1)
@@ -544,8 +544,8 @@ def _truncation_table() -> "RectBivariateSpline":
     q_weights = np.tile(2 * gauss_weights, q.size // gauss_weights.size)
     kernel = j0(q[:, None] * radii) * (radius_weights * radii)
     fill_ratios = (
-        _UNTRUNCATED_FILL_MAX
-        + (1 - _UNTRUNCATED_FILL_MAX) * (1 - np.cos(np.linspace(0, np.pi, 13))) / 2
+        _UNTRUNCATED_FILL_RATIO_MAX
+        + (1 - _UNTRUNCATED_FILL_RATIO_MAX) * (1 - np.cos(np.linspace(0, np.pi, 13))) / 2
     )
     phase_coordinates = np.geomspace(1 / (1 + _RIM_PHASE_MAX / _TABLE_MIDDLE_PHASE), 1.0, 80)
     table = np.empty((fill_ratios.size, phase_coordinates.size))

@@ -75,7 +75,7 @@ far rougher than it is."""
 _N_SEGMENTS = 3
 """Number of segments of a shot, over which errors of the detection probability are summed."""
 
-NODE_COUNTS = np.array([
+NODE_COUNTS_ALONG_SLOPE = np.array([
     2, 3, 4, 5, 6, 7, 9, 11, 15, 22, 33, 49, 73, 109, 163, 244, 366, 549, 823, 1234, 1851, 2776,
     4096,
 ])  # fmt: skip
@@ -473,7 +473,9 @@ def required_nodes(
     single_line_error = (
         _single_node_line_error(window_name, spread) / largest_bin_powers[table_index]
     )
-    counts = NODE_COUNTS[: np.searchsorted(NODE_COUNTS, error_budget.beamlets_max, "right")]
+    counts = NODE_COUNTS_ALONG_SLOPE[
+        : np.searchsorted(NODE_COUNTS_ALONG_SLOPE, error_budget.beamlets_max, "right")
+    ]
     total_error = tabulated_errors[: counts.size, table_index] + single_line_error
     count_index, error = _cheapest_within_tolerance(total_error, counts[:, None], tolerance)
     n_lines = np.ones(count_index.shape, np.int64)
@@ -492,7 +494,7 @@ def required_nodes(
             line_counts[is_better],
             line_errors[is_better],
         )
-    return n_lines, NODE_COUNTS[count_index], np.minimum(error, 1.0)
+    return n_lines, NODE_COUNTS_ALONG_SLOPE[count_index], np.minimum(error, 1.0)
 
 
 def _cheapest_within_tolerance(
@@ -531,7 +533,7 @@ def _choose_node_lines(
     Returns
     -------
     count_index : ndarray (n,)
-        Index of the number of nodes in NODE_COUNTS.
+        Index of the number of nodes in NODE_COUNTS_ALONG_SLOPE.
     n_lines : ndarray (n,)
         Number of lines of nodes.
     error : ndarray (n,)
@@ -563,7 +565,7 @@ def _choose_node_lines(
         segment_error = np.fmin(errors_across[:, np.searchsorted(_CURVATURES, c)], smoothed_error)
         error_across = np.maximum(error_across, segment_error / largest_bin_power)
     total_error = error_along[:, None] + error_across
-    cost = NODE_COUNTS[:, None] * NODE_COUNTS_ACROSS_SLOPE
+    cost = NODE_COUNTS_ALONG_SLOPE[:, None] * NODE_COUNTS_ACROSS_SLOPE
     total_error = np.where((cost <= beamlets_max)[..., None], total_error, np.inf).reshape(
         -1, quadratic_max.size
     )
@@ -615,8 +617,8 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     )
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
     weight = _window_autocorrelation(window_name, lag)
-    errors = np.empty((NODE_COUNTS.size, spreads.size + 1))
-    for row, n_nodes in zip(errors, NODE_COUNTS.tolist(), strict=True):
+    errors = np.empty((NODE_COUNTS_ALONG_SLOPE.size, spreads.size + 1))
+    for row, n_nodes in zip(errors, NODE_COUNTS_ALONG_SLOPE.tolist(), strict=True):
         row[:] = np.append(_node_spacing_as_error(spreads, n_nodes), np.inf)
         for i, spread in enumerate(spreads.tolist()):
             rule_error = (
@@ -650,7 +652,7 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
     Returns
     -------
     along : ndarray (counts, m + 1)
-        Errors of NODE_COUNTS along the slope, at _CURVATURES and beyond the largest.
+        Errors of NODE_COUNTS_ALONG_SLOPE along the slope, at _CURVATURES and beyond the largest.
     across : ndarray (lines, m + 1)
         Errors of NODE_COUNTS_ACROSS_SLOPE across the slope.
     """
@@ -672,7 +674,7 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
             1e3,
         )
 
-    along, across = NODE_COUNTS.tolist(), (2 * NODE_COUNTS_ACROSS_SLOPE).tolist()
+    along, across = NODE_COUNTS_ALONG_SLOPE.tolist(), (2 * NODE_COUNTS_ACROSS_SLOPE).tolist()
     return np.array([errors_of_rule(number) for number in along]), np.array(
         [errors_of_rule(number) for number in across]
     )

@@ -50,6 +50,10 @@ AUTOMATIC = -1.0
 """Value of an error setting in :class:`ErrorBudget` that means: compute it from the tolerance."""
 
 
+THESIS_BEAMLET_COUNT = 109
+"""Number of beamlets of a beam in the thesis [T 3.3.1]."""
+
+
 @dataclass(frozen=True)
 class ErrorBudget:
     """Error tolerance of a study, and its division among the sources of error.
@@ -105,8 +109,8 @@ class ErrorBudget:
 
     beamlets_fraction: float = 0.25
     """Fraction of the tolerance for the number of beamlets, if that number follows from the
-    tolerance. It is included in `effects_fraction`. Half of it costs one more step of `NODE_COUNTS`
-    at most points.
+    tolerance. It is included in `effects_fraction`. Half of it costs one more step of
+    `NODE_COUNTS_ALONG_SLOPE` at most points.
     """
 
     lines_fraction: float = 1.0
@@ -128,8 +132,8 @@ class ErrorBudget:
     least error, and their output ``beamlets_error`` states the error.
     """
 
-    thesis_beamlet_count: int = 109
-    """Number of beamlets of [T 3.3.1]. It is used where amplitudes add over a smooth plane. Their
+    thesis_beamlet_count: int = THESIS_BEAMLET_COUNT
+    """Number of beamlets of the thesis. It is used where amplitudes add over a smooth plane. Their
     sum almost cancels, so that no number of beamlets is enough for the tolerance.
     """
 

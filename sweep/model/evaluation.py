@@ -12,7 +12,10 @@ import numpy as np
 from sweep.model import waveform
 from sweep.model.beamlet_counts import split_with_beamlet_counts
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.detection_probability import shot_pd_and_miss
+from sweep.model.detection.detection_probability import (
+    joint_detection_probability,
+    shot_pd_and_miss,
+)
 from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 from sweep.model.effects.catalogue import (
     DEFAULT_EFFECTS,
@@ -255,8 +258,8 @@ def shot_statistics(
     if shots.any_two:
         pd_up, _, pd_down = pd
         magnitude_up, _, magnitude_down = magnitude
-        results["pd_both_chirps"] = shots.joint_detection_probability(
-            pd_up, pd_down, (magnitude_up, magnitude_down)
+        results["pd_both_chirps"] = joint_detection_probability(
+            shots, pd_up, pd_down, (magnitude_up, magnitude_down)
         )
     if shots.detection_settings.reported_peaks == waveform.STRONGEST_PEAK:
         results |= strongest_peak_probabilities(shots, pd, miss, magnitude)

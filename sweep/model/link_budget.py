@@ -139,7 +139,7 @@ class WaveformSettings:
             1.0,
             *(
                 np.asarray(parameters.get(path, waveform.WAVEFORM_DEFAULTS[path]), float)
-                for path in (waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH)
+                for path in (waveform.DOPPLER_SEGMENT_SLOPE_PATH, waveform.DOWN_SEGMENT_SLOPE_PATH)
             ),
         )
         chirp_bandwidth = parameters[CHIRP_PREFIX + "bandwidth"]
@@ -487,10 +487,11 @@ class NoiseBudget:
         return self.variances.get(ADC_NOISE_SOURCE, 0.0) / self.variance_without_echo
 
 
-class LinkScales(NamedTuple):
-    """Echo power and beat amplitude per relative echo, and transmission of light from the ground.
+class EchoScales(NamedTuple):
+    """Echo power [W] and beat amplitude [V] of a target with a relative echo of 1/sr.
 
-    The relative echo is the backscatter of the beamlets [1/sr].
+    The relative echo is the backscatter of the beamlets [1/sr]. Effects scale both, and change the
+    transmission of light from the ground that is kept with them.
     """
 
     echo_power: np.ndarray
@@ -504,8 +505,8 @@ class LinkScales(NamedTuple):
 
     def scale_echo(
         self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
-    ) -> "LinkScales":
-        """Return the scales times factors on the echo's power and on the beat's amplitude."""
+    ) -> "EchoScales":
+        """Return the record with factors on the echo's power and on the beat's amplitude."""
         return self._replace(
             echo_power=self.echo_power * power_factor,
             beat_amplitude=self.beat_amplitude * amplitude_factor,
@@ -550,12 +551,12 @@ class LinkBudget:
         return Looks.from_parameters(self.parameters)
 
     @cached_property
-    def link_scales(self) -> LinkScales:
-        """Echo power and beat amplitude for a relative echo of 1/sr."""
+    def echo_scales(self) -> EchoScales:
+        """Echo power [W] and beat amplitude [V] of a target with a relative echo of 1/sr."""
         echo_power, current = echo_power_and_beat_current(
             self.waveform.architecture, self.parameters
         )
-        return LinkScales(echo_power, current * self.parameters[RECEIVER_PREFIX + "transimpedance"])
+        return EchoScales(echo_power, current * self.parameters[RECEIVER_PREFIX + "transimpedance"])
 
     @cached_property
     def receiver_noise(self) -> receiver_chain.ReceiverNoise:

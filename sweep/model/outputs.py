@@ -182,6 +182,9 @@ _SEGMENT_PHRASES = {
     "down": "the down-chirp segment",
     "doppler": "the Doppler segment",
 }
+DRAW_BATCH_DIM = "batch"
+"""Name of the array dimension in a store along which draws are counted in batches."""
+
 DRAW_COUNT_OUTPUTS: dict[str, OutputVariable] = {
     f"n_{name}_{segment}": OutputVariable(
         "1", f"number of draws with a {event} in {segment_phrase}", dtype="int64"

@@ -20,20 +20,15 @@ from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import bin_noise
 from sweep.model.detection.detectors import main_lobe_half_width
-from sweep.model.detection.looks import (
-    LOOKS_NUMBER_PATH,
-    LOOKS_VOTES_PATH,
-    DetectionArrays,
-    Looks,
-)
+from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH, Looks
 from sweep.model.error_budget import AUTOMATIC
 from sweep.model.ground import Ground
 from sweep.model.laser_line import LaserLine
 from sweep.model.link_budget import (
     PROCESSING_PREFIX,
+    EchoScales,
     LineMotion,
     LinkBudget,
-    LinkScales,
     NoiseBudget,
     ReceiverFilter,
     RecordSettings,
@@ -66,7 +61,7 @@ BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
 """Parameter path of the error of the detection probability due to the number of beamlets. It is
 present if that number follows from the tolerance."""
 
-CHIRP_SLOPE_PATHS = waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH
+CHIRP_SLOPE_PATHS = waveform.DOPPLER_SEGMENT_SLOPE_PATH, waveform.DOWN_SEGMENT_SLOPE_PATH
 """Parameter paths of the chirp rates of Doppler segment and down-chirp, over that of the up-chirp.
 """
 CATEGORY_PATHS = (
@@ -111,8 +106,10 @@ class Shots:
     """Range and velocity of the target on the beam's axis at the shot's start, (n,) each. Lines use
     the Doppler ratio of :attr:`motion` instead.
     """
-    link_scales: LinkScales
-    """Echo power and beat amplitude for a relative echo of 1/sr."""
+    echo_scales: EchoScales
+    """Echo power on the detector [W] and beat amplitude at the ADC [V] of a target with a relative
+    echo of 1/sr, (n,) or scalars.
+    """
     receiver_noise: ReceiverNoise
     """Noise at the ADC: variances of the receiver's own sources [V^2], and variances per noise
     current in the detector [V^2/A^2] and per power of light [V^2/W].
@@ -138,7 +135,7 @@ class Shots:
     speckle: EchoSpeckle = EchoSpeckle()  # noqa: RUF009
     """Speckle of an echo that fades; none by default."""
     permanent_line: PermanentLine | None = None
-    """Beat of other light than the echo's that is in every record; None without it."""
+    """Line of light other than the echo's, which is in every record; None if there is none."""
 
     @property
     def range(self) -> np.ndarray:
@@ -255,7 +252,7 @@ class Shots:
     @property
     def echo_power(self) -> np.ndarray:
         """Echo power on the detector [W], (n,)."""
-        return self.link_scales.echo_power * self.total_relative_echo
+        return self.echo_scales.echo_power * self.total_relative_echo
 
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
@@ -417,110 +414,6 @@ class Shots:
         )
         return np.where(stated_floor == AUTOMATIC, automatic_floor, stated_floor)
 
-    def joint_detection_probability(
-        self, pd_up: np.ndarray, pd_down: np.ndarray, magnitudes: tuple[np.ndarray, np.ndarray]
-    ) -> np.ndarray:
-        """Return the probability that both up and down segment are detected.
-
-        Parameters
-        ----------
-        pd_up, pd_down : ndarray (..., n)
-            Probabilities of detection of each segment.
-        magnitudes : tuple of ndarray (..., n)
-            |X| of the strongest bins of up and down segment [V].
-
-        Returns
-        -------
-        ndarray (..., n)
-            The product of the two without speckle. In developed speckle the segments are correlated
-            and the probability is larger.
-        """
-        from sweep.model.detection import echo_detection
-        from sweep.model.detection.pseudo_variance import mean_over_phases
-
-        if self.speckle.segment_correlations is None:
-            return pd_up * pd_down
-        threshold_ratio, correlation = (
-            self.threshold / self.line_noise_sigma,
-            np.abs(self.speckle.segment_correlations.up_down),
-        )
-        if self.looks.is_noncoherent:
-            signal_up, signal_down = (magnitude / self.line_noise_sigma for magnitude in magnitudes)
-            look_speckle = self.speckle.look_speckle
-            if look_speckle is not None:
-                correlation = look_speckle.segment_correlation[1]
-            pd_both = self.looks.joint_pd_in_speckle(
-                signal_up, signal_down, threshold_ratio, correlation, look_speckle
-            )
-            if self.speckle_table.ratio_row[
-                [0, 2]
-            ].any():  # take the shared fraction as far from DC and Nyquist
-                pd_up_far_from_ends, pd_down_far_from_ends = self._pd_in_looks_far_from_ends(
-                    signal_up, signal_down, threshold_ratio
-                )
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    shared_fraction = (pd_both - pd_up_far_from_ends * pd_down_far_from_ends) / (
-                        np.minimum(pd_up_far_from_ends, pd_down_far_from_ends)
-                        - pd_up_far_from_ends * pd_down_far_from_ends
-                    )
-                shared_fraction = np.clip(np.nan_to_num(shared_fraction), 0.0, 1.0)
-                is_near_ends = self.speckle_table.ratio_row[[0, 2]].any(axis=0)
-                pd_both = np.where(
-                    is_near_ends,
-                    pd_up * pd_down
-                    + shared_fraction * (np.minimum(pd_up, pd_down) - pd_up * pd_down),
-                    pd_both,
-                )
-        else:
-            n_equivalent = self.detection_equivalent_bins((pd_up, pd_down), magnitudes)
-            pd_both = echo_detection.joint_pd_in_speckle(
-                pd_up, pd_down, threshold_ratio, correlation, n_equivalent
-            )
-            speckle_table, speckle_rows = self.speckle_table, self.speckle_table.ratio_row[[0, 2]]
-            near_ends = np.flatnonzero(speckle_rows.any(axis=0))
-            if near_ends.size:
-                threshold_ratio, correlation, n_equivalent = (
-                    np.broadcast_to(v, pd_up.shape)[..., near_ends]
-                    for v in (threshold_ratio, correlation, n_equivalent)
-                )
-                (pd_both[..., near_ends],) = mean_over_phases(
-                    speckle_table.phase_factors[speckle_rows[:, near_ends]],
-                    (pd_up[..., near_ends], pd_down[..., near_ends]),
-                    lambda up, down: (
-                        echo_detection.joint_pd_in_speckle(
-                            up, down, threshold_ratio, correlation, n_equivalent
-                        ),
-                    ),
-                )
-        return np.where((pd_up == 0) | (pd_down == 0), 0.0, pd_both)
-
-    def detection_equivalent_bins(
-        self, probabilities: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]
-    ) -> np.ndarray | float:
-        """Return the number of independent bins that detect as often as an echo's correlated bins.
-
-        It is the geometric mean over the segments.
-
-        Parameters
-        ----------
-        probabilities : tuple of ndarray
-            Probabilities of detection of the segments.
-        magnitudes : tuple of ndarray
-            |X| of the segments' strongest bins [V].
-        """
-        from sweep.model.detection.echo_detection import detection_equivalent_bins
-
-        if self.detection_settings.echo_bins == "peak_bin":
-            return 1.0
-        noise_sigma = self.line_noise_sigma
-        threshold_ratio = self.threshold / noise_sigma
-        n_equivalent: Any = 1.0
-        for pd, magnitude in zip(probabilities, magnitudes, strict=True):
-            n_equivalent = n_equivalent * detection_equivalent_bins(
-                pd, magnitude / noise_sigma, threshold_ratio
-            )
-        return np.asarray(n_equivalent ** (1 / len(probabilities)))
-
     @property
     def any_two(self) -> bool:
         """True if a shot counts as detected when any two of its three segments detect it."""
@@ -528,151 +421,6 @@ class Shots:
             self.detection_settings.shot_rule == waveform.ANY_TWO
             and len(self.waveform.segment_order) == 3
         )
-
-    def pd_and_miss_in_looks(
-        self,
-        magnitude: np.ndarray,
-        bins: np.ndarray,
-        point_indices: np.ndarray | slice = slice(None),
-    ) -> DetectionArrays:
-        """Return the probabilities that a bin is detected in several looks, and that it is missed.
-
-        A look is one of several records of the same segment.
-
-        Parameters
-        ----------
-        magnitude : ndarray (..., m)
-            |X| of one look [V]; nan without an echo.
-        bins : ndarray (..., m)
-            Bin numbers.
-        point_indices : ndarray (m,) or slice
-            Points to which the columns belong.
-
-        Returns
-        -------
-        DetectionArrays
-            pd and miss, (..., m); nan where `magnitude` is.
-        """
-        is_present, sigma_and_threshold = (
-            np.isfinite(magnitude),
-            (self.line_noise_sigma, self.threshold),
-        )
-        noise_sigma, threshold = (
-            np.broadcast_to(v, self.size)[point_indices] for v in sigma_and_threshold
-        )
-        signal_ratio = np.where(is_present, magnitude, 0.0) / noise_sigma
-        if self.speckle.segment_correlations is not None:
-            pd_and_miss = self._pd_and_miss_in_speckle(
-                signal_ratio, threshold / noise_sigma, bins, point_indices
-            )
-        else:
-            is_real_bin = np.isin(bins, (0, self.real_fft_size // 2)) & (self.real_fft_size > 0)
-            pd_and_miss = self.looks.pd_and_miss_steady(
-                signal_ratio, threshold / noise_sigma, is_real_bin
-            )
-        return DetectionArrays(
-            *(np.where(is_present, probability, np.nan) for probability in pd_and_miss)
-        )
-
-    def _pd_in_looks_far_from_ends(
-        self, signal_up: np.ndarray, signal_down: np.ndarray, threshold_ratio: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return pd of up and down segment over several looks.
-
-        Bins are treated as if DC and Nyquist were far away. Signals and threshold are relative to
-        the noise sigma.
-        """
-        signals = np.nan_to_num(np.stack([signal_up, 0 * signal_up, signal_down], axis=-2))
-        pd_up, _, pd_down = np.moveaxis(
-            self.looks.pd_and_miss_in_speckle(
-                signals, threshold_ratio[..., None, :], self.speckle.look_speckle
-            ).pd,
-            -2,
-            0,
-        )
-        return pd_up, pd_down
-
-    def _pd_and_miss_in_speckle(
-        self,
-        signal_ratio: np.ndarray,
-        threshold_ratio: np.ndarray,
-        bins: np.ndarray,
-        point_indices: np.ndarray | slice,
-    ) -> DetectionArrays:
-        """Return pd and 1 - pd of bins in developed speckle.
-
-        Signal and threshold are relative to the noise sigma.
-        """
-        from sweep.model.detection.pseudo_variance import multilook_pd_and_miss_near_ends
-
-        look_speckle = (
-            None
-            if self.speckle.look_speckle is None
-            else self.speckle.look_speckle.select(point_indices)
-        )
-        pd, miss = self.looks.pd_and_miss_in_speckle(signal_ratio, threshold_ratio, look_speckle)
-        rule, speckle_table = self.detection_rule, self.speckle_table
-        speckle_row, nyquist_bin = (
-            np.broadcast_to(speckle_table.ratio_row[:, point_indices], signal_ratio.shape),
-            self.fft_size // 2,
-        )
-        bins_from_end = np.minimum(bins, nyquist_bin - bins)
-        is_near_end = (
-            (speckle_row > 0)
-            & (bins_from_end >= 0)
-            & (bins_from_end < speckle_table.pseudo_variance_ratio.shape[1])
-        )
-        if is_near_end.any():
-            signal_pseudo_variance_ratio = speckle_table.pseudo_variance_ratio[
-                speckle_row[is_near_end], bins_from_end[is_near_end]
-            ]
-            noise_pseudo_variance_ratio = (
-                rule.noise_pseudo_variance_ratio[bins_from_end[is_near_end]]
-                if rule.real_noise_at_ends
-                else np.zeros(signal_pseudo_variance_ratio.size)
-            )
-            near_threshold_ratio = np.broadcast_to(threshold_ratio, signal_ratio.shape)[is_near_end]
-            pd, miss = pd.copy(), miss.copy()
-            segment, point_column = (
-                index_grid[is_near_end] for index_grid in np.indices(signal_ratio.shape)[-2:]
-            )
-            look_covariance = self._look_amplitude_covariance(
-                segment, np.arange(self.size)[point_indices][point_column]
-            )
-            pd[is_near_end], miss[is_near_end] = multilook_pd_and_miss_near_ends(
-                self.looks,
-                signal_ratio[is_near_end],
-                near_threshold_ratio,
-                signal_pseudo_variance_ratio,
-                noise_pseudo_variance_ratio,
-                look_covariance,
-            )
-        return DetectionArrays(pd, miss)
-
-    def _look_amplitude_covariance(self, segment: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Return the covariance of an echo's amplitudes over k looks, (m, k, k).
-
-        A look is one of several records of the same segment. ``segment`` and ``point`` have m
-        elements.
-        """
-        from sweep.model.detection.look_speckle import phase_rotated_look_covariances
-
-        n_looks = self.looks.number
-        correlation_by_lag, look_power = (
-            np.ones((point.size, n_looks), complex),
-            np.ones((point.size, n_looks)),
-        )
-        if self.looks.has_independent_speckle:
-            correlation_by_lag[:, 1:] = 0.0
-        elif self.speckle.look_speckle is not None:
-            correlation_by_lag = self.speckle.look_speckle.correlation_by_lag[segment, point]
-            look_power = self.speckle.look_speckle.look_power[segment, point]
-        cycles_per_look = (
-            np.zeros(point.size)
-            if self.speckle.phase_cycles_per_look is None
-            else self.speckle.phase_cycles_per_look[segment, point]
-        )
-        return phase_rotated_look_covariances(correlation_by_lag, look_power, cycles_per_look)
 
     def _noise_sigma_of(self, variance: np.ndarray) -> np.ndarray:
         """Return the noise standard deviation per quadrature of a bin [V].
@@ -836,7 +584,7 @@ class Shots:
             self.range,
             self.motion.doppler_ratio,
             self.waveform.chirp_rate,
-            self.link_scales.beat_amplitude,
+            self.echo_scales.beat_amplitude,
             self.receiver_filter.detector_bandwidth,
             self.receiver_filter.amplifier_bandwidth,
             self.sample_rate,
@@ -891,7 +639,7 @@ class Shots:
     def detection_rule(self) -> "DetectionRule":
         """Rule by which the bins of one record detect an echo."""
         from sweep.model.detection.echo_detection import DetectionRule
-        from sweep.model.detection.joint_tail import joint_tail_rule
+        from sweep.model.detection.joint_tail import joint_tail_quadrature
         from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
         from sweep.model.detection.speckle_modes import NO_MODES, mode_table
         from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
@@ -919,7 +667,7 @@ class Shots:
             in_speckle=in_speckle,
             noise_correlation=self.noise_bin_correlation,
             real_record_in_speckle=real_record_in_speckle,
-            joint_tail_rule=joint_tail_rule(self.noise_bin_correlation),
+            neighbour_crossing_quadrature=joint_tail_quadrature(self.noise_bin_correlation),
             noise_pseudo_variance_ratio=noise_ratio,
             mode_table=modes,
             sidelobe_correlation=sidelobe_correlation(self.window, self.fft_size),
@@ -1100,7 +848,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
             range=budget.target.range + zeros,
             radial_velocity=budget.target.radial_velocity + zeros,
         ),
-        link_scales=budget.link_scales,
+        echo_scales=budget.echo_scales,
         receiver_noise=budget.receiver_noise,
         noise=budget.noise,
         footprint=FootprintLines(
@@ -1131,20 +879,20 @@ _POINT_FIELD_LABELS = {
     "target.radial_velocity": "radial velocity",
     "target.acceleration": "acceleration",
     "motion.doppler_ratio": "Doppler shift",
-    "link_scales.echo_power": "echo's power",
-    "link_scales.beat_amplitude": "beat's amplitude",
+    "echo_scales.echo_power": "echo's power",
+    "echo_scales.beat_amplitude": "beat's amplitude",
     "bin_noise_sigma": "noise",
     "threshold": "threshold",
 }
-"""Fields of `Shots`, with one value per point, that have to be finite, and their names in messages.
-"""
+"""Fields of `Shots` that must be finite, with one value for each point. Keys are dotted paths to
+them, and values their names in error messages."""
 _BEAMLET_FIELD_LABELS = {
     "footprint.relative_range_offset": "beamlets' ranges",
     "footprint.doppler_ratio_offset": "beamlets' velocities",
     "footprint.relative_amplitude": "beamlets' echoes",
 }
-"""Fields of `Shots`, with one value per beamlet, that have to be finite, and their names in
-messages."""
+"""Fields of `Shots` that must be finite, with one value for each beamlet. Keys are dotted paths to
+them, and values their names in error messages."""
 
 
 def require_finite(shots: Shots) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from sweep.model import receiver_chain, window
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection.detection_probability import pd_and_miss_in_looks
 from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import SEGMENT_FIELDS
@@ -132,8 +133,8 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
                 )
     if shots.looks.is_noncoherent:
         peak = np.rint(segment_results[:, frequency_row] / (shots.sample_rate / shots.fft_size))
-        segment_results[:, pd_row], segment_results[:, miss_row] = shots.pd_and_miss_in_looks(
-            segment_results[:, magnitude_row], peak
+        segment_results[:, pd_row], segment_results[:, miss_row] = pd_and_miss_in_looks(
+            shots, segment_results[:, magnitude_row], peak
         )
     return segment_results
 
@@ -218,7 +219,7 @@ def analytic_record(
         amplifier_bandwidth=_value_at(shots.receiver_filter.amplifier_bandwidth, point),
     )
     amplitude = (
-        _value_at(shots.link_scales.beat_amplitude, point)
+        _value_at(shots.echo_scales.beat_amplitude, point)
         * shots.footprint.relative_amplitude[shots.footprint.row_of_point[point], beamlet]
     )
     amplitude = amplitude * shots.whitening_gain[segment][point]

@@ -42,9 +42,9 @@ SEGMENT_ORDERS = (
     "doppler down up", "up down doppler", "down up doppler",
 )  # fmt: skip
 """Possible sets of segments of a shot, each in the order of time."""
-DOPPLER_SLOPE_PATH = "instrument.chirp.doppler_slope"
+DOPPLER_SEGMENT_SLOPE_PATH = "instrument.chirp.doppler_slope"
 """Parameter path of the chirp rate of the Doppler segment, over that of the up-chirp."""
-DOWN_SLOPE_PATH = "instrument.chirp.down_slope"
+DOWN_SEGMENT_SLOPE_PATH = "instrument.chirp.down_slope"
 """Parameter path of the chirp rate of the down segment, over that of the up-chirp."""
 SHOT_DETECTION_PATH = "instrument.processing.shot_detection"
 """Parameter path of the rule by which a shot is detected, one of `SHOT_DETECTION_RULES`."""
@@ -66,8 +66,8 @@ DEFAULT_CHIRP_SLOPES = (1, 0, -1)
 WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     SEGMENT_ORDER_PATH: SEGMENT_ORDERS[0],
     SEGMENT_GAP_PATH: 0.0,
-    DOPPLER_SLOPE_PATH: 0.0,
-    DOWN_SLOPE_PATH: -1.0,
+    DOPPLER_SEGMENT_SLOPE_PATH: 0.0,
+    DOWN_SEGMENT_SLOPE_PATH: -1.0,
     SHOT_DETECTION_PATH: BOTH_CHIRPS,
     TWO_BEAT_ASSUMPTION_PATH: FAR_TARGET,
     PEAKS_PATH: ALL_PEAKS,
@@ -193,7 +193,7 @@ def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
     """
     doppler, down = (
         float(np.ravel(parameters.get(path, WAVEFORM_DEFAULTS[path]))[0])
-        for path in (DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH)
+        for path in (DOPPLER_SEGMENT_SLOPE_PATH, DOWN_SEGMENT_SLOPE_PATH)
     )
     return 1.0, doppler, down
 

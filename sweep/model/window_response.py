@@ -70,7 +70,7 @@ class WindowResponse(NamedTuple):
         clipped_distance = np.fmin(distance, 0.5)
         return self.main_lobe[(clipped_distance * (2 * _MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
 
-    def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
+    def magnitude_max_beyond(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest magnitude, over the peak, at ``distance`` [bins] or farther.
 
         ``distance`` is from a line.

@@ -482,7 +482,7 @@ def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
     unbroken_label = next(iter(LIMIT_VARIABLE_BY_LABEL))
     if isinstance(item, Chart):
         range_label, unbroken_panels = (
-            item.panels[0].y.label,
+            item.panels[0].y_axis.label,
             [p for p in item.panels if p.facet_choices["answer"] == unbroken_label],
         )
         values = np.concatenate([line.y for panel in unbroken_panels for line in panel.lines])

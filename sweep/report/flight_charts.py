@@ -432,7 +432,7 @@ def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> C
         labelled_recordings, "shot", [*quantities, "beam"], quantity_lines
     )
     extent_texts = [
-        f"{panel.y.label}: "
+        f"{panel.y_axis.label}: "
         f"{labels.describe_value_extent(np.concatenate([line.y for line in panel.lines]))}"
         for panel in panels[: len(quantities)]
     ]

@@ -138,8 +138,8 @@ def make_interactive_plot(chart: Chart) -> InteractivePlot:
         go.Figure(
             [trace for panel in chart.panels for trace in _panel_traces(panel, chart.colour_scale)],
             plot_layout(
-                xaxis=_axis_layout(first_panel.x),
-                yaxis=_axis_layout(first_panel.y, automargin=True),
+                xaxis=_axis_layout(first_panel.x_axis),
+                yaxis=_axis_layout(first_panel.y_axis, automargin=True),
                 **layout_options,
             ),
         ),
@@ -156,7 +156,7 @@ def _make_control(panels: Sequence[Panel], name: str, label: str) -> PlotControl
     """
     axes_by_option: dict[str, set[ChartAxis]] = {}
     for panel in panels:
-        axes_by_option.setdefault(panel.facet_choices[name], set()).add(panel.y)
+        axes_by_option.setdefault(panel.facet_choices[name], set()).add(panel.y_axis)
     relayout: dict[str, dict[str, Any]] = {}
     if (
         all(len(option_axes) == 1 for option_axes in axes_by_option.values())
@@ -224,7 +224,7 @@ def _to_float32(values: np.ndarray) -> np.ndarray:
 def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]:
     """Yield plotly's traces of a line: its band, if it has one, and then the line."""
     meta = trace_meta(line.style_index, **panel.facet_choices)
-    if panel.y.kind == LOG_SCALE:
+    if panel.y_axis.kind == LOG_SCALE:
         line = _mask_nonpositive(line)
     x, y, low, high = line.x, line.y, line.low, line.high
     trace_options: dict[str, Any] = {

@@ -17,13 +17,7 @@ import yaml
 
 from sweep.analysis import labels
 from sweep.analysis.charts import Chart, ChartSizeLimits
-from sweep.analysis.datasets import (
-    ACCURACY_KIND,
-    GRID_KIND,
-    SCENE_KIND,
-    NotAStoreError,
-    read_attributes_of_kind,
-)
+from sweep.analysis.datasets import NotAStoreError, read_attributes_of_kind
 from sweep.analysis.scene_results.consistency import check_error_consistency
 from sweep.analysis.scene_results.recordings import (
     INTERPOLATED_RANGES,
@@ -51,7 +45,12 @@ from sweep.spec import GridSpec, SceneSpec, SlicesFigure, SurfaceFigure
 from sweep.spec.noise_alarms import false_alarm_probabilities
 from sweep.spec.sections import parameter_rules
 from sweep.storage.locations import Location, parse_location, write_path_atomically
-from sweep.storage.store_format import parse_software_versions
+from sweep.storage.store_format import (
+    ACCURACY_STORE_KIND,
+    GRID_STORE_KIND,
+    SCENE_STORE_KIND,
+    parse_software_versions,
+)
 
 PAGE_SIZE_LIMITS = ChartSizeLimits(
     parts_max=detector_charts.CHART_PARTS_MAX,
@@ -108,11 +107,11 @@ def write_report(store: str | Location, file: str | Path) -> Path:
     """
     store, file = parse_location(store), Path(file)
     kind = read_attributes_of_kind(store)["kind"]
-    if kind == ACCURACY_KIND:
+    if kind == ACCURACY_STORE_KIND:
         raise NotAStoreError(f"{store} holds what accuracy costs: sweep figures {store}  draws it")
-    if kind not in (GRID_KIND, SCENE_KIND):
-        read_attributes_of_kind(store, GRID_KIND)  # raises an error that names its kind
-    page = _scene_report(store) if kind == SCENE_KIND else _grid_report(store)
+    if kind not in (GRID_STORE_KIND, SCENE_STORE_KIND):
+        read_attributes_of_kind(store, GRID_STORE_KIND)  # raises an error that names its kind
+    page = _scene_report(store) if kind == SCENE_STORE_KIND else _grid_report(store)
     html = render_html(page)
     with write_path_atomically(file, replace=True) as draft_path:
         draft_path.write_text(html, encoding="utf-8")

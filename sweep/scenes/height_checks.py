@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.messages import counted
+from sweep.messages import number_with_noun
 from sweep.scenes.scene_files import SceneError
 
 PLAUSIBLE_HEIGHT_MAX = 1e6
@@ -90,7 +90,8 @@ def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) 
     if is_too_far.any():
         wrong_height = float(values[is_too_far][0])
         problem = (
-            f"holds the height {wrong_height:g} at {counted(int(is_too_far.sum()), 'cell')}, "
+            f"holds the height {wrong_height:g} at "
+            f"{number_with_noun(int(is_too_far.sum()), 'cell')}, "
             f"farther than {PLAUSIBLE_HEIGHT_MAX:g}"
         )
         raise SceneError(
@@ -146,7 +147,7 @@ def _undeclared_no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
                 )
             if is_doubtful:
                 warnings.append(
-                    f"{path}: the value {value:g} stands in {counted(count, 'cell')}, "
+                    f"{path}: the value {value:g} stands in {number_with_noun(count, 'cell')}, "
                     f"{gap:.4g} from the next: if it means that there is no data, "
                     f"state 'no_data: {_shortest_decimal_text(value)}'"
                 )
@@ -186,7 +187,7 @@ def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]
         return []
     return [
         f"{path}: neighbouring cells differ by up to {largest_rise:.4g} m over "
-        f"{step_at_largest:.3g} m, at {counted(n_cliffs, 'place')}: "
+        f"{step_at_largest:.3g} m, at {number_with_noun(n_cliffs, 'place')}: "
         "if the ground has no such cliffs, a value stands for missing heights there: "
         "state it as no_data, or mend the file"
     ]

@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from sweep.messages import EscapedTextError, counted
+from sweep.messages import EscapedTextError, number_with_noun
 from sweep.model.geometry.quaternion import from_heading
 from sweep.units import QuantityError, read_unit
 
@@ -445,8 +445,8 @@ def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str
     line_number, cells = numbered_row
     if len(cells) != len(column_names):
         problem = (
-            f"has {counted(len(cells), 'cell')} under {counted(len(column_names), 'column')} "
-            f"on line {line_number}"
+            f"has {number_with_noun(len(cells), 'cell')} under "
+            f"{number_with_noun(len(column_names), 'column')} on line {line_number}"
         )
         raise SceneError(path, problem, "fill or cut the line")
     values = [_parse_finite_number(cell) for cell in cells]

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.outputs import GRID_VARIABLE_NAMES
+from sweep.model.outputs import DRAW_BATCH_DIM, GRID_VARIABLE_NAMES
 from sweep.spec.rules import (
     Finding,
     Findings,
@@ -38,7 +38,7 @@ from sweep.spec.sections import (
 )
 from sweep.units import QuantityError, Unit
 
-RESERVED_DIMENSIONS = ("batch", "draw", "point", "spec", "study_id")
+RESERVED_DIMENSIONS = (DRAW_BATCH_DIM, "draw", "point", "spec", "study_id")
 """Names of dimensions that a store may have in addition to the axes.
 
 No axis may have such a name.

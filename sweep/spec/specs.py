@@ -493,22 +493,26 @@ def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, 
 
 def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if the slopes of segments do not separate range and velocity."""
-    if grid.any_point_meets({waveform.DOWN_SLOPE_PATH: lambda slope: slope == 1.0}):
+    if grid.any_point_meets({waveform.DOWN_SEGMENT_SLOPE_PATH: lambda slope: slope == 1.0}):
         problem = "is the slope of the segment 'up': range and velocity need two slopes"
         yield grid.make_finding(
-            waveform.DOWN_SLOPE_PATH, problem, "write another, or -1 for a triangle"
+            waveform.DOWN_SEGMENT_SLOPE_PATH, problem, "write another, or -1 for a triangle"
         )
     any_two_condition: dict[str, ValueCondition] = {
         waveform.SHOT_DETECTION_PATH: lambda rule: rule == waveform.ANY_TWO
     }
-    slopes = {1.0, *grid.parameter_values(waveform.DOWN_SLOPE_PATH)}
+    slopes = {1.0, *grid.parameter_values(waveform.DOWN_SEGMENT_SLOPE_PATH)}
     if grid.any_point_meets(
         any_two_condition
-        | {waveform.DOPPLER_SLOPE_PATH: lambda doppler_slopes: np.isin(doppler_slopes, [*slopes])}
+        | {
+            waveform.DOPPLER_SEGMENT_SLOPE_PATH: lambda doppler_slopes: np.isin(
+                doppler_slopes, [*slopes]
+            )
+        }
     ):
         problem = "is another segment's too, and these two give neither range nor velocity: any_two"
         yield grid.make_finding(
-            waveform.DOPPLER_SLOPE_PATH, problem, "write another, or take both_chirps"
+            waveform.DOPPLER_SEGMENT_SLOPE_PATH, problem, "write another, or take both_chirps"
         )
 
 

@@ -79,11 +79,16 @@ OPEN_ZARR_KWARGS: dict[str, Any] = {"consolidated": True, "zarr_format": 3}
 #: Largest uncompressed size of an array file [bytes], and largest number of chunks of an array.
 UNCOMPRESSED_FILE_BYTES_MAX = ARRAY_CHUNKS_MAX = 2**31
 
+GRID_STORE_KIND, SCENE_STORE_KIND, EYEPOINTS_STORE_KIND, ACCURACY_STORE_KIND = (
+    "grid", "scene", "eyepoints", "accuracy",
+)  # fmt: skip
+"""Kinds of stores: results of grids, of flights over scenes, of rays, and of `sweep accuracy`."""
+
 _ATTRIBUTES_BY_STORE_KIND = {
-    "grid": ("title", "spec", "coordinates"),
-    "scene": ("title", "spec", "scanners", "surfaces"),
-    "eyepoints": ("geometry", "shots_a_cycle"),
-    "accuracy": ("title", "spec", "coordinates"),
+    GRID_STORE_KIND: ("title", "spec", "coordinates"),
+    SCENE_STORE_KIND: ("title", "spec", "scanners", "surfaces"),
+    EYEPOINTS_STORE_KIND: ("geometry", "shots_a_cycle"),
+    ACCURACY_STORE_KIND: ("title", "spec", "coordinates"),
 }
 """Names of the attributes that each kind of store must have, in addition to the common ones."""
 
@@ -164,7 +169,7 @@ def read_root_metadata(path: Location) -> dict[str, Any]:
             _check_node_metadata(name, node)
         _check_dimension_lengths(nodes)
         flags_arrays = [f"{name}/flags" for name in attributes.get("scanners", ())]
-        required_arrays = ["effects"] if attributes["kind"] == "grid" else flags_arrays
+        required_arrays = ["effects"] if attributes["kind"] == GRID_STORE_KIND else flags_arrays
         if missing_arrays := [name for name in required_arrays if name not in nodes]:
             raise ValueError(f"it lacks {missing_arrays[0]}")
     except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import counted, option_text, suggested_call
+from sweep.messages import number_with_noun, option_text, suggested_call
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage.locations import (
     PACKED_ATTRIBUTE,
@@ -380,7 +380,7 @@ def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy)
         n_blocks_done = int(np.count_nonzero(blocks_with_receipt(store_path, study)))
         problem = (
             f"{store_path} holds this study already, {n_blocks_done} of "
-            f"{counted(study.n_blocks, 'block')} done"
+            f"{number_with_noun(study.n_blocks, 'block')} done"
         )
         if n_blocks_done == study.n_blocks:
             remedy = f"{suggested_call('status', store_path)} tells about it"

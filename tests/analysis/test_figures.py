@@ -156,7 +156,7 @@ def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path)
     figures = GridResults.from_store(path)
     for figure in figures.figure_specs[:1]:
         (panel,) = figures.make_chart(figure, SHEET_SIZE_LIMITS).panels
-        assert panel.x.kind == "category"
+        assert panel.x_axis.kind == "category"
         for line in panel.lines:  # in the order of the study, not of the alphabet
             assert line.x.tolist() == ["rectangular", "hann", "blackman"]
     values = figures.dataset.pd_shot

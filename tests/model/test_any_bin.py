@@ -26,7 +26,7 @@ from sweep.model.detection.echo_detection import (
     mark_exempt_bins,
     pd_and_miss,
 )
-from sweep.model.detection.joint_tail import joint_tail_rule
+from sweep.model.detection.joint_tail import joint_tail_quadrature
 from sweep.model.detection.speckle_modes import mode_table
 from sweep.model.sampling import philox
 from sweep.model.sampling.samplers import simulate_draws
@@ -213,7 +213,7 @@ def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
         True,
         neighbour_noise_correlation(shape, size),
         False,
-        joint_tail_rule(0.0),
+        joint_tail_quadrature(0.0),
         np.empty(0),
         mode_table(shape, size),
     )

@@ -59,7 +59,7 @@ def shots(table_4_1):
     [("target", "range", "the range"),
      ("footprint", "relative_amplitude", "beamlets' echoes"),
      ("footprint", "relative_range_offset", "beamlets' ranges"),
-     ("link_scales", "echo_power", "echo's power")],
+     ("echo_scales", "echo_power", "echo's power")],
 )  # fmt: skip
 def test_a_shot_with_a_number_that_is_not_finite_is_named(
     table_4_1, record_name, name, words, value

@@ -64,7 +64,7 @@ def error(shots, degree):
         peak = shots.footprint.relative_amplitude[shots.footprint.row_of_point[i]]
         peak = np.sqrt((peak**2).sum()) if shots.footprint.adds_powers else peak.sum()
         peak *= (
-            np.broadcast_to(shots.link_scales.beat_amplitude, shots.size)[i]
+            np.broadcast_to(shots.echo_scales.beat_amplitude, shots.size)[i]
             * shots.window.sum
             / 2
             * gain

@@ -103,7 +103,7 @@ def test_random_effects_come_and_go_without_moving_each_others_numbers(table_4_1
     )
     np.testing.assert_array_equal(both.footprint.phase_cycles, speckled.footprint.phase_cycles)
     np.testing.assert_array_equal(
-        both.link_scales.beat_amplitude, twinkling.link_scales.beat_amplitude
+        both.echo_scales.beat_amplitude, twinkling.echo_scales.beat_amplitude
     )
     shaken, every = (drawn_shots(parameters, e) for e in (["pointing_jitter"], RANDOM))
     np.testing.assert_array_equal(every.range, shaken.range)

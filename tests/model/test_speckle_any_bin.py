@@ -19,7 +19,7 @@ from sweep.model.detection.echo_detection import (
     mark_exempt_bins,
     pd_and_miss,
 )
-from sweep.model.detection.joint_tail import joint_tail_rule
+from sweep.model.detection.joint_tail import joint_tail_quadrature
 from sweep.model.detection.speckle_modes import mode_table
 from sweep.model.window import get_window, window_samples
 
@@ -64,7 +64,7 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
         True,
         neighbour_noise_correlation(shape, size),
         False,
-        joint_tail_rule(0.0),
+        joint_tail_quadrature(0.0),
         np.empty(0),
         mode_table(shape, size),
     )

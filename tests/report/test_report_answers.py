@@ -54,7 +54,7 @@ def test_the_maximum_range_is_the_answer_s_in_the_units_of_the_page(grid_store, 
         line = drawn_lines(chart, answer=choice)[f"power {power} W"]
         assert list(line.x) == [20, 50, 80]
         np.testing.assert_allclose(line.y, expected.sel(power=power), rtol=1e-6)
-    assert {panel.y.label for panel in chart.panels} == {"maximum range (km)"}
+    assert {panel.y_axis.label for panel in chart.panels} == {"maximum range (km)"}
     assert f"pd of {detector_charts.REPORTED_PD_LEVEL:g}" in chart.heading
 
 

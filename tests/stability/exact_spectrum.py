@@ -59,7 +59,7 @@ class ExactLine:
         self.phase = -carrier * delay + sign * rate * delay**2 / 2 + start
         poles = 1 + 1j * self.beat / point_value(shots.receiver_filter.detector_bandwidth, point)
         poles *= 1 + 1j * self.beat / point_value(shots.receiver_filter.amplifier_bandwidth, point)
-        scale = point_value(shots.link_scales.beat_amplitude, point) * mp.mpf(
+        scale = point_value(shots.echo_scales.beat_amplitude, point) * mp.mpf(
             float(shots.footprint.relative_amplitude[row, beamlet])
         )
         self.weight = scale / 2 / poles * mp.expjpi(2 * self.phase)

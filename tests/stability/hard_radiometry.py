@@ -290,7 +290,7 @@ def wider_than_the_band() -> float:
     _, magnitude = segment_spectrum(single_shot, 0, 1)
     half_amplitude = (
         float(
-            single_shot.link_scales.beat_amplitude * single_shot.footprint.relative_amplitude[0, 0]
+            single_shot.echo_scales.beat_amplitude * single_shot.footprint.relative_amplitude[0, 0]
         )
         / 2
     )

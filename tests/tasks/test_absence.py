@@ -304,7 +304,7 @@ def test_an_asynchronous_client_is_refused_in_words(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
     compiled = threading.Event()
-    monkeypatch.setattr(progress, "ACTIVITY_SHOWN_AFTER_SECONDS", 0.1)
+    monkeypatch.setattr(progress, "ACTIVITY_MESSAGE_DELAY_SECONDS", 0.1)
     monkeypatch.setattr(GridStudy, "compile_kernels", lambda self: compiled.wait(60))
     told = Told(lambda: os.kill(os.getpid(), number) if len(told.lines) == 1 else None)
     begun = time.monotonic()

@@ -34,7 +34,7 @@ class Told(progress.Progress):
 @pytest.fixture
 def at_once(monkeypatch):
     """No time that passes before something is said, and little between lines."""
-    monkeypatch.setattr(progress, "ACTIVITY_SHOWN_AFTER_SECONDS", 0.01)
+    monkeypatch.setattr(progress, "ACTIVITY_MESSAGE_DELAY_SECONDS", 0.01)
     monkeypatch.setattr(progress, "PROGRESS_LINE_INTERVAL_SECONDS", 0.01)
 
 

@@ -497,8 +497,10 @@ def describe_common_shots(differences: xr.Dataset) -> str:
         differences.attrs["other_shots"],
     )
     if n_common == n_ours == n_other:
-        return f"all {labels.counted(n_common, 'shot')}"
-    return f"{labels.counted(n_common, 'shot')} that both have, of {n_ours:,} and {n_other:,}"
+        return f"all {labels.number_with_noun(n_common, 'shot')}"
+    return (
+        f"{labels.number_with_noun(n_common, 'shot')} that both have, of {n_ours:,} and {n_other:,}"
+    )
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
@@ -522,9 +524,9 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
     if not n_points:
         return "nothing", "Nothing that both stores have is computed yet."
     if not n_different:
-        phrase = f"agree at {labels.counted(n_points, noun)}"
+        phrase = f"agree at {labels.number_with_noun(n_points, noun)}"
         return "same", f"Probabilities of detection {phrase}{count_note}."
-    phrase = f"differ at {n_different:,} of {labels.counted(n_points, noun)}"
+    phrase = f"differ at {n_different:,} of {labels.number_with_noun(n_points, noun)}"
     return "different", f"Probabilities of detection {phrase}{count_note}."
 
 

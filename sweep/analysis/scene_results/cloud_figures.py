@@ -552,7 +552,9 @@ def draw_scatter_sheet(
     is_inside = within_limits_mask(columns, limits)
     count_texts = [thinned_rows.describe_count("point" if "flags" in column_arrays else "shot")]
     if n_outside := int((~is_inside & ~is_true).sum()) * thinned_rows.step:
-        count_texts.append(f"{labels.counted(n_outside, 'false point')} outside of the picture")
+        count_texts.append(
+            f"{labels.number_with_noun(n_outside, 'false point')} outside of the picture"
+        )
     picture_sheet = PictureSheet(
         SCATTER_SIZE_INCHES[0] + AXIS_MARGINS_INCHES[0],
         SCATTER_SIZE_INCHES[1] + AXIS_MARGINS_INCHES[1],

@@ -411,7 +411,7 @@ class ThinnedRows:
     def describe_count(self, noun: str, qualifier: str = "") -> str:
         """Return a text with the number of all appended rows, and with the share that is kept."""
         kept_note = f", one in {self.step} of them shown" if self.step > 1 else ""
-        return labels.counted(self.n_total, noun) + qualifier + kept_note
+        return labels.number_with_noun(self.n_total, noun) + qualifier + kept_note
 
     def to_columns(self) -> ColumnArrays:
         """Return the kept rows as columns by name; an empty dict if no table was appended."""
@@ -599,7 +599,7 @@ class PointCloud:
             count_texts.append(self.thinned_dropouts.describe_count("shot", " without a point"))
         if self.n_outside:
             count_texts.append(
-                f"{labels.counted(self.n_outside, 'false point')} outside of the picture"
+                f"{labels.number_with_noun(self.n_outside, 'false point')} outside of the picture"
             )
         return count_texts
 

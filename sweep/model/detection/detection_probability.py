@@ -1,4 +1,4 @@
-"""Probabilities of detection of segments and shots, whatever the rule of detection.
+"""Probabilities of detection of bins, segments and shots, whatever the rule of detection.
 
 Each probability of detection pd, and its complement, the miss probability, is computed once, from
 |X| without noise (the modulus of the spectrum) in the bins around an echo:
@@ -6,26 +6,34 @@ Each probability of detection pd, and its complement, the miss probability, is c
 =============================  ====================================================================
 one echo in one record         :func:`sweep.model.detection.echo_detection.pd_and_miss`, by the
                                strongest bin or any bin, steady or in developed speckle
-one bin in several looks       :meth:`sweep.model.preparation.Shots.pd_and_miss_in_looks`
+one bin in several looks       :func:`pd_and_miss_in_looks`
 the segments of points         :func:`detect_in_spans`, by one of these two laws. A span is the
                                range of bins around an echo; it is final then: cut to the search
                                band, and empty in segments that no echo reaches
-both chirps of a shot          :meth:`sweep.model.preparation.Shots.joint_detection_probability`
+both chirps of a shot          :func:`joint_detection_probability`
 a shot                         :func:`shot_pd_and_miss`, by both chirps or any two of three segments
 =============================  ====================================================================
 
+Developed speckle makes the segments of a shot fade together. Far from DC and Nyquist an echo's bins
+are circular complex Gaussian numbers, and the joint laws are those of
+:mod:`sweep.model.detection.echo_detection` and :mod:`sweep.model.detection.looks`. Near these ends
+of a real record, lines overlap their images, and the laws are corrected by
+:mod:`sweep.model.detection.pseudo_variance`.
+
 Three callers apply the first two laws to bins of their own: groups of bins
-(:mod:`sweep.model.pointcloud.bin_groups`), the line of leaked light, which changes |X|
-(:mod:`sweep.model.effects.circulator_leak`), and higher thresholds
+(:mod:`sweep.model.pointcloud.bin_groups`), permanent lines, which change |X|
+(:mod:`sweep.model.spectrum.permanent_line`, by :func:`detect_in_bins`), and higher thresholds
 (:mod:`sweep.model.spectrum.strongest_peak`).
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.kernel_cache import njit
+from sweep.model.detection import echo_detection
 from sweep.model.detection.echo_detection import (
+    Detection,
     EchoBins,
     EchoSpans,
     at_least_two_of_three,
@@ -33,11 +41,18 @@ from sweep.model.detection.echo_detection import (
     bin_threshold_at,
     pd_and_miss,
 )
+from sweep.model.detection.look_speckle import phase_rotated_look_covariances
 from sweep.model.detection.looks import DetectionArrays, pd_and_miss_any_two_in_speckle
-from sweep.model.detection.pseudo_variance import mean_over_phases
+from sweep.model.detection.pseudo_variance import (
+    mean_over_phases,
+    multilook_pd_and_miss_near_ends,
+)
+
+if TYPE_CHECKING:
+    from sweep.model.preparation import Shots
 
 
-def pd_follows_from_computed_spans(shots: Any) -> bool:
+def pd_follows_from_computed_spans(shots: "Shots") -> bool:
     """Test if probabilities of detection follow from the bins around an echo as first computed.
 
     They do not if a search band later removes some of these bins, if leaked light adds a line to
@@ -55,7 +70,7 @@ def pd_follows_from_computed_spans(shots: Any) -> bool:
     )
 
 
-def detect_in_spans(shots: Any, spans: Any) -> Any:
+def detect_in_spans(shots: "Shots", spans: Any) -> Any:
     """Set the probabilities of detection of each segment from the bins around its echo.
 
     Parameters
@@ -75,8 +90,8 @@ def detect_in_spans(shots: Any, spans: Any) -> Any:
     """
     pd, miss = spans.pd, spans.miss
     if shots.looks.is_noncoherent:
-        pd, miss = shots.pd_and_miss_in_looks(
-            spans.peak_magnitude, spans.first_bin + spans.peak_index, spans.point_numbers
+        pd, miss = pd_and_miss_in_looks(
+            shots, spans.peak_magnitude, spans.first_bin + spans.peak_index, spans.point_numbers
         )
     elif not pd_follows_from_computed_spans(shots):
         pd, miss = np.full((2, *spans.first_bin.shape), np.nan)
@@ -144,8 +159,328 @@ def _fill_span_pd_and_miss(spans, point_indices, rule, bin_thresholds, speckle_t
             pd[s, j], miss[s, j] = detection.pd, detection.miss
 
 
+def detect_in_bins(
+    shots: "Shots",
+    magnitudes: np.ndarray,
+    is_echo: np.ndarray,
+    *,
+    first_bin: int,
+    peak_index: int,
+    segment: int,
+    point: int,
+) -> Detection:
+    """Return the probabilities that the bins of one segment of one point detect an echo, or not.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    magnitudes : ndarray (bins,)
+        |X| of adjacent bins [V].
+    is_echo : ndarray (bins,) bool
+        True for bins of the echo; others do not detect it.
+    first_bin : int
+        Number of the first of these bins.
+    peak_index : int
+        Index of the strongest bin among them.
+    segment, point : int
+        Indices of the segment and of the point.
+    """
+    detection: Detection = pd_and_miss(
+        EchoBins(magnitudes, is_echo, first_bin),
+        peak_index,
+        shots.detection_rule,
+        bin_threshold_at(shots.bin_thresholds, point),
+        bin_speckle_at(shots.speckle_table, segment, point),
+    )
+    return detection
+
+
+def pd_and_miss_in_looks(
+    shots: "Shots",
+    magnitude: np.ndarray,
+    bins: np.ndarray,
+    point_indices: np.ndarray | slice = slice(None),
+) -> DetectionArrays:
+    """Return the probabilities that a bin is detected in several looks, and that it is missed.
+
+    A look is one of several records of the same segment.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    magnitude : ndarray (..., m)
+        |X| of one look [V]; nan without an echo.
+    bins : ndarray (..., m)
+        Bin numbers.
+    point_indices : ndarray (m,) or slice
+        Points to which the columns belong.
+
+    Returns
+    -------
+    DetectionArrays
+        pd and miss, (..., m); nan where `magnitude` is.
+    """
+    is_present = np.isfinite(magnitude)
+    noise_sigma, threshold = (
+        np.broadcast_to(values, shots.size)[point_indices]
+        for values in (shots.line_noise_sigma, shots.threshold)
+    )
+    signal_ratio = np.where(is_present, magnitude, 0.0) / noise_sigma
+    if shots.speckle.segment_correlations is not None:
+        detection = _pd_and_miss_in_looks_and_speckle(
+            shots, signal_ratio, threshold / noise_sigma, bins, point_indices
+        )
+    else:
+        is_real_bin = np.isin(bins, (0, shots.real_fft_size // 2)) & (shots.real_fft_size > 0)
+        detection = shots.looks.pd_and_miss_steady(
+            signal_ratio, threshold / noise_sigma, is_real_bin
+        )
+    return DetectionArrays(
+        *(np.where(is_present, probability, np.nan) for probability in detection)
+    )
+
+
+def _pd_and_miss_in_looks_and_speckle(
+    shots: "Shots",
+    signal_ratio: np.ndarray,
+    threshold_ratio: np.ndarray,
+    bins: np.ndarray,
+    point_indices: np.ndarray | slice,
+) -> DetectionArrays:
+    """Compute :func:`pd_and_miss_in_looks` of bins in developed speckle.
+
+    Signal and threshold are relative to the noise sigma.
+    """
+    look_speckle = (
+        None
+        if shots.speckle.look_speckle is None
+        else shots.speckle.look_speckle.select(point_indices)
+    )
+    pd, miss = shots.looks.pd_and_miss_in_speckle(signal_ratio, threshold_ratio, look_speckle)
+    rule, speckle_table = shots.detection_rule, shots.speckle_table
+    speckle_row = np.broadcast_to(speckle_table.ratio_row[:, point_indices], signal_ratio.shape)
+    bins_from_end = np.minimum(bins, shots.fft_size // 2 - bins)
+    is_near_end = (
+        (speckle_row > 0)
+        & (bins_from_end >= 0)
+        & (bins_from_end < speckle_table.pseudo_variance_ratio.shape[1])
+    )
+    if is_near_end.any():
+        signal_pseudo_variance_ratio = speckle_table.pseudo_variance_ratio[
+            speckle_row[is_near_end], bins_from_end[is_near_end]
+        ]
+        noise_pseudo_variance_ratio = (
+            rule.noise_pseudo_variance_ratio[bins_from_end[is_near_end]]
+            if rule.real_noise_at_ends
+            else np.zeros(signal_pseudo_variance_ratio.size)
+        )
+        near_threshold_ratio = np.broadcast_to(threshold_ratio, signal_ratio.shape)[is_near_end]
+        pd, miss = pd.copy(), miss.copy()
+        segment, point_column = (
+            index_grid[is_near_end] for index_grid in np.indices(signal_ratio.shape)[-2:]
+        )
+        look_covariance = _look_amplitude_covariance(
+            shots, segment, np.arange(shots.size)[point_indices][point_column]
+        )
+        pd[is_near_end], miss[is_near_end] = multilook_pd_and_miss_near_ends(
+            shots.looks,
+            signal_ratio[is_near_end],
+            near_threshold_ratio,
+            signal_pseudo_variance_ratio,
+            noise_pseudo_variance_ratio,
+            look_covariance,
+        )
+    return DetectionArrays(pd, miss)
+
+
+def _look_amplitude_covariance(
+    shots: "Shots", segment: np.ndarray, point: np.ndarray
+) -> np.ndarray:
+    """Return the covariance of an echo's amplitudes over k looks, (m, k, k).
+
+    A look is one of several records of the same segment. ``segment`` and ``point`` have m elements.
+    """
+    n_looks = shots.looks.number
+    correlation_by_lag, look_power = (
+        np.ones((point.size, n_looks), complex),
+        np.ones((point.size, n_looks)),
+    )
+    if shots.looks.has_independent_speckle:
+        correlation_by_lag[:, 1:] = 0.0
+    elif shots.speckle.look_speckle is not None:
+        correlation_by_lag = shots.speckle.look_speckle.correlation_by_lag[segment, point]
+        look_power = shots.speckle.look_speckle.look_power[segment, point]
+    cycles_per_look = (
+        np.zeros(point.size)
+        if shots.speckle.phase_cycles_per_look is None
+        else shots.speckle.phase_cycles_per_look[segment, point]
+    )
+    return phase_rotated_look_covariances(correlation_by_lag, look_power, cycles_per_look)
+
+
+def joint_detection_probability(
+    shots: "Shots",
+    pd_up: np.ndarray,
+    pd_down: np.ndarray,
+    magnitudes: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Return the probability that both up and down segment are detected.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    pd_up, pd_down : ndarray (..., n)
+        Probabilities of detection of each segment.
+    magnitudes : tuple of ndarray (..., n)
+        |X| of the strongest bins of up and down segment [V].
+
+    Returns
+    -------
+    ndarray (..., n)
+        The product of the two without speckle. In developed speckle the segments are correlated and
+        the probability is larger.
+    """
+    if shots.speckle.segment_correlations is None:
+        return pd_up * pd_down
+    joint_law = _joint_pd_in_looks if shots.looks.is_noncoherent else _joint_pd_in_one_record
+    correlation = np.abs(shots.speckle.segment_correlations.up_down)
+    pd_both = joint_law(shots, pd_up, pd_down, magnitudes, correlation)
+    return np.where((pd_up == 0) | (pd_down == 0), 0.0, pd_both)
+
+
+def _joint_pd_in_one_record(
+    shots: "Shots",
+    pd_up: np.ndarray,
+    pd_down: np.ndarray,
+    magnitudes: tuple[np.ndarray, np.ndarray],
+    correlation: np.ndarray,
+) -> np.ndarray:
+    """Compute :func:`joint_detection_probability` of one record of each segment in speckle.
+
+    ``correlation`` (n,) is the magnitude of the correlation of the two segments' speckle.
+    """
+    threshold_ratio = shots.threshold / shots.line_noise_sigma
+    n_equivalent = mean_detection_equivalent_bins(shots, (pd_up, pd_down), magnitudes)
+    pd_both = echo_detection.joint_pd_in_speckle(
+        pd_up, pd_down, threshold_ratio, correlation, n_equivalent
+    )
+    speckle_table, speckle_rows = shots.speckle_table, shots.speckle_table.ratio_row[[0, 2]]
+    near_ends = np.flatnonzero(speckle_rows.any(axis=0))
+    if near_ends.size:
+        threshold_ratio, correlation, n_equivalent = (
+            np.broadcast_to(values, pd_up.shape)[..., near_ends]
+            for values in (threshold_ratio, correlation, n_equivalent)
+        )
+        (pd_both[..., near_ends],) = mean_over_phases(
+            speckle_table.phase_factors[speckle_rows[:, near_ends]],
+            (pd_up[..., near_ends], pd_down[..., near_ends]),
+            lambda up, down: (
+                echo_detection.joint_pd_in_speckle(
+                    up, down, threshold_ratio, correlation, n_equivalent
+                ),
+            ),
+        )
+    return pd_both
+
+
+def _joint_pd_in_looks(
+    shots: "Shots",
+    pd_up: np.ndarray,
+    pd_down: np.ndarray,
+    magnitudes: tuple[np.ndarray, np.ndarray],
+    correlation: np.ndarray,
+) -> np.ndarray:
+    """Compute :func:`joint_detection_probability` of several looks in speckle.
+
+    ``correlation`` (n,) is the magnitude of the correlation of the two segments' speckle. It is
+    replaced if the looks are partially correlated.
+
+    Notes
+    -----
+    Far from DC and Nyquist the law is that of
+    :meth:`sweep.model.detection.looks.Looks.joint_pd_in_speckle`. Near them the excess over the
+    product of both pd is the same fraction of the largest possible excess as far from them.
+    """
+    threshold_ratio = shots.threshold / shots.line_noise_sigma
+    signal_up, signal_down = (magnitude / shots.line_noise_sigma for magnitude in magnitudes)
+    look_speckle = shots.speckle.look_speckle
+    if look_speckle is not None:
+        correlation = look_speckle.segment_correlation[1]
+    pd_both = shots.looks.joint_pd_in_speckle(
+        signal_up, signal_down, threshold_ratio, correlation, look_speckle
+    )
+    is_near_ends = shots.speckle_table.ratio_row[[0, 2]].any(axis=0)
+    if not is_near_ends.any():
+        return pd_both
+    pd_up_far_from_ends, pd_down_far_from_ends = _pd_in_looks_far_from_ends(
+        shots, signal_up, signal_down, threshold_ratio
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess_fraction = (pd_both - pd_up_far_from_ends * pd_down_far_from_ends) / (
+            np.minimum(pd_up_far_from_ends, pd_down_far_from_ends)
+            - pd_up_far_from_ends * pd_down_far_from_ends
+        )
+    excess_fraction = np.clip(np.nan_to_num(excess_fraction), 0.0, 1.0)
+    return np.where(
+        is_near_ends,
+        pd_up * pd_down + excess_fraction * (np.minimum(pd_up, pd_down) - pd_up * pd_down),
+        pd_both,
+    )
+
+
+def _pd_in_looks_far_from_ends(
+    shots: "Shots", signal_up: np.ndarray, signal_down: np.ndarray, threshold_ratio: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return pd of up and down segment over several looks, as if DC and Nyquist were far away.
+
+    Signals and threshold are relative to the noise sigma.
+    """
+    signals = np.nan_to_num(np.stack([signal_up, 0 * signal_up, signal_down], axis=-2))
+    pd_up, _, pd_down = np.moveaxis(
+        shots.looks.pd_and_miss_in_speckle(
+            signals, threshold_ratio[..., None, :], shots.speckle.look_speckle
+        ).pd,
+        -2,
+        0,
+    )
+    return pd_up, pd_down
+
+
+def mean_detection_equivalent_bins(
+    shots: "Shots", probabilities: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]
+) -> np.ndarray | float:
+    """Return the number of independent bins that detect as often as an echo's correlated bins.
+
+    It is the geometric mean over the given segments of
+    :func:`sweep.model.detection.echo_detection.detection_equivalent_bins`, and 1 if only the
+    strongest bin detects.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    probabilities : tuple of ndarray
+        Probabilities of detection of the segments.
+    magnitudes : tuple of ndarray
+        |X| of the segments' strongest bins [V].
+    """
+    if shots.detection_settings.echo_bins == "peak_bin":
+        return 1.0
+    noise_sigma = shots.line_noise_sigma
+    threshold_ratio = shots.threshold / noise_sigma
+    n_equivalent: Any = 1.0
+    for pd, magnitude in zip(probabilities, magnitudes, strict=True):
+        n_equivalent = n_equivalent * echo_detection.detection_equivalent_bins(
+            pd, magnitude / noise_sigma, threshold_ratio
+        )
+    return np.asarray(n_equivalent ** (1 / len(probabilities)))
+
+
 def shot_pd_and_miss(
-    shots: Any, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
+    shots: "Shots", pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
 ) -> DetectionArrays:
     """Return the probabilities that a shot is detected, and that it is missed.
 
@@ -169,7 +504,7 @@ def shot_pd_and_miss(
     pd_up, _, pd_down = pd
     miss_up, _, miss_down = miss
     magnitude_up, _, magnitude_down = magnitudes
-    pd_both = shots.joint_detection_probability(pd_up, pd_down, (magnitude_up, magnitude_down))
+    pd_both = joint_detection_probability(shots, pd_up, pd_down, (magnitude_up, magnitude_down))
     miss_shot = miss_up + pd_up * miss_down
     if shots.speckle.segment_correlations is not None:
         miss_shot = miss_up + np.maximum(pd_up - pd_both, 0.0)
@@ -177,7 +512,7 @@ def shot_pd_and_miss(
 
 
 def _pd_and_miss_any_two(
-    shots: Any, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
+    shots: "Shots", pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
 ) -> DetectionArrays:
     """Compute :func:`shot_pd_and_miss` where detection in any two of three segments suffices."""
     if shots.speckle.segment_correlations is None:

@@ -19,7 +19,7 @@ from sweep.model.detection.hoyt import (
     pseudo_variance_ratio_at,
 )
 from sweep.model.detection.joint_tail import (
-    JointTailRule,
+    JointTailQuadrature,
     joint_tail_excess,
     joint_tail_excess_by_four_nodes,
 )
@@ -117,7 +117,7 @@ class DetectionRule(NamedTuple):
     real_record_in_speckle: bool
     """True for echoes in developed speckle in a real record. Near DC and Nyquist the quadratures of
     their amplitudes have unequal variances."""
-    joint_tail_rule: JointTailRule
+    neighbour_crossing_quadrature: JointTailQuadrature
     """Quadrature for the probability that two neighbouring bins both cross the threshold."""
     noise_pseudo_variance_ratio: np.ndarray
     """(bins,): ratio E[n^2] / E[|n|^2] of the noise n, 0 if circular, by distance [bins] from the
@@ -853,7 +853,8 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
-    by the quadrature ``rule.joint_tail_rule``. Bins are treated as a first-order Markov chain.
+    by the quadrature ``rule.neighbour_crossing_quadrature``. Bins are treated as a first-order
+    Markov chain.
 
     References
     ----------
@@ -877,7 +878,7 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
         if not tails.below > 0.0:
             return Detection(1.0, 0.0)
         given_neighbour, deviate = _crossing_given_neighbour_below(
-            tails, previous_p_stay, previous_deviate, rule.joint_tail_rule
+            tails, previous_p_stay, previous_deviate, rule.neighbour_crossing_quadrature
         )
         pd += miss * given_neighbour.above
         miss *= given_neighbour.below
@@ -913,7 +914,9 @@ def _zero_bins_given_mode(n_bins):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _crossing_given_neighbour_below(tails, previous_p_stay, previous_deviate, joint_tail_rule):
+def _crossing_given_neighbour_below(
+    tails, previous_p_stay, previous_deviate, neighbour_crossing_quadrature
+):
     """Return a bin's crossing probability given that the bin below does not cross.
 
     Parameters
@@ -924,8 +927,8 @@ def _crossing_given_neighbour_below(tails, previous_p_stay, previous_deviate, jo
         Probability that the bin below does not cross, and the number that a standard normal
         variable exceeds as often as that bin crosses. The probability is negative if no bin of the
         echo lies below.
-    joint_tail_rule
-        :class:`sweep.model.detection.joint_tail.JointTailRule` of the noise of neighbours.
+    neighbour_crossing_quadrature
+        :class:`sweep.model.detection.joint_tail.JointTailQuadrature` of the noise of neighbours.
 
     Returns
     -------
@@ -936,13 +939,13 @@ def _crossing_given_neighbour_below(tails, previous_p_stay, previous_deviate, jo
     deviate = _normal_deviate_of_tails(tails)
     if not previous_p_stay > 0.0:
         return tails, deviate
-    p_joint = joint_tail_excess(deviate, previous_deviate, joint_tail_rule)
+    p_joint = joint_tail_excess(deviate, previous_deviate, neighbour_crossing_quadrature)
     p_joint = min(p_joint / previous_p_stay, tails.above)
     return Tails(tails.above - p_joint, tails.below + p_joint), deviate
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def any_crossing_of_chain(probabilities, n_bins, joint_tail_rule):
+def any_crossing_of_chain(probabilities, n_bins, neighbour_crossing_quadrature):
     """Return the probability that any of adjacent bins crosses, from the probability of each bin.
 
     Neighbours are correlated as in :func:`pd_and_miss_any_bin`. Bins that cross with less than 1e-4
@@ -954,8 +957,8 @@ def any_crossing_of_chain(probabilities, n_bins, joint_tail_rule):
         Crossing probability of each bin, at least ``n_bins`` of them.
     n_bins
         Number of bins.
-    joint_tail_rule
-        :class:`sweep.model.detection.joint_tail.JointTailRule` of the noise of neighbours.
+    neighbour_crossing_quadrature
+        :class:`sweep.model.detection.joint_tail.JointTailQuadrature` of the noise of neighbours.
     """
     p_any, p_none, previous_p_stay, previous_deviate = 0.0, 1.0, -1.0, 0.0
     for i in range(n_bins):
@@ -967,7 +970,7 @@ def any_crossing_of_chain(probabilities, n_bins, joint_tail_rule):
             p_any, p_none, previous_p_stay = p_any + p_none * p_cross, p_none * p_stay, -1.0
             continue
         given_neighbour, deviate = _crossing_given_neighbour_below(
-            Tails(p_cross, p_stay), previous_p_stay, previous_deviate, joint_tail_rule
+            Tails(p_cross, p_stay), previous_p_stay, previous_deviate, neighbour_crossing_quadrature
         )
         p_any += p_none * given_neighbour.above
         p_none *= given_neighbour.below

@@ -89,7 +89,7 @@ SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
 }
 """Default parameters, by dotted path, of detector and estimator in full spectra."""
 
-_TABLE_STEPS = 512
+_TONE_STEPS_PER_BIN = 512
 """Number of steps per bin in tables over the offset, -1..1 bin, of a tone from a bin."""
 _NEIGHBOUR_HEIGHT_MIN = 0.25
 """Ratio of |X| of a neighbour to |X| of a bin on which a tone lies, below which the neighbours
@@ -269,7 +269,7 @@ def _tone_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
     """
     from sweep.model.detection.sub_bin_interpolation import tone_spectrum
 
-    offset = np.arange(-_TABLE_STEPS, _TABLE_STEPS + 1) / _TABLE_STEPS
+    offset = np.arange(-_TONE_STEPS_PER_BIN, _TONE_STEPS_PER_BIN + 1) / _TONE_STEPS_PER_BIN
     return offset, tone_spectrum(window, fft_size)(np.array([-1, 0, 1]) - offset[:, None]).real
 
 
@@ -281,7 +281,7 @@ def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
     ratio into an offset [bins].
     """
     offset, tone_bins = _tone_bins(window, fft_size)
-    _, centre, above = tone_bins[_TABLE_STEPS]
+    _, centre, above = tone_bins[_TONE_STEPS_PER_BIN]
     if abs(above) < _NEIGHBOUR_HEIGHT_MIN * centre:
         return 1, 1.0
     is_near = np.abs(offset) <= 0.5

@@ -15,7 +15,7 @@ from sweep.kernel_cache import njit
 _JOINT_TAIL_NODES, _JOINT_TAIL_WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
-class JointTailRule(NamedTuple):
+class JointTailQuadrature(NamedTuple):
     """Quadrature of the joint tail of two correlated standard normal numbers.
 
     Notes
@@ -41,33 +41,32 @@ class JointTailRule(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def joint_tail_rule(correlation: float) -> JointTailRule:
+def joint_tail_quadrature(correlation: float) -> JointTailQuadrature:
     """Return the quadrature for two numbers with a given correlation, 0..1 (cached)."""
     if correlation == 0.0:
-        return JointTailRule(np.empty(0), np.empty(0), np.empty(0))
+        return JointTailQuadrature(np.empty(0), np.empty(0), np.empty(0))
     node, weight = np.polynomial.legendre.leggauss(12)
     half_angle = 0.5 * math.asin(correlation)
     sine = np.sin(half_angle * (node + 1))
-    return JointTailRule(sine, half_angle * weight / (2 * math.pi), 0.5 / (1 - sine**2))
+    return JointTailQuadrature(sine, half_angle * weight / (2 * math.pi), 0.5 / (1 - sine**2))
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
+def joint_tail_excess(deviate, previous_deviate, quadrature):
     """Return P(S > s, T > t) - P(S > s) P(T > t) of correlated standard normal numbers S and T.
 
-    ``deviate`` is s and ``previous_deviate`` is t. ``joint_tail_rule`` is the
-    :class:`JointTailRule` of the correlation of S and T.
+    ``deviate`` is s and ``previous_deviate`` is t. ``quadrature`` is the
+    :class:`JointTailQuadrature` of the correlation of S and T.
     """
     excess = 0.0
-    for k in range(joint_tail_rule.sine.size):
+    for k in range(quadrature.sine.size):
         quadratic_form = (
             deviate * deviate
             + previous_deviate * previous_deviate
-            - 2.0 * deviate * previous_deviate * joint_tail_rule.sine[k]
+            - 2.0 * deviate * previous_deviate * quadrature.sine[k]
         )
-        excess += joint_tail_rule.weight[k] * math.exp(
-            -quadratic_form * joint_tail_rule.exponent_factor[k]
-        )
+        excess += quadrature.weight[k] * math.exp(-quadratic_form * quadrature.exponent_factor[k])
+        excess += quadrature.weight[k] * math.exp(-quadratic_form * quadrature.exponent[k])
     return excess
 
 
@@ -75,7 +74,7 @@ def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
 def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
     """Compute :func:`joint_tail_excess` for a given ``correlation``, with 4 quadrature nodes.
 
-    The result is less precise than the 12 nodes of a :class:`JointTailRule`, and needs none.
+    The result is less precise than the 12 nodes of a :class:`JointTailQuadrature`, and needs none.
     """
     excess, half_angle = 0.0, 0.5 * math.asin(correlation)
     for j in range(_JOINT_TAIL_NODES.size):

@@ -240,11 +240,11 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
         -optical_depth(profile, **_path_geometry(context.parameters, shots.range))
     )
     is_direct = shots.waveform.architecture == "direct"
-    link_scales = shots.link_scales.scale_echo(
+    echo_scales = shots.echo_scales.scale_echo(
         power_factor=transmission**2,
         amplitude_factor=transmission**2 if is_direct else transmission,
     )
-    return replace(shots, link_scales=link_scales._replace(ground_transmission=transmission))
+    return replace(shots, echo_scales=echo_scales._replace(ground_transmission=transmission))
 
 
 def extinction_bound(points: PlannerInputs) -> ErrorBound | None:

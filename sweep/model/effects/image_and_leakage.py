@@ -82,10 +82,10 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
         points.peak_power_bounds[0]
         / (1 + 2 * points.phase_error_shift_bins / points.padding_factor)
     )
-    response_outside = points.sidelobe_max(bins_to_image)
+    response_outside = points.magnitude_max_beyond(bins_to_image)
     response_inside, response_beyond = (
-        points.sidelobe_max(1.5 * bins_to_image),
-        points.sidelobe_max(0.5 * bins_to_image),
+        points.magnitude_max_beyond(1.5 * bins_to_image),
+        points.magnitude_max_beyond(0.5 * bins_to_image),
     )
     power_elsewhere = response_beyond * response_beyond + response_outside * response_outside
     image_power = (
@@ -111,7 +111,7 @@ def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
     image_ratio = (
         points.line_signal_ratio
         * points.footprint_extent.amplitude_gain_max
-        * points.sidelobe_max(points.bins_to_image)
+        * points.magnitude_max_beyond(points.bins_to_image)
     )
     squared_ratio, threshold_ratio = (
         np.minimum(image_ratio, _RATIO_MAX) ** 2,
@@ -162,7 +162,7 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
         2 * points.bins_to_image + threshold_distance,
     ):
         threshold_fraction = np.minimum(
-            total_ratio * points.sidelobe_max(distance) / points.threshold_ratio, 1.0
+            total_ratio * points.magnitude_max_beyond(distance) / points.threshold_ratio, 1.0
         )
         moved_fraction = moved_fraction + (
             threshold_fraction
@@ -350,7 +350,8 @@ def leakage_table(
         * (
             _added_crossing_probability(
                 np.minimum(
-                    total_ratio[:, None] * response.sidelobe_max(distance - 0.5 - reach_bins),
+                    total_ratio[:, None]
+                    * response.magnitude_max_beyond(distance - 0.5 - reach_bins),
                     threshold_ratio,
                 ),
                 threshold_ratio,

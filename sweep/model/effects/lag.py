@@ -49,10 +49,10 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     if not beam.is_single_mode(context.parameters):
         return shots
     kept_fraction = beam.axis_offset_transmission(context.parameters, shots.range)
-    link_scales = shots.link_scales.scale_echo(
+    echo_scales = shots.echo_scales.scale_echo(
         power_factor=kept_fraction, amplitude_factor=np.sqrt(kept_fraction)
     )
-    return replace(shots, link_scales=link_scales)
+    return replace(shots, echo_scales=echo_scales)
 
 
 LAG = Effect(

@@ -196,7 +196,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
             "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
         )
     line_fraction, in_phase_pedestal = _line_fraction_and_pedestal(shots, timing)
-    line_power = (shots.link_scales.beat_amplitude / 2) ** 2 * shots.total_relative_echo
+    line_power = (shots.echo_scales.beat_amplitude / 2) ** 2 * shots.total_relative_echo
     side_pedestal = pedestal_power_under_line(window=shots.window, **timing)
     if shots.echo_record.n_samples_before is not None:
         side_pedestal = (
@@ -206,7 +206,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
         )
     return replace(
         shots,
-        link_scales=shots.link_scales.scale_echo(amplitude_factor=np.sqrt(line_fraction)),
+        echo_scales=shots.echo_scales.scale_echo(amplitude_factor=np.sqrt(line_fraction)),
         laser_line=LaserLine(
             lorentzian_width=line_width,
             pedestal_variance_beside=line_power * side_pedestal / shots.window.energy,

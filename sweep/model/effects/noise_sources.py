@@ -153,7 +153,7 @@ def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
     power P is that of :func:`received_sunlight` times the air's transmission.
     """
     presence = context.presence_factor("solar_background")
-    light = received_sunlight(context.parameters) * shots.link_scales.ground_transmission * presence
+    light = received_sunlight(context.parameters) * shots.echo_scales.ground_transmission * presence
     return add_noise_sources(
         shots, solar_shot=np.asarray(shots.receiver_noise.shot_noise_variance_per_watt * light)
     )

@@ -583,7 +583,7 @@ def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
             shots.looks, acceleration=shots.target.acceleration, carrier=up_carrier,
             look_period=shots.waveform.look_period,
         )  # fmt: skip
-        shots = replace(shots, link_scales=shots.link_scales.scale_echo(amplitude_factor=gain))
+        shots = replace(shots, echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gain))
     drift_time = shots.record.acquisition_delay + shots.record.duration / 2
     shots = replace(shots, motion=shots.motion._replace(velocity_drift_time=drift_time))
     return _add_phase_error(

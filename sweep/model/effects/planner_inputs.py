@@ -223,7 +223,7 @@ class PlannerInputs(LinkBudget):
     @cached_property
     def beat_amplitude(self) -> np.ndarray:
         """Amplitude of the beat of the line on the axis [V], before the receiver's poles."""
-        return self.link_scales.beat_amplitude * relative_amplitude(
+        return self.echo_scales.beat_amplitude * relative_amplitude(
             self.waveform.architecture, self.footprint_extent.axis_echo
         )
 
@@ -234,7 +234,7 @@ class PlannerInputs(LinkBudget):
             self.footprint_extent.total_echo_ratio, 1.0
         )
         return (
-            self.link_scales.echo_power
+            self.echo_scales.echo_power
             * total_echo
             * self.receiver_noise.shot_noise_variance_per_watt
             / self.noise.variance_without_echo
@@ -297,18 +297,18 @@ class PlannerInputs(LinkBudget):
             self.window, np.broadcast_to(n_missing, self.beat_frequency.shape)
         )
 
-    def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
+    def magnitude_max_beyond(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest relative magnitude of a bin at least ``distance`` [bins] from a line.
 
         The magnitude is relative to the line's peak in a record that the echo fills.
         """
-        response_max = self.window_response.sidelobe_max(distance)
+        response_max = self.window_response.magnitude_max_beyond(distance)
         if self.missing_samples is None:
             return response_max
         rectangular_response = window_response("rectangular", self.window.length, self.fft_size)
         step_sidelobe = (
             self.missing_samples.step_sidelobe_factor
-            * rectangular_response.sidelobe_max(distance - self.padding_factor)
+            * rectangular_response.magnitude_max_beyond(distance - self.padding_factor)
         )
         return np.asarray(
             response_max + np.minimum(step_sidelobe, self.missing_samples.lost_fraction)
@@ -441,7 +441,7 @@ class PlannerInputs(LinkBudget):
         """
         smear_factor = 1 + 2 * self.phase_error_shift_bins / self.padding_factor
         gain_rise = np.exp(np.minimum(self.gain_slope_max * self.line_spread.extreme, 50.0))
-        image_response = self.sidelobe_max(self.bins_to_image) * np.sqrt(smear_factor)
+        image_response = self.magnitude_max_beyond(self.bins_to_image) * np.sqrt(smear_factor)
         return np.asarray(
             gain_rise * image_response / self.window_response.scalloping_gain(self.bin_offset)
         )

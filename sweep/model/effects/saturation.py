@@ -165,7 +165,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     gains = clipping_gains(amplitude=amplitude, deviation=deviation, full_scale=voltage_limit)
     return replace(
         shots,
-        link_scales=shots.link_scales.scale_echo(amplitude_factor=gains.signal_gain),
+        echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gains.signal_gain),
         noise=replace(shots.noise, gain=shots.noise.gain * gains.noise_gain),
     )
 
@@ -192,7 +192,7 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
     gain = shots.receiver_filter.gain(lowest_beat)
     echo = shots.total_relative_echo
     echo = echo if shots.waveform.architecture == "direct" else np.sqrt(echo)
-    return np.asarray(shots.link_scales.beat_amplitude * echo * gain)
+    return np.asarray(shots.echo_scales.beat_amplitude * echo * gain)
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:

@@ -415,7 +415,7 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     }
     return replace(
         shots,
-        link_scales=shots.link_scales.scale_echo(
+        echo_scales=shots.echo_scales.scale_echo(
             power_factor=power_factor, amplitude_factor=beat_factor
         ),
         noise=shots.noise.with_sources(**echo_variances),

@@ -339,7 +339,7 @@ having the same speckle."""
 def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     """Set the correlation of the speckle between the looks of a shot, from the motion between them.
 
-    Looks that are added coherently get a smaller amplitude (``link_scales``) instead.
+    Looks that are added coherently get a smaller amplitude (``echo_scales``) instead.
     """
     looks = shots.looks
     n_looks, n_points = looks.number, shots.size
@@ -370,7 +370,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
             axis=1
         )
         gain = np.sqrt(np.maximum(n_looks + squared_sum, 0.0)) / n_looks
-        return replace(shots, link_scales=shots.link_scales.scale_echo(amplitude_factor=gain))
+        return replace(shots, echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gain))
     look_power = _look_powers(shots, beam_spread.slopes)
     if (
         np.abs(correlation_by_lag - 1).max() < _DECORRELATION_MIN

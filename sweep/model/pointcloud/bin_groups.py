@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
+from sweep.model.detection.detection_probability import pd_and_miss_in_looks
 from sweep.model.detection.echo_detection import (
     EchoBins,
     bin_speckle_at,
@@ -168,8 +169,8 @@ def find_groups_in_spans(
             bin_groups.strongest_bin[spans.point_numbers],
             bin_groups.magnitude[spans.point_numbers],
         )
-        peak_pd = shots.pd_and_miss_in_looks(
-            peak_magnitudes.T, strongest_bins.T, spans.point_numbers
+        peak_pd = pd_and_miss_in_looks(
+            shots, peak_magnitudes.T, strongest_bins.T, spans.point_numbers
         ).pd
         pd[spans.point_numbers] = peak_pd.T
     lacks_group = (bin_groups.strongest_bin[spans.point_numbers, :, 0] < 0) & shots.has_segment

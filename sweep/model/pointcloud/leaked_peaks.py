@@ -95,8 +95,8 @@ LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
 
 LOG_POWER_MIN_FAINT = -5.0
 """Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal, whose
-sum of rates is at most FAINT_RATE_SUM_MAX. The part below this limit is extrapolated."""
-FAINT_RATE_SUM_MAX = 0.1
+sum of rates is at most FAINT_LEAKAGE_RATE_SUM_MAX. The part below this limit is extrapolated."""
+FAINT_LEAKAGE_RATE_SUM_MAX = 0.1
 """Largest sum of a segment's rates -ln(1 - c), at mean speckle power, for which the integral over
 speckle begins at LOG_POWER_MIN_FAINT. c is the probability that a bin crosses the threshold."""
 
@@ -1132,7 +1132,9 @@ def _average_leakage(leakage_bins, leakage_probability):
             for s in range(3):
                 begin, end = leakage_bins.bins_begin[j, s], leakage_bins.bins_end[j, s]
                 first_node = (
-                    faint_first_node if leakage_bins.rate_sum[j, s] <= FAINT_RATE_SUM_MAX else 0
+                    faint_first_node
+                    if leakage_bins.rate_sum[j, s] <= FAINT_LEAKAGE_RATE_SUM_MAX
+                    else 0
                 )
                 rate_sums, joining_rates = (
                     node_scratch[0, first_node:],

@@ -105,9 +105,9 @@ Exactly one of the first five bits is set. They follow from a comparison with th
 """
 
 
-FALSE_PEAK = -1
+FALSE_PEAK_GROUP = -1
 """Group number of a false peak, which belongs to no group of bins of an echo."""
-NO_PEAK = -2
+NO_PEAK_GROUP = -2
 """Group number that stands for a missing peak: no Doppler peak confirms the return, or the segment
 does not exist."""
 
@@ -394,7 +394,7 @@ def judge_return(groups, positions, first_bin, last_bin, line_positions, beamlet
         Beamlet nearest to the peaks, of those whose lines are in all peaks; -1 for none.
     """
     for s in range(3):
-        if groups[s] == FALSE_PEAK:
+        if groups[s] == FALSE_PEAK_GROUP:
             return FALSE_ALARM_FLAG, -1
     nearest_beamlet, least_distance, held_segments = -1, np.inf, 0
     for beamlet in range(beamlet_amplitude.size):

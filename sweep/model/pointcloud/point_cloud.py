@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sweep.model.detection.detection_probability import joint_detection_probability
 from sweep.model.detection.detectors import FIXED_THRESHOLD
 from sweep.model.detection.estimators import DETECTOR_PREFIX
 from sweep.model.detection.marcum import at_least_one_probability
@@ -264,8 +265,8 @@ def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, n
     The names are those of :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`.
     """
     pd_up, pd_doppler, pd_down = bin_groups.pd[:, :, 0].T
-    pd_both = shots.joint_detection_probability(
-        pd_up, pd_down, (bin_groups.magnitude[:, 0, 0], bin_groups.magnitude[:, 2, 0])
+    pd_both = joint_detection_probability(
+        shots, pd_up, pd_down, (bin_groups.magnitude[:, 0, 0], bin_groups.magnitude[:, 2, 0])
     )
     pfa_bin = np.exp(shots.looks.log_pfa(shots.threshold / shots.bin_noise_sigma))[:, None]
     pfa_noise = at_least_one_probability(

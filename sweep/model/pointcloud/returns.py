@@ -53,6 +53,10 @@ from sweep.kernel_cache import njit
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.bin_noise import noise_filter
+from sweep.model.detection.detection_probability import (
+    joint_detection_probability,
+    mean_detection_equivalent_bins,
+)
 from sweep.model.detection.echo_detection import (
     BinThresholds,
     bin_threshold_at,
@@ -86,9 +90,9 @@ from sweep.model.pointcloud.leaked_peaks import (
 )
 from sweep.model.pointcloud.pairing import (
     CONFIRMATION_TOLERANCE_BINS,
-    FALSE_PEAK,
+    FALSE_PEAK_GROUP,
     MISREAD_FLAG,
-    NO_PEAK,
+    NO_PEAK_GROUP,
     TRUE_FLAG,
     UNCONFIRMED_FLAG,
     DopplerPrediction,
@@ -193,7 +197,7 @@ class PeakLists(NamedTuple):
     """(3, peaks) in each field: peaks of the up, Doppler and down segment."""
     group: np.ndarray
     """(3, peaks) int64: index of the group of adjacent bins to which each peak belongs, or
-    FALSE_PEAK."""
+    FALSE_PEAK_GROUP."""
     n_peaks: np.ndarray
     """(3,) int64: number of peaks of each segment."""
 
@@ -262,7 +266,7 @@ class Returns(NamedTuple):
         arrays: dict[str, np.ndarray] = {
             "flags": np.zeros(shape, np.uint8),
             "beamlet": np.full(shape, -1, np.int32),
-            "group": np.full((*shape, 3), FALSE_PEAK, np.int8),
+            "group": np.full((*shape, 3), FALSE_PEAK_GROUP, np.int8),
         }
         return cls(
             **{
@@ -643,7 +647,7 @@ class DrawnPeaks(NamedTuple):
     velocity, for chirp slopes 1, 0 and -1; -1 without a return."""
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group of adjacent bins to which the up, Doppler and
-    down peak belong, or FALSE_PEAK or NO_PEAK."""
+    down peak belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
     flags: np.ndarray
     """(n, draws, returns) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
@@ -658,7 +662,7 @@ class DrawnPeaks(NamedTuple):
         return cls(
             Peaks.empty((n, draws, groups_max, 3)),
             np.full((n, draws, groups_max), -1),
-            np.full((n, draws, groups_max, 3), NO_PEAK, np.int8),
+            np.full((n, draws, groups_max, 3), NO_PEAK_GROUP, np.int8),
             np.zeros((n, draws, groups_max), np.uint8),
             np.full((n, draws, groups_max), -1, np.int32),
         )
@@ -676,7 +680,7 @@ class ListedReturns(NamedTuple):
     chirp slopes 1, 0 and -1."""
     group: np.ndarray
     """(m, 3) int8: index of the group of adjacent bins to which the up, Doppler and down peak
-    belong, or FALSE_PEAK or NO_PEAK."""
+    belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
     flags: np.ndarray
     """(m,) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`)."""
@@ -724,8 +728,8 @@ def make_draw_inputs(
     total = weight.sum(axis=-1)
     total[total == 0] = 1.0
     pd_up, pd_down = bin_groups.pd[:, 0], bin_groups.pd[:, 2]
-    pd_both = shots.joint_detection_probability(
-        pd_up.T, pd_down.T, (bin_groups.magnitude[:, 0].T, bin_groups.magnitude[:, 2].T)
+    pd_both = joint_detection_probability(
+        shots, pd_up.T, pd_down.T, (bin_groups.magnitude[:, 0].T, bin_groups.magnitude[:, 2].T)
     ).T
     down_pd = down_pd_given_up(pd_up, pd_down, pd_both)
     magnitude_below, magnitude, magnitude_above = np.ascontiguousarray(
@@ -800,8 +804,7 @@ def _n_independent_bins(
 ) -> np.ndarray:
     """Return the equivalent number of independent bins that detect each echo, (n, 3, groups).
 
-    For the chirps it is that of :meth:`sweep.model.preparation.Shots.joint_detection_probability`;
-    near DC and Nyquist it is 1.
+    For the chirps it is that of :func:`joint_detection_probability`; near DC and Nyquist it is 1.
     """
     n_independent = np.ones(bin_groups.pd.shape)
     if shots.detection_settings.echo_bins == "peak_bin":
@@ -810,7 +813,7 @@ def _n_independent_bins(
         pd_by_segment = tuple(bin_groups.pd[:, s].T for s in segments)
         magnitudes_by_segment = tuple(bin_groups.magnitude[:, s].T for s in segments)
         n_equivalent = np.asarray(
-            shots.detection_equivalent_bins(pd_by_segment, magnitudes_by_segment)
+            mean_detection_equivalent_bins(shots, pd_by_segment, magnitudes_by_segment)
         ).T
         for s in segments:
             n_independent[:, s] = n_equivalent
@@ -1034,7 +1037,7 @@ def _measure_listed_returns(
         <= tolerance_half_bins * measurements.velocity_per_half_bin
     )
     up_group, doppler_group, down_group = listed_returns.group.T
-    is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK)
+    is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK_GROUP)
     up_index, _, down_index = group.T
     pd = inputs.pd[point, 0, up_index] * inputs.down_pd_if_up_detected[point, down_index]
     is_misread = (listed_returns.flags & TRUE_FLAG > 0) & ~is_right
@@ -1071,7 +1074,7 @@ def _measure_listed_returns(
             is_misread, listed_returns.flags ^ (TRUE_FLAG | MISREAD_FLAG), listed_returns.flags
         ),
         beamlet=listed_returns.beamlet,
-        group=np.maximum(listed_returns.group, FALSE_PEAK),
+        group=np.maximum(listed_returns.group, FALSE_PEAK_GROUP),
         range_per_slip=np.broadcast_to(per_slip.range, point.shape),
         radial_velocity_per_slip=np.broadcast_to(per_slip.radial_velocity, point.shape),
     )
@@ -2089,7 +2092,7 @@ def draw_segment_peaks(
             config,
             interpolation,
         )
-        store_peak(peak, FALSE_PEAK, segment, n_peaks, peak_lists)
+        store_peak(peak, FALSE_PEAK_GROUP, segment, n_peaks, peak_lists)
         n_peaks += 1
     peak_lists.n_peaks[segment] = n_peaks
 
@@ -2661,7 +2664,7 @@ def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def store_peak(peak, group, segment, index, peak_lists):
-    """Store a peak of a group (or FALSE_PEAK) as number ``index`` of a segment's list."""
+    """Store a peak of a group (or FALSE_PEAK_GROUP) as number ``index`` of a segment's list."""
     peaks = peak_lists.peaks
     peaks.bin[segment, index], peaks.position[segment, index] = peak.bin, peak.position
     peaks.position_error[segment, index] = peak.position_error

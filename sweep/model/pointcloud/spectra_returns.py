@@ -32,7 +32,7 @@ from sweep.model.detection.estimators import ESTIMATOR_PREFIX, PEAK_BIN, SPECTRU
 from sweep.model.detection.sub_bin_interpolation import interpolator, sub_bin_standard_error
 from sweep.model.pointcloud.bin_groups import BinGroups
 from sweep.model.pointcloud.ego_motion import EgoMotion
-from sweep.model.pointcloud.pairing import FALSE_PEAK, PeakPairs
+from sweep.model.pointcloud.pairing import FALSE_PEAK_GROUP, PeakPairs
 from sweep.model.pointcloud.returns import (
     ROUNDING_VARIANCE,
     DrawConfig,
@@ -200,7 +200,8 @@ class FlaggedPeaks(NamedTuple):
     strongest_bin: np.ndarray
     """(peaks,) int64: index of the strongest bin of each peak."""
     echo_number: list[int]
-    """Number, for each peak, of the echo to which it belongs; FALSE_PEAK for a peak of no echo."""
+    """Number, for each peak, of the echo to which it belongs; FALSE_PEAK_GROUP for a peak of no
+    echo."""
 
 
 def _echo_bin_bounds(
@@ -283,14 +284,14 @@ def list_flagged_peaks(
     for group_index in np.argsort(-np.array(group_power), kind="stable"):
         start, end = int(starts[group_index]), int(ends[group_index])
         touches_echo = (echo_bounds.first_bin < end) & (start <= echo_bounds.last_bin)
-        echo_number = int(touches_echo.argmax()) if touches_echo.any() else FALSE_PEAK
-        if echo_number == FALSE_PEAK and (
+        echo_number = int(touches_echo.argmax()) if touches_echo.any() else FALSE_PEAK_GROUP
+        if echo_number == FALSE_PEAK_GROUP and (
             start > end_index - first_searched or end <= first_searched
         ):
             continue
-        if echo_number == FALSE_PEAK and is_exempt[start:end].any():
+        if echo_number == FALSE_PEAK_GROUP and is_exempt[start:end].any():
             continue
-        if echo_number != FALSE_PEAK and echo_number in echo_of_peak:
+        if echo_number != FALSE_PEAK_GROUP and echo_number in echo_of_peak:
             continue
         strongest_bins.append((start + int(power[start:end].argmax()) - shift) % all_power.size)
         echo_of_peak.append(echo_number)

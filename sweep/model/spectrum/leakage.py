@@ -76,7 +76,7 @@ INTEGRAL_END_CORRECTION_BINS = 3
 """Number of bins that correct an integral over bins at its end near the lines. They are on each
 side of that end."""
 
-END_CORRECTION_ERROR_MAX = 1e-7
+LAST_END_CORRECTION_FRACTION_MAX = 1e-7
 """Largest accepted value of the last end correction of the integral over bins, relative to the
 whole leakage. Leakage is the probability of false alarms due to the echo's signal far from its
 lines.
@@ -880,7 +880,7 @@ def _leakage_of_all_bins(
     )
     if not (
         largest_far_half_square <= half_square_max
-        and last_terms <= END_CORRECTION_ERROR_MAX * (span_leakage + far_rate)
+        and last_terms <= LAST_END_CORRECTION_FRACTION_MAX * (span_leakage + far_rate)
     ):
         return LeakageResult(0.0, False)
     if speckle_power_max > 1.0:

@@ -1,4 +1,4 @@
-"""Line of other light than the echo's that is in every record, such as leaked transmitted light.
+"""Line of light other than the echo's, which is in every record, such as leaked transmitted light.
 
 The line's beat has the amplitude A, the delay tau and the phase phi. With the window's transform W,
 the receiver's transfer function H, the chirp rate S, the FFT size N and the sample rate fs, its
@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.model import receiver_chain
+from sweep.model.detection.detection_probability import detect_in_bins
 from sweep.model.detection.looks import Looks
 from sweep.model.preparation import Shots
 from sweep.model.waveform import count_samples_before_echo
@@ -284,13 +285,6 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
     BinSpans
         Spectra with changed magnitudes, probabilities, exempt bins and leakage.
     """
-    from sweep.model.detection.echo_detection import (
-        EchoBins,
-        bin_speckle_at,
-        bin_threshold_at,
-        pd_and_miss,
-    )
-
     magnitudes = bin_spans.magnitudes.copy()
     pd, miss, exempted, leakage = (
         values.copy()
@@ -300,7 +294,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
         np.broadcast_to(values, shots.size)[bin_spans.point_numbers]
         for values in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
     )
-    fft_size, rule, speckle = shots.fft_size, shots.detection_rule, shots.speckle_table
+    fft_size = shots.fft_size
     for segment_index, i in np.argwhere(bin_spans.n_bins > 0):
         bin_slice = slice(
             bin_spans.span_start[segment_index, i],
@@ -341,12 +335,14 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
         if is_masked[bins[peak]]:
             pd[segment_index, i], miss[segment_index, i] = 0.0, 1.0
         else:
-            pd[segment_index, i], miss[segment_index, i] = pd_and_miss(
-                EchoBins(equivalent_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
-                peak,
-                rule,
-                bin_threshold_at(shots.bin_thresholds, bin_spans.point_numbers[i]),
-                bin_speckle_at(speckle, segment_index, bin_spans.point_numbers[i]),
+            pd[segment_index, i], miss[segment_index, i] = detect_in_bins(
+                shots,
+                equivalent_magnitudes,
+                is_echo,
+                first_bin=bin_spans.first_bin[segment_index, i],
+                peak_index=peak,
+                segment=segment_index,
+                point=bin_spans.point_numbers[i],
             )
         exempted[segment_index, i] += np.count_nonzero(is_masked & is_searched)
         if shots.waveform_segments[segment_index].includes_leakage:

@@ -1226,9 +1226,9 @@ def _evaluate_segment(
             leakage = leakage_of_bins(
                 n_bins, limits, negligible_signal_ratio, span, crossing_series
             )
-            if image_gain > 0.0 and rule.joint_tail_rule.sine.size > 0:
+            if image_gain > 0.0 and rule.neighbour_crossing_quadrature.sine.size > 0:
                 leakage = any_crossing_of_chain(
-                    span.crossing_probability, n_bins, rule.joint_tail_rule
+                    span.crossing_probability, n_bins, rule.neighbour_crossing_quadrature
                 )
     if layout.spectrum_type == COMPLEX_RECORD:  # no bin of a span is below 0
         first_bin += layout.fft_size

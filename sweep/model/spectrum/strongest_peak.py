@@ -24,13 +24,14 @@ A shot is wrong if both chirps report a peak, and not both peaks are the echo's.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model import waveform
 from sweep.model.detection import bin_noise
+from sweep.model.detection.detection_probability import joint_detection_probability
 from sweep.model.detection.echo_detection import (
     BinThreshold,
     Detection,
@@ -40,6 +41,7 @@ from sweep.model.detection.echo_detection import (
     pd_and_miss,
 )
 from sweep.model.detection.marcum import marcum_q1_tails
+from sweep.model.preparation import Shots
 from sweep.model.spectrum.search_restriction import span_leakage_probability
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
@@ -95,7 +97,7 @@ class LevelProbabilities(NamedTuple):
 
 
 def strongest_peak_probabilities(
-    shots: Any, pd: np.ndarray, miss: np.ndarray, magnitude: np.ndarray
+    shots: Shots, pd: np.ndarray, miss: np.ndarray, magnitude: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Compute detection and wrong-range probabilities if only the strongest peak is reported.
 
@@ -134,7 +136,7 @@ def strongest_peak_probabilities(
     p_both_right = pd_right[UP] * pd_right[DOWN] + shared_speckle_gain
     if shots.speckle.segment_correlations is not None:
         speckle_covariance = (
-            shots.joint_detection_probability(pd[UP], pd[DOWN], (magnitude[UP], magnitude[DOWN]))
+            joint_detection_probability(shots, pd[UP], pd[DOWN], (magnitude[UP], magnitude[DOWN]))
             - pd[UP] * pd[DOWN]
         )
         p_both_right = np.minimum(
@@ -150,7 +152,7 @@ def strongest_peak_probabilities(
     }
 
 
-def _span_probabilities(shots: Any, spans: BinSpans, pd: np.ndarray) -> SpanProbabilities:
+def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> SpanProbabilities:
     """Compute the :class:`SpanProbabilities` of the points of some spans.
 
     A span is a set of adjacent bins around a segment's lines. ``pd`` (3, n) is the probability that
@@ -211,7 +213,7 @@ def _span_probabilities(shots: Any, spans: BinSpans, pd: np.ndarray) -> SpanProb
     )
 
 
-def _level_half_squares(shots: Any, spans: Any, threshold_ratio: np.ndarray) -> np.ndarray:
+def _level_half_squares(shots: Shots, spans: BinSpans, threshold_ratio: np.ndarray) -> np.ndarray:
     """Return z^2 / (2 sigma^2) of all magnitude levels z, (3, m, levels), the threshold first.
 
     sigma is the noise per quadrature. ``threshold_ratio`` (m,) is the threshold over sigma.
@@ -226,7 +228,7 @@ def _level_half_squares(shots: Any, spans: Any, threshold_ratio: np.ndarray) -> 
     return np.concatenate([first, first_half_square[..., None] + inner], axis=-1)
 
 
-def _noise_exponents(shots: Any, spans: Any, half_squares: np.ndarray) -> np.ndarray:
+def _noise_exponents(shots: Shots, spans: BinSpans, half_squares: np.ndarray) -> np.ndarray:
     """Return -ln of the probability that no bin of noise exceeds a magnitude level z.
 
     ``half_squares`` (3, m, levels) is z^2 / (2 sigma^2), with the noise sigma. The result has the

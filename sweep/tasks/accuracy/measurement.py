@@ -54,7 +54,7 @@ from sweep.tasks.engine.progress import (
     show_activity,
 )
 from sweep.tasks.studies.output_layouts import cf_attributes
-from sweep.tasks.studies.study_loading import ACCURACY_STORE_KIND, make_study
+from sweep.tasks.studies.study_loading import make_study
 
 DEFAULT_SAMPLE_POINTS, DEFAULT_TIME_LIMIT_SECONDS = 200, 60.0
 """Defaults of `measure_accuracy`: number of sampled points, and time limit of the measurement [s].
@@ -187,7 +187,7 @@ def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
     """Raise a StoreError if the path holds something that may not be overwritten."""
     if can_create_store(store_path):
         return
-    if store_format.read_attributes(store_path)["kind"] != ACCURACY_STORE_KIND:
+    if store_format.read_attributes(store_path)["kind"] != store_format.ACCURACY_STORE_KIND:
         raise StoreError(
             f"{store_path} holds a study's results: name another {option_name('store')}"
         )
@@ -577,7 +577,7 @@ class AccuracyTemplate:
             if setting.kind == THESIS_KIND
         ]
         attributes: dict[str, Any] = {
-            "kind": ACCURACY_STORE_KIND,
+            "kind": store_format.ACCURACY_STORE_KIND,
             "title": spec.title,
             "question": "What does accuracy cost in time?",
             "spec": spec.to_json(),

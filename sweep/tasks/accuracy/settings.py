@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
+from sweep.model.error_budget import THESIS_BEAMLET_COUNT
 from sweep.model.ground import beamlets_add_as_powers
 from sweep.spec import GridSpec, SceneSpec
 from sweep.spec.fields import OFF
@@ -53,9 +54,6 @@ The line follows the slope of the target, which must be a plane.
 FIXED_EFFECTS_LINE_BEAMLET_COUNT = 163
 """Number of beamlets along a line in settings with fixed effects; enough for the widest footprints.
 """
-
-THESIS_BEAMLET_COUNT = 109
-"""Number of beamlets per beam that the thesis uses [T 3.3.1]."""
 
 REFERENCE_RAYS_PER_SHOT, REFERENCE_RAYS_TOLERANCE = 8017, 3e-7
 """Settings of rays for the reference of a flight, the most accurate setting.

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain, takewhile
 from typing import TYPE_CHECKING, Any
 
-from sweep.messages import counted, option_name
+from sweep.messages import number_with_noun, option_name
 from sweep.storage.store_format import NotAStoreError
 from sweep.tasks.engine.journal import Receipt
 from sweep.tasks.engine.progress import SchedulerLostError, StoreError, duration_text
@@ -212,17 +212,18 @@ class TaskDispatcher:
         now = time.monotonic()
         tasks = set(self._in_flight.values())
         lines = [
-            f"{counted(self._block_queue.n_unassigned, 'block')} not yet sent, "
+            f"{number_with_noun(self._block_queue.n_unassigned, 'block')} not yet sent, "
             f"{len(self._block_queue.failed_blocks):,} failed once, "
             f"{len(self._unverified_receipts):,} written but not yet found in the store",
-            f"{counted(len(tasks), 'task')} in flight, {len(self._superseded):,} superseded; "
-            f"{counted(self._throughput.n_blocks, 'block')} came back in "
+            f"{number_with_noun(len(tasks), 'task')} in flight, "
+            f"{len(self._superseded):,} superseded; "
+            f"{number_with_noun(self._throughput.n_blocks, 'block')} came back in "
             f"{duration_text(self._throughput.work_seconds)} of work",
         ]
         lines += [
             f"task of block {task.blocks[0]} and {len(task.blocks) - 1} more: sent "
             f"{duration_text(now - task.last_sent_at)} ago, "
-            f"{counted(len(task.futures_by_key), 'time')}; Dask says "
+            f"{number_with_noun(len(task.futures_by_key), 'time')}; Dask says "
             f"{', '.join(sorted({str(future.status) for future in task.futures_by_key.values()}))}"
             for task in sorted(tasks, key=lambda task: task.last_sent_at)[:TASKS_IN_SUMMARY_MAX]
         ]
@@ -235,7 +236,7 @@ class TaskDispatcher:
             )
             excluded_text = ", left out" if worker in self._excluded_workers else ""
             lines.append(
-                f"worker {worker}: {counted(threads, 'thread')}, last answer "
+                f"worker {worker}: {number_with_noun(threads, 'thread')}, last answer "
                 f"{last_response_text}{excluded_text}"
             )
         return "\n".join(lines)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from sweep.messages import EscapedTextError, counted, escape_unprintable
+from sweep.messages import EscapedTextError, escape_unprintable, number_with_noun
 from sweep.regular_files import RefusedFileError
 from sweep.storage.store_format import StoreError as StoreError
 from sweep.tasks.engine.text_streams import StallTolerantStream, is_terminal
@@ -27,8 +27,8 @@ BAR_REFRESH_RATE_HZ = 4.0
 #: Width of a terminal from which a progress bar shows workers and bytes too [columns].
 WIDE_TERMINAL_COLUMNS_MIN = 100
 
-#: Duration of an activity before a message about it is shown [s]. Most activities are shorter.
-ACTIVITY_SHOWN_AFTER_SECONDS = 2.0
+#: Duration of an activity after which a message about it is shown [s]. Most activities are shorter.
+ACTIVITY_MESSAGE_DELAY_SECONDS = 2.0
 
 _logger = logging.getLogger("sweep")
 
@@ -160,7 +160,7 @@ def show_activity(activity: str, progress: Progress | None = None) -> Iterator[N
         )
 
     def report() -> None:
-        delay = ACTIVITY_SHOWN_AFTER_SECONDS
+        delay = ACTIVITY_MESSAGE_DELAY_SECONDS
         while not is_over.wait(delay):
             if isinstance(listener, ProgressBar):
                 with listener.console.status(activity_text()) as status:
@@ -229,7 +229,9 @@ class _CountingProgress(Progress):
             if self._points_per_second > 0
             else "",
             "work": self._workers_text,
-            "failures": f"{counted(self._n_failed, 'block')} failed" if self._n_failed else "",
+            "failures": f"{number_with_noun(self._n_failed, 'block')} failed"
+            if self._n_failed
+            else "",
         }
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sweep.messages import counted
+from sweep.messages import number_with_noun
 from sweep.scenes.scene_files import SceneError
 from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world
 
@@ -101,7 +101,7 @@ def refuse_flight_without_hits(spec: SceneSpec) -> None:
         return
     n_shots = sum(scanner.n_shots for scanner in flight_coverage.scanner_hits)
     rule = (
-        f"leads nowhere that a beam hits anything, of {counted(n_shots, 'shot')}: "
+        f"leads nowhere that a beam hits anything, of {number_with_noun(n_shots, 'shot')}: "
         f"{flight_coverage.extents_text()}"
     )
     remedy = (

@@ -36,6 +36,7 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
+    DRAW_BATCH_DIM,
     DRAW_COUNT_OUTPUTS,
     EFFECT_VARIABLES,
     GRID_OUTPUTS,
@@ -401,10 +402,6 @@ class EffectPlanner:
         )
 
 
-#: Name of the dimension of batches of draws.
-BATCH_DIM = "batch"
-
-
 def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
     """Return the output variables that blocks write, by name in sorted order.
 
@@ -430,7 +427,7 @@ def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
         outputs |= GRID_OUTPUTS | STANDARD_ERROR_OUTPUTS | draw_outputs | running_outputs
     extra_dims = {RUNNING_SUMS: ("sum",)}
     if not spec.draws.is_adaptive:
-        extra_dims |= dict.fromkeys(DRAW_COUNT_OUTPUTS, (BATCH_DIM,))
+        extra_dims |= dict.fromkeys(DRAW_COUNT_OUTPUTS, (DRAW_BATCH_DIM,))
     return {name: replace(outputs[name], dims=extra_dims.get(name, ())) for name in sorted(outputs)}
 
 
@@ -478,7 +475,7 @@ class GridStudy(ExtendableStudy):
             arrays.append(
                 ArrayLayout.from_values(
                     "batch_draws",
-                    (BATCH_DIM,),
+                    (DRAW_BATCH_DIM,),
                     np.array(draws_per_batch, np.int64),
                     batch_attributes,
                 )
@@ -487,7 +484,7 @@ class GridStudy(ExtendableStudy):
 
     def output_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of the model's outputs, and of the arrays of effects."""
-        sizes = {BATCH_DIM: len(batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
+        sizes = {DRAW_BATCH_DIM: len(batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
         off_axes = self.spec.parameters_off_axes()
         promised_accuracy = {  # accuracy that the half-widths of intervals are compared with
             name: float(off_axes[f"accuracy.{name}"])

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 
-from sweep.messages import counted, suggested_call
+from sweep.messages import number_with_noun, suggested_call
 from sweep.storage import store_format
 from sweep.storage.foreign_files import list_foreign_files
 from sweep.storage.locations import (
@@ -161,8 +161,8 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
             f"{suggested_call('status', store_path)} names it"
         )
     if (
-        attributes["kind"] == study_loading.ACCURACY_STORE_KIND
-        or (attributes["kind"] == "eyepoints" and not read_recipe(store_path))
+        attributes["kind"] == store_format.ACCURACY_STORE_KIND
+        or (attributes["kind"] == store_format.EYEPOINTS_STORE_KIND and not read_recipe(store_path))
         or PACKED_ATTRIBUTE in attributes
     ):
         return None
@@ -319,7 +319,7 @@ def _find_block_damages(
         and objects_match_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max)
     ):
         return []  # earlier responses were incomplete
-    description = f"one of its {counted(len(chunk_paths), 'chunk')}"
+    description = f"one of its {number_with_noun(len(chunk_paths), 'chunk')}"
     return damages or [Damage(description, "is whole but not the one that was committed", block)]
 
 
@@ -488,7 +488,7 @@ def pack_store(
         reason = (
             "is packed already"
             if attributes.get(PACKED_ATTRIBUTE)
-            else f"lacks {counted(n_missing, 'block')}: resume it"
+            else f"lacks {number_with_noun(n_missing, 'block')}: resume it"
         )
         raise StoreError(f"{store_path} {reason}")
     if not can_create_store(output):

@@ -50,9 +50,6 @@ from sweep.tasks.studies.parameter_grid import TOLERANCE_PARAMETER, ParameterGri
 
 AnySpec = GridSpec | SceneSpec
 
-ACCURACY_STORE_KIND = "accuracy"
-"""Kind of the stores of `sweep accuracy`, which hold no study."""
-
 GridOrFlightStudy = GridStudy | FlightStudy
 AnyStudy = GridOrFlightStudy | EyepointStudy
 
@@ -97,7 +94,7 @@ def _find_reuse_source(
 def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
     """Return the attributes of a store, and its study; raise StoreError if it can't be read."""
     attributes = store_format.read_attributes(store_path)
-    if attributes["kind"] == ACCURACY_STORE_KIND:
+    if attributes["kind"] == store_format.ACCURACY_STORE_KIND:
         figures_command = shell_command("figures", store_path)
         raise StoreError(
             f"{store_path} holds what accuracy costs, no study: `{figures_command}` draws it"
@@ -108,7 +105,7 @@ def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
 def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
     """Return the study of a store from its attributes; raise StoreError if it can't be read."""
     recipe = read_recipe(store_path)
-    if attributes["kind"] == "eyepoints":
+    if attributes["kind"] == store_format.EYEPOINTS_STORE_KIND:
         if "spec" not in recipe:
             raise StoreError(
                 f"{store_path} does not say how its eyepoints were made: run their study again"

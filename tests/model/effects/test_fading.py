@@ -16,7 +16,7 @@ from sweep.model.detection.echo_detection import (
     joint_pd_in_speckle,
     pd_and_miss,
 )
-from sweep.model.detection.joint_tail import joint_tail_rule
+from sweep.model.detection.joint_tail import joint_tail_quadrature
 from sweep.model.detection.marcum import marcum_q1
 from sweep.model.detection.speckle_correlation import SEGMENT_PAIRS
 from sweep.model.detection.speckle_modes import NO_MODES
@@ -52,7 +52,7 @@ def amplitudes(rng, size):
 def of_one_bin(magnitude, level):
     """Chances of a bin in noise of power 1 to be found, and to be missed."""
     rule = DetectionRule(
-        False, 0, False, 64, True, 0.0, False, joint_tail_rule(0.0), np.empty(0), NO_MODES
+        False, 0, False, 64, True, 0.0, False, joint_tail_quadrature(0.0), np.empty(0), NO_MODES
     )
     noise = np.sqrt(0.5)
     levels, one = BinThreshold(noise, level, noise, noise), np.ones(1, bool)

@@ -37,7 +37,7 @@ def difference(shots, i, segment, **how):
         exact = np.roll(exact, -(shots.fft_size // 2))[bins % shots.fft_size]
     scale = (
         shots.window.sum
-        * float(np.broadcast_to(shots.link_scales.beat_amplitude, shots.size)[i])
+        * float(np.broadcast_to(shots.echo_scales.beat_amplitude, shots.size)[i])
         / 2
     )
     return np.abs(fast - exact).max() / (scale * np.sqrt(shots.total_relative_echo[i]))
@@ -347,7 +347,7 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
     }  # fmt: skip
     shots, plain = shots_of(scene, "line_width"), shots_of(scene)
     first = int(shots.echo_record.n_samples_before[0, 0])
-    share = float((shots.link_scales.beat_amplitude / plain.link_scales.beat_amplitude)[0] ** 2)
+    share = float((shots.echo_scales.beat_amplitude / plain.echo_scales.beat_amplitude)[0] ** 2)
     rng = np.random.default_rng(3)
     delay, rate = 2 * far / SPEED_OF_LIGHT, 600e6
     w, n = get_window("hann", 6000).samples(), np.arange(6000)
@@ -360,7 +360,7 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
     line = (w * (n >= first)).sum() ** 2
     pedestal = float(np.ravel(shots.laser_line.pedestal_variance_under_line)[0])
     amplitude = (
-        float(np.ravel(plain.link_scales.beat_amplitude)[0]) ** 2 * plain.total_relative_echo[0] / 4
+        float(np.ravel(plain.echo_scales.beat_amplitude)[0]) ** 2 * plain.total_relative_echo[0] / 4
     )
     told = share + pedestal * get_window("hann", 6000).energy / amplitude / line
     assert np.mean(power) / line == pytest.approx(told, rel=0.15)
