@@ -401,10 +401,10 @@ def accuracy(
 ) -> None:
     """Measure what accuracy costs in SPEC: error against time of a ladder of settings.
 
-    The command computes a sample of the study's own points, the same every time, with many
-    settings. These are the spec as written, effects on demand at tolerances from 0.1 to 1e-6, all
-    effects on, and the same effects everywhere. Fixed numbers of beamlets or draws and the thesis's
-    way are measured too.
+    The command computes a fixed sample of the study's points with each of these settings: the spec
+    as written; effects left out by tolerances from 0.1 to 1e-6; all effects everywhere; fixed
+    numbers of beamlets or draws; and the algorithm of the thesis, which transforms whole records.
+
     Errors are differences from the finest setting, which is compared with the time domain. All
     settings take turns on parts of the sample, round after round, so that a slow machine slows
     them alike; the best round counts. Planning is counted, storing is not.

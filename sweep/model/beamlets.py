@@ -278,7 +278,7 @@ class OffsetMoments(NamedTuple):
         """
         return OffsetMoments(*(np.minimum(value, 1e200) * factor for value in self))
 
-    def sum_bound(self, other: "OffsetMoments") -> "OffsetMoments":
+    def bound_on_summed_offsets(self, other: "OffsetMoments") -> "OffsetMoments":
         """Return upper bounds on the moments of the sum of two offsets.
 
         ``other`` are the moments of the second offset.

@@ -260,7 +260,9 @@ def _pd_and_miss_in_looks_and_speckle(
     )
     pd, miss = shots.looks.pd_and_miss_in_speckle(signal_ratio, threshold_ratio, look_speckle)
     rule, speckle_table = shots.detection_rule, shots.speckle_table
-    speckle_row = np.broadcast_to(speckle_table.ratio_row[:, point_indices], signal_ratio.shape)
+    speckle_row = np.broadcast_to(
+        speckle_table.pseudo_variance_row[:, point_indices], signal_ratio.shape
+    )
     bins_from_end = np.minimum(bins, shots.fft_size // 2 - bins)
     is_near_end = (
         (speckle_row > 0)
@@ -367,7 +369,10 @@ def _joint_pd_in_one_record(
     pd_both = echo_detection.joint_pd_in_speckle(
         pd_up, pd_down, threshold_ratio, correlation, n_equivalent
     )
-    speckle_table, speckle_rows = shots.speckle_table, shots.speckle_table.ratio_row[[0, 2]]
+    speckle_table, speckle_rows = (
+        shots.speckle_table,
+        shots.speckle_table.pseudo_variance_row[[0, 2]],
+    )
     near_ends = np.flatnonzero(speckle_rows.any(axis=0))
     if near_ends.size:
         threshold_ratio, correlation, n_equivalent = (
@@ -412,7 +417,7 @@ def _joint_pd_in_looks(
     pd_both = shots.looks.joint_pd_in_speckle(
         signal_up, signal_down, threshold_ratio, correlation, look_speckle
     )
-    is_near_ends = shots.speckle_table.ratio_row[[0, 2]].any(axis=0)
+    is_near_ends = shots.speckle_table.pseudo_variance_row[[0, 2]].any(axis=0)
     if not is_near_ends.any():
         return pd_both
     pd_up_far_from_ends, pd_down_far_from_ends = _pd_in_looks_far_from_ends(
@@ -532,12 +537,12 @@ def _pd_and_miss_any_two(
     correlations = np.abs(np.array(shots.speckle.segment_correlations))
     pd_shot, miss_shot = pd_and_miss_any_two_in_speckle(pd, miss, threshold_ratio, correlations)
     speckle_table = shots.speckle_table
-    near_ends = np.flatnonzero(speckle_table.ratio_row.any(axis=0))
+    near_ends = np.flatnonzero(speckle_table.pseudo_variance_row.any(axis=0))
     if near_ends.size:
         threshold_ratio = np.broadcast_to(threshold_ratio, shots.size)[near_ends]
         correlations = correlations[:, near_ends]
         pd_shot[near_ends], miss_shot[near_ends] = mean_over_phases(
-            speckle_table.phase_factors[speckle_table.ratio_row[:, near_ends]],
+            speckle_table.phase_factors[speckle_table.pseudo_variance_row[:, near_ends]],
             tuple(pd[:, near_ends]),
             lambda *pd: pd_and_miss_any_two_in_speckle(
                 np.array(pd), 1 - np.array(pd), threshold_ratio, correlations

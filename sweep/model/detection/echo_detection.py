@@ -289,7 +289,7 @@ class SpeckleTable(NamedTuple):
 
     line_deviation_bins: np.ndarray
     """(segments, n): standard deviation [FFT bins] of the frequencies of an echo's lines."""
-    ratio_row: np.ndarray
+    pseudo_variance_row: np.ndarray
     """(segments, n) int64: row of ``pseudo_variance_ratio`` for each echo. Row 0 is for echoes far
     from DC and Nyquist."""
     pseudo_variance_ratio: np.ndarray
@@ -301,11 +301,12 @@ class SpeckleTable(NamedTuple):
 
     def select(self, segment: int, points: np.ndarray) -> "SpeckleTable":
         """Return the table of one segment of some points, given by their indices."""
-        line_deviation_bins, ratio_row = (
-            values[[segment]][:, points] for values in (self.line_deviation_bins, self.ratio_row)
+        line_deviation_bins, pseudo_variance_row = (
+            values[[segment]][:, points]
+            for values in (self.line_deviation_bins, self.pseudo_variance_row)
         )
         return SpeckleTable(
-            line_deviation_bins, ratio_row, self.pseudo_variance_ratio, self.phase_factors
+            line_deviation_bins, pseudo_variance_row, self.pseudo_variance_ratio, self.phase_factors
         )
 
 
@@ -426,11 +427,11 @@ def bin_speckle_at(speckle_table, segment, point):
 
     ``segment`` and ``point`` are indices.
     """
-    ratio_row = speckle_table.ratio_row[segment, point]
-    n_bins = speckle_table.pseudo_variance_ratio.shape[1] if ratio_row > 0 else 0
+    pseudo_variance_row = speckle_table.pseudo_variance_row[segment, point]
+    n_bins = speckle_table.pseudo_variance_ratio.shape[1] if pseudo_variance_row > 0 else 0
     return BinSpeckle(
         speckle_table.line_deviation_bins[segment, point],
-        speckle_table.pseudo_variance_ratio[ratio_row, :n_bins],
+        speckle_table.pseudo_variance_ratio[pseudo_variance_row, :n_bins],
     )
 
 

@@ -52,7 +52,7 @@ class SignalPseudoVariance(NamedTuple):
     A bin X has q = E[X^2] / E[|X|^2], which is 0 for circular X.
     """
 
-    ratio_row: np.ndarray
+    pseudo_variance_row: np.ndarray
     """(segments, n) int64: row of ``ratio`` and ``phase_factors`` for each echo. Row 0, in which
     the pseudo-variance ratio is 0, is for echoes far from DC and Nyquist."""
     ratio: np.ndarray
@@ -68,7 +68,7 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
     """Compute the pseudo-variance ratios of echoes near DC and Nyquist of real records."""
     fft_size, padding_factor = shots.fft_size, shots.fft_size / shots.window.length
     n_bins = n_tabulated_bins(shots.window, fft_size)
-    ratio_row = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
+    pseudo_variance_row = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     ratio_rows, factor_rows = [np.zeros((1, n_bins))], [np.ones((1, N_PHASE_NODES))]
     near_end = lines_overlap_images(shots)
     for s in np.flatnonzero(shots.has_segment):
@@ -91,7 +91,7 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
             * (line_transform * line_transform + image_transform * image_transform)
         ).sum(axis=1)
         pseudo_variance = (line_power[..., None] * 2 * line_transform * image_transform).sum(axis=1)
-        ratio_row[s, points] = sum(map(len, ratio_rows)) + np.arange(points.size)
+        pseudo_variance_row[s, points] = sum(map(len, ratio_rows)) + np.arange(points.size)
         ratio_rows.append(
             np.where(mean_power > 1e-12 * mean_power.max(axis=1)[:, None], pseudo_variance, 0.0)
         )
@@ -110,7 +110,9 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
         factor_rows.append(
             np.where(peak_mean_power > 0, phase_power / np.maximum(peak_mean_power, 1e-300), 1.0)
         )
-    return SignalPseudoVariance(ratio_row, np.concatenate(ratio_rows), np.concatenate(factor_rows))
+    return SignalPseudoVariance(
+        pseudo_variance_row, np.concatenate(ratio_rows), np.concatenate(factor_rows)
+    )
 
 
 def mean_over_phases(

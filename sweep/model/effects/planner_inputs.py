@@ -408,7 +408,7 @@ class PlannerInputs(LinkBudget):
 
         The bounds include offsets due to both range and radial velocity.
         """
-        return self.range_spread.sum_bound(self.velocity_spread)
+        return self.range_spread.bound_on_summed_offsets(self.velocity_spread)
 
     @cached_property
     def total_phase_error_bound(self) -> PhaseErrorBound:

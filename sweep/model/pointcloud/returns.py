@@ -336,7 +336,7 @@ def draw_returns(
         if (
             shots.real_fft_size
             and shots.speckle.segment_correlations is not None
-            and (shots.speckle_table.ratio_row > 0).any()
+            and (shots.speckle_table.pseudo_variance_row > 0).any()
         ):
             noise_ratio = noise_pseudo_variance_ratio(shots.window, shots.fft_size)
             n_near_bins = 1 + int(
@@ -836,7 +836,7 @@ def _speckle_draw_inputs(
             np.zeros(bin_groups.pd.shape),
             np.ones(bin_groups.pd.shape),
         )
-    has_noncircular_bins = (shots.speckle_table.ratio_row.T > 0)[:, :, None] & (
+    has_noncircular_bins = (shots.speckle_table.pseudo_variance_row.T > 0)[:, :, None] & (
         shots.real_fft_size > 0
     )
     n_independent = _n_independent_bins(shots, bin_groups, has_noncircular_bins)

@@ -121,7 +121,7 @@ class CountInputs(NamedTuple):
     """(6, m): Cholesky factor of the correlation of speckle in the three segments
     (:meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`); (0, m)
     without speckle."""
-    ratio_row: np.ndarray
+    pseudo_variance_row: np.ndarray
     """(3, m) int64: row of ``CountConfig.pseudo_variance_ratio`` for each segment; 0 for an echo
     far from frequency 0 and Nyquist."""
     line_grid: SpeckleLineGrid
@@ -242,7 +242,7 @@ def count_by_probability(
         pd_if_condition_holds=probabilities.pd_if_condition_holds,
         any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
         speckle_cholesky_factors=np.empty((0, n_rows)),
-        ratio_row=np.zeros((3, n_rows), np.int64),
+        pseudo_variance_row=np.zeros((3, n_rows), np.int64),
         line_grid=SpeckleLineGrid.empty(),
         line_centre=np.empty((0, 3)),
     )
@@ -294,7 +294,7 @@ def count_in_noise(
             pd_if_condition_holds=no_probabilities,
             any_two=np.full(indices.size, shots.any_two),
             speckle_cholesky_factors=speckle_cholesky_factors[:, indices].copy(),
-            ratio_row=speckle_table.ratio_row[:, indices].copy(),
+            pseudo_variance_row=speckle_table.pseudo_variance_row[:, indices].copy(),
             line_grid=line_grid.select(indices),
             line_centre=np.ascontiguousarray(
                 mean_line_positions(shots, indices, spectra.first_bin + spectra.peak_index)
@@ -719,9 +719,10 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     spectra.peak_ratio[j, s],
                     spectra.peak_index[j, s],
                 )
-                ratio_row = inputs.ratio_row[s, j]
+                pseudo_variance_row = inputs.pseudo_variance_row[s, j]
                 pseudo_variance_ratios = config.pseudo_variance_ratio[
-                    ratio_row, : (config.pseudo_variance_ratio.shape[1] if ratio_row > 0 else 0)
+                    pseudo_variance_row,
+                    : (config.pseudo_variance_ratio.shape[1] if pseudo_variance_row > 0 else 0),
                 ]
                 if config.in_noise and n_filter_bins > 0:
                     _mark_any_bin_crossings(
@@ -742,7 +743,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                         deviation_in_phase = math.sqrt(2.0) * line_noise_ratio
                         deviation_in_quadrature = 0.0
                     factor_in_phase[:], factor_in_quadrature[:] = segment_factors[s], 0.0
-                    if ratio_row > 0:
+                    if pseudo_variance_row > 0:
                         bin_pseudo_variance = pseudo_variance_ratio_at(
                             spectra.first_bin[j, s] + peak_index,
                             config.nyquist_bin,

@@ -627,7 +627,7 @@ def draw_bin_speckle(
             has_speckle &= signal.nearest_echo[bins % n_bins] == echo_number
         bins = bins[has_speckle] % n_bins
         factors[:, bins] = amplitudes[:, has_speckle]
-        if shots.real_fft_size and shots.speckle_table.ratio_row[segment, point] > 0:
+        if shots.real_fft_size and shots.speckle_table.pseudo_variance_row[segment, point] > 0:
             # Refer their phases to the record's middle, as those of the noise are.
             first_sample = (
                 0

@@ -54,7 +54,7 @@ SOURCE_LOG_ACCURACY = 28.0
 """-ln of the largest relative error of F when equivalent lines replace a segment's lines. F is the
 lines' spectrum. The value includes a margin for windows with poles."""
 
-END_POLYNOMIAL_EXTRA_LOG_ACCURACY = 11.0
+FAR_LINE_EXTRA_LOG_ACCURACY = 11.0
 """Extra accuracy of the polynomials A and B, added to -ln of the equivalent lines' relative error.
 A and B give a line's spectrum far from it (:mod:`sweep.model.spectrum.line_shape`)."""
 
@@ -673,7 +673,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
             4.0 + (2.0 * envelope_log_ratio if layout.adds_powers else envelope_log_ratio),
         )
     n_sources = compute_sources(bundle, source_distance, log_accuracy, layout, field)
-    polynomial_log_accuracy = log_accuracy + END_POLYNOMIAL_EXTRA_LOG_ACCURACY
+    polynomial_log_accuracy = log_accuracy + FAR_LINE_EXTRA_LOG_ACCURACY
     # In some bins the table holds some lines and not others. Sources serve all bins but these.
     first_batch_bin = math.floor(lowest_position)
     last_batch_bin = (

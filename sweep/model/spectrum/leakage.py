@@ -54,7 +54,7 @@ from sweep.model.detection.speckle_crossing_rates import (
     rate_at_brightest_speckle,
 )
 from sweep.model.spectrum.bin_spectrum import (
-    END_POLYNOMIAL_EXTRA_LOG_ACCURACY,
+    FAR_LINE_EXTRA_LOG_ACCURACY,
     SOURCE_LOG_ACCURACY,
     ZERO,
     AveragingShifts,
@@ -996,7 +996,7 @@ def _fill_far_powers(
                 ZERO,
                 field.far_equivalent_lines,
                 source,
-                log_accuracy + END_POLYNOMIAL_EXTRA_LOG_ACCURACY,
+                log_accuracy + FAR_LINE_EXTRA_LOG_ACCURACY,
                 shape.ends,
                 layout,
                 field,

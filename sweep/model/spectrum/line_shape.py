@@ -245,7 +245,7 @@ class LineShapeTables(NamedTuple):
     """
     envelope_distance: np.ndarray
     """(m,): distances from the line at which envelopes are tabulated [bins of fs/N]."""
-    envelope_cotangent: np.ndarray
+    cotangent_at_envelope_distance: np.ndarray
     """(m,): cot(pi d / N) of each ``envelope_distance`` d, with the FFT size N."""
     full_table_re: np.ndarray
     """(segments, cells * columns): :attr:`LineShape.table_re` of tables that hold all bins;
@@ -348,7 +348,7 @@ def line_shape_tables(
         first_sample_sine=first_sample_sine,
         mode_ends=_end_polynomials(taylor_coefficients, length),
         envelope_distance=distance,
-        envelope_cotangent=_cotangents(distance, fft_size),
+        cotangent_at_envelope_distance=_cotangents(distance, fft_size),
         full_table_re=_NO_TABLE,
         full_table_im=_NO_TABLE,
         full_envelope=_no_full_envelope(distance),
@@ -435,7 +435,7 @@ def late_line_shape_tables(
         first_sample_sine=np.empty(0),
         mode_ends=_NO_ENDS,
         envelope_distance=distance,
-        envelope_cotangent=_cotangents(distance, fft_size),
+        cotangent_at_envelope_distance=_cotangents(distance, fft_size),
         full_table_re=_NO_TABLE,
         full_table_im=_NO_TABLE,
         full_envelope=_no_full_envelope(distance),
@@ -560,7 +560,7 @@ def full_line_shape_tables(
         first_sample_sine=np.empty(0),
         mode_ends=_NO_ENDS,
         envelope_distance=distance,
-        envelope_cotangent=_cotangents(distance, fft_size),
+        cotangent_at_envelope_distance=_cotangents(distance, fft_size),
         full_table_re=table_re,
         full_table_im=table_im,
         full_envelope=envelope,
@@ -1031,7 +1031,7 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
         squared_magnitude[i] = transform_re[i] * transform_re[i] + transform_im[i] * transform_im[i]
     if layout.adds_powers:
         _fill_table(squared_magnitude, layout, shape.table_re)
-    _fill_envelope(squared_magnitude, layout, tables.envelope_cotangent, shape)
+    _fill_envelope(squared_magnitude, layout, tables.cotangent_at_envelope_distance, shape)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1178,7 +1178,7 @@ def build_late_line_shape(segment, shape_index, modes, tables, shape):
         squared_magnitude[i] = transform_re[i] * transform_re[i] + transform_im[i] * transform_im[i]
     if layout.adds_powers:
         _fill_table(squared_magnitude, layout, shape.table_re)
-    _fill_envelope(squared_magnitude, layout, tables.envelope_cotangent, shape)
+    _fill_envelope(squared_magnitude, layout, tables.cotangent_at_envelope_distance, shape)
 
 
 @njit(cache=True, error_model="numpy")
@@ -1202,7 +1202,7 @@ def _fill_table(values, layout, table):
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_envelope(squared_magnitude, layout, envelope_cotangent, shape):
+def _fill_envelope(squared_magnitude, layout, cotangent_at_envelope_distance, shape):
     """Fill the envelope of a shape from squared magnitudes at cells and from its end polynomials.
 
     The polynomials are used at distances outside the table. The squared magnitude varies over
@@ -1215,7 +1215,7 @@ def _fill_envelope(squared_magnitude, layout, envelope_cotangent, shape):
     line_cell = table_bins * cells_per_bin + cells_per_bin - 1 + _TAP_REACH_CELLS
     half_bin_cells = cells_per_bin // 2
     for i in range(np.uint64(table_bins + 1), np.uint64(distance.size)):
-        c, a, b, p, q = envelope_cotangent[i], 0.0, 0.0, 0.0, 0.0
+        c, a, b, p, q = cotangent_at_envelope_distance[i], 0.0, 0.0, 0.0, 0.0
         for k in range(N_END_COEFFICIENTS):
             d = N_END_COEFFICIENTS - 1 - k
             a, b = a * c + ends.start_re[d], b * c + ends.start_im[d]

@@ -75,7 +75,7 @@ TIMED_SEQUENCE_TIME_FACTOR = 2
 It is a multiple of the target duration of a trial.
 """
 
-FIRST_TIMED_SEQUENCE_DIVISOR = 8
+SHORTENING_OF_FIRST_TIMED_SEQUENCE = 8
 """Factor by which the first timed sequence of points is shorter than the longest one.
 
 The first sequences only show which settings are slow.
@@ -253,7 +253,7 @@ class AccuracyMeasurement:
         self._is_tried_once = np.zeros(len(self._settings), bool)
         self._order_generator = np.random.default_rng(0)
 
-    def run(self) -> AccuracyTemplate:
+    def run(self) -> AccuracyStoreTemplate:
         """Run as many rounds as the time limit allows. Return the content of the store.
 
         NoMeasurementError is raised if the run is interrupted before any point is complete.
@@ -271,7 +271,7 @@ class AccuracyMeasurement:
         finally:
             self._progress.end()
 
-    def _run_rounds(self, parts: list[np.ndarray], n_rounds: int) -> AccuracyTemplate:
+    def _run_rounds(self, parts: list[np.ndarray], n_rounds: int) -> AccuracyStoreTemplate:
         """Run all rounds of trials, with the time-domain comparison after the first one.
 
         Return the content of the store.
@@ -301,7 +301,7 @@ class AccuracyMeasurement:
             [merge_trials(trials_of_round) for trials_of_round in zip(*parts, strict=True)]
             for parts in complete_rounds
         ]
-        return AccuracyTemplate(
+        return AccuracyStoreTemplate(
             self._sample,
             self._setting_ladder,
             sample_rows,
@@ -349,7 +349,7 @@ class AccuracyMeasurement:
         ):
             n_points = min(2 * n_points, self._sample.timed_points_max)
             self._n_timed_points[0] = n_points
-        n_points_first = max(1, n_points // FIRST_TIMED_SEQUENCE_DIVISOR)
+        n_points_first = max(1, n_points // SHORTENING_OF_FIRST_TIMED_SEQUENCE)
         self._n_timed_points[:] = n_points_first
         first_seconds = np.array(
             [
@@ -538,7 +538,7 @@ def _probability_differences(first: np.ndarray, second: np.ndarray) -> np.ndarra
 
 
 @dataclass
-class AccuracyTemplate:
+class AccuracyStoreTemplate:
     """Content of a store of `sweep accuracy`: errors and times of all settings.
 
     Errors are stored by setting and point, times by setting and round.

@@ -48,8 +48,8 @@ def chunk_slices(
 class ArrayLayout:
     """Layout of one array of a store: name, dimensions, shape, chunks and attributes.
 
-    `name` is the path inside the store. `values` is None for arrays that blocks write; other values
-    are known before any block is computed.
+    `name` is the path inside the store. `known_values` are the values of an array that is known
+    before any block is computed; None for arrays that blocks write.
     """
 
     name: str
@@ -59,7 +59,7 @@ class ArrayLayout:
     dtype: str
     fill_value: float | int | str | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    values: np.ndarray | None = None
+    known_values: np.ndarray | None = None
 
     @classmethod
     def from_values(
@@ -81,7 +81,7 @@ class ArrayLayout:
             dtype="string" if is_text else str(values.dtype),
             fill_value=fill_value,
             attributes=attributes,
-            values=values.astype(object) if is_text else values,
+            known_values=values.astype(object) if is_text else values,
         )
 
     @property

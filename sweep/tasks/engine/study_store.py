@@ -276,8 +276,8 @@ def _create_array(
         attributes=dict(layout.attributes),
         compressors=CHUNK_CODECS,
     )
-    if layout.values is not None:
-        array[...] = layout.values
+    if layout.known_values is not None:
+        array[...] = layout.known_values
 
 
 def _consolidate_metadata(store_path: Path) -> None:

@@ -579,7 +579,7 @@ def shard_shape_of_array(layout: ArrayLayout) -> tuple[int, ...] | None:
 
     A shard is filled along the last axis first.
     """
-    if layout.values is not None:
+    if layout.known_values is not None:
         return None
     chunks_left = SHARD_BYTES_MAX // max(1, layout.nbytes_of_part(layout.chunks))
     counts = [1] * len(layout.shape)
