@@ -66,7 +66,6 @@ def joint_tail_excess(deviate, previous_deviate, quadrature):
             - 2.0 * deviate * previous_deviate * quadrature.sine[k]
         )
         excess += quadrature.weight[k] * math.exp(-quadratic_form * quadrature.exponent_factor[k])
-        excess += quadrature.weight[k] * math.exp(-quadratic_form * quadrature.exponent[k])
     return excess
 
 
