@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.model import receiver_chain
-from sweep.model.detection.detection_probability import detect_in_bins
+from sweep.model.detection.detection_probability import detect_in_bins, pd_and_miss_in_looks
 from sweep.model.detection.looks import Looks
 from sweep.model.preparation import Shots
 from sweep.model.waveform import count_samples_before_echo
@@ -290,6 +290,8 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
         values.copy()
         for values in (bin_spans.pd, bin_spans.miss, bin_spans.n_exempt, bin_spans.leakage)
     )
+    peak_magnitude = bin_spans.peak_magnitude.copy()
+    is_detectable = bin_spans.peak_is_searched.copy()
     noise_sigma, line_noise_sigma, threshold = (
         np.broadcast_to(values, shots.size)[bin_spans.point_numbers]
         for values in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
@@ -332,9 +334,9 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
         )
         equivalent_magnitudes[is_masked[bins]] = 0.0
         magnitudes[bin_slice] = equivalent_magnitudes
-        if is_masked[bins[peak]]:
-            pd[segment_index, i], miss[segment_index, i] = 0.0, 1.0
-        else:
+        peak_magnitude[segment_index, i] = equivalent_magnitudes[peak]
+        is_detectable[segment_index, i] &= not is_masked[bins[peak]]
+        if not shots.looks.is_noncoherent:
             pd[segment_index, i], miss[segment_index, i] = detect_in_bins(
                 shots,
                 equivalent_magnitudes,
@@ -354,6 +356,17 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
                 threshold_ratio=threshold[i] / noise_sigma[i],
             )
             leakage[segment_index, i] += (1 - leakage[segment_index, i]) * alarm_probability
+    if shots.looks.is_noncoherent:
+        pd, miss = pd_and_miss_in_looks(
+            shots,
+            peak_magnitude,
+            bin_spans.first_bin + bin_spans.peak_index,
+            bin_spans.point_numbers,
+        )
     return bin_spans._replace(
-        magnitudes=magnitudes, pd=pd, miss=miss, n_exempt=exempted, leakage=leakage
+        magnitudes=magnitudes,
+        pd=np.where(is_detectable, pd, 0.0),
+        miss=np.where(is_detectable, miss, 1.0),
+        n_exempt=exempted,
+        leakage=leakage,
     )

@@ -5,11 +5,13 @@ import pytest
 from random_planner_points import prepare_single_category
 
 from sweep.model import evaluation
+from sweep.model.detection.looks import LOOKS_COMBINE_PATH, LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH
 from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects import circulator_leak as leak
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.spectrum import permanent_line
 from sweep.model.spectrum.segment_spectra import iter_spans
+from sweep.model.waveform import SEARCH_BAND_PATHS
 
 LIGHT, CHARGE = 299792458.0, 1.602176634e-19
 PATH, ISOLATION = 3.0, 1e5
@@ -186,3 +188,25 @@ def test_near_echoes_are_hidden_and_far_ones_are_not(leaking):
     assert seen["pd_up"] > 0.9
     # Masked bins are not searched.
     assert seen["pfa_segment"] < alone["pfa_segment"]
+
+
+@pytest.mark.parametrize("combine", ["power", "binary"])
+def test_several_looks_beside_a_line_of_no_power_detect_as_without_it(leaking, combine):
+    """A line 250 dB down hides nothing, so that the looks' law is left as it is."""
+    looks = {LOOKS_NUMBER_PATH: 8, LOOKS_COMBINE_PATH: combine, LOOKS_VOTES_PATH: 2}
+    parameters = leaking(isolation=1e25, range=6000.0, radial_velocity=0.0, further=looks)
+    with_line, without = (
+        evaluation.evaluate(parameters, effects) for effects in (WITH, DEFAULT_EFFECTS)
+    )
+    one_look = evaluation.evaluate(parameters | {LOOKS_NUMBER_PATH: 1}, WITH)
+    assert 0.05 < without["pd_up"] < 0.9999
+    assert abs(without["pd_up"] - one_look["pd_up"]) > 0.02
+    for name in ("pd_up", "pd_doppler", "pd_down"):
+        assert with_line[name] == pytest.approx(without[name], rel=1e-6)
+
+
+def test_a_line_leaves_undetected_what_lies_outside_the_search_band(leaking):
+    band = dict(zip(SEARCH_BAND_PATHS, (100.0, 500.0, -10.0, 10.0), strict=True))
+    parameters = leaking(isolation=1e25, range=2000.0, radial_velocity=0.0, further=band)
+    result = evaluation.evaluate(parameters, WITH)
+    assert result["pd_up"] == 0 and result["miss_up"] == 1
