@@ -44,7 +44,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy import special
-from scipy.interpolate import RegularGridInterpolator
 
 from sweep.kernel_cache import njit
 from sweep.model.beamlets import gaussian_quadrature
@@ -57,12 +56,14 @@ from sweep.model.detection.speckle_correlation import (
     transform_table,
 )
 from sweep.model.detection.sub_bin_interpolation import (
-    Interpolator,
     complex_exponentials,
-    estimate_sub_bin_offset,
-    interpolator,
 )
 from sweep.model.sampling import philox
+from sweep.model.sampling.peak_shape_errors import (
+    PeakShapeErrors,
+    TwoBinErrors,
+    estimates_by_two_bins,
+)
 from sweep.model.window import Window, window_samples
 
 if TYPE_CHECKING:
@@ -990,6 +991,8 @@ def position_error_moments(
     peaks: SpecklePeaks,
     shots: "Shots",
     pairs: tuple[tuple[int, int], ...] = SEGMENT_PAIRS_WITH_SELF,
+    *,
+    from_three_bins: bool = True,
 ) -> np.ndarray:
     """Return the second moments E[e_i e_j] of errors of peak positions by speckle [bins^2].
 
@@ -1005,6 +1008,9 @@ def position_error_moments(
         Prepared shots, for window, FFT size, rule of detection and looks.
     pairs
         Pairs of segments (i, j) that are computed.
+    from_three_bins
+        True if positions are those of :mod:`sweep.model.detection.sub_bin_interpolation`. Other
+        estimators do not mistake the side of a peak in the rectangular window.
 
     Returns
     -------
@@ -1020,8 +1026,9 @@ def position_error_moments(
     y^2 / A - s^2 of the lines about the complex shift s. Re V has the mean b^2 and the variance
     b^4 (v / q^2 + v^2 / q^4). Here b is the spread of the lines [bins], q^2 the peak's power over
     its mean, and v the echo fraction. In wider footprints the error has the same relative
-    deviation. If only the strongest bin is tested, the wander's deviation is divided by sqrt(1 +
-    variance / WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the
+    deviation. Positions by two bins have the errors of :class:`TwoBinErrors` in its place. If only
+    the strongest bin is tested, the wander's deviation is divided by sqrt(1 + variance /
+    WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the
     variance.
     """
     squared_shift = (gradients.line_shift**2).sum(axis=-1)
@@ -1029,19 +1036,24 @@ def position_error_moments(
     relative_power = np.where(has_peak, np.maximum(peaks.relative_power, 1e-12), 1.0)
     echo_fraction = np.where(has_peak, peaks.echo_fraction, 0.0)
     variance = squared_shift * echo_fraction / (2 * relative_power)
-    shape_errors = PeakShapeErrors.from_offset(
-        np.where(has_peak, peaks.offset, 0.0),
-        np.where(echo_fraction > 0, squared_shift, 0.0),
-        variance,
-        shots,
-    )
-    spread_error = peaks.folding_sign * shape_errors.spread_error
-    mean_error = spread_error + peaks.folding_sign * shape_errors.quadrature_error
-    shape_deviation = (
-        np.sqrt((echo_fraction / relative_power) * (1 + echo_fraction / relative_power))
-        * spread_error
-    )
-    quadrature_deviation = peaks.folding_sign * shape_errors.quadrature_deviation
+    squared_spread = np.where(echo_fraction > 0, squared_shift, 0.0)
+    offset, shift_ratio = np.where(has_peak, peaks.offset, 0.0), echo_fraction / relative_power
+    shape_deviation, quadrature_deviation, own_variance = np.zeros((3, *variance.shape))
+    if not estimates_by_two_bins(shots):
+        shape_errors = PeakShapeErrors.from_offset(offset, squared_spread, variance, shots)
+        spread_error = peaks.folding_sign * shape_errors.spread_error
+        mean_error = spread_error + peaks.folding_sign * shape_errors.quadrature_error
+        shape_deviation = np.sqrt(shift_ratio * (1 + shift_ratio)) * spread_error
+        quadrature_deviation = peaks.folding_sign * shape_errors.quadrature_deviation
+    elif from_three_bins:
+        noise_ratio = np.sqrt((1 - echo_fraction) / (2 * relative_power))
+        side_errors = TwoBinErrors.from_offset(
+            offset, squared_spread, shift_ratio, noise_ratio, shots
+        )
+        mean_error = np.where(has_peak, peaks.folding_sign * side_errors.mean, 0.0)
+        own_variance = np.where(echo_fraction > 0, side_errors.excess_variance, 0.0)
+    else:
+        mean_error = np.zeros(variance.shape)
     wander_factor = np.ones(variance.shape)
     if shots.detection_settings.echo_bins == "peak_bin":
         wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
@@ -1055,8 +1067,10 @@ def position_error_moments(
         both_exist = has_peak[:, first] & has_peak[:, second]
         if first == second:
             moment, amplitude_correlation = variance[:, first], 1.0
+            own_moment = own_variance[:, first]
         else:
             pair = [first, second]
+            own_moment = np.zeros(variance.shape[0])
             moment = wander_covariance(
                 gradients, (first, second), relative_power[:, pair].T, echo_fraction[:, pair].T
             )
@@ -1072,166 +1086,8 @@ def position_error_moments(
             )
             * amplitude_correlation
         )
-        moment = moment * wander_factor[:, first] * wander_factor[:, second] / n_looks
+        moment = moment * wander_factor[:, first] * wander_factor[:, second] + own_moment
+        moment = moment / n_looks
         moment = np.where(both_exist, moment + mean_error[:, first] * mean_error[:, second], 0.0)
         moments[:, first, second] = moments[:, second, first] = moment
     return moments
-
-
-_SPREAD_GRID_CELLS = np.array([0.01, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0])
-"""Tabulated spreads of a footprint's lines, as standard deviations in units of fs/L, the sample
-rate over the number of samples in the record."""
-_QUADRATURE_SHIFT_VARIANCES = np.concatenate([[1e-4], np.geomspace(3e-3, 30.0, 13)])
-"""Tabulated variances of the imaginary part of the complex shift [(fs/L)^2]."""
-_SHAPE_OFFSETS_BINS = np.linspace(0.0, 1.0, 33)
-"""Tabulated offsets of a peak from the bin about which it is estimated [bins]."""
-_SHAPE_SAMPLES_MAX = 2048
-"""Largest number of window samples from which deformed peaks are computed."""
-_SHAPE_NODES, _SHAPE_WEIGHTS = np.polynomial.hermite_e.hermegauss(20)
-
-
-class PeakShapeErrors(NamedTuple):
-    """Errors of peak positions because speckle deforms peaks.
-
-    Notes
-    -----
-    A is the amplitude of the echo, G(x) the window's transform at the distance x, and b the spread
-    of the lines along the beam's coordinate y [bins]. In units of its mean, the power of the peak
-    is q^2, and v is the fraction of the echo in this mean. Lines have weights a^2 and random
-    amplitudes z. Given A, the mean of the bin at the distance x is A H(x), with the line H as the
-    footprint broadens it,
-
-        H(x) = sum a^2 G(x - b y).                                                              (1)
-
-    It is the transform of the window times exp(-(2 pi b n / N)^2 / 2), with the sample n counted
-    from the middle of the record and the FFT size N. The estimate for the magnitudes of H differs
-    from that for G by the spread's error. It is proportional to b^2 for small b, and less for wide
-    footprints.
-
-    To first order in b, a bin departs from A H by -A s H', with the complex shift s. Its real and
-    imaginary part each have the variance |b|^2 v / (2 q^2). The real part is the wander. The
-    imaginary part is in quadrature with the line, and gives three bins the magnitudes
-
-        |A| (H^2 + (Im s)^2 H'^2)^(1/2).                                                        (2)
-
-    They are not those of any tone. Mean and deviation of the error follow from the normal
-    distribution of Im s.
-    """
-
-    spread_error: np.ndarray
-    """(m, 3): error of the peak position [bins] by the broadening of the line, equation (1)."""
-    quadrature_error: np.ndarray
-    """(m, 3): mean error of the peak position [bins] by the imaginary part of the complex shift,
-    equation (2)."""
-    quadrature_deviation: np.ndarray
-    """(m, 3): standard deviation of the error by the imaginary part [bins], with the sign of the
-    mean error at small shifts."""
-
-    @classmethod
-    def from_offset(
-        cls, offset: np.ndarray, squared_shift: np.ndarray, variance: np.ndarray, shots: "Shots"
-    ) -> "PeakShapeErrors":
-        """Return the errors of the positions of peaks at given offsets from their strongest bin.
-
-        Parameters
-        ----------
-        offset
-            (m, 3): offset of each peak [bins].
-        squared_shift
-            (m, 3): b^2, the variance of the lines' positions [bins^2].
-        variance
-            (m, 3): variance of the real, and of the imaginary part of the complex shift [bins^2].
-        shots
-            Prepared shots, for window and FFT size.
-        """
-        tables = _peak_shape_error_tables(shots.window, shots.fft_size)
-        squared_cell = (shots.fft_size / shots.window.length) ** 2
-        spread = np.clip(
-            np.sqrt(squared_shift / squared_cell), _SPREAD_GRID_CELLS[0], _SPREAD_GRID_CELLS[-1]
-        )
-        limited_square = np.minimum(squared_shift / squared_cell, _SPREAD_GRID_CELLS[-1] ** 2)
-        limited_variance = np.minimum(variance / squared_cell, _QUADRATURE_SHIFT_VARIANCES[-1])
-        log_variance = np.log(np.maximum(limited_variance, _QUADRATURE_SHIFT_VARIANCES[0]))
-        sign, distance = np.sign(offset), np.minimum(np.abs(offset), 1.0)
-        return cls(
-            sign * limited_square * tables.spread_error((spread, distance)),
-            sign * limited_variance * tables.quadrature_error((spread, log_variance, distance)),
-            sign * limited_variance * tables.quadrature_deviation((spread, log_variance, distance)),
-        )
-
-
-class PeakShapeErrorTables(NamedTuple):
-    """Interpolators of :class:`PeakShapeErrors` by spread [fs/L], log variance, and offset [bins].
-
-    fs/L is the sample rate over the number of samples in the record. The variance is that of the
-    imaginary part of the complex shift [(fs/L)^2].
-    """
-
-    spread_error: RegularGridInterpolator
-    """Error by the broadening of the line [bins], over b^2 [(fs/L)^2]; by spread and offset."""
-    quadrature_error: RegularGridInterpolator
-    """Mean error by the imaginary shift [bins], over its variance; by spread, log variance and
-    offset."""
-    quadrature_deviation: RegularGridInterpolator
-    """Standard deviation of that error [bins], over the variance; by the same coordinates."""
-
-
-@lru_cache(maxsize=16)
-def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTables:
-    """Tabulate errors of peak positions by deformed peaks."""
-    interpolation, padding = interpolator(window, fft_size), fft_size / window.length
-    n_samples = min(window.length, _SHAPE_SAMPLES_MAX)
-    window_values = window_samples(window.name, n_samples)
-    # Phase of a sample per bin, about the middle of the record.
-    sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding
-    phase = sample_phase * (np.array([[-1.0], [0.0], [1.0]]) - _SHAPE_OFFSETS_BINS)[..., None]
-    cosine, sine = np.cos(phase), np.sin(phase)
-    offset_grid = (_SPREAD_GRID_CELLS, _SHAPE_OFFSETS_BINS)
-    spread_error = np.empty((len(_SPREAD_GRID_CELLS), _SHAPE_OFFSETS_BINS.size))
-    mean, deviation = np.empty((2, len(_SPREAD_GRID_CELLS), *_quadrature_table_shape()))
-    unbroadened = _offsets_of_magnitudes(np.abs(cosine @ window_values), interpolation)
-    imaginary_shift = padding * np.sqrt(_QUADRATURE_SHIFT_VARIANCES)[:, None] * _SHAPE_NODES
-    node_weights = _SHAPE_WEIGHTS / _SHAPE_WEIGHTS.sum()
-    for i, spread in enumerate(_SPREAD_GRID_CELLS):
-        taper = window_values * np.exp(-0.5 * (spread * padding * sample_phase) ** 2)
-        line, slope = cosine @ taper, -(sine @ (taper * sample_phase))
-        offset = _offsets_of_magnitudes(np.abs(line), interpolation)
-        spread_error[i] = (offset - unbroadened) / spread**2
-        magnitudes = np.hypot(
-            line[:, None, None], imaginary_shift[..., None] * slope[:, None, None]
-        )
-        errors = _offsets_of_magnitudes(magnitudes, interpolation) - offset
-        mean[i] = np.einsum("n,vno->vo", node_weights, errors)
-        mean_square = np.einsum("n,vno->vo", node_weights, errors**2)
-        deviation[i] = np.sqrt(np.maximum(mean_square - mean[i] ** 2, 0.0))
-    mean /= _QUADRATURE_SHIFT_VARIANCES[:, None]
-    deviation /= _QUADRATURE_SHIFT_VARIANCES[:, None]
-    variance_grid = (_SPREAD_GRID_CELLS, np.log(_QUADRATURE_SHIFT_VARIANCES), _SHAPE_OFFSETS_BINS)
-    return PeakShapeErrorTables(
-        RegularGridInterpolator(offset_grid, spread_error),
-        RegularGridInterpolator(variance_grid, mean, bounds_error=False, fill_value=None),
-        RegularGridInterpolator(variance_grid, deviation, bounds_error=False, fill_value=None),
-    )
-
-
-def _quadrature_table_shape() -> tuple[int, int]:
-    """Return the numbers of tabulated variances and offsets."""
-    return _QUADRATURE_SHIFT_VARIANCES.size, _SHAPE_OFFSETS_BINS.size
-
-
-@njit(cache=True, error_model="numpy")
-def _estimate_sub_bin_offsets(magnitudes, interpolation, offset):
-    """Set ``offset`` (m,) to the estimates from magnitudes (3, m) below, at and above a bin."""
-    for i in range(offset.size):
-        offset[i] = estimate_sub_bin_offset(
-            magnitudes[0, i], magnitudes[1, i], magnitudes[2, i], interpolation
-        )
-
-
-def _offsets_of_magnitudes(magnitudes: np.ndarray, interpolation: Interpolator) -> np.ndarray:
-    """Return the estimated offset [bins] of peaks with magnitudes (3, ...) of three bins."""
-    offset = np.empty(magnitudes.shape[1:])
-    _estimate_sub_bin_offsets(
-        np.ascontiguousarray(magnitudes.reshape(3, -1)), interpolation, offset.reshape(-1)
-    )
-    return offset
