@@ -1010,7 +1010,8 @@ def position_error_moments(
         Pairs of segments (i, j) that are computed.
     from_three_bins
         True if positions are those of :mod:`sweep.model.detection.sub_bin_interpolation`. Other
-        estimators do not mistake the side of a peak in the rectangular window.
+        estimators do not mistake the side of a peak in the rectangular window, and have the errors
+        of :class:`PeakShapeErrors` in any window.
 
     Returns
     -------
@@ -1039,13 +1040,7 @@ def position_error_moments(
     squared_spread = np.where(echo_fraction > 0, squared_shift, 0.0)
     offset, shift_ratio = np.where(has_peak, peaks.offset, 0.0), echo_fraction / relative_power
     shape_deviation, quadrature_deviation, own_variance = np.zeros((3, *variance.shape))
-    if not estimates_by_two_bins(shots):
-        shape_errors = PeakShapeErrors.from_offset(offset, squared_spread, variance, shots)
-        spread_error = peaks.folding_sign * shape_errors.spread_error
-        mean_error = spread_error + peaks.folding_sign * shape_errors.quadrature_error
-        shape_deviation = np.sqrt(shift_ratio * (1 + shift_ratio)) * spread_error
-        quadrature_deviation = peaks.folding_sign * shape_errors.quadrature_deviation
-    elif from_three_bins:
+    if from_three_bins and estimates_by_two_bins(shots):
         noise_ratio = np.sqrt((1 - echo_fraction) / (2 * relative_power))
         side_errors = TwoBinErrors.from_offset(
             offset, squared_spread, shift_ratio, noise_ratio, shots
@@ -1053,7 +1048,11 @@ def position_error_moments(
         mean_error = np.where(has_peak, peaks.folding_sign * side_errors.mean, 0.0)
         own_variance = np.where(echo_fraction > 0, side_errors.excess_variance, 0.0)
     else:
-        mean_error = np.zeros(variance.shape)
+        shape_errors = PeakShapeErrors.from_offset(offset, squared_spread, variance, shots)
+        spread_error = peaks.folding_sign * shape_errors.spread_error
+        mean_error = spread_error + peaks.folding_sign * shape_errors.quadrature_error
+        shape_deviation = np.sqrt(shift_ratio * (1 + shift_ratio)) * spread_error
+        quadrature_deviation = peaks.folding_sign * shape_errors.quadrature_deviation
     wander_factor = np.ones(variance.shape)
     if shots.detection_settings.echo_bins == "peak_bin":
         wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
