@@ -6,7 +6,11 @@ from shot_helpers import parametrize_product
 
 from sweep.model.detection import estimators
 from sweep.model.detection.detectors import SpectrumSettings, cached_window_samples
-from sweep.model.detection.estimators import ESTIMATORS, jacobsen_coefficients
+from sweep.model.detection.estimators import (
+    ESTIMATORS,
+    jacobsen_coefficients,
+    position_error_at_sigma,
+)
 from sweep.model.window import get_window
 
 SIZE, BIN, DRAWS = 512, 120, 1500
@@ -111,6 +115,32 @@ def test_the_largest_value_of_the_windowed_spectrum_is_as_good_as_the_window_all
     error, bound, windowed = errors("chirp_z", shape, length, decibel)
     assert np.sqrt(np.mean(error**2)) == pytest.approx(windowed, rel=0.1)
     assert windowed == pytest.approx(bound) if shape == "rectangular" else windowed > 1.05 * bound
+
+
+@pytest.mark.parametrize("name", ["candan", "chirp_z", "maximum_likelihood"])
+@pytest.mark.parametrize("shape", ["rectangular", "hann", "hamming"])
+@pytest.mark.parametrize("padding", [1, 4])
+def test_the_standard_error_of_a_position_is_the_spread_of_estimates_in_noise(name, shape, padding):
+    """Complex records, as their tones have no image."""
+    length, number, noise = 256, 1500, 0.02
+    fft_size, rng = padding * length, np.random.default_rng(0)
+    window, middle = get_window(shape, length), fft_size // 2
+    settings = SpectrumSettings(
+        fft_size=fft_size, sample_rate=1.0, window=window, noise_power=1.0, threshold=1.0,
+        training=4, guard=1, rank=3, pfa=1e-6, complex_record=True,
+    )  # fmt: skip
+    stated = position_error_at_sigma(name, window, fft_size)
+    peak, samples = fft_size // 5, np.arange(length)
+    for delta in (0.0, 0.2, 0.45):
+        phase = 2 * np.pi * ((peak + delta) * samples / fft_size + rng.random((number, 1)))
+        normal = rng.normal(size=(2, number, length)) / np.sqrt(2)
+        record = np.exp(1j * phase) + noise * (normal[0] + 1j * normal[1])
+        spectrum = np.fft.fftshift(np.fft.fft(settings.taper * record, fft_size), axes=1)
+        ratio = np.abs(spectrum[:, peak + middle]).mean() / (noise * np.sqrt(window.energy / 2))
+        position = ESTIMATORS[name](spectrum, np.full(number, peak + middle), settings) - middle
+        error = np.interp(delta, np.linspace(0, 1, stated.size), stated) / ratio
+        assert position.std() == pytest.approx(error, rel=0.09)
+        assert abs(position.mean() - peak - delta) < 5 * error / np.sqrt(number) + 1e-5
 
 
 @pytest.mark.parametrize("name", BIASES)

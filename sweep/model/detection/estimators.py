@@ -468,6 +468,72 @@ def windowed_peak_deviation(
         )
 
 
+@lru_cache(maxsize=32)
+def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np.ndarray | None:
+    """Return the standard error by noise of an estimator's position of a tone [bins], (m,).
+
+    It holds if the peak bin's |X| equals the noise per quadrature, and falls as 1/|X|.
+
+    Parameters
+    ----------
+    estimator
+        Name of the estimator.
+    window, fft_size
+        Window of the record, and number of bins of its FFT.
+
+    Returns
+    -------
+    numpy.ndarray or None
+        By the tone's distance from the peak bin, 0..1 bin, at as many distances as
+        :attr:`sweep.model.detection.sub_bin_interpolation.Interpolator.error_at_sigma`. None for
+        estimators of which no law is known.
+
+    Notes
+    -----
+    Errors are those to first order in white noise. Let rho be |X| of the peak bin over the noise
+    per quadrature, W the window's transform at the tone's distance, and E = sum(w^2). The tone's
+    power over the noise power before the FFT is then cnr = rho^2 E / W^2. ``maximum_likelihood``
+    has the Cramer-Rao bound of the samples that it uses, ``chirp_z`` the error of
+    :func:`windowed_peak_deviation`. ``candan`` has R = Re[N / D] with N = Z_+ - Z_- and
+    D = 2 Z_0 + Z_- + Z_+. Noise in phase with the tone changes R by the sum of g_j times the noise
+    of the bins, with g_+- = +-1 / D - R / D and g_0 = -2 R / D. With the covariance C of the noise
+    of three bins, the variance is g' C g / (dR / d delta)^2.
+    """
+    from sweep.model.detection.sub_bin_interpolation import (
+        interpolator,
+        neighbour_noise_correlations,
+        tone_spectrum,
+    )
+
+    offset = np.linspace(0.0, 1.0, interpolator(window, fft_size).error_at_sigma.size)
+    tone_bins = tone_spectrum(window, fft_size)(np.array([-1, 0, 1]) - offset[:, None]).real
+    height = np.maximum(np.abs(tone_bins[:, 1]), 1e-3 * np.abs(tone_bins[0, 1]))
+    cnr = window.energy / height**2
+    if estimator == "maximum_likelihood":
+        w = np.abs(cached_window_samples(window))
+        sample = np.flatnonzero(w > _WINDOW_FRACTION_MIN * w.max())
+        squared_length = ((sample - sample.mean()) ** 2).sum()
+        return np.asarray(fft_size / (2 * math.pi) / np.sqrt(cnr * squared_length))
+    if estimator == "chirp_z":
+        return windowed_peak_deviation(cnr=cnr, window=window, sample_rate=fft_size)
+    if estimator != "candan":
+        return None
+    correlation_1, correlation_2 = neighbour_noise_correlations(window, fft_size)
+    covariance = np.array(
+        [
+            [1, correlation_1, correlation_2],
+            [correlation_1, 1, correlation_1],
+            [correlation_2, correlation_1, 1],
+        ]
+    )
+    ratio = _jacobsen_ratio(tone_bins, 1)
+    denominator = tone_bins @ np.array([1.0, 2.0, 1.0])
+    gradient = np.stack([-1 - ratio, -2 * ratio, 1 - ratio], axis=-1) / denominator[:, None]
+    slope = np.maximum(np.gradient(ratio, offset), 1e-6)
+    variance = np.einsum("mi,ij,mj->m", gradient, covariance, gradient)
+    return np.asarray(height * np.sqrt(np.maximum(variance, 0.0)) / slope)
+
+
 def range_velocity_deviation(
     *,
     up: ArrayLike,

@@ -1006,7 +1006,7 @@ def _measure_listed_returns(
         listed_returns = _correct_late_echoes(
             shots, listed_returns, measure(shots, listed_returns, None)
         )
-    wander_covariance = _wander_covariance(shots, inputs, listed_returns)
+    wander_covariance = _wander_covariance(shots, inputs, listed_returns, from_three_bins)
     if wander_covariance is not None:
         wander_variance = np.diagonal(wander_covariance, axis1=-2, axis2=-1)
         listed_returns = listed_returns._replace(
@@ -1086,7 +1086,7 @@ def _values_at(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> n
 
 
 def _wander_covariance(
-    shots: Shots, inputs: DrawInputs, listed_returns: ListedReturns
+    shots: Shots, inputs: DrawInputs, listed_returns: ListedReturns, from_three_bins: bool
 ) -> np.ndarray | None:
     """Return the covariance [bins^2] of the errors of each return's three peaks by speckle.
 
@@ -1129,7 +1129,11 @@ def _wander_covariance(
         else SEGMENT_PAIRS_WITH_SELF
     )
     covariance[is_echo] = position_error_moments(
-        line_gradients.select(point), speckle_peaks, shots, segment_pairs
+        line_gradients.select(point),
+        speckle_peaks,
+        shots,
+        segment_pairs,
+        from_three_bins=from_three_bins,
     )
     return covariance
 

@@ -17,8 +17,10 @@ false alarms, too.
 Each draw is processed alone, so that a user's function returns the same values however draws are
 grouped.
 
-Standard errors are those of interpolation by three bins, whatever the estimator is, because an
-instrument has no better knowledge. Those of ``peak_bin`` include its rounding.
+Standard errors by noise are those of interpolation by three bins. In developed speckle they are
+those of the estimator where its law is known
+(:func:`sweep.model.detection.estimators.position_error_at_sigma`). Those of ``peak_bin`` include
+its rounding.
 """
 
 import math
@@ -28,7 +30,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.detection.detectors import main_lobe_half_width
-from sweep.model.detection.estimators import ESTIMATOR_PREFIX, PEAK_BIN, SPECTRUM_METHOD_DEFAULTS
+from sweep.model.detection.estimators import (
+    ESTIMATOR_PREFIX,
+    PEAK_BIN,
+    SPECTRUM_METHOD_DEFAULTS,
+    position_error_at_sigma,
+)
 from sweep.model.detection.sub_bin_interpolation import interpolator, sub_bin_standard_error
 from sweep.model.pointcloud.bin_groups import BinGroups
 from sweep.model.pointcloud.ego_motion import EgoMotion
@@ -110,11 +117,13 @@ def draw_spectra_returns(
         zero_frequency_index(shots),
         1 if shots.detection_settings.reported_peaks == STRONGEST_PEAK else groups_max + 1,
     )
-    rounding_error = (
-        math.sqrt(ROUNDING_VARIANCE)
-        if str(method_parameters[ESTIMATOR_PREFIX + "kind"]) == PEAK_BIN
-        else 0.0
-    )
+    estimator = str(method_parameters[ESTIMATOR_PREFIX + "kind"])
+    rounding_error = math.sqrt(ROUNDING_VARIANCE) if estimator == PEAK_BIN else 0.0
+    error_law = interpolation
+    if shots.speckle.line_gradients is not None:
+        error_at_sigma = position_error_at_sigma(estimator, shots.window, shots.fft_size)
+        if error_at_sigma is not None:
+            error_law = interpolation._replace(error_at_sigma=error_at_sigma)
     for point in range(shots.size):
         point_spectra = prepare_point_spectra(
             shots,
@@ -151,7 +160,7 @@ def draw_spectra_returns(
                     ratio = math.sqrt(power[bin_]) / noise_sigma
                     offset = min(max(position - bin_, -0.5), 0.5)
                     error = (
-                        sub_bin_standard_error(offset, ratio / line_noise_ratio, interpolation)
+                        sub_bin_standard_error(offset, ratio / line_noise_ratio, error_law)
                         / root_n_looks
                     )
                     line_deviation = (

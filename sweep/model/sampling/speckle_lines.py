@@ -57,11 +57,13 @@ from sweep.model.detection.speckle_correlation import (
 )
 from sweep.model.detection.sub_bin_interpolation import (
     complex_exponentials,
-    estimate_sub_bin_offset,
-    interpolator,
-    tone_spectrum,
 )
 from sweep.model.sampling import philox
+from sweep.model.sampling.peak_shape_errors import (
+    PeakShapeErrors,
+    TwoBinErrors,
+    estimates_by_two_bins,
+)
 from sweep.model.window import Window, window_samples
 
 if TYPE_CHECKING:
@@ -995,6 +997,8 @@ def position_error_moments(
     peaks: SpecklePeaks,
     shots: "Shots",
     pairs: tuple[tuple[int, int], ...] = SEGMENT_PAIRS_WITH_SELF,
+    *,
+    from_three_bins: bool = True,
 ) -> np.ndarray:
     """Return the second moments E[e_i e_j] of peak position errors due to speckle [bins^2].
 
@@ -1010,6 +1014,10 @@ def position_error_moments(
         Prepared shots, for window, FFT size, rule of detection and looks.
     pairs
         Pairs of segments (i, j) that are computed.
+    from_three_bins
+        True if positions are those of :mod:`sweep.model.detection.sub_bin_interpolation`. Other
+        estimators do not mistake the side of a peak in the rectangular window, and have the errors
+        of :class:`PeakShapeErrors` in any window.
 
     Returns
     -------
@@ -1020,11 +1028,14 @@ def position_error_moments(
     Notes
     -----
     An error is the sum of two parts: the wander, by equation (3) and :func:`wander_covariance`, and
-    the error due to the shape of the peak (:class:`PeakShapeErrors`). The real part of the complex
-    variance V of :class:`PeakShapeErrors` has the mean b^2 and the variance b^4 (v / q^2 + v^2 /
-    q^4). Here b is the spread of the lines [bins], q^2 the peak's power over its mean, and v the
-    echo fraction. If only the strongest bin is tested, the wander's deviation is divided by sqrt(1
-    + variance / WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the
+    the error by the shape of the peak (:class:`PeakShapeErrors`). In footprints of much less than a
+    bin the error by broadening is proportional to Re V, with the complex variance V = sum a z b^2
+    y^2 / A - s^2 of the lines about the complex shift s. Re V has the mean b^2 and the variance
+    b^4 (v / q^2 + v^2 / q^4). Here b is the spread of the lines [bins], q^2 the peak's power over
+    its mean, and v the echo fraction. In wider footprints the error has the same relative
+    deviation. Positions by two bins have the errors of :class:`TwoBinErrors` in its place. If only
+    the strongest bin is tested, the wander's deviation is divided by sqrt(1 + variance /
+    WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the
     variance.
     """
     squared_shift = (gradients.line_shift**2).sum(axis=-1)
@@ -1032,17 +1043,22 @@ def position_error_moments(
     relative_power = np.where(has_peak, np.maximum(peaks.relative_power, 1e-12), 1.0)
     echo_fraction = np.where(has_peak, peaks.echo_fraction, 0.0)
     variance = squared_shift * echo_fraction / (2 * relative_power)
-    shape_errors = PeakShapeErrors.from_offset(
-        np.where(has_peak, peaks.offset, 0.0), variance, shots
-    )
-    shape_error = (
-        peaks.folding_sign * shape_errors.error_per_variance * squared_shift * (echo_fraction > 0)
-    )
-    mean_error = peaks.folding_sign * shape_errors.imaginary_shift_error + shape_error
-    shape_deviation = (
-        np.sqrt((echo_fraction / relative_power) * (1 + echo_fraction / relative_power))
-        * shape_error
-    )
+    squared_spread = np.where(echo_fraction > 0, squared_shift, 0.0)
+    offset, shift_ratio = np.where(has_peak, peaks.offset, 0.0), echo_fraction / relative_power
+    shape_deviation, quadrature_deviation, own_variance = np.zeros((3, *variance.shape))
+    if from_three_bins and estimates_by_two_bins(shots):
+        noise_ratio = np.sqrt((1 - echo_fraction) / (2 * relative_power))
+        side_errors = TwoBinErrors.from_offset(
+            offset, squared_spread, shift_ratio, noise_ratio, shots
+        )
+        mean_error = np.where(has_peak, peaks.folding_sign * side_errors.mean, 0.0)
+        own_variance = np.where(echo_fraction > 0, side_errors.excess_variance, 0.0)
+    else:
+        shape_errors = PeakShapeErrors.from_offset(offset, squared_spread, variance, shots)
+        spread_error = peaks.folding_sign * shape_errors.spread_error
+        mean_error = spread_error + peaks.folding_sign * shape_errors.quadrature_error
+        shape_deviation = np.sqrt(shift_ratio * (1 + shift_ratio)) * spread_error
+        quadrature_deviation = peaks.folding_sign * shape_errors.quadrature_deviation
     wander_factor = np.ones(variance.shape)
     if shots.detection_settings.echo_bins == "peak_bin":
         wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
@@ -1056,8 +1072,10 @@ def position_error_moments(
         both_exist = has_peak[:, first] & has_peak[:, second]
         if first == second:
             moment, amplitude_correlation = variance[:, first], 1.0
+            own_moment = own_variance[:, first]
         else:
             pair = [first, second]
+            own_moment = np.zeros(variance.shape[0])
             moment = wander_covariance(
                 gradients, (first, second), relative_power[:, pair].T, echo_fraction[:, pair].T
             )
@@ -1066,100 +1084,15 @@ def position_error_moments(
                 -0.5 * (phase_difference * phase_difference).sum(axis=-1)
             )
         moment = (
-            moment + shape_deviation[:, first] * shape_deviation[:, second] * amplitude_correlation
+            moment
+            + (
+                shape_deviation[:, first] * shape_deviation[:, second]
+                + quadrature_deviation[:, first] * quadrature_deviation[:, second]
+            )
+            * amplitude_correlation
         )
-        moment = moment * wander_factor[:, first] * wander_factor[:, second] / n_looks
+        moment = moment * wander_factor[:, first] * wander_factor[:, second] + own_moment
+        moment = moment / n_looks
         moment = np.where(both_exist, moment + mean_error[:, first] * mean_error[:, second], 0.0)
         moments[:, first, second] = moments[:, second, first] = moment
     return moments
-
-
-_TEST_DISPLACEMENT_BINS = 0.05
-"""Displacement of pure tones [bins] with which numerical derivatives of the peak's shape are
-computed."""
-
-
-class PeakShapeErrors(NamedTuple):
-    """Errors of peak positions because speckle deforms peaks, to second order in the lines' spread.
-
-    Notes
-    -----
-    A is the amplitude of the echo, G(x) the window's transform at the distance x, and b the spread
-    of the lines along the beam's coordinate y [bins]. To second order in b the bin at the distance
-    x is A (G - s G' + (V + s^2) G'' / 2). In units of its mean, the power of the peak is q^2, and v
-    is the fraction of the echo in this mean. Lines have weights a^2 and random amplitudes z. The
-    real and imaginary part of the complex shift s each have the variance |b|^2 v / (2 q^2), and
-
-        V = sum a z b^2 y^2 / A - s^2.
-
-    The real part of s is the wander. Im s and V make the magnitudes of three bins differ from those
-    of any tone. The error of the estimate is proportional to (Im s)^2 and to Re V.
-    """
-
-    imaginary_shift_error: np.ndarray
-    """Mean error of the peak position [bins] due to the imaginary part of the complex shift s."""
-    error_per_variance: np.ndarray
-    """Error of the peak position [bins] per Re V [bins^2], the real part of the lines' complex
-    variance."""
-
-    @classmethod
-    def from_offset(
-        cls, offset: np.ndarray, variance: np.ndarray, shots: "Shots"
-    ) -> "PeakShapeErrors":
-        """Return the errors of the positions of peaks at given offsets from their strongest bin.
-
-        Parameters
-        ----------
-        offset
-            (m, 3): offset of each peak [bins].
-        variance
-            (m, 3): variance of the real, and of the imaginary part of the complex shift [bins^2].
-        shots
-            Prepared shots, for window and FFT size.
-        """
-        positions, error_per_square_shift, error_per_variance = _peak_shape_error_table(
-            shots.window, shots.fft_size
-        )
-        sign, distance = np.sign(offset), np.abs(offset)
-        return cls(
-            sign * np.interp(distance, positions, error_per_square_shift) * variance,
-            sign * np.interp(distance, positions, error_per_variance),
-        )
-
-
-@lru_cache(maxsize=16)
-def _peak_shape_error_table(
-    window: Window, fft_size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate errors of the positions of deformed peaks over a peak's offset from its bin.
-
-    Returns
-    -------
-    positions : ndarray (n,)
-        Offsets of the peak from its strongest bin, 0..1 [bins].
-    error_per_square_shift : ndarray (n,)
-        Error over (Im s)^2 [1/bins].
-    error_per_variance : ndarray (n,)
-        Error over Re V [1/bins].
-    """
-    interpolation, tone = interpolator(window, fft_size), tone_spectrum(window, fft_size)
-    positions = np.linspace(0.0, 1.0, 65)
-    bins = np.array([[-1.0], [0.0], [1.0]]) - positions
-    shifted_tones, broadened_tones = (
-        tone(bins - 1j * _TEST_DISPLACEMENT_BINS),
-        0.5 * (tone(bins + _TEST_DISPLACEMENT_BINS) + tone(bins - _TEST_DISPLACEMENT_BINS)),
-    )
-    error_per_square_shift, error_per_variance = (
-        (
-            np.array(
-                [
-                    estimate_sub_bin_offset(*magnitudes, interpolation)
-                    for magnitudes in np.abs(values).T
-                ]
-            )
-            - positions
-        )
-        / _TEST_DISPLACEMENT_BINS**2
-        for values in (shifted_tones, broadened_tones)
-    )
-    return positions, error_per_square_shift, error_per_variance

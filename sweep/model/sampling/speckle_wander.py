@@ -44,7 +44,7 @@ def wander_variance(
     if shots.speckle.line_gradients is None:
         return np.zeros((2, point_indices.size))
     beat_covariance_bins = position_error_moments(
-        shots.speckle.line_gradients.select(point_indices), peaks, shots
+        shots.speckle.line_gradients.select(point_indices), peaks, shots, from_three_bins=False
     )
     is_resolved = np.array(
         [True, shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or shots.any_two, True]
