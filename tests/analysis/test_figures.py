@@ -162,7 +162,7 @@ def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path)
     values = figures.dataset.pd_shot
     for figure, words in zip(figures.figure_specs[2:], ("x", "y"), strict=True):
         (panel,) = figures.make_chart(figure, SHEET_SIZE_LIMITS).panels
-        assert getattr(panel, words).kind == "category"
+        assert getattr(panel, f"{words}_axis").kind == "category"
         own = (
             values.transpose("range", "window") if words == "x" else values.transpose("window", ...)
         )
