@@ -753,7 +753,7 @@ def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetti
     return loaded, read_settings(loaded)
 
 
-def write_sheet_and_tables(
+def write_figure_and_tables(
     store: Location, directory: Path | None = None, picture_format: str = "png"
 ) -> list[Path]:
     """Write the figure and the tables of a store NAME.zarr of `sweep accuracy`.

@@ -193,7 +193,7 @@ def draw_figures(
     attributes = read_attributes_of_kind(store)
     kind = attributes["kind"]
     if kind == ACCURACY_STORE_KIND:
-        return accuracy_results.write_sheet_and_tables(
+        return accuracy_results.write_figure_and_tables(
             store, None if directory is None else Path(directory), picture_format
         )
     stem = store.name.removesuffix(".zarr")

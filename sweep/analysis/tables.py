@@ -266,7 +266,7 @@ def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, TableCel
     return records
 
 
-def noise_only_reference(
+def noise_false_alarm_reference(
     spec: GridSpec, setting_parameters: dict[str, Any]
 ) -> tuple[dict[str, TableCell], float]:
     """Return the probabilities of false alarms due to noise alone, in closed form and by the model.
@@ -348,7 +348,9 @@ def false_alarm_records(
         Published values: for each setting a list with a value for each cut.
     """
     setting_parts = split_by_setting(grid_points, spec, by)
-    noise_references = [noise_only_reference(spec, setting)[0] for _, setting, _ in setting_parts]
+    noise_references = [
+        noise_false_alarm_reference(spec, setting)[0] for _, setting, _ in setting_parts
+    ]
     cut_groups = [
         (
             i,
@@ -468,7 +470,7 @@ def threshold_page(
         "pfa_bin",
     )
     for i, (name, setting, _) in enumerate(setting_parts):
-        noise_reference, pfa_bin = noise_only_reference(spec, setting)
+        noise_reference, pfa_bin = noise_false_alarm_reference(spec, setting)
         tnr = float(noise_reference["tnr"])
         closed_form = noise_false_alarms.bin_pfa(tnr)
         printed_value = _published_value(printed, i, 0)

@@ -839,6 +839,6 @@ def print_accuracy_measurement(
     )
     for sentence in accuracy_results.conclusion_sentences(dataset, settings):
         echo_wrapped(sentence)
-    return [store, *accuracy_results.write_sheet_and_tables(store)], dataset.attrs[
+    return [store, *accuracy_results.write_figure_and_tables(store)], dataset.attrs[
         "stopped"
     ] != "interrupted"

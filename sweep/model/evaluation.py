@@ -337,7 +337,7 @@ def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     shot_time = (
         last_start
         + np.asarray(shots.waveform.chirp_duration)
-        + np.abs(shots.motion.range_walk_time)
+        + np.abs(shots.motion.range_reference_time)
     )
     range_change = (
         np.abs(shots.target.approach_speed) + np.abs(shots.target.radial_velocity)

@@ -95,7 +95,7 @@ class LineMotion(NamedTuple):
     """(3, n): frequency shift of each segment's lines from one look to the next [bins of fs/N]. A
     look is one of several records of the same segment.
     """
-    range_walk_time: np.ndarray | float = 0.0
+    range_reference_time: np.ndarray | float = 0.0
     """Time [s] from the start of the shot to the instant whose range the beats measure. The target
     closes in this time.
     """

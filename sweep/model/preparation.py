@@ -480,7 +480,7 @@ class Shots:
         """
         return (
             np.asarray(
-                self.motion.range_walk_time
+                self.motion.range_reference_time
                 - (self.motion.segment_starts[0] + self.motion.segment_starts[2]) / 2
             )
             / 2
@@ -536,7 +536,7 @@ class Shots:
                 self.motion.segment_starts,
                 self.waveform.chirp_slopes,
                 self.waveform.carriers,
-                (self.motion.range_walk_time,),
+                (self.motion.range_reference_time,),
                 (self.waveform.chirp_rate,),
             )
         )

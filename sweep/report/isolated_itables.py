@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import os
 
-_user_setting = os.environ.get("ITABLES_CONFIG")
+_itables_config_of_user = os.environ.get("ITABLES_CONFIG")
 os.environ["ITABLES_CONFIG"] = ""  # itables reads the empty string as "no configuration"
 try:
     import itables.options as options
     from itables.javascript import get_itable_arguments
 finally:
     del os.environ["ITABLES_CONFIG"]
-    if _user_setting is not None:
-        os.environ["ITABLES_CONFIG"] = _user_setting
+    if _itables_config_of_user is not None:
+        os.environ["ITABLES_CONFIG"] = _itables_config_of_user
 
 __all__ = ["get_itable_arguments", "options"]

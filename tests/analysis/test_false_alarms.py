@@ -55,7 +55,7 @@ def test_noise_alone_is_the_closed_form_and_knows_nothing_of_power(entries):
 def test_noise_alone_follows_the_setting_of_its_row():
     spec = spec_over_axes({"instrument.processing.fft_size": ["2^16", "2^18"], "cut": CUT_AXIS})
     settings = ({"instrument.processing.fft_size": n} for n in (2**16, 2**18))
-    sizes = [tables.noise_only_reference(spec, setting)[0] for setting in settings]
+    sizes = [tables.noise_false_alarm_reference(spec, setting)[0] for setting in settings]
     assert [size["bins"] for size in sizes] == [2**16, 2**18]
     # 16 times the pairs of bins, to first order in N p = 1e-4
     assert sizes[1]["noise_only"] / sizes[0]["noise_only"] == pytest.approx(16.0, rel=2e-4)
@@ -64,7 +64,7 @@ def test_noise_alone_follows_the_setting_of_its_row():
 def test_half_the_bins_give_a_quarter_of_the_alarms():
     processing = INSTRUMENT["processing"] | {"bins_counted": "half"}
     spec = spec_over_axes({}, instrument=INSTRUMENT | {"processing": processing})
-    found, _ = tables.noise_only_reference(spec, {})
+    found, _ = tables.noise_false_alarm_reference(spec, {})
     assert found["bins"] == 2**16
     # the model leaves out the bins of the strongest line and its neighbours: 3 of 65,536
     assert found["noise_only"] == pytest.approx(found["closed_form"], rel=2 * 3 / 2**16)

@@ -323,7 +323,7 @@ def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, ta
         for name in ("bins_begin", "bins_end", "bins"):
             assert (getattr(leaks, name) == getattr(others, name)).all()
         assert (leaks.group == others.group).all() and (
-            leaks.exempt_neighbour_side == others.exempt_neighbour_side
+            leaks.side_of_adjacent_echo_bin == others.side_of_adjacent_echo_bin
         ).all()
         np.testing.assert_allclose(leaks.log_amplitude, others.log_amplitude, rtol=1e-9)
         np.testing.assert_allclose(found.leakage[part], others.mean_leakage(), rtol=1e-9)

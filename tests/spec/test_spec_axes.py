@@ -7,7 +7,7 @@ from base_spec import axis_member_content, changed_spec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.analysis.tables import noise_only_reference
+from sweep.analysis.tables import noise_false_alarm_reference
 from sweep.model.threshold import DESIGN_PFA_SHOT_PATH, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec, SpecError
 from sweep.tasks.studies.grid_study import GridStudy
@@ -206,7 +206,7 @@ def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
     at = spec.parameters_with_overrides({"tnr": 10})
     assert at[TNR_PATH] == 10 and DESIGN_PFA_SHOT_PATH not in at
     first = tnr_from_parameters(spec.parameters() | {DESIGN_PFA_SHOT_PATH: 1e-9})
-    assert noise_only_reference(spec, {})[0]["tnr"] == pytest.approx(float(first))
+    assert noise_false_alarm_reference(spec, {})[0]["tnr"] == pytest.approx(float(first))
     with pytest.raises(SpecError, match=r"has no threshold; write 'tnr: 10', or threshold_to_mean"):
         GridSpec.from_mapping(changed_spec({TNR_PATH: ...}))
     with pytest.raises(SpecError, match=r"by tnr and by design_pfa_shot; keep one of them"):

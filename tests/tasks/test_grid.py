@@ -89,7 +89,7 @@ def test_a_study_without_axes_is_one_point_in_one_block():
 
 def test_geometry_order_brings_equal_geometry_together_and_drops_nothing():
     grid = ParameterBlockGrid(small_spec(storage={"block_points": 36}))
-    order, parameters = grid.geometry_order(0), grid.parameters_of_block(0)
+    order, parameters = grid.point_order_by_geometry(0), grid.parameters_of_block(0)
     assert sorted(order) == list(range(grid.count_block_points(0)))
     ranges = parameters["target.range"][order]
     angles = parameters["target.grazing_angle"][order]

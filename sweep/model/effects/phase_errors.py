@@ -441,8 +441,8 @@ def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
         radial_velocity=velocity,
         slide=slide,
     )
-    walk_time = shots.motion.range_walk_time + chirp_drift_time(shots)
-    return replace(shots, motion=shots.motion._replace(range_walk_time=walk_time))
+    walk_time = shots.motion.range_reference_time + chirp_drift_time(shots)
+    return replace(shots, motion=shots.motion._replace(range_reference_time=walk_time))
 
 
 def chirp_drift_time(shots: Shots) -> np.ndarray:

@@ -117,7 +117,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     middle_time, half_interval = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
     motion = motion._replace(
         segment_starts=waveform.middle_look_starts(looks),
-        range_walk_time=motion.range_walk_time + (middle_time + waveform.middle_look_delay(looks)),
+        range_reference_time=motion.range_reference_time
+        + (middle_time + waveform.middle_look_delay(looks)),
         velocity_bias_fraction=waveform.chirp_rate
         * half_interval
         / (waveform.carriers[0] + waveform.chirp_bandwidth / 2),

@@ -149,7 +149,7 @@ class LeakageBins(NamedTuple):
 
     bins_begin: np.ndarray
     """(m, 3) int64: index of each segment's first bin in the arrays from ``bins`` to
-    ``exempt_neighbour_side``."""
+    ``side_of_adjacent_echo_bin``."""
     bins_end: np.ndarray
     """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1."""
     bins: np.ndarray
@@ -162,7 +162,7 @@ class LeakageBins(NamedTuple):
     exempt_neighbour: np.ndarray
     """(bins,): |X| / sigma of the adjacent bin that belongs to an echo, and so cannot raise a false
     alarm; 0 if no adjacent bin does."""
-    exempt_neighbour_side: np.ndarray
+    side_of_adjacent_echo_bin: np.ndarray
     """(bins,) int64: 1 if the adjacent bin of the echo is above the bin, -1 if it is below."""
     rate_sum: np.ndarray
     """(m, 3): upper bound on the sum of rates -ln(1 - c) of a segment's bins at mean speckle power.
@@ -230,7 +230,7 @@ class LeakageBins(NamedTuple):
             log_amplitude=np.empty(0),
             group=no_bins,
             exempt_neighbour=np.empty(0),
-            exempt_neighbour_side=no_bins,
+            side_of_adjacent_echo_bin=no_bins,
             rate_sum=np.zeros(sum_shape),
             rate_sum_bounds=np.zeros((*sum_shape, N_BOUND_POWERS)),
             mean_probability_sum=np.full(sum_shape, np.nan),
@@ -356,7 +356,7 @@ def iter_leakage_bins(
                 log_amplitude=np.log(spectra.leaked_ratio),
                 group=fading_group,
                 exempt_neighbour=spectra.exempt_neighbour_ratio,
-                exempt_neighbour_side=spectra.exempt_neighbour_side,
+                side_of_adjacent_echo_bin=spectra.side_of_adjacent_echo_bin,
             )
             yield batch, _add_rate_tables(shots, batch, leakage_bins)
 
@@ -407,7 +407,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         np.ascontiguousarray(array)
         for array in (spans.first_bin, spans.n_bins, spans.peak_index, spans.span_start)
     )
-    bins, group, exempt_neighbour_side = np.empty((3, n_bins.sum()), np.int64)
+    bins, group, side_of_adjacent_echo_bin = np.empty((3, n_bins.sum()), np.int64)
     log_amplitude, exempt_neighbour = np.empty((2, bins.size))
     bins_begin, bins_end = np.empty((2, spans.point_numbers.size, 3), np.int64)
     n_listed = _fill_leakage_bins(
@@ -429,7 +429,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         log_amplitude,
         group,
         exempt_neighbour,
-        exempt_neighbour_side,
+        side_of_adjacent_echo_bin,
     )
     leakage_bins = LeakageBins.empty(spans.point_numbers.size)._replace(
         bins_begin=bins_begin,
@@ -438,7 +438,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         log_amplitude=log_amplitude[:n_listed],
         group=group[:n_listed],
         exempt_neighbour=exempt_neighbour[:n_listed],
-        exempt_neighbour_side=exempt_neighbour_side[:n_listed],
+        side_of_adjacent_echo_bin=side_of_adjacent_echo_bin[:n_listed],
     )
     return _add_rate_tables(shots, spans.point_numbers, leakage_bins)
 
@@ -463,7 +463,7 @@ def _fill_leakage_bins(
     log_amplitude,
     group,
     exempt_neighbour,
-    exempt_neighbour_side,
+    side_of_adjacent_echo_bin,
 ):
     """List the bins of leaked signal in spans (adjacent bins of a segment); return their number.
 
@@ -482,7 +482,7 @@ def _fill_leakage_bins(
         (n, 3, groups): strongest bins of groups, -1 for none.
     circle_bins
         Number of bins of a complex record, else 0.
-    bins_begin, bins_end, bins, log_amplitude, group, exempt_neighbour, exempt_neighbour_side
+    bins_begin, bins_end, bins, log_amplitude, group, exempt_neighbour, side_of_adjacent_echo_bin
         Results, as in :class:`LeakageBins`.
     """
     n_listed = 0
@@ -522,7 +522,7 @@ def _fill_leakage_bins(
                     nearest_group,
                     max(ratio_below, ratio_above),
                 )
-                exempt_neighbour_side[n_listed] = 1 if ratio_above >= ratio_below else -1
+                side_of_adjacent_echo_bin[n_listed] = 1 if ratio_above >= ratio_below else -1
                 n_listed += 1
             bins_end[j, s] = n_listed
     return n_listed
@@ -695,7 +695,7 @@ def _mask_leaked_light(
             leaked_index=spectra.leaked_index[is_kept],
             leaked_ratio=spectra.leaked_ratio[is_kept],
             exempt_neighbour_ratio=spectra.exempt_neighbour_ratio[is_kept],
-            exempt_neighbour_side=spectra.exempt_neighbour_side[is_kept],
+            side_of_adjacent_echo_bin=spectra.side_of_adjacent_echo_bin[is_kept],
         ),
         group[is_kept],
         LeakageBins.empty(batch.size)._replace(
@@ -1028,7 +1028,7 @@ def _evaluate_joining_bins(
     int
         Index of the last of these bins.
     """
-    n_nodes, step = joining_rates.size, -leakage_bins.exempt_neighbour_side[bin_index]
+    n_nodes, step = joining_rates.size, -leakage_bins.side_of_adjacent_echo_bin[bin_index]
     end_index = bin_index + step
     while (
         bins_begin <= end_index < bins_end

@@ -50,7 +50,7 @@ sampling rate and L the number of samples of the record."""
 _LOBE_STEPS_PER_BIN = 1024
 """Number of entries per bin of fs/L in the table of a line's power by distance. fs is the sampling
 rate and L the number of samples of the record."""
-_WINDOW_SAMPLES = 1024
+_LINE_TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the window from which the table of a line's power by distance is computed.
 """
 
@@ -368,9 +368,9 @@ def _main_lobe_table(window_name: str) -> np.ndarray:
     W is the transform of the window. A bin of fs/L has ``_LOBE_STEPS_PER_BIN`` steps, for windows
     of any length L and any sampling rate fs.
     """
-    w = window_samples(window_name, _WINDOW_SAMPLES)
+    w = window_samples(window_name, _LINE_TABLE_WINDOW_SAMPLES)
     transform = np.abs(
-        np.fft.rfft(w, _WINDOW_SAMPLES * _LOBE_STEPS_PER_BIN)[
+        np.fft.rfft(w, _LINE_TABLE_WINDOW_SAMPLES * _LOBE_STEPS_PER_BIN)[
             : _LOBE_REACH_BINS * _LOBE_STEPS_PER_BIN + 1
         ]
     )

@@ -1049,7 +1049,7 @@ def _measure_listed_returns(
         )
         interpolated = interpolated._replace(
             radial_velocity=velocity,
-            range=interpolated.range + velocity * at_returns(shots.motion.range_walk_time),
+            range=interpolated.range + velocity * at_returns(shots.motion.range_reference_time),
         )
     per_slip = ShiftsByMotion(np.zeros(()), np.zeros(()))
     if motion is not None:
@@ -2141,7 +2141,7 @@ def list_noisy_leaked_peaks(
         if ratio > largest:
             peak, largest = bin_number, ratio
         if spectra.exempt_neighbour_ratio[n] > 0.0:
-            neighbour_index = spectra.leaked_index[n] + spectra.exempt_neighbour_side[n]
+            neighbour_index = spectra.leaked_index[n] + spectra.side_of_adjacent_echo_bin[n]
             re_own, im_own = philox.normal_pair(
                 key_0, key_1, draw, philox.STREAM_NOISE[segment], neighbour_index
             )

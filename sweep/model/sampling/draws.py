@@ -540,7 +540,7 @@ class NoiselessSpectra(NamedTuple):
     exempt_neighbour_ratio: np.ndarray
     """(leaked,): |X| over sigma of the adjacent bin that belongs to an echo, and so cannot raise a
     false alarm; 0 if no adjacent bin does."""
-    exempt_neighbour_side: np.ndarray
+    side_of_adjacent_echo_bin: np.ndarray
     """(leaked,) int64: 1 if the adjacent bin of the echo is above the bin of leaked signal, -1 if
     it is below."""
 
@@ -567,7 +567,7 @@ class NoiselessSpectra(NamedTuple):
             leaked_index=no_numbers,
             leaked_ratio=no_values,
             exempt_neighbour_ratio=no_values,
-            exempt_neighbour_side=no_numbers,
+            side_of_adjacent_echo_bin=no_numbers,
         )
 
 
@@ -640,7 +640,7 @@ def iter_noiseless_spectra(
             leaked_index=index_in_span[is_leaked],
             leaked_ratio=ratio[is_leaked],
             exempt_neighbour_ratio=np.maximum(below, above)[is_leaked],
-            exempt_neighbour_side=np.where(above >= below, 1, -1)[is_leaked],
+            side_of_adjacent_echo_bin=np.where(above >= below, 1, -1)[is_leaked],
         )
         # In C order as in `NoiselessSpectra.empty`: numba compiles anew for each order.
         yield spans.point_numbers, NoiselessSpectra(*map(np.ascontiguousarray, spectra))
@@ -911,7 +911,7 @@ def _mark_leakage_alarms(
                     key_0, key_1, first_draw + d, stream, spectra.leaked_index[leaked_bin]
                 )
                 edge_index = (
-                    spectra.leaked_index[leaked_bin] + spectra.exempt_neighbour_side[leaked_bin]
+                    spectra.leaked_index[leaked_bin] + spectra.side_of_adjacent_echo_bin[leaked_bin]
                 )
                 re_edge, im_edge = philox.normal_pair(
                     key_0, key_1, first_draw + d, stream, edge_index

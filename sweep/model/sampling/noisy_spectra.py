@@ -1125,9 +1125,9 @@ def count_detections(
         sum(f.n_false_bins for f in detections),
         sum(f.n_false_groups for f in detections),
     )
-    squared_bounds = np.square(_bounds_by_draw(point_spectra, is_detected)) + _wander_variances(
-        point_spectra, detections, is_detected
-    )
+    squared_bounds = np.square(
+        _error_bounds_by_draw(point_spectra, is_detected)
+    ) + _wander_variances(point_spectra, detections, is_detected)
     if point_spectra.shots.any_two:  # bounds depend on the detected segments
         squared_bounds = np.where(is_resolved, squared_bounds, np.nan)
     errors = [
@@ -1139,7 +1139,7 @@ def count_detections(
     )
 
 
-def _bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.ndarray:
+def _error_bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.ndarray:
     """Return the smallest standard deviations of range [m] and velocity [m/s] by draw, (2, m).
 
     The standard deviations are bounds for the segments that are detected in a draw, ``is_detected``
@@ -1272,7 +1272,7 @@ def _measurement_errors(
         1 + _value_at(shots.motion.velocity_bias_fraction, point)
     )
     range_walk = (
-        _value_at(shots.motion.range_walk_time, point) * measured_velocity
+        _value_at(shots.motion.range_reference_time, point) * measured_velocity
     )  # to the shot's start
     measured_range = measured.range + range_walk
     uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or (

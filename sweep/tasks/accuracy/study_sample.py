@@ -436,9 +436,11 @@ class GridSample(StudySample):
         (block,), (local_index,) = (
             array.tolist() for array in grid.locate_points(np.array([point_index]))
         )
-        geometry_order = grid.geometry_order(block)
-        order_positions = np.flatnonzero(geometry_order == local_index) + np.arange(n_points)
-        return grid.grid_indices(block, geometry_order.take(order_positions, mode="wrap"))
+        point_order_by_geometry = grid.point_order_by_geometry(block)
+        order_positions = np.flatnonzero(point_order_by_geometry == local_index) + np.arange(
+            n_points
+        )
+        return grid.grid_indices(block, point_order_by_geometry.take(order_positions, mode="wrap"))
 
 
 class FlightSample(StudySample):

@@ -146,7 +146,7 @@ class FootprintDeviations(NamedTuple):
     """Standard deviation of the radial velocity (n,) [m/s]."""
 
     @classmethod
-    def on_plane(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
+    def of_plane_footprint(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
         """Return the deviations of footprints on a plane at ranges `range_` (n,) [m].
 
         Text parameters in `p` are the same at all points.
@@ -258,7 +258,9 @@ def _crosses_spectrum_edge(
         or not is_speckled
     ):
         return np.zeros(range_.shape, bool)
-    footprint = FootprintDeviations.on_plane(p, range_) if footprint is None else footprint
+    footprint = (
+        FootprintDeviations.of_plane_footprint(p, range_) if footprint is None else footprint
+    )
     budget = LinkBudget(p)
     settings, record = budget.waveform, budget.record
     chirp_rate, record_length = settings.chirp_rate, record.window.length

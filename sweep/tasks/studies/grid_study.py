@@ -675,7 +675,7 @@ def iter_block_results(
     points in them are not computed again, and unfinished points are continued. `UnfinishedBlock` is
     raised at the deadline; a later call continues to the same bits.
     """
-    parameters, order = grid.parameters_of_block(block), grid.geometry_order(block)
+    parameters, order = grid.parameters_of_block(block), grid.point_order_by_geometry(block)
     order = order[
         ~np.isin(
             order,

@@ -208,7 +208,7 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
             parameters |= {path: array[axis_indices] for path, array in values.items()}
         return parameters
 
-    def geometry_order(self, block: int) -> np.ndarray:
+    def point_order_by_geometry(self, block: int) -> np.ndarray:
         """Return an order (n,) of a block's points that puts points with equal geometry together.
 
         Radiometric axes vary fastest, and velocities slowest, as the change of a spectral line

@@ -250,7 +250,7 @@ def _sampled_indices_of_block(study: GridStudy, block: int, n_geometries: int) -
         grid.actual_block_shape(block), grid.is_geometric_axis, strict=True
     ):
         points_per_geometry *= 1 if is_geometric else length
-    geometry_groups = grid.geometry_order(block).reshape(-1, points_per_geometry)
+    geometry_groups = grid.point_order_by_geometry(block).reshape(-1, points_per_geometry)
     sampled_groups = np.unique(
         np.linspace(0, len(geometry_groups) - 1, n_geometries).astype(np.int64)
     )
