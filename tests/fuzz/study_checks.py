@@ -211,7 +211,9 @@ def _check_whole_spectra(results: Results) -> None:
 def _check_draws(spec: GridSpec, results: Results, no_doppler: np.ndarray) -> None:
     """Counts of draws between none and all, and errors of means of none or several draws."""
     (batches,) = (
-        array.known_values for array in GridStudy(spec).array_layouts() if array.name == "batch_draws"
+        array.known_values
+        for array in GridStudy(spec).array_layouts()
+        if array.name == "batch_draws"
     )
     for name in DRAW_COUNT_OUTPUTS:
         assert (results[name] <= batches).all(), f"{name} has more than all"
