@@ -26,7 +26,8 @@ from sweep.model.window import get_window, window_samples
 
 LENGTH, HALF_WIDTH = 1024, 9
 SNR, THRESHOLD = 1800.0, 6.0
-"""Of the mean echo on a bin, and the threshold over the noise per quadrature: 10 times below."""
+"""SNR of the mean echo on a bin, and the threshold over the noise per quadrature. |X| is ten times
+the threshold."""
 SPREAD_AT_5_DEG, TURN_PER_SPREAD = 0.66, 0.46
 """Deviation of the lines [bins] from 300 m on a slope of 5 degrees, of a beam of 5 mm and 1 GHz in
 50 us, and the phase [rad] per bin by which up and down chirp turn against each other."""

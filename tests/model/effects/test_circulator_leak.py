@@ -205,8 +205,9 @@ def test_several_looks_beside_a_line_of_no_power_detect_as_without_it(leaking, c
         assert with_line[name] == pytest.approx(without[name], rel=1e-6)
 
 
-def test_a_line_leaves_undetected_what_lies_outside_the_search_band(leaking):
-    band = dict(zip(SEARCH_BAND_PATHS, (100.0, 500.0, -10.0, 10.0), strict=True))
+def test_a_line_leaves_undetected_an_echo_just_outside_the_search_band(leaking):
+    """The echo's strongest bin is outside, and bins of its main lobe are inside."""
+    band = dict(zip(SEARCH_BAND_PATHS, (2000.3, 3000.0, -0.001, 0.001), strict=True))
     parameters = leaking(isolation=1e25, range=2000.0, radial_velocity=0.0, further=band)
     result = evaluation.evaluate(parameters, WITH)
     assert result["pd_up"] == 0 and result["miss_up"] == 1
