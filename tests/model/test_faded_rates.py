@@ -18,6 +18,9 @@ from sweep.model.detection.speckle_crossing_rates import (
     SPECKLE_POWER_MAX,
     TABULATED_SPECKLE_POWERS,
     add_rates_by_power,
+    add_rates_of_entries,
+    add_to_entry_weights,
+    count_entry_weights,
     tabulate_crossing_rates,
 )
 from sweep.model.spectrum import leakage
@@ -53,6 +56,21 @@ def test_tabulated_rates_are_those_of_a_bin_at_each_speckle_power(level):
         sound = expected < CERTAIN
         np.testing.assert_allclose(told[sound], expected[sound], rtol=2e-5, atol=1e-14)
         assert (told[~sound] > 0.9 * CERTAIN).all()
+
+
+@pytest.mark.parametrize("level", [1.5, 6.55, 35.0])
+def test_sums_by_table_entry_are_the_sums_bin_by_bin(level):
+    table, rng = table_of(level), np.random.default_rng(11)
+    amplitudes = np.exp(rng.uniform(np.log(1e-7), np.log(level + 60), 500))
+    one_by_one, by_entry = np.zeros(N_SPECKLE_POWERS), np.zeros(N_SPECKLE_POWERS)
+    entry_weights = np.zeros(count_entry_weights(table))
+    for amplitude in amplitudes:
+        add_rates_by_power(amplitude**2, 1.0, table, one_by_one)
+        add_to_entry_weights(amplitude**2, table, entry_weights)
+    add_rates_of_entries(entry_weights, table, by_entry)
+    np.testing.assert_allclose(by_entry, one_by_one, rtol=1e-12)
+    # Polynomials reproduce constants: the weights of a bin sum to its squared amplitude.
+    np.testing.assert_allclose(entry_weights.sum(), (amplitudes**2).sum(), rtol=1e-12)
 
 
 def run_at_random(seed, level):

@@ -248,6 +248,57 @@ def rate_table(grid, arrays):
     )
 
 
+class TablePlace(NamedTuple):
+    """Place of a bin in the table, at the faintest speckle power."""
+
+    first_entry: int
+    """Number of the first of the six entries from which its rate is interpolated."""
+    fraction: float
+    """Position between the third entry and the fourth, 0 to 1."""
+
+
+class InterpolationWeights(NamedTuple):
+    """Weights of six adjacent table entries in a bin's rate."""
+
+    w0: float
+    w1: float
+    w2: float
+    w3: float
+    w4: float
+    w5: float
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _place_in_table(squared_ratio, rate_table):
+    """Return the :class:`TablePlace` of a bin with the ``squared_ratio`` of `add_rates_by_power`."""
+    table_position = (
+        0.5 * math.log(squared_ratio)
+        + _LOG_AMPLITUDE_AT_FAINTEST_POWER
+        - rate_table.log_amplitude_first
+    ) / rate_table.log_amplitude_step
+    table_position = min(max(table_position, 2.0), rate_table.position_max)
+    return TablePlace(
+        np.uint64(table_position) - np.uint64(2), table_position - math.floor(table_position)
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _interpolation_weights(x, weight):
+    """Return ``weight`` times the :class:`InterpolationWeights` of Lagrange's polynomial at ``x``.
+
+    ``x`` is the fraction of :class:`TablePlace`.
+    """
+    square_1, square_2 = x * x - 1.0, x * x - 4.0
+    return InterpolationWeights(
+        weight * x * square_1 * (x - 2.0) * (3.0 - x) / 120.0,
+        weight * x * (x - 1.0) * square_2 * (x - 3.0) / 24.0,
+        weight * square_1 * square_2 * (3.0 - x) / 12.0,
+        weight * x * (x + 1.0) * square_2 * (x - 3.0) / 12.0,
+        weight * x * square_1 * (x + 2.0) * (3.0 - x) / 24.0,
+        weight * x * square_1 * square_2 / 120.0,
+    )
+
+
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
     """Add a bin's crossing rates at all speckle powers to sums over bins.
@@ -266,45 +317,75 @@ def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
     rate_sums
         (N_SPECKLE_POWERS,): sums by speckle power; changed in place.
     """
-    table_position = (
-        0.5 * math.log(squared_ratio)
-        + _LOG_AMPLITUDE_AT_FAINTEST_POWER
-        - rate_table.log_amplitude_first
-    ) / rate_table.log_amplitude_step
-    table_position = min(max(table_position, 2.0), rate_table.position_max)
-    first_entry = np.uint64(table_position) - np.uint64(2)
-    relative_rates, fraction = (
-        rate_table.relative_rates,
-        table_position - math.floor(table_position),
-    )
+    place = _place_in_table(squared_ratio, rate_table)
+    relative_rates = rate_table.relative_rates
     entries_per_power = np.uint64(rate_table.entries_per_power)
-    column = first_entry // entries_per_power
-    row = first_entry - column * entries_per_power
-    # Lagrange's polynomial through six entries.
-    quadratic = fraction * fraction - 1.0
-    cubic, weight = (fraction * fraction - 1.0) * (fraction - 2.0), weight * squared_ratio
-    a = weight * fraction * cubic * (3.0 - fraction) / 120.0
-    b = weight * fraction * (fraction - 1.0) * (fraction * fraction - 4.0) * (fraction - 3.0) / 24.0
-    c = weight * quadratic * (fraction * fraction - 4.0) * (3.0 - fraction) / 12.0
-    d = weight * fraction * (fraction + 1.0) * (fraction * fraction - 4.0) * (fraction - 3.0) / 12.0
-    e = weight * fraction * quadratic * (fraction + 2.0) * (3.0 - fraction) / 24.0
-    f = weight * fraction * quadratic * (fraction * fraction - 4.0) / 120.0
+    column = place.first_entry // entries_per_power
+    row = place.first_entry - column * entries_per_power
+    w = _interpolation_weights(place.fraction, weight * squared_ratio)
     for j in range(np.uint64(N_SPECKLE_POWERS)):
         power_column = column + j
         rate_sums[j] += (
             (
-                a * relative_rates[row, power_column]
-                + b * relative_rates[row + np.uint64(1), power_column]
+                w.w0 * relative_rates[row, power_column]
+                + w.w1 * relative_rates[row + np.uint64(1), power_column]
             )
             + (
-                c * relative_rates[row + np.uint64(2), power_column]
-                + d * relative_rates[row + np.uint64(3), power_column]
+                w.w2 * relative_rates[row + np.uint64(2), power_column]
+                + w.w3 * relative_rates[row + np.uint64(3), power_column]
             )
             + (
-                e * relative_rates[row + np.uint64(4), power_column]
-                + f * relative_rates[row + np.uint64(5), power_column]
+                w.w4 * relative_rates[row + np.uint64(4), power_column]
+                + w.w5 * relative_rates[row + np.uint64(5), power_column]
             )
         )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def count_entry_weights(rate_table):
+    """Return the size of ``entry_weights`` in :func:`add_to_entry_weights`, for a table."""
+    return rate_table.entries_per_power * rate_table.relative_rates.shape[1]
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def add_to_entry_weights(squared_ratio, rate_table, entry_weights):
+    """Add a bin's interpolation weights to sums by table entry.
+
+    The rate of a bin is a weighted sum of six entries. The sum over many bins is therefore one
+    weighted sum of all entries (:func:`add_rates_of_entries`). This costs six additions for a bin;
+    :func:`add_rates_by_power` needs six for each power.
+
+    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_power`. ``entry_weights``
+    (:func:`count_entry_weights`,) is changed in place.
+    """
+    place = _place_in_table(squared_ratio, rate_table)
+    w = _interpolation_weights(place.fraction, squared_ratio)
+    first_entry = place.first_entry
+    entry_weights[first_entry] += w.w0
+    entry_weights[first_entry + np.uint64(1)] += w.w1
+    entry_weights[first_entry + np.uint64(2)] += w.w2
+    entry_weights[first_entry + np.uint64(3)] += w.w3
+    entry_weights[first_entry + np.uint64(4)] += w.w4
+    entry_weights[first_entry + np.uint64(5)] += w.w5
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def add_rates_of_entries(entry_weights, rate_table, rate_sums):
+    """Add the crossing rates of all bins in ``entry_weights`` to sums by speckle power.
+
+    ``entry_weights`` is filled by :func:`add_to_entry_weights`; ``rate_table`` and ``rate_sums``
+    are as in :func:`add_rates_by_power`.
+    """
+    relative_rates = rate_table.relative_rates
+    entries_per_power = np.uint64(rate_table.entries_per_power)
+    for entry in range(np.uint64(entry_weights.size)):
+        weight = entry_weights[entry]
+        if weight == 0.0:
+            continue
+        column = entry // entries_per_power
+        row = entry - column * entries_per_power
+        for j in range(np.uint64(N_SPECKLE_POWERS)):
+            rate_sums[j] += weight * relative_rates[row, column + j]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)

@@ -269,7 +269,7 @@ class SpectrumWorkspace(NamedTuple):
     """Quadrature points of the integral over bins outside ``span``, which gives their leakage."""
 
 
-_SCRATCH_BYTES_KEPT_MAX = 1 << 26
+_SCRATCH_BYTES_KEPT_MAX = 1 << 28
 """Largest scratch array [bytes] that a thread keeps for its next batch of points."""
 
 _thread_scratch = threading.local()

@@ -51,6 +51,9 @@ from sweep.model.detection.speckle_crossing_rates import (
     SPECKLE_POWER_MAX,
     TABULATED_SPECKLE_POWERS,
     add_rates_by_power,
+    add_rates_of_entries,
+    add_to_entry_weights,
+    count_entry_weights,
     rate_at_brightest_speckle,
 )
 from sweep.model.spectrum.bin_spectrum import (
@@ -459,6 +462,7 @@ def _mean_leakage_over_speckle(
     )
     magnitudes, is_echo = np.zeros(n_listed_max), np.zeros(n_listed_max, np.bool_)
     n_listed, is_gap_listed = 0, True
+    entry_weights = np.zeros(count_entry_weights(speckle_rates))
     for i in range(first_index, end_index):
         squared_ratio = span.magnitude[i] * span.magnitude[i] * scale
         if span.is_exempt[i]:
@@ -471,9 +475,10 @@ def _mean_leakage_over_speckle(
             add_rates_by_power(squared_ratio, 1.0, speckle_rates, joining_rates[n_listed])
             magnitudes[n_listed], n_listed, is_gap_listed = span.magnitude[i], n_listed + 1, False
         else:
-            add_rates_by_power(squared_ratio, 1.0, speckle_rates, rate_sums)
+            add_to_entry_weights(squared_ratio, speckle_rates, entry_weights)
             if not is_gap_listed:
                 n_listed, is_gap_listed = n_listed + 1, True
+    add_rates_of_entries(entry_weights, speckle_rates, rate_sums)
     rate_at_brightest = rate_sums[N_SPECKLE_POWERS - 1] + max(
         relative_rates_of_far_bins[N_SPECKLE_POWERS - 1], 0.0
     )
