@@ -429,9 +429,9 @@ SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
         "beamlets_error": OutputVariable(
             "1",
             "largest change by more beamlets",
-            "of pd in all three segments, or of a relative magnitude, whichever is more; "
-            "estimated from the shot's own rays, where accuracy.tolerance says how many they are; "
-            "else nan: not checked",
+            "of pd in all three segments or, without speckle, of a relative magnitude, whichever "
+            "is more; estimated from the shot's own rays, where accuracy.tolerance says how many "
+            "they are; else nan: not checked",
         ),
     },
 )

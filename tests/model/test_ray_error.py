@@ -4,15 +4,23 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.special import gammainc
 from shot_helpers import parametrize_product
 from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
 from sweep.model.beamlet_counts import initial_ray_count, next_ray_counts
 from sweep.model.beamlets import place_beamlets
+from sweep.model.detection.marcum import marcum_q1
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.pointcloud.point_cloud import simulate_cloud
-from sweep.model.pointcloud.ray_error import _fill_power_errors, fold_lattice
+from sweep.model.pointcloud.ray_error import (
+    _fill_power_errors,
+    _pd_change_bound_of_looks,
+    _speckled_pd_change,
+    fold_lattice,
+)
 from sweep.model.sampling import philox
 from sweep.scenes.meshes import clean_mesh
 
@@ -221,3 +229,47 @@ def test_more_rays_leave_less_out(width):
     errors = [_ridge_errors(number, width)[0].max() for number in RAYS[:5]]
     assert all(after < 0.7 * before for before, after in itertools.pairwise(errors))
     assert errors[-1] < 5e-5
+
+
+# Speckle
+
+
+@pytest.mark.parametrize("relative", [1e-4, 0.03, 0.4, 1.5])
+def test_speckled_change_is_that_of_the_fading_law(relative):
+    """The law is integrated here over the power of the speckle, and Marcum's Q."""
+    power, step = np.linspace(0.0, 60.0, 200_001, retstep=True)
+    for a, b in [(0.5, 4.0), (4.0, 4.0), (9.0, 4.0), (60.0, 4.0), (9.0, 6.5)]:
+        changed = [
+            (np.exp(-power) * marcum_q1(a * np.sqrt(power * factor), np.array(b)).q).sum() * step
+            for factor in (max(1 - relative, 0.0), 1.0, 1 + relative)
+        ]
+        expected = np.abs(np.diff(changed)).max()
+        told = float(_speckled_pd_change(np.array(a), np.array(b), relative))
+        assert told == pytest.approx(expected, rel=2e-3, abs=2e-6)
+
+
+@pytest.mark.parametrize("n_looks", [2, 3, 8, 50])
+def test_bound_of_looks_is_above_the_change_of_any_gamma_law(n_looks):
+    for relative in (1e-3, 0.05):
+        scale = np.geomspace(0.1, 10, 2001)
+        change = gammainc(n_looks, n_looks * scale * (1 + relative)) - gammainc(
+            n_looks, n_looks * scale
+        )
+        bound = float(_pd_change_bound_of_looks(n_looks, relative))
+        assert 0.7 * bound < change.max() <= bound * (1 + 1 / n_looks)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_in_speckle_it_tells_what_far_more_rays_would_change(table_4_1, scene):
+    """Of 97 in 100 shots at least half of the change of pd; the magnitude asks for no rays."""
+    parameters = _parameters(table_4_1, power=0.05) | {"footprint.speckle": "developed"}
+    effects = (*DEFAULT_EFFECTS, "fading")
+    many = _cloud(_seen(scene, MANY), parameters, effects=effects)
+    few = _cloud(_seen(scene, 37), parameters, effects=effects, estimates_ray_error=True)
+    steady = _cloud(_seen(scene, 37), _parameters(table_4_1, power=0.05), estimates_ray_error=True)
+    real = sum(abs(few[name] - many[name]) for name in DETECTED)
+    off = (real > 1e-6) & (np.ptp(_seen(scene, 37).surface, axis=1) == (scene != "rough ground"))
+    ratio = few["beamlets_error"][off] / real[off]
+    assert off.sum() > SHOTS / 10
+    assert (ratio >= 0.5).mean() >= 0.97
+    assert np.nanmedian(few["beamlets_error"]) < 0.7 * np.nanmedian(steady["beamlets_error"])

@@ -270,7 +270,7 @@ class InterpolationWeights(NamedTuple):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _place_in_table(squared_ratio, rate_table):
-    """Return the :class:`TablePlace` of a bin with the ``squared_ratio`` of `add_rates_by_power`."""
+    """Return the :class:`TablePlace` of a bin; arguments as in :func:`add_rates_by_power`."""
     table_position = (
         0.5 * math.log(squared_ratio)
         + _LOG_AMPLITUDE_AT_FAINTEST_POWER

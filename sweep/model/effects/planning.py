@@ -36,6 +36,8 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 _LN_10 = math.log(10.0)
 _CHANGE_MAX = 1e12
 """Upper limit of relative changes and of signals over noise, which avoids overflow."""
+_LOSS_MAX = 1.0 - 1e-12
+"""Upper limit of relative losses of magnitude, whose logarithm stays finite."""
 _BIN_MOVING_STAGES = ("lines", "record", "spectrum")
 """Stages whose effects move light from bin to bin of the spectrum."""
 
@@ -287,8 +289,12 @@ def omission_errors(
         pd_change, other_change = 0.0, np.maximum(bound.shift_bins, bound.log10_pfa_change)
         if _is_nonzero(bound.magnitude_change):
             relative_change = np.minimum(bound.magnitude_change, _CHANGE_MAX)
+            # The slope is that over ln |X|, which falls by -ln(1 - d) where |X| falls by d.
+            log_change = np.maximum(
+                relative_change, -np.log1p(-np.minimum(relative_change, _LOSS_MAX))
+            )
             pd_change, other_change = (
-                pd_change + relative_change * slope,
+                pd_change + log_change * slope,
                 np.maximum(other_change, relative_change * relative_weight),
             )
         if _is_nonzero(bound.coherent_sum_change):

@@ -171,6 +171,24 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
 
 
 @pytest.mark.parametrize("kind", range(len(KINDS)))
+def test_a_large_loss_changes_pd_no_more_than_its_size(table_4_1, kind):
+    """As large as the threshold's slope times the change of ln |X|, which exceeds that of |X|."""
+    noticed = 0
+    for extinction in np.geomspace(1e-6, 1e-3, 12).tolist():
+        parameters = random_parameters(
+            table_4_1, POINTS, 3, fft_size=2**13, bins_counted="all",
+            **{"beamlets": 7} | KINDS[kind],
+        )  # fmt: skip
+        parameters |= {"atmosphere.profile": "exponential", "atmosphere.extinction": extinction}
+        made = plan_points(planner_inputs(parameters), {}, 1.0)
+        most = made.omission_error[made.effect_names.index("extinction")]
+        on, off = (find_spectra(parameters, {"doppler"} | also) for also in ({"extinction"}, set()))
+        assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
+        noticed += (most < 1).sum()
+    assert noticed > 10
+
+
+@pytest.mark.parametrize("kind", range(len(KINDS)))
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-2, 0.3])
 def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
     kept = dropped = 0
