@@ -13,8 +13,9 @@ from benchmark_helpers import DOCS, EXPERIMENTS, markdown_table
 
 from sweep.analysis import accuracy_results, canvas
 from sweep.spec import load
+from sweep.storage.accuracy_setting_kinds import AS_WRITTEN_KIND
 from sweep.tasks.accuracy.measurement import measure_accuracy
-from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting
+from sweep.tasks.accuracy.settings import AccuracySetting
 
 
 class MeasuredStudy(NamedTuple):

@@ -24,7 +24,8 @@ from sweep.model.effects.speckle import coherent_echo_fraction
 from sweep.model.evaluation import evaluate_segments, prepare_shots
 from sweep.model.outputs import PD_OUTPUTS
 from sweep.spec import GridSpec, load
-from sweep.tasks.accuracy.settings import ADAPTIVE_KIND, AccuracySetting
+from sweep.storage.accuracy_setting_kinds import ADAPTIVE_KIND
+from sweep.tasks.accuracy.settings import AccuracySetting
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 

@@ -18,6 +18,13 @@ from rich.progress import Progress
 
 from sweep.model.error_budget import ErrorBudget
 from sweep.spec import GridSpec, SceneSpec, SpecError, load
+from sweep.storage.accuracy_setting_kinds import (
+    ADAPTIVE_KIND,
+    ALL_EFFECTS_KIND,
+    AS_WRITTEN_KIND,
+    FIXED_EFFECTS_KIND,
+    REFERENCE_KIND,
+)
 from sweep.tasks.accuracy.measurement import (
     N_ERRORS_BOUNDED_BY_TOLERANCE,
     add_settings_with_fixed_effects,
@@ -25,11 +32,6 @@ from sweep.tasks.accuracy.measurement import (
     tolerance_of_setting,
 )
 from sweep.tasks.accuracy.settings import (
-    ADAPTIVE_KIND,
-    ALL_EFFECTS_KIND,
-    AS_WRITTEN_KIND,
-    FIXED_EFFECTS_KIND,
-    REFERENCE_KIND,
     REFERENCE_RAYS_PER_SHOT,
     REFERENCE_RAYS_TOLERANCE,
     TRIED_TOLERANCES,

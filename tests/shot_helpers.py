@@ -17,8 +17,6 @@ from sweep.model.spectrum.lines import (
     beamlet_arrays,
     beat_parameters_at,
     compute_lines,
-    point_parameters,
-    segment_parameters,
 )
 from sweep.model.spectrum.segment_spectra import iter_spans
 
@@ -95,8 +93,8 @@ def segment_lines(shots, i, segment):
     """Origin of a segment's lines, places beside it [bins], weights C_b."""
     n, row = shots.footprint.n_beamlets, int(shots.footprint.row_of_point[i])
     layout = SpectrumLayout(shots.fft_size, shots.window.length, 0, 0, False, False, 0)
-    table, lines = shots.point_parameter_table(), LineArrays(*np.empty((3, n)))
-    beat = beat_parameters_at(point_parameters(table), segment_parameters(table), segment, i)
+    lines = LineArrays(*np.empty((3, n)))
+    beat = beat_parameters_at(shots.point_parameters(), shots.segment_parameters(), segment, i)
     origin = compute_lines(
         beat, segment, beamlet_arrays(shots.beamlet_table), row, layout, lines, *np.empty((2, n))
     )

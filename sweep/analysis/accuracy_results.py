@@ -22,6 +22,21 @@ from sweep.analysis import canvas, labels
 from sweep.analysis.datasets import read_attributes_of_kind
 from sweep.analysis.tables import PageTable, TablePage
 from sweep.model.error_budget import THESIS_BEAMLET_COUNT
+from sweep.storage.accuracy_setting_kinds import (
+    ADAPTIVE_KIND,
+    ALL_EFFECTS_KIND,
+    AS_WRITTEN_KIND,
+    BEAMLETS_KIND,
+    CLOSED_FORM_KIND,
+    COUNTED_DRAWS_KIND,
+    DRAWS_IN_NOISE_KIND,
+    FIXED_EFFECTS_KIND,
+    IMPROVED_THESIS_KIND,
+    LINE_PATTERN_KIND,
+    MEAN_OF_DRAWS_KIND,
+    REFERENCE_KIND,
+    THESIS_KIND,
+)
 from sweep.storage.locations import Location, derived_files_dir
 from sweep.storage.store_format import ACCURACY_STORE_KIND, OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
@@ -35,39 +50,12 @@ NEGLIGIBLE_ERROR = 1e-9
 The reference, to which they are compared, has errors of this size itself.
 """
 
-AS_WRITTEN_KIND, ADAPTIVE_KIND, THESIS_KIND, REFERENCE_KIND = (
-    "as written",
-    "adaptive",
-    "thesis",
-    "reference",
-)
-"""Kinds of accuracy settings: the spec as written, adaptive, the thesis's method, the reference.
-
-Adaptive settings simulate an effect only where a tolerance requires it. The reference is the most
-accurate setting.
-"""
-CLOSED_FORM_KIND, IMPROVED_THESIS_KIND = "closed form", "thesis improved"
-"""Kinds of accuracy settings: closed forms with the thesis's effects, and its improved method."""
-BEAMLETS_KIND, LINE_PATTERN_KIND = "beamlets", "in a line"
-"""Kinds of accuracy settings with a fixed number of beamlets, in a lattice or in a line.
-
-Beamlets are the rays that sample the cross-section of a beam.
-"""
-MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
-    "means of draws",
-    "draws counted",
-    "draws in noise",
-)
-"""Kinds of settings with a fixed number of draws.
-
-They average pd over draws, count detections, or count detections with noise in every bin.
-"""
 FIXED_KINDS = (
-    "fixed effects",
+    FIXED_EFFECTS_KIND,
     BEAMLETS_KIND,
     LINE_PATTERN_KIND,
     CLOSED_FORM_KIND,
-    "all on",
+    ALL_EFFECTS_KIND,
     MEAN_OF_DRAWS_KIND,
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
@@ -103,7 +91,7 @@ class MeasuredSetting:
     name: str
     """Name of the setting."""
     kind: str
-    """Kind of the setting, one of the constants of this module that end in `_KIND`."""
+    """Kind of the setting (:mod:`sweep.storage.accuracy_setting_kinds`)."""
     tolerance: float
     """Tolerance of an adaptive setting."""
     seconds_by_round: np.ndarray
@@ -601,10 +589,10 @@ A line connects their marks.
 
 MARK_BY_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
-    "fixed effects": ("s", canvas.LINE_COLOURS[2], "the same effects everywhere"),
+    FIXED_EFFECTS_KIND: ("s", canvas.LINE_COLOURS[2], "the same effects everywhere"),
     BEAMLETS_KIND: ("^", canvas.LINE_COLOURS[1], "number of beamlets in a lattice"),
     LINE_PATTERN_KIND: ("<", canvas.LINE_COLOURS[7], "number of beamlets in a line"),
-    "all on": ("D", canvas.LINE_COLOURS[3], "all effects on"),
+    ALL_EFFECTS_KIND: ("D", canvas.LINE_COLOURS[3], "all effects on"),
     MEAN_OF_DRAWS_KIND: ("P", canvas.LINE_COLOURS[5], "mean over so many draws"),
     COUNTED_DRAWS_KIND: ("^", canvas.LINE_COLOURS[1], "detections in so many draws"),
     DRAWS_IN_NOISE_KIND: ("<", canvas.LINE_COLOURS[7], "the same, noise in every bin"),

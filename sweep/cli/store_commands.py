@@ -68,10 +68,12 @@ def status(store: Location) -> None:
         rate_text = (
             f"{float(f'{store_status.points_per_second:.3g}'):,.12g} {store_status.points_noun}/s"
         )
-        click.echo(
-            f"{rate_text} in the last run, by "
-            f"{number_with_noun(store_status.workers_in_last_run, 'worker')}"
+        workers_text = (
+            number_with_noun(store_status.threads_in_last_run, "thread")
+            if store_status.threads_in_last_run
+            else number_with_noun(store_status.workers_in_last_run, "worker")
         )
+        click.echo(f"{rate_text} in the last run, by {workers_text}")
     if store_status.is_lock_holder_alive and store_status.lock_holder:
         echo_wrapped(
             f"running: process {escape_to_one_line(store_status.lock_holder.pid)} on "

@@ -359,7 +359,7 @@ def apparent_line_and_pedestal(
         (phase_variance[:, None] < _DECAY_EXPONENT_MAX) & (looks == 1), mean_exponent, 0.0
     )
     single_factor, double_factor = np.exp(mean_exponent), w * np.exp(2 * mean_exponent)
-    sums = (w * single_factor).sum(axis=1), double_factor.sum(axis=1)
+    single_sum, double_sum = (w * single_factor).sum(axis=1), double_factor.sum(axis=1)
     nodes, weight = _gauss_legendre(128)
     lag_at_nodes = 0.5 * (nodes + 1) * lag[:, None]
     # One transform at a time, so that bits do not depend on the number of rows.
@@ -375,8 +375,8 @@ def apparent_line_and_pedestal(
     decorrelated = -np.expm1(-gamma[:, None] * (lag[:, None] - lag_at_nodes)) * correlation * weight
     decorrelated_sum = decorrelated.sum(axis=1) * lag * w.size
     squared_window_sum = window.sum**2
-    pedestal = 0.5 * (1 + sums[1] ** 2 - decorrelated_sum) - sums[0] ** 2
-    line_fraction = np.maximum(coherent_fraction * sums[0] ** 2, _LINE_POWER_FRACTION_MIN)
+    pedestal = 0.5 * (1 + double_sum**2 - decorrelated_sum) - single_sum**2
+    line_fraction = np.maximum(coherent_fraction * single_sum**2, _LINE_POWER_FRACTION_MIN)
     return line_fraction, np.maximum(
         0.5 * power + coherent_fraction * pedestal * squared_window_sum, 0.0
     )

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -54,6 +54,7 @@ from sweep.model.window import Window
 
 if TYPE_CHECKING:
     from sweep.model.detection.echo_detection import BinThresholds, DetectionRule, SpeckleTable
+    from sweep.model.spectrum.lines import PointParameters, SegmentParameters
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
@@ -78,6 +79,18 @@ text parameters as well."""
 LINE_APPROXIMATIONS_MAX = 2
 """Largest number of approximations in one sum of lines. The tolerated error of a bin's magnitude is
 divided equally among them."""
+
+
+class _PedestalShapes(NamedTuple):
+    """Shapes of the pedestals that laser phase noise leaves around the lines of n points."""
+
+    reach_bins: np.ndarray
+    """(n,): distance from the lines up to which the pedestal counts as echo [FFT bins]."""
+    line_width_bins: np.ndarray
+    """(n,): line width of the laser [FFT bins]."""
+    delay: np.ndarray
+    """(n,): delay of the echo, at most the duration of the record [N/fs, FFT size over sample
+    rate]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -325,43 +338,42 @@ class Shots:
         side_noise_sigma = self._noise_sigma_of(
             self.noise_variance + self.laser_line.pedestal_variance_beside
         )
-        sigmas_and_threshold = (
-            self.line_noise_sigma,
-            self.threshold,
-            self.bin_noise_sigma,
-            side_noise_sigma,
+        shapes = self._pedestal_shapes
+        values = BinThresholds(
+            line_noise=self.line_noise_sigma,
+            threshold=self.threshold,
+            noise_without_pedestal=self.bin_noise_sigma,
+            side_noise=side_noise_sigma,
+            pedestal_reach_bins=shapes.reach_bins,
+            pedestal_line_width_bins=shapes.line_width_bins,
+            pedestal_delay=shapes.delay,
         )
-        rows = (*sigmas_and_threshold, *self._pedestal_shape_rows)
-        return BinThresholds(*broadcast_rows(rows, (self.size,)))
+        return BinThresholds(*broadcast_rows(values, (self.size,)))
 
     @property
-    def _pedestal_shape_rows(self) -> np.ndarray:
-        """Reach [bins], line width [bins] and delay [N/fs] of the phase-noise pedestal, (3, n).
-
-        The pedestal is the laser's phase noise around a line. The reach is the distance from the
-        lines up to which it counts as echo. It is 0 where it adds no bins that detect the echo.
-        """
-        shape_rows = np.zeros((3, self.size))
+    def _pedestal_shapes(self) -> _PedestalShapes:
+        """Shapes of phase-noise pedestals; the reach is 0 where they add no bins to an echo."""
         if (
             self.detection_settings.echo_bins == "peak_bin"
             or self.looks.is_noncoherent
             or not np.any(self.laser_line.lorentzian_width)
         ):
-            return shape_rows
+            return _PedestalShapes(*np.zeros((3, self.size)))
         from sweep.model.detection.echo_detection import pedestal_reach_bins
 
         line_width_bins = self.laser_line.lorentzian_width * self.fft_size / self.sample_rate
         delay = np.minimum(2 * self.range / SPEED_OF_LIGHT, self.record.duration)
         delay = delay * self.sample_rate / self.fft_size
         power_ratio = self.laser_line.pedestal_variance_beside / self.noise_variance
-        power_ratio, *shape_rows[1:] = (
-            np.broadcast_to(v, self.size) for v in (power_ratio, line_width_bins, delay)
+        power_ratio, line_width_bins, delay = broadcast_rows(
+            (power_ratio, line_width_bins, delay), (self.size,)
         )
-        reach_bins = pedestal_reach_bins(
-            np.ascontiguousarray(power_ratio), shape_rows[1], shape_rows[2], self.fft_size // 2
+        reach_bins = pedestal_reach_bins(power_ratio, line_width_bins, delay, self.fft_size // 2)
+        return _PedestalShapes(
+            np.where(reach_bins > self.detection_rule.lobe_half_width, reach_bins, 0.0),
+            line_width_bins,
+            delay,
         )
-        shape_rows[0] = np.where(reach_bins > self.detection_rule.lobe_half_width, reach_bins, 0.0)
-        return shape_rows
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
         """Return the signal-to-noise ratio of a bin, mean signal power over mean noise power.
@@ -571,48 +583,56 @@ class Shots:
         """True if the target's motion between segments is simulated."""
         return any(np.any(start) for start in self.motion.segment_starts)
 
-    def point_parameter_table(self) -> np.ndarray:
-        """Return the table of point parameters for the compiled kernels.
+    def point_parameters(self) -> "PointParameters":
+        """Return the parameters of points that all segments share, for the compiled kernels."""
+        from sweep.model.spectrum.lines import PointParameters
 
-        Returns
-        -------
-        ndarray (rows, n)
-            First the fields of :class:`sweep.model.spectrum.lines.PointParameters`, then for each
-            segment those of :class:`sweep.model.spectrum.lines.SegmentParameters`.
-        """
-        shared_columns = (
-            self.range,
-            self.motion.doppler_ratio,
-            self.waveform.chirp_rate,
-            self.echo_scales.beat_amplitude,
-            self.receiver_filter.detector_bandwidth,
-            self.receiver_filter.amplifier_bandwidth,
-            self.sample_rate,
-            self.record.acquisition_delay,
-            self.waveform.carriers[0],
-            self.waveform.carriers[2],
-            self.bin_noise_sigma,
-            self.threshold,
-            self.negligible_signal_ratio,
-            self.line_noise_sigma,
-            self.tolerances.leakage_probability,
-            self.tolerances.line_error,
-            self.images.iq_gain,
-            *self.bin_thresholds[3:],
+        up_carrier, _, down_carrier = self.waveform.carriers
+        bin_thresholds = self.bin_thresholds
+        values = PointParameters(
+            range=self.range,
+            doppler_ratio=np.asarray(self.motion.doppler_ratio),
+            chirp_rate=self.waveform.chirp_rate,
+            beat_amplitude_scale=self.echo_scales.beat_amplitude,
+            detector_bandwidth=self.receiver_filter.detector_bandwidth,
+            amplifier_bandwidth=self.receiver_filter.amplifier_bandwidth,
+            sample_rate=self.sample_rate,
+            record_start=self.record.acquisition_delay,
+            up_carrier=up_carrier,
+            down_carrier=down_carrier,
+            noise_sigma=self.bin_noise_sigma,
+            threshold=self.threshold,
+            negligible_signal_ratio=self.negligible_signal_ratio,
+            line_noise=self.line_noise_sigma,
+            leakage_tolerance=self.tolerances.leakage_probability,
+            line_error_tolerance=self.tolerances.line_error,
+            image_gain=np.asarray(self.images.iq_gain),
+            side_noise=bin_thresholds.side_noise,
+            pedestal_reach_bins=bin_thresholds.pedestal_reach_bins,
+            pedestal_line_width_bins=bin_thresholds.pedestal_line_width_bins,
+            pedestal_delay=bin_thresholds.pedestal_delay,
         )
-        segment_columns = (
-            x
-            for segment, gain in zip(self.waveform_segments, self.whitening_gain, strict=True)
-            for x in (
-                segment.chirp_rate,
-                segment.carrier,
-                gain,
-                segment.range_decrease,
-                segment.doppler_ratio,
-                segment.start_time,
+        return PointParameters(*broadcast_rows(values, (self.size,)))
+
+    def segment_parameters(self) -> "SegmentParameters":
+        """Return the parameters of points that differ by segment, for the compiled kernels."""
+        from sweep.model.spectrum.lines import SegmentParameters
+
+        rows_by_segment = [
+            broadcast_rows(
+                SegmentParameters(
+                    chirp_rate=segment.chirp_rate,
+                    carrier=segment.carrier,
+                    whitening_gain=gain,
+                    range_decrease=np.asarray(segment.range_decrease),
+                    doppler_ratio=np.asarray(segment.doppler_ratio),
+                    start_time=np.asarray(segment.start_time),
+                ),
+                (self.size,),
             )
-        )
-        return broadcast_rows((*shared_columns, *segment_columns), (self.size,))
+            for segment, gain in zip(self.waveform_segments, self.whitening_gain, strict=True)
+        ]
+        return SegmentParameters(*np.stack(rows_by_segment, axis=1))
 
     @property
     def real_fft_size(self) -> int:

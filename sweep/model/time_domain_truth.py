@@ -132,9 +132,13 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
                     float(shots.sample_rate[point]) / 2
                 )
     if shots.looks.is_noncoherent:
-        peak = np.rint(segment_results[:, frequency_row] / (shots.sample_rate / shots.fft_size))
+        peak_bins = np.rint(
+            segment_results[:, frequency_row] / (shots.sample_rate / shots.fft_size)
+        )
         segment_results[:, pd_row], segment_results[:, miss_row] = pd_and_miss_in_looks(
-            shots, segment_results[:, magnitude_row], peak
+            shots,
+            segment_results[:, magnitude_row],
+            np.where(np.isnan(peak_bins), -1, peak_bins).astype(np.int64),  # no segment: no bin
         )
     return segment_results
 

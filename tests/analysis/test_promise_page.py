@@ -8,7 +8,8 @@ import tolerance_of_draws
 
 from sweep.model.outputs import PD_OUTPUTS
 from sweep.spec import load
-from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting
+from sweep.storage.accuracy_setting_kinds import AS_WRITTEN_KIND
+from sweep.tasks.accuracy.settings import AccuracySetting
 from sweep.tasks.studies.grid_study import GridStudy
 
 ROOT = Path(__file__).parents[2]

@@ -16,7 +16,7 @@ from small_scenes import (
 from sweep.model.detection.looks import Looks
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.ray_casting import RayCaster
-from sweep.model.pointcloud.bin_groups import _list_groups
+from sweep.model.pointcloud.bin_groups import GroupBounds, _list_groups
 from sweep.model.pointcloud.eyepoints import HIT_RANGE_MIN, prepare_eyepoint_shots
 from sweep.model.preparation import require_finite
 from sweep.model.spectrum.search_restriction import SearchBand, _mark_searched_echoes
@@ -32,10 +32,10 @@ def test_lists_of_groups_end_wherever_a_magnitude_is_not_finite(value, level):
     for place in range(6):
         magnitude = np.array([1.0, 3.0, 4.0, 1.0, 5.0, 1.0])
         magnitude[place] = value
-        bins = np.full((3, 4), -1)
+        bounds = GroupBounds(*np.full((3, 4), -1))
         peak = int(np.nanargmax(magnitude))
         exempt = np.zeros(6, np.bool_)
-        assert _list_groups(magnitude, exempt, peak, level, bins) <= 4
+        assert _list_groups(magnitude, exempt, peak, level, bounds) <= 4
         _mark_searched_echoes(magnitude, exempt, 0, level, 0, SearchBand(0, 6, 0), np.array([2.0]))
 
 

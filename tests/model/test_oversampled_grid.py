@@ -44,7 +44,13 @@ def spectrum(shots, i, segment, *, degree=0, real=False, folded=False):
     (cells,) = oversampled_grid.cells_per_point(shots)[[i]].tolist()
     options = oversampled_grid.GridOptions(degree, real, folded)
     low, magnitude = oversampled_grid.grid_magnitudes(
-        shots, shots.point_parameter_table(), np.array([i]), segment, cells, options
+        shots,
+        shots.point_parameters(),
+        shots.segment_parameters(),
+        np.array([i]),
+        segment,
+        cells,
+        options,
     )
     bins = low[0] + np.arange(magnitude.shape[1])
     within = (bins >= 0) & (bins <= shots.fft_size // 2)

@@ -22,6 +22,7 @@ from sweep.model.detection.pseudo_variance import multilook_pd_and_miss_near_end
 from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
 from sweep.model.evaluation import evaluate_segments, shot_statistics
 from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.time_domain_truth import evaluate_segments_in_time_domain
 
 DRAWS = 20_000
 BIN_WIDTH = (
@@ -157,6 +158,23 @@ def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, ta
         detected = (magnitude >= level).sum(axis=1) >= 2
     drawn, expected = detected.mean(), float(shot_statistics(shots)["pd_doppler"][0])
     assert abs(drawn - expected) < 4 * np.sqrt(expected * (1 - expected) / draws)
+
+
+@pytest.mark.parametrize("waveform", ["three segments", "two segments"])
+@pytest.mark.parametrize("speckle", ["common", "independent"])
+def test_looks_near_dc_are_detected_alike_in_the_time_domain(speckle, waveform, table_4_1):
+    p = PARAMETER_DEFAULTS | table_4_1() | HOVER | {
+        "instrument.processing.tnr": 4.0, "instrument.looks.number": 4,
+        "instrument.looks.speckle": speckle,
+    }  # fmt: skip
+    if waveform == "two segments":
+        p |= {"instrument.chirp.segments": "up down"}
+    shots = prepare_single_category(
+        with_signal_over_threshold(at_doppler(p, 0.3 * BIN_WIDTH), 1.3),
+        tuple(name for name in COMPARED_EFFECTS if name != "range_walk"),
+    )
+    in_time = evaluate_segments_in_time_domain(shots, with_range_walk=False)
+    np.testing.assert_allclose(in_time[:, :4], evaluate_segments(shots)[:, :4], rtol=1e-4)
 
 
 @pytest.mark.parametrize("share", [-1.0, -0.4, 0.0, 1e-6, 0.3, 0.9, 0.9999, 1.0])

@@ -10,6 +10,14 @@ from small_flights import SCENE_MAPPING, small_scene_spec
 from small_studies import STUDY_MAPPING, small_spec
 
 from sweep.model.effects.catalogue import EFFECT_NAMES
+from sweep.storage.accuracy_setting_kinds import (
+    ADAPTIVE_KIND,
+    AS_WRITTEN_KIND,
+    BEAMLETS_KIND,
+    FIXED_EFFECTS_KIND,
+    LINE_PATTERN_KIND,
+    REFERENCE_KIND,
+)
 from sweep.tasks.accuracy import measurement, settings
 from sweep.tasks.accuracy import study_sample as benches
 from sweep.tasks.accuracy.measurement import measure_accuracy as measured
@@ -69,7 +77,7 @@ def test_a_longer_sample_begins_with_the_shorter():
 def test_overrides_are_put_onto_the_spec_and_leave_it_alone():
     spec = small_spec()
     rung = settings.AccuracySetting(
-        name="x", kind=settings.ADAPTIVE_KIND, overrides={"accuracy.tolerance": 0.25}
+        name="x", kind=ADAPTIVE_KIND, overrides={"accuracy.tolerance": 0.25}
     )
     other = rung.apply_to(spec)
     assert other.accuracy.tolerance == 0.25 and spec.accuracy.tolerance == 1e-3
@@ -79,15 +87,11 @@ def test_overrides_are_put_onto_the_spec_and_leave_it_alone():
 def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
     ladder = settings.build_setting_ladder(small_spec())
     kinds = [rung.kind for rung in ladder.settings]
-    assert kinds[0] == settings.AS_WRITTEN_KIND and kinds[-1] == settings.REFERENCE_KIND
-    adaptive = [rung for rung in ladder.settings if rung.kind == settings.ADAPTIVE_KIND]
+    assert kinds[0] == AS_WRITTEN_KIND and kinds[-1] == REFERENCE_KIND
+    adaptive = [rung for rung in ladder.settings if rung.kind == ADAPTIVE_KIND]
     tolerances = [rung.overrides["accuracy.tolerance"] for rung in adaptive]
     assert tolerances == [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
-    fixed = [
-        rung
-        for rung in ladder.settings
-        if rung.kind in (settings.BEAMLETS_KIND, settings.LINE_PATTERN_KIND)
-    ]
+    fixed = [rung for rung in ladder.settings if rung.kind in (BEAMLETS_KIND, LINE_PATTERN_KIND)]
     numbers = [rung.overrides["footprint.beamlets"] for rung in fixed]
     assert numbers == [*settings.TRIED_BEAMLET_COUNTS, *settings.TRIED_LINE_BEAMLET_COUNTS]
     assert all(r.overrides["footprint.beamlets"] == "auto" for r in adaptive)
@@ -123,7 +127,7 @@ def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
     ladder = settings.add_fixed_effect_settings(
         settings.build_setting_ladder(small_spec()), small_spec(), sets
     )
-    fixed = [rung for rung in ladder.settings if rung.kind == settings.FIXED_EFFECTS_KIND]
+    fixed = [rung for rung in ladder.settings if rung.kind == FIXED_EFFECTS_KIND]
     assert [rung.name for rung in fixed] == [
         f"{what}, to {tolerance:g}"
         for what in ("1 effects as at 0.1", "2 effects as at 1e-06")
@@ -132,7 +136,7 @@ def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
     assert [rung.overrides["accuracy.tolerance"] for rung in fixed] == [*sets, *sets]
     modes = fixed[0].apply_to(small_spec()).effect_modes()
     assert modes["doppler"] == "on" and set(modes.values()) == {"on", "off"}
-    assert ladder.settings[-1].kind == settings.REFERENCE_KIND
+    assert ladder.settings[-1].kind == REFERENCE_KIND
 
 
 def test_a_study_with_draws_has_rungs_of_draws_and_other_draws_for_reference():
@@ -201,7 +205,7 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     spec, _, _ = coherent
     bench = GridSample(spec, 72)
     rung = settings.AccuracySetting(
-        name="coarse", kind=settings.ADAPTIVE_KIND, overrides={"accuracy.tolerance": 0.1}
+        name="coarse", kind=ADAPTIVE_KIND, overrides={"accuracy.tolerance": 0.1}
     )
     seen = bench.try_setting(rung, np.arange(72), 3).results
     study = GridStudy(rung.apply_to(spec))
@@ -215,7 +219,7 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
 
 def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
     bench = GridSample(small_spec(footprint=COHERENT, storage={"block_points": 24}), 8)
-    rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
+    rung = settings.AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
     grid = bench.study_with_setting(rung).grid
     assert grid.block_shape == (2, 4, 3) and grid.dims == ("power", "range", "grazing_angle")
     for number in bench.point_indices:
@@ -230,7 +234,7 @@ def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
 
 def test_points_are_timed_as_many_together_as_a_block_has(monkeypatch):
     """A study of one point has the cost of a call for it alone."""
-    rung, together = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND), []
+    rung, together = settings.AccuracySetting(name="as written", kind=AS_WRITTEN_KIND), []
     ran = GridSample._run_setting
 
     def noted(self, rung, numbers):
@@ -331,7 +335,7 @@ def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch
     assert len(parts) > 4
     tiles = [{(place, tile) for tile in (own // 32).tolist()} for place, own in shots]
     assert sum(map(len, tiles)) == len(set().union(*tiles)) and max(map(len, tiles)) == 2
-    rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
+    rung = settings.AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
     for part in (parts[0], parts[-1]):
         alone, beside = (bench.try_setting(rung, part, times).results for times in (1, 10_000))
         assert len(alone.noise_sigma) == len(part)
@@ -356,7 +360,7 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
         footprint={"beamlets": rays, "speckle": "none"}, accuracy={"tolerance": 1e-6}
     )
     bench = FlightSample(spec, 10_000)
-    rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
+    rung = settings.AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
     part = bench.split_into_parts(1)[0]
     seen = bench.try_setting(rung, part, 1).results
     place, numbers = bench.flight_block_and_shots(bench.extend_to_complete_tiles(part, 1))

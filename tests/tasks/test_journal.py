@@ -102,12 +102,13 @@ def test_a_line_that_the_disk_takes_in_part_is_taken_back(tmp_path, monkeypatch)
 
 def test_runs_are_recorded_with_their_times(tmp_path):
     opened = Journal(tmp_path)
-    assert journal.last_run_start_time(tmp_path) == float("inf")
-    opened.record_run_event("begun", pid=5)
+    assert journal.read_last_run(tmp_path) == journal.LastRun(start_time=float("inf"), n_threads=0)
+    opened.record_run_event("begun", pid=5, threads=3)
     opened.record_run_event("ended", blocks=3)
     begun, ended = iter_records(tmp_path / JOURNAL_DIR / journal.SESSION_LOG_FILE)
     assert begun["event"] == "begun" and begun["pid"] == 5 and ended["blocks"] == 3
-    assert journal.last_run_start_time(tmp_path) == begun["time"] > 0
+    last_run = journal.read_last_run(tmp_path)
+    assert last_run.start_time == begun["time"] > 0 and last_run.n_threads == 3
 
 
 @pytest.mark.parametrize(("n_blocks", "points"), [(2, [5, 0]), (3, [5, 0, 7]), (4, [5, 0, 7, 0])])

@@ -68,6 +68,26 @@ def test_what_is_over_soon_is_not_told_of():
     assert told.lines == []
 
 
+@pytest.mark.parametrize("number, words", [(1, "1 thread, 5.0 kB"), (4, "4 threads, 5.0 kB")])
+def test_threads_of_the_command_are_counted_as_threads(capsys, number, words):
+    lines = progress.ProgressLines()
+    lines.update_threads(threads=number, stored=5_000)
+    lines.end()
+    assert words in capsys.readouterr().err
+
+
+def test_a_listener_that_knows_workers_alone_is_told_of_threads():
+    class WorkerCounts(progress.Progress):
+        counts = ()
+
+        def update_workers(self, *, workers, stored):
+            self.counts = (*self.counts, (workers, stored))
+
+    listener = WorkerCounts()
+    progress.make_progress(listener).update_threads(threads=3, stored=7)
+    assert listener.counts == ((3, 7),)
+
+
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
     monkeypatch.setenv("COLUMNS", str(width))

@@ -1,11 +1,13 @@
 """Blocks that threads of the command's own process compute."""
 
 import os
+import re
 import signal
 import threading
 import time
 
 import pytest
+from click.testing import CliRunner
 from small_flights import small_scene_spec
 from small_studies import (
     RecordingProgress,
@@ -15,9 +17,12 @@ from small_studies import (
     small_spec,
 )
 
+from sweep.cli import main
 from sweep.storage.store_format import read_attributes
 from sweep.tasks.driver import resume, run
-from sweep.tasks.engine import interrupts, worker_memory
+from sweep.tasks.engine import interrupts, study_store, worker_memory
+from sweep.tasks.engine.progress import Progress
+from sweep.tasks.studies.store_summary import status
 
 N_BLOCKS = 12
 
@@ -34,6 +39,34 @@ def test_threads_compute_blocks_at_the_same_time(undisturbed, tmp_path):
     assert outcome.complete and not outcome.failures
     assert sorted(receipt_blocks(outcome.store)) == list(range(N_BLOCKS))
     assert file_digests(outcome.store) == file_digests(undisturbed)
+
+
+class ThreadCounts(Progress):
+    """Progress that keeps the numbers of threads it is told of."""
+
+    def __init__(self):
+        self.counts = set()
+
+    def update_threads(self, *, threads, stored):
+        self.counts.add(threads)
+
+
+@pytest.mark.parametrize("options, number", [({"threads": 3}, 3), ({"scheduler": "none"}, 1)])
+def test_progress_and_status_count_threads(tmp_path, options, number):
+    counter = ThreadCounts()
+    outcome = run(small_spec(), store=tmp_path / "s.zarr", progress=counter, **options)
+    assert counter.counts == {number}
+    assert status(outcome.store).threads_in_last_run == number
+    shown = CliRunner().invoke(main, ["status", str(outcome.store)]).output
+    assert re.search(rf"in the last run, by {number} thread{'s' * (number > 1)}\n", shown)
+
+
+def test_lost_results_leave_the_number_of_threads(tmp_path, monkeypatch):
+    """Also where a receipt's block is not seen in the store, and fails in its place."""
+    monkeypatch.setattr(study_store, "is_block_visible", lambda *_: False)
+    counter = ThreadCounts()
+    run(small_spec(), store=tmp_path / "s.zarr", progress=counter, threads=2)
+    assert counter.counts == {2}
 
 
 def test_a_flight_by_threads_has_the_bytes_of_a_plain_loop(flight, tmp_path):

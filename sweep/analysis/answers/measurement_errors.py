@@ -198,10 +198,8 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
             )
             pd, snr = (np.array([c[rows] for c in columns[k : k + 3]]) for k in (1, 4))
             for batch_rows, shots in prepare_shots(fixed_parameters | varying_values, effects):
-                estimate_variances = mean_wander_variance(
-                    shots, pd[:, batch_rows], snr[:, batch_rows]
-                )
-                variance[rows[batch_rows]] = estimate_variances[0 if quantity == "range" else 1]
+                estimate_errors = mean_wander_variance(shots, pd[:, batch_rows], snr[:, batch_rows])
+                variance[rows[batch_rows]] = getattr(estimate_errors, quantity)
         return np.sqrt(variance).reshape(shape)
 
     return xr.apply_ufunc(

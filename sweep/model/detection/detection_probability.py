@@ -413,7 +413,7 @@ def _joint_pd_in_looks(
     signal_up, signal_down = (magnitude / shots.line_noise_sigma for magnitude in magnitudes)
     look_speckle = shots.speckle.look_speckle
     if look_speckle is not None:
-        correlation = look_speckle.segment_correlation[1]
+        _, correlation, _ = look_speckle.segment_correlation  # of up and down
     pd_both = shots.looks.joint_pd_in_speckle(
         signal_up, signal_down, threshold_ratio, correlation, look_speckle
     )

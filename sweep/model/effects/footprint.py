@@ -178,7 +178,7 @@ def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
     line_distance_bins = (
         points.footprint_extent.off_axis_range_offset_max * points.bins_per_relative_range
     )
-    power_min = points.peak_power_bounds_for_spread(axis_surface_spread(points))[0]
+    power_min = points.peak_power_bounds_for_spread(axis_surface_spread(points)).power_min
     gain_ratio_max = np.minimum(
         np.exp(np.minimum(points.gain_slope_max * line_distance_bins, 50.0)),
         1 / points.transfer_gain**2,

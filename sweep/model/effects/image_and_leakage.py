@@ -79,7 +79,7 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
             leaking_bin_change_sigma=leaking_bin_change,
         )
     power_min = points.power_min_with_missing_samples(
-        points.peak_power_bounds[0]
+        points.peak_power_bounds.power_min
         / (1 + 2 * points.phase_error_shift_bins / points.padding_factor)
     )
     response_outside = points.magnitude_max_beyond(bins_to_image)

@@ -97,7 +97,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     spread_loss = np.minimum((2 * np.pi * line_deviation) ** 2 * moments.position_variance, 1.0)
     smear_factor = 1 + 2 * points.phase_error_shift_bins / points.padding_factor
     power_min = points.power_min_with_missing_samples(
-        points.peak_power_bounds[0] / np.where(points.is_near_image, 2.0, 1.01) / smear_factor
+        points.peak_power_bounds.power_min
+        / np.where(points.is_near_image, 2.0, 1.01)
+        / smear_factor
     )
     magnitude_change = magnitude_change_from_power(
         moments.magnitude_sum**2 * spread_loss / power_min

@@ -68,7 +68,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         else 0.0
     )
     power_min = (
-        points.peak_power_bounds[0]
+        points.peak_power_bounds.power_min
         / np.where(points.is_near_image, 2.0, 1.01)
         / (1 + points.total_phase_error_bound.extra_shift_window_bins)
     )

@@ -289,9 +289,8 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
         + turned_by_others
     )
     b = np.minimum(even_phase, moments.magnitude_sum) + turned_by_others
-    peak_power_min, _ = points.peak_power_bounds
     power_min = (
-        peak_power_min
+        points.peak_power_bounds.power_min
         / np.where(points.is_near_image, 2.0, 1.01)
         / (1 + other_bounds.extra_shift_window_bins)
     )

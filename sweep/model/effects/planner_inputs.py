@@ -10,7 +10,7 @@ segments. All points share text parameters, and the parameters that
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,6 +49,15 @@ _NEAR_IMAGE_WINDOW_BINS = 8.0
 """Distance of a line from its image beyond which they cannot add up or cancel. The unit is the
 sample rate over the number of samples. The power of the image's sidelobes is below 0.4 % there, and
 its derivatives are below 5 %."""
+
+
+class PeakPowerBounds(NamedTuple):
+    """Bounds on the largest bin's power, over the power that all lines would have on one bin."""
+
+    power_min: np.ndarray
+    """(n,): lower bound."""
+    power_max: np.ndarray
+    """(n,): upper bound."""
 
 
 class PlannerInputs(LinkBudget):
@@ -459,14 +468,11 @@ class PlannerInputs(LinkBudget):
         return self.is_near_image | (self.n_beamlets > 1)
 
     @cached_property
-    def peak_power_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bound of the largest bin's power.
-
-        Both are relative to the power that all lines together would have on one bin.
-        """
+    def peak_power_bounds(self) -> PeakPowerBounds:
+        """Lower and upper bound of the largest bin's power."""
         return self.peak_power_bounds_for_spread(self.line_spread)
 
-    def peak_power_bounds_for_spread(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
+    def peak_power_bounds_for_spread(self, moments: OffsetMoments) -> PeakPowerBounds:
         """Return bounds on the largest bin's power for lines of a given spread.
 
         Parameters
@@ -476,7 +482,7 @@ class PlannerInputs(LinkBudget):
 
         Returns
         -------
-        power_min, power_max : ndarray
+        PeakPowerBounds
             Bounds over the power of all lines on a bin, with images included.
 
         Notes
@@ -492,7 +498,7 @@ class PlannerInputs(LinkBudget):
         )
         axis_power = response.scalloping_gain(self.bin_offset) ** 2
         if moments is NO_SPREAD or self.n_beamlets == 1:
-            return axis_power, axis_power * np.where(self.is_near_image, 2.0, 1.01)
+            return PeakPowerBounds(axis_power, axis_power * np.where(self.is_near_image, 2.0, 1.01))
         curvature_loss = 0.5 * response.curvature_max * rms * rms
         power_min = (
             axis_power
@@ -515,7 +521,7 @@ class PlannerInputs(LinkBudget):
         gain_rise = np.exp(np.minimum(gain_slope * extreme, 50.0))
         power_max = power_max * np.where(self.is_near_image, 2.0, 1.01)
         power_max = power_max * (1 + gain_rise * np.minimum(gain_slope * rms, 50.0))
-        return np.minimum(power_min, power_max), power_max
+        return PeakPowerBounds(np.minimum(power_min, power_max), power_max)
 
     def power_change_bound(
         self,
@@ -547,7 +553,7 @@ class PlannerInputs(LinkBudget):
         """
         response, power_min = (
             self.window_response,
-            self.peak_power_bounds_for_spread(present_moments)[0],
+            self.peak_power_bounds_for_spread(present_moments).power_min,
         )
         power_change = response.slope_max * (added_moments.mean + shift_bins)
         power_change = power_change + response.curvature_max * (

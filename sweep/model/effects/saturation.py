@@ -109,15 +109,15 @@ def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndar
     The mean loss above is f(a) - a Q(a), and likewise below.
     """
     a, b = (v - x) / s, (-v - x) / s
-    density = [np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi) for z in (a, b)]
+    density_above, density_below = (np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi) for z in (a, b))
     probability_above, probability_below = ndtr(-a), ndtr(b)
-    mean_loss = (density[0] - a * probability_above) - (density[1] + b * probability_below)
+    mean_loss = (density_above - a * probability_above) - (density_below + b * probability_below)
     mean_square = (
         a * a * probability_above
         + b * b * probability_below
         + (ndtr(a) - probability_below)
-        + b * density[1]
-        - a * density[0]
+        + b * density_below
+        - a * density_above
     )
     return s * np.maximum(mean_loss, 0.0), s * s * np.maximum(
         mean_square - mean_loss * mean_loss, 0.0

@@ -398,18 +398,19 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     for pair_index, (pair, phase) in enumerate(
         zip(SEGMENT_PAIRS, segment_phase_differences(shots), strict=True)
     ):
+        first, second = pair
         if not shots.has_segment[list(pair)].all() or (pair_index != 1 and not shots.any_two):
             continue
         squared_sum = zeros
         for lag in range(1 - n_looks, n_looks):
             turned_phase = PhaseDifference(
-                phase.doppler_cycles + lag * cycles_per_look[pair[1]], phase.delay_cycles
+                phase.doppler_cycles + lag * cycles_per_look[second], phase.delay_cycles
             )
             squared_correlation = np.abs(beam_spread.correlation(shots, pair, turned_phase)) ** 2
             squared_sum = squared_sum + (n_looks - abs(lag)) * squared_correlation
         segment_correlation[pair_index] = (
             np.sqrt(squared_sum)
-            / (squared_sum_by_segment[pair[0]] * squared_sum_by_segment[pair[1]]) ** 0.25
+            / (squared_sum_by_segment[first] * squared_sum_by_segment[second]) ** 0.25
         )
     from sweep.model.detection.look_speckle import LookSpeckle  # imports kernels
 

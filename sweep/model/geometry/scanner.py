@@ -279,8 +279,9 @@ def raster_scan(
     both_ways : bool
         True if every other row is scanned backwards; False if each row starts at the right.
     """
-    angles_across = half_angles[0] * np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)
-    angles_along = half_angles[1] * np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)
+    half_angle_across, half_angle_along = half_angles
+    angles_across = half_angle_across * np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)
+    angles_along = half_angle_along * np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)
     order = np.arange(rows * columns).reshape(rows, columns)
     if both_ways:
         order[1::2] = order[1::2, ::-1]

@@ -22,9 +22,6 @@ from sweep.model.detection.echo_detection import (
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
-STRONGEST_ROW, FIRST_ROW, LAST_ROW = range(3)
-"""Rows of the array of a group's bin numbers: strongest bin, first bin and last bin."""
-
 
 class BinGroups(NamedTuple):
     """Groups of adjacent bins at or above the threshold in noiseless spectra, by point and segment.
@@ -83,6 +80,17 @@ class BinGroups(NamedTuple):
         )
 
 
+class GroupBounds(NamedTuple):
+    """Strongest, first and last bins of the groups of one segment, as indices in its span."""
+
+    strongest: np.ndarray
+    """(groups,) int64: index of each group's strongest bin."""
+    first: np.ndarray
+    """(groups,) int64: index of the first (lowest) bin of each group."""
+    last: np.ndarray
+    """(groups,) int64: index of the last (highest) bin of each group."""
+
+
 def list_bin_groups(
     shots: Shots, *, groups_max: int = 4, every_bin: bool = False, with_leakage: bool = True
 ) -> BinGroups:
@@ -101,32 +109,27 @@ def list_bin_groups(
     with_leakage
         False to skip the probability of leakage, which is then 0.
     """
-    bin_rows, bin_groups = allocate_bin_groups(shots.size, groups_max)
+    bin_groups = allocate_bin_groups(shots.size, groups_max)
     for spans in iter_spans(shots, bin_by_bin=every_bin, leakage=with_leakage, with_pd=False):
-        find_groups_in_spans(shots, spans, bin_rows, bin_groups)
+        find_groups_in_spans(shots, spans, bin_groups)
     return bin_groups
 
 
-def allocate_bin_groups(n_points: int, groups_max: int) -> tuple[np.ndarray, BinGroups]:
-    """Return an array for the bin numbers of groups, and empty groups whose bins are views of it.
-
-    The array is (3, points, 3 segments, groups) int64. Its first axis has the rows STRONGEST_ROW,
-    FIRST_ROW and LAST_ROW.
-    """
-    bin_rows = np.full((3, n_points, 3, groups_max), -1, np.int64)
-    return bin_rows, BinGroups(
-        bin_rows[STRONGEST_ROW],
-        bin_rows[FIRST_ROW],
-        bin_rows[LAST_ROW],
-        np.full((n_points, 3, groups_max, 3), np.nan),
-        np.full((n_points, 3, groups_max), np.nan),
-        *np.full((2, n_points, 3), np.nan),
+def allocate_bin_groups(n_points: int, groups_max: int) -> BinGroups:
+    """Return arrays for at most ``groups_max`` groups of each segment, without any group."""
+    shape = n_points, 3, groups_max
+    return BinGroups(
+        strongest_bin=np.full(shape, -1, np.int64),
+        first_bin=np.full(shape, -1, np.int64),
+        last_bin=np.full(shape, -1, np.int64),
+        neighbour_magnitudes=np.full((*shape, 3), np.nan),
+        pd=np.full(shape, np.nan),
+        n_exempt=np.full((n_points, 3), np.nan),
+        leakage=np.full((n_points, 3), np.nan),
     )
 
 
-def find_groups_in_spans(
-    shots: Shots, spans: BinSpans, bin_rows: np.ndarray, bin_groups: BinGroups
-) -> None:
+def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -> None:
     """Find groups of adjacent bins above the threshold, and write them into preallocated arrays.
 
     The search covers spans: ranges of adjacent bins around the lines of each segment.
@@ -137,7 +140,7 @@ def find_groups_in_spans(
         Prepared shots.
     spans
         Spans of bins of some of the points.
-    bin_rows, bin_groups
+    bin_groups
         Arrays of :func:`allocate_bin_groups` for all points, in which the groups are written.
     """
     pd = bin_groups.pd
@@ -160,9 +163,7 @@ def find_groups_in_spans(
         nyquist_bin,
         shots.detection_rule,
         shots.speckle_table,
-        bin_rows,
-        bin_groups.neighbour_magnitudes,
-        pd,
+        bin_groups,
     )
     if shots.looks.is_noncoherent:
         strongest_bins, peak_magnitudes = (
@@ -217,11 +218,9 @@ def _fill_groups(
     nyquist_bin,
     rule,
     speckle_table,
-    bin_rows,
-    neighbour_magnitudes,
-    pd,
+    bin_groups,
 ):
-    """Find groups in every span, and write them into arrays with the shapes of :class:`BinGroups`.
+    """Find groups in every span, and write them into the arrays of a :class:`BinGroups`.
 
     A group is a run of adjacent bins at or above the threshold. A span holds the adjacent bins
     around the lines of a segment.
@@ -245,10 +244,8 @@ def _fill_groups(
         :attr:`sweep.model.preparation.Shots.detection_rule`.
     speckle_table
         :attr:`sweep.model.preparation.Shots.speckle_table`.
-    bin_rows
-        (3, n, 3, groups) int64, in rows STRONGEST_ROW, FIRST_ROW and LAST_ROW: output array.
-    neighbour_magnitudes, pd
-        Output arrays, as in :class:`BinGroups`.
+    bin_groups
+        Result: bins, magnitudes and pd of the groups of all n points in a :class:`BinGroups`.
     """
     for j in range(point_numbers.size):
         i = point_numbers[j]
@@ -261,20 +258,23 @@ def _fill_groups(
             end = begin + n_bins[segment, j]
             magnitude = magnitudes[begin:end]
             is_echo = is_exempt[begin : end if nyquist_bin == 0 else begin]
-            n_groups = _list_groups(
-                magnitude, is_echo, peak_index[segment, j], threshold, bin_rows[:, i, segment]
+            bounds = GroupBounds(
+                bin_groups.strongest_bin[i, segment],
+                bin_groups.first_bin[i, segment],
+                bin_groups.last_bin[i, segment],
             )
+            n_groups = _list_groups(magnitude, is_echo, peak_index[segment, j], threshold, bounds)
             for group in range(n_groups):
-                strongest_index = bin_rows[STRONGEST_ROW, i, segment, group]
+                strongest_index = bounds.strongest[group]
                 lobe_half_width = echo_half_width(rule, bin_threshold.pedestal.reach_bins)
                 first_index, last_index = echo_bounds(
                     magnitude,
-                    bin_rows[FIRST_ROW, i, segment, group],
-                    bin_rows[LAST_ROW, i, segment, group],
+                    bounds.first[group],
+                    bounds.last[group],
                     threshold,
                     lobe_half_width,
                 )
-                pd[i, segment, group] = pd_and_miss(
+                bin_groups.pd[i, segment, group] = pd_and_miss(
                     EchoBins(
                         magnitude[first_index : last_index + 1],
                         np.ones(last_index - first_index + 1, np.bool_),
@@ -286,11 +286,12 @@ def _fill_groups(
                     bin_speckle_at(speckle_table, segment, i),
                 ).pd
                 for side in range(3):
-                    neighbour_magnitudes[i, segment, group, side] = _mirrored_magnitude(
+                    bin_groups.neighbour_magnitudes[i, segment, group, side] = _mirrored_magnitude(
                         magnitude, first_bin[segment, j], strongest_index + side - 1, nyquist_bin
                     )
-                for field in range(3):
-                    bin_rows[field, i, segment, group] += first_bin[segment, j]
+                bounds.strongest[group] += first_bin[segment, j]  # from indices to bin numbers
+                bounds.first[group] += first_bin[segment, j]
+                bounds.last[group] += first_bin[segment, j]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -306,16 +307,17 @@ def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _list_groups(magnitude, is_echo, peak_index, threshold, bin_rows):
+def _list_groups(magnitude, is_echo, peak_index, threshold, bounds):
     """List the strongest groups of adjacent bins at or above the threshold; return their number.
 
-    The output array ``bin_rows`` (3, groups) holds indices in ``magnitude``. Groups whose strongest
-    bin is not ``is_echo`` are leaked signal, and omitted. If ``is_echo`` is empty, none is omitted.
+    The result is written into ``bounds``, a :class:`GroupBounds` of indices in ``magnitude``.
+    Groups whose strongest bin is not ``is_echo`` are leaked signal, and omitted. If ``is_echo`` is
+    empty, none is omitted.
     """
     if not magnitude[peak_index] >= threshold:
-        bin_rows[:, 0] = peak_index
+        bounds.strongest[0] = bounds.first[0] = bounds.last[0] = peak_index
         return 1
-    groups_max, n_groups, k = bin_rows.shape[1], 0, 0
+    groups_max, n_groups, k = bounds.strongest.size, 0, 0
     while k < magnitude.size:
         if not magnitude[k] >= threshold:  # also true for nan, which would loop forever
             k += 1
@@ -327,16 +329,12 @@ def _list_groups(magnitude, is_echo, peak_index, threshold, bin_rows):
         if is_echo.size > 0 and not is_echo[strongest_index] and strongest_index != peak_index:
             continue
         g = n_groups
-        while g > 0 and magnitude[bin_rows[STRONGEST_ROW, g - 1]] < magnitude[strongest_index]:
+        while g > 0 and magnitude[bounds.strongest[g - 1]] < magnitude[strongest_index]:
             g -= 1
         n_groups = min(n_groups + 1, groups_max)
         for h in range(n_groups - 1, g, -1):
-            for field in range(3):
-                bin_rows[field, h] = bin_rows[field, h - 1]
+            bounds.strongest[h] = bounds.strongest[h - 1]
+            bounds.first[h], bounds.last[h] = bounds.first[h - 1], bounds.last[h - 1]
         if g < groups_max:
-            bin_rows[STRONGEST_ROW, g], bin_rows[FIRST_ROW, g], bin_rows[LAST_ROW, g] = (
-                strongest_index,
-                first,
-                k - 1,
-            )
+            bounds.strongest[g], bounds.first[g], bounds.last[g] = strongest_index, first, k - 1
     return n_groups

@@ -370,10 +370,10 @@ def find_groups_and_leakage_bins(
     of leaked light need two separate searches instead
     (:func:`sweep.model.pointcloud.bin_groups.list_bin_groups`, :func:`iter_leakage_bins`).
     """
-    bin_rows, groups = allocate_bin_groups(shots.size, groups_max)
+    groups = allocate_bin_groups(shots.size, groups_max)
     leakage_bins_by_part = []
     for spans in _iter_leaking_spans(shots, np.arange(shots.size)):
-        find_groups_in_spans(shots, spans, bin_rows, groups)
+        find_groups_in_spans(shots, spans, groups)
         leakage_bins = _leakage_bins_of_spans(shots, groups, spans)
         groups.leakage[spans.point_numbers] = leakage_bins.mean_leakage()
         leakage_bins_by_part.append((spans.point_numbers, leakage_bins))

@@ -92,7 +92,7 @@ from sweep.model.sampling.speckle_lines import (
     folding_signs,
     speckle_line_grid,
 )
-from sweep.model.sampling.speckle_wander import wander_variance
+from sweep.model.sampling.speckle_wander import MeanSquareErrors, wander_variance
 from sweep.model.spectrum.search_band import is_searched
 from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import full_segment_spectrum
@@ -1125,11 +1125,14 @@ def count_detections(
         sum(f.n_false_bins for f in detections),
         sum(f.n_false_groups for f in detections),
     )
-    squared_bounds = np.square(
-        _error_bounds_by_draw(point_spectra, is_detected)
-    ) + _wander_variances(point_spectra, detections, is_detected)
+    least_deviations = _error_bounds_by_draw(point_spectra, is_detected)
+    speckle_errors = _wander_variances(point_spectra, detections, is_detected)
+    squared_bounds = [
+        np.square(least_deviations.range) + speckle_errors.range,
+        np.square(least_deviations.radial_velocity) + speckle_errors.radial_velocity,
+    ]
     if point_spectra.shots.any_two:  # bounds depend on the detected segments
-        squared_bounds = np.where(is_resolved, squared_bounds, np.nan)
+        squared_bounds = [np.where(is_resolved, bound, np.nan) for bound in squared_bounds]
     errors = [
         np.where(is_resolved, error, np.nan)
         for error in _measurement_errors(point_spectra, detections, is_detected)
@@ -1139,33 +1142,39 @@ def count_detections(
     )
 
 
-def _error_bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.ndarray:
-    """Return the smallest standard deviations of range [m] and velocity [m/s] by draw, (2, m).
+def _error_bounds_by_draw(
+    point_spectra: PointSpectra, is_detected: np.ndarray
+) -> RangeVelocityDeviation:
+    """Return the smallest standard deviations of range and radial velocity by draw, (m,) each.
 
     The standard deviations are bounds for the segments that are detected in a draw, ``is_detected``
     (3, m).
     """
-    bounds = np.empty((2, is_detected.shape[1]))
-    bounds[...] = np.reshape(measurement_bound(point_spectra), (2, 1))
+    bounds = RangeVelocityDeviation(
+        *(
+            np.full(is_detected.shape[1], deviation, float)
+            for deviation in measurement_bound(point_spectra)
+        )
+    )
     if point_spectra.shots.any_two:
         for is_missing in np.eye(3, dtype=bool):
             has_pattern = (is_detected == ~is_missing[:, None]).all(axis=0)
-            bounds[:, has_pattern] = np.reshape(
-                measurement_bound(point_spectra, ~is_missing), (2, 1)
-            )
+            pattern_bound = measurement_bound(point_spectra, ~is_missing)
+            bounds.range[has_pattern] = pattern_bound.range
+            bounds.radial_velocity[has_pattern] = pattern_bound.radial_velocity
     return bounds
 
 
 def _wander_variances(
     point_spectra: PointSpectra, detections: Sequence[SegmentDetections], is_detected: np.ndarray
-) -> np.ndarray:
-    """Return the mean square errors of range [m^2] and velocity [m^2/s^2] due to speckle, (2, m).
+) -> MeanSquareErrors:
+    """Return the mean square errors of range and radial velocity due to speckle, (m,) each.
 
     `detections` are those of each segment, and `is_detected` (3, m) says which count.
     """
     shots, point, n_draws = point_spectra.shots, point_spectra.point, is_detected.shape[1]
     if shots.speckle.line_gradients is None:
-        return np.zeros((2, n_draws))
+        return MeanSquareErrors(np.zeros(n_draws), np.zeros(n_draws))
     point_indices = np.full(n_draws, point)
     line_noise_sigma = float(np.broadcast_to(shots.line_noise_sigma, shots.size)[point])
     signal = np.array([

@@ -1,5 +1,7 @@
 """Errors of range and radial velocity because peaks move with the speckle of the echo."""
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.special import exp1
 
@@ -12,10 +14,19 @@ NEGATIVE_LOG_PD_MAX = 700.0
 e^-700."""
 
 
+class MeanSquareErrors(NamedTuple):
+    """Mean square errors of ranges and radial velocities."""
+
+    range: np.ndarray
+    """(m,): mean square error of the range [m^2]."""
+    radial_velocity: np.ndarray
+    """(m,): mean square error of the radial velocity [m^2/s^2]."""
+
+
 def wander_variance(
     shots: Shots, point_indices: np.ndarray, peaks: SpecklePeaks, is_detected: np.ndarray
-) -> np.ndarray:
-    """Return the mean square errors of m ranges and velocities due to speckle, (2, m).
+) -> MeanSquareErrors:
+    """Return the mean square errors of m ranges and radial velocities due to speckle.
 
     Parameters
     ----------
@@ -31,9 +42,8 @@ def wander_variance(
 
     Returns
     -------
-    ndarray (2, m)
-        Mean square error of the range [m^2] and of the radial velocity [m^2/s^2]; 0 without
-        developed speckle.
+    MeanSquareErrors
+        (m,) each; 0 without developed speckle.
 
     Notes
     -----
@@ -42,7 +52,7 @@ def wander_variance(
     these positions, and J' is its transpose.
     """
     if shots.speckle.line_gradients is None:
-        return np.zeros((2, point_indices.size))
+        return MeanSquareErrors(np.zeros(point_indices.size), np.zeros(point_indices.size))
     beat_covariance_bins = position_error_moments(
         shots.speckle.line_gradients.select(point_indices), peaks, shots, from_three_bins=False
     )
@@ -62,11 +72,13 @@ def wander_variance(
             for unit in np.eye(3)
         ]
     )
-    return np.einsum("iam,mij,jam->am", response_per_bin, beat_covariance_bins, response_per_bin)
+    return MeanSquareErrors(
+        *np.einsum("iam,mij,jam->am", response_per_bin, beat_covariance_bins, response_per_bin)
+    )
 
 
-def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.ndarray:
-    """Return the mean square errors of range and velocity at n points due to speckle, (2, n).
+def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> MeanSquareErrors:
+    """Return the mean square errors of range and radial velocity at n points due to speckle.
 
     The means are over detected echoes.
 
@@ -80,8 +92,8 @@ def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.nd
 
     Returns
     -------
-    ndarray (2, n)
-        Mean square error of the range [m^2] and of the radial velocity [m^2/s^2].
+    MeanSquareErrors
+        (n,) each.
 
     Notes
     -----

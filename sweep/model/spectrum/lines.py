@@ -166,10 +166,7 @@ def beamlet_arrays(beamlet_table: np.ndarray) -> BeamletArrays:
 
 
 class PointParameters(NamedTuple):
-    """Parameters of points that all segments share, (n,) each.
-
-    The fields are the first rows of :meth:`sweep.model.preparation.Shots.point_parameter_table`.
-    """
+    """Parameters of points that all segments share, (n,) each."""
 
     range: np.ndarray
     """Range along the beam's axis at the start of the shot [m]."""
@@ -224,10 +221,7 @@ class PointParameters(NamedTuple):
 
 
 class SegmentParameters(NamedTuple):
-    """Parameters of the segments of points, (segments, n) each.
-
-    The fields are the last rows of :meth:`sweep.model.preparation.Shots.point_parameter_table`.
-    """
+    """Parameters of the segments of points, (segments, n) each."""
 
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
@@ -241,24 +235,6 @@ class SegmentParameters(NamedTuple):
     """Doppler ratio 2 v_r / c at the start of the segment, with the radial velocity v_r."""
     start_time: np.ndarray
     """Time from the start of the shot to that of the segment [s]."""
-
-
-def point_parameters(point_table: np.ndarray) -> PointParameters:
-    """Return the rows of a point table that all segments share as named fields.
-
-    The table is :meth:`sweep.model.preparation.Shots.point_parameter_table`.
-    """
-    return PointParameters(*point_table[: len(PointParameters._fields)])
-
-
-def segment_parameters(point_table: np.ndarray) -> SegmentParameters:
-    """Return the rows of a point table that differ by segment as named fields.
-
-    The table is :meth:`sweep.model.preparation.Shots.point_parameter_table`.
-    """
-    n_fields, n_points = len(SegmentParameters._fields), point_table.shape[1]
-    rows_by_segment = point_table[len(PointParameters._fields) :].reshape(-1, n_fields, n_points)
-    return SegmentParameters(*np.ascontiguousarray(rows_by_segment.swapaxes(0, 1)))
 
 
 class BeatParameters(NamedTuple):

@@ -29,14 +29,14 @@ from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.lines import (
     LineArrays,
+    PointParameters,
+    SegmentParameters,
     SpectrumLayout,
     add_image_lines,
     beamlet_arrays,
     beat_parameters_at,
     compute_lines,
     fold_lines,
-    point_parameters,
-    segment_parameters,
 )
 
 CELLS_PER_BIN = 16
@@ -107,18 +107,18 @@ def find_peaks_on_grid(
         waveform lacks.
     """
     peaks = np.full((3, 6, shots.size), np.nan)
-    point_table, n_cells_of_point, grid_options = (
-        shots.point_parameter_table(),
-        cells_per_point(shots, size),
-        GridOptions(degree, real, folded),
-    )
+    parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()
+    n_cells_of_point = cells_per_point(shots, size)
+    grid_options = GridOptions(degree, real, folded)
     segments = np.flatnonzero(shots.has_segment).tolist()
     for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
         members = np.flatnonzero(n_cells_of_point == cells)
         for points in np.split(
             members, range(_SPECTRA_PER_TRANSFORM, members.size, _SPECTRA_PER_TRANSFORM)
         ):
-            spectra = grid_magnitudes(shots, point_table, points, segment, cells, grid_options)
+            spectra = grid_magnitudes(
+                shots, parameters, parameters_by_segment, points, segment, cells, grid_options
+            )
             detections = detect_in_spectra(
                 spectra.magnitude,
                 spectra.first_bin,
@@ -155,7 +155,8 @@ def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray
 
 def grid_magnitudes(
     shots: Shots,
-    point_table: np.ndarray,
+    parameters: PointParameters,
+    parameters_by_segment: SegmentParameters,
     points: np.ndarray,
     segment: int,
     n_cells: int,
@@ -165,8 +166,10 @@ def grid_magnitudes(
 
     Parameters
     ----------
-    shots, point_table
-        All shots, and their parameters by `Shots.point_parameter_table`.
+    shots
+        All shots.
+    parameters, parameters_by_segment
+        Their parameters by `Shots.point_parameters` and `Shots.segment_parameters`.
     points
         Indices of the m points, (m,), which have `n_cells` cells each.
     segment
@@ -181,8 +184,8 @@ def grid_magnitudes(
     centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
     _deposit_lines(
         points,
-        point_parameters(point_table),
-        segment_parameters(point_table),
+        parameters,
+        parameters_by_segment,
         shots.footprint.row_of_point[points],
         beamlet_arrays(shots.beamlet_table),
         segment,

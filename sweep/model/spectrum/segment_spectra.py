@@ -69,6 +69,8 @@ from sweep.model.spectrum.lines import (
     REAL_WITH_IMAGES,
     REAL_WITHOUT_IMAGES,
     BeatParameters,
+    PointParameters,
+    SegmentParameters,
     SpectrumLayout,
     add_image_lines,
     allowed_relative_error,
@@ -78,9 +80,7 @@ from sweep.model.spectrum.lines import (
     count_nodes,
     fold_lines,
     node_phase_limits,
-    point_parameters,
     replace_lines_by_nodes,
-    segment_parameters,
     summarise_lines,
 )
 from sweep.model.spectrum.permanent_line import apply_permanent_line
@@ -298,8 +298,7 @@ def iter_spans(
     BinSpans
         Spans of some points.
     """
-    point_table = shots.point_parameter_table()
-    parameters = point_parameters(point_table)
+    parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()
     # Else probabilities are set from the final spans.
     computes_pd_at_once = with_pd and pd_follows_from_computed_spans(shots)
     point_levels = (
@@ -323,7 +322,8 @@ def iter_spans(
             )
             spans = _evaluate_batch(
                 shots,
-                point_table,
+                parameters,
+                parameters_by_segment,
                 lowest_levels,
                 group,
                 leakage_method,
@@ -736,7 +736,8 @@ def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray
 
 def _evaluate_batch(
     shots: Shots,
-    point_table: np.ndarray,
+    parameters: PointParameters,
+    parameters_by_segment: SegmentParameters,
     lowest_levels: np.ndarray,
     group: ShapeGroup,
     leakage_method: int,
@@ -748,7 +749,7 @@ def _evaluate_batch(
 
     The batch begins with the group's point number ``batch_begin``. It has as many points as fit
     into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
-    shapes. ``point_table`` is :meth:`sweep.model.preparation.Shots.point_parameter_table`.
+    shapes. ``parameters`` and ``parameters_by_segment`` are those of all n points.
     ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be left out.
     """
     points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
@@ -773,10 +774,9 @@ def _evaluate_batch(
         is_exempt=np.empty(n_kept, np.bool_),
         peak_is_searched=np.ones(shape, np.bool_),
     )
-    parameters = point_parameters(point_table)
     n_done = _evaluate_points(
         parameters,
-        segment_parameters(point_table),
+        parameters_by_segment,
         lowest_levels,
         beamlet_arrays(shots.beamlet_table),
         np.ascontiguousarray(shots.footprint.row_of_point, np.int64),

@@ -22,12 +22,14 @@ from sweep.messages import option_name, option_text
 from sweep.model import VERSION
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
-from sweep.storage.locations import Location, can_create_store, resolve_links
-from sweep.tasks.accuracy.settings import (
+from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
     REFERENCE_KIND,
     THESIS_KIND,
+)
+from sweep.storage.locations import Location, can_create_store, resolve_links
+from sweep.tasks.accuracy.settings import (
     AccuracySetting,
     SettingLadder,
     add_fixed_effect_settings,

@@ -14,28 +14,22 @@ from sweep.model.error_budget import THESIS_BEAMLET_COUNT
 from sweep.model.ground import beamlets_add_as_powers
 from sweep.spec import GridSpec, SceneSpec
 from sweep.spec.fields import OFF
-from sweep.tasks.studies.study_loading import AnySpec, apply_changes
-
-(
-    AS_WRITTEN_KIND,
+from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
-    FIXED_EFFECTS_KIND,
+    AS_WRITTEN_KIND,
     BEAMLETS_KIND,
+    CLOSED_FORM_KIND,
+    COUNTED_DRAWS_KIND,
+    DRAWS_IN_NOISE_KIND,
+    FIXED_EFFECTS_KIND,
+    IMPROVED_THESIS_KIND,
     LINE_PATTERN_KIND,
-) = ("as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line")
-CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND, REFERENCE_KIND = (
-    "closed form",
-    "thesis",
-    "thesis improved",
-    "reference",
+    MEAN_OF_DRAWS_KIND,
+    REFERENCE_KIND,
+    THESIS_KIND,
 )
-MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
-    "means of draws",
-    "draws counted",
-    "draws in noise",
-)
-"""Kinds of settings with random draws. They differ in how a point's pd follows from the draws."""
+from sweep.tasks.studies.study_loading import AnySpec, apply_changes
 
 TRIED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 

@@ -34,7 +34,8 @@ from sweep.model.spectrum.oversampled_grid import find_peaks_on_grid
 from sweep.model.waveform import SEGMENT_NAMES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import Axis, GridSpec, SceneSpec
-from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting, AnySpec
+from sweep.storage.accuracy_setting_kinds import AS_WRITTEN_KIND
+from sweep.tasks.accuracy.settings import AccuracySetting, AnySpec
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.studies.eyepoint_study import build_world
 from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy

@@ -211,11 +211,25 @@ def read_permanent_failures(store_path: Location, n_blocks: int) -> dict[int, di
     return {block: failure for block, failure in last_failures.items() if block < n_blocks}
 
 
-def last_run_start_time(store_path: Location) -> float:
-    """Return the time at which the last run began [s since the epoch]; inf if there was none."""
+@dataclass(frozen=True, kw_only=True)
+class LastRun:
+    """Begin of the last run of a store, and the threads that computed in it."""
+
+    start_time: float  # time at which it began [s since the epoch]; inf if there was none
+    n_threads: int  # number of threads of the command that computed; 0 if workers did, or unknown
+
+
+def read_last_run(store_path: Location) -> LastRun:
+    """Return when the last run of a store began, and by how many threads it computed."""
     runs = iter_records(store_path / JOURNAL_DIR / SESSION_LOG_FILE)
-    start_times = [run["time"] for run in runs if run.get("event") == "begun"]
-    return float(start_times[-1]) if start_times else np.inf
+    starts = [run for run in runs if run.get("event") == "begun"]
+    if not starts:
+        return LastRun(start_time=np.inf, n_threads=0)
+    n_threads = starts[-1].get("threads", 0)  # absent in the logs of older versions
+    return LastRun(
+        start_time=float(starts[-1]["time"]),
+        n_threads=n_threads if isinstance(n_threads, int) else 0,
+    )
 
 
 def write_recipe(store_path: Location, **facts: Any) -> None:

@@ -24,7 +24,7 @@ PROGRESS_LINE_INTERVAL_SECONDS = 30.0
 #: Number of times per second that a progress bar is drawn [Hz]. Each time takes some ms.
 BAR_REFRESH_RATE_HZ = 4.0
 
-#: Width of a terminal from which a progress bar shows workers and bytes too [columns].
+#: Width of a terminal from which a progress bar shows threads or workers and bytes too [columns].
 WIDE_TERMINAL_COLUMNS_MIN = 100
 
 #: Duration of an activity after which a message about it is shown [s]. Most activities are shorter.
@@ -85,6 +85,14 @@ class Progress:
     def update_workers(self, *, workers: int, stored: int) -> None:
         """Set the number of workers and the size stored so far [bytes]. Called before `advance`."""
 
+    def update_threads(self, *, threads: int, stored: int) -> None:
+        """Set the number of threads and the size stored so far [bytes]. Called before `advance`.
+
+        The threads of the command's process compute without workers. A listener that does not
+        distinguish them from workers need not define this method.
+        """
+        self.update_workers(workers=threads, stored=stored)
+
     def say(self, text: str) -> None:
         """Show a message to the user."""
 
@@ -128,6 +136,9 @@ class _GuardedListener(Progress):
 
     def update_workers(self, **keywords: Any) -> None:
         self._call_listener("update_workers", **keywords)
+
+    def update_threads(self, **keywords: Any) -> None:
+        self._call_listener("update_threads", **keywords)
 
     def say(self, text: str) -> None:
         self._call_listener("say", text)
@@ -205,13 +216,19 @@ class _CountingProgress(Progress):
         self._show_state()
 
     def _show_state(self, *, is_start: bool = False) -> None:
-        """Show the present numbers of points, workers, bytes and failures."""
+        """Show the present numbers of points, threads or workers, bytes and failures."""
 
     def update_workers(self, *, workers: int, stored: int) -> None:
+        self._set_workers_text(number_with_noun(workers, "worker"), stored)
+
+    def update_threads(self, *, threads: int, stored: int) -> None:
+        self._set_workers_text(number_with_noun(threads, "thread"), stored)
+
+    def _set_workers_text(self, workers: str, stored: int) -> None:
+        """Set the text that names the workers or threads, and the size stored so far [bytes]."""
         from rich.filesize import decimal
 
-        count = f"{workers:,} worker{'' if workers == 1 else 's'}"
-        self._workers_text = f"{count}, {decimal(stored)} stored"
+        self._workers_text = f"{workers}, {decimal(stored)} stored"
 
     @property
     def _points_per_second(self) -> float:

@@ -352,17 +352,23 @@ class ComputeBackend(ExitStack):
         """True if blocks are computed in this process, by threads or one after the other."""
         return self.options.client is None and self._cluster is None
 
-    def _n_threads(self) -> int:
-        """Return the number of threads that compute: as many as memory and blocks suffice for."""
-        n_threads = min(self.options.n_threads(self._workload), self.max_workers)
+    @property
+    def n_threads(self) -> int:
+        """Number of threads of this process that compute; 0 if workers do.
+
+        There are as many as memory and blocks suffice for.
+        """
+        if not self.is_in_process:
+            return 0
+        n_threads = self._n_threads_without_memory_limit
         if n_threads == 1 or self.memory.suffices_for(n_threads * self.bytes_per_thread):
-            return max(n_threads, 1)
-        n_with_memory = max(int(self.memory.bytes_max / self.bytes_per_thread), 1)
-        self.progress.say(
-            f"memory suffices for {n_with_memory} of {n_threads} threads: a block takes up to "
-            f"{self.bytes_per_thread / 1e9:,.1f} GB"
-        )
-        return n_with_memory
+            return n_threads
+        return max(int(self.memory.bytes_max / self.bytes_per_thread), 1)
+
+    @property
+    def _n_threads_without_memory_limit(self) -> int:
+        """Number of threads that the options ask for, at most one per block."""
+        return max(min(self.options.n_threads(self._workload), self.max_workers), 1)
 
     @property
     def uses_running_scheduler(self) -> bool:
@@ -432,7 +438,12 @@ class ComputeBackend(ExitStack):
                 self.progress.say(
                     "no performance report: a plain loop has no scheduler to tell of it"
                 )
-            n_threads = self._n_threads()
+            n_threads, n_without_limit = self.n_threads, self._n_threads_without_memory_limit
+            if n_threads < n_without_limit:
+                self.progress.say(
+                    f"memory suffices for {n_threads} of {n_without_limit} threads: a block takes "
+                    f"up to {self.bytes_per_thread / 1e9:,.1f} GB"
+                )
             in_process = settings, block_queue, lambda: self.interrupts.is_stopping, verify_receipt
             if n_threads == 1:
                 _logger.info("blocks are computed in this process, one after the other")
@@ -590,7 +601,12 @@ class Session:
                 n_blocks_skipped,
             )
             stop_reason = (
-                self._record_run_event("begun", host=socket.gethostname(), pid=os.getpid())
+                self._record_run_event(
+                    "begun",
+                    host=socket.gethostname(),
+                    pid=os.getpid(),
+                    threads=0 if is_settled.all() else self._backend.n_threads,
+                )
                 or prior_stop_reason
             )
             stop_reason = (
@@ -757,7 +773,10 @@ class Session:
             self._checkpoint_points[block] = saved_points
         self._flush_receipts()
         bytes_stored = self._bytes_before + int(self._receipt_totals["bytes"])
-        self._progress.update_workers(workers=task_result.n_workers, stored=bytes_stored)
+        if self._backend.is_in_process:
+            self._progress.update_threads(threads=task_result.n_workers, stored=bytes_stored)
+        else:
+            self._progress.update_workers(workers=task_result.n_workers, stored=bytes_stored)
         self._progress.advance(
             points=self._points_so_far() - points_before,
             failed=len(self._permanent_failures) - failures_before,

@@ -95,7 +95,7 @@ class TaskResult:
     worker_address: str = ""  # address of the worker; '' for serial computation
     host: str = ""  # host name of the worker
     worker_error: Exception | None = None  # why the worker can't compute any block
-    n_workers: int = 1  # number of usable workers when the result arrived
+    n_workers: int = 1  # number of usable workers when the result arrived, or of threads
 
 
 _open_writer_lock = threading.Lock()
@@ -469,8 +469,9 @@ def run_in_threads(
                 yield TaskResult(n_workers=n_threads)
                 continue
             n_in_flight -= 1
-            task_result.n_workers = n_threads
-            yield _accept_result(task_result, task_blocks, block_queue, verify_receipt)
+            accepted_result = _accept_result(task_result, task_blocks, block_queue, verify_receipt)
+            accepted_result.n_workers = n_threads
+            yield accepted_result
     finally:
         for _ in range(n_threads):
             assigned_blocks.put(None)

@@ -470,6 +470,7 @@ class Status:
     bytes_stored: int  # size of all results as stored, or of all files of a packed copy
     points_per_second: float  # points per second in the last run; 0 if it committed nothing
     workers_in_last_run: int  # number of processes that computed in the last run
+    threads_in_last_run: int  # number of threads of the command that computed; 0 if workers did
     heartbeat_age: float  # age of the last heartbeat of the lock [s]; inf without one
 
     @property
@@ -510,14 +511,14 @@ def status(store: str | Location) -> Status:
     """
     store_path = parse_location(store)
     attributes, study = study_loading.read_study(store_path)
-    run_start = journal.last_run_start_time(store_path)
-    receipts = read_receipt_totals(store_path, study.n_blocks, since=run_start)
+    last_run = journal.read_last_run(store_path)
+    receipts = read_receipt_totals(store_path, study.n_blocks, since=last_run.start_time)
     packed_bytes = (
         sum(file_sizes_below(store_path).values()) if PACKED_ATTRIBUTE in attributes else 0
     )
     holder = journal.read_lock_holder(store_path)
     points_done = study.count_points_in_blocks(receipts.points_by_block > 0)
-    run_seconds = receipts.last_receipt_time - run_start
+    run_seconds = receipts.last_receipt_time - last_run.start_time
     return Status(
         store=store_path,
         title=attributes.get("title", ""),
@@ -540,5 +541,6 @@ def status(store: str | Location) -> Status:
         if receipts.recent_points and run_seconds > 0
         else 0.0,
         workers_in_last_run=len(receipts.recent_workers),
+        threads_in_last_run=last_run.n_threads,
         heartbeat_age=journal.heartbeat_age(store_path) if holder else float("inf"),
     )

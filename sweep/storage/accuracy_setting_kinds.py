@@ -1,0 +1,34 @@
+"""Kinds of accuracy settings, as the stores of `sweep accuracy` hold them.
+
+An accuracy setting is a choice of tolerance, effects, beamlets or draws.
+"""
+
+AS_WRITTEN_KIND = "as written"
+"""Kind of the setting that is the spec as written."""
+ADAPTIVE_KIND = "adaptive"
+"""Kind of settings that simulate an effect only where a tolerance requires it."""
+ALL_EFFECTS_KIND = "all on"
+"""Kind of settings with all effects at every point."""
+FIXED_EFFECTS_KIND = "fixed effects"
+"""Kind of settings with the same effects at every point."""
+BEAMLETS_KIND = "beamlets"
+"""Kind of settings with a fixed number of beamlets in a lattice.
+
+Beamlets are the rays that sample the cross-section of a beam.
+"""
+LINE_PATTERN_KIND = "in a line"
+"""Kind of settings with a fixed number of beamlets in a line."""
+CLOSED_FORM_KIND = "closed form"
+"""Kind of settings that compute the thesis's effects in closed form."""
+THESIS_KIND = "thesis"
+"""Kind of settings that compute by the thesis's method."""
+IMPROVED_THESIS_KIND = "thesis improved"
+"""Kind of settings that compute by an improved form of the thesis's method."""
+REFERENCE_KIND = "reference"
+"""Kind of the reference, the most accurate setting, to which all are compared."""
+MEAN_OF_DRAWS_KIND = "means of draws"
+"""Kind of settings with a fixed number of draws, over which pd is averaged."""
+COUNTED_DRAWS_KIND = "draws counted"
+"""Kind of settings with a fixed number of draws, in which detections are counted."""
+DRAWS_IN_NOISE_KIND = "draws in noise"
+"""Kind of settings that count detections in a fixed number of draws with noise in every bin."""
