@@ -48,7 +48,7 @@ IDS = {
 """Of the study, and of the geometry of each scanner: the first digits."""
 
 POINTS = {
-    "quickstart": 199 * 90 * 3,
+    "quickstart": 100 * 45 * 3,
     "range_angle_coarse": 4500,
     "single_shot_2000m": 1,
     "single_shot_45deg": 2,
