@@ -52,6 +52,14 @@ def test_sampled_cycles_are_spread_over_the_flight(n_cycles):
     assert np.ptp(np.diff(cycles)) <= 1 if n_cycles > 2 else True
 
 
+def test_a_part_of_a_long_cycle_is_timed(tmp_path):
+    scanner = {"kind": "raster", "columns": 200, "rows": 200, "half_angles": ["9 deg", "9 deg"]}
+    spec = small_scene_spec(scanners={"wide": scanner | {"rate": "0.1 Hz"}}, axes={})
+    (scanner_plan,) = plan_study(spec, store_path=tmp_path / "a.zarr").scanners
+    assert 0 < scanner_plan.n_timed_shots <= study_plan.TIMED_SHOT_DRAWS_MAX
+    assert scanner_plan.n_shots >= 40_000 > scanner_plan.n_timed_shots
+
+
 def test_without_kernels_no_shot_is_simulated_and_the_plan_says_so(tmp_path, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("a shot is simulated")

@@ -218,10 +218,11 @@ class EyepointStudy(BlockStudy):
 
         A single cycle is that in the middle.
         """
-        n_cycles = min(n_cycles, self.n_cycles)
-        return self._shot_numbers_of_cycles(
-            (2 * np.arange(n_cycles) + 1) * self.n_cycles // (2 * n_cycles)
-        )
+        return self._shot_numbers_of_cycles(_middles_of_equal_parts(self.n_cycles, n_cycles))
+
+    def spread_shot_numbers(self, n_shots: int) -> np.ndarray:
+        """Return the numbers of `n_shots` shots spread evenly over the flight."""
+        return _middles_of_equal_parts(self.n_points, n_shots)
 
     def _shot_numbers_of_cycles(self, cycle_numbers: np.ndarray) -> np.ndarray:
         """Return the numbers of all shots in the cycles with given numbers (n,)."""
@@ -279,6 +280,12 @@ class EyepointStudy(BlockStudy):
             "footprint_angles": self.spec.footprint_angles(),
             "bodies_rotate": self.spec.effect_modes()["rotation"] != "off",
         }
+
+
+def _middles_of_equal_parts(n_items: int, n_parts: int) -> np.ndarray:
+    """Return the index in the middle of each of `n_parts` equal parts of `n_items` items."""
+    n_parts = min(n_parts, n_items)
+    return np.asarray((2 * np.arange(n_parts) + 1) * n_items // (2 * n_parts))
 
 
 @lru_cache(maxsize=1)

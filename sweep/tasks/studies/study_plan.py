@@ -56,8 +56,11 @@ FLIGHT_TIMING_SECONDS = 1.0
 TIMED_RAYS_MAX = 1 << 17
 TIMED_SHOT_DRAWS_MAX = 1 << 14
 
-#: Number of cycles, spread over the flight, that load kernels and tables before any is timed.
-LOADING_CYCLES = 8
+#: Number of shots, spread over the flight, that load kernels and tables before any is timed.
+LOADING_SHOTS = 32
+
+#: Largest number of shots of a cycle of which whole cycles are timed, with their navigation.
+TIMED_CYCLE_SHOTS_MAX = 128
 
 #: Number of points along a flight's axes at which shots are timed.
 TIMED_AXIS_POINTS_MAX = 3
@@ -71,7 +74,7 @@ TIMED_SPECTRA_MAX = 10
 #: Estimated times for a plan [s]: of starting worker processes, of writing one chunk, of starting
 #: the command, of creating a flight's stores and summing up its results, and of compiling a flight.
 WORKER_START_SECONDS = 3.0
-CHUNK_WRITE_SECONDS = 1e-3
+CHUNK_WRITE_SECONDS = 2e-3
 COMMAND_START_CPU_SECONDS = 1.5
 FLIGHT_STORE_CPU_SECONDS = 1.0
 FLIGHT_COMPILE_CPU_SECONDS = 100.0
@@ -455,23 +458,32 @@ class _ScannerTimer:
         ]
         self.n_draws = len(self._flight_blocks[0].draws)
         self.shots_per_block = len(self._flight_blocks[0].cycles) * self.grid.shots_per_cycle
-        self.n_cycles_max = max(
+        self.n_shots_max = max(
             1,
             min(
-                TIMED_RAYS_MAX // (self.grid.shots_per_cycle * eyepoints.n_beamlets),
-                TIMED_SHOT_DRAWS_MAX // (self.grid.shots_per_cycle * self.n_draws),
-                len(self._flight_blocks[0].cycles),
+                TIMED_RAYS_MAX // eyepoints.n_beamlets,
+                TIMED_SHOT_DRAWS_MAX // self.n_draws,
+                self.shots_per_block,
             ),
         )
+        # Navigation needs complete cycles. In long ones it takes little of the time of a shot.
+        self._takes_cycles = self.grid.shots_per_cycle <= min(
+            TIMED_CYCLE_SHOTS_MAX, self.n_shots_max
+        )
 
-    def time_cycles(self, n_cycles: int) -> tuple[int, float, float]:
-        """Time some cycles. Return their shots, and times of casting and of simulating [s].
+    def time_shots(self, n_shots: int) -> tuple[int, float, float]:
+        """Time some shots. Return their number, and times of casting and of simulating [s].
 
         The time of simulating is that of all draws of a block, averaged over points of the axes.
         """
         start = time.process_time()
-        shot_numbers = self._eyepoints.shot_numbers_of_spread_cycles(n_cycles)
-        shot_arrays = self._eyepoints.cast_cycles(shot_numbers)
+        if self._takes_cycles:
+            shot_numbers = self._eyepoints.shot_numbers_of_spread_cycles(
+                max(n_shots // self.grid.shots_per_cycle, 1)
+            )
+        else:
+            shot_numbers = self._eyepoints.spread_shot_numbers(n_shots)
+        shot_arrays = self._eyepoints.cast_shots(shot_numbers)
         cast_at = time.process_time()
         shot_eyepoints = eyepoints_from_arrays(shot_arrays, self._eyepoints.beamlet_weights)
         for flight_block in self._flight_blocks:
@@ -481,32 +493,35 @@ class _ScannerTimer:
                 shot_eyepoints,
                 self._study.select_effects(flight_block, shot_eyepoints, shot_numbers),
                 shot_numbers,
+                solves_navigation=self._takes_cycles,
             )
         simulation_seconds = (time.process_time() - cast_at) / len(self._flight_blocks)
         return len(shot_numbers), cast_at - start, simulation_seconds
 
 
 def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
-    """Return the plan of a scanner, with times measured on cycles spread over its flight.
+    """Return the plan of a scanner, with times measured on shots spread over its flight.
 
     A call takes a time of its own, and a time for each shot. Both follow from two numbers of shots.
     """
     timer = _ScannerTimer(study, eyepoints)
     seconds_max = FLIGHT_TIMING_SECONDS / len(study.spec.scanners)
     # The first shots load kernels and tables, which other places in the flight may need too.
-    _, first_casting_seconds, first_seconds = timer.time_cycles(
-        min(LOADING_CYCLES, timer.n_cycles_max)
+    _, first_casting_seconds, first_seconds = timer.time_shots(
+        min(LOADING_SHOTS, timer.n_shots_max)
     )
     start = time.process_time()
-    n_cycles, samples = 1, [timer.time_cycles(1)]
-    while n_cycles < timer.n_cycles_max and (
+    n_timed, samples = 1, [timer.time_shots(1)]
+    while n_timed < timer.n_shots_max and (
         samples[-1][1] + samples[-1][2] < seconds_max / 4
         and time.process_time() - start < seconds_max
     ):
-        n_cycles = min(4 * n_cycles, timer.n_cycles_max)
-        samples.append(timer.time_cycles(n_cycles))
+        n_timed = min(4 * samples[-1][0], timer.n_shots_max)
+        samples.append(timer.time_shots(n_timed))
+        if samples[-1][0] == samples[-2][0]:  # the next cycle would be beyond the limit
+            break
     # Shots elsewhere may need tables of their own, which the second time finds.
-    n_shots, casting_seconds, simulation_seconds = timer.time_cycles(n_cycles)
+    n_shots, casting_seconds, simulation_seconds = timer.time_shots(n_timed)
     loading_seconds = first_casting_seconds + first_seconds - samples[0][1] - samples[0][2]
     loading_seconds += samples[-1][1] + samples[-1][2] - casting_seconds - simulation_seconds
     n_small, _, small_seconds = samples[0]
@@ -523,7 +538,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         n_shots=eyepoints.n_points,
         n_rays=eyepoints.n_rays,
         has_eyepoints=eyepoint_store_location(study.store_path, eyepoints.id).exists(),
-        seconds_per_ray=casting_seconds / eyepoints.count_rays(n_shots),
+        seconds_per_ray=casting_seconds / (n_shots * eyepoints.n_beamlets),
         seconds_per_draw=block_seconds / (timer.shots_per_block * timer.n_draws),
         n_timed_shots=n_shots,
         loading_seconds=max(loading_seconds, 0.0),
