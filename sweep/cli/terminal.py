@@ -642,7 +642,7 @@ def plan_rows(
             else ""
         ),
     )
-    yield "", _time_parts_text(study_plan)
+    yield "parts", _time_parts_text(study_plan)
     memory_share = " a worker" if study_plan.has_workers else ""
     yield "memory", f"about {decimal(study_plan.memory_bytes)}{memory_share}"
     if reason := _excessive_size_text(
