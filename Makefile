@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling plan-honesty validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -96,6 +96,10 @@ peers: $(READY)
 
 scaling: $(READY)
 	$(BIN)/python benchmarks/worker_scaling.py
+
+# What plans of flights predict and take, and what their runs take; some ten minutes.
+plan-honesty: $(READY)
+	$(BIN)/python benchmarks/plan_honesty.py
 
 effects: $(READY)
 	$(BIN)/python benchmarks/effects_page.py

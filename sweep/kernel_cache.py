@@ -181,6 +181,14 @@ class KernelCache(FunctionCache):
             _remove_unused_caches(folder)
 
 
+def is_compiled(kernel: Any) -> bool:
+    """Return True if a kernel is compiled, in this process or in the cache, for any arguments."""
+    if not isinstance(kernel, Dispatcher) or kernel.signatures:
+        return True  # no Dispatcher: NUMBA_DISABLE_JIT is set, and nothing is compiled
+    cache_path, name = kernel.stats.cache_path, kernel.py_func.__name__
+    return cache_path is not None and any(Path(cache_path).glob(f"*.{name}-*.nbi"))
+
+
 def _holds_arrays(kind: Any) -> bool:
     """Return True if a numba type is an array type, or a tuple type that contains one."""
     parts = getattr(kind, "types", ())  # member types of a tuple
@@ -239,7 +247,7 @@ def cache_folder() -> CacheFolder:
                 base = find_base()
                 if os.path.isabs(base):  # without a home directory, user_cache_dir is relative
                     root = Path(base) / f"sweep-kernels-{os.getuid()}"
-                    _create_private_folder(root)
+                    create_private_folder(root)
                     _log.info("compiled kernels are kept in %s", root / fingerprint)
                     return CacheFolder(root / fingerprint)
             except OSError as error:
@@ -259,7 +267,7 @@ def _configured_cache_base() -> str:
     return os.path.abspath(cache_dir) if cache_dir else ""
 
 
-def _create_private_folder(root: Path) -> None:
+def create_private_folder(root: Path) -> None:
     """Create a folder that no other user can write to; raise OSError if that is impossible."""
     root.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):

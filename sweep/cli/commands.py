@@ -310,9 +310,10 @@ def resume(store: Location, spec: Path | None, retry_failed: bool, **options: An
 def plan(spec: Path, workers: int | None) -> None:
     """Print the size and time of SPEC, and the effects it simulates. Nothing is written.
 
-    The time is measured on points of the study, in about a second. For each effect a table gives
-    the points at which it is simulated, a bound on its change of pd, log10 pfa or magnitude, and
-    its share of a point's time.
+    The time is measured on points of the study, in about a second, and its parts are printed. Shots
+    of a flight are counted, and a few spread over it are timed. For each effect a table gives the
+    points at which it is simulated, and a bound on its change of pd, log10 pfa or magnitude. For
+    grids it also gives the effect's share of a point's time, where that repeats to 10 %.
     """
     from sweep.tasks.engine.progress import show_activity
 

@@ -8,6 +8,7 @@ import re
 import shutil
 import sys
 import textwrap
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +41,9 @@ ASK_ABOVE_POINTS, ASK_ABOVE_BYTES, ASK_ABOVE_CPU_SECONDS = 10**9, 10**12, 30 * 8
 
 It is the number of points, the size of the results [bytes], and the time on one core [s].
 """
+
+BUSY_RATIO_SHOWN_MIN = 1.3
+"""Wall time over processor time of this process above which a plan says that others compute."""
 
 MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
 """Number of points times draws of a study above which a run first estimates its time."""
@@ -608,9 +612,9 @@ def plan_rows(
     from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
     from sweep.tasks.studies.study_plan import plan_study
 
+    study_plan = plan_study(spec, store_path=store, n_workers=workers)
     if isinstance(spec, SceneSpec):
         refuse_flight_without_hits(spec)
-    study_plan = plan_study(spec, store_path=store, n_workers=workers)
     if isinstance(spec, GridSpec):
         block_shape_text = " x ".join(
             f"{count} {name}" for name, count in study_plan.block_shape.items()
@@ -631,14 +635,37 @@ def plan_rows(
     yield (
         "time",
         f"{bound_text} {duration_text(study_plan.wall_seconds)} on "
-        f"{number_with_noun(study_plan.n_workers, computing_unit)}",
+        f"{number_with_noun(study_plan.n_workers, computing_unit)}"
+        + (
+            ", with the processors as busy as now"
+            if study_plan.busy_ratio > BUSY_RATIO_SHOWN_MIN
+            else ""
+        ),
     )
+    yield "parts", _time_parts_text(study_plan)
     memory_share = " a worker" if study_plan.has_workers else ""
     yield "memory", f"about {decimal(study_plan.memory_bytes)}{memory_share}"
     if reason := _excessive_size_text(
         study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds
     ):
         yield "question", f"sweep run asks first, or takes --yes: {reason}"
+
+
+def _time_parts_text(study_plan: StudyPlan) -> str:
+    """Return the parts of the processor time of a run in words, and what compiling adds."""
+    seconds_by_name: dict[str, float] = defaultdict(float)
+    for part in study_plan.time_parts:
+        seconds_by_name[part.name] += part.cpu_seconds
+    parts_text = ", ".join(
+        f"{name} {seconds:.2g}" for name, seconds in seconds_by_name.items() if seconds > 0
+    )
+    text = f"{study_plan.cpu_seconds:.2g} s of one core: {parts_text} s"
+    if not study_plan.is_compiled:
+        text += (
+            "; the model is not compiled yet, which the first run does, so that the time of shots "
+            "is a guess"
+        )
+    return text
 
 
 def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[str, str]]:
@@ -668,7 +695,16 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
                 f"{1e6 * scanner_plan.seconds_per_ray:.3g} us on one core"
             ),
         )
-        yield "", f"{1e6 * scanner_plan.seconds_per_draw:,.0f} us a shot and draw on one core"
+        timed_text = (
+            f", by {number_with_noun(scanner_plan.n_timed_shots, 'shot')} spread over the flight"
+            if scanner_plan.n_timed_shots
+            else ", assumed"
+        )
+        yield (
+            "",
+            f"{1e6 * scanner_plan.seconds_per_draw:,.0f} us a shot and draw on one core"
+            + timed_text,
+        )
     scene_coverage = sample_coverage(spec)
     for scanner in scene_coverage.scanner_hits:
         yield "hits", f"{scanner.name}: {scanner.hits_text()}"
@@ -684,7 +720,11 @@ def print_effects(table: EffectsTable) -> None:
     """
     active_rows = [row for row in table.rows if row.change_bound > 0 or row.simulated_fraction > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
-    print_table("Effects", headings, [_effect_row_cells(row) for row in active_rows], "called for")
+    rows = [_effect_row_cells(row) for row in active_rows]
+    if not any(row.time_fraction == row.time_fraction for row in active_rows):  # all are nan
+        headings.remove("costs")
+        rows = [cells[:2] + cells[3:] for cells in rows]
+    print_table("Effects", headings, rows, "called for")
     absent_effects = [row.name for row in table.rows if row not in active_rows]
     if absent_effects:
         echo_wrapped(f"Not in this study: {', '.join(absent_effects).replace('_', ' ')}.")
@@ -797,11 +837,7 @@ def _effect_row_cells(row: EffectRow) -> list[str]:
     return [
         row.name.replace("_", " ") + mode_text,
         percent(row.simulated_fraction),
-        percent(cost, ".2g")
-        if cost == cost
-        else "too short to measure"
-        if row.simulated_fraction
-        else "-",
+        percent(cost, ".2g") if cost == cost else "not measured" if row.simulated_fraction else "-",
         f"{row.change_bound:.2g}",
         "nowhere, but forced on"
         if row.change_bound == 0 and row.mode == "on"

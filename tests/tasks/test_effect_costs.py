@@ -60,7 +60,7 @@ def test_long_work_is_measured_a_few_times_only(monkeypatch):
     ("share", "cost", "text"),
     [
         (0.5, 0.26, "26 %"),
-        (0.5, math.nan, "too short to measure"),
+        (0.5, math.nan, "not measured"),
         (0.0, math.nan, "-"),
     ],
 )

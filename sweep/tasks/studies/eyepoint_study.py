@@ -28,6 +28,7 @@ from sweep.tasks.engine.block_study import BlockStudy
 from sweep.tasks.engine.blocks import FILL_VALUE_BY_DTYPE_KIND, ArrayLayout, BlockGrid, Results
 from sweep.tasks.studies.output_layouts import cf_attributes, make_output_layout
 from sweep.tasks.studies.parameter_grid import DEFAULT_BLOCKS_MIN, SHOTS_PER_TILE
+from sweep.tasks.studies.scene_cache import load_or_build_scene
 
 if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
@@ -44,6 +45,9 @@ DEFAULT_BLOCK_BEAMLETS_MIN = 1 << 17
 
 #: Largest number of beamlets (rays) that are cast at once. It limits memory if cycles are long.
 RAYS_PER_CAST_MAX = 1 << 18
+
+#: Largest number of beamlets (rays) of the shots that sample a flight before it runs.
+SAMPLED_RAYS_MAX = 1 << 19
 
 #: Number of nodes of a scene's map along the longer side, and least number along the shorter side.
 MAP_NODES_MAX = 256
@@ -187,25 +191,41 @@ class EyepointStudy(BlockStudy):
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def shot_numbers_of_sampled_tiles(self, n_tiles: int) -> np.ndarray:
-        """Return the numbers of all shots in up to `n_tiles` tiles spread over the flight.
+        """Return the numbers of shots in up to `n_tiles` tiles spread over the flight.
 
-        A tile is a run of consecutive shots whose effects are planned together.
+        A tile is a run of consecutive shots whose effects are planned together. All its shots are
+        taken, or fewer, evenly spaced, if they have more than `SAMPLED_RAYS_MAX` rays.
         """
         last_tile = (self.n_points - 1) // SHOTS_PER_TILE
         first_shots = (
             np.unique(np.linspace(0, last_tile, n_tiles).astype(np.int64)) * SHOTS_PER_TILE
         )
         shot_numbers = (first_shots[:, None] + np.arange(SHOTS_PER_TILE)).ravel()
-        return np.asarray(shot_numbers[shot_numbers < self.n_points])
+        shot_numbers = shot_numbers[shot_numbers < self.n_points]
+        return shot_numbers[:: -(-shot_numbers.size * self.n_beamlets // SAMPLED_RAYS_MAX)]
 
     def shot_numbers_of_sampled_cycles(self, n_tiles: int) -> np.ndarray:
         """Return the numbers of all shots in cycles that overlap `n_tiles` tiles of the flight.
 
         A tile is a run of consecutive shots whose effects are planned together.
         """
-        cycle_numbers = np.unique(
-            self.shot_numbers_of_sampled_tiles(n_tiles) // self.shots_per_cycle
+        return self._shot_numbers_of_cycles(
+            np.unique(self.shot_numbers_of_sampled_tiles(n_tiles) // self.shots_per_cycle)
         )
+
+    def shot_numbers_of_spread_cycles(self, n_cycles: int) -> np.ndarray:
+        """Return the numbers of all shots in `n_cycles` cycles spread evenly over the flight.
+
+        A single cycle is that in the middle.
+        """
+        return self._shot_numbers_of_cycles(_middles_of_equal_parts(self.n_cycles, n_cycles))
+
+    def spread_shot_numbers(self, n_shots: int) -> np.ndarray:
+        """Return the numbers of `n_shots` shots spread evenly over the flight."""
+        return _middles_of_equal_parts(self.n_points, n_shots)
+
+    def _shot_numbers_of_cycles(self, cycle_numbers: np.ndarray) -> np.ndarray:
+        """Return the numbers of all shots in the cycles with given numbers (n,)."""
         return np.asarray(
             (
                 cycle_numbers[:, None] * self.shots_per_cycle + np.arange(self.shots_per_cycle)
@@ -262,10 +282,16 @@ class EyepointStudy(BlockStudy):
         }
 
 
+def _middles_of_equal_parts(n_items: int, n_parts: int) -> np.ndarray:
+    """Return the index in the middle of each of `n_parts` equal parts of `n_items` items."""
+    n_parts = min(n_parts, n_items)
+    return np.asarray((2 * np.arange(n_parts) + 1) * n_items // (2 * n_parts))
+
+
 @lru_cache(maxsize=1)
 def build_world(spec: SceneSpec) -> BuiltScene:
-    """Build the scene of a study; the last one is cached, as building can take seconds."""
-    return spec.build_scene()
+    """Return the scene of a study, built or from the cache; the last one is kept in memory."""
+    return load_or_build_scene(spec, spec.build_scene)
 
 
 def height_above_surface(

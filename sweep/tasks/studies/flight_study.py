@@ -421,10 +421,13 @@ class FlightStudy(ExtendableStudy):
         selected_effects: SelectedEffects,
         shot_numbers: np.ndarray,
         reused_cloud: ReusedCloud | None = None,
+        *,
+        solves_navigation: bool = True,
     ) -> Results:
         """Simulate radiometry, draws and navigation of shots that make complete measurement cycles.
 
-        Results that are ``reused_cloud`` holds are not simulated again.
+        Results that are ``reused_cloud`` holds are not simulated again. Shots may be any if
+        ``solves_navigation`` is False.
         """
         scanner_grid = self.scanner_grids[flight_block.scanner]
         n_draws, shots_per_cycle = len(flight_block.draws), scanner_grid.shots_per_cycle
@@ -442,7 +445,7 @@ class FlightStudy(ExtendableStudy):
                 simulate_cloud,
             ):
                 _insert_results(results, shot_rows, draw_slice, part_results)
-        if scanner_grid.has_navigation_solution:
+        if scanner_grid.has_navigation_solution and solves_navigation:
             is_missing = (~is_reused).reshape(-1, shots_per_cycle, n_draws).any(axis=1)
             for cycles, draw_slice in _iter_missing_draws(np.asarray(is_missing)):
                 rows = (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -14,18 +15,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import psutil
 
+from sweep.kernel_cache import is_compiled
+from sweep.messages import is_run_as_command
 from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
-from sweep.model.outputs import SHOT_VARIABLES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.storage.locations import Location, eyepoint_store_location
 from sweep.tasks.engine.session import RunOptions
 from sweep.tasks.engine.worker_memory import process_memory
-from sweep.tasks.studies.eyepoint_study import EyepointStudy
-from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
+from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world, terrain_map_layouts
+from sweep.tasks.studies.flight_coverage import sample_coverage
+from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import (
     EffectPlanner,
     GridStudy,
-    SelectedEffects,
     evaluate_points,
     limit_draws,
     select_parameters,
@@ -41,16 +43,27 @@ from sweep.tasks.studies.study_loading import make_study
 from sweep.tasks.studies.workload import SpecWorkload
 
 if TYPE_CHECKING:
-    from sweep.model.pointcloud.eyepoints import Eyepoints
     from sweep.spec import GridSpec, SceneSpec
-    from sweep.tasks.engine.blocks import Results
 
 #: Limits of measuring the time per point: duration of the measurement [s], and number of blocks.
 POINT_TIMING_SECONDS = 1.0
 TIMED_BLOCKS_MAX = 16
 
-#: Approximate time limit of measuring one scanner [s].
-SCANNER_TIMING_SECONDS = 0.5
+#: Approximate time limit of measuring all scanners of a flight [s].
+FLIGHT_TIMING_SECONDS = 1.0
+
+#: Limits of the shots of a scanner that are timed: of their rays, and of products with draws.
+TIMED_RAYS_MAX = 1 << 17
+TIMED_SHOT_DRAWS_MAX = 1 << 14
+
+#: Number of shots, spread over the flight, that load kernels and tables before any is timed.
+LOADING_SHOTS = 32
+
+#: Largest number of shots of a cycle of which whole cycles are timed, with their navigation.
+TIMED_CYCLE_SHOTS_MAX = 128
+
+#: Number of points along a flight's axes at which shots are timed.
+TIMED_AXIS_POINTS_MAX = 3
 
 #: Largest number of draws of a point whose time is measured.
 TIMED_DRAWS_MAX = 1000
@@ -58,9 +71,32 @@ TIMED_DRAWS_MAX = 1000
 #: Largest number of draws of whole spectra whose time is measured.
 TIMED_SPECTRA_MAX = 10
 
-#: Estimated times for a plan [s]: of starting worker processes, and of writing one chunk.
+#: Estimated times for a plan [s]: of starting worker processes, of writing one chunk, of starting
+#: the command, of creating a flight's stores and summing up its results, and of compiling a flight.
 WORKER_START_SECONDS = 3.0
 CHUNK_WRITE_SECONDS = 2e-3
+COMMAND_START_CPU_SECONDS = 1.5
+FLIGHT_STORE_CPU_SECONDS = 1.0
+FLIGHT_COMPILE_CPU_SECONDS = 100.0
+
+#: Assumed times of a flight whose kernels are not compiled yet [s]: of loading the model, and of a
+#: ray, of a shot, and of each of its draws.
+MODEL_LOADING_CPU_SECONDS = 3.0
+UNMEASURED_RAY_CPU_SECONDS = 1e-6
+UNMEASURED_SHOT_CPU_SECONDS, UNMEASURED_DRAW_CPU_SECONDS = 5e-4, 3e-5
+
+#: Limits of the ratio of wall time to processor time of this process. It is above 1 if other
+#: programs keep the processors busy.
+BUSY_RATIO_MAX = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimePart:
+    """Part of the time that a run takes."""
+
+    name: str
+    cpu_seconds: float  # processor time [s]
+    n_parallel: int = 1  # number of threads or workers that share it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +110,13 @@ class ScannerPlan:
     has_eyepoints: bool  # whether the eyepoints exist already
     seconds_per_ray: float  # measured time of a ray on one worker [s]
     seconds_per_draw: float  # measured time of one draw of a shot, with navigation [s]
+    n_timed_shots: int  # number of different shots that were timed; 0 if none was
+    loading_seconds: float = 0.0  # time of loading kernels and tables before the first shot [s]
+
+    @property
+    def casting_seconds(self) -> float:
+        """Processor time of casting the rays [s]; 0 if the eyepoints exist."""
+        return 0.0 if self.has_eyepoints else self.n_rays * self.seconds_per_ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +131,8 @@ class StudyPlan:
     n_workers: int  # number of worker processes, or of threads of the command
     has_workers: bool  # whether worker processes compute, in the place of threads
     seconds_per_point: float  # measured time of a point on one core [s]
-    wall_seconds: float  # estimated wall time of the study [s]
+    time_parts: tuple[TimePart, ...]  # parts of the time of the run
+    busy_ratio: float  # wall time over processor time of this process as it planned, at least 1
     memory_bytes: (
         int  # estimated memory of each worker, or of this process with its threads [bytes]
     )
@@ -97,8 +141,21 @@ class StudyPlan:
 
     @property
     def cpu_seconds(self) -> float:
-        """Estimated computing time of the whole study on one core [s]."""
-        return self.n_points * self.seconds_per_point
+        """Estimated processor time of the run: the sum of its parts [s]."""
+        return sum(part.cpu_seconds for part in self.time_parts)
+
+    @property
+    def wall_seconds(self) -> float:
+        """Estimated wall time of the run, with the processors as busy as now [s]."""
+        start_seconds = WORKER_START_SECONDS if self.has_workers else 0.0
+        return start_seconds + self.busy_ratio * sum(
+            part.cpu_seconds / part.n_parallel for part in self.time_parts
+        )
+
+    @property
+    def is_compiled(self) -> bool:
+        """True if the kernels of the study are compiled, so that its points could be timed."""
+        return all(scanner_plan.n_timed_shots for scanner_plan in self.scanners)
 
 
 def plan_study(
@@ -126,36 +183,40 @@ def plan_study(
     SpecError
         If a point, a block or the scene needs more memory than this machine has.
     """
+    start_wall, start_cpu = time.perf_counter(), time.process_time()
+    start_part = TimePart(
+        name="start", cpu_seconds=start_cpu if is_run_as_command() else COMMAND_START_CPU_SECONDS
+    )
     refuse_too_large_point(spec, process_memory())
     study = make_study(spec, (store_path or Path("nowhere.zarr")).absolute())
     refuse_too_large_blocks(study, process_memory())
+    options = RunOptions(workers=n_workers)
+    has_workers = options.resolve_cluster(SpecWorkload(spec)) is not None
+    n_workers = n_workers or spec.execution.workers or options.n_threads(SpecWorkload(spec))
+    n_parallel = min(n_workers, study.n_blocks)
     scanners: tuple[ScannerPlan, ...] = ()
     scene_reports: tuple[str, ...] = ()
     block_shape = {}
     if isinstance(study, FlightStudy):
-        eyepoints = study.eyepoint_studies()
-        scanners = tuple(_plan_scanner(study, seconds_per_point) for seconds_per_point in eyepoints)
-        ray_seconds = sum(
-            0 if scanner_plan.has_eyepoints else scanner_plan.n_rays * scanner_plan.seconds_per_ray
-            for scanner_plan in scanners
-        )
-        draw_seconds = sum(
-            grid.n_points * scanner_plan.seconds_per_draw
-            for grid, scanner_plan in zip(study.grids, scanners, strict=True)
-        )
-        refuse_too_large_scene(study.spec, process_memory())
-        seconds_per_point, scene_reports = (
-            (ray_seconds + draw_seconds) / study.n_points,
-            eyepoints[0].world.mesh_reports,
-        )
+        scanners, parts, scene_reports = _plan_flight(study, n_workers)
+        seconds_per_point = sum(
+            part.cpu_seconds for part in parts if part.name in ("rays", "shots")
+        ) / (study.n_points)
     else:
         seconds_per_point = measure_seconds_per_point(study)
         block_shape = dict(zip(study.grid.dims, study.grid.block_shape, strict=True))
-    options = RunOptions(workers=n_workers)
-    has_workers = options.resolve_cluster(SpecWorkload(spec)) is not None
-    n_workers = n_workers or spec.execution.workers or options.n_threads(SpecWorkload(spec))
-    start_seconds = WORKER_START_SECONDS if has_workers else 0.0
-    cpu_seconds = study.n_points * seconds_per_point + study.n_chunks * CHUNK_WRITE_SECONDS
+        parts = (
+            TimePart(
+                name="points",
+                cpu_seconds=study.n_points * seconds_per_point,
+                n_parallel=n_parallel,
+            ),
+        )
+    writing_part = TimePart(
+        name="writing", cpu_seconds=study.n_chunks * CHUNK_WRITE_SECONDS, n_parallel=n_parallel
+    )
+    wall_seconds = time.perf_counter() - start_wall
+    cpu_seconds = max(time.process_time() - start_cpu, 1e-9)
     return StudyPlan(
         n_points=study.n_points,
         n_blocks=study.n_blocks,
@@ -165,12 +226,73 @@ def plan_study(
         n_workers=n_workers,
         has_workers=has_workers,
         seconds_per_point=seconds_per_point,
-        wall_seconds=start_seconds + cpu_seconds / min(n_workers, study.n_blocks),
+        time_parts=(start_part, *parts, writing_part),
+        busy_ratio=min(max(wall_seconds / cpu_seconds, 1.0), BUSY_RATIO_MAX),
         # with the model loaded, and for each block at work its results and their encoded copy
         memory_bytes=psutil.Process().memory_info().rss
-        + (1 if has_workers else min(n_workers, study.n_blocks)) * block_bytes_max(study),
+        + (1 if has_workers else n_parallel) * block_bytes_max(study),
         scanners=scanners,
         scene_reports=scene_reports,
+    )
+
+
+def _plan_flight(
+    study: FlightStudy, n_workers: int
+) -> tuple[tuple[ScannerPlan, ...], tuple[TimePart, ...], tuple[str, ...]]:
+    """Return plans of a flight's scanners, parts of its time, and reports of its scene."""
+    spec, eyepoint_studies = study.spec, study.eyepoint_studies()
+    times = [time.process_time()]
+    world = build_world(spec)
+    times.append(time.process_time())
+    sample_coverage(spec)
+    terrain_map_layouts(spec)
+    times.append(time.process_time())
+    scene_seconds, checks_seconds = np.diff(times).tolist()
+    refuse_too_large_scene(spec, process_memory())
+    if are_flight_kernels_compiled(spec):
+        plan_scanner, compile_seconds = _plan_scanner, 0.0
+    else:
+        plan_scanner, compile_seconds = _plan_scanner_unmeasured, FLIGHT_COMPILE_CPU_SECONDS
+    scanners = tuple(plan_scanner(study, eyepoints) for eyepoints in eyepoint_studies)
+    parts = [
+        TimePart(name="scene", cpu_seconds=scene_seconds),
+        # warnings sample the flight as the coverage does
+        TimePart(name="checks", cpu_seconds=2 * checks_seconds + FLIGHT_STORE_CPU_SECONDS),
+        TimePart(name="compiling", cpu_seconds=compile_seconds),
+        TimePart(name="model", cpu_seconds=sum(plan.loading_seconds for plan in scanners)),
+    ]
+    for name, seconds_by_scanner, block_counts in (
+        (
+            "rays",
+            [plan.casting_seconds for plan in scanners],
+            [eyepoints.n_blocks for eyepoints in eyepoint_studies],
+        ),
+        (
+            "shots",
+            [
+                grid.n_points * plan.seconds_per_draw
+                for grid, plan in zip(study.grids, scanners, strict=True)
+            ],
+            [study.n_blocks] * len(scanners),
+        ),
+    ):
+        seconds_by_n_parallel: dict[int, float] = defaultdict(float)
+        for seconds, n_blocks in zip(seconds_by_scanner, block_counts, strict=True):
+            seconds_by_n_parallel[min(n_workers, n_blocks)] += seconds
+        parts += [
+            TimePart(name=name, cpu_seconds=seconds, n_parallel=n_parallel)
+            for n_parallel, seconds in seconds_by_n_parallel.items()
+        ]
+    return scanners, tuple(parts), world.mesh_reports
+
+
+def are_flight_kernels_compiled(spec: SceneSpec) -> bool:
+    """Return True if kernels of casting and of simulating shots are in memory or in the cache."""
+    from sweep.model.geometry.bvh import find_nearest_triangles
+    from sweep.model.pointcloud.returns import store_peak
+
+    return is_compiled(find_nearest_triangles) and (
+        spec.draws.draws_whole_spectra or is_compiled(store_peak)
     )
 
 
@@ -323,39 +445,119 @@ def time_points(
     )
 
 
-def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
-    """Return the plan of a scanner, with times measured on a sample of its cycles."""
-    scanner_grid = study.scanner_grids[eyepoints.scanner]
-    flight_block = scanner_grid.flight_block(0)
-    flight_block = flight_block._replace(draws=flight_block.draws[:TIMED_DRAWS_MAX])
+class _ScannerTimer:
+    """Stopwatch of a scanner's shots, spread over the flight and over the points of the axes."""
 
-    def time_round(n_tiles: int) -> TimedRound:
-        start = time.process_time()
-        shot_numbers = eyepoints.shot_numbers_of_sampled_cycles(n_tiles)
-        shot_arrays = eyepoints.cast_cycles(shot_numbers)
-        cast_at = time.process_time()
-        shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
-        study.simulate_shots(
-            flight_block,
-            shot_arrays,
-            shot_eyepoints,
-            study.select_effects(flight_block, shot_eyepoints, shot_numbers),
-            shot_numbers,
+    def __init__(self, study: FlightStudy, eyepoints: EyepointStudy) -> None:
+        self._study, self._eyepoints = study, eyepoints
+        self.grid = study.scanner_grids[eyepoints.scanner]
+        axis_points = list(np.ndindex(self.grid.axes_shape))
+        self._flight_blocks = [
+            self.grid.first_flight_block(axis_point)
+            for axis_point in _select_evenly_spaced(axis_points, TIMED_AXIS_POINTS_MAX)
+        ]
+        self.n_draws = len(self._flight_blocks[0].draws)
+        self.shots_per_block = len(self._flight_blocks[0].cycles) * self.grid.shots_per_cycle
+        self.n_shots_max = max(
+            1,
+            min(
+                TIMED_RAYS_MAX // eyepoints.n_beamlets,
+                TIMED_SHOT_DRAWS_MAX // self.n_draws,
+                self.shots_per_block,
+            ),
         )
-        simulated_at = time.process_time()
-        return TimedRound(len(shot_numbers), (cast_at - start, simulated_at - cast_at))
+        # Navigation needs complete cycles. In long ones it takes little of the time of a shot.
+        self._takes_cycles = self.grid.shots_per_cycle <= min(
+            TIMED_CYCLE_SHOTS_MAX, self.n_shots_max
+        )
 
-    time_round(1)  # loads compiled kernels, which takes longer than many points
-    timed_round = _time_growing_rounds(time_round, eyepoints.n_points, SCANNER_TIMING_SECONDS)
-    casting_seconds, draw_seconds = timed_round.seconds_by_part
+    def time_shots(self, n_shots: int) -> tuple[int, float, float]:
+        """Time some shots. Return their number, and times of casting and of simulating [s].
+
+        The time of simulating is that of all draws of a block, averaged over points of the axes.
+        """
+        start = time.process_time()
+        if self._takes_cycles:
+            shot_numbers = self._eyepoints.shot_numbers_of_spread_cycles(
+                max(n_shots // self.grid.shots_per_cycle, 1)
+            )
+        else:
+            shot_numbers = self._eyepoints.spread_shot_numbers(n_shots)
+        shot_arrays = self._eyepoints.cast_shots(shot_numbers)
+        cast_at = time.process_time()
+        shot_eyepoints = eyepoints_from_arrays(shot_arrays, self._eyepoints.beamlet_weights)
+        for flight_block in self._flight_blocks:
+            self._study.simulate_shots(
+                flight_block,
+                shot_arrays,
+                shot_eyepoints,
+                self._study.select_effects(flight_block, shot_eyepoints, shot_numbers),
+                shot_numbers,
+                solves_navigation=self._takes_cycles,
+            )
+        simulation_seconds = (time.process_time() - cast_at) / len(self._flight_blocks)
+        return len(shot_numbers), cast_at - start, simulation_seconds
+
+
+def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
+    """Return the plan of a scanner, with times measured on shots spread over its flight.
+
+    A call takes a time of its own, and a time for each shot. Both follow from two numbers of shots.
+    """
+    timer = _ScannerTimer(study, eyepoints)
+    seconds_max = FLIGHT_TIMING_SECONDS / len(study.spec.scanners)
+    # The first shots load kernels and tables, which other places in the flight may need too.
+    _, first_casting_seconds, first_seconds = timer.time_shots(
+        min(LOADING_SHOTS, timer.n_shots_max)
+    )
+    start = time.process_time()
+    n_timed, samples = 1, [timer.time_shots(1)]
+    while n_timed < timer.n_shots_max and (
+        samples[-1][1] + samples[-1][2] < seconds_max / 4
+        and time.process_time() - start < seconds_max
+    ):
+        n_timed = min(4 * samples[-1][0], timer.n_shots_max)
+        samples.append(timer.time_shots(n_timed))
+        if samples[-1][0] == samples[-2][0]:  # the next cycle would be beyond the limit
+            break
+    # Shots elsewhere may need tables of their own, which the second time finds.
+    n_shots, casting_seconds, simulation_seconds = timer.time_shots(n_timed)
+    loading_seconds = first_casting_seconds + first_seconds - samples[0][1] - samples[0][2]
+    loading_seconds += samples[-1][1] + samples[-1][2] - casting_seconds - simulation_seconds
+    n_small, _, small_seconds = samples[0]
+    seconds_per_shot = (
+        max(simulation_seconds - small_seconds, 0.0) / (n_shots - n_small)
+        if n_shots > n_small
+        else simulation_seconds / n_shots
+    )
+    call_seconds = max(simulation_seconds - n_shots * seconds_per_shot, 0.0)
+    block_seconds = call_seconds + timer.shots_per_block * seconds_per_shot
     return ScannerPlan(
         name=eyepoints.scanner,
         n_cycles=eyepoints.n_cycles,
         n_shots=eyepoints.n_points,
         n_rays=eyepoints.n_rays,
         has_eyepoints=eyepoint_store_location(study.store_path, eyepoints.id).exists(),
-        seconds_per_ray=casting_seconds / eyepoints.count_rays(timed_round.n_points),
-        seconds_per_draw=draw_seconds / (timed_round.n_points * len(flight_block.draws)),
+        seconds_per_ray=casting_seconds / (n_shots * eyepoints.n_beamlets),
+        seconds_per_draw=block_seconds / (timer.shots_per_block * timer.n_draws),
+        n_timed_shots=n_shots,
+        loading_seconds=max(loading_seconds, 0.0),
+    )
+
+
+def _plan_scanner_unmeasured(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
+    """Return the plan of a scanner from assumed times, as measuring them would compile kernels."""
+    shot_seconds = UNMEASURED_SHOT_CPU_SECONDS / study.scanner_grids[eyepoints.scanner].n_draws
+    return ScannerPlan(
+        name=eyepoints.scanner,
+        n_cycles=eyepoints.n_cycles,
+        n_shots=eyepoints.n_points,
+        n_rays=eyepoints.n_rays,
+        has_eyepoints=eyepoint_store_location(study.store_path, eyepoints.id).exists(),
+        seconds_per_ray=UNMEASURED_RAY_CPU_SECONDS,
+        seconds_per_draw=shot_seconds + UNMEASURED_DRAW_CPU_SECONDS,
+        n_timed_shots=0,
+        loading_seconds=MODEL_LOADING_CPU_SECONDS / len(study.spec.scanners),
     )
 
 
@@ -365,14 +567,13 @@ GRID_TILES_SAMPLED_MAX = 1024
 #: Number of tiles of each scanner of a flight that are planned, and of points along the axes.
 SCANNER_TILES_SAMPLED, AXIS_POINTS_SAMPLED = 16, 12
 
-#: Sample for measuring the cost of an effect: tiles of a grid, points or shots of each, draws of
-#: each point, and samples of a flight's scanners.
+#: Sample for measuring the cost of an effect: tiles of a grid, points of each, and draws of each
+#: point.
 (
     EFFECT_COST_TILES_MAX,
     EFFECT_COST_POINTS_MAX,
     EFFECT_COST_DRAWS_MAX,
-    EFFECT_COST_SCANNER_SAMPLES_MAX,
-) = 4, 24, 20, 3
+) = 4, 24, 20
 #: Number of rounds of measuring the cost of an effect, at most, and at least if they take long.
 EFFECT_COST_ROUNDS_MAX, EFFECT_COST_ROUNDS_MIN = 5, 3
 
@@ -426,7 +627,8 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
     study
         Study over a grid, or flight.
     costs
-        Whether to measure the fraction of time that each effect takes.
+        Whether to measure the fraction of time that each effect of a grid takes. It is not measured
+        for a flight: the time of a shot varies too much for the share of one effect.
 
     Returns
     -------
@@ -435,7 +637,7 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
     """
     if isinstance(study, GridStudy):
         return _grid_effects_table(study, costs)
-    return _flight_effects_table(study, costs)
+    return _flight_effects_table(study)
 
 
 def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
@@ -484,7 +686,7 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
     )
 
 
-def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
+def _flight_effects_table(study: FlightStudy) -> EffectsTable:
     """Return the table of effects of a flight, from tiles spread over it and its axes."""
     tile_effects, tile_times, n_shots = [], [], 0
     axes = tuple(int(axis.size) for axis in study.spec.axes)
@@ -523,10 +725,7 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
     if not tile_effects:
         tolerance = float(study.spec.accuracy.tolerance)
         return EffectsTable(rows=(), tolerance=tolerance, error_bound=0.0, tile_fraction=1.0)
-    time_of_tile, shot_samples = (
-        np.concatenate(tile_times),
-        _sample_flight_shots(study) if costs else [],
-    )
+    time_of_tile = np.concatenate(tile_times)
     return _make_effects_table(
         study.spec,
         _TileEffects(
@@ -534,7 +733,7 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
         ),
         n_points=n_shots,
         region_text=lambda is_in_region: _time_range_text(time_of_tile[is_in_region]),
-        effect_cost=lambda name, is_in_region: _flight_effect_cost(study, shot_samples, name),
+        effect_cost=lambda name, is_in_region: math.nan,
         tile_fraction=n_shots * study.spec.draws.number / study.n_points,
     )
 
@@ -715,114 +914,10 @@ def reproducible_time_fraction(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]
     return median if np.ptp(fractions) <= EFFECT_COST_SPREAD_MAX * median else math.nan
 
 
-class _ShotSample(NamedTuple):
-    """Arguments of :meth:`FlightStudy.simulate_shots` for some cycles of a scanner, to be timed."""
-
-    flight_block: FlightBlock
-    shot_arrays: Results
-    eyepoints: Eyepoints
-    selected_effects: SelectedEffects
-    shot_numbers: np.ndarray
-
-    def subset(self, rows: np.ndarray, *, removed_flags: np.uint32) -> _ShotSample:
-        """Return the sample of some shots, without the effects in `removed_flags`."""
-        shot_arrays = {name: self.shot_arrays[name][rows] for name in SHOT_VARIABLES}
-        effect_flags = self.selected_effects.effect_flags[rows] & ~removed_flags
-        selected_effects = SelectedEffects(effect_flags, self.selected_effects.error_bound[rows])
-        return _ShotSample(
-            self.flight_block,
-            shot_arrays,
-            self.eyepoints.select(rows),
-            selected_effects,
-            self.shot_numbers[rows],
-        )
-
-
-def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
-    """Sample measurement cycles spread over the flight of each scanner.
-
-    They are taken at the first and at the last point of all axes.
-    """
-    axis_corners = {
-        tuple(end_factor * (int(axis.size) - 1) for axis in study.spec.axes)
-        for end_factor in (0, 1)
-    }
-    samples = []
-    for eyepoints in study.eyepoint_studies():
-        shot_numbers = eyepoints.shot_numbers_of_sampled_cycles(SCANNER_TILES_SAMPLED)
-        shot_arrays = eyepoints.cast_cycles(shot_numbers)
-        shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
-        for corner in sorted(axis_corners):
-            flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(corner)
-            flight_block = flight_block._replace(
-                draws=range(min(len(flight_block.draws), EFFECT_COST_DRAWS_MAX))
-            )
-            selected_effects = study.select_effects(flight_block, shot_eyepoints, shot_numbers)
-            samples.append(
-                _ShotSample(
-                    flight_block, shot_arrays, shot_eyepoints, selected_effects, shot_numbers
-                )
-            )
-    return samples
-
-
-def _flight_effect_cost(
-    study: FlightStudy, shot_samples: Sequence[_ShotSample], effect_name: str
-) -> float:
-    """Return an effect's share of the computing time of shots, measured on sampled cycles."""
-    no_flags, effect_flag = np.uint32(0), np.uint32(1 << EFFECT_NAMES.index(effect_name))
-
-    def stopwatches_of_sample(sample: _ShotSample) -> tuple[Stopwatch, Stopwatch]:
-        shots_per_cycle = study.scanner_grids[sample.flight_block.scanner].shots_per_cycle
-        cycles_with_effect = np.flatnonzero(
-            (sample.selected_effects.effect_flags & effect_flag)
-            .reshape(-1, shots_per_cycle)
-            .any(axis=1)
-        )
-        for n_cycles in (1, -(-EFFECT_COST_POINTS_MAX // shots_per_cycle)):
-            cycles = np.array(_select_evenly_spaced(cycles_with_effect, n_cycles))
-            if (
-                _seconds_of_cycles(study, sample, cycles, removed_flags=no_flags)
-                > EFFECT_COST_ROUND_SECONDS / 2
-            ):  # one cycle takes long enough
-                break
-        return (
-            lambda: _seconds_of_cycles(study, sample, cycles, removed_flags=no_flags),
-            lambda: _seconds_of_cycles(study, sample, cycles, removed_flags=effect_flag),
-        )
-
-    samples_with_effect = [
-        sample
-        for sample in shot_samples
-        if (sample.selected_effects.effect_flags & effect_flag).any()
-    ]
-    return reproducible_time_fraction(
-        map(
-            stopwatches_of_sample,
-            _select_evenly_spaced(samples_with_effect, EFFECT_COST_SCANNER_SAMPLES_MAX),
-        )
-    )
-
-
 def _select_evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
     """Return at most `n_max` of the items, evenly spaced from the first to the last."""
     positions = np.linspace(0, len(sequence) - 1, min(n_max, len(sequence))).astype(int)
     return [sequence[k] for k in positions]
-
-
-def _seconds_of_cycles(
-    study: FlightStudy, sample: _ShotSample, cycles: np.ndarray, *, removed_flags: np.uint32
-) -> float:
-    """Return the time of some cycles without the effects in `removed_flags` [s]."""
-    shots_per_cycle = study.scanner_grids[sample.flight_block.scanner].shots_per_cycle
-    cycle_sample = sample.subset(
-        (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel(),
-        removed_flags=removed_flags,
-    )
-
-    start = time.process_time()
-    study.simulate_shots(*cycle_sample)
-    return time.process_time() - start
 
 
 def _tile_grid_indices(

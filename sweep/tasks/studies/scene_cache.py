@@ -1,0 +1,181 @@
+"""Cache of built scenes: a large elevation model takes longer to build than to read.
+
+A file holds the bodies of a scene with their box trees. Its name is a digest of everything that
+they follow from: the spec's scene and platform, the content of the files that these name, and the
+sources of this package that build them.
+
+    BASE/sweep-scenes-UID/DIGEST
+
+BASE is the folder that holds the compiled kernels (:mod:`sweep.kernel_cache`). A file is read by
+`pickle`, which can execute code, so the folder is used only if no other user can write to it. A
+file that is damaged counts as absent. Anyone may delete the files at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import pickle
+import platform
+import tempfile
+import time
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+
+from sweep.kernel_cache import cache_folder, create_private_folder
+from sweep.spec.fields import identity_digest
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec
+    from sweep.spec.scene_sections import BuiltScene
+
+CACHED_BUILD_SECONDS_MIN = 1.0
+"""Processor time of building a scene from which on the scene is cached [s]."""
+
+CACHE_BYTES_MAX = 2 << 30
+"""Largest size of all cached scenes together [bytes]. The least recently used ones are deleted."""
+
+DRAFT_AGE_MAX = 86400.0
+"""Age at which an unfinished file is deleted, since its writer must have died [s]."""
+
+_DRAFT_PREFIX = "draft-"
+_HEADER_BYTES = 8  # CRC-32 of the rest of the file, as hexadecimal digits
+_READ_BYTES = 1 << 20
+
+_log = logging.getLogger("sweep")
+
+
+def load_or_build_scene(spec: SceneSpec, build: Callable[[], BuiltScene]) -> BuiltScene:
+    """Return the scene of a spec from the cache, or build it and cache it if that takes long.
+
+    Parameters
+    ----------
+    spec
+        Spec of a flight.
+    build
+        Function that builds the scene.
+
+    Returns
+    -------
+    BuiltScene
+        The scene. Its arrays have the same bits, whether it was built or read.
+    """
+    root = _cache_root()
+    path = None if root is None else root / _scene_digest(spec)
+    if path is not None and (cached_scene := _read_scene(path)) is not None:
+        return cached_scene
+    start = time.thread_time()
+    scene = build()
+    if path is not None and time.thread_time() - start >= CACHED_BUILD_SECONDS_MIN:
+        _write_scene(path, scene)
+    return scene
+
+
+@cache
+def _cache_root() -> Path | None:
+    """Return the folder of cached scenes, next to that of the kernels; None if there is none."""
+    kernel_folder = cache_folder().path
+    if kernel_folder is None:
+        return None
+    root = kernel_folder.parent.with_name(f"sweep-scenes-{os.getuid()}")
+    try:
+        create_private_folder(root)
+    except OSError as error:
+        _log.info("built scenes are not cached: %s", error)
+        return None
+    return root
+
+
+def _scene_digest(spec: SceneSpec) -> str:
+    """Return a digest of everything from which the arrays and reports of a scene follow."""
+    identity = spec.identity()
+    parts = {name: identity[name] for name in ("objects", "scene", "platform")}
+    versions = [_source_digest(), np.__version__, scipy.__version__, platform.python_version()]
+    return identity_digest(parts | {"versions": versions})
+
+
+@cache
+def _source_digest() -> str:
+    """Return a digest of the sources that build scenes."""
+    package_dir = Path(__file__).parents[2]
+    digest = hashlib.sha256()
+    for folder in ("model", "scenes", "spec"):
+        for path in sorted((package_dir / folder).rglob("*.py")):
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(package_dir)}\0{len(content)}\0".encode())
+            digest.update(content)
+    return digest.hexdigest()
+
+
+class _ChecksumWriter:
+    """Binary file that computes the CRC-32 of what is written to it."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file, self.checksum = file, 0
+
+    def write(self, data: Any) -> int:
+        """Write bytes, or an object with a buffer of bytes."""
+        self.checksum = zlib.crc32(data, self.checksum)
+        return self._file.write(data)
+
+
+def _read_scene(path: Path) -> BuiltScene | None:
+    """Return the scene of a cached file; None if the file is absent, damaged or unreadable."""
+    try:
+        with path.open("rb") as file:
+            expected_checksum, checksum = int(file.read(_HEADER_BYTES), 16), 0
+            while data := file.read(_READ_BYTES):
+                checksum = zlib.crc32(data, checksum)
+            if checksum != expected_checksum:
+                return None
+            file.seek(_HEADER_BYTES)
+            scene: BuiltScene = pickle.load(file)
+        os.utime(path)  # the least recently used files are deleted first
+    except Exception:  # unpickling bytes of another version may raise any exception
+        return None
+    return scene
+
+
+def _write_scene(path: Path, scene: BuiltScene) -> None:
+    """Write a scene to a draft, and rename it into place; what fails leaves no file behind."""
+    draft = None
+    try:
+        with tempfile.NamedTemporaryFile(
+            dir=path.parent, prefix=_DRAFT_PREFIX, delete=False
+        ) as file:
+            draft = Path(file.name)
+            file.write(b"0" * _HEADER_BYTES)
+            writer = _ChecksumWriter(file)
+            pickle.dump(scene, writer, protocol=5)
+            file.seek(0)
+            file.write(f"{writer.checksum:0{_HEADER_BYTES}x}".encode())
+        os.replace(draft, path)
+    except Exception as error:  # a full disk, or an object that can't be pickled
+        _log.info("a built scene is not cached: %s", error)
+        if draft is not None:
+            draft.unlink(missing_ok=True)
+    else:
+        _delete_least_recently_used(path.parent)
+
+
+def _delete_least_recently_used(root: Path) -> None:
+    """Delete the least recently used scenes beyond the size limit, and abandoned drafts."""
+    with suppress(OSError):
+        statuses = sorted(
+            ((path.stat(), path) for path in root.iterdir()), key=lambda pair: -pair[0].st_mtime
+        )
+        total_bytes = 0
+        for status, path in statuses:
+            is_draft = path.name.startswith(_DRAFT_PREFIX)
+            total_bytes += 0 if is_draft else status.st_size
+            is_abandoned = is_draft and time.time() - status.st_mtime > DRAFT_AGE_MAX
+            if is_abandoned or (not is_draft and total_bytes > CACHE_BYTES_MAX):
+                path.unlink(missing_ok=True)
