@@ -43,7 +43,7 @@ TableCell = str | float | int
 
 @dataclass(frozen=True)
 class PageTable:
-    """Table of a page."""
+    """Heading, column names and rows of a table on a page."""
 
     heading: str
     """Heading above the table."""

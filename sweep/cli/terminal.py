@@ -794,7 +794,7 @@ def false_alarm_text(spec: GridSpec | SceneSpec) -> str:
 
 
 def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
-    """Print warnings about a spec, such as a too narrow beam, its scene, path and false alarms.
+    """Print warnings about a spec: its beam, scene, path and false alarms.
 
     Raise SceneError for a flight whose beams never hit the scene.
     """

@@ -297,8 +297,8 @@ class BaseSpec(SpecSection):
     def parameters(self) -> dict[str, float | int | str]:
         """Return the SI values of all parameters by dotted path.
 
-        A parameter on an axis has the value of its field, or its first value on the axis without a
-        field.
+        A parameter on an axis has the value that its field states. If the spec does not state the
+        field, it has the first value on the axis.
         """
         return {
             path: value

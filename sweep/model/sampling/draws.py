@@ -207,7 +207,8 @@ class BinInNoise(NamedTuple):
     factor_in_phase: np.ndarray
     """(draws,): real part of the factor by speckle on the signal."""
     factor_in_quadrature: np.ndarray
-    """(draws,): imaginary part of the factor by speckle on the signal."""
+    """(draws,): imaginary part of the complex speckle factor, of mean power 1, by which the
+    signal is multiplied."""
 
 
 def count_by_probability(

@@ -94,7 +94,7 @@ DRAW_INCREMENTS = CounterIncrements(draw=1, block=0)
 """Counter increments for columns that hold the same block (four random words) of successive
 draws."""
 BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
-"""Counter increments for columns that hold successive blocks (four random words) of one draw."""
+"""Counter increments of successive blocks of four random words that belong to one draw."""
 
 
 @njit(cache=True)

@@ -262,7 +262,8 @@ class SpectrumWorkspace(NamedTuple):
     imaginary_part: np.ndarray
     """Scratch: imaginary part of the spectrum in the computed bins around the lines."""
     mean_square: np.ndarray
-    """Scratch: squared magnitude averaged over shifts, in the computed bins around the lines."""
+    """Scratch: squared magnitude in the computed bins around the lines. It is averaged over
+    frequency shifts (:class:`AveragingShifts`)."""
     span: SpanArrays
     """Magnitudes and crossing probabilities in the computed bins around the lines."""
     leakage_quadrature: LeakageQuadrature

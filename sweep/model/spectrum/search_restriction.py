@@ -228,8 +228,8 @@ def _restrict_spans(
     Parameters
     ----------
     spans
-        :class:`sweep.model.detection.echo_detection.EchoSpans` (segments, m); all of its arrays are
-        changed.
+        :class:`sweep.model.detection.echo_detection.EchoSpans` (segments, m) of m points; all of
+        its arrays are changed.
     bands
         :class:`SearchBand` with arrays (segments, m).
     peak_is_searched
@@ -246,10 +246,10 @@ def _restrict_spans(
     evaluates_leakage
         (segments,) bool: True for segments whose leakage is evaluated.
     n_exempt
-        (segments, m): number of exempt bins; the result for spans that are cut.
+        (segments, m): number of exempt bins; changed for spans that the band cuts.
     leakage
-        (segments, m): probability of a false peak due to leakage; the result for spans that are
-        cut.
+        (segments, m): probability of a false peak due to leakage; changed for spans that the
+        band cuts.
     """
     first_bin, n_bins, peak_index, span_starts = (
         spans.first_bin,
