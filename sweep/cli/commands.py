@@ -308,7 +308,7 @@ def resume(store: Location, spec: Path | None, retry_failed: bool, **options: An
 @WORKERS_OPTION
 @ALLOW_CODE_OPTION
 def plan(spec: Path, workers: int | None) -> None:
-    """Print the size and time of SPEC, and the effects it simulates. Nothing is written.
+    """Print the size and time of SPEC, and the effects it simulates. No store is written.
 
     The time is measured on points of the study, in about a second, and its parts are printed. Shots
     of a flight are counted, and a few spread over it are timed. For each effect a table gives the

@@ -653,13 +653,17 @@ def plan_rows(
 
 def _time_parts_text(study_plan: StudyPlan) -> str:
     """Return the parts of the processor time of a run in words, and what compiling adds."""
+    from sweep.tasks.engine.progress import duration_text
+
     seconds_by_name: dict[str, float] = defaultdict(float)
     for part in study_plan.time_parts:
         seconds_by_name[part.name] += part.cpu_seconds
     parts_text = ", ".join(
-        f"{name} {seconds:.2g}" for name, seconds in seconds_by_name.items() if seconds > 0
+        f"{name} {duration_text(seconds)}"
+        for name, seconds in seconds_by_name.items()
+        if seconds > 0
     )
-    text = f"{study_plan.cpu_seconds:.2g} s of one core: {parts_text} s"
+    text = f"{duration_text(study_plan.cpu_seconds)} of one core: {parts_text}"
     if not study_plan.is_compiled:
         text += (
             "; the model is not compiled yet, which the first run does, so that the time of shots "

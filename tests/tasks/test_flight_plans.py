@@ -7,6 +7,7 @@ from small_flights import small_scene_spec
 from sweep.cli import terminal
 from sweep.tasks.studies import study_plan
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
+from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.study_plan import plan_study
 
 
@@ -39,6 +40,20 @@ def test_a_plan_times_a_bounded_number_of_shots_and_rays(tmp_path, monkeypatch):
     plan = plan_study(spec, store_path=tmp_path / "a.zarr")
     assert plan.scanners[0].n_rays > 2 * sum(cast)
     assert plan.scanners[0].n_timed_shots <= study_plan.TIMED_SHOT_DRAWS_MAX
+
+
+def test_a_plan_times_a_bounded_number_of_draws(tmp_path, monkeypatch):
+    timed, simulate_shots = [], FlightStudy.simulate_shots
+
+    def counted(study, flight_block, *arguments, **keywords):
+        timed.append(len(flight_block.draws))
+        return simulate_shots(study, flight_block, *arguments, **keywords)
+
+    monkeypatch.setattr(FlightStudy, "simulate_shots", counted)
+    monkeypatch.setattr(study_plan, "TIMED_DRAWS_MAX", 5)
+    plan = plan_study(small_scene_spec(axes={}, draws={"number": 40}), store_path=tmp_path / "a")
+    assert timed and set(timed) == {5}
+    assert plan.scanners[0].seconds_per_draw > 0
 
 
 @pytest.mark.parametrize("n_cycles", [1, 2, 7, 1000])

@@ -88,6 +88,18 @@ def test_a_listener_that_knows_workers_alone_is_told_of_threads():
     assert listener.counts == ((3, 7),)
 
 
+def test_a_listener_of_no_class_of_ours_is_told_of_threads_too():
+    class Counts:
+        counts = ()
+
+        def update_workers(self, *, workers, stored):
+            self.counts = (*self.counts, (workers, stored))
+
+    listener = Counts()
+    progress.make_progress(listener).update_threads(threads=3, stored=7)
+    assert listener.counts == ((3, 7),)
+
+
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
     monkeypatch.setenv("COLUMNS", str(width))

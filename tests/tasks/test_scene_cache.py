@@ -111,6 +111,33 @@ def test_scenes_unused_for_longest_go_first_and_so_do_drafts_of_the_dead(root, m
     assert {path.name for path in root.iterdir()} == {new_name, "old", "draft-live"}
 
 
+def test_a_scene_beyond_the_limit_is_not_written_and_deletes_no_other(root, monkeypatch):
+    spec = small_scene_spec()
+    (root / "other").write_bytes(b"x" * 100)
+    monkeypatch.setattr(scene_cache, "CACHE_BYTES_MAX", 1000)
+    build = CountedBuild(spec)
+    load_or_build_scene(spec, build)
+    assert build.count == 1 and [path.name for path in root.iterdir()] == ["other"]
+    (root / "new").write_bytes(b"x" * 2000)
+    scene_cache._delete_least_recently_used(root)
+    assert [path.name for path in root.iterdir()] == ["other"]
+
+
+def test_sources_that_can_not_be_read_only_cost_time(root, monkeypatch):
+    monkeypatch.setattr(scene_cache, "_source_digest", lambda: None)
+    build = CountedBuild(small_scene_spec())
+    load_or_build_scene(build.spec, build)
+    assert build.count == 1 and not list(root.iterdir())
+
+
+def test_other_versions_of_libraries_build_anew(root, monkeypatch):
+    build = CountedBuild(small_scene_spec())
+    load_or_build_scene(build.spec, build)
+    monkeypatch.setattr(scene_cache, "_library_versions", lambda: ("0",))
+    load_or_build_scene(build.spec, build)
+    assert build.count == 2
+
+
 def test_a_folder_that_can_not_be_written_only_costs_time(root, monkeypatch):
     def refuse(*arguments, **named):
         raise OSError(28, "No space left on device")

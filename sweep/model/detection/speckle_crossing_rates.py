@@ -380,7 +380,7 @@ def add_rates_of_entries(entry_weights, rate_table, rate_sums):
     entries_per_power = np.uint64(rate_table.entries_per_power)
     for entry in range(np.uint64(entry_weights.size)):
         weight = entry_weights[entry]
-        if weight == 0.0:
+        if weight == 0.0:  # most entries, as amplitudes of the bins are similar
             continue
         column = entry // entries_per_power
         row = entry - column * entries_per_power

@@ -143,12 +143,13 @@ def estimate_ray_error(
         ) | (_pd_change_bound(shots, a, b, 1.0) >= _PROBABILITY_CHANGE_MIN)
         indices = np.flatnonzero(has_peak & is_relevant)
         relative_power_error = np.empty(indices.size)
-        _fill_power_errors(
-            _bin_powers(shots, beamlet_table, s, indices, peak_bins[indices, s]),
-            lattice,
-            relative_power_error,
-        )
-        pd_change[indices] += _pd_change_bound(shots, a[indices], b[indices], relative_power_error)
+        bin_powers = _bin_powers(shots, beamlet_table, s, indices, peak_bins[indices, s])
+        _fill_power_errors(bin_powers.power, lattice, relative_power_error)
+        pd_error = _pd_change_bound(shots, a[indices], b[indices], relative_power_error)
+        if shots.detection_rule.in_speckle and shots.detection_rule.any_bin:
+            # Bins of a wide echo fade by themselves, and their powers err by different rays.
+            pd_error = np.minimum(pd_error * np.sqrt(bin_powers.echo_width), 1.0)
+        pd_change[indices] += pd_error
         magnitude_change[indices] = np.maximum(
             magnitude_change[indices],
             np.where(
@@ -215,9 +216,10 @@ def _pd_change_bound_of_looks(n_looks: int, relative: np.ndarray | float) -> np.
     """Return an upper bound on the change of a detection probability of several faded looks.
 
     The summed power of N looks is gamma-distributed with the shape N. Its logarithm has a density
-    of at most sqrt(N / (2 pi)). ``relative`` is the relative change of the power.
+    of at most sqrt(N / (2 pi)). A loss of ``relative`` changes the logarithm by -ln(1 - relative).
     """
-    return np.asarray(np.minimum(relative * math.sqrt(n_looks / (2.0 * math.pi)), 1.0))
+    log_change = -np.log1p(-np.minimum(relative, 1.0 - 1e-12))
+    return np.asarray(np.minimum(log_change * math.sqrt(n_looks / (2.0 * math.pi)), 1.0))
 
 
 def _magnitude_change(a: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
@@ -229,14 +231,25 @@ def _magnitude_change(a: np.ndarray, relative: np.ndarray | float) -> np.ndarray
     return np.asarray(0.5 * relative * np.minimum(a, 1.0))
 
 
+class BinPowers(NamedTuple):
+    """Powers of beamlets in one bin of m shots, and the width of the shots' echoes."""
+
+    power: np.ndarray
+    """(m, b): power that each beamlet's line has in the bin, up to a factor that is common to the
+    beamlets of a shot."""
+    echo_width: np.ndarray
+    """(m,): width of a uniform echo with the spread of the lines, plus 1 [bins of fs/L]. fs is the
+    sampling rate and L the number of samples of the record."""
+
+
 def _bin_powers(
     shots: Shots,
     beamlet_table: BeamletTable,
     segment_index: int,
     indices: np.ndarray,
     bins: np.ndarray,
-) -> np.ndarray:
-    """Return the power (m, b) that each beamlet's line has in one bin of m shots.
+) -> BinPowers:
+    """Return the :class:`BinPowers` that beamlets' lines have in one bin of m shots.
 
     Parameters
     ----------
@@ -251,8 +264,7 @@ def _bin_powers(
 
     Returns
     -------
-    ndarray (m, b)
-        Powers, up to a factor that is common to the beamlets of a shot.
+    BinPowers
     """
     segment = shots.waveform_segments[segment_index]
     columns = (
@@ -295,22 +307,28 @@ def _bin_powers(
     ) * axis_range * (1 + doppler_ratio)
     axis_position = axis_position * (fft_size / sample_rate)
     wrap_shift = np.floor(axis_position / fft_size + 0.5) * fft_size
-    bin_position = np.abs(
+    bin_position = (
         np.where(axis_position < wrap_shift, -1.0, 1.0) * (bin_position - wrap_shift)
         - bins[:, None]
     )
+    echo = beamlet_table.relative_echo[row]
+    total_echo = echo.sum(axis=1)
+    mean_position = (echo * bin_position).sum(axis=1) / total_echo
+    variance = (echo * np.square(bin_position - mean_position[:, None])).sum(axis=1) / total_echo
+    echo_width = 1.0 + np.sqrt(12.0 * variance) * (shots.window.length / fft_size)
+    bin_position = np.abs(bin_position)
     lobe = _main_lobe_table(shots.window.name)
     bin_position *= shots.window.length / fft_size * _LOBE_STEPS_PER_BIN
     table_index = np.minimum(bin_position, lobe.size - 2.0).astype(np.int64)
     table_fraction = np.minimum(bin_position - table_index, 1.0)
-    power = beamlet_table.relative_echo[row] * (
+    power = echo * (
         lobe[table_index] + (lobe[table_index + 1] - lobe[table_index]) * table_fraction
     )
     p, q = (
         1 - beat * beat / (detector_bandwidth * amplifier_bandwidth),
         beat * (1 / detector_bandwidth + 1 / amplifier_bandwidth),
     )
-    return np.asarray(power / (p * p + q * q))
+    return BinPowers(np.asarray(power / (p * p + q * q)), np.asarray(echo_width))
 
 
 @lru_cache(maxsize=16)

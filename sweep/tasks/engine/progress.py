@@ -137,8 +137,11 @@ class _GuardedListener(Progress):
     def update_workers(self, **keywords: Any) -> None:
         self._call_listener("update_workers", **keywords)
 
-    def update_threads(self, **keywords: Any) -> None:
-        self._call_listener("update_threads", **keywords)
+    def update_threads(self, *, threads: int, stored: int) -> None:
+        if hasattr(self._listener, "update_threads"):
+            self._call_listener("update_threads", threads=threads, stored=stored)
+        else:  # a user's own class that does not derive from `Progress`
+            self._call_listener("update_workers", workers=threads, stored=stored)
 
     def say(self, text: str) -> None:
         self._call_listener("say", text)

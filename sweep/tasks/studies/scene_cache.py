@@ -1,8 +1,8 @@
 """Cache of built scenes: a large elevation model takes longer to build than to read.
 
 A file holds the bodies of a scene with their box trees. Its name is a digest of everything that
-they follow from: the spec's scene and platform, the content of the files that these name, and the
-sources of this package that build them.
+they follow from: the spec's scene and platform, the content of the files that these name, the
+sources of this package, and the versions of the libraries that build them.
 
     BASE/sweep-scenes-UID/DIGEST
 
@@ -24,11 +24,9 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
-
-import numpy as np
-import scipy
 
 from sweep.kernel_cache import cache_folder, create_private_folder
 from sweep.spec.fields import identity_digest
@@ -45,6 +43,11 @@ CACHE_BYTES_MAX = 2 << 30
 
 DRAFT_AGE_MAX = 86400.0
 """Age at which an unfinished file is deleted, since its writer must have died [s]."""
+
+LIBRARIES_OF_SCENES = (
+    "numpy", "scipy", "trimesh", "rasterio", "pyproj", "pillow", "matplotlib", "pint",
+)  # fmt: skip
+"""Libraries whose version may change the arrays of a scene."""
 
 _DRAFT_PREFIX = "draft-"
 _HEADER_BYTES = 8  # CRC-32 of the rest of the file, as hexadecimal digits
@@ -68,8 +71,8 @@ def load_or_build_scene(spec: SceneSpec, build: Callable[[], BuiltScene]) -> Bui
     BuiltScene
         The scene. Its arrays have the same bits, whether it was built or read.
     """
-    root = _cache_root()
-    path = None if root is None else root / _scene_digest(spec)
+    root, digest = _cache_root(), _scene_digest(spec)
+    path = None if root is None or digest is None else root / digest
     if path is not None and (cached_scene := _read_scene(path)) is not None:
         return cached_scene
     start = time.thread_time()
@@ -94,25 +97,46 @@ def _cache_root() -> Path | None:
     return root
 
 
-def _scene_digest(spec: SceneSpec) -> str:
-    """Return a digest of everything from which the arrays and reports of a scene follow."""
+def _scene_digest(spec: SceneSpec) -> str | None:
+    """Return a digest of everything from which the arrays and reports of a scene follow.
+
+    None if the sources can't be read.
+    """
+    source_digest = _source_digest()
+    if source_digest is None:
+        return None
     identity = spec.identity()
     parts = {name: identity[name] for name in ("objects", "scene", "platform")}
-    versions = [_source_digest(), np.__version__, scipy.__version__, platform.python_version()]
+    versions = [source_digest, *_library_versions(), platform.python_version()]
     return identity_digest(parts | {"versions": versions})
 
 
 @cache
-def _source_digest() -> str:
-    """Return a digest of the sources that build scenes."""
+def _source_digest() -> str | None:
+    """Return a digest of the package's sources; None if one can't be read."""
     package_dir = Path(__file__).parents[2]
     digest = hashlib.sha256()
-    for folder in ("model", "scenes", "spec"):
-        for path in sorted((package_dir / folder).rglob("*.py")):
+    try:
+        for path in sorted(package_dir.rglob("*.py")):
             content = path.read_bytes()
             digest.update(f"{path.relative_to(package_dir)}\0{len(content)}\0".encode())
             digest.update(content)
+    except OSError as error:
+        _log.info("built scenes are not cached: %s", error)
+        return None
     return digest.hexdigest()
+
+
+@cache
+def _library_versions() -> tuple[str, ...]:
+    """Return the versions of the libraries that read and build scenes, "" for an absent one."""
+    versions = []
+    for name in LIBRARIES_OF_SCENES:
+        try:
+            versions.append(version(name))
+        except PackageNotFoundError:
+            versions.append("")
+    return tuple(versions)
 
 
 class _ChecksumWriter:
@@ -138,15 +162,21 @@ def _read_scene(path: Path) -> BuiltScene | None:
                 return None
             file.seek(_HEADER_BYTES)
             scene: BuiltScene = pickle.load(file)
-        os.utime(path)  # the least recently used files are deleted first
     except Exception:  # unpickling bytes of another version may raise any exception
         return None
+    with suppress(OSError):
+        os.utime(path)  # the least recently used files are deleted first
     return scene
 
 
 def _write_scene(path: Path, scene: BuiltScene) -> None:
-    """Write a scene to a draft, and rename it into place; what fails leaves no file behind."""
+    """Write a scene to a draft, and rename it into place; what fails leaves no file behind.
+
+    A scene larger than CACHE_BYTES_MAX is not written.
+    """
     draft = None
+    if scene.caster.nbytes > CACHE_BYTES_MAX:
+        return
     try:
         with tempfile.NamedTemporaryFile(
             dir=path.parent, prefix=_DRAFT_PREFIX, delete=False
@@ -158,10 +188,12 @@ def _write_scene(path: Path, scene: BuiltScene) -> None:
             file.seek(0)
             file.write(f"{writer.checksum:0{_HEADER_BYTES}x}".encode())
         os.replace(draft, path)
-    except Exception as error:  # a full disk, or an object that can't be pickled
-        _log.info("a built scene is not cached: %s", error)
+    except BaseException as error:  # a full disk, an object that can't be pickled, or Ctrl-C
         if draft is not None:
             draft.unlink(missing_ok=True)
+        if not isinstance(error, Exception):
+            raise
+        _log.info("a built scene is not cached: %s", error)
     else:
         _delete_least_recently_used(path.parent)
 
@@ -175,7 +207,9 @@ def _delete_least_recently_used(root: Path) -> None:
         total_bytes = 0
         for status, path in statuses:
             is_draft = path.name.startswith(_DRAFT_PREFIX)
-            total_bytes += 0 if is_draft else status.st_size
             is_abandoned = is_draft and time.time() - status.st_mtime > DRAFT_AGE_MAX
-            if is_abandoned or (not is_draft and total_bytes > CACHE_BYTES_MAX):
+            is_beyond_limit = not is_draft and total_bytes + status.st_size > CACHE_BYTES_MAX
+            if is_abandoned or is_beyond_limit:
                 path.unlink(missing_ok=True)
+            elif not is_draft:
+                total_bytes += status.st_size

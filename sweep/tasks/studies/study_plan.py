@@ -452,9 +452,14 @@ class _ScannerTimer:
         self._study, self._eyepoints = study, eyepoints
         self.grid = study.scanner_grids[eyepoints.scanner]
         axis_points = list(np.ndindex(self.grid.axes_shape))
-        self._flight_blocks = [
+        draws_max = TIMED_SPECTRA_MAX if study.spec.draws.draws_whole_spectra else TIMED_DRAWS_MAX
+        flight_blocks = [
             self.grid.first_flight_block(axis_point)
             for axis_point in _select_evenly_spaced(axis_points, TIMED_AXIS_POINTS_MAX)
+        ]
+        self._flight_blocks = [
+            flight_block._replace(draws=flight_block.draws[:draws_max])
+            for flight_block in flight_blocks
         ]
         self.n_draws = len(self._flight_blocks[0].draws)
         self.shots_per_block = len(self._flight_blocks[0].cycles) * self.grid.shots_per_cycle
@@ -466,7 +471,8 @@ class _ScannerTimer:
                 self.shots_per_block,
             ),
         )
-        # Navigation needs complete cycles. In long ones it takes little of the time of a shot.
+        # Navigation needs complete cycles. It is left out of the time where cycles are too long for
+        # a sample.
         self._takes_cycles = self.grid.shots_per_cycle <= min(
             TIMED_CYCLE_SHOTS_MAX, self.n_shots_max
         )
@@ -474,7 +480,7 @@ class _ScannerTimer:
     def time_shots(self, n_shots: int) -> tuple[int, float, float]:
         """Time some shots. Return their number, and times of casting and of simulating [s].
 
-        The time of simulating is that of all draws of a block, averaged over points of the axes.
+        The time of simulating is that of ``n_draws`` draws, averaged over points of the axes.
         """
         start = time.process_time()
         if self._takes_cycles:
