@@ -63,12 +63,18 @@ def first_circular_bin(window: Window, fft_size: int) -> int:
     return last_noncircular_bin + 1
 
 
+@lru_cache(maxsize=2)
+def _squared_window_samples(window: Window) -> np.ndarray:
+    """Return the squared samples (length,) of a window."""
+    return window_samples(window.name, window.length) ** 2
+
+
 def _noise_correlation_at(window: Window, fft_size: int, bin_distance: int) -> float:
     """Return the modulus of the noise correlation of two bins ``bin_distance`` apart, 0..1.
 
     The distance is in bins of the FFT of ``fft_size`` samples.
     """
-    squared_window = window_samples(window.name, window.length) ** 2
+    squared_window = _squared_window_samples(window)
     exponentials = np.exp(
         -2j * np.pi * (bin_distance * np.arange(window.length) % fft_size) / fft_size
     )

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-#: Memory that every machine has which runs this program [bytes]. The machine is not asked for so
-#: little, as asking it imports Dask, which takes longer than small studies do.
-ALWAYS_AVAILABLE_BYTES = 1e8
+#: Memory that every machine has which runs this program [bytes]; the program takes as much by
+#: itself. The machine is not asked for so little, as asking it imports Dask, which takes longer
+#: than small studies do.
+ALWAYS_AVAILABLE_BYTES = 6e8
 
 
 @dataclass(frozen=True)
