@@ -32,7 +32,7 @@ IDS = {
     "gale_crater_descent": "4362f6cb 48dbaca0",
     "morpheus_three_beam": "0947b3b2 7422a280",
     "oblique_descent": "86f12ef1 a09399cd",
-    "quickstart": "2b8873b9",
+    "quickstart": "1054d3c5",
     "range_angle": "e6a78546",
     "range_angle_coarse": "ca166832",
     "scan_pattern_comparison": "09a87081 15a2ffe4 f8fe970d c3bbf3c2",
