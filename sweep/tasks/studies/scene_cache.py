@@ -1,8 +1,8 @@
 """Cache of built scenes: a large elevation model takes longer to build than to read.
 
 A file holds the bodies of a scene with their box trees. Its name is a digest of everything that
-they follow from: the spec's scene and platform, the content of the files that these name, the
-sources of this package, and the versions of the libraries that build them.
+they follow from: the spec's scene and platform, and the content of the files that these name. The
+sources of this package, and the versions of the libraries that build scenes, count too.
 
     BASE/sweep-scenes-UID/DIGEST
 
@@ -28,7 +28,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from sweep.kernel_cache import cache_folder, create_private_folder
 from sweep.spec.fields import identity_digest
 
 if TYPE_CHECKING:
@@ -85,6 +84,8 @@ def load_or_build_scene(spec: SceneSpec, build: Callable[[], BuiltScene]) -> Bui
 @cache
 def _cache_root() -> Path | None:
     """Return the folder of cached scenes, next to that of the kernels; None if there is none."""
+    from sweep.kernel_cache import cache_folder, create_private_folder  # imports the compiler
+
     kernel_folder = cache_folder().path
     if kernel_folder is None:
         return None

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import psutil
 
-from sweep.kernel_cache import is_compiled
 from sweep.messages import is_run_as_command
 from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
@@ -288,6 +287,7 @@ def _plan_flight(
 
 def are_flight_kernels_compiled(spec: SceneSpec) -> bool:
     """Return True if kernels of casting and of simulating shots are in memory or in the cache."""
+    from sweep.kernel_cache import is_compiled  # imports the compiler
     from sweep.model.geometry.bvh import find_nearest_triangles
     from sweep.model.pointcloud.returns import store_peak
 
