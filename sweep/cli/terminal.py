@@ -42,7 +42,7 @@ ASK_ABOVE_POINTS, ASK_ABOVE_BYTES, ASK_ABOVE_CPU_SECONDS = 10**9, 10**12, 30 * 8
 It is the number of points, the size of the results [bytes], and the time on one core [s].
 """
 
-BUSY_RATIO_SHOWN_MIN = 1.3
+WALL_TO_CPU_TIME_RATIO_NOTED_MIN = 1.3
 """Wall time over processor time of this process above which a plan says that others compute."""
 
 MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
@@ -638,7 +638,7 @@ def plan_rows(
         f"{number_with_noun(study_plan.n_workers, computing_unit)}"
         + (
             ", with the processors as busy as now"
-            if study_plan.busy_ratio > BUSY_RATIO_SHOWN_MIN
+            if study_plan.busy_ratio > WALL_TO_CPU_TIME_RATIO_NOTED_MIN
             else ""
         ),
     )

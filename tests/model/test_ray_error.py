@@ -260,10 +260,14 @@ def test_bound_of_looks_is_above_the_change_of_any_gamma_law(n_looks):
         assert relative > 0.05 or change.max() > 0.9 * bound
 
 
+@pytest.mark.parametrize("detection", ["peak_bin", "any_bin"])
 @pytest.mark.parametrize("scene", SCENES)
-def test_in_speckle_it_tells_what_far_more_rays_would_change(table_4_1, scene):
-    """Of 97 in 100 shots at least half of the change of pd; the magnitude asks for no rays."""
-    parameters = _parameters(table_4_1, power=0.05) | {"footprint.speckle": "developed"}
+def test_in_speckle_it_tells_what_far_more_rays_would_change(table_4_1, scene, detection):
+    """At least half of the change of pd, in 97 of 100 shots; the magnitude asks for no rays."""
+    parameters = _parameters(table_4_1, power=0.05) | {
+        "footprint.speckle": "developed",
+        "instrument.processing.detection": detection,
+    }
     effects = (*DEFAULT_EFFECTS, "fading")
     many = _cloud(_seen(scene, MANY), parameters, effects=effects)
     few = _cloud(_seen(scene, 37), parameters, effects=effects, estimates_ray_error=True)
@@ -273,4 +277,5 @@ def test_in_speckle_it_tells_what_far_more_rays_would_change(table_4_1, scene):
     ratio = few["beamlets_error"][off] / real[off]
     assert off.sum() > SHOTS / 10
     assert (ratio >= 0.5).mean() >= 0.97
+    assert np.median(ratio) < 20
     assert np.nanmedian(few["beamlets_error"]) < 0.7 * np.nanmedian(steady["beamlets_error"])

@@ -31,7 +31,7 @@ def test_the_parts_of_the_time_are_its_sum(tmp_path):
 
 
 def test_a_plan_times_a_bounded_number_of_shots_and_rays(tmp_path, monkeypatch):
-    """Of a flight of 100 times the shots it casts no more."""
+    """The limit does not depend on the length of the flight."""
     cast = []
     cast_eyepoints = EyepointStudy.cast_eyepoints
 

@@ -76,26 +76,15 @@ def test_threads_of_the_command_are_counted_as_threads(capsys, number, words):
     assert words in capsys.readouterr().err
 
 
-def test_a_listener_that_knows_workers_alone_is_told_of_threads():
-    class WorkerCounts(progress.Progress):
+@pytest.mark.parametrize("base", [progress.Progress, object])
+def test_a_listener_that_knows_workers_alone_is_told_of_threads(base):
+    class WorkerCounts(base):
         counts = ()
 
         def update_workers(self, *, workers, stored):
             self.counts = (*self.counts, (workers, stored))
 
     listener = WorkerCounts()
-    progress.make_progress(listener).update_threads(threads=3, stored=7)
-    assert listener.counts == ((3, 7),)
-
-
-def test_a_listener_of_no_class_of_ours_is_told_of_threads_too():
-    class Counts:
-        counts = ()
-
-        def update_workers(self, *, workers, stored):
-            self.counts = (*self.counts, (workers, stored))
-
-    listener = Counts()
     progress.make_progress(listener).update_threads(threads=3, stored=7)
     assert listener.counts == ((3, 7),)
 

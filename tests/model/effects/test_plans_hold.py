@@ -172,7 +172,7 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
 
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 def test_a_large_loss_changes_pd_no_more_than_its_size(table_4_1, kind):
-    """As large as the threshold's slope times the change of ln |X|, which exceeds that of |X|."""
+    """The size is the threshold's slope times the change of ln |X|, which exceeds that of |X|."""
     noticed = 0
     for extinction in np.geomspace(1e-6, 1e-3, 12).tolist():
         parameters = random_parameters(
