@@ -349,14 +349,14 @@ def count_entry_weights(rate_table):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_to_entry_weights(squared_ratio, rate_table, entry_weights):
-    """Add a bin's interpolation weights to sums by table entry.
+    """Add the six interpolation weights of one bin to the weights of the table's entries.
 
     The rate of a bin is a weighted sum of six entries. The sum over many bins is therefore one
-    weighted sum of all entries (:func:`add_rates_of_entries`). This costs six additions for a bin;
-    :func:`add_rates_by_power` needs six for each power.
+    weighted sum of all entries, which :func:`add_rates_of_entries` computes at the end. A bin costs
+    six additions here, and six for each speckle power in :func:`add_rates_by_power`.
 
-    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_power`. ``entry_weights``
-    (:func:`count_entry_weights`,) is changed in place.
+    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_power`. ``entry_weights`` is
+    changed in place; its size is that of :func:`count_entry_weights`.
     """
     place = _place_in_table(squared_ratio, rate_table)
     w = _interpolation_weights(place.fraction, squared_ratio)

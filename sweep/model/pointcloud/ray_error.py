@@ -199,10 +199,11 @@ def _steady_pd_change_bound(
 
 
 def _speckled_pd_change(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
-    """Return the larger change of a probability of detection by more and by less signal power.
+    """Return by how much a probability of detection rises or falls as the signal power changes.
 
-    The probability is that of a bin in developed speckle, exp(-(b^2 / 2) / (1 + a^2 / 2)). ``a``,
-    ``b`` and ``relative`` are as in :func:`_pd_change_bound`.
+    The mean power a^2 is multiplied by 1 + relative and by 1 - relative; the larger of the two
+    absolute changes counts. The probability is that of a bin in developed speckle,
+    exp(-(b^2 / 2) / (1 + a^2 / 2)). The arguments are as in :func:`_pd_change_bound`.
     """
     snr, squared_threshold = 0.5 * a * a, 0.5 * b * b
     less, equal, more = (
