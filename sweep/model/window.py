@@ -240,6 +240,61 @@ def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
     return (np.exp(-2j * np.pi * (cycles - np.rint(cycles))) * w).sum(axis=-1)
 
 
+def centred_transform(window: Window, y: np.ndarray, *, squared: bool = False) -> np.ndarray:
+    """Return the transform about the record's middle of a window, or of its square.
+
+    Cosine sums of many samples are transformed in closed form, other windows by a direct sum.
+
+    Parameters
+    ----------
+    window : Window
+        Window of L samples; missing first samples are not left out.
+    y : ndarray (n,)
+        Frequencies [bins of fs/L], less than L/2 in modulus.
+    squared : bool
+        Whether the squared window is transformed.
+
+    Returns
+    -------
+    ndarray (n,) complex
+        sum_n w[n]^p exp(-2 pi i y (n/L - 1/2)), with p = 2 if ``squared``, else 1.
+
+    Notes
+    -----
+    About its middle u = n - L/2, a cosine sum is the sum of c_m cos(2 pi m u / L). The transform of
+    a constant is D(y) = exp(i pi y / L) sin(pi y) / sin(pi y / L), so that the window's is
+
+        c_0 D(y) + sum_m c_m (D(y - m) + D(y + m)) / 2.
+
+    Examples
+    --------
+    >>> transform = centred_transform(get_window("hann", 1024), np.array([0.0, 1.0, 2.0]))
+    >>> np.abs(np.round(transform / 1024, 3)).tolist()
+    [0.5, 0.25, 0.0]
+    """
+    y, length = np.asarray(y, float), window.length
+    if window.name not in COSINE_SUM_COEFFICIENTS or length < _CLOSED_FORM_LENGTH_MIN:
+        w = window_samples(window.name, length)
+        w = w * w if squared else w
+        record_position = np.arange(length) / length - 0.5
+        # Sums, not products of matrices, whose order depends on the number of threads.
+        return np.array([(w * np.exp(-2j * np.pi * f * record_position)).sum() for f in y])
+    cosine_coefficients = [float(t) for t in COSINE_SUM_COEFFICIENTS[window.name]]
+    amplitudes = np.array(
+        [c / 2 for c in cosine_coefficients[:0:-1]]
+        + cosine_coefficients[:1]
+        + [c / 2 for c in cosine_coefficients[1:]]
+    )  # of exp(2 pi i m u / L), m = -M .. M
+    if squared:
+        amplitudes = np.convolve(amplitudes, amplitudes)
+    order_max = amplitudes.size // 2
+    transform = np.zeros(y.shape, complex)
+    for m, amplitude in enumerate(amplitudes.tolist(), -order_max):
+        constant_transform = length * np.sinc(y - m) / np.sinc((y - m) / length)
+        transform += amplitude * constant_transform * np.exp(1j * np.pi * (y - m) / length)
+    return transform
+
+
 def _cosine_sum_window(name: str, length: int) -> Window:
     """Return a cosine-sum :class:`Window`, computed from closed forms."""
     coefficients = tuple(float(t) for t in COSINE_SUM_COEFFICIENTS[name])

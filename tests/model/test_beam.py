@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.special import j0
 from small_scenes import level_plate, straight_flight
 
 from sweep.model import beam, evaluation
@@ -182,6 +183,25 @@ def test_no_beam_that_its_aperture_cuts_off_does_better_than_0_40():
         whole = fill**2 / near**2
         found = whole * beam.truncation_efficiency(fill, defocus)
         assert found == pytest.approx(cut_off(fill, defocus), rel=3e-3)
+
+
+def test_what_an_aperture_cuts_off_is_tabulated_to_1e_4():
+    """Against the Hankel transform of each field by a finer quadrature, to higher frequencies."""
+    rng = np.random.default_rng(52)
+    radii, radius_weights = np.polynomial.legendre.leggauss(200)
+    radii, radius_weights = (radii + 1) / 2, radius_weights / 2
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    q = (np.arange(0.0, 260, 3.0)[:, None] + 1.5 * (nodes + 1)).ravel()
+    kernel = j0(q[:, None] * radii) * (radii * radius_weights)
+    fills = np.concatenate([rng.uniform(0.3, 1, 60), [1.0, 1.0, 0.8]])
+    phases = np.concatenate([60 * rng.uniform(0, 1, 40) ** 3, rng.uniform(0, 3, 20), [0, 60, 0]])
+    for fill, phase in zip(fills, phases, strict=True):
+        c = 1 / fill**2 - 1j * phase
+        power = np.abs(kernel @ np.exp(-c * radii**2)) ** 2
+        echo = (power**2 * q * np.tile(1.5 * weights, q.size // 16)).sum()
+        expected = 32 * abs(c) ** 2 * c.real * echo
+        assert beam.truncation_efficiency(fill, phase) == pytest.approx(expected, rel=1e-4)
+        assert beam.truncation_efficiency(fill, -phase) == beam.truncation_efficiency(fill, phase)
 
 
 def test_a_flight_sees_a_plane_as_a_grid_does(table_4_1):

@@ -8,6 +8,7 @@ from scipy import signal
 from sweep.model.window import (
     COSINE_SUM_COEFFICIENTS,
     canonical_window_name,
+    centred_transform,
     direct_transform,
     get_window,
     window_samples,
@@ -50,6 +51,19 @@ def test_sum_and_energy_are_those_of_the_samples(name, length):
     assert shape.energy == pytest.approx((w**2).sum(), rel=1e-13)
     assert shape.first_value == pytest.approx(w[0], abs=1e-15)
     assert shape.length == length
+
+
+@pytest.mark.parametrize("name", [*COSINE_SUM_COEFFICIENTS, "kaiser(8.6)"])
+@pytest.mark.parametrize("length", [40, 64, 65, 1000, 4097])
+@pytest.mark.parametrize("squared", [False, True])
+def test_a_transform_about_the_middle_is_the_sum_over_the_samples(name, length, squared):
+    """Rounding of the sum, which has the square root of L terms' worth, bounds the difference."""
+    y = np.concatenate([np.arange(0, 770) / 64, [-3.3, -0.5, 17.25]])
+    w = window_samples(name, length) ** (2 if squared else 1)
+    position = np.arange(length) / length - 0.5
+    expected = [(w * np.exp(-2j * np.pi * f * position)).sum() for f in y]
+    found = centred_transform(get_window(name, length), y, squared=squared)
+    assert np.abs(found - expected).max() < 1e-13 * np.abs(w).sum()
 
 
 @pytest.mark.parametrize(

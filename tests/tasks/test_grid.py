@@ -210,6 +210,23 @@ def test_a_block_of_points_that_take_long_holds_fewer(changes, most):
     assert ParameterBlockGrid(spec).block_shape == (most,)
 
 
+def test_points_in_speckle_are_cut_into_smaller_blocks_than_smooth_ones():
+    """A quick start of 13,500 points has work for several threads, of half a second and more."""
+    axes = {"target.range": {"linear": ["1 km", "2 km"], "number": 13_500}}
+    grids = {
+        speckle: ParameterBlockGrid(
+            small_spec(
+                axes=axes,
+                storage={},
+                footprint=STUDY_MAPPING["footprint"] | {"phases": "incoherent", "speckle": speckle},
+            )
+        )
+        for speckle in ("developed", "none")
+    }
+    assert grids["developed"].block_shape == (2000,)
+    assert grids["none"].n_blocks <= 2
+
+
 def test_the_dearest_value_of_an_axis_decides_how_large_blocks_are():
     sizes = {"instrument.processing.fft_size": [2**12, 2**16, 2**14]}
     spec = small_spec(axes=STUDY_MAPPING["axes"] | sizes, draws=SPECTRA)

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.detection.looks import SINGLE_LOOK, Looks
-from sweep.model.window import Window, window_samples
+from sweep.model.window import Window, centred_transform, window_samples
 
 CIRCULAR_RATIO_MAX = 0.01
 """Limit below which a bin's noise counts as circular (equal variances in both quadratures). The
@@ -42,7 +42,7 @@ mean."""
 @lru_cache(maxsize=64)
 def neighbour_noise_correlation(window: Window, fft_size: int) -> float:
     """Return the modulus of the noise correlation of adjacent bins of the FFT, 0..1."""
-    return _noise_correlation_at(window, fft_size, 1)
+    return float(_noise_correlations_at(window, fft_size, np.array([1]))[0])
 
 
 @lru_cache(maxsize=64)
@@ -56,31 +56,23 @@ def first_circular_bin(window: Window, fft_size: int) -> int:
     transform W2 of the squared window. The noise counts as circular if the ratio is at most
     :data:`CIRCULAR_RATIO_MAX` in this bin and in all bins farther away.
     """
-    padding_factor, last_noncircular_bin = fft_size / window.length, 0
-    for k in range(1, math.ceil(8 * padding_factor), max(int(padding_factor / 16), 1)):
-        if _noise_correlation_at(window, fft_size, 2 * k) > CIRCULAR_RATIO_MAX:
-            last_noncircular_bin = k
-    return last_noncircular_bin + 1
+    padding_factor = fft_size / window.length
+    step = max(int(padding_factor / 16), 1)
+    bins = np.arange(1, math.ceil(8 * padding_factor), step)
+    is_circular = _noise_correlations_at(window, fft_size, 2 * bins) <= CIRCULAR_RATIO_MAX
+    return int(np.max(bins[~is_circular], initial=0)) + 1
 
 
-@lru_cache(maxsize=2)
-def _squared_window_samples(window: Window) -> np.ndarray:
-    """Return the squared samples (length,) of a window."""
-    return window_samples(window.name, window.length) ** 2
+def _noise_correlations_at(window: Window, fft_size: int, bin_distances: np.ndarray) -> np.ndarray:
+    """Return the modulus of the noise correlation of two bins at given distances, (n,), 0..1.
 
-
-def _noise_correlation_at(window: Window, fft_size: int, bin_distance: int) -> float:
-    """Return the modulus of the noise correlation of two bins ``bin_distance`` apart, 0..1.
-
-    The distance is in bins of the FFT of ``fft_size`` samples.
+    ``bin_distances`` (n,) are in bins of the FFT of ``fft_size`` samples.
     """
-    squared_window = _squared_window_samples(window)
-    exponentials = np.exp(
-        -2j * np.pi * (bin_distance * np.arange(window.length) % fft_size) / fft_size
-    )
-    correlation = abs((squared_window * exponentials).sum()) / squared_window.sum()
+    frequencies = np.append(0.0, bin_distances * (window.length / fft_size))
+    transform = np.abs(centred_transform(window, frequencies, squared=True))
+    correlations = transform[1:] / transform[0]
     # Bins of an unpadded rectangular window are uncorrelated except for rounding.
-    return float(correlation) if correlation > 1e-12 else 0.0
+    return np.where(correlations > 1e-12, correlations, 0.0)
 
 
 def alarm_equivalent_bins(

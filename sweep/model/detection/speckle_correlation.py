@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.window import Window, window_samples
+from sweep.model.window import Window, centred_transform, window_samples
 
 SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
 """Pairs of segment indices (0 up, 1 Doppler, 2 down), in the order of arrays over pairs."""
@@ -237,8 +237,5 @@ def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
         np.arange(int(2 * TRANSFORM_REACH_BINS * TRANSFORM_SAMPLES_PER_BIN) + 1)
         / TRANSFORM_SAMPLES_PER_BIN
     )
-    w = window_samples(window.name, window.length)
-    record_position = (np.arange(window.length) - window.length / 2) / window.length
-    # Sums, not products of matrices, whose order depends on the number of threads.
-    transform = np.array([(w * np.cos(2 * np.pi * y * record_position)).sum() for y in distances])
-    return distances, transform / w.sum()
+    transform = centred_transform(window, distances).real
+    return distances, transform / transform[0]

@@ -116,29 +116,17 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
     for s, deviation in enumerate(deviations):
         node, weight = _gaussian_nodes(LINE_DEVIATIONS[s])
         for d, offset in enumerate(offsets):
-            line_positions = offset + deviation * node
             bin_transforms = window_transform(
-                record_window, bin_positions[:, None] - line_positions
+                record_window, bin_positions[:, None] - (offset + deviation * node)
             )
             # Sums, not products of matrices, whose order depends on the number of threads.
-            power, neighbour_product = (
-                np.zeros(bin_positions.size),
-                np.zeros(bin_positions.size - 1),
-            )
-            for line_index in range(node.size):
-                power += weight[line_index] * bin_transforms[:, line_index] ** 2
-                neighbour_product += (
-                    weight[line_index]
-                    * bin_transforms[1:, line_index]
-                    * bin_transforms[:-1, line_index]
-                )
-            power = np.maximum(power, 1e-300)
-            mode = _strongest_mode(bin_transforms, weight, np.sqrt(power))
+            power = np.maximum((weight * bin_transforms**2).sum(axis=1), 1e-300)
+            neighbour_product = (weight * bin_transforms[1:] * bin_transforms[:-1]).sum(axis=1)
+            amplitude = np.sqrt(power)
+            mode = _strongest_mode(bin_transforms, weight, amplitude)
             power_fraction[s, d] = np.minimum(mode**2 / power, 1.0)
-            asymmetry[s, d] = power_asymmetry(*np.sqrt(power[half_bins - 1 : half_bins + 2]))
-            neighbour_correlation[s, d, 1:] = neighbour_product / (
-                np.sqrt(power[1:]) * np.sqrt(power[:-1])
-            )
+            asymmetry[s, d] = power_asymmetry(*amplitude[half_bins - 1 : half_bins + 2])
+            neighbour_correlation[s, d, 1:] = neighbour_product / (amplitude[1:] * amplitude[:-1])
     # A single line has one mode, also in bins where its transform is 0.
     power_fraction[0], neighbour_correlation[0] = (
         1.0,
@@ -175,29 +163,33 @@ def _strongest_mode(
         (bins, lines): amplitude of each line in each bin.
     line_weights
         (lines,): power of each line. The covariance is the weighted sum of the outer products of
-        the lines' amplitudes. With more bins than lines it is not formed, as it may have millions
-        of elements in padded spectra.
+        the lines' amplitudes.
     mode
         (bins,): vector from which the power iteration starts.
+
+    Notes
+    -----
+    With B, the amplitudes times the roots of the powers, the covariance is B B^T. Its leading
+    eigenvector times the root of the eigenvalue is B u, with the leading unit eigenvector u of
+    B^T B. The smaller of both matrices is iterated.
     """
-    covariance, eigenvalue = None, 1.0
-    if len(bin_transforms) <= line_weights.size:
-        covariance = np.zeros((len(bin_transforms), len(bin_transforms)))
-        for line_index in range(line_weights.size):
-            covariance += (
-                line_weights[line_index]
-                * bin_transforms[:, line_index, None]
-                * bin_transforms[None, :, line_index]
-            )
+    amplitudes = bin_transforms * np.sqrt(line_weights)
+    has_fewer_lines = amplitudes.shape[1] < amplitudes.shape[0]
+    vector = (amplitudes * mode[:, None]).sum(axis=0) if has_fewer_lines else mode
+    factors = amplitudes if has_fewer_lines else amplitudes.T
+    # Not a product of matrices, whose order of sums depends on the number of threads.
+    matrix = np.einsum("ti,tj->ij", factors, factors, optimize=False)
+    eigenvalue = 1.0
+    vector = vector / math.sqrt((vector**2).sum())
     for _ in range(_POWER_ITERATIONS):
-        if covariance is None:
-            line_products = line_weights * (bin_transforms * mode[:, None]).sum(axis=0)
-            product = (bin_transforms * line_products).sum(axis=1)
-        else:
-            product = (covariance * mode).sum(axis=1)
+        product = (matrix * vector).sum(axis=1)
         eigenvalue = math.sqrt((product**2).sum())
-        mode = product / max(eigenvalue, 1e-300)
-    return mode * math.sqrt(eigenvalue)
+        previous, vector = vector, product / max(eigenvalue, 1e-300)
+        if np.abs(vector - previous).max() < 1e-15:
+            break
+    if has_fewer_lines:
+        return (amplitudes * vector).sum(axis=1)
+    return vector * math.sqrt(eigenvalue)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)

@@ -43,6 +43,10 @@ BLOCK_CPU_SECONDS_MAX = 60.0
 DEFAULT_BLOCK_POINTS = 1 << 16
 BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
 
+#: Time on one core of a draw, or of a point without draws, in developed speckle and else [s].
+SPECKLED_DRAW_CPU_SECONDS = 2.5e-4
+SMOOTH_DRAW_CPU_SECONDS = 4e-5
+
 #: Number of blocks into which studies are cut by default, so that all cores of a machine have work
 #: from the first second on; and least estimated time of such a block on one core [s].
 DEFAULT_BLOCKS_MIN = 32
@@ -58,11 +62,16 @@ def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
     worst_parameters = {
         path: value for path, value in spec.parameters().items() if not isinstance(value, str)
     }
+    speckle_values = {str(spec.parameters()["footprint.speckle"])}
     for axis in spec.axes:
         for member in axis.parameters:
-            if isinstance(member.values, np.ndarray):
+            if member.path == "footprint.speckle":
+                speckle_values = set(map(str, member.values))
+            if isinstance(member.values, np.ndarray) and member.values.dtype.kind in "iuf":
                 worst_parameters[member.path] = member.values.max()
-    seconds_per_draw = 4e-5 + 2e-7 * float(worst_parameters.get("footprint.beamlets", 0.0))
+    is_speckled = "developed" in speckle_values
+    seconds_per_draw = SPECKLED_DRAW_CPU_SECONDS if is_speckled else SMOOTH_DRAW_CPU_SECONDS
+    seconds_per_draw += 2e-7 * float(worst_parameters.get("footprint.beamlets", 0.0))
     if spec.draws.draws_whole_spectra:
         seconds_per_draw += 2e-7 * float(worst_parameters["instrument.processing.fft_size"])
     return seconds_per_draw
