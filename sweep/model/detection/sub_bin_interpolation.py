@@ -36,7 +36,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Chebyshev
-from scipy.interpolate import RegularGridInterpolator
 
 from sweep.kernel_cache import njit
 from sweep.model.window import Window, window_samples
@@ -404,6 +403,8 @@ def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size:
     drift
         Linear change of the position over the whole record [bins].
     """
+    from scipy.interpolate import RegularGridInterpolator  # slow to import
+
     error_factor = RegularGridInterpolator(
         (_DRIFTS_BINS, _DRIFT_POSITIONS_BINS),
         _drift_error_table(window, fft_size),
@@ -481,6 +482,8 @@ def late_echo_correction(
     n_missing
         Number of samples at the record's start without an echo.
     """
+    from scipy.interpolate import RegularGridInterpolator  # slow to import
+
     shift, error_factor = _late_echo_tables(window, fft_size)
     offset, missing_fraction = np.broadcast_arrays(offset, np.asarray(n_missing) / window.length)
     table_position = (

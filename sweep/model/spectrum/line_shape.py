@@ -40,7 +40,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import cheb2poly, chebfit
-from scipy.special import i0
+from scipy.special import i0, roots_legendre
 
 from sweep.kernel_cache import njit
 from sweep.model.elementary_functions import sincos_cycles
@@ -277,7 +277,7 @@ def _no_full_envelope(distance: np.ndarray) -> LineEnvelope:
     return LineEnvelope(distance, _NO_TABLE, _NO_TABLE)
 
 
-_gauss_legendre = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)
+_gauss_legendre = lru_cache(maxsize=8)(roots_legendre)
 
 
 @lru_cache(maxsize=24)
