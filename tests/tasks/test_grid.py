@@ -223,7 +223,7 @@ def test_points_in_speckle_are_cut_into_smaller_blocks_than_smooth_ones():
         )
         for speckle in ("developed", "none")
     }
-    assert grids["developed"].block_shape == (2000,)
+    assert 6 <= grids["developed"].n_blocks <= 8
     assert grids["none"].n_blocks <= 2
 
 

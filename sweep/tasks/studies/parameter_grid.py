@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sweep.spec.rules import Mistake, SpecError
+from sweep.spec.specs import GridSpec, SceneSpec
 from sweep.tasks.engine.blocks import BLOCKS_PER_STUDY_MAX, BlockGrid
-
-if TYPE_CHECKING:
-    from sweep.spec import GridSpec, SceneSpec
 
 ParameterValue = float | int | str | np.ndarray
 
@@ -43,9 +40,14 @@ BLOCK_CPU_SECONDS_MAX = 60.0
 DEFAULT_BLOCK_POINTS = 1 << 16
 BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
 
-#: Time on one core of a draw, or of a point without draws, in developed speckle and else [s].
-SPECKLED_DRAW_CPU_SECONDS = 2.5e-4
-SMOOTH_DRAW_CPU_SECONDS = 4e-5
+#: Time on one core of a point of a grid without draws, or of one of its draws, and what a point in
+#: developed speckle takes longer [s].
+POINT_DRAW_CPU_SECONDS = 4e-5
+SPECKLE_CPU_SECONDS = 2e-4
+
+#: Time on one core of a flight's shot, and of each of its draws [s].
+SHOT_CPU_SECONDS = 7e-5
+SHOT_DRAW_CPU_SECONDS = 2e-5
 
 #: Number of blocks into which studies are cut by default, so that all cores of a machine have work
 #: from the first second on; and least estimated time of such a block on one core [s].
@@ -62,15 +64,13 @@ def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
     worst_parameters = {
         path: value for path, value in spec.parameters().items() if not isinstance(value, str)
     }
-    speckle_values = {str(spec.parameters()["footprint.speckle"])}
     for axis in spec.axes:
         for member in axis.parameters:
-            if member.path == "footprint.speckle":
-                speckle_values = set(map(str, member.values))
             if isinstance(member.values, np.ndarray) and member.values.dtype.kind in "iuf":
                 worst_parameters[member.path] = member.values.max()
-    is_speckled = "developed" in speckle_values
-    seconds_per_draw = SPECKLED_DRAW_CPU_SECONDS if is_speckled else SMOOTH_DRAW_CPU_SECONDS
+    seconds_per_draw = POINT_DRAW_CPU_SECONDS
+    if isinstance(spec, SceneSpec):
+        seconds_per_draw = SHOT_DRAW_CPU_SECONDS + SHOT_CPU_SECONDS / max(spec.draws.number, 1)
     seconds_per_draw += 2e-7 * float(worst_parameters.get("footprint.beamlets", 0.0))
     if spec.draws.draws_whole_spectra:
         seconds_per_draw += 2e-7 * float(worst_parameters["instrument.processing.fft_size"])
@@ -82,7 +82,14 @@ def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
 
     If draws continue until a tolerance is met, their limit counts.
     """
-    return worst_cpu_seconds_per_draw(spec) * max(spec.draws.number, spec.draws.limit, 1)
+    n_draws = max(spec.draws.number, spec.draws.limit, 1)
+    speckle_modes = {spec.parameters()["footprint.speckle"]}
+    for axis in spec.axes:
+        for member in axis.parameters:
+            if member.path == "footprint.speckle":
+                speckle_modes = set(member.values)
+    speckle_seconds = SPECKLE_CPU_SECONDS if "developed" in speckle_modes else 0.0
+    return worst_cpu_seconds_per_draw(spec) * n_draws + speckle_seconds
 
 
 def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
