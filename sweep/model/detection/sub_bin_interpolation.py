@@ -38,6 +38,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 
 from sweep.kernel_cache import njit
+from sweep.model.table_interpolation import interpolate_tables
 from sweep.model.window import Window, window_samples
 
 _TABLE_INTERVALS = 2048
@@ -403,19 +404,12 @@ def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size:
     drift
         Linear change of the position over the whole record [bins].
     """
-    from scipy.interpolate import RegularGridInterpolator  # slow to import
-
-    error_factor = RegularGridInterpolator(
+    (error_factor,) = interpolate_tables(
         (_DRIFTS_BINS, _DRIFT_POSITIONS_BINS),
-        _drift_error_table(window, fft_size),
-        bounds_error=False,
+        (_drift_error_table(window, fft_size),),
+        (drift, np.abs(offset)),
     )
-    offset, drift = np.broadcast_arrays(np.abs(offset), drift)
-    table_position = (
-        np.clip(offset, 0.0, _DRIFT_POSITIONS_BINS[-1]),
-        np.clip(drift, _DRIFTS_BINS[0], _DRIFTS_BINS[-1]),
-    )
-    return np.asarray(np.minimum(error_factor(table_position[::-1]) * drift * drift, drift / 2))
+    return np.asarray(np.minimum(error_factor * drift * drift, drift / 2))
 
 
 _DRIFTS_BINS = np.array([0.5, 1.0, 2.0, 4.0])
@@ -482,18 +476,11 @@ def late_echo_correction(
     n_missing
         Number of samples at the record's start without an echo.
     """
-    from scipy.interpolate import RegularGridInterpolator  # slow to import
-
-    shift, error_factor = _late_echo_tables(window, fft_size)
-    offset, missing_fraction = np.broadcast_arrays(offset, np.asarray(n_missing) / window.length)
-    table_position = (
-        np.clip(missing_fraction, 0.0, _MISSING_FRACTIONS[-1]),
-        np.minimum(np.abs(offset), 1.0),
-    )
-    table_axes = _MISSING_FRACTIONS, np.linspace(0.0, 1.0, _N_LATE_POSITIONS)
-    shift_at, factor_at = (
-        RegularGridInterpolator(table_axes, values, bounds_error=False)(table_position)
-        for values in (shift, error_factor)
+    missing_fraction = np.asarray(n_missing) / window.length
+    shift_at, factor_at = interpolate_tables(
+        (_MISSING_FRACTIONS, np.linspace(0.0, 1.0, _N_LATE_POSITIONS)),
+        _late_echo_tables(window, fft_size),
+        (missing_fraction, np.abs(offset)),
     )
     is_late = missing_fraction > 0
     return LateEchoCorrection(

@@ -9,7 +9,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.sub_bin_interpolation import (
@@ -18,6 +17,7 @@ from sweep.model.detection.sub_bin_interpolation import (
     estimate_sub_bin_offset,
     interpolator,
 )
+from sweep.model.table_interpolation import interpolate_tables
 from sweep.model.window import Window, window_samples
 
 if TYPE_CHECKING:
@@ -97,27 +97,35 @@ class PeakShapeErrors(NamedTuple):
         limited_square = np.minimum(squared_shift / squared_cell, _SPREAD_GRID_CELLS[-1] ** 2)
         limited_variance = np.minimum(variance / squared_cell, _QUADRATURE_SHIFT_VARIANCES[-1])
         log_variance = np.log(np.maximum(limited_variance, _QUADRATURE_SHIFT_VARIANCES[0]))
-        sign, distance = np.sign(offset), np.minimum(np.abs(offset), 1.0)
+        sign, distance = np.sign(offset), np.abs(offset)
+        (spread_error,) = interpolate_tables(
+            (_SPREAD_GRID_CELLS, _SHAPE_OFFSETS_BINS), (tables.spread_error,), (spread, distance)
+        )
+        quadrature_error, quadrature_deviation = interpolate_tables(
+            (_SPREAD_GRID_CELLS, np.log(_QUADRATURE_SHIFT_VARIANCES), _SHAPE_OFFSETS_BINS),
+            (tables.quadrature_error, tables.quadrature_deviation),
+            (spread, log_variance, distance),
+        )
         return cls(
-            sign * limited_square * tables.spread_error((spread, distance)),
-            sign * limited_variance * tables.quadrature_error((spread, log_variance, distance)),
-            sign * limited_variance * tables.quadrature_deviation((spread, log_variance, distance)),
+            sign * limited_square * spread_error,
+            sign * limited_variance * quadrature_error,
+            sign * limited_variance * quadrature_deviation,
         )
 
 
 class PeakShapeErrorTables(NamedTuple):
-    """Interpolators of :class:`PeakShapeErrors` by spread [fs/L], log variance, and offset [bins].
+    """Tables of :class:`PeakShapeErrors` by spread [fs/L], log variance, and offset [bins].
 
     fs/L is the sample rate over the number of samples in the record. The variance is that of the
     imaginary part of the complex shift [(fs/L)^2].
     """
 
-    spread_error: RegularGridInterpolator
+    spread_error: np.ndarray
     """Error by the broadening of the line [bins], over b^2 [(fs/L)^2]; by spread and offset."""
-    quadrature_error: RegularGridInterpolator
+    quadrature_error: np.ndarray
     """Mean error by the imaginary shift [bins], over its variance; by spread, log variance and
     offset."""
-    quadrature_deviation: RegularGridInterpolator
+    quadrature_deviation: np.ndarray
     """Standard deviation of that error [bins], over the variance; by the same coordinates."""
 
 
@@ -131,7 +139,6 @@ def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTab
     sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding
     phase = sample_phase * (np.array([[-1.0], [0.0], [1.0]]) - _SHAPE_OFFSETS_BINS)[..., None]
     cosine, sine = np.cos(phase), np.sin(phase)
-    offset_grid = (_SPREAD_GRID_CELLS, _SHAPE_OFFSETS_BINS)
     spread_error = np.empty((len(_SPREAD_GRID_CELLS), _SHAPE_OFFSETS_BINS.size))
     mean, deviation = np.empty((2, len(_SPREAD_GRID_CELLS), *_quadrature_table_shape()))
     unbroadened = _offsets_of_magnitudes(np.abs(cosine @ window_values), interpolation)
@@ -151,12 +158,7 @@ def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTab
         deviation[i] = np.sqrt(np.maximum(mean_square - mean[i] ** 2, 0.0))
     mean /= _QUADRATURE_SHIFT_VARIANCES[:, None]
     deviation /= _QUADRATURE_SHIFT_VARIANCES[:, None]
-    variance_grid = (_SPREAD_GRID_CELLS, np.log(_QUADRATURE_SHIFT_VARIANCES), _SHAPE_OFFSETS_BINS)
-    return PeakShapeErrorTables(
-        RegularGridInterpolator(offset_grid, spread_error),
-        RegularGridInterpolator(variance_grid, mean, bounds_error=False, fill_value=None),
-        RegularGridInterpolator(variance_grid, deviation, bounds_error=False, fill_value=None),
-    )
+    return PeakShapeErrorTables(spread_error, mean, deviation)
 
 
 def _quadrature_table_shape() -> tuple[int, int]:
@@ -250,11 +252,11 @@ class TwoBinErrors(NamedTuple):
         shots
             Prepared shots, for window, FFT size and rule of detection.
         """
-        relative_mean, log_mean_square = _two_bin_error_tables(
+        tables = _two_bin_error_tables(
             shots.window, shots.fft_size, shots.detection_settings.echo_bins == "peak_bin"
         )
         spread_cells = np.sqrt(squared_shift) * shots.window.length / shots.fft_size
-        table_position = tuple(
+        log_coordinates = (
             np.log(np.clip(values, grid[0], grid[-1]))
             for values, grid in (
                 (spread_cells, _TWO_BIN_SPREADS_CELLS),
@@ -262,9 +264,11 @@ class TwoBinErrors(NamedTuple):
                 (noise_ratio, _TWO_BIN_NOISE_RATIOS),
             )
         )
-        table_position = (*table_position, np.minimum(np.abs(offset), 1.0))
-        mean_square = np.exp(log_mean_square(table_position))
-        mean = relative_mean(table_position) * np.sqrt(mean_square)
+        relative_mean, log_mean_square = interpolate_tables(
+            _two_bin_error_grids(), tables, (*log_coordinates, np.abs(offset))
+        )
+        mean_square = np.exp(log_mean_square)
+        mean = relative_mean * np.sqrt(mean_square)
         error_at_sigma = interpolator(shots.window, shots.fft_size).error_at_sigma
         noise_error = noise_ratio * np.interp(
             np.abs(offset), np.linspace(0, 1, error_at_sigma.size), error_at_sigma
@@ -276,7 +280,7 @@ class TwoBinErrors(NamedTuple):
 @lru_cache(maxsize=8)
 def _two_bin_error_tables(
     window: Window, fft_size: int, keeps_strongest_bin: bool
-) -> tuple[RegularGridInterpolator, RegularGridInterpolator]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Tabulate moments of :class:`TwoBinErrors`.
 
     ``keeps_strongest_bin`` is True if peaks are estimated about the bin that is strongest without
@@ -284,10 +288,10 @@ def _two_bin_error_tables(
 
     Returns
     -------
-    relative_mean : RegularGridInterpolator
+    relative_mean : ndarray
         Mean error over its root mean square, by the logarithms of spread, shift ratio and noise
         ratio, and by offset.
-    log_mean_square : RegularGridInterpolator
+    log_mean_square : ndarray
         Logarithm of the mean square error [bins^2], by the same coordinates.
     """
     interpolation, padding = interpolator(window, fft_size), fft_size / window.length
@@ -302,13 +306,7 @@ def _two_bin_error_tables(
     curvature, noise_below, noise_above = rng.normal(size=(3, _TWO_BIN_DRAWS)) + 1j * rng.normal(
         size=(3, _TWO_BIN_DRAWS)
     )
-    grids = (
-        np.log(_TWO_BIN_SPREADS_CELLS),
-        np.log(_TWO_BIN_SHIFT_RATIOS),
-        np.log(_TWO_BIN_NOISE_RATIOS),
-        _TWO_BIN_OFFSETS_BINS,
-    )
-    mean, mean_square = np.empty((2, *(grid.size for grid in grids)))
+    mean, mean_square = np.empty((2, *(grid.size for grid in _two_bin_error_grids())))
     for i, spread in enumerate(_TWO_BIN_SPREADS_CELLS * padding):
         taper = window_values * np.exp(-0.5 * (spread * sample_phase) ** 2)
         line, slope, second_slope = (
@@ -334,9 +332,16 @@ def _two_bin_error_tables(
                 mean[i, j, k], mean_square[i, j, k] = _mean_errors_by_offset(
                     np.abs(estimate)[is_peak], error[is_peak]
                 )
+    return mean / np.sqrt(mean_square), np.log(mean_square)
+
+
+def _two_bin_error_grids() -> tuple[np.ndarray, ...]:
+    """Return the coordinates of :func:`_two_bin_error_tables`, in the order of their axes."""
     return (
-        RegularGridInterpolator(grids, mean / np.sqrt(mean_square)),
-        RegularGridInterpolator(grids, np.log(mean_square)),
+        np.log(_TWO_BIN_SPREADS_CELLS),
+        np.log(_TWO_BIN_SHIFT_RATIOS),
+        np.log(_TWO_BIN_NOISE_RATIOS),
+        _TWO_BIN_OFFSETS_BINS,
     )
 
 

@@ -1,0 +1,51 @@
+"""Linear interpolation of tables that share coordinates."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def interpolate_tables(
+    grids: Sequence[np.ndarray], tables: Sequence[np.ndarray], positions: Sequence[ArrayLike]
+) -> tuple[np.ndarray, ...]:
+    """Interpolate tables linearly in each of their coordinates.
+
+    Parameters
+    ----------
+    grids : sequence of ndarray
+        Increasing coordinates at which the tables are given, one array for each axis.
+    tables : sequence of ndarray
+        Tables; the shape of each is that of the grids.
+    positions : sequence of array_like
+        Coordinates of the points, one array for each axis; the arrays broadcast. Points beyond a
+        grid take the value at its end.
+
+    Returns
+    -------
+    tuple of ndarray
+        Value of each table at the points; nan where a coordinate is nan.
+
+    Examples
+    --------
+    >>> grids = np.array([0.0, 1.0, 4.0]), np.array([0.0, 1.0])
+    >>> table = np.add.outer(grids[0], 10 * grids[1])
+    >>> interpolate_tables(grids, [table], [[2.0, 9.0], 0.5])
+    (array([7., 9.]),)
+    """
+    from scipy.ndimage import map_coordinates  # slow to import
+
+    indices = np.array(
+        np.broadcast_arrays(
+            *(
+                np.interp(np.asarray(position, float), grid, np.arange(grid.size))
+                for position, grid in zip(positions, grids, strict=True)
+            )
+        )
+    )
+    is_defined = np.isfinite(indices).all(axis=0)
+    indices = np.where(is_defined, indices, 0.0)
+    return tuple(
+        np.where(is_defined, map_coordinates(table, indices, order=1, mode="nearest"), np.nan)
+        for table in tables
+    )
