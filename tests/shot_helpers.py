@@ -115,10 +115,10 @@ class PreparedShape(NamedTuple):
 def line_shape_of_window(window, fft_size, *, power=False, phase=None, view=REAL_WITH_IMAGES):
     """Line shape of a window with a phase error [cycles], a function of x = -1 .. 1."""
     phase, n_modes, shift = phase or np.zeros_like, 0, 0.0
-    for tier, (modes_max, _, _) in enumerate(line_shape.MODE_TIERS):
+    for tier, (modes_max, _, _) in enumerate(line_shape.LINE_SHAPE_TIERS):
         if not line_shape.window_has_modes(window, fft_size):
             break
-        modes = line_shape.zero_modes(1, 1, modes_max)
+        modes = line_shape.zero_phase_error_modes(1, 1, modes_max)
         phase_at_nodes = phase(line_shape.chebyshev_nodes(2 * modes_max))[None, None]
         line_shape.decompose_phase_errors(
             phase_at_nodes,
@@ -134,7 +134,7 @@ def line_shape_of_window(window, fft_size, *, power=False, phase=None, view=REAL
     if not n_modes:
         x = 2 * np.arange(window.length) / window.length - 1
         tables = line_shape.full_line_shape_tables(window, fft_size, power, phase(x)[None])
-        modes = line_shape.zero_modes(1, 1, 1)
+        modes = line_shape.zero_phase_error_modes(1, 1, 1)
     shape = line_shape.select_segment(line_shape.allocate_line_shapes(tables, 1), 0)
     line_shape.build_line_shape(0, np.int64(0), np.int64(-1), modes, tables, shape)
     layout = tables.layout._replace(spectrum_type=view)

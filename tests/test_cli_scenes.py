@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 from test_cli import STUDY, refused, sweep
 
-from sweep.tasks.studies.eyepoint_study import build_world
+from sweep.tasks.studies.eyepoint_study import get_built_scene
 
 SCENE = (
     STUDY.split("target:")[0]
@@ -154,5 +154,5 @@ def test_a_file_that_changes_under_a_study_is_noticed(here):
     refused(sweep("run", "array.yaml", "--store", store), "another study", "ground")
     (eyepoints,) = (here / "results" / "eyepoints").iterdir()
     (eyepoints / "offset" / "c" / "0" / "0").unlink()
-    build_world.cache_clear()  # as in another process
+    get_built_scene.cache_clear()  # as in another process
     refused(sweep("resume", store, "--scheduler", "none"), "ground.npy", "changed")

@@ -50,7 +50,7 @@ NEGLIGIBLE_ERROR = 1e-9
 The reference, to which they are compared, has errors of this size itself.
 """
 
-FIXED_KINDS = (
+FIXED_SETTING_KINDS = (
     FIXED_EFFECTS_KIND,
     BEAMLETS_KIND,
     LINE_PATTERN_KIND,
@@ -248,7 +248,7 @@ def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[Set
     adaptive_settings = select_settings_of_kinds(settings, ADAPTIVE_KIND)
     fixed_settings = [
         setting
-        for setting in select_settings_of_kinds(settings, *FIXED_KINDS)
+        for setting in select_settings_of_kinds(settings, *FIXED_SETTING_KINDS)
         if setting.covers_leakage_error
     ]
     errors = sorted(
@@ -352,7 +352,7 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
     """Return sentences with the conclusions from a measurement of accuracy."""
     attributes = dataset.attrs
     conclusions = [_as_written_setting_sentences(dataset, settings)]
-    conclusions += _fixed_sentences(compare_adaptive_with_fixed(settings), attributes)
+    conclusions += _fixed_setting_sentences(compare_adaptive_with_fixed(settings), attributes)
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
     ) + _closed_form_sentences(settings)
@@ -415,7 +415,9 @@ def _as_written_setting_sentences(dataset: xr.Dataset, settings: Sequence[Measur
     )
 
 
-def _fixed_sentences(comparisons: Sequence[SettingComparison], attributes: dict) -> list[str]:
+def _fixed_setting_sentences(
+    comparisons: Sequence[SettingComparison], attributes: dict
+) -> list[str]:
     """Return the sentences that compare adaptive with fixed settings."""
     if not comparisons:
         return []
@@ -572,7 +574,7 @@ def format_error(value: float) -> str:
     )
 
 
-NUMBERED_KINDS = (
+NUMBERED_SETTING_KINDS = (
     BEAMLETS_KIND,
     LINE_PATTERN_KIND,
     MEAN_OF_DRAWS_KIND,
@@ -581,7 +583,7 @@ NUMBERED_KINDS = (
 )
 """Kinds of accuracy settings whose names begin with a number of beamlets or draws."""
 
-CONNECTED_KINDS = (ADAPTIVE_KIND, *NUMBERED_KINDS)
+CONNECTED_SETTING_KINDS = (ADAPTIVE_KIND, *NUMBERED_SETTING_KINDS)
 """Kinds of accuracy settings that differ only in tolerance or number.
 
 A line connects their marks.
@@ -621,7 +623,7 @@ def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]
         kind_settings = select_settings_of_kinds(plotted_settings, kind)
         for i, setting in enumerate(kind_settings):
             _draw_setting_mark(axes, setting, marker, colour, label if i == 0 else "")
-        if kind in CONNECTED_KINDS and kind_settings:
+        if kind in CONNECTED_SETTING_KINDS and kind_settings:
             polyline = zip(*map(_setting_plot_position, kind_settings), strict=True)
             axes.plot(*polyline, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
             kind_settings = kind_settings[:1] + kind_settings[1:][-1:]
@@ -685,7 +687,7 @@ def _short_setting_name(setting: MeasuredSetting) -> str:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
     if setting.kind == THESIS_KIND:
         return setting.name.removeprefix("thesis ")
-    if setting.kind in NUMBERED_KINDS:
+    if setting.kind in NUMBERED_SETTING_KINDS:
         return setting.name.split()[0]
     return ""
 

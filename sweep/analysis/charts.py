@@ -190,10 +190,10 @@ A heat map has no more cells than pixels, so that no cell is lost.
 LINES_PER_PANEL_MAX = 8
 """Largest number of lines in a panel; further lines are omitted."""
 
-REDUCED_LINE_INTERVALS = 500
-"""Number of values to which a long line is reduced.
+REDUCED_LINE_CELLS = 500
+"""Number of cells along the horizontal axis to which the points of a long line are reduced.
 
-Lines with at most twice as many points are kept.
+Lines with at most twice as many points are not reduced.
 """
 
 _LOG_SCALE_DECADES_MIN = 3
@@ -648,8 +648,8 @@ def read_lines_along(
     for points, variable in points_and_variables:
         coordinate = points.sorted_coordinate(x)
         dataset_with_ends, confidence = _value_and_interval_ends(points.dataset, variable)
-        cells_max = REDUCED_LINE_INTERVALS * (
-            1 if coordinate.values.size > 2 * REDUCED_LINE_INTERVALS else 2
+        cells_max = REDUCED_LINE_CELLS * (
+            1 if coordinate.values.size > 2 * REDUCED_LINE_CELLS else 2
         )
         has_ends = len(dataset_with_ends) > 1
         cell_statistics = (

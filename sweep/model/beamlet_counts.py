@@ -87,7 +87,7 @@ NODE_COUNTS_ACROSS_SLOPE = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
 
 _UNIFORM_QUADRATURE_ERROR = 1e-10
 """Relative error of evenly spaced quadrature nodes, from the Gaussian's tails outside them."""
-_WINDOW_SAMPLES = 1024
+_TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the windows from which tables of quadrature errors are computed."""
 _N_LAGS = 4096
 """Number of lags of a window's autocorrelation for quadrature errors by spread of the lines."""
@@ -590,7 +590,7 @@ def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndar
             * math.sqrt(np.pi / 2)
             * (spread.quadratic_spread / spread.smoothing_deviation) ** 2
         )
-    lobe_shape = window_response(window_name, _WINDOW_SAMPLES, _WINDOW_SAMPLES)
+    lobe_shape = window_response(window_name, _TABLE_WINDOW_SAMPLES, _TABLE_WINDOW_SAMPLES)
     return np.asarray(
         2
         * np.fmin(lobe_shape.curvature_max * spread.quadratic_spread**2, smoothed_error).max(axis=0)
@@ -613,13 +613,13 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     """
     spreads = np.geomspace(1e-3, 400.0, 96)
     largest_bin_powers = _largest_bin_power(
-        window_response(window_name, _WINDOW_SAMPLES, _WINDOW_SAMPLES), spreads
+        window_response(window_name, _TABLE_WINDOW_SAMPLES, _TABLE_WINDOW_SAMPLES), spreads
     )
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
     weight = _window_autocorrelation(window_name, lag)
     errors = np.empty((NODE_COUNTS_ALONG_SLOPE.size, spreads.size + 1))
     for row, n_nodes in zip(errors, NODE_COUNTS_ALONG_SLOPE.tolist(), strict=True):
-        row[:] = np.append(_node_spacing_as_error(spreads, n_nodes), np.inf)
+        row[:] = np.append(_substitute_for_unbounded_error(spreads, n_nodes), np.inf)
         for i, spread in enumerate(spreads.tolist()):
             rule_error = (
                 weight * _quadrature_error_for_cosine(n_nodes, 2 * np.pi * spread * lag)
@@ -627,7 +627,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
             if rule_error > 1:
                 break  # wider spreads have larger errors
             row[i] = rule_error
-        row[-1] = _node_spacing_as_error(1e3, n_nodes)
+        row[-1] = _substitute_for_unbounded_error(1e3, n_nodes)
     return (
         spreads,
         np.maximum.accumulate(errors, axis=1),
@@ -635,7 +635,7 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     )
 
 
-def _node_spacing_as_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
+def _substitute_for_unbounded_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
     """Return the distance between nodes [bins], at least 1, in place of an unbounded error.
 
     More nodes are then preferred where no error has a bound.
@@ -670,7 +670,9 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
             * np.interp(phase, _CURVATURE_PHASES, _quadrature_error_for_quadratic_phase(n_nodes))
         ).sum(axis=1)
         return np.append(
-            np.where(rule_errors < 1, rule_errors, _node_spacing_as_error(_CURVATURES, n_nodes)),
+            np.where(
+                rule_errors < 1, rule_errors, _substitute_for_unbounded_error(_CURVATURES, n_nodes)
+            ),
             1e3,
         )
 
@@ -735,9 +737,11 @@ def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
 
     The magnitude is divided by the signed sum of the autocorrelation over all lags.
     """
-    w = window_samples(window_name, _WINDOW_SAMPLES)
-    r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _WINDOW_SAMPLES)) ** 2)[: _WINDOW_SAMPLES + 1]
-    at_lags = np.interp(lag * _WINDOW_SAMPLES, np.arange(_WINDOW_SAMPLES + 1), r)
+    w = window_samples(window_name, _TABLE_WINDOW_SAMPLES)
+    r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _TABLE_WINDOW_SAMPLES)) ** 2)[
+        : _TABLE_WINDOW_SAMPLES + 1
+    ]
+    at_lags = np.interp(lag * _TABLE_WINDOW_SAMPLES, np.arange(_TABLE_WINDOW_SAMPLES + 1), r)
     return np.asarray(np.abs(at_lags) / at_lags.sum())
 
 

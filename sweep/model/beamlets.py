@@ -268,7 +268,7 @@ class OffsetMoments(NamedTuple):
     """Magnitude of the mean offset from the axis, in the unit of the offsets."""
     rms: np.ndarray | float
     """Root mean square offset from the axis, in the unit of the offsets."""
-    extreme: np.ndarray | float
+    largest_magnitude: np.ndarray | float
     """Largest magnitude of an offset from the axis, in the unit of the offsets."""
 
     def scaled_by(self, factor: np.ndarray) -> "OffsetMoments":
@@ -336,9 +336,12 @@ def plane_offset_moment_bounds(
 
     Notes
     -----
-    Both are weighted by echo power. u of the module's description has the rms q. Further terms
-    bound the remainders of Taylor series. A beamlet x off the axis sees, of a velocity across and
-    along the beam, v_across x / |d| + v_along (1/|d| - 1), with |d|^2 = 1 + x^2.
+    Moments are weighted by echo power. They follow from Taylor series in the offset u of the
+    module's description, whose rms is q = (divergence / 4) cot(grazing angle). Bounds on the
+    remainders of the series are added. A beamlet at the angle x from the axis has the radial
+    velocity of the axis plus
+
+        v_across x / |d| + v_along (1/|d| - 1),    |d|^2 = 1 + x^2.
     """
     radius, sigma = pattern_radius(n_beamlets, pattern), np.asarray(beam_divergence, float) / 4
     transverse_velocity, radial_velocity = np.abs(transverse_velocity), np.abs(radial_velocity)

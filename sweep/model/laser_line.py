@@ -84,7 +84,7 @@ class LaserLine(NamedTuple):
     """(n,): full width at half maximum [Hz] of the laser's Lorentzian line, from a random walk of
     its phase.
     """
-    pedestal_variance_beside: np.ndarray | float = 0.0
+    pedestal_variance_beside_line: np.ndarray | float = 0.0
     """Phase-noise pedestal as noise variance at the ADC [V^2], in bins next to the lines."""
     pedestal_variance_under_line: np.ndarray | float = 0.0
     """Phase-noise pedestal as noise variance at the ADC [V^2], only in bins that contain lines."""
@@ -92,7 +92,7 @@ class LaserLine(NamedTuple):
     def scale_pedestal(self, power_factor: np.ndarray) -> "LaserLine":
         """Return the laser line with a pedestal for an echo whose power changes by a factor."""
         return self._replace(
-            pedestal_variance_beside=self.pedestal_variance_beside * power_factor,
+            pedestal_variance_beside_line=self.pedestal_variance_beside_line * power_factor,
             pedestal_variance_under_line=self.pedestal_variance_under_line * power_factor,
         )
 

@@ -321,12 +321,12 @@ class Shots:
     @cached_property
     def bin_noise_sigma(self) -> np.ndarray:
         """Noise standard deviation per quadrature of a bin [V, summed over the record], (n,)."""
-        return self._noise_sigma_of(self.noise_variance)
+        return self._bin_noise_sigma_from_variance(self.noise_variance)
 
     @cached_property
     def line_noise_sigma(self) -> np.ndarray:
         """Noise standard deviation per quadrature of a bin with lines [V], (n,)."""
-        return self._noise_sigma_of(
+        return self._bin_noise_sigma_from_variance(
             self.noise_variance + self.laser_line.pedestal_variance_under_line
         )
 
@@ -335,8 +335,8 @@ class Shots:
         """Thresholds and noise sigmas of each point's bins."""
         from sweep.model.detection.echo_detection import BinThresholds
 
-        side_noise_sigma = self._noise_sigma_of(
-            self.noise_variance + self.laser_line.pedestal_variance_beside
+        side_noise_sigma = self._bin_noise_sigma_from_variance(
+            self.noise_variance + self.laser_line.pedestal_variance_beside_line
         )
         shapes = self._pedestal_shapes
         values = BinThresholds(
@@ -364,7 +364,7 @@ class Shots:
         line_width_bins = self.laser_line.lorentzian_width * self.fft_size / self.sample_rate
         delay = np.minimum(2 * self.range / SPEED_OF_LIGHT, self.record.duration)
         delay = delay * self.sample_rate / self.fft_size
-        power_ratio = self.laser_line.pedestal_variance_beside / self.noise_variance
+        power_ratio = self.laser_line.pedestal_variance_beside_line / self.noise_variance
         power_ratio, line_width_bins, delay = broadcast_rows(
             (power_ratio, line_width_bins, delay), (self.size,)
         )
@@ -398,7 +398,8 @@ class Shots:
     def threshold(self) -> np.ndarray:
         """Threshold on a bin's magnitude [V, summed over the record], (n,)."""
         return threshold(
-            self.detection_settings.tnr, self._noise_sigma_of(self.noise_variance_without_echo)
+            self.detection_settings.tnr,
+            self._bin_noise_sigma_from_variance(self.noise_variance_without_echo),
         )
 
     @property
@@ -434,7 +435,7 @@ class Shots:
             and len(self.waveform.segment_order) == 3
         )
 
-    def _noise_sigma_of(self, variance: np.ndarray) -> np.ndarray:
+    def _bin_noise_sigma_from_variance(self, variance: np.ndarray) -> np.ndarray:
         """Return the noise standard deviation per quadrature of a bin [V].
 
         ``variance`` is the noise variance of a sample at the ADC [V^2].
@@ -894,7 +895,7 @@ def window_energy_from_sample(window: Window) -> np.ndarray:
     return np.append(np.cumsum(window.samples()[::-1] ** 2)[::-1], 0.0)
 
 
-_POINT_FIELD_LABELS = {
+_LABEL_BY_POINT_FIELD = {
     "target.range": "range",
     "target.radial_velocity": "radial velocity",
     "target.acceleration": "acceleration",
@@ -906,7 +907,7 @@ _POINT_FIELD_LABELS = {
 }
 """Fields of `Shots` that must be finite, with one value for each point. Keys are dotted paths to
 them, and values their names in error messages."""
-_BEAMLET_FIELD_LABELS = {
+_LABEL_BY_BEAMLET_FIELD = {
     "footprint.relative_range_offset": "beamlets' ranges",
     "footprint.doppler_ratio_offset": "beamlets' velocities",
     "footprint.relative_amplitude": "beamlets' echoes",
@@ -923,14 +924,14 @@ def require_finite(shots: Shots) -> None:
     UnsupportedShotError
         Names the quantity that is not finite, and the shot.
     """
-    for name, label in (_POINT_FIELD_LABELS | _BEAMLET_FIELD_LABELS).items():
+    for name, label in (_LABEL_BY_POINT_FIELD | _LABEL_BY_BEAMLET_FIELD).items():
         values = np.asarray(attrgetter(name)(shots))
         if math.isfinite(float(values.sum())):  # the sum is not finite with any nan or inf
             continue
         is_not_finite = ~np.isfinite(values)
         if not is_not_finite.any():
             continue
-        if name in _BEAMLET_FIELD_LABELS:
+        if name in _LABEL_BY_BEAMLET_FIELD:
             row_has_wrong = is_not_finite.any(axis=1)
             point_index = int(row_has_wrong[shots.footprint.row_of_point].argmax())
             value = values[shots.footprint.row_of_point[point_index]][

@@ -41,8 +41,9 @@ class FootprintLines(NamedTuple):
     the radial velocity.
     """
     relative_amplitude: np.ndarray
-    """(rows, beamlets): amplitude of a beamlet's beat for a beat amplitude scale of 1. It is the
-    square root of the relative echo [1/sr]; for direct detection it is the relative echo itself.
+    """(rows, beamlets): amplitude of each beamlet's beat over
+    :attr:`sweep.model.link_budget.EchoScales.beat_amplitude`. It is the square root of the relative
+    echo [1/sr], or with direct detection the relative echo itself.
     """
     adds_powers: bool = True
     """True if the powers of beamlets add, False if their amplitudes do."""

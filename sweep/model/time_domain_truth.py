@@ -18,7 +18,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.detection_probability import pd_and_miss_in_looks
 from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.preparation import Shots
-from sweep.model.spectrum.segment_spectra import SEGMENT_FIELDS
+from sweep.model.spectrum.segment_spectra import SEGMENT_RESULT_NAMES
 from sweep.model.waveform import SAMPLE_TIME_TOLERANCE
 
 
@@ -56,7 +56,7 @@ def time_domain_spectrum(
     w = window.window_samples(shots.window.name, shots.window.length)
     n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record
     record_sum = np.zeros(shots.window.length, complex)
-    power, image_gain = np.zeros(shots.n_bins), _value_at(shots.images.iq_gain, point)
+    power, image_gain = np.zeros(shots.n_bins), _value_of_point(shots.images.iq_gain, point)
     for beamlet in range(shots.footprint.n_beamlets):
         beamlet_record = analytic_record(
             shots,
@@ -98,16 +98,16 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
     -------
     ndarray (3, fields, n)
         Results by segment, field and point, with the fields of
-        :data:`sweep.model.spectrum.segment_spectra.SEGMENT_FIELDS`. Leakage is 0.
+        :data:`sweep.model.spectrum.segment_spectra.SEGMENT_RESULT_NAMES`. Leakage is 0.
 
     Notes
     -----
     Range walk is the only change of frequency within a record that is included.
     """
     pd_row, miss_row, magnitude_row, frequency_row = map(
-        SEGMENT_FIELDS.index, ("pd", "miss", "magnitude", "frequency")
+        SEGMENT_RESULT_NAMES.index, ("pd", "miss", "magnitude", "frequency")
     )
-    segment_results = np.full((3, len(SEGMENT_FIELDS), shots.size), np.nan)
+    segment_results = np.full((3, len(SEGMENT_RESULT_NAMES), shots.size), np.nan)
     for point in range(shots.size):
         for segment in map(int, np.flatnonzero(shots.has_segment)):
             look_magnitudes = [
@@ -176,30 +176,30 @@ def analytic_record(
     """
     chirp_slope, carrier = (
         shots.waveform.chirp_slopes[segment],
-        float(_value_at(shots.waveform.carriers[segment], point)),
+        float(_value_of_point(shots.waveform.carriers[segment], point)),
     )
     doppler_ratio_offset, segment_start = (
         float(shots.footprint.doppler_ratio_offset[shots.footprint.row_of_point[point], beamlet]),
-        float(_value_at(shots.motion.segment_starts[segment], point)),
+        float(_value_of_point(shots.motion.segment_starts[segment], point)),
     )
     approach_speed, acceleration_value = (
-        float(_value_at(shots.target.approach_speed, point)),
-        float(_value_at(shots.target.acceleration, point)),
+        float(_value_of_point(shots.target.approach_speed, point)),
+        float(_value_of_point(shots.target.acceleration, point)),
     )
     alpha = acceleration_value / SPEED_OF_LIGHT
     doppler_ratio = (
-        float(_value_at(shots.motion.doppler_ratio, point))
+        float(_value_of_point(shots.motion.doppler_ratio, point))
         + 2 * alpha * segment_start
         + doppler_ratio_offset
     )
-    chirp_rate = float(_value_at(shots.waveform.chirp_rate, point))
+    chirp_rate = float(_value_of_point(shots.waveform.chirp_rate, point))
     axis_range = float(shots.range[point])
     range_offset = axis_range * float(
         shots.footprint.relative_range_offset[shots.footprint.row_of_point[point], beamlet]
     )
     range_offset -= SPEED_OF_LIGHT / 2 * doppler_ratio_offset * segment_start
     range_decrease = approach_speed * segment_start + acceleration_value * segment_start**2 / 2
-    t = float(_value_at(shots.record.acquisition_delay, point)) + np.arange(
+    t = float(_value_of_point(shots.record.acquisition_delay, point)) + np.arange(
         shots.window.length
     ) / float(shots.sample_rate[point])
     start_delay = 2 * (axis_range - range_decrease + range_offset) / SPEED_OF_LIGHT
@@ -219,11 +219,11 @@ def analytic_record(
     beat = carrier * doppler_ratio - chirp_slope * chirp_rate * start_delay * (1 + doppler_ratio)
     gain = receiver_chain.receiver_transfer(
         np.array(beat),
-        detector_bandwidth=_value_at(shots.receiver_filter.detector_bandwidth, point),
-        amplifier_bandwidth=_value_at(shots.receiver_filter.amplifier_bandwidth, point),
+        detector_bandwidth=_value_of_point(shots.receiver_filter.detector_bandwidth, point),
+        amplifier_bandwidth=_value_of_point(shots.receiver_filter.amplifier_bandwidth, point),
     )
     amplitude = (
-        _value_at(shots.echo_scales.beat_amplitude, point)
+        _value_of_point(shots.echo_scales.beat_amplitude, point)
         * shots.footprint.relative_amplitude[shots.footprint.row_of_point[point], beamlet]
     )
     amplitude = amplitude * shots.whitening_gain[segment][point]
@@ -232,7 +232,7 @@ def analytic_record(
         has_arrived = (
             t >= start_delay + delay_change - SAMPLE_TIME_TOLERANCE / shots.sample_rate[point]
         )
-        record *= has_arrived & (t <= _value_at(shots.waveform.chirp_duration, point))
+        record *= has_arrived & (t <= _value_of_point(shots.waveform.chirp_duration, point))
     return np.asarray(record)
 
 
@@ -256,7 +256,7 @@ def _start_phase_cycles(
     return float(phase - round(phase))
 
 
-def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
+def _value_of_point(column: np.ndarray | float, point: int) -> np.ndarray:
     """Return a point's value from an array (n,), or the one number that all points share."""
     column = np.asarray(column)
     return column[point] if column.ndim else column

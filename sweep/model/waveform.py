@@ -100,7 +100,8 @@ class WaveformSegment(NamedTuple):
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
+    """Optical frequency at the segment's start [Hz]. Times a delay, it gives the echo's phase
+    [cycles]."""
     includes_leakage: bool
     """True if leakage, false alarms due to the echo's signal far from its line, is evaluated
     here."""

@@ -243,7 +243,7 @@ def _point_label(profile: GridProfile, index: int) -> str:
 
 def _roc_indices(profile: GridProfile) -> np.ndarray:
     """Return the indices along a profile whose pd is closest to the `ROC_POINT_PDS`."""
-    indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_INTERVALS)
+    indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_CELLS)
     pd = profile.variable_values("pd_shot", indices)
     if not np.isfinite(pd).any():
         return np.zeros(0, int)
@@ -455,7 +455,7 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
     max_ranges = [
         (
             words,
-            _maximum_range_selection(shown_points, range_parameter.coordinate, range_axis.factor),
+            _points_with_maximum_range(shown_points, range_parameter.coordinate, range_axis.factor),
         )
         for words, shown_points in shown_parts
     ]
@@ -519,10 +519,10 @@ def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
     return sentences
 
 
-def _maximum_range_selection(
+def _points_with_maximum_range(
     points: PointSelection, name: str, unit_factor: float
 ) -> PointSelection:
-    """Return the maximum range over the other coordinates of points, as a lazy selection.
+    """Return points without a range coordinate, and their maximum range as a lazy variable.
 
     `name` is the coordinate of range, `unit_factor` converts it to display units.
     """

@@ -410,7 +410,7 @@ class ReportPage:
     """Title of the study."""
     question: str
     """Question of the study, from its spec."""
-    facts: Sequence[tuple[str, str]]
+    key_facts: Sequence[tuple[str, str]]
     """Name and value of each key fact."""
     remarks: Sequence[str]
     """Sentences that the reader must not miss."""

@@ -147,7 +147,7 @@ def _grid_report(store: Location) -> ReportPage:
         ]
     request_section = _spec_and_effects_section(spec, [dataset["effects"]], dataset)
     axis_texts = [f"{axis.size:,} {labels.coordinate_label(axis.name)}" for axis in spec.axes]
-    facts = [("points", f"{dataset.attrs['points']:,}"),
+    key_facts = [("points", f"{dataset.attrs['points']:,}"),
              ("grid", " x ".join(axis_texts) or "a single point")]  # fmt: skip
     sections = [
         _main_results_section(
@@ -158,7 +158,7 @@ def _grid_report(store: Location) -> ReportPage:
         request_section,
         _page_section("tables", "Tables", [*table_items, _grid_point_table(results)]),
     ]
-    return _report_page(spec, dataset.attrs, "points", facts, sections, store)
+    return _report_page(spec, dataset.attrs, "points", key_facts, sections, store)
 
 
 def _main_results_section(
@@ -247,7 +247,7 @@ def _report_page(
     first_facts: Sequence[tuple[str, str]], sections: Sequence[PageSection], store: Location,
 ) -> ReportPage:  # fmt: skip
     """Return a report with its key facts, its sections, and instructions to reproduce the study."""
-    facts = [
+    key_facts = [
         *first_facts,
         ("study", attributes["study_id"][:8]),
         ("model", str(attributes["model_version"])),
@@ -262,7 +262,7 @@ def _report_page(
     return ReportPage(
         spec.title,
         spec.question,
-        [(name, value) for name, value in facts if value],
+        [(name, value) for name, value in key_facts if value],
         [remark] if n_done < n_total else [],
         [*sections, _reproduction_section(attributes, spec, str(store))],
     )
@@ -339,7 +339,7 @@ def _scene_report(store: Location) -> ReportPage:
     request_section = _spec_and_effects_section(
         spec, [g["effects"].chunk() for g in scanner_datasets], scanner_datasets[0]
     )
-    facts = [("shots times draws", f"{attributes['points']:,}"),
+    key_facts = [("shots times draws", f"{attributes['points']:,}"),
              ("scanners", ", ".join(map(labels.coordinate_label, results.scanners)))]  # fmt: skip
     returns_table = flight_charts.returns_table(labelled_recordings)
     sections = [
@@ -362,7 +362,7 @@ def _scene_report(store: Location) -> ReportPage:
         request_section,
         _page_section("tables", "Tables", [returns_table, _cloud_point_table(labelled_recordings)]),
     ]
-    return _report_page(spec, attributes, "blocks", facts, sections, store)
+    return _report_page(spec, attributes, "blocks", key_facts, sections, store)
 
 
 def consistency_sentences(tree: xr.DataTree) -> list[str]:

@@ -175,12 +175,14 @@ class ClusterConfig(SpecSection):
 
     security: Security | None = None
 
-    _base: Path = PrivateAttr(default=Path())
+    _base_folder: Path = PrivateAttr(default=Path())
     """Folder that paths in the configuration are relative to."""
 
     def resolve_path(self, raw_path: str) -> str:
         """Return the path of a file; ``raw_path`` may be relative to the cluster file's folder."""
-        return str(self._base / os.path.expanduser(raw_path))  # an unknown ~user is left as it is
+        return str(
+            self._base_folder / os.path.expanduser(raw_path)
+        )  # an unknown ~user is left as it is
 
     def certificate_paths(self) -> tuple[str, str, str] | None:
         """Return the paths of authority, certificate and private key; None without `security`."""
@@ -390,7 +392,7 @@ def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
     except ValidationError as error:
         findings += validation_findings(error, AnyClusterConfig)
     else:
-        cluster._base = base
+        cluster._base_folder = base
         findings += _cluster_findings(cluster)
     if findings:
         raise SpecError(document.to_mistakes(findings))

@@ -461,10 +461,10 @@ def reachable_models(*roots: type[BaseModel]) -> list[type[BaseModel]]:
     return list(visited)
 
 
-class ResolvedLocation(NamedTuple):
-    """A location in a spec, with the models of the value there and of the section around it."""
+class SpecLocation(NamedTuple):
+    """Location of a value in a spec, with the models of the value and of the section around it."""
 
-    location: Location
+    keys: Location
     """Keys and indices that lead to the value in the file."""
     value_models: ModelClasses
     """Pydantic models of the value, one for each kind of it; empty for a scalar or list."""
@@ -472,7 +472,7 @@ class ResolvedLocation(NamedTuple):
     """Pydantic models of the section that contains the value, one for each kind of section."""
 
 
-def translate_error_location(pydantic_location: Location, root: Any) -> ResolvedLocation:
+def translate_error_location(pydantic_location: Location, root: Any) -> SpecLocation:
     """Translate a location of a pydantic error to a location in a spec.
 
     Parameters
@@ -497,7 +497,7 @@ def translate_error_location(pydantic_location: Location, root: Any) -> Resolved
             annotation = None if field is None else field.annotation
         else:
             annotation = _element_annotation(annotation)
-    return ResolvedLocation(tuple(keys), models_of_annotation(annotation), enclosing_section_models)
+    return SpecLocation(tuple(keys), models_of_annotation(annotation), enclosing_section_models)
 
 
 # Traversal of the values of sections

@@ -17,7 +17,7 @@ from sweep.model.geometry import quaternion
 from sweep.model.geometry import scanner as scan_patterns
 from sweep.model.geometry.scanner import ScanPattern
 from sweep.spec.fields import SpecFiles, SpecSection
-from sweep.spec.rules import JsonObject, ListRule, Rule, read_element
+from sweep.spec.rules import JsonObject, ListRule, Rule, read_list_element
 from sweep.units import QuantityError
 
 Vector = tuple[float, ...]
@@ -350,7 +350,8 @@ class BeamDirectionsRule(Rule):
         if not isinstance(raw_value, list | tuple) or not 0 < len(raw_value) <= BEAMS_MAX:
             raise QuantityError(f"must be a list of 1 to {BEAMS_MAX} beams", remedy)
         return tuple(
-            read_element(beam_rule(raw_beam), i, raw_beam) for i, raw_beam in enumerate(raw_value)
+            read_list_element(beam_rule(raw_beam), i, raw_beam)
+            for i, raw_beam in enumerate(raw_value)
         )
 
     def format(self, value: Any) -> Any:

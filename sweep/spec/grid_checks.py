@@ -745,7 +745,7 @@ class ParameterRequirement(NamedTuple):
     """Text of the finding: the end of a sentence about `path`."""
     remedy: str
     """Text of the remedy, as an imperative clause."""
-    holds_if_forced_on: bool = False
+    applies_if_forced_on: bool = False
     """True if the requirement applies, at any value of the parameter, when its effect is ``on``."""
 
 
@@ -828,7 +828,7 @@ EFFECT_PARAMETER_REQUIREMENTS = (
         _condition_equal_to("direct"),
         "makes speckle, and direct detection averages an unknown number of speckle grains",
         "take a coherent receiver",
-        holds_if_forced_on=True,
+        applies_if_forced_on=True,
     ),
     ParameterRequirement(
         "target.roughness",
@@ -879,7 +879,7 @@ def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
         ):
             yield grid.make_finding(requirement.path, requirement.problem, remedy)
         elif (
-            requirement.holds_if_forced_on
+            requirement.applies_if_forced_on
             and mode == ON
             and grid.any_point_meets({requirement.other_path: requirement.is_broken_by})
         ):

@@ -646,7 +646,7 @@ class ListRule(Rule):
             )
             raise QuantityError(f"must be a list of {length_text}{self.element_noun}", remedy)
         values = tuple(
-            read_element(self.element_rule, i, value) for i, value in enumerate(raw_value)
+            read_list_element(self.element_rule, i, value) for i, value in enumerate(raw_value)
         )
         if self.increasing and any(b <= a for a, b in pairwise(values)):
             raise QuantityError("must begin below its end", "put the lower value first")
@@ -668,7 +668,7 @@ class ListRule(Rule):
         )
 
 
-def read_element(rule: Rule, index: int, raw_value: object) -> Any:
+def read_list_element(rule: Rule, index: int, raw_value: object) -> Any:
     """Read one value of a list; the error of an invalid value names its index."""
     try:
         return rule.read(raw_value)
@@ -720,7 +720,7 @@ class FrequencyErrorTableRule(Rule):
             if not isinstance(row, list | tuple) or len(row) != 2:
                 raise QuantityError(f"has a row {i} that is no time with its error", remedy)
             rules = zip((_CHIRP_TIME_RULE, _FREQUENCY_ERROR_RULE), row, strict=True)
-            rows.append([read_element(rule, i, value) for rule, value in rules])
+            rows.append([read_list_element(rule, i, value) for rule, value in rules])
         if any(b[0] <= a[0] for a, b in pairwise(rows)):
             raise QuantityError("has times that do not rise", "sort the rows by time")
         table_text = ", ".join(f"{time!r} {error!r}" for time, error in rows)

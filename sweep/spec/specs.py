@@ -144,7 +144,7 @@ class BaseSpec(SpecSection):
 
     _yaml_mapping: dict[str, Any] = PrivateAttr(default_factory=dict)
     """The spec with all defaults, as a user would write it."""
-    _base: Path = PrivateAttr(default=Path())
+    _base_folder: Path = PrivateAttr(default=Path())
     """Folder that paths in the spec are relative to."""
     _file_digests: dict[str, str] = PrivateAttr(default_factory=dict)
     """Digest of each file's content, by the file's path as written in the spec."""
@@ -204,7 +204,7 @@ class BaseSpec(SpecSection):
             raise SpecError([Mistake("", "must be a mapping", format_raw_value(raw_spec))])
         digests = raw_spec.pop(FILE_DIGESTS_KEY, {})
         spec = cls.from_document(Document(raw_spec), None)
-        spec._base, spec._file_digests = Path(base or "."), digests
+        spec._base_folder, spec._file_digests = Path(base or "."), digests
         return spec
 
     @classmethod
@@ -664,7 +664,7 @@ class SceneSpec(BaseSpec):
         spec = super().from_document(document, base)
         if base is not None:
             files = SpecFiles(base)
-            spec._base = base
+            spec._base_folder = base
             paths_and_rules = [(file, rule) for _, rule, file in iter_file_paths(spec)]
             spec._file_digests = {
                 file: rule.compute_digest(files.resolve(file)) for file, rule in paths_and_rules
@@ -699,12 +699,12 @@ class SceneSpec(BaseSpec):
     @property
     def base(self) -> Path:
         """Folder that paths in the spec are relative to."""
-        return self._base
+        return self._base_folder
 
     @property
     def files(self) -> SpecFiles:
         """Files that the spec names, with the time in their tables at which the flight begins."""
-        files = SpecFiles(self._base, self._file_digests)
+        files = SpecFiles(self._base_folder, self._file_digests)
         return replace(files, time_origin=self.platform.read_time_origin(files))
 
     def parameters(self) -> dict[str, float | int | str]:

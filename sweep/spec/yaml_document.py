@@ -242,7 +242,7 @@ class Document:
             finding.problem,
         )
         if Path(file).parent == _INSTRUMENT_LIBRARY_FOLDER and file != self.file:
-            library_value = _value_at(self.content, location)
+            library_value = _value_at_location(self.content, location)
             rule += (
                 ""
                 if isinstance(library_value, dict)
@@ -259,7 +259,11 @@ class Document:
         path or in words, a field of the same section, and the name of the instrument.
         """
         location, message = finding.location, f"{finding.problem} {finding.suggestion}"
-        section = location if isinstance(_value_at(self.content, location), dict) else location[:-1]
+        section = (
+            location
+            if isinstance(_value_at_location(self.content, location), dict)
+            else location[:-1]
+        )
         user_positions = {
             field_location: position
             for field_location, position in self.positions.items()
@@ -751,7 +755,7 @@ def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
     return result
 
 
-def _value_at(value: Any, location: Location) -> Any:
+def _value_at_location(value: Any, location: Location) -> Any:
     """Return the value at a location of nested data; empty text if there is none."""
     try:
         for key in location:
@@ -818,8 +822,8 @@ def validation_findings(error: ValidationError, annotation: Any) -> list[Finding
 def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
     """Convert one entry of `ValidationError.errors` to a finding."""
     error_type, raw_value = detail["type"], detail["input"]
-    resolved = spec_fields.translate_error_location(detail["loc"], annotation)
-    location = resolved.location
+    spec_location = spec_fields.translate_error_location(detail["loc"], annotation)
+    location = spec_location.keys
     if error_type == RULE_ERROR_TYPE:
         context, path = detail["ctx"], dotted_path(location)
         if (
@@ -833,40 +837,40 @@ def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
         shown_value = MISSING if isinstance(raw_value, dict) else raw_value
         return Finding(location, context["rule"], context["suggestion"], shown_value)
     if error_type == "missing":
-        return Finding(location, "is missing", _missing_field_remedy(resolved))
+        return Finding(location, "is missing", _missing_field_remedy(spec_location))
     if error_type == "extra_forbidden":
         models_by_kind = {
             spec_fields.kind_of_model(model): model
             for model in spec_fields.models_of_annotation(annotation)
         }
         model = models_by_kind.get(detail["loc"][0], annotation)
-        return Finding(location, "is no field", _suggest_field(resolved, model))
+        return Finding(location, "is no field", _suggest_field(spec_location, model))
     if error_type == "union_tag_invalid":
         tag, kind_names = (
             detail["ctx"]["tag"],
-            [spec_fields.kind_of_model(model) for model in resolved.value_models],
+            [spec_fields.kind_of_model(model) for model in spec_location.value_models],
         )
         problem = f"must be one of {', '.join(kind_names)}"
         return Finding((*location, "kind"), problem, _suggest_kind(str(tag), kind_names), tag)
     if error_type == "union_tag_not_found":
         return Finding(
-            location, "lacks its kind", f"write {_kind_hint(resolved.value_models)}", raw_value
+            location, "lacks its kind", f"write {_kind_hint(spec_location.value_models)}", raw_value
         )
     problem = _PROBLEM_BY_ERROR_TYPE.get(error_type, "has an invalid value")
     remedy = (
-        _missing_field_remedy(resolved)
-        if resolved.value_models
-        else _list_remedy(resolved, error_type)
+        _missing_field_remedy(spec_location)
+        if spec_location.value_models
+        else _list_remedy(spec_location, error_type)
     )
     return Finding(location, problem, remedy, raw_value)
 
 
-def _list_remedy(resolved: spec_fields.ResolvedLocation, error_type: str) -> str:
+def _list_remedy(spec_location: spec_fields.SpecLocation, error_type: str) -> str:
     """Return the remedy for a value that must be a list, or a mapping of sections."""
     if error_type in ("list_type", "tuple_type"):
         return "put it in brackets, [...], or on lines that begin with '- '"
     return (
-        f"write '{resolved.location[-1]}:' with a name and its fields below"
+        f"write '{spec_location.keys[-1]}:' with a name and its fields below"
         if error_type == "dict_type"
         else ""
     )
@@ -884,37 +888,37 @@ def _suggest_kind(tag: str, kind_names: list[str]) -> str:
     return suggest_similar_name(tag, kind_names)
 
 
-def _missing_field_remedy(resolved: spec_fields.ResolvedLocation) -> str:
+def _missing_field_remedy(spec_location: spec_fields.SpecLocation) -> str:
     """Return the remedy for a missing field or section."""
-    name, section = resolved.location[-1], resolved.location[:-1]
-    if resolved.location == _INSTRUMENT_LOCATION:
+    name, section = spec_location.keys[-1], spec_location.keys[:-1]
+    if spec_location.keys == _INSTRUMENT_LOCATION:
         return missing_instrument_remedy()
     field = (
-        spec_fields.fields_by_name(resolved.enclosing_section_models[0]).get(str(name))
-        if resolved.enclosing_section_models
+        spec_fields.fields_by_name(spec_location.enclosing_section_models[0]).get(str(name))
+        if spec_location.enclosing_section_models
         else None
     )
     rule = spec_fields.rule_of_field(field) if field is not None else None
     example = rule.example if rule is not None else ""
     if example:
         may_vary = (
-            isinstance(rule, NumericRule) and dotted_path(resolved.location) in parameter_rules()
+            isinstance(rule, NumericRule) and dotted_path(spec_location.keys) in parameter_rules()
         )
         return f"write e.g. '{name}: {example}'" + (", or put it on an axis" if may_vary else "")
-    if isinstance(name, int) and resolved.value_models:
-        has_kinds = len(resolved.value_models) > 1
+    if isinstance(name, int) and spec_location.value_models:
+        has_kinds = len(spec_location.value_models) > 1
         field_names = (
-            _kind_hint(resolved.value_models)
+            _kind_hint(spec_location.value_models)
             if has_kinds
-            else ", ".join(spec_fields.fields_by_name(resolved.value_models[0]))
+            else ", ".join(spec_fields.fields_by_name(spec_location.value_models[0]))
         )
         return f"write a mapping with {field_names}"
-    if len(resolved.value_models) > 1:
-        return f"write '{name}:' with {_kind_hint(resolved.value_models)}"
-    if resolved.value_models:
+    if len(spec_location.value_models) > 1:
+        return f"write '{name}:' with {_kind_hint(spec_location.value_models)}"
+    if spec_location.value_models:
         remedy = (
             f"write '{name}:' with "
-            f"{', '.join(spec_fields.fields_by_name(resolved.value_models[0]))}"
+            f"{', '.join(spec_fields.fields_by_name(spec_location.value_models[0]))}"
         )
         like_remedy = f", or take all that is missing from another: 'like: {_EXAMPLE_INSTRUMENT}'"
         return remedy + (like_remedy if section == _INSTRUMENT_LOCATION else "")
@@ -930,15 +934,15 @@ def missing_instrument_remedy() -> str:
     )
 
 
-def _suggest_field(resolved: spec_fields.ResolvedLocation, root_model: type[BaseModel]) -> str:
+def _suggest_field(spec_location: spec_fields.SpecLocation, root_model: type[BaseModel]) -> str:
     """Suggest a known field for an unknown one: of the same section, else of the whole spec."""
-    name = str(resolved.location[-1])
+    name = str(spec_location.keys[-1])
     sibling_names = [
         field
-        for model in resolved.enclosing_section_models
+        for model in spec_location.enclosing_section_models
         for field in spec_fields.fields_by_name(model)
     ]
-    if name in _OTHER_SPEC_REMEDIES and resolved.enclosing_section_models == (root_model,):
+    if name in _OTHER_SPEC_REMEDIES and spec_location.enclosing_section_models == (root_model,):
         return _OTHER_SPEC_REMEDIES[name]
     known_paths = dict.fromkeys((*parameter_rules(), *spec_fields.rules_by_path(root_model, "")))
     if name[:1].isdigit():

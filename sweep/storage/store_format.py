@@ -814,7 +814,8 @@ def _read_log_object(log_object: ObjectPath) -> bytes:
 def iter_raw_lines(path: Location) -> Iterator[bytes]:
     """Yield the lines of a log in order, with their line ends.
 
-    In an object store a small file of lines, such as the manifest, is read too.
+    In an object store a log consists of many objects. A file of lines that is a single object, such
+    as the manifest, can be read as well.
     """
     if isinstance(path, ObjectPath):
         object_names = list_log_objects(path)

@@ -64,7 +64,7 @@ from sweep.tasks.engine.study_store import (
     sync_file_system,
 )
 from sweep.tasks.studies import study_loading
-from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world
+from sweep.tasks.studies.eyepoint_study import EyepointStudy, get_built_scene
 from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
@@ -435,7 +435,7 @@ def _compute_into_path(
             write_recipe(working_path, **read_recipe(working_path) | recipe)
         if isinstance(spec, SceneSpec) and (from_scratch or not already_exists):
             with show_activity("building the scene", backend.progress):
-                scene_reports = build_world(spec).mesh_reports
+                scene_reports = get_built_scene(spec).mesh_reports
                 if not _eyepoint_stores_exist(working_path, study):
                     refuse_flight_without_hits(spec)
             for report in scene_reports:

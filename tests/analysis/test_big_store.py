@@ -63,7 +63,7 @@ def test_neither_does_that_of_its_figures(tmp_path, monkeypatch):
     monkeypatch.setattr(
         charts, "SHEET_SIZE_LIMITS", replace(charts.SHEET_SIZE_LIMITS, columns_max=20)
     )
-    monkeypatch.setattr(charts, "REDUCED_LINE_INTERVALS", 5)
+    monkeypatch.setattr(charts, "REDUCED_LINE_CELLS", 5)
     monkeypatch.setattr(canvas, "save_sheet", lambda sheet, path, source: path)
     sizes = stores(tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37

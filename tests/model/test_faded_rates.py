@@ -17,9 +17,9 @@ from sweep.model.detection.speckle_crossing_rates import (
     POWERS_PER_OCTAVE_MAX,
     SPECKLE_POWER_MAX,
     TABULATED_SPECKLE_POWERS,
-    add_rates_by_power,
-    add_rates_of_entries,
-    add_to_entry_weights,
+    add_entry_weights_of_bin,
+    add_rates_by_speckle_power,
+    add_rates_from_entry_weights,
     count_entry_weights,
     tabulate_crossing_rates,
 )
@@ -49,7 +49,7 @@ def test_tabulated_rates_are_those_of_a_bin_at_each_speckle_power(level):
     table = table_of(level)
     for amplitude in np.exp(np.linspace(np.log(1e-4), np.log(level + 20), 300)):
         sums = np.zeros(N_SPECKLE_POWERS)
-        add_rates_by_power(amplitude**2, 1.0, table, sums)
+        add_rates_by_speckle_power(amplitude**2, 1.0, table, sums)
         told = sums * TABULATED_SPECKLE_POWERS
         faded = amplitude * np.sqrt(TABULATED_SPECKLE_POWERS)
         expected = direct_rates(faded, level)
@@ -65,9 +65,9 @@ def test_sums_by_table_entry_are_the_sums_bin_by_bin(level):
     one_by_one, by_entry = np.zeros(N_SPECKLE_POWERS), np.zeros(N_SPECKLE_POWERS)
     entry_weights = np.zeros(count_entry_weights(table))
     for amplitude in amplitudes:
-        add_rates_by_power(amplitude**2, 1.0, table, one_by_one)
-        add_to_entry_weights(amplitude**2, table, entry_weights)
-    add_rates_of_entries(entry_weights, table, by_entry)
+        add_rates_by_speckle_power(amplitude**2, 1.0, table, one_by_one)
+        add_entry_weights_of_bin(amplitude**2, table, entry_weights)
+    add_rates_from_entry_weights(entry_weights, table, by_entry)
     np.testing.assert_allclose(by_entry, one_by_one, rtol=1e-12)
     # Polynomials reproduce constants: the weights of a bin sum to its squared amplitude.
     np.testing.assert_allclose(entry_weights.sum(), (amplitudes**2).sum(), rtol=1e-12)

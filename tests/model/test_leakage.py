@@ -19,10 +19,10 @@ from sweep.model.evaluation import evaluate_segments, prepare_ray_traced_shots, 
 from sweep.model.ground import BeamletTable, RayTracedGround
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.spectrum.bin_spectrum import (
-    SOURCE_LOG_ACCURACY,
+    FAR_LINE_LOG_ACCURACY,
     LineBundle,
     allocate_workspace,
-    compute_sources,
+    compute_end_strengths_and_far_lines,
     far_line_weight,
 )
 from sweep.model.spectrum.segment_spectra import segment_spectrum
@@ -88,7 +88,9 @@ def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(nam
         lines, bundle = field.lines, LineBundle(0, n, -half, half, total)
         lines.position[:n], lines.re[:n], lines.im[:n] = places, s.real, s.imag
         clearance = float(layout.clearance_bins)
-        n_sources = compute_sources(bundle, clearance, SOURCE_LOG_ACCURACY, layout, field)
+        n_sources = compute_end_strengths_and_far_lines(
+            bundle, clearance, FAR_LINE_LOG_ACCURACY, layout, field
+        )
         bound = far_line_weight(total, n_sources, layout, field.far_equivalent_lines)
         away = np.geomspace(layout.clearance_bins + 1, 2000, 24) + generator.uniform(0, 1)
         y = half + away[:, None] - places

@@ -184,7 +184,7 @@ def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
     signal = {places.get(a, a): n for a, n in amplitudes.items()}
     bins = np.repeat(list(signal), list(signal.values()))
     levels, law = leaked._distinct_thresholds(np.full(2, level))
-    table = leaked._tabulate_log_rates(SINGLE_LOOK, float(levels[0]))
+    table = leaked._tabulate_log_crossing_rates(SINGLE_LOOK, float(levels[0]))
     ends = np.zeros((2, 3), np.int64)
     ends[1, 2] = bins.size  # the other point and segments have none
     leaks = leaked.LeakageBins.empty(2)._replace(
@@ -194,11 +194,11 @@ def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
         group=np.zeros(bins.size, np.int64),
         exempt_neighbour=np.zeros(bins.size),
         threshold_index=law,
-        log_rates=table.log_rates[None],
+        log_crossing_rates=table.log_crossing_rates[None],
         first_log_amplitude=np.array([table.first_log_amplitude]),
         log_amplitude_step=np.array([table.log_amplitude_step]),
         threshold_ratio=levels,
-        rate_sum=np.full((2, 3), sum(n * _rate(a, level) for a, n in signal.items())),
+        crossing_rate_sum=np.full((2, 3), sum(n * _rate(a, level) for a, n in signal.items())),
     )
     means = leaks.mean_leakage()
     within = {"rel": 1e-6, "abs": 1e-6 * leaked.LEAKAGE_MIN}
@@ -282,7 +282,9 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
     level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
     scale, line = permanent_line.line_of_point(shots, 0, 0)
-    bins = leaks.line_bins[leaks.line_begin[0, 0] : leaks.line_end[0, 0]]
+    bins = leaks.permanent_line_bins[
+        leaks.permanent_line_begin[0, 0] : leaks.permanent_line_end[0, 0]
+    ]
     one, other = scale / shots.bin_noise_sigma[0] * line.transforms[:, bins]
     turn = np.exp(2j * np.pi * random.random(draws))[:, None]
     noise = random.standard_normal((draws, 2 * bins.size)).view(complex)
@@ -292,7 +294,9 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     assert (places >= 0).mean() > 0.1
     assert _difference(places, own) < _allowed(draws, draws)
     # Noise alone raises nothing where the line is masked.
-    hidden = leaks.excluded_bins[leaks.excluded_begin[0, 0] : leaks.excluded_end[0, 0]]
+    hidden = leaks.no_noise_peak_bins[
+        leaks.no_noise_peak_begin[0, 0] : leaks.no_noise_peak_end[0, 0]
+    ]
     assert (scale * line.magnitude_max[hidden] >= 0.8 * shots.threshold[0]).all() and hidden.size
     assert not set(hidden) & set(bins)
 
@@ -336,24 +340,26 @@ def test_faint_leakage_is_what_the_average_over_all_bins_together_gives(table_4_
     ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
     means = leaks.mean_leakage()
     together = leaks._replace(
-        mean_probability_sum=leaks.mean_probability_sum * np.nan
+        mean_crossing_probability_sum=leaks.mean_crossing_probability_sum * np.nan
     ).mean_leakage()
     faint = (together > leaked.LEAKAGE_MIN) & (together < 0.9 * leaked.FAINT_LEAKAGE_MAX)
     assert faint.sum() > 3
-    np.testing.assert_array_equal(means[faint], leaks.mean_probability_sum[faint])
+    np.testing.assert_array_equal(means[faint], leaks.mean_crossing_probability_sum[faint])
     np.testing.assert_allclose(means[faint], together[faint], rtol=5e-3)
 
 
 def test_rates_stay_below_their_bounds_at_every_octave_of_speckle(table_4_1):
     shots = _faint_shots(table_4_1, 20.0)
     ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
-    for octave in range(leaked.N_BOUND_POWERS):
-        for j, s in np.ndindex(leaks.rate_sum.shape):
+    for octave in range(leaked.N_BOUND_SPECKLE_POWERS):
+        for j, s in np.ndindex(leaks.crossing_rate_sum.shape):
             bins = slice(leaks.bins_begin[j, s], leaks.bins_end[j, s])
             amplitudes = leaks.log_amplitude[bins] + 0.5 * octave * math.log(2.0)
             law = leaks.threshold_index[j]
-            table = leaked.RateTable(
-                leaks.log_rates[law], leaks.first_log_amplitude[law], leaks.log_amplitude_step[law]
+            table = leaked.CrossingRateTable(
+                leaks.log_crossing_rates[law],
+                leaks.first_log_amplitude[law],
+                leaks.log_amplitude_step[law],
             )
             whole = sum(leaked._crossing_rate(a, table) for a in amplitudes)
-            assert whole <= leaks.rate_sum_bounds[j, s, octave] <= 1.3 * whole
+            assert whole <= leaks.crossing_rate_sum_bounds[j, s, octave] <= 1.3 * whole

@@ -19,7 +19,7 @@ from sweep.model.pointcloud.ray_error import (
     _fill_power_errors,
     _pd_change_bound_of_looks,
     _speckled_pd_change,
-    fold_lattice,
+    pair_opposite_beamlets,
 )
 from sweep.model.sampling import philox
 from sweep.scenes.meshes import clean_mesh
@@ -124,7 +124,7 @@ def test_where_no_number_is_enough_it_is_the_thesis_s(change):
 @pytest.mark.parametrize("number", RAYS)
 def test_numbers_are_whole_shells(number):
     """Each beamlet has one opposite, and the fold tells them all."""
-    rule = fold_lattice(number)
+    rule = pair_opposite_beamlets(number)
     offsets, weight = place_beamlets(number)
     np.testing.assert_allclose(
         offsets[:, rule.opposite_beamlet], -offsets[:, rule.beamlet], atol=1e-12
@@ -212,7 +212,7 @@ def _ridge_errors(number, width):
     squared = 1 + width**2
     true = width / np.sqrt(squared) * np.exp(-0.5 * place.ravel() ** 2 / squared)
     told = np.empty(len(power))
-    _fill_power_errors(power, fold_lattice(number), told)
+    _fill_power_errors(power, pair_opposite_beamlets(number), told)
     return abs(power.sum(axis=1) / true - 1), told
 
 

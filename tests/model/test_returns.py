@@ -35,11 +35,11 @@ from sweep.model.pointcloud.returns import (
     Peak,
     PeakLists,
     beamlet_line_positions,
+    compare_return_with_truth,
     draw_free_bin,
     draw_returns,
     draw_segment_peaks,
     empty_group_speckle,
-    judge_return,
     largest_noise_magnitude,
 )
 from sweep.model.sampling.draws import NoiseFilter, NoiselessSpectra
@@ -542,14 +542,17 @@ def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
     nowhere = bins + np.array([0, 0, 20])[:, None]
     centres, all_three = np.array([10.9, 5.0, 31.2]), np.zeros(3, np.int8)
     lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
-    assert judge_return(all_three, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
-    assert judge_return(all_three, centres, *bins, lines, dim) == (TRUE_FLAG, 0)
+    assert compare_return_with_truth(all_three, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
+    assert compare_return_with_truth(all_three, centres, *bins, lines, dim) == (TRUE_FLAG, 0)
     apart = np.array([0, 0, 1], np.int8)
-    assert judge_return(apart, centres, *bins, lines, lit) == (MISPAIRED_FLAG, -1)
-    assert judge_return(all_three, centres, *nowhere, lines, lit) == (SIDELOBE_FLAG, -1)
+    assert compare_return_with_truth(apart, centres, *bins, lines, lit) == (MISPAIRED_FLAG, -1)
+    assert compare_return_with_truth(all_three, centres, *nowhere, lines, lit) == (
+        SIDELOBE_FLAG,
+        -1,
+    )
     no_doppler, noise = np.array([0, -2, 0], np.int8), np.array([0, 0, -1], np.int8)
-    assert judge_return(no_doppler, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
-    assert judge_return(noise, centres, *bins, lines, lit) == (FALSE_ALARM_FLAG, -1)
+    assert compare_return_with_truth(no_doppler, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
+    assert compare_return_with_truth(noise, centres, *bins, lines, lit) == (FALSE_ALARM_FLAG, -1)
 
 
 def _only(found, present):

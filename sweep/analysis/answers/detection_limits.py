@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from sweep.analysis.answers.dataset_lookup import find_coordinate, parse_pd_level, require_variables
 from sweep.analysis.answers.probability import (
-    confidence_attribute,
+    confidence_level_attributes,
     pd_half_width,
     segment_variable_name,
 )
@@ -151,7 +151,7 @@ def limit(
             }
     result = xr.Dataset(limits).assign_attrs(dataset.attrs)
     return _set_limit_attributes(
-        result, coord, segment, level, confidence_attribute(dataset, interval_half_width)
+        result, coord, segment, level, confidence_level_attributes(dataset, interval_half_width)
     )
 
 

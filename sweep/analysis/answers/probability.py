@@ -81,12 +81,12 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
     for name, end_word in (("low", "lower"), ("high", "upper")):
         result[name].attrs = {
             "units": "1", "long_name": f"{end_word} end of the interval of {pd_long_name}",
-            **confidence_attribute(dataset, interval_half_width),
+            **confidence_level_attributes(dataset, interval_half_width),
         }  # fmt: skip
     return result
 
 
-def confidence_attribute(
+def confidence_level_attributes(
     dataset: xr.Dataset, interval_half_width: xr.DataArray | None
 ) -> dict[str, float]:
     """Return the confidence level of pd's intervals as a dict of attributes.

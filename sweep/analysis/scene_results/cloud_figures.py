@@ -19,7 +19,7 @@ from mpl_toolkits.mplot3d import proj3d
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.scene_results import point_styles
-from sweep.analysis.scene_results.point_styles import PictureSheet
+from sweep.analysis.scene_results.point_styles import SheetWithLegends
 from sweep.analysis.scene_results.recordings import (
     CATEGORICAL_QUANTITIES,
     LOG_QUANTITIES,
@@ -153,7 +153,7 @@ class ObliqueView:
             inches_per_unit * (high[1] - low[1]),
         )
         left, below, right, above = OBLIQUE_MARGINS_INCHES
-        self.picture_sheet = PictureSheet(
+        self.picture_sheet = SheetWithLegends(
             self.size_inches[0] + left + right,
             self.size_inches[1] + below + above,
             title=title,
@@ -204,7 +204,7 @@ class ObliqueView:
 
         The corners are fractions of matplotlib's square axes, (2,) each.
         """
-        trial_sheet = PictureSheet(
+        trial_sheet = SheetWithLegends(
             _TRIAL_SHEET_SIDE_INCHES, _TRIAL_SHEET_SIDE_INCHES, title="", caption=""
         )
         axes = trial_sheet.add_axes(
@@ -295,7 +295,7 @@ class AxisAlignedView:
             max(self.inches_per_unit * sides[0], AXIS_VIEW_SIDE_MIN_INCHES),
             max(self.inches_per_unit * sides[1], AXIS_VIEW_SIDE_MIN_INCHES),
         )
-        self.picture_sheet = PictureSheet(
+        self.picture_sheet = SheetWithLegends(
             self.size_inches[0] + AXIS_MARGINS_INCHES[0],
             self.size_inches[1] + AXIS_MARGINS_INCHES[1],
             title=title,
@@ -555,7 +555,7 @@ def draw_scatter_sheet(
         count_texts.append(
             f"{labels.number_with_noun(n_outside, 'false point')} outside of the picture"
         )
-    picture_sheet = PictureSheet(
+    picture_sheet = SheetWithLegends(
         SCATTER_SIZE_INCHES[0] + AXIS_MARGINS_INCHES[0],
         SCATTER_SIZE_INCHES[1] + AXIS_MARGINS_INCHES[1],
         title=title,

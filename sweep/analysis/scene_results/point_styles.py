@@ -174,7 +174,7 @@ TITLE_HEIGHT_INCHES, CAPTION_HEIGHT_INCHES, CAPTION_LINE_HEIGHT_INCHES = 0.75, 0
 """Heights of the title, of the caption's first line, and of each further line [inches]."""
 
 
-class PictureSheet:
+class SheetWithLegends:
     """Sheet with a picture of a given size [inches], and with legends at its right."""
 
     def __init__(self, width: float, height: float, *, title: str, caption: str) -> None:

@@ -1049,7 +1049,7 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
             i += 1
         if has_strong_bin:
             if n_runs > 0:
-                bin_run = _pd_and_miss_of_run(
+                bin_run = _pd_and_miss_of_adjacent_bins(
                     echo, run_begin, echo_begin, rule, bin_threshold, bin_speckle
                 )
                 pd, miss, run_begin = (
@@ -1059,7 +1059,9 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
                 )
             n_runs += 1
         i += 1
-    bin_run = _pd_and_miss_of_run(echo, run_begin, magnitude.size, rule, bin_threshold, bin_speckle)
+    bin_run = _pd_and_miss_of_adjacent_bins(
+        echo, run_begin, magnitude.size, rule, bin_threshold, bin_speckle
+    )
     return Detection(pd + miss * bin_run.pd, miss * bin_run.miss)
 
 
@@ -1081,7 +1083,7 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
 
 
 @njit(cache=True, error_model="numpy")
-def _pd_and_miss_of_run(echo, begin, end, rule, bin_threshold, bin_speckle):
+def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_speckle):
     """Return the :class:`Detection` of a run of bins of an echo in developed speckle.
 
     The adjacent bins of the run fade together (:func:`pd_and_miss_in_speckle`). They are bins begin

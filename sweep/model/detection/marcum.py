@@ -33,7 +33,9 @@ error is exp(-(2 pi / h)^2 / 2) = 3e-18."""
 
 _MIDPOINT_NODES = tuple((_MIDPOINT_STEP * (k + 0.5)) ** 2 for k in range(13))
 _MIDPOINT_WEIGHTS = tuple(_MIDPOINT_STEP / math.pi * math.exp(-0.5 * v) for v in _MIDPOINT_NODES)
-_POLE_REACH = 2.0 * math.pi / _MIDPOINT_STEP
+_POLE_DECAY_RATE = 2.0 * math.pi / _MIDPOINT_STEP
+"""Decay rate c of the midpoint rule's correction for the integrand's pole. At the distance
+d = |a - b| the correction is 1 / (1 + exp(c d)). It is neglected from d = c on."""
 
 _SQUARED_DISTANCE_MAX = 1500.0
 """Limit of (a - b)^2 above which the smaller tail of Marcum's Q_1(a, b) is 0 in float64. The tail
@@ -160,7 +162,7 @@ def marcum_q1_tails(a, b):
             total += (_MIDPOINT_WEIGHTS[k] * (shift + half_step * v)) / (
                 (d_square + v) * math.sqrt(1.0 - quarter * v)
             )
-        pole = 1.0 / (1.0 + math.exp(_POLE_REACH * d)) if d < _POLE_REACH else 0.0
+        pole = 1.0 / (1.0 + math.exp(_POLE_DECAY_RATE * d)) if d < _POLE_DECAY_RATE else 0.0
         tail = total * decay + pole
     return Tails(1.0 - tail, tail) if is_p else Tails(tail, 1.0 - tail)
 

@@ -248,7 +248,7 @@ def rate_table(grid, arrays):
     )
 
 
-class TablePlace(NamedTuple):
+class RateTablePlace(NamedTuple):
     """Place of a bin in the table, at the faintest speckle power."""
 
     first_entry: int
@@ -269,15 +269,18 @@ class InterpolationWeights(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _place_in_table(squared_ratio, rate_table):
-    """Return the :class:`TablePlace` of a bin; arguments as in :func:`add_rates_by_power`."""
+def _rate_table_place(squared_ratio, rate_table):
+    """Return the :class:`RateTablePlace` of a bin.
+
+    Arguments are as in :func:`add_rates_by_speckle_power`.
+    """
     table_position = (
         0.5 * math.log(squared_ratio)
         + _LOG_AMPLITUDE_AT_FAINTEST_POWER
         - rate_table.log_amplitude_first
     ) / rate_table.log_amplitude_step
     table_position = min(max(table_position, 2.0), rate_table.position_max)
-    return TablePlace(
+    return RateTablePlace(
         np.uint64(table_position) - np.uint64(2), table_position - math.floor(table_position)
     )
 
@@ -286,7 +289,7 @@ def _place_in_table(squared_ratio, rate_table):
 def _interpolation_weights(x, weight):
     """Return ``weight`` times the :class:`InterpolationWeights` of Lagrange's polynomial at ``x``.
 
-    ``x`` is the fraction of :class:`TablePlace`.
+    ``x`` is the fraction of :class:`RateTablePlace`.
     """
     square_1, square_2 = x * x - 1.0, x * x - 4.0
     return InterpolationWeights(
@@ -300,7 +303,7 @@ def _interpolation_weights(x, weight):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
+def add_rates_by_speckle_power(squared_ratio, weight, rate_table, rate_sums):
     """Add a bin's crossing rates at all speckle powers to sums over bins.
 
     Each rate -ln(1 - c), with the crossing probability c due to leaked signal, is divided by the
@@ -317,7 +320,7 @@ def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
     rate_sums
         (N_SPECKLE_POWERS,): sums by speckle power; changed in place.
     """
-    place = _place_in_table(squared_ratio, rate_table)
+    place = _rate_table_place(squared_ratio, rate_table)
     relative_rates = rate_table.relative_rates
     entries_per_power = np.uint64(rate_table.entries_per_power)
     column = place.first_entry // entries_per_power
@@ -343,22 +346,23 @@ def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def count_entry_weights(rate_table):
-    """Return the size of ``entry_weights`` in :func:`add_to_entry_weights`, for a table."""
+    """Return the size of ``entry_weights`` in :func:`add_entry_weights_of_bin`, for a table."""
     return rate_table.entries_per_power * rate_table.relative_rates.shape[1]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def add_to_entry_weights(squared_ratio, rate_table, entry_weights):
+def add_entry_weights_of_bin(squared_ratio, rate_table, entry_weights):
     """Add the six interpolation weights of one bin to the weights of the table's entries.
 
     The rate of a bin is a weighted sum of six entries. The sum over many bins is therefore one
-    weighted sum of all entries, which :func:`add_rates_of_entries` computes at the end. A bin costs
-    six additions here, and six for each speckle power in :func:`add_rates_by_power`.
+    weighted sum of all entries, which :func:`add_rates_from_entry_weights` computes at the end. A
+    bin costs six additions here, and six for each speckle power in
+    :func:`add_rates_by_speckle_power`.
 
-    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_power`. ``entry_weights`` is
-    changed in place; its size is that of :func:`count_entry_weights`.
+    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_speckle_power`.
+    ``entry_weights`` is changed in place; its size is that of :func:`count_entry_weights`.
     """
-    place = _place_in_table(squared_ratio, rate_table)
+    place = _rate_table_place(squared_ratio, rate_table)
     w = _interpolation_weights(place.fraction, squared_ratio)
     first_entry = place.first_entry
     entry_weights[first_entry] += w.w0
@@ -370,11 +374,11 @@ def add_to_entry_weights(squared_ratio, rate_table, entry_weights):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def add_rates_of_entries(entry_weights, rate_table, rate_sums):
+def add_rates_from_entry_weights(entry_weights, rate_table, rate_sums):
     """Add the crossing rates of all bins in ``entry_weights`` to sums by speckle power.
 
-    ``entry_weights`` is filled by :func:`add_to_entry_weights`; ``rate_table`` and ``rate_sums``
-    are as in :func:`add_rates_by_power`.
+    ``entry_weights`` is filled by :func:`add_entry_weights_of_bin`; ``rate_table`` and
+    ``rate_sums`` are as in :func:`add_rates_by_speckle_power`.
     """
     relative_rates = rate_table.relative_rates
     entries_per_power = np.uint64(rate_table.entries_per_power)
@@ -394,7 +398,7 @@ def rate_at_brightest_speckle(squared_ratio, rate_table):
 
     c is the probability that leaked signal makes the bin cross the threshold.
 
-    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_power`.
+    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_speckle_power`.
     """
     table_position = (
         0.5 * math.log(squared_ratio)

@@ -110,7 +110,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     if points.waveform.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
         return None
     current_variance = emission_beat_current_variance(
-        points.parameters, points.option(_AMPLIFIED_LIGHT_PATH)
+        points.parameters, points.shared_option(_AMPLIFIED_LIGHT_PATH)
     )
     return ErrorBound(
         noise_variance_change=current_variance

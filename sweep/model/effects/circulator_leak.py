@@ -120,7 +120,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         _leaked_power_and_current(parameters, points.waveform.architecture)[0]
         * receiver_noise.shot_noise_variance_per_watt
     )
-    line_shape = points.option(LASER_PREFIX + "line_shape")
+    line_shape = points.shared_option(LASER_PREFIX + "line_shape")
     noise_variance = (
         noise_variance
         + leak_beat_current_variance(parameters, points.waveform.architecture, line_shape)

@@ -76,7 +76,7 @@ def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBoun
         magnitude_change = np.where(is_far, 0.0, near_change)
     if points.adds_amplitudes:
         stretched_shift_bins = shift_bins * (
-            1 + points.line_spread.extreme
+            1 + points.line_spread.largest_magnitude
         )  # the Doppler ratio scales range beats as well
         coherent_change = np.where(is_far, 0.0, points.coherent_sum_bound(stretched_shift_bins))
     return ErrorBound(
@@ -118,10 +118,12 @@ def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
     as amplitudes, the bound is relative to their sum in phase and follows from the largest shift.
     """
     velocity_spread = points.velocity_spread
-    if not np.any(velocity_spread.extreme):
+    if not np.any(velocity_spread.largest_magnitude):
         return None
     coherent_change = (
-        points.coherent_sum_bound(velocity_spread.extreme) if points.adds_amplitudes else 0.0
+        points.coherent_sum_bound(velocity_spread.largest_magnitude)
+        if points.adds_amplitudes
+        else 0.0
     )
     if points.waveform.architecture == "direct":
         return ErrorBound(coherent_sum_change=coherent_change)

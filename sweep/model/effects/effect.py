@@ -75,16 +75,16 @@ class EffectContext(NamedTuple):
     """Values of the spec's parameters by dotted path, each (n,) or scalar."""
     ground: Ground
     """Ground that the beams of the points meet."""
-    presence: Mapping[str, np.ndarray] = MappingProxyType({})
+    masks_by_effect: Mapping[str, np.ndarray] = MappingProxyType({})
     """Masks (n,), by name, of the effects that only some points have: 1.0 where the point has the
     effect, else 0.0."""
 
-    def presence_factor(self, effect: str) -> np.ndarray | float:
-        """Return 1 for points that have the named effect and 0 for others, (n,).
+    def effect_mask(self, effect: str) -> np.ndarray | float:
+        """Return the mask of a named effect, (n,): 1 for points that have it, 0 for others.
 
         If all points are alike, the result is a single number.
         """
-        return self.presence.get(effect, 1.0)
+        return self.masks_by_effect.get(effect, 1.0)
 
     def select_beamlets(
         self, effect: str, row: np.ndarray, with_effect: np.ndarray, without_effect: np.ndarray
@@ -105,10 +105,10 @@ class EffectContext(NamedTuple):
         ndarray (rows, beamlets)
             `with_effect` in rows whose points have the effect, else `without_effect`.
         """
-        if effect not in self.presence:
+        if effect not in self.masks_by_effect:
             return with_effect
         has_effect = np.ones((len(with_effect), 1), np.bool_)
-        has_effect[row, 0] = self.presence[effect] > 0
+        has_effect[row, 0] = self.masks_by_effect[effect] > 0
         return np.where(has_effect, with_effect, without_effect)
 
 
@@ -163,7 +163,8 @@ class Effect:
     parent. Where the parent is off, so is this effect."""
     needs_separate_batches: bool = True
     """True if points with and without the effect are computed separately. If False, `apply` uses
-    :attr:`EffectContext.presence` and leaves the bits of points without the effect unchanged."""
+    :attr:`EffectContext.masks_by_effect` and leaves the bits of points without the effect
+    unchanged."""
     uses_beamlet_velocities: bool = False
     """True if `apply` reads the radial velocities of single beamlets, which are computed only then.
     """

@@ -46,7 +46,9 @@ def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
     echo_change = 2 * np.abs(points.footprint_extent.total_echo_ratio - 1)
     if points.waveform.architecture != "direct":
         return ErrorBound(magnitude_change=magnitude_change_from_power(power_change + echo_change))
-    range_deviation = points.range * points.footprint_extent.axis_surface_range_offsets.extreme
+    range_deviation = (
+        points.range * points.footprint_extent.axis_surface_range_offsets.largest_magnitude
+    )
     highest_frequency = points.carriers + 2 * points[CHIRP_PREFIX + "bandwidth"]
     phase_change = np.minimum(4 * np.pi / SPEED_OF_LIGHT * highest_frequency * range_deviation, 2.0)
     coherent_change = np.where(points.is_near_image, 2 * phase_change, 0.5 * phase_change**2)

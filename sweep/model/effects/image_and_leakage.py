@@ -68,7 +68,7 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
     amplitudes add, they may cancel. Images then add to any bin at most the largest sidelobe at e
     bins, relative to the sum of all lines in phase.
     """
-    if points.option(RECORD_PATH) == "complex":
+    if points.shared_option(RECORD_PATH) == "complex":
         return None
     log10_pfa_change, bins_to_image = _log10_pfa_change(points), points.bins_to_image
     leaking_bin_change = _leaking_bin_change(points)
@@ -132,12 +132,12 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     bound is that of the expected number of such bins, and at least of one. It is 0 if fewer than
     ``_EXPECTED_BINS_MIN`` are expected.
     """
-    if points.option(PROCESSING_PREFIX + "bins_counted") == "all":
+    if points.shared_option(PROCESSING_PREFIX + "bins_counted") == "all":
         return 0.0
     response, nyquist_bin = points.window_response, points.fft_size / 2
     chirp_slice = slice(None, None, 2) if len(points.existing_chirp_rates) == 3 else slice(None)
     extent_bins = np.minimum(
-        points.line_spread.extreme + points.phase_error_shift_bins, nyquist_bin
+        points.line_spread.largest_magnitude + points.phase_error_shift_bins, nyquist_bin
     )
     total_ratio = np.maximum(
         points.line_signal_ratio * points.footprint_extent.amplitude_gain_max, 1e-300
@@ -232,7 +232,7 @@ def leakage_bound(points: PlannerInputs) -> ErrorBound:
     )
     ratio_to_threshold = np.where(np.isnan(ratio_to_threshold), np.inf, ratio_to_threshold)
     reach_bins = np.where(
-        is_near_image, np.inf, points.line_spread.extreme + points.phase_error_shift_bins
+        is_near_image, np.inf, points.line_spread.largest_magnitude + points.phase_error_shift_bins
     )
     if points.missing_samples is None:
         return ErrorBound(

@@ -57,7 +57,7 @@ def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     The distance is the shift of a :class:`PhaseErrorBound`. The result is None for other line
     shapes.
     """
-    if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
+    if not points.any_nonzero(_WIDTH_PATH) or points.shared_option(_SHAPE_PATH) != "gaussian":
         return None
     return PhaseErrorBound(
         extra_shift_window_bins=_LINE_REACH_DEVIATIONS * _line_deviation_window_bins(points)
@@ -91,7 +91,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if not points.any_nonzero(_WIDTH_PATH):
         return None
-    if points.option(_SHAPE_PATH) == "lorentzian":
+    if points.shared_option(_SHAPE_PATH) == "lorentzian":
         return _lorentzian_bound(points)
     moments, line_deviation = window_moments(points.window), _line_deviation_window_bins(points)
     spread_loss = np.minimum((2 * np.pi * line_deviation) ** 2 * moments.position_variance, 1.0)
@@ -211,7 +211,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
         echo_scales=shots.echo_scales.scale_echo(amplitude_factor=np.sqrt(line_fraction)),
         laser_line=LaserLine(
             lorentzian_width=line_width,
-            pedestal_variance_beside=line_power * side_pedestal / shots.window.energy,
+            pedestal_variance_beside_line=line_power * side_pedestal / shots.window.energy,
             pedestal_variance_under_line=line_power * 2 * in_phase_pedestal / shots.window.energy,
         ),
     )

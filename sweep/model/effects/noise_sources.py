@@ -47,7 +47,7 @@ def apply_signal_shot_noise(shots: Shots, context: EffectContext) -> Shots:
     variance = (
         shots.receiver_noise.shot_noise_variance_per_watt
         * shots.echo_power
-        * context.presence_factor("signal_shot_noise")
+        * context.effect_mask("signal_shot_noise")
     )
     return add_noise_sources(shots, signal_shot=np.asarray(variance))
 
@@ -152,8 +152,10 @@ def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
     The current variance is 2 q M^2 F Re P B_e, with the symbols of the module's description. The
     power P is that of :func:`received_sunlight` times the air's transmission.
     """
-    presence = context.presence_factor("solar_background")
-    light = received_sunlight(context.parameters) * shots.echo_scales.ground_transmission * presence
+    effect_mask = context.effect_mask("solar_background")
+    light = (
+        received_sunlight(context.parameters) * shots.echo_scales.ground_transmission * effect_mask
+    )
     return add_noise_sources(
         shots, solar_shot=np.asarray(shots.receiver_noise.shot_noise_variance_per_watt * light)
     )

@@ -122,7 +122,9 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
     missing = points.missing_samples
     assert missing is not None
     range_moments = points.footprint_extent.range_offsets
-    mean_range = np.minimum(np.abs(range_moments.mean) + range_moments.rms, range_moments.extreme)
+    mean_range = np.minimum(
+        np.abs(range_moments.mean) + range_moments.rms, range_moments.largest_magnitude
+    )
     look_drift_samples = (
         points.sample_rate
         * 2
@@ -131,7 +133,7 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
         * points.middle_look_delay
     )
     extra_samples_max = (
-        points.sample_rate * points.target.delay * np.minimum(range_moments.extreme, 1e3)
+        points.sample_rate * points.target.delay * np.minimum(range_moments.largest_magnitude, 1e3)
         + look_drift_samples
     )
     extra_samples_mean = (

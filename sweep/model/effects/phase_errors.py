@@ -113,14 +113,14 @@ class WindowMoments(NamedTuple):
     root_mean_square: MomentsByPower
     """Root mean squares of x^k about its mean for k = 2, 4, and 0 for k = 1, 3. x is the position
     in the record, -1..1; means are weighted by the window."""
-    linear_slope: MomentsByPower
+    fitted_slopes: MomentsByPower
     """Slopes of the best straight line to x^k, k = 1 .. 4, with the position x in the record,
     -1..1. They are 0 for even k."""
-    linear_slope_max: float
+    fitted_slope_max: float
     """Largest slope of the best straight line to any function of x with values in -1..1."""
     magnitude_sum: float
     """Sum of the window's magnitudes |w| over the sum of its values w, >= 1."""
-    first_weight: float
+    first_sample_weight: float
     """Magnitude of the window's first value over the sum of its values."""
     position_variance: float
     """Variance of the position in the record under the window's |w|, over the square of the
@@ -136,10 +136,10 @@ def window_moments(window: Window) -> WindowMoments:
     window_at_nodes = np.interp(node, sample_position, np.append(w, w[:1]))
     weight = np.abs(window_at_nodes) / window_at_nodes.sum()
     magnitude_sum, second_moment = float(weight.sum()), float((node * node * weight).sum())
-    mean_absolute, root_mean_square, linear_slope = [], [], []
+    mean_absolute, root_mean_square, fitted_slopes = [], [], []
     for k in range(1, 5):
         power = node**k
-        linear_slope.append(float((power * node * weight).sum()) / second_moment if k % 2 else 0.0)
+        fitted_slopes.append(float((power * node * weight).sum()) / second_moment if k % 2 else 0.0)
         if k % 2 == 0:
             power = power - (power * weight).sum() / magnitude_sum
         mean_absolute.append(float((abs(power) * weight).sum()))
@@ -148,10 +148,10 @@ def window_moments(window: Window) -> WindowMoments:
     return WindowMoments(
         mean_absolute=mean_absolute_by_power,
         root_mean_square=MomentsByPower(*root_mean_square),
-        linear_slope=MomentsByPower(*linear_slope),
-        linear_slope_max=mean_absolute_by_power.linear / second_moment,
+        fitted_slopes=MomentsByPower(*fitted_slopes),
+        fitted_slope_max=mean_absolute_by_power.linear / second_moment,
         magnitude_sum=magnitude_sum,
-        first_weight=abs(window.first_value) / window.sum,
+        first_sample_weight=abs(window.first_value) / window.sum,
         position_variance=second_moment / 4 / magnitude_sum,
     )
 
@@ -296,11 +296,13 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     )
     c = _LINE_FRACTION_WITH_IMAGE_MIN * np.sqrt(power_min) - others_phase
     magnitude_change = np.where(
-        c > 0, (a + b * moments.first_weight / c) / c + 0.5 * (b / c) ** 2, np.inf
+        c > 0, (a + b * moments.first_sample_weight / c) / c + 0.5 * (b / c) ** 2, np.inf
     )
-    mean_slope = non_polynomial / _RADIANS_PER_CYCLE * moments.linear_slope_max
-    for coefficient, linear_slope in zip(own_bound.coefficients, moments.linear_slope, strict=True):
-        mean_slope = mean_slope + coefficient * linear_slope
+    mean_slope = non_polynomial / _RADIANS_PER_CYCLE * moments.fitted_slope_max
+    for coefficient, fitted_slope in zip(
+        own_bound.coefficients, moments.fitted_slopes, strict=True
+    ):
+        mean_slope = mean_slope + coefficient * fitted_slope
     if missing is not None:
         mean_slope = mean_slope + missing.centroid_bound * (2 * quadratic + 3 * cubic + 4 * quartic)
     shift_bins = 2 * mean_slope * points.padding_factor
@@ -736,7 +738,7 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
     departure from the middle of its range of values, are taken at their largest. The result is None
     without an error.
     """
-    table_text = points.option(ERROR_TABLE_PATH)
+    table_text = points.shared_option(ERROR_TABLE_PATH)
     if not points.any_nonzero(*_ERROR_PEAK_PATHS):
         return (
             None

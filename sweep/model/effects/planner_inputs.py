@@ -108,7 +108,7 @@ class PlannerInputs(LinkBudget):
         )
         """Signed chirp rate of each existing segment, relative to that of the up-chirp."""
         is_direct = self.waveform.architecture == "direct"
-        is_coherent = self.option("footprint.phases") == "coherent"
+        is_coherent = self.shared_option("footprint.phases") == "coherent"
         self.adds_amplitudes = is_coherent or is_direct
         self.adds_field_amplitudes = is_coherent and not is_direct
         """True if beamlets add as optical amplitudes (roots of their echo powers), and not as
@@ -118,8 +118,8 @@ class PlannerInputs(LinkBudget):
         """Return the values of the numeric parameter with a dotted path."""
         return self.parameters[path]
 
-    def option(self, path: str) -> str:
-        """Return the text parameter with a dotted path; all points share it."""
+    def shared_option(self, path: str) -> str:
+        """Return the chosen option of a text parameter, by dotted path; all points share it."""
         return str(self.parameters[path])
 
     def shared_integer(self, path: str) -> int:
@@ -179,7 +179,7 @@ class PlannerInputs(LinkBudget):
         The level is one of |X| over the noise per quadrature. It is None if segments report all
         peaks that cross the threshold.
         """
-        if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
+        if self.shared_option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
         return float(np.sqrt(2 * np.log(1e3 * self.fft_size)))
 
@@ -201,7 +201,7 @@ class PlannerInputs(LinkBudget):
         if (extent := self._given_extent) is not None:
             return extent if self.adds_field_amplitudes else extent._replace(amplitude_gain_max=1.0)
         grazing_angle = self["target.grazing_angle"]
-        axis_echo = backscatter(self.option("target.reflectance_law"), np.sin(grazing_angle))
+        axis_echo = backscatter(self.shared_option("target.reflectance_law"), np.sin(grazing_angle))
         if self.n_beamlets == 1:
             return FootprintExtent(axis_echo, 1.0, NO_SPREAD, NO_SPREAD, NO_SPREAD)
         geometry: dict[str, Any] = {
@@ -214,7 +214,9 @@ class PlannerInputs(LinkBudget):
             direction_spread_angle=self.footprint_angles.directions,
             **geometry,
         )
-        echo_ratio = plane_echo_ratio_bound(self.option("target.reflectance_law"), **geometry)
+        echo_ratio = plane_echo_ratio_bound(
+            self.shared_option("target.reflectance_law"), **geometry
+        )
         amplitude_gain = 1.0
         if self.adds_field_amplitudes:
             amplitude_gain = float(
@@ -267,7 +269,11 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def existing_segments(self) -> list[WaveformSegment]:
-        """Existing segments, with the motion that is not switched off."""
+        """Existing segments of the shots' waveform.
+
+        They include the target's motion, unless the effects ``doppler`` or ``segment_motion`` are
+        switched off.
+        """
         motion = LineMotion(
             doppler_ratio=0.0 if "doppler" in self.effects_off else self.target.doppler_ratio,
             segment_starts=(0.0, 0.0, 0.0)
@@ -294,7 +300,7 @@ class PlannerInputs(LinkBudget):
             )
         ).astype(np.int64)
         latest_delay = delay * np.minimum(
-            self.footprint_extent.range_offsets.extreme, 1e3
+            self.footprint_extent.range_offsets.largest_magnitude, 1e3
         )  # beyond the axis's
         latest_delay = (
             latest_delay
@@ -435,7 +441,7 @@ class PlannerInputs(LinkBudget):
     @cached_property
     def bins_to_image(self) -> np.ndarray:
         """Distance from DC and Nyquist to the nearest light of any line [FFT bins]."""
-        return self.bins_to_edge - self.line_spread.extreme - self.phase_error_shift_bins
+        return self.bins_to_edge - self.line_spread.largest_magnitude - self.phase_error_shift_bins
 
     @cached_property
     def is_near_image(self) -> np.ndarray:
@@ -449,7 +455,9 @@ class PlannerInputs(LinkBudget):
         The result is relative to the |X| of all lines in phase.
         """
         smear_factor = 1 + 2 * self.phase_error_shift_bins / self.padding_factor
-        gain_rise = np.exp(np.minimum(self.gain_slope_max * self.line_spread.extreme, 50.0))
+        gain_rise = np.exp(
+            np.minimum(self.gain_slope_max * self.line_spread.largest_magnitude, 50.0)
+        )
         image_response = self.magnitude_max_beyond(self.bins_to_image) * np.sqrt(smear_factor)
         return np.asarray(
             gain_rise * image_response / self.window_response.scalloping_gain(self.bin_offset)
@@ -560,7 +568,7 @@ class PlannerInputs(LinkBudget):
             present_moments.rms * added_moments.rms + added_moments.rms**2 / 2
         )
         gain_exponent = self.gain_slope_max * (
-            present_moments.extreme + added_moments.extreme + shift_bins
+            present_moments.largest_magnitude + added_moments.largest_magnitude + shift_bins
         )
         power_change = power_change + self.gain_slope_max * (added_moments.rms + shift_bins)
         image_factor = np.where(self.is_near_image, 2.0, 1.05)
@@ -583,7 +591,9 @@ class PlannerInputs(LinkBudget):
             np.sqrt(self.window_response.curvature_max) + 2 * self.gain_slope_max + phase_per_bin
         ) * shift_bins
         gain_rise = np.exp(
-            np.minimum(self.gain_slope_max * (self.line_spread.extreme + shift_bins), 50.0)
+            np.minimum(
+                self.gain_slope_max * (self.line_spread.largest_magnitude + shift_bins), 50.0
+            )
         )
         return (
             2 * gain_rise * np.minimum(line_change, 2.0) / self.window_response.scalloping_gain_min

@@ -80,7 +80,7 @@ def clipping_gains(
     voltages = (np.asarray(value, float) for value in (amplitude, deviation, full_scale))
     a, s, v = (value[..., None] for value in np.broadcast_arrays(*voltages))
     a = np.maximum(a, _AMPLITUDE_MIN_SIGMA * s)
-    phase, weight = _phase_rule(a, s, v)
+    phase, weight = _phase_quadrature(a, s, v)
     sine = np.sin(phase)
     voltage_loss, variance_left = _clipping_loss(a * sine, s, v)
     amplitude_loss = 2 * (weight * voltage_loss * sine).sum(axis=-1)  # loss of the line's amplitude
@@ -90,7 +90,7 @@ def clipping_gains(
     )
 
 
-def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _phase_quadrature(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return phases in a quarter period and weights whose sum is 1, (n, nodes) each."""
     split_phases = np.arcsin(np.clip((v + _SPLIT_DEVIATIONS * s) / a, 0.0, 1.0))
     zeros = np.zeros(a.shape)

@@ -372,12 +372,12 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     over segments, which share one factor, the suprema of two slopes times E L^2 are added.
     """
     if (
-        points.option(_TURBULENCE_PATH) == "none"
+        points.shared_option(_TURBULENCE_PATH) == "none"
         or (turbulence := turbulence_profile(points.parameters)) is None
     ):
         return None
     mean_log_amplitude, mean_square = _log_amplitude_moments(
-        points.option(_DISTRIBUTION_PATH),
+        points.shared_option(_DISTRIBUTION_PATH),
         two_way_log_variances(turbulence, points.parameters, points.range),
     )
     threshold_ratio = points.threshold_ratio

@@ -92,7 +92,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     bound = line_shift_bound(points, shift_bins)
     if not points.adds_amplitudes:
         return bound
-    spread_cycles = points.velocity_spread.extreme * points.record.bin_width * points.segment_starts
+    spread_cycles = (
+        points.velocity_spread.largest_magnitude * points.record.bin_width * points.segment_starts
+    )
     spread_change = (
         np.minimum(2 * np.pi * spread_cycles, 2.0) / points.window_response.scalloping_gain_min
     )

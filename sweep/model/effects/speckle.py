@@ -185,7 +185,7 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
     )
 
 
-_DECORRELATED_KAPPA_MAX = 1e-6
+_DECORRELATED_COHERENT_FRACTION_MAX = 1e-6
 """Limit on the fraction of the echo's power that keeps its phase, for footprints whose beamlets add
 as amplitudes. Below it the speckle may differ from segment to segment."""
 _ZERO_DIVISOR_SUBSTITUTE = 1e-300
@@ -231,7 +231,9 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     )
     amplitude = mean_amplitude * magnitude
     # The coherent part of a smooth surface has the same phase at the start of every segment.
-    is_decorrelated = shots.footprint.adds_powers | (coherent_fraction < _DECORRELATED_KAPPA_MAX)
+    is_decorrelated = shots.footprint.adds_powers | (
+        coherent_fraction < _DECORRELATED_COHERENT_FRACTION_MAX
+    )
     is_decorrelated &= not shots.target_moves_between_segments  # else lines contain it
     phase = np.empty((3, *cycles.shape))
     for segment_index, (carrier, start) in enumerate(
@@ -267,7 +269,7 @@ def fading_bound(points: PlannerInputs) -> ErrorBound | None:
     is_smooth = points.adds_field_amplitudes or points.waveform.architecture == "direct"
     return (
         None
-        if is_smooth or points.option(_SPECKLE_PATH) == "none"
+        if is_smooth or points.shared_option(_SPECKLE_PATH) == "none"
         else ErrorBound(magnitude_change=1.0)
     )
 
@@ -291,7 +293,7 @@ def apply_fading(shots: Shots, context: EffectContext) -> Shots:
     ):
         return shots
     beam_spread = _beam_spread(shots, context.ground)
-    line_deviation = _line_deviation_bins(shots, beam_spread.moments)
+    line_deviation = _line_deviation_bins(shots, beam_spread.beamlet_moments)
     correlations = [
         beam_spread.correlation(shots, pair, phase)
         for pair, phase in zip(SEGMENT_PAIRS, segment_phase_differences(shots), strict=True)
@@ -371,7 +373,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
         )
         gain = np.sqrt(np.maximum(n_looks + squared_sum, 0.0)) / n_looks
         return replace(shots, echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gain))
-    look_power = _look_powers(shots, beam_spread.slopes)
+    look_power = _look_powers(shots, beam_spread.beam_gradients)
     if (
         np.abs(correlation_by_lag - 1).max() < _DECORRELATION_MIN
         and np.abs(look_power - 1).max() < _DECORRELATION_MIN
@@ -420,7 +422,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     return replace(shots, speckle=shots.speckle._replace(look_speckle=look_speckle))
 
 
-def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
+def _look_powers(shots: Shots, beam_gradients: BeamGradients) -> np.ndarray:
     """Return each look's power in the strongest bin over the mean of looks, (3, n, looks).
 
     The power differs between looks because lines drift out of the bin.
@@ -441,7 +443,7 @@ def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
         / padding_factor
     )
     for segment in map(int, np.flatnonzero(shots.has_segment)):
-        gradients = _line_pair_gradients(shots, (segment, segment), zero_phase, slopes)
+        gradients = _line_pair_gradients(shots, (segment, segment), zero_phase, beam_gradients)
         line_position = (
             gradients.bin_distance[0][:, None] - drift[segment][:, None] * looks_from_middle
         )
@@ -457,11 +459,11 @@ def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
 class BeamSpread(NamedTuple):
     """Spread of ranges and Doppler ratios (2 v / c) over the beam on the ground."""
 
-    slopes: BeamGradients
+    beam_gradients: BeamGradients
     """Gradients of range and Doppler ratio across the beam."""
     plane: FlatGround | None
     """Plane that the beam meets; None for ray-traced ground."""
-    moments: "BeamletMoments"
+    beamlet_moments: "BeamletMoments"
     """Power-weighted moments of the Doppler ratio and the relative range of the beam's rays."""
 
     def correlation(
@@ -487,12 +489,12 @@ class BeamSpread(NamedTuple):
             correlations = self.plane.mean_phasor(*phase).astype(complex)
             variance_across = np.zeros(shots.size)
         else:
-            (mean,), (variance,) = _phase_moments(self.moments, [phase])
+            (mean,), (variance,) = _phase_moments(self.beamlet_moments, [phase])
             correlations = np.exp(1j * mean - 0.5 * variance)
             variance_across = np.maximum(
-                variance - phase.phase_per_deviation(self.slopes) ** 2, 0.0
+                variance - phase.phase_per_deviation(self.beam_gradients) ** 2, 0.0
             )
-        gradients = _line_pair_gradients(shots, pair, phase, self.slopes)
+        gradients = _line_pair_gradients(shots, pair, phase, self.beam_gradients)
         wide_points = np.flatnonzero(gradients.line_shift_max > LINE_SHIFT_MIN_BINS)
         if wide_points.size:
             bin_correlations = peak_bin_correlation(shots.window, gradients.select(wide_points))
@@ -507,7 +509,7 @@ def _beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
     moments = _beamlet_moments(shots, ground)
     if isinstance(ground, FlatGround):
         return BeamSpread(ground.gradients, ground, moments)
-    return BeamSpread(_ray_traced_slopes(moments), None, moments)
+    return BeamSpread(_ray_traced_gradients(moments), None, moments)
 
 
 def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineGradients:
@@ -517,22 +519,22 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
     footprint are too small to change probabilities, because peak positions wander with them.
     """
     if isinstance(ground, FlatGround):
-        slopes, doppler_across = ground.gradients, np.zeros(shots.size)
+        beam_gradients, doppler_across = ground.gradients, np.zeros(shots.size)
     else:
         row, offset, doppler, echo = ground.beamlets
         moments = _moments_by_surface(
             echo, np.array([doppler, offset]), ground.off_axis_surface, row
         )
-        slopes = _ray_traced_slopes(moments)
-        variance_across = moments.covariance[0, 0] - slopes.doppler_ratio**2
+        beam_gradients = _ray_traced_gradients(moments)
+        variance_across = moments.covariance[0, 0] - beam_gradients.doppler_ratio**2
         doppler_across = np.sqrt(np.maximum(variance_across, 0.0))
     bin_width = shots.sample_rate / shots.fft_size
     line_shift = np.zeros((3, 2, shots.size))
     for segment_index, segment in enumerate(shots.waveform_segments):
         delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease)
         shift_hertz = (
-            segment.carrier * slopes.doppler_ratio
-            - segment.chirp_rate * delay * slopes.relative_range
+            segment.carrier * beam_gradients.doppler_ratio
+            - segment.chirp_rate * delay * beam_gradients.relative_range
         )
         line_shift[segment_index] = (
             shift_hertz / bin_width,
@@ -543,7 +545,7 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
         SEGMENT_PAIRS[:2], segment_phase_differences(shots)[:2], strict=True
     ):
         phase_gradient[second] = (
-            phase.phase_per_deviation(slopes),
+            phase.phase_per_deviation(beam_gradients),
             2 * np.pi * phase.doppler_cycles * doppler_across,
         )
     return LineGradients(np.moveaxis(line_shift, -1, 0), np.moveaxis(phase_gradient, -1, 0))
@@ -561,14 +563,14 @@ class PhaseDifference(NamedTuple):
     """Phase difference between two segments [cycles] per unit of relative range, with the sign
     reversed."""
 
-    def phase_per_deviation(self, slopes: BeamGradients) -> np.ndarray:
+    def phase_per_deviation(self, beam_gradients: BeamGradients) -> np.ndarray:
         """Return the phase difference per standard deviation of the beam [rad], (n,)."""
         return (
             2
             * np.pi
             * (
-                self.doppler_cycles * slopes.doppler_ratio
-                - self.delay_cycles * slopes.relative_range
+                self.doppler_cycles * beam_gradients.doppler_ratio
+                - self.delay_cycles * beam_gradients.relative_range
             )
         )
 
@@ -621,7 +623,7 @@ def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
 
 
 def _line_pair_gradients(
-    shots: Shots, pair: tuple[int, int], phase: PhaseDifference, slopes: BeamGradients
+    shots: Shots, pair: tuple[int, int], phase: PhaseDifference, beam_gradients: BeamGradients
 ) -> LinePairGradients:
     """Return the gradients of two segments' lines, and the distance of their strongest bins."""
     window_bin_width = shots.sample_rate / shots.window.length
@@ -635,8 +637,8 @@ def _line_pair_gradients(
         bin_position = beat / window_bin_width * padding_factor
         # With any_bin, bins at the middles of two echoes represent all bins that may detect them.
         shift_hertz = (
-            segment.carrier * slopes.doppler_ratio
-            - segment.chirp_rate * delay * slopes.relative_range
+            segment.carrier * beam_gradients.doppler_ratio
+            - segment.chirp_rate * delay * beam_gradients.relative_range
         )
         line_shifts.append(np.broadcast_to(shift_hertz / window_bin_width, shots.size))
         bin_position = np.broadcast_to(bin_position, shots.size)
@@ -649,8 +651,8 @@ def _line_pair_gradients(
     return LinePairGradients(
         (distances[0], distances[1]),
         (line_shifts[0], line_shifts[1]),
-        phase.phase_per_deviation(slopes),
-        np.broadcast_to(slopes.relative_echo, shots.size),
+        phase.phase_per_deviation(beam_gradients),
+        np.broadcast_to(beam_gradients.relative_echo, shots.size),
     )
 
 
@@ -764,7 +766,7 @@ def _phase_moments(
     return (weights * moments.mean).sum(axis=1), variance
 
 
-def _ray_traced_slopes(moments: BeamletMoments) -> BeamGradients:
+def _ray_traced_gradients(moments: BeamletMoments) -> BeamGradients:
     """Return the gradients of ray-traced ground along its steepest range, (n,) each."""
     deviation = np.sqrt(moments.covariance[1, 1])
     doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _ZERO_DIVISOR_SUBSTITUTE)

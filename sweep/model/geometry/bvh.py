@@ -106,14 +106,14 @@ class _Scratch(NamedTuple):
     """(6, 3): constants of the box tests of a bundle of rays, for each coordinate axis
     (:func:`_prepare_bundle`)."""
     child_entry: np.ndarray
-    """(8,): smallest distance at which a ray may enter each child's box, in lengths of the
-    direction; inf if none can."""
+    """(8,): smallest distance at which a ray of the bundle may enter each child's box, in units of
+    the length of the direction vector; inf if no ray can."""
     node_stack: np.ndarray
     """(_STACK_SIZE,) int64: nodes and leaves still to be visited, encoded as in
     :attr:`BoxTree.children`."""
     entry_stack: np.ndarray
-    """(_STACK_SIZE,): smallest distance at which a ray may enter each element of ``node_stack``, in
-    lengths of the direction."""
+    """(_STACK_SIZE,): smallest distance at which a ray of the bundle may enter the box of each
+    element of ``node_stack``, in units of the length of the direction vector."""
 
 
 def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:

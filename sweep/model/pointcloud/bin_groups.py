@@ -110,7 +110,7 @@ def list_bin_groups(
         False to skip the probability of leakage, which is then 0.
     """
     bin_groups = allocate_bin_groups(shots.size, groups_max)
-    for spans in iter_spans(shots, bin_by_bin=every_bin, leakage=with_leakage, with_pd=False):
+    for spans in iter_spans(shots, bin_by_bin=every_bin, leakage=with_leakage, computes_pd=False):
         find_groups_in_spans(shots, spans, bin_groups)
     return bin_groups
 

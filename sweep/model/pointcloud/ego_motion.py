@@ -143,9 +143,9 @@ class EgoMotion(NamedTuple):
         constant, linear, quadratic = (
             _align_with_ranges(v, distance)
             for v in (
-                _row_dot(at_range_0, at_range_0),
-                2 * _row_dot(at_range_0, per_range),
-                _row_dot(per_range, per_range),
+                _scalar_products(at_range_0, at_range_0),
+                2 * _scalar_products(at_range_0, per_range),
+                _scalar_products(per_range, per_range),
             )
         )
         slope_variance = slope_deviation**2 * (
@@ -201,8 +201,10 @@ def ego_motion_of_beams(
     Let z be the vertical, R the range, and u the speed at which the range falls. Then u = V.z / d.z
     + R d'.z / d.z, and the slip is V.d - u.
     """
-    closing_rate = _row_dot(acceleration, direction) + _row_dot(velocity, direction_rate)
-    closing_speed = _row_dot(velocity, direction)
+    closing_rate = _scalar_products(acceleration, direction) + _scalar_products(
+        velocity, direction_rate
+    )
+    closing_speed = _scalar_products(velocity, direction)
     meets_ground = direction[:, 2] < -DEPRESSION_SINE_MIN
     direction_z = np.where(meets_ground, direction[:, 2], -1.0)
 
@@ -214,7 +216,7 @@ def ego_motion_of_beams(
         """
         over_ground = vector * direction_z[:, None] - vector[:, 2:] * direction
         over_ground /= direction_z[:, None] ** 2
-        for_facing_surface = vector - _row_dot(vector, direction)[:, None] * direction
+        for_facing_surface = vector - _scalar_products(vector, direction)[:, None] * direction
         return np.where(meets_ground[:, None], over_ground, for_facing_surface)
 
     return EgoMotion(
@@ -227,7 +229,7 @@ def ego_motion_of_beams(
         slip_per_target_speed=np.where(
             meets_ground, np.sqrt(np.maximum(direction_z**-2 - 1.0, 0.0)), 0.0
         ),
-        turn_rate=np.sqrt(_row_dot(direction_rate, direction_rate)),
+        turn_rate=np.sqrt(_scalar_products(direction_rate, direction_rate)),
         priors=priors,
     )
 
@@ -237,7 +239,7 @@ def _align_with_ranges(values: np.ndarray, distance: np.ndarray) -> np.ndarray:
     return values.reshape(-1, *[1] * (np.ndim(distance) - 1))
 
 
-def _row_dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _scalar_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the scalar products (n,) of the rows of two arrays (n, 3)."""
     return np.asarray(
         first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1] + first[:, 2] * second[:, 2]

@@ -38,7 +38,7 @@ from sweep.model.sampling.philox import STREAM_ERROR_FLOOR, point_keys, to_norma
 if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
-KEY_DOMAIN = "sweep.error_floor"
+ERROR_FLOOR_KEY_DOMAIN = "sweep.error_floor"
 """Text that is hashed into the random keys of the errors shared by several shots."""
 
 INSTRUMENT_KEY_NUMBER = -1.0
@@ -186,7 +186,9 @@ def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed:
     The numbers are the beam's pointing errors on two axes, in standard deviations.
     """
     keys = np.repeat(
-        point_keys(beam_numbers[:, None], domain=KEY_DOMAIN, seed=seed), draw_numbers.size, axis=0
+        point_keys(beam_numbers[:, None], domain=ERROR_FLOOR_KEY_DOMAIN, seed=seed),
+        draw_numbers.size,
+        axis=0,
     )
     normal_numbers = to_normals_by_row(
         uniforms(keys, np.tile(draw_numbers, beam_numbers.size), STREAM_ERROR_FLOOR, 2)

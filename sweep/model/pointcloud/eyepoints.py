@@ -109,7 +109,7 @@ class Eyepoints(NamedTuple):
     @property
     def platform_radial_velocity(self) -> np.ndarray:
         """Component of the instrument's velocity along each commanded beam, (n,) [m/s]."""
-        return _row_dot(self.velocity, self.direction)
+        return _scalar_products(self.velocity, self.direction)
 
     def select(self, selection: slice | np.ndarray) -> "Eyepoints":
         """Return selected shots, by slice, indices or mask, without a copy of consecutive shots."""
@@ -383,13 +383,17 @@ def _reference_beam_motion(
             is_on_body, direction_rate - np.cross(angular_velocity, ray), relative_direction_rate
         )
     reference_range = np.where(bundle.reference_beamlet >= 0, bundle.range, np.nan)
-    closing_acceleration = _row_dot(acceleration, ray) + _row_dot(velocity, direction_rate)
-    incidence_cosine = np.minimum(_row_dot(bundle.normal, ray), -_GRAZING_SINE_MIN)
+    closing_acceleration = _scalar_products(acceleration, ray) + _scalar_products(
+        velocity, direction_rate
+    )
+    incidence_cosine = np.minimum(_scalar_products(bundle.normal, ray), -_GRAZING_SINE_MIN)
     approach_speed = (
-        _row_dot(velocity + reference_range[:, None] * relative_direction_rate, bundle.normal)
+        _scalar_products(
+            velocity + reference_range[:, None] * relative_direction_rate, bundle.normal
+        )
         / incidence_cosine
     )
-    turn_rate = np.sqrt(_row_dot(direction_rate, direction_rate))
+    turn_rate = np.sqrt(_scalar_products(direction_rate, direction_rate))
     return (
         np.where(bundle.reference_beamlet >= 0, closing_acceleration, np.nan),
         approach_speed,
@@ -397,7 +401,7 @@ def _reference_beam_motion(
     )
 
 
-def _row_dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _scalar_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the scalar products (n,) of the rows of two arrays (n, 3)."""
     return first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1] + first[:, 2] * second[:, 2]
 

@@ -57,7 +57,7 @@ from sweep.model.sampling.draws import NoiselessSpectra, iter_noiseless_spectra
 from sweep.model.spectrum.permanent_line import N_PHASES, line_bin_masks, line_of_point
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
-N_RATES = 2048
+N_TABLE_AMPLITUDES = 2048
 """Number of signal amplitudes at which the rate -ln(1 - c) is tabulated. c is the probability that
 signal lifts a bin above the threshold."""
 
@@ -74,15 +74,15 @@ LEAKAGE_MIN = 1e-9
 """Smallest probability of a false peak by leaked signal in a segment for which such peaks are
 drawn."""
 
-LINE_RANDOM_OFFSET = 1 << 24
+PERMANENT_LINE_RANDOM_OFFSET = 1 << 24
 """Index of the first random number used for the line of leaked light. Lower indices of the same
 stream are used for signal leaked from echoes."""
 
-EDGE_RANDOM_OFFSET = 1 << 25
+ECHO_EDGE_RANDOM_OFFSET = 1 << 25
 """Index of the first random number used for the noise of an echo's outermost bins, which are next
 to bins of leaked signal."""
 
-LINE_BATCH_POINTS = 4
+PERMANENT_LINE_BATCH_POINTS = 4
 """Number of points that are processed together if leaked light has a line. It limits memory to some
 1e8 numbers."""
 
@@ -90,26 +90,28 @@ BISECTION_STEPS = 40
 """Number of bisection steps by which the magnitude of a false peak is computed, to a relative error
 of 1e-11."""
 
-LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
+LOG_SPECKLE_POWER_MIN, LOG_SPECKLE_POWER_MAX = -10.0, 3.5
 """Limits of the integral over speckle, in ln(speckle power). The mean speckle power is 1."""
 
-LOG_POWER_MIN_FAINT = -5.0
+LOG_SPECKLE_POWER_MIN_FAINT = -5.0
 """Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal, whose
-sum of rates is at most FAINT_LEAKAGE_RATE_SUM_MAX. The part below this limit is extrapolated."""
-FAINT_LEAKAGE_RATE_SUM_MAX = 0.1
+sum of rates is at most FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX. The part below this limit is
+extrapolated."""
+FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX = 0.1
 """Largest sum of a segment's rates -ln(1 - c), at mean speckle power, for which the integral over
-speckle begins at LOG_POWER_MIN_FAINT. c is the probability that a bin crosses the threshold."""
+speckle begins at LOG_SPECKLE_POWER_MIN_FAINT. c is the probability that a bin crosses the
+threshold."""
 
-LOG_POWER_STEP_MAX = 0.25
+LOG_SPECKLE_POWER_STEP_MAX = 0.25
 """Largest step in ln(speckle power) of the integral over speckle. The relative error of the mean is
 then 1e-8."""
 
-JOINING_RATE_MIN = 1e-2
+JOINING_CROSSING_RATE_MIN = 1e-2
 """Smallest rate -ln(1 - c), in bright speckle, at which one more adjacent bin is considered part of
 an echo. c is the probability that leaked signal lifts the bin before it above the threshold."""
-BRIGHT_LOG_AMPLITUDE = math.log(4.0)
-"""ln of the factor on the signal amplitude in bright speckle, at which JOINING_RATE_MIN is tested.
-"""
+BRIGHT_SPECKLE_LOG_AMPLITUDE = math.log(4.0)
+"""ln of the factor on the signal amplitude in bright speckle, at which JOINING_CROSSING_RATE_MIN is
+tested."""
 
 FAINT_LEAKAGE_MAX = 1e-5
 """Largest probability of a false peak by leaked signal that is computed as a sum of means over
@@ -118,22 +120,22 @@ speckle, one of each bin.
 So faint bins hardly ever cross the threshold together, or together with an adjacent echo.
 """
 
-MEAN_TABLE_STRIDE = 8
+MEAN_CROSSING_TABLE_STRIDE = 8
 """Number of table steps between signal amplitudes at which the mean over speckle of a bin's
 crossing probability is integrated. Amplitudes between them are interpolated."""
 
-N_BOUND_POWERS = 5
+N_BOUND_SPECKLE_POWERS = 5
 """Number of speckle powers 1, 2, 4 .. (mean 1) at which upper bounds of the sum of a segment's
 rates -ln(1 - c) are stored. c is the probability that signal lifts a bin above the threshold."""
 
-EDGE_LOG_POWER_STEP = 0.75
+ECHO_EDGE_LOG_SPECKLE_POWER_STEP = 0.75
 """Step in ln(speckle power) between values at which the probability that an echo's outermost bin
 crosses the threshold is computed. It is interpolated between them."""
-EDGE_LOG_POWER_DEPTH = 3.0
+ECHO_EDGE_LOG_SPECKLE_POWER_DEPTH = 3.0
 """Largest -ln(speckle power) at which the probability that an echo's outermost bin crosses the
 threshold is computed. At lower powers the value at this power is used."""
 
-LOG_RATE_STEP_MAX = 0.5
+LOG_CROSSING_RATE_STEP_MAX = 0.5
 """Largest difference of ln(rate) between successive nodes of the integral over speckle; with more
 the mean errs by over 1e-7. The rate is -ln(1 - c), with c the probability that signal lifts a bin
 above the threshold."""
@@ -143,8 +145,9 @@ class LeakageBins(NamedTuple):
     """Bins in which leaked signal may raise false peaks, by point and segment (m, 3).
 
     Leaked signal is echo power far from the echo's line. A bin crosses if its magnitude reaches the
-    threshold. The rate of a bin is -ln(1 - c), with c the probability that signal makes it cross. A
-    law is the table of rates for one threshold. sigma is the noise of a bin per quadrature.
+    threshold. The crossing rate of a bin is -ln(1 - c), with c the probability that signal makes it
+    cross. Rates are tabulated for each distinct threshold. sigma is the noise of a bin per
+    quadrature.
     """
 
     bins_begin: np.ndarray
@@ -164,50 +167,51 @@ class LeakageBins(NamedTuple):
     alarm; 0 if no adjacent bin does."""
     side_of_adjacent_echo_bin: np.ndarray
     """(bins,) int64: 1 if the adjacent bin of the echo is above the bin, -1 if it is below."""
-    rate_sum: np.ndarray
+    crossing_rate_sum: np.ndarray
     """(m, 3): upper bound on the sum of rates -ln(1 - c) of a segment's bins at mean speckle power.
     c is the probability that a bin crosses the threshold."""
-    rate_sum_bounds: np.ndarray
-    """(m, 3, N_BOUND_POWERS): upper bounds on the sum of rates -ln(1 - c) of a segment's bins. c is
-    the probability that a bin crosses the threshold. Bounds are for speckle powers of 1, 2, 4 ..
-    times the mean."""
-    mean_probability_sum: np.ndarray
+    crossing_rate_sum_bounds: np.ndarray
+    """(m, 3, N_BOUND_SPECKLE_POWERS): upper bounds on the sum of rates -ln(1 - c) of a segment's
+    bins. c is the probability that a bin crosses the threshold. Bounds are for speckle powers of 1,
+    2, 4 .. times the mean."""
+    mean_crossing_probability_sum: np.ndarray
     """(m, 3): sum over a segment's bins of the probability, averaged over speckle, that leaked
     signal lifts the bin above the threshold; nan if not computed."""
-    line_begin: np.ndarray
-    """(m, 3) int64: index of each segment's first bin in ``line_bins`` and ``line_log_amplitude``.
-    """
-    line_end: np.ndarray
+    permanent_line_begin: np.ndarray
+    """(m, 3) int64: index of each segment's first bin in ``permanent_line_bins`` and
+    ``permanent_line_log_amplitude``."""
+    permanent_line_end: np.ndarray
     """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1."""
-    line_bins: np.ndarray
+    permanent_line_bins: np.ndarray
     """(line bins,) int64: numbers of the bins that the line of light leaked in the circulator may
     lift above the threshold."""
-    line_log_amplitude: np.ndarray
+    permanent_line_log_amplitude: np.ndarray
     """(N_PHASES, line bins): ln(|X| / sigma) by the line of leaked light, at each of its phases.
     sigma is the noise of a bin per quadrature."""
-    line_rate_sum: np.ndarray
-    """(m, 3): sum over ``line_bins`` of the rates -ln(1 - c), with c the probability that the line
-    of leaked light lifts a bin above the threshold. It is the largest sum of all phases of the
-    line."""
-    excluded_begin: np.ndarray
-    """(m, 3) int64: index of each segment's first bin in ``excluded_bins``."""
-    excluded_end: np.ndarray
-    """(m, 3) int64: index of each segment's last bin in ``excluded_bins``, plus 1."""
-    excluded_bins: np.ndarray
+    permanent_line_crossing_rate_sum: np.ndarray
+    """(m, 3): sum over ``permanent_line_bins`` of the rates -ln(1 - c), with c the probability that
+    the line of leaked light lifts a bin above the threshold. It is the largest sum of all phases of
+    the line."""
+    no_noise_peak_begin: np.ndarray
+    """(m, 3) int64: index of each segment's first bin in ``no_noise_peak_bins``."""
+    no_noise_peak_end: np.ndarray
+    """(m, 3) int64: index of each segment's last bin in ``no_noise_peak_bins``, plus 1."""
+    no_noise_peak_bins: np.ndarray
     """(excluded,) int64: numbers of the bins in which no false peak of noise alone is drawn."""
     threshold_index: np.ndarray
-    """(m,) int64: index of each point's threshold in the arrays with an axis of laws, such as
-    ``log_rates``."""
-    log_rates: np.ndarray
-    """(laws, N_RATES): ln of the rate -ln(1 - c) at evenly spaced ln(|X| / sigma), for each
-    threshold. c is the probability that signal lifts a bin above the threshold."""
+    """(m,) int64: index of each point's threshold in the tables of all distinct thresholds, such as
+    ``log_crossing_rates``."""
+    log_crossing_rates: np.ndarray
+    """(thresholds, N_TABLE_AMPLITUDES): ln of the rate -ln(1 - c) at evenly spaced ln(|X| / sigma),
+    for each threshold. c is the probability that signal lifts a bin above the threshold."""
     first_log_amplitude: np.ndarray
-    """(laws,): smallest ln(|X| / sigma) at which ``log_rates`` is tabulated."""
+    """(thresholds,): smallest ln(|X| / sigma) at which ``log_crossing_rates`` is tabulated."""
     log_amplitude_step: np.ndarray
-    """(laws,): difference of successive ln(|X| / sigma) at which ``log_rates`` is tabulated."""
+    """(thresholds,): difference of successive ln(|X| / sigma) at which ``log_crossing_rates`` is
+    tabulated."""
     threshold_ratio: np.ndarray
-    """(laws,): threshold [sigma] for one record that is equivalent to the combination of all looks
-    (records of a segment)."""
+    """(thresholds,): threshold [sigma] for one record that is equivalent to the combination of all
+    looks (records of a segment)."""
     amplitude_gain_max: float
     """Factor from |X| / sigma in one look (record) to |X| / sigma in the single record that is
     equivalent to all looks."""
@@ -231,19 +235,19 @@ class LeakageBins(NamedTuple):
             group=no_bins,
             exempt_neighbour=np.empty(0),
             side_of_adjacent_echo_bin=no_bins,
-            rate_sum=np.zeros(sum_shape),
-            rate_sum_bounds=np.zeros((*sum_shape, N_BOUND_POWERS)),
-            mean_probability_sum=np.full(sum_shape, np.nan),
-            line_begin=no_indices,
-            line_end=no_indices,
-            line_bins=no_bins,
-            line_log_amplitude=np.empty((N_PHASES, 0)),
-            line_rate_sum=np.zeros(sum_shape),
-            excluded_begin=no_indices,
-            excluded_end=no_indices,
-            excluded_bins=no_bins,
+            crossing_rate_sum=np.zeros(sum_shape),
+            crossing_rate_sum_bounds=np.zeros((*sum_shape, N_BOUND_SPECKLE_POWERS)),
+            mean_crossing_probability_sum=np.full(sum_shape, np.nan),
+            permanent_line_begin=no_indices,
+            permanent_line_end=no_indices,
+            permanent_line_bins=no_bins,
+            permanent_line_log_amplitude=np.empty((N_PHASES, 0)),
+            permanent_line_crossing_rate_sum=np.zeros(sum_shape),
+            no_noise_peak_begin=no_indices,
+            no_noise_peak_end=no_indices,
+            no_noise_peak_bins=no_bins,
             threshold_index=np.zeros(n_points, np.int64),
-            log_rates=np.zeros((1, 1)),
+            log_crossing_rates=np.zeros((1, 1)),
             first_log_amplitude=np.zeros(1),
             log_amplitude_step=np.zeros(1),
             threshold_ratio=np.zeros(1),
@@ -259,14 +263,14 @@ class LeakageBins(NamedTuple):
         by_point = (
             "bins_begin",
             "bins_end",
-            "rate_sum",
-            "rate_sum_bounds",
-            "mean_probability_sum",
-            "line_begin",
-            "line_end",
-            "line_rate_sum",
-            "excluded_begin",
-            "excluded_end",
+            "crossing_rate_sum",
+            "crossing_rate_sum_bounds",
+            "mean_crossing_probability_sum",
+            "permanent_line_begin",
+            "permanent_line_end",
+            "permanent_line_crossing_rate_sum",
+            "no_noise_peak_begin",
+            "no_noise_peak_end",
             "threshold_index",
         )
         return self._replace(**{name: getattr(self, name)[points] for name in by_point})
@@ -276,8 +280,8 @@ class LeakageBins(NamedTuple):
 
         It is the mean over speckle and over the phase of the line of leaked light.
         """
-        leakage = np.empty(self.rate_sum.shape)
-        _average_leakage(self, leakage)
+        leakage = np.empty(self.crossing_rate_sum.shape)
+        _mean_segment_leakage(self, leakage)
         return leakage
 
 
@@ -326,9 +330,9 @@ def bins_without_noise_peaks(
     """
     return LeakageBins.empty(points.size)._replace(
         group=fading_group_of_bins(shots, groups, points, spectra),
-        excluded_begin=spectra.leaked_begin,
-        excluded_end=spectra.leaked_end,
-        excluded_bins=_leaked_bins(spectra).number,
+        no_noise_peak_begin=spectra.leaked_begin,
+        no_noise_peak_end=spectra.leaked_end,
+        no_noise_peak_bins=_leaked_bins(spectra).number,
     )
 
 
@@ -341,9 +345,9 @@ def iter_leakage_bins(
             yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
         return
     echoes_alone = replace(shots, permanent_line=None)
-    for batch_begin in range(0, points.size, LINE_BATCH_POINTS):
+    for batch_begin in range(0, points.size, PERMANENT_LINE_BATCH_POINTS):
         for batch, spectra in iter_noiseless_spectra(
-            echoes_alone, points[batch_begin : batch_begin + LINE_BATCH_POINTS]
+            echoes_alone, points[batch_begin : batch_begin + PERMANENT_LINE_BATCH_POINTS]
         ):
             fading_group = fading_group_of_bins(shots, groups, batch, spectra)
             spectra, fading_group, leakage_bins = _mask_leaked_light(
@@ -358,7 +362,7 @@ def iter_leakage_bins(
                 exempt_neighbour=spectra.exempt_neighbour_ratio,
                 side_of_adjacent_echo_bin=spectra.side_of_adjacent_echo_bin,
             )
-            yield batch, _add_rate_tables(shots, batch, leakage_bins)
+            yield batch, _add_crossing_rate_tables(shots, batch, leakage_bins)
 
 
 def find_groups_and_leakage_bins(
@@ -386,7 +390,7 @@ def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[Bin
         shots.threshold, _leaking_signal_ratio_min(shots) * shots.bin_noise_sigma
     )
     return iter_spans(
-        shots, points=point_indices, level_min=magnitude_min, leakage=False, with_pd=False
+        shots, points=point_indices, level_min=magnitude_min, leakage=False, computes_pd=False
     )
 
 
@@ -440,7 +444,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         exempt_neighbour=exempt_neighbour[:n_listed],
         side_of_adjacent_echo_bin=side_of_adjacent_echo_bin[:n_listed],
     )
-    return _add_rate_tables(shots, spans.point_numbers, leakage_bins)
+    return _add_crossing_rate_tables(shots, spans.point_numbers, leakage_bins)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", borrows=True)
@@ -528,7 +532,9 @@ def _fill_leakage_bins(
     return n_listed
 
 
-def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins) -> LeakageBins:
+def _add_crossing_rate_tables(
+    shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins
+) -> LeakageBins:
     """Add the tables and sums of rates -ln(1 - c) to a list of bins of leaked signal.
 
     c is the probability that signal lifts a bin above the threshold. ``batch`` holds the indices of
@@ -545,7 +551,7 @@ def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins)
     ]
     leakage_bins = leakage_bins._replace(
         threshold_index=threshold_index,
-        log_rates=np.array([table.log_rates for table in tables]),
+        log_crossing_rates=np.array([table.log_crossing_rates for table in tables]),
         first_log_amplitude=np.array([table.first_log_amplitude for table in tables]),
         log_amplitude_step=np.array([table.log_amplitude_step for table in tables]),
         threshold_ratio=shots.looks.equivalent_threshold_ratio(threshold_ratios),
@@ -560,64 +566,64 @@ def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins)
     return leakage_bins
 
 
-class RateTable(NamedTuple):
+class CrossingRateTable(NamedTuple):
     """Table of the rates of bins at one threshold, for compiled code.
 
     The rate is -ln(1 - c), with c the probability that signal lifts a bin above the threshold.
     sigma is the noise of a bin per quadrature.
     """
 
-    log_rates: np.ndarray
-    """(N_RATES,): ln of the rate at evenly spaced ln(|X| / sigma) of the signal."""
+    log_crossing_rates: np.ndarray
+    """(N_TABLE_AMPLITUDES,): ln of the rate at evenly spaced ln(|X| / sigma) of the signal."""
     first_log_amplitude: float
     """Smallest ln(|X| / sigma) in the table."""
     log_amplitude_step: float
     """Difference of successive ln(|X| / sigma) in the table."""
 
 
-class RateTables(NamedTuple):
+class CrossingTables(NamedTuple):
     """Tables for one threshold, by ln(|X| / sigma) of the signal.
 
     The rate is -ln(1 - c), with c the probability that signal lifts a bin above the threshold.
     sigma is the noise of a bin per quadrature.
     """
 
-    log_rates: np.ndarray
-    """(N_RATES,): ln of the rate -ln(1 - c), with c the probability that signal lifts a bin above
-    the threshold."""
+    log_crossing_rates: np.ndarray
+    """(N_TABLE_AMPLITUDES,): ln of the rate -ln(1 - c), with c the probability that signal lifts a
+    bin above the threshold."""
     first_log_amplitude: float
     """Smallest ln(|X| / sigma) in the tables."""
     log_amplitude_step: float
     """Difference of successive ln(|X| / sigma) in the tables."""
     linear_rates: np.ndarray
-    """(N_RATES,): rate -ln(1 - c), with c the probability that signal lifts a bin above the
-    threshold."""
+    """(N_TABLE_AMPLITUDES,): rate -ln(1 - c), with c the probability that signal lifts a bin above
+    the threshold."""
     mean_probabilities: np.ndarray
-    """(N_RATES,): probability, averaged over speckle, that signal lifts a bin above the threshold,
-    by ln(|X| / sigma) at mean speckle power. Without speckle it has no elements."""
+    """(N_TABLE_AMPLITUDES,): probability, averaged over speckle, that signal lifts a bin above the
+    threshold, by ln(|X| / sigma) at mean speckle power. Without speckle it has no elements."""
 
 
 @lru_cache(maxsize=64)
-def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> RateTables:
-    """Return :class:`RateTables` for a threshold [sigma].
+def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> CrossingTables:
+    """Return :class:`CrossingTables` for a threshold [sigma].
 
     Means over speckle are included if ``in_speckle``.
     """
-    rate_table = _tabulate_log_rates(looks, threshold_ratio)
+    rate_table = _tabulate_log_crossing_rates(looks, threshold_ratio)
     mean_probabilities = np.empty(0)
     if in_speckle:
         coarse_means, coarse_positions = (
-            np.empty(N_RATES // MEAN_TABLE_STRIDE + 1),
-            np.arange(N_RATES) / MEAN_TABLE_STRIDE,
+            np.empty(N_TABLE_AMPLITUDES // MEAN_CROSSING_TABLE_STRIDE + 1),
+            np.arange(N_TABLE_AMPLITUDES) / MEAN_CROSSING_TABLE_STRIDE,
         )
         _fill_mean_probabilities(rate_table, coarse_means)
         log_means = np.log(np.maximum(coarse_means, 1e-300))
         mean_probabilities = np.exp(
             CubicSpline(np.arange(coarse_means.size), log_means)(coarse_positions)
         )
-    return RateTables(
+    return CrossingTables(
         *rate_table,
-        linear_rates=np.exp(rate_table.log_rates),
+        linear_rates=np.exp(rate_table.log_crossing_rates),
         mean_probabilities=mean_probabilities,
     )
 
@@ -626,14 +632,16 @@ def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> R
 def _fill_mean_probabilities(rate_table, mean_probabilities):
     """Compute the probability, averaged over speckle, that signal lifts a bin above the threshold.
 
-    The signal amplitudes are every MEAN_TABLE_STRIDE-th of ``rate_table``, a :class:`RateTable`.
+    The signal amplitudes are every MEAN_CROSSING_TABLE_STRIDE-th of ``rate_table``, a
+    :class:`CrossingRateTable`.
     """
     quadrature = _make_speckle_quadrature(rate_table)
     rate_sums = np.empty(quadrature.weights.size)
     for k in range(mean_probabilities.size):
         rate_sums[:] = 0.0
         _add_rates_at_nodes(
-            rate_table.first_log_amplitude + k * MEAN_TABLE_STRIDE * rate_table.log_amplitude_step,
+            rate_table.first_log_amplitude
+            + k * MEAN_CROSSING_TABLE_STRIDE * rate_table.log_amplitude_step,
             rate_table,
             quadrature,
             rate_sums,
@@ -654,7 +662,7 @@ def _mask_leaked_light(
     """Remove bins that a line of leaked light masks, and list the bins that the line raises.
 
     Returns the reduced spectra, ``group`` of the remaining bins (:func:`fading_group_of_bins`), and
-    :class:`LeakageBins` with the fields ``line_*`` and ``excluded_*`` only.
+    :class:`LeakageBins` with the fields ``permanent_line_*`` and ``no_noise_peak_*`` only.
     """
     is_kept = np.ones(spectra.leaked_index.size, bool)
     n_kept, n_raised, n_masked = np.zeros((3, batch.size, 3), np.int64)
@@ -699,13 +707,13 @@ def _mask_leaked_light(
         ),
         group[is_kept],
         LeakageBins.empty(batch.size)._replace(
-            line_begin=raised_end - n_raised,
-            line_end=raised_end,
-            line_bins=np.concatenate([no_bins, *raised_bins]),
-            line_log_amplitude=np.concatenate(line_amplitudes, axis=1),
-            excluded_begin=masked_end - n_masked,
-            excluded_end=masked_end,
-            excluded_bins=np.concatenate([no_bins, *masked_bins]),
+            permanent_line_begin=raised_end - n_raised,
+            permanent_line_end=raised_end,
+            permanent_line_bins=np.concatenate([no_bins, *raised_bins]),
+            permanent_line_log_amplitude=np.concatenate(line_amplitudes, axis=1),
+            no_noise_peak_begin=masked_end - n_masked,
+            no_noise_peak_end=masked_end,
+            no_noise_peak_bins=np.concatenate([no_bins, *masked_bins]),
         ),
     )
 
@@ -719,25 +727,29 @@ def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.nd
     return distinct_ratios, threshold_index.ravel().astype(np.int64)
 
 
-def _tabulate_log_rates(looks: Looks, threshold_ratio: float) -> RateTable:
+def _tabulate_log_crossing_rates(looks: Looks, threshold_ratio: float) -> CrossingRateTable:
     """Tabulate the rates of bins at a threshold [sigma].
 
     Several looks (records) count as they are combined.
     """
-    log_rates = np.empty(N_RATES)
-    first_log_amplitude, log_amplitude_step = _fill_log_rates(threshold_ratio, log_rates)
+    log_crossing_rates = np.empty(N_TABLE_AMPLITUDES)
+    first_log_amplitude, log_amplitude_step = _fill_log_crossing_rates(
+        threshold_ratio, log_crossing_rates
+    )
     if looks.is_noncoherent:
-        amplitudes = np.exp(first_log_amplitude + log_amplitude_step * np.arange(N_RATES))
+        amplitudes = np.exp(
+            first_log_amplitude + log_amplitude_step * np.arange(N_TABLE_AMPLITUDES)
+        )
         added_probability = np.minimum(
             looks.added_crossing_probability(amplitudes, threshold_ratio), 1 - 1e-16
         )
-        log_rates[:] = np.log(np.maximum(-np.log1p(-added_probability), 1e-300))
-    return RateTable(log_rates, first_log_amplitude, log_amplitude_step)
+        log_crossing_rates[:] = np.log(np.maximum(-np.log1p(-added_probability), 1e-300))
+    return CrossingRateTable(log_crossing_rates, first_log_amplitude, log_amplitude_step)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_log_rates(threshold_ratio, log_rates):
-    """Compute the table of ``log_rates`` (N_RATES,) for a single look (record of each segment).
+def _fill_log_crossing_rates(threshold_ratio, log_crossing_rates):
+    """Fill the table ``log_crossing_rates`` (N_TABLE_AMPLITUDES,) for one record of each segment.
 
     ``threshold_ratio`` is the threshold [sigma]. The smallest ln(|X| / sigma) of the table and the
     step are returned.
@@ -745,9 +757,9 @@ def _fill_log_rates(threshold_ratio, log_rates):
     first_log_amplitude = math.log(TABLE_AMPLITUDE_MIN_SIGMA)
     log_amplitude_step = (
         math.log(threshold_ratio + CERTAIN_MARGIN_SIGMA) - first_log_amplitude
-    ) / (N_RATES - 1)
+    ) / (N_TABLE_AMPLITUDES - 1)
     p_noise_stay = -math.expm1(-0.5 * threshold_ratio * threshold_ratio)
-    for k in range(N_RATES):
+    for k in range(N_TABLE_AMPLITUDES):
         amplitude, rate = math.exp(first_log_amplitude + log_amplitude_step * k), 0.0
         if p_noise_stay > 0.0 and amplitude < threshold_ratio:
             rate = -math.log1p(-marcum_q1_excess(amplitude, threshold_ratio) / p_noise_stay)
@@ -755,7 +767,7 @@ def _fill_log_rates(threshold_ratio, log_rates):
             rate = -math.log(
                 max(marcum_q1_tails(amplitude, threshold_ratio).below, 1e-300) / p_noise_stay
             )
-        log_rates[k] = math.log(max(rate, 1e-300))
+        log_crossing_rates[k] = math.log(max(rate, 1e-300))
     return first_log_amplitude, log_amplitude_step
 
 
@@ -763,19 +775,24 @@ def _fill_log_rates(threshold_ratio, log_rates):
 def _crossing_rate(log_amplitude, rate_table):
     """Return the rate -ln(1 - c) of a bin by interpolation, with c its probability of crossing.
 
-    ``log_amplitude`` is ln(|X| / sigma), and ``rate_table`` a :class:`RateTable`. Below the table
-    the rate is proportional to the amplitude squared.
+    ``log_amplitude`` is ln(|X| / sigma), and ``rate_table`` a :class:`CrossingRateTable`. Below the
+    table the rate is proportional to the amplitude squared.
     """
-    log_rates = rate_table.log_rates
+    log_crossing_rates = rate_table.log_crossing_rates
     table_position = (
         log_amplitude - rate_table.first_log_amplitude
     ) / rate_table.log_amplitude_step
     if table_position <= 0.0:
-        return math.exp(log_rates[0] + 2.0 * (log_amplitude - rate_table.first_log_amplitude))
+        return math.exp(
+            log_crossing_rates[0] + 2.0 * (log_amplitude - rate_table.first_log_amplitude)
+        )
     k = int(table_position)
-    if k >= log_rates.size - 1:
-        return math.exp(log_rates[log_rates.size - 1])
-    return math.exp(log_rates[k] + (table_position - k) * (log_rates[k + 1] - log_rates[k]))
+    if k >= log_crossing_rates.size - 1:
+        return math.exp(log_crossing_rates[log_crossing_rates.size - 1])
+    return math.exp(
+        log_crossing_rates[k]
+        + (table_position - k) * (log_crossing_rates[k + 1] - log_crossing_rates[k])
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -784,24 +801,28 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
 
     c is the probability that signal lifts a bin above the threshold.
 
-    ``line_log_amplitude`` is converted from amplitudes to logarithms. ``linear_rates`` and
-    ``mean_probabilities`` (laws, N_RATES) are those of :class:`RateTables`.
+    ``permanent_line_log_amplitude`` is converted from amplitudes to logarithms. ``linear_rates``
+    and ``mean_probabilities`` (thresholds, N_TABLE_AMPLITUDES) are those of
+    :class:`CrossingTables`.
     """
-    for phase in range(leakage_bins.line_log_amplitude.shape[0]):
-        for k in range(leakage_bins.line_log_amplitude.shape[1]):
-            leakage_bins.line_log_amplitude[phase, k] = math.log(
-                max(leakage_bins.line_log_amplitude[phase, k], 1e-300)
+    for phase in range(leakage_bins.permanent_line_log_amplitude.shape[0]):
+        for k in range(leakage_bins.permanent_line_log_amplitude.shape[1]):
+            leakage_bins.permanent_line_log_amplitude[phase, k] = math.log(
+                max(leakage_bins.permanent_line_log_amplitude[phase, k], 1e-300)
             )
-    for j in range(leakage_bins.rate_sum.shape[0]):
+    for j in range(leakage_bins.crossing_rate_sum.shape[0]):
         threshold_index = leakage_bins.threshold_index[j]
-        rate_table = RateTable(
-            leakage_bins.log_rates[threshold_index],
+        rate_table = CrossingRateTable(
+            leakage_bins.log_crossing_rates[threshold_index],
             leakage_bins.first_log_amplitude[threshold_index],
             leakage_bins.log_amplitude_step[threshold_index],
         )
         steps_per_power_doubling = math.ceil(0.5 * math.log(2.0) / rate_table.log_amplitude_step)
         for s in range(3):
-            rate_sums, mean_probability_sum = leakage_bins.rate_sum_bounds[j, s], 0.0
+            rate_sums, mean_crossing_probability_sum = (
+                leakage_bins.crossing_rate_sum_bounds[j, s],
+                0.0,
+            )
             rate_sums[:] = 0.0
             for k in range(leakage_bins.bins_begin[j, s], leakage_bins.bins_end[j, s]):
                 log_amplitude_above_first = (
@@ -813,15 +834,15 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
                 )
                 if table_position < 0.0:  # rate proportional to the amplitude squared
                     power_fraction, table_position = math.exp(2.0 * log_amplitude_above_first), 0.0
-                table_index = min(int(table_position), N_RATES - 2)
-                for doublings in range(N_BOUND_POWERS):
+                table_index = min(int(table_position), N_TABLE_AMPLITUDES - 2)
+                for doublings in range(N_BOUND_SPECKLE_POWERS):
                     rate_sums[doublings] += (
                         power_fraction
                         * linear_rates[
                             threshold_index,
                             min(
                                 table_index + 1 + doublings * steps_per_power_doubling,
-                                N_RATES - 1,
+                                N_TABLE_AMPLITUDES - 1,
                             ),
                         ]
                     )
@@ -830,20 +851,27 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
                         mean_probabilities[threshold_index, table_index],
                         mean_probabilities[threshold_index, table_index + 1],
                     )
-                    mean_probability_sum += power_fraction * (
+                    mean_crossing_probability_sum += power_fraction * (
                         mean_at_index
                         + min(table_position - table_index, 1.0) * (mean_at_next - mean_at_index)
                     )
-            leakage_bins.rate_sum[j, s], leakage_bins.line_rate_sum[j, s] = rate_sums[0], 0.0
+            (
+                leakage_bins.crossing_rate_sum[j, s],
+                leakage_bins.permanent_line_crossing_rate_sum[j, s],
+            ) = rate_sums[0], 0.0
             if mean_probabilities.shape[1] > 0:
-                leakage_bins.mean_probability_sum[j, s] = mean_probability_sum
-            for phase in range(leakage_bins.line_log_amplitude.shape[0]):
+                leakage_bins.mean_crossing_probability_sum[j, s] = mean_crossing_probability_sum
+            for phase in range(leakage_bins.permanent_line_log_amplitude.shape[0]):
                 phase_sum = 0.0
-                for k in range(leakage_bins.line_begin[j, s], leakage_bins.line_end[j, s]):
+                for k in range(
+                    leakage_bins.permanent_line_begin[j, s], leakage_bins.permanent_line_end[j, s]
+                ):
                     phase_sum += _crossing_rate(
-                        leakage_bins.line_log_amplitude[phase, k], rate_table
+                        leakage_bins.permanent_line_log_amplitude[phase, k], rate_table
                     )
-                leakage_bins.line_rate_sum[j, s] = max(leakage_bins.line_rate_sum[j, s], phase_sum)
+                leakage_bins.permanent_line_crossing_rate_sum[j, s] = max(
+                    leakage_bins.permanent_line_crossing_rate_sum[j, s], phase_sum
+                )
 
 
 class SpeckleQuadrature(NamedTuple):
@@ -872,34 +900,37 @@ class SpeckleQuadrature(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _make_speckle_quadrature(rate_table):
-    """Return the trapezoidal rule for means over speckle, for one :class:`RateTable`."""
-    log_rates, log_amplitude_step, log_rate_step_max = (
-        rate_table.log_rates,
+    """Return the trapezoidal rule for means over speckle, for one :class:`CrossingRateTable`."""
+    log_crossing_rates, log_amplitude_step, log_rate_step_max = (
+        rate_table.log_crossing_rates,
         rate_table.log_amplitude_step,
         0.0,
     )
-    for k in range(1, log_rates.size):
-        if log_rates[k] < 1.0:  # at higher rates a bin crosses at almost any power
-            log_rate_step_max = max(log_rate_step_max, log_rates[k] - log_rates[k - 1])
+    for k in range(1, log_crossing_rates.size):
+        if log_crossing_rates[k] < 1.0:  # at higher rates a bin crosses at almost any power
+            log_rate_step_max = max(
+                log_rate_step_max, log_crossing_rates[k] - log_crossing_rates[k - 1]
+            )
     node_stride = max(
         int(
             min(
-                0.5 * LOG_POWER_STEP_MAX / log_amplitude_step, LOG_RATE_STEP_MAX / log_rate_step_max
+                0.5 * LOG_SPECKLE_POWER_STEP_MAX / log_amplitude_step,
+                LOG_CROSSING_RATE_STEP_MAX / log_rate_step_max,
             )
         ),
         1,
     )
     log_power_step = 2.0 * node_stride * log_amplitude_step
     n_below_mean, n_above_mean = (
-        int(-LOG_POWER_MIN / log_power_step) + 1,
-        int(LOG_POWER_MAX / log_power_step) + 1,
+        int(-LOG_SPECKLE_POWER_MIN / log_power_step) + 1,
+        int(LOG_SPECKLE_POWER_MAX / log_power_step) + 1,
     )
     weights = np.empty(n_below_mean + n_above_mean + 1)
     for i in range(weights.size):
         power = math.exp((i - n_below_mean) * log_power_step)
         weights[i] = log_power_step * power * math.exp(-power)
     # From `n_below_mean` strides beyond the table a bin crosses even at the faintest node.
-    n_columns = 2 * n_below_mean + n_above_mean + log_rates.size // node_stride + 4
+    n_columns = 2 * n_below_mean + n_above_mean + log_crossing_rates.size // node_stride + 4
     interleaved_rates = np.empty(node_stride * n_columns)
     for k in range(interleaved_rates.size):
         table_position = float(k - n_below_mean * node_stride - 1)
@@ -1014,9 +1045,9 @@ def _evaluate_joining_bins(
     leakage_bins
         :class:`LeakageBins` of the batch.
     threshold_index
-        Index of the law in ``leakage_bins.log_rates``.
+        Index of the threshold in ``leakage_bins.log_crossing_rates``.
     rate_table, quadrature
-        :class:`RateTable` and :class:`SpeckleQuadrature` of this law.
+        :class:`CrossingRateTable` and :class:`SpeckleQuadrature` for this threshold.
     is_evaluated
         (bins,) bool: True for bins that were evaluated before.
     joining_rates
@@ -1035,11 +1066,11 @@ def _evaluate_joining_bins(
         and leakage_bins.bins[end_index] - leakage_bins.bins[bin_index] == end_index - bin_index
     ):
         bright_log_amplitude = (
-            leakage_bins.log_amplitude[end_index - step] + BRIGHT_LOG_AMPLITUDE
+            leakage_bins.log_amplitude[end_index - step] + BRIGHT_SPECKLE_LOG_AMPLITUDE
         )  # amplitude in bright speckle
         if (
             abs(end_index - bin_index) > 1
-            and _crossing_rate(bright_log_amplitude, rate_table) < JOINING_RATE_MIN
+            and _crossing_rate(bright_log_amplitude, rate_table) < JOINING_CROSSING_RATE_MIN
         ):
             break
         if (
@@ -1060,9 +1091,11 @@ def _evaluate_joining_bins(
     bin_rates[:] = 0.0
     _add_rates_at_nodes(leakage_bins.log_amplitude[bin_index], rate_table, quadrature, bin_rates)
     log_power_step = 2.0 * quadrature.node_stride * rate_table.log_amplitude_step
-    nodes_per_step = max(int(EDGE_LOG_POWER_STEP / log_power_step), 1)
+    nodes_per_step = max(int(ECHO_EDGE_LOG_SPECKLE_POWER_STEP / log_power_step), 1)
     mean_power_node = n_nodes - quadrature.weights.size + quadrature.n_below_mean
-    first_edge_node = max(mean_power_node - int(EDGE_LOG_POWER_DEPTH / log_power_step), 0)
+    first_edge_node = max(
+        mean_power_node - int(ECHO_EDGE_LOG_SPECKLE_POWER_DEPTH / log_power_step), 0
+    )
     edge_ratio, neighbour_ratio = (
         leakage_bins.amplitude_gain_max * leakage_bins.exempt_neighbour[bin_index],
         leakage_bins.amplitude_gain_max * math.exp(leakage_bins.log_amplitude[bin_index]),
@@ -1099,7 +1132,7 @@ def _crossing_probability(rate):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _average_leakage(leakage_bins, leakage_probability):
+def _mean_segment_leakage(leakage_bins, leakage_probability):
     """Compute the probability of a false peak by leaked signal in each segment, (m, 3).
 
     It is the mean over speckle, with which each echo fades independently, and over the phase of the
@@ -1108,8 +1141,8 @@ def _average_leakage(leakage_bins, leakage_probability):
     is_evaluated = np.zeros(leakage_bins.bins.size, np.bool_)
     no_quadrature = SpeckleQuadrature(1, 0, np.empty(0), np.empty(0))
     for threshold_index in range(leakage_bins.first_log_amplitude.size):
-        rate_table = RateTable(
-            leakage_bins.log_rates[threshold_index],
+        rate_table = CrossingRateTable(
+            leakage_bins.log_crossing_rates[threshold_index],
             leakage_bins.first_log_amplitude[threshold_index],
             leakage_bins.log_amplitude_step[threshold_index],
         )
@@ -1118,14 +1151,16 @@ def _average_leakage(leakage_bins, leakage_probability):
             for s in range(3):
                 needs_quadrature |= (
                     leakage_bins.threshold_index[j] == threshold_index
-                    and not leakage_bins.mean_probability_sum[j, s] <= FAINT_LEAKAGE_MAX
+                    and not leakage_bins.mean_crossing_probability_sum[j, s] <= FAINT_LEAKAGE_MAX
                 )
         quadrature, node_scratch, faint_first_node = no_quadrature, np.empty((2, 0)), 0
         if needs_quadrature:
             quadrature = _make_speckle_quadrature(rate_table)
             node_scratch = np.empty((2, quadrature.weights.size))
             log_power_step = 2.0 * quadrature.node_stride * rate_table.log_amplitude_step
-            faint_first_node = int((LOG_POWER_MIN_FAINT - LOG_POWER_MIN) / log_power_step)
+            faint_first_node = int(
+                (LOG_SPECKLE_POWER_MIN_FAINT - LOG_SPECKLE_POWER_MIN) / log_power_step
+            )
         for j in range(leakage_probability.shape[0]):
             if leakage_bins.threshold_index[j] != threshold_index:
                 continue
@@ -1133,7 +1168,7 @@ def _average_leakage(leakage_bins, leakage_probability):
                 begin, end = leakage_bins.bins_begin[j, s], leakage_bins.bins_end[j, s]
                 first_node = (
                     faint_first_node
-                    if leakage_bins.rate_sum[j, s] <= FAINT_LEAKAGE_RATE_SUM_MAX
+                    if leakage_bins.crossing_rate_sum[j, s] <= FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX
                     else 0
                 )
                 rate_sums, joining_rates = (
@@ -1141,8 +1176,8 @@ def _average_leakage(leakage_bins, leakage_probability):
                     node_scratch[1, first_node:],
                 )
                 p_leakage, n_groups = 0.0, 0
-                if leakage_bins.mean_probability_sum[j, s] <= FAINT_LEAKAGE_MAX:
-                    p_leakage, end = leakage_bins.mean_probability_sum[j, s], begin
+                if leakage_bins.mean_crossing_probability_sum[j, s] <= FAINT_LEAKAGE_MAX:
+                    p_leakage, end = leakage_bins.mean_crossing_probability_sum[j, s], begin
                 for k in range(begin, end):
                     n_groups = max(n_groups, leakage_bins.group[k] + 1)
                 for group in range(n_groups):
@@ -1174,14 +1209,17 @@ def _average_leakage(leakage_bins, leakage_probability):
                     p_leakage += _mean_leakage_from_rate_sums(rate_sums, quadrature.weights) * (
                         1.0 - p_leakage
                     )
-                n_phases, p_line_alarm = leakage_bins.line_log_amplitude.shape[0], 0.0
+                n_phases, p_line_alarm = leakage_bins.permanent_line_log_amplitude.shape[0], 0.0
                 for phase in range(n_phases):
-                    rate_sum = 0.0
-                    for k in range(leakage_bins.line_begin[j, s], leakage_bins.line_end[j, s]):
-                        rate_sum += _crossing_rate(
-                            leakage_bins.line_log_amplitude[phase, k], rate_table
+                    crossing_rate_sum = 0.0
+                    for k in range(
+                        leakage_bins.permanent_line_begin[j, s],
+                        leakage_bins.permanent_line_end[j, s],
+                    ):
+                        crossing_rate_sum += _crossing_rate(
+                            leakage_bins.permanent_line_log_amplitude[phase, k], rate_table
                         )
-                    p_line_alarm -= math.expm1(-rate_sum) / n_phases
+                    p_line_alarm -= math.expm1(-crossing_rate_sum) / n_phases
                 leakage_probability[j, s] = p_leakage + p_line_alarm * (1.0 - p_leakage)
 
 
@@ -1248,8 +1286,8 @@ def draw_leaked_peaks(
     """
     key_0, key_1, draw = address
     threshold_index = leakage_bins.threshold_index[point]
-    rate_table = RateTable(
-        leakage_bins.log_rates[threshold_index],
+    rate_table = CrossingRateTable(
+        leakage_bins.log_crossing_rates[threshold_index],
         leakage_bins.first_log_amplitude[threshold_index],
         leakage_bins.log_amplitude_step[threshold_index],
     )
@@ -1259,10 +1297,10 @@ def draw_leaked_peaks(
             speckle_power_max,
             fading_factors[group_index, segment] * fading_factors[group_index, segment],
         )
-    while bound_index < N_BOUND_POWERS and speckle_power_max > float(1 << bound_index):
+    while bound_index < N_BOUND_SPECKLE_POWERS and speckle_power_max > float(1 << bound_index):
         bound_index += 1
-    if bound_index < N_BOUND_POWERS:
-        rate_sum_bound = leakage_bins.rate_sum_bounds[point, segment, bound_index]
+    if bound_index < N_BOUND_SPECKLE_POWERS:
+        rate_sum_bound = leakage_bins.crossing_rate_sum_bounds[point, segment, bound_index]
     n_peaks = 0
     if rate_sum_bound > 0.0:
         n_peaks = _draw_raised_bins(
@@ -1285,23 +1323,23 @@ def draw_leaked_peaks(
             peak_ratios,
             n_peaks,
         )
-    if leakage_bins.line_rate_sum[point, segment] > 0.0:
+    if leakage_bins.permanent_line_crossing_rate_sum[point, segment] > 0.0:
         uniform_phase = philox.uniform(
-            key_0, key_1, draw, philox.STREAM_LEAKAGE[segment], LINE_RANDOM_OFFSET
+            key_0, key_1, draw, philox.STREAM_LEAKAGE[segment], PERMANENT_LINE_RANDOM_OFFSET
         )
-        phase = int(uniform_phase * leakage_bins.line_log_amplitude.shape[0])
+        phase = int(uniform_phase * leakage_bins.permanent_line_log_amplitude.shape[0])
         n_peaks = _draw_raised_bins(
             address,
             segment,
-            LINE_RANDOM_OFFSET + 1,
-            leakage_bins.line_begin[point, segment],
-            leakage_bins.line_end[point, segment],
-            leakage_bins.line_bins,
-            leakage_bins.line_log_amplitude[phase],
+            PERMANENT_LINE_RANDOM_OFFSET + 1,
+            leakage_bins.permanent_line_begin[point, segment],
+            leakage_bins.permanent_line_end[point, segment],
+            leakage_bins.permanent_line_bins,
+            leakage_bins.permanent_line_log_amplitude[phase],
             leakage_bins.group[:0],
             leakage_bins.exempt_neighbour[:0],
             fading_factors[:, segment],
-            leakage_bins.line_rate_sum[point, segment],
+            leakage_bins.permanent_line_crossing_rate_sum[point, segment],
             rate_table,
             threshold_ratio,
             n_looks,
@@ -1325,7 +1363,7 @@ def _draw_raised_bins(
     group,
     exempt_neighbour,
     fading_factors,
-    rate_sum,
+    crossing_rate_sum,
     rate_table,
     threshold_ratio,
     n_looks,
@@ -1353,10 +1391,10 @@ def _draw_raised_bins(
         Fields of :class:`LeakageBins`; empty for bins that do not fade and join no echo.
     fading_factors
         (groups,): factors on the echoes' magnitudes by speckle.
-    rate_sum
+    crossing_rate_sum
         Upper bound on the sum of the rates of all bins in this draw.
     rate_table
-        :class:`RateTable` of the threshold.
+        :class:`CrossingRateTable` of the threshold.
     threshold_ratio, n_looks, noise_correlation
         Threshold [sigma], number of looks, and correlation of neighbours' noise.
     peak_bins, peak_ratios, n_peaks
@@ -1366,10 +1404,10 @@ def _draw_raised_bins(
     stream = philox.STREAM_LEAKAGE[segment]
     remainder = math.sqrt(1.0 - noise_correlation * noise_correlation)
     probability = philox.uniform(key_0, key_1, draw, stream, first_random)
-    if probability > rate_sum:  # then -ln(1 - probability) is larger, too
+    if probability > crossing_rate_sum:  # then -ln(1 - probability) is larger, too
         return n_peaks
     exponent_left = -math.log1p(-probability)
-    if exponent_left > rate_sum:
+    if exponent_left > crossing_rate_sum:
         return n_peaks
     root_looks = math.sqrt(float(n_looks))
     scaled_threshold = threshold_ratio * root_looks
@@ -1393,11 +1431,11 @@ def _draw_raised_bins(
             exempt_neighbour.size > 0 and exempt_neighbour[k] > 0.0
         ):  # its noise is correlated with that of this bin
             re, im = philox.normal_pair(
-                key_0, key_1, draw, stream, EDGE_RANDOM_OFFSET + k - bins_begin
+                key_0, key_1, draw, stream, ECHO_EDGE_RANDOM_OFFSET + k - bins_begin
             )
             echo_bin_signal = exempt_neighbour[k] * fading_factor * root_looks
             echo_bin_in_phase = echo_bin_signal + noise_correlation * (
-                _raised_magnitude(signal, scaled_threshold, probability) - signal
+                _magnitude_at_crossing_probability(signal, scaled_threshold, probability) - signal
             )
             is_echo |= (
                 math.hypot(echo_bin_in_phase + remainder * re, remainder * im) >= scaled_threshold
@@ -1411,7 +1449,8 @@ def _draw_raised_bins(
         ):
             peak_bin, peak_ratio = (
                 bins[k],
-                _raised_magnitude(signal, scaled_threshold, probability) / root_looks,
+                _magnitude_at_crossing_probability(signal, scaled_threshold, probability)
+                / root_looks,
             )
         first_random += 2
         exponent_left = -math.log1p(-philox.uniform(key_0, key_1, draw, stream, first_random))
@@ -1432,7 +1471,7 @@ def _added_crossing_probability(signal, threshold_ratio):
 
 
 @njit(cache=True, error_model="numpy")
-def _raised_magnitude(signal, threshold_ratio, probability):
+def _magnitude_at_crossing_probability(signal, threshold_ratio, probability):
     """Return the magnitude z [sigma] at which c(z) of the module is ``probability``.
 
     c(z) is the probability that ``signal`` lifts a bin to z, if noise alone does not. z is at least

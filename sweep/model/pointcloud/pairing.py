@@ -122,7 +122,7 @@ class DopplerPrediction(NamedTuple):
     """Derivative of the predicted Doppler beat with respect to the up beat."""
     down_coefficient: np.ndarray | float
     """Derivative of the predicted Doppler beat with respect to the down beat."""
-    motion_mismatch: np.ndarray | float
+    motion_shift_max_bins: np.ndarray | float
     """Largest shift of the Doppler beat by the instrument's motion between the segments [bins]. It
     is added to the tolerance of the prediction."""
 
@@ -144,8 +144,8 @@ class PeakPairs(NamedTuple):
     down: np.ndarray
     """(pairs,) int64: index of the down peak."""
     reading: np.ndarray
-    """(pairs,) int64: number of the way to read the beats as range and velocity
-    (:func:`sweep.model.waveform.beats_of_reading`)."""
+    """(pairs,) int64: which reading of the beats gave range and velocity, as numbered by
+    :func:`sweep.model.waveform.beats_of_reading`."""
 
     @classmethod
     def allocate(cls, pairs_max: int) -> "PeakPairs":
@@ -166,8 +166,8 @@ class ConfirmingPeak(NamedTuple):
     doppler_index: int
     """Index of the Doppler peak in the list of the segment's peaks; -1 if no peak fits."""
     reading: int
-    """Number of the way to read the beats as range and velocity
-    (:func:`sweep.model.waveform.beats_of_reading`); -1 if no peak fits."""
+    """Which reading of the beats gives range and velocity, as numbered by
+    :func:`sweep.model.waveform.beats_of_reading`; -1 if no peak fits."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -280,8 +280,8 @@ def find_confirming_peak(
         The peak of least cost within the tolerance.
     """
     least_cost, doppler_index, best_reading = np.inf, -1, -1
-    up_coefficient, down_coefficient, motion_mismatch = doppler_prediction
-    tolerance += motion_mismatch
+    up_coefficient, down_coefficient, motion_shift_max_bins = doppler_prediction
+    tolerance += motion_shift_max_bins
     for k in range(doppler.size):
         for reading in range(
             SIGNED_READING if down_beat_sign else 0,
@@ -371,7 +371,9 @@ def _match_pairs(cost):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def judge_return(groups, positions, first_bin, last_bin, line_positions, beamlet_amplitude):
+def compare_return_with_truth(
+    groups, positions, first_bin, last_bin, line_positions, beamlet_amplitude
+):
     """Compare a return's peaks with the truth; return its flag and the nearest beamlet.
 
     Range and velocity, to which the peaks are converted, are not compared here.

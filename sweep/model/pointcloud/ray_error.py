@@ -65,7 +65,7 @@ _QUARTIC_RAYS_MIN = 37
 """Smallest number of rays for which polynomials of degree 4, and not 2, are subtracted. With fewer
 rays too few residuals would remain."""
 
-_UNAFFECTED_DISTANCE_SIGMA = 15.0
+_NEGLIGIBLE_DENSITY_DISTANCE_SIGMA = 15.0
 """Difference between magnitude and threshold, in standard deviations of the noise, beyond which a
 magnitude's error changes no probability. The density there is e^-112 of the largest."""
 
@@ -74,7 +74,7 @@ _PROBABILITY_CHANGE_MIN = 1e-9
 a bound on the change of a probability of detection, or a relative change of a peak's magnitude."""
 
 
-class FoldedLattice(NamedTuple):
+class OppositeBeamletPairs(NamedTuple):
     """Hexagonal lattice of beamlets, as h pairs of opposite beamlets about the central one.
 
     The central beamlet is a pair by itself. Quantities that are odd about the beam's axis cancel in
@@ -128,7 +128,7 @@ def estimate_ray_error(
     """
     threshold, noise_sigma = shots.threshold, shots.line_noise_sigma
     pd_change, magnitude_change = np.zeros((2, shots.size))
-    lattice = fold_lattice(beamlet_table.relative_echo.shape[1])
+    beamlet_pairs = pair_opposite_beamlets(beamlet_table.relative_echo.shape[1])
     for s in range(3):
         has_peak = peak_bins[:, s] >= 0 if shots.has_segment[s] else np.zeros(shots.size, bool)
         a, b = magnitude[:, s] / noise_sigma, np.broadcast_to(threshold / noise_sigma, shots.size)
@@ -144,7 +144,7 @@ def estimate_ray_error(
         indices = np.flatnonzero(has_peak & is_relevant)
         relative_power_error = np.empty(indices.size)
         bin_powers = _bin_powers(shots, beamlet_table, s, indices, peak_bins[indices, s])
-        _fill_power_errors(bin_powers.power, lattice, relative_power_error)
+        _fill_power_errors(bin_powers.power, beamlet_pairs, relative_power_error)
         pd_error = _pd_change_bound(shots, a[indices], b[indices], relative_power_error)
         if shots.detection_rule.in_speckle and shots.detection_rule.any_bin:
             # Bins of a wide echo fade by themselves, and their powers err by different rays.
@@ -195,7 +195,7 @@ def _steady_pd_change_bound(
     """
     distance = np.maximum(np.abs(a - b) - 0.5 * relative * a, 0.0)
     bound = 0.5 * relative * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * distance**2)
-    return np.where(distance > _UNAFFECTED_DISTANCE_SIGMA, 0.0, np.minimum(bound, 1.0))
+    return np.where(distance > _NEGLIGIBLE_DENSITY_DISTANCE_SIGMA, 0.0, np.minimum(bound, 1.0))
 
 
 def _speckled_pd_change(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
@@ -333,7 +333,7 @@ def _bin_powers(
 
 
 @lru_cache(maxsize=16)
-def fold_lattice(n_beamlets: int) -> FoldedLattice:
+def pair_opposite_beamlets(n_beamlets: int) -> OppositeBeamletPairs:
     """Return the hexagonal lattice of ``n_beamlets`` beamlets as pairs of opposite beamlets.
 
     The beamlets fill whole shells of the lattice.
@@ -371,7 +371,7 @@ def fold_lattice(n_beamlets: int) -> FoldedLattice:
         representatives.size / (representatives.size - len(polynomials))
     )
     density_change = _density_change(offsets, weights)[representatives] / weights[representatives]
-    return FoldedLattice(
+    return OppositeBeamletPairs(
         representatives,
         opposite[representatives],
         1 / folded_weights,
@@ -448,7 +448,7 @@ def _main_lobe_table(window_name: str) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_power_errors(powers, lattice, relative_errors):
+def _fill_power_errors(powers, beamlet_pairs, relative_errors):
     """Compute the relative errors of the powers of m bins that are due to too few rays per beam.
 
     The module's description derives them.
@@ -457,16 +457,22 @@ def _fill_power_errors(powers, lattice, relative_errors):
     ----------
     powers
         (m, b): power of each beamlet's line in the bins.
-    lattice
-        Lattice of the beamlets (:class:`FoldedLattice`).
+    beamlet_pairs
+        Lattice of the beamlets (:class:`OppositeBeamletPairs`).
     relative_errors
         (m,): output array, at most 1.
     """
-    beamlet, opposite_beamlet = lattice.beamlet, lattice.opposite_beamlet
-    inverse_weight, density_change = lattice.inverse_weight, lattice.density_change
-    polynomials, weighted_polynomials = lattice.polynomials, lattice.weighted_polynomials
-    first_neighbour, second_neighbour = lattice.first_neighbour, lattice.second_neighbour
-    neighbour_weight = lattice.neighbour_weight
+    beamlet, opposite_beamlet = beamlet_pairs.beamlet, beamlet_pairs.opposite_beamlet
+    inverse_weight, density_change = beamlet_pairs.inverse_weight, beamlet_pairs.density_change
+    polynomials, weighted_polynomials = (
+        beamlet_pairs.polynomials,
+        beamlet_pairs.weighted_polynomials,
+    )
+    first_neighbour, second_neighbour = (
+        beamlet_pairs.first_neighbour,
+        beamlet_pairs.second_neighbour,
+    )
+    neighbour_weight = beamlet_pairs.neighbour_weight
     residual = np.empty(beamlet.size)
     for i in range(relative_errors.size):
         total_power = bias = 0.0

@@ -97,7 +97,7 @@ from sweep.model.pointcloud.pairing import (
     UNCONFIRMED_FLAG,
     DopplerPrediction,
     PeakPairs,
-    judge_return,
+    compare_return_with_truth,
     pair_peaks,
 )
 from sweep.model.preparation import Shots
@@ -357,7 +357,7 @@ def draw_returns(
             int(spectra.n_bins.max(initial=0)),
         )
         workspace = DrawWorkspace.allocate(n_filter_bins, groups_max)
-        _draw_points(
+        _draw_returns_of_points(
             keys[indices],
             np.ascontiguousarray(indices, np.int64),
             part_config,
@@ -611,11 +611,11 @@ class DrawWorkspace(NamedTuple):
     pedestal_power: np.ndarray
     """(bins,): power of the phase-noise pedestal in an echo's bins, divided by the power of noise.
     """
-    all_echo: np.ndarray
+    all_bins_are_echo: np.ndarray
     """(bins,) bool: mask that marks all bins as bins of the echo (all True)."""
-    false_bins: np.ndarray
+    false_peak_bins: np.ndarray
     """(groups + 1,) int64: numbers of the bins of a segment's false peaks."""
-    false_ratios: np.ndarray
+    false_peak_ratios: np.ndarray
     """(groups + 1,): |X| of a segment's false peaks over sigma, the noise of a bin per quadrature.
     """
     peak_positions: np.ndarray
@@ -643,8 +643,8 @@ class DrawnPeaks(NamedTuple):
     """(n, draws, returns, 3) in each field: up, Doppler and down peak of each return; nan for none.
     """
     reading: np.ndarray
-    """(n, draws, returns) int64: number of the reading, the way to interpret the beats as range and
-    velocity, for chirp slopes 1, 0 and -1; -1 without a return."""
+    """(n, draws, returns) int64: which reading of the beats gave range and velocity, as numbered by
+    :func:`sweep.model.waveform.beats_of_reading`; -1 without a return."""
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group of adjacent bins to which the up, Doppler and
     down peak belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
@@ -676,8 +676,8 @@ class ListedReturns(NamedTuple):
     peaks: Peaks
     """(m, 3) in each field: up, Doppler and down peak of each return; nan for none."""
     reading: np.ndarray
-    """(m,) int64: number of the reading, the way to interpret the beats as range and velocity, for
-    chirp slopes 1, 0 and -1."""
+    """(m,) int64: which reading of the beats gave range and velocity, as numbered by
+    :func:`sweep.model.waveform.beats_of_reading`."""
     group: np.ndarray
     """(m, 3) int8: index of the group of adjacent bins to which the up, Doppler and down peak
     belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
@@ -999,7 +999,10 @@ def _measure_listed_returns(
     The fields of the result are (m,).
     """
     uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
-    point, at_returns = listed_returns.point, partial(_values_at, shots, listed_returns.point)
+    point, at_returns = (
+        listed_returns.point,
+        partial(_values_of_points, shots, listed_returns.point),
+    )
     listed_returns = _add_drift_errors(shots, listed_returns, motion)
     measure = _measure_by_fit if uses_fit else _measure_by_reading
     if from_three_bins and shots.echo_record.n_samples_before is not None:  # errors by noise alone
@@ -1080,7 +1083,7 @@ def _measure_listed_returns(
     )
 
 
-def _values_at(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> np.ndarray:
+def _values_of_points(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> np.ndarray:
     """Return the elements of values (n,), or of one common value, at the indices ``point`` (m,)."""
     return np.broadcast_to(values, shots.size)[point]
 
@@ -1188,7 +1191,7 @@ def _correct_late_echoes(
     The instrument knows the number of these samples from the range by whole bins. No standard error
     exceeds half a bin, because a position is always within one.
     """
-    at_returns = partial(_values_at, shots, listed_returns.point)
+    at_returns = partial(_values_of_points, shots, listed_returns.point)
     delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_bin.range)
     beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_bin.radial_velocity)
     n_missing = waveform.count_samples_before_echo(
@@ -1342,7 +1345,7 @@ def _measure_by_reading(
     Nyquist or not. Errors of both peaks by common speckle are correlated. Their covariance reduces
     the variance of the range, and adds to that of the velocity.
     """
-    at_returns = partial(_values_at, shots, listed_returns.point)
+    at_returns = partial(_values_of_points, shots, listed_returns.point)
     up_carrier, _, _ = shots.waveform.carriers
     carrier, bandwidth, duration, sample_rate = (
         at_returns(values)
@@ -1483,7 +1486,7 @@ def _add_wander_covariance(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_points(
+def _draw_returns_of_points(
     keys,
     rows,
     config,
@@ -1852,7 +1855,7 @@ def pair_into_returns(point, row, draw, config, inputs, peak_lists, pairs, works
             DopplerPrediction(
                 inputs.doppler_prediction.up_coefficient[point],
                 inputs.doppler_prediction.down_coefficient[point],
-                inputs.doppler_prediction.motion_mismatch[point],
+                inputs.doppler_prediction.motion_shift_max_bins[point],
             ),
             2.0 * config.nyquist_bin,
             config.down_beat_sign,
@@ -1891,7 +1894,7 @@ def pair_into_returns(point, row, draw, config, inputs, peak_lists, pairs, works
                     * config.nyquist_bin
                     * math.floor(bin_distance / (2 * config.nyquist_bin) + 0.5)
                 )
-        flag, drawn_peaks.beamlet[row, draw, r] = judge_return(
+        flag, drawn_peaks.beamlet[row, draw, r] = compare_return_with_truth(
             group,
             positions,
             inputs.first_bin[point],
@@ -2022,12 +2025,12 @@ def draw_segment_peaks(
             n_peaks += 1
     _, n_peaks_max = peak_lists.group.shape
     n_free = n_peaks_max - n_peaks
-    false_bins, false_ratios, n_false = (
-        workspace.false_bins[:n_free],
-        workspace.false_ratios[:n_free],
+    false_peak_bins, false_peak_ratios, n_false = (
+        workspace.false_peak_bins[:n_free],
+        workspace.false_peak_ratios[:n_free],
         0,
     )
-    false_ratios[:] = 0.0
+    false_peak_ratios[:] = 0.0
     if config.in_noise:
         n_false = list_noisy_leaked_peaks(
             address,
@@ -2038,8 +2041,8 @@ def draw_segment_peaks(
             speckle_factors[:, segment],
             threshold_ratio,
             interpolation,
-            false_bins,
-            false_ratios,
+            false_peak_bins,
+            false_peak_ratios,
         )
     else:
         n_false = draw_leaked_peaks(
@@ -2051,8 +2054,8 @@ def draw_segment_peaks(
             threshold_ratio,
             config.n_looks,
             interpolation,
-            false_bins,
-            false_ratios,
+            false_peak_bins,
+            false_peak_ratios,
         )
     stream = (
         philox.STREAM_NOISE_MAXIMUM[segment]
@@ -2068,30 +2071,32 @@ def draw_segment_peaks(
             largest_noise_magnitude(spectra.n_noise_bins[point, segment], uniform, config.n_looks),
             threshold_ratio,
         )
-        excluded_bins = leakage_bins.excluded_bins[
-            leakage_bins.excluded_begin[point, segment] : leakage_bins.excluded_end[point, segment]
+        no_noise_peak_bins = leakage_bins.no_noise_peak_bins[
+            leakage_bins.no_noise_peak_begin[point, segment] : leakage_bins.no_noise_peak_end[
+                point, segment
+            ]
         ]
         false_bin = draw_free_bin(
             philox.to_uniform(bin_word),
             strongest_bins,
             inputs.first_bin[point, segment],
             inputs.last_bin[point, segment],
-            excluded_bins,
+            no_noise_peak_bins,
             inputs.first_searched_bin[point, segment],
             inputs.last_searched_bin[point, segment],
             2 * config.nyquist_bin,
             config.down_beat_sign,
         )
-        n_false = insert_peak(false_bin, ratio, false_bins, false_ratios, n_false)
+        n_false = insert_peak(false_bin, ratio, false_peak_bins, false_peak_ratios, n_false)
     for n in range(n_false):
-        error = sub_bin_standard_error(0.0, false_ratios[n], interpolation) / math.sqrt(
+        error = sub_bin_standard_error(0.0, false_peak_ratios[n], interpolation) / math.sqrt(
             config.n_looks
         )
         peak = fold_peak(
-            false_bins[n],
-            float(false_bins[n]),
+            false_peak_bins[n],
+            float(false_peak_bins[n]),
             error,
-            false_ratios[n],
+            false_peak_ratios[n],
             0.0,
             config,
             interpolation,
@@ -2587,7 +2592,9 @@ def draw_all_bins(
         for k in range(n_bins):
             magnitudes[k] = noise_sigma * span_ratios[first_index + k]
         bin_threshold = bin_threshold_at(inputs.bin_thresholds, point)
-        fill_pedestal_ratios(magnitudes, workspace.all_echo[:n_bins], bin_threshold, pedestal_power)
+        fill_pedestal_ratios(
+            magnitudes, workspace.all_bins_are_echo[:n_bins], bin_threshold, pedestal_power
+        )
     stream, first_number = philox.STREAM_NOISE[segment], ECHO_NOISE_FIRST_INDEX * (1 + group)
     if speckle.n_bins[group, segment] > 0:
         draw_adjacent_noise(
@@ -2682,7 +2689,7 @@ def draw_free_bin(
     strongest_bins,
     first_bins,
     last_bins,
-    excluded_bins,
+    no_noise_peak_bins,
     first_searched_bin,
     last_searched_bin,
     fft_size,
@@ -2697,7 +2704,7 @@ def draw_free_bin(
     strongest_bins, first_bins, last_bins
         (groups,) int64: strongest, first and last bin of each echo (group of adjacent bins). An
         echo includes one bin on either side. Groups end at the first negative strongest bin.
-    excluded_bins
+    no_noise_peak_bins
         (excluded,) int64: other bins that are not drawn.
     first_searched_bin, last_searched_bin
         First and last bin that may be drawn.
@@ -2723,12 +2730,14 @@ def draw_free_bin(
         span_end = max(min(ends[g] + 2, last + 1), begins[g])
         ends[g], n_free = span_end, n_free - (span_end - begins[g])
     excluded_elsewhere = np.empty(
-        excluded_bins.size, np.int64
+        no_noise_peak_bins.size, np.int64
     )  # excluded bins that are searched and in no group
     n_excluded = 0
-    for k in range(excluded_bins.size):
+    for k in range(no_noise_peak_bins.size):
         bin_number = (
-            first + (excluded_bins[k] - first) % fft_size if down_beat_sign else excluded_bins[k]
+            first + (no_noise_peak_bins[k] - first) % fft_size
+            if down_beat_sign
+            else no_noise_peak_bins[k]
         )
         is_skipped = bin_number < first or bin_number > last
         for g in range(n_groups):

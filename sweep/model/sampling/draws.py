@@ -593,7 +593,7 @@ def iter_noiseless_spectra(
     )
     magnitude_min = np.minimum(shots.threshold, negligible_ratio * noise_sigma)
     for spans in iter_spans(
-        shots, points=point_indices, level_min=magnitude_min, leakage=False, with_pd=False
+        shots, points=point_indices, level_min=magnitude_min, leakage=False, computes_pd=False
     ):
         n_bins, start, peak_index = (
             c.T.ravel() for c in (spans.n_bins, spans.span_start, spans.peak_index)

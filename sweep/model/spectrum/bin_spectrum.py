@@ -43,14 +43,14 @@ from sweep.model.spectrum.lines import (
     replace_lines_by_nodes,
 )
 
-ZERO = np.int64(0)
+INTEGER_ZERO = np.int64(0)
 """The integer 0 as an argument of compiled functions. Numba would compile them anew for a literal
 0."""
 
 FAR_BINS_PER_BATCH = 128
 """Number of frequency bins per pass of the calculation far from the lines."""
 
-SOURCE_LOG_ACCURACY = 28.0
+FAR_LINE_LOG_ACCURACY = 28.0
 """-ln of the largest relative error of F when equivalent lines replace a segment's lines. F is the
 lines' spectrum. The value includes a margin for windows with poles."""
 
@@ -426,7 +426,7 @@ def _add_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, 
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def compute_sources(bundle, distance_min, log_accuracy, layout, field):
+def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layout, field):
     """Compute the lines' amplitudes at the record's ends, and equivalent lines for far bins.
 
     Far from the lines, a few equivalent lines (sources) give the same spectrum.
@@ -506,26 +506,26 @@ def far_line_weight(weight_sum, n_sources, layout, sources):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def tangent_at(bin_, fft_size, tangents):
+def tangent_at(bin_, fft_size, bin_tangents):
     """Return tan(pi k / N) of any bin k, for the FFT size N.
 
-    ``tangents`` holds the values of bins 0 .. N/2.
+    ``bin_tangents`` holds the values of bins 0 .. N/2.
     """
     bin_ %= fft_size
-    return tangents[bin_] if 2 * bin_ <= fft_size else -tangents[fft_size - bin_]
+    return bin_tangents[bin_] if 2 * bin_ <= fft_size else -bin_tangents[fft_size - bin_]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def prepare_far_bins(first_bin, n_bins, layout, tangents, far_bins):
+def prepare_far_bins(first_bin, n_bins, layout, bin_tangents, far_bins):
     """Compute tan(pi k / N) and exp(i pi k L / N) of a batch of bins k into ``far_bins``.
 
     N is the FFT size, L the number of samples. ``n_bins`` is at most FAR_BINS_PER_BATCH.
-    ``tangents`` holds the tangents of bins 0 .. N/2.
+    ``bin_tangents`` holds the bin_tangents of bins 0 .. N/2.
     """
     fft_size = layout.fft_size
     k = first_bin % fft_size
     for i in range(n_bins):
-        far_bins.tangent[i] = tangents[k] if 2 * k <= fft_size else -tangents[fft_size - k]
+        far_bins.tangent[i] = bin_tangents[k] if 2 * k <= fft_size else -bin_tangents[fft_size - k]
         k = k + 1 if k + 1 < fft_size else 0
     if fft_size == layout.record_length:
         for i in range(n_bins):
@@ -628,7 +628,7 @@ def add_line_by_record_ends(
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, tangents, field):
+def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bin_tangents, field):
     """Compute the lines' spectrum F in ``n_bins`` bins into ``field.re`` and ``field.im``.
 
     Parameters
@@ -645,7 +645,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
         :class:`sweep.model.spectrum.line_shape.LineShape`.
     layout
         :class:`SpectrumLayout`.
-    tangents
+    bin_tangents
         tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     field
         :class:`FieldWorkspace`.
@@ -661,7 +661,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
         and first_bin + n_bins - lowest_position < table_reach
     ):
         return
-    log_accuracy = SOURCE_LOG_ACCURACY
+    log_accuracy = FAR_LINE_LOG_ACCURACY
     source_distance = max(
         bins_to_nearest_line(first_bin, n_bins, lowest_position, highest_position, layout.fft_size),
         float(table_reach),
@@ -673,7 +673,9 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
             log_accuracy,
             4.0 + (2.0 * envelope_log_ratio if layout.adds_powers else envelope_log_ratio),
         )
-    n_sources = compute_sources(bundle, source_distance, log_accuracy, layout, field)
+    n_sources = compute_end_strengths_and_far_lines(
+        bundle, source_distance, log_accuracy, layout, field
+    )
     polynomial_log_accuracy = log_accuracy + FAR_LINE_EXTRA_LOG_ACCURACY
     # In some bins the table holds some lines and not others. Sources serve all bins but these.
     first_batch_bin = math.floor(lowest_position)
@@ -693,17 +695,17 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
             )
         is_far = not is_in_part_of_table
         if is_far or last_batch_bin > first_batch_bin:
-            prepare_far_bins(current, stop - current, layout, tangents, field.far_bins)
+            prepare_far_bins(current, stop - current, layout, bin_tangents, field.far_bins)
         if is_far:
             for source in range(n_sources):
                 add_line_by_record_ends(
-                    ZERO,
+                    INTEGER_ZERO,
                     stop - current,
                     current - first_bin,
                     field.far_equivalent_lines,
                     source,
                     polynomial_log_accuracy,
-                    shape.ends,
+                    shape.end_polynomials,
                     layout,
                     field,
                 )
@@ -727,7 +729,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
                             field.line_ends,
                             line,
                             polynomial_log_accuracy,
-                            shape.ends,
+                            shape.end_polynomials,
                             layout,
                             field,
                         )
@@ -768,7 +770,7 @@ def envelope_index(distance, envelope):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def compute_magnitudes(
-    first_bin, n_bins, bundle, negligible_ratio, shifts, shape, layout, tangents, workspace
+    first_bin, n_bins, bundle, negligible_ratio, shifts, shape, layout, bin_tangents, workspace
 ):
     """Compute the magnitude of the spectrum in ``n_bins`` bins, into ``workspace.span.magnitude``.
 
@@ -823,7 +825,7 @@ def compute_magnitudes(
                 negligible_ratio,
                 shape,
                 layout,
-                tangents,
+                bin_tangents,
                 field,
             )
             for i in range(n_bins):
@@ -910,7 +912,10 @@ def bins_around_lines(margin_bins, visible_range, layout):
         last_bin = max(last_bin, -first_bin)
     if last_bin > nyquist_bin:
         first_bin = min(first_bin, fft_size - last_bin)
-    return BinRange(min(max(first_bin, ZERO), nyquist_bin), max(min(last_bin, nyquist_bin), ZERO))
+    return BinRange(
+        min(max(first_bin, INTEGER_ZERO), nyquist_bin),
+        max(min(last_bin, nyquist_bin), INTEGER_ZERO),
+    )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -940,7 +945,7 @@ def detect_in_span(
     shifts,
     shape,
     layout,
-    tangents,
+    bin_tangents,
     workspace,
 ):
     """Compute the spectrum in the bins around a segment's lines, and detect the echo there.
@@ -954,18 +959,19 @@ def detect_in_span(
     threshold
         Threshold on |X| [V].
     lowest_level
-        |X| [V] below which bins may be left out. If no bin reaches it, bins that are certainly
-        smaller than the largest bin are left out.
+        |X| [V] below which bins may be left out. If no bin reaches this level, only bins that are
+        certainly smaller than the largest one are left out.
     lobe_half_width
-        Half-width of the echo's main lobe or pedestal [bins], or 0: bins that are exempt with a
-        strong bin (:func:`sweep.model.detection.echo_detection.mark_exempt_bins`).
+        Half-width of the echo's main lobe or pedestal [bins]. Bins within this distance of a strong
+        bin are exempt (:func:`sweep.model.detection.echo_detection.mark_exempt_bins`). 0 if only
+        the strongest bin may detect the echo.
     shifts
         :class:`AveragingShifts`.
     shape
         :class:`sweep.model.spectrum.line_shape.LineShape`.
     layout
         :class:`SpectrumLayout`.
-    tangents
+    bin_tangents
         tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     workspace
         :class:`SpectrumWorkspace`, whose ``span.magnitude`` and ``span.is_exempt`` are results.
@@ -998,8 +1004,8 @@ def detect_in_span(
         and bundle.n_lines > 1
         and shifts.offset.size == 0
     ):
-        n_sources = compute_sources(
-            bundle, float(layout.clearance_bins), SOURCE_LOG_ACCURACY, layout, workspace.field
+        n_sources = compute_end_strengths_and_far_lines(
+            bundle, float(layout.clearance_bins), FAR_LINE_LOG_ACCURACY, layout, workspace.field
         )
         far_weight = far_line_weight(
             weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
@@ -1023,7 +1029,7 @@ def detect_in_span(
             shifts,
             shape,
             layout,
-            tangents,
+            bin_tangents,
             workspace,
         )
         peak_index, n_exempt = mark_exempt_bins(

@@ -50,22 +50,22 @@ from sweep.model.detection.speckle_crossing_rates import (
     POWERS_PER_OCTAVE_MAX,
     SPECKLE_POWER_MAX,
     TABULATED_SPECKLE_POWERS,
-    add_rates_by_power,
-    add_rates_of_entries,
-    add_to_entry_weights,
+    add_entry_weights_of_bin,
+    add_rates_by_speckle_power,
+    add_rates_from_entry_weights,
     count_entry_weights,
     rate_at_brightest_speckle,
 )
 from sweep.model.spectrum.bin_spectrum import (
     FAR_LINE_EXTRA_LOG_ACCURACY,
-    SOURCE_LOG_ACCURACY,
-    ZERO,
+    FAR_LINE_LOG_ACCURACY,
+    INTEGER_ZERO,
     AveragingShifts,
     DetectedSpan,
     add_line_by_record_ends,
     bins_around_lines,
+    compute_end_strengths_and_far_lines,
     compute_magnitudes,
-    compute_sources,
     distance_below_level_with_images,
     envelope_index,
     far_line_weight,
@@ -187,7 +187,7 @@ def detect_with_leakage(
     lobe_half_width,
     shape,
     layout,
-    tangents,
+    bin_tangents,
     workspace,
     crossing_series,
     speckle_rates,
@@ -246,8 +246,8 @@ def detect_with_leakage(
         far_weight, distance_min, image_distance, brightest_limits, envelope
     )
     if tolerance_left < 0.0 or crossing_distance > clearance:
-        n_sources = compute_sources(
-            bundle, float(clearance), SOURCE_LOG_ACCURACY, layout, workspace.field
+        n_sources = compute_end_strengths_and_far_lines(
+            bundle, float(clearance), FAR_LINE_LOG_ACCURACY, layout, workspace.field
         )
         far_weight = far_line_weight(
             weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
@@ -274,7 +274,7 @@ def detect_with_leakage(
     near_bins = bins_around_lines(
         distance_min if is_integral_negligible else float(clearance), visible_range, layout
     )
-    extra_bins = ZERO
+    extra_bins = INTEGER_ZERO
     if not is_integral_negligible:
         extra_bins = _extra_bins_min(
             far_weight,
@@ -291,7 +291,7 @@ def detect_with_leakage(
         if not is_integral_negligible:
             first_bin, last_bin = first_bin - extra_bins, last_bin + extra_bins
             end_bins = extra_bins + INTEGRAL_END_CORRECTION_BINS
-            first_bin = ZERO if first_bin <= end_bins else first_bin
+            first_bin = INTEGER_ZERO if first_bin <= end_bins else first_bin
             last_bin = nyquist_bin if nyquist_bin - last_bin <= end_bins else last_bin
         n_bins = last_bin - first_bin + 1
         compute_magnitudes(
@@ -302,7 +302,7 @@ def detect_with_leakage(
             no_shifts,
             shape,
             layout,
-            tangents,
+            bin_tangents,
             workspace,
         )
         peak_index, n_exempt = mark_exempt_bins(
@@ -326,7 +326,7 @@ def detect_with_leakage(
             speckle_power_max,
             shape,
             layout,
-            tangents,
+            bin_tangents,
             workspace,
             crossing_series,
             speckle_rates,
@@ -406,7 +406,7 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
     _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
     exclude_bins_joining_echo(
         span.crossing_probability,
-        ZERO,
+        INTEGER_ZERO,
         n_bins,
         span.magnitude,
         span.is_exempt,
@@ -414,7 +414,7 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
         limits.threshold,
         limits.sidelobe_correlation,
     )
-    return any_crossing_probability(span.crossing_probability, ZERO, n_bins)
+    return any_crossing_probability(span.crossing_probability, INTEGER_ZERO, n_bins)
 
 
 @njit(cache=True, error_model="numpy")
@@ -424,7 +424,7 @@ def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
     The bins are the computed ones around a segment's lines (a span).
     """
     return _mean_leakage_over_speckle(
-        ZERO, n_bins, limits, span, speckle_rates, np.zeros(N_SPECKLE_POWERS)
+        INTEGER_ZERO, n_bins, limits, span, speckle_rates, np.zeros(N_SPECKLE_POWERS)
     )
 
 
@@ -472,13 +472,13 @@ def _mean_leakage_over_speckle(
                 magnitudes[n_listed], is_echo[n_listed] = span.magnitude[i], True
                 n_listed, is_gap_listed = n_listed + 1, False
         elif span.crossing_probability[i] > 0.0:  # marked by _mark_joining_bins
-            add_rates_by_power(squared_ratio, 1.0, speckle_rates, joining_rates[n_listed])
+            add_rates_by_speckle_power(squared_ratio, 1.0, speckle_rates, joining_rates[n_listed])
             magnitudes[n_listed], n_listed, is_gap_listed = span.magnitude[i], n_listed + 1, False
         else:
-            add_to_entry_weights(squared_ratio, speckle_rates, entry_weights)
+            add_entry_weights_of_bin(squared_ratio, speckle_rates, entry_weights)
             if not is_gap_listed:
                 n_listed, is_gap_listed = n_listed + 1, True
-    add_rates_of_entries(entry_weights, speckle_rates, rate_sums)
+    add_rates_from_entry_weights(entry_weights, speckle_rates, rate_sums)
     rate_at_brightest = rate_sums[N_SPECKLE_POWERS - 1] + max(
         relative_rates_of_far_bins[N_SPECKLE_POWERS - 1], 0.0
     )
@@ -500,7 +500,7 @@ def _mean_leakage_over_speckle(
             root_power = math.sqrt(power)
             exclude_bins_joining_echo(
                 probabilities,
-                ZERO,
+                INTEGER_ZERO,
                 n_listed,
                 magnitudes,
                 is_echo,
@@ -660,13 +660,14 @@ def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelop
 
     Notes
     -----
-    With x = a^2/2, y = b^2/2 and z = a b, of the signal a [sigma] and the threshold b [sigma], a
-    single bin adds at most
+    Let a be the signal in a bin and b the threshold, both in units of the noise sigma. With
+    x = a^2/2, y = b^2/2 and z = a b, the bin adds at most
 
-        x dQ_1/dx = x y e^{-y} g,    g = I_1(z) / (z/2) <= e^{z^2/8}, 2 e^z / sqrt(2 pi z^3),
+        x dQ_1/dx = x y e^{-y} g(z),    g(z) = I_1(z) / (z/2),
 
-    so that all of them together add at most y e^{-y} g(nearest) times the sum of x. Images are no
-    nearer to a bin than the lines, nor than ``image_distance`` bins.
+    where g(z) is at most e^{z^2/8}, and at most 2 e^z / sqrt(2 pi z^3). It rises with z, so the
+    nearest bin has the largest value. All bins together add at most y e^{-y} times this value times
+    the sum of x. Images are no nearer to a bin than the lines, nor than ``image_distance`` bins.
     """
     weight_ratio, b = weight_sum / limits.noise_sigma, limits.threshold / limits.noise_sigma
     y = 0.5 * b * b
@@ -782,7 +783,7 @@ def _leakage_of_all_bins(
     speckle_power_max,
     shape,
     layout,
-    tangents,
+    bin_tangents,
     workspace,
     crossing_series,
     speckle_rates,
@@ -811,7 +812,7 @@ def _leakage_of_all_bins(
         math.floor(0.5 * (visible_range.lowest_position + visible_range.highest_position) + 0.5)
     )
     centre_bin = fft_size - centre_bin if centre_bin > nyquist_bin else centre_bin
-    far_rate, last_terms, n_points = 0.0, 0.0, ZERO
+    far_rate, last_terms, n_points = 0.0, 0.0, INTEGER_ZERO
     for side in (-1, 1):
         if not (goes_on_below if side < 0 else goes_on_above):
             continue
@@ -831,13 +832,13 @@ def _leakage_of_all_bins(
             centre_bin,
             near_end.steepness,
             layout,
-            tangents,
+            bin_tangents,
             integral.cotangent,
             integral.weight,
             n_points,
         )
     first_index, end_index = (
-        INTEGRAL_END_CORRECTION_BINS if goes_on_below else ZERO,
+        INTEGRAL_END_CORRECTION_BINS if goes_on_below else INTEGER_ZERO,
         n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
     exclude_bins_joining_echo(
@@ -865,9 +866,11 @@ def _leakage_of_all_bins(
             math.log(200.0 * threshold_ratio * threshold_ratio / max(limits.tolerance, 1e-300)),
             4.0,
         ),
-        SOURCE_LOG_ACCURACY,
+        FAR_LINE_LOG_ACCURACY,
     )
-    _fill_far_powers(n_points, centre_bin, bundle, log_accuracy, shape, layout, tangents, workspace)
+    _fill_far_powers(
+        n_points, centre_bin, bundle, log_accuracy, shape, layout, bin_tangents, workspace
+    )
     # The span's scratch arrays now serve the points of the integral.
     for i in range(n_points):
         integral.half_square[i] *= scale
@@ -924,21 +927,21 @@ def _mean_leakage_of_all_bins(
         )  # the last bin before the integral
         for offset in range(-2, 4):
             magnitude = span.magnitude[last_near_index + side * offset]
-            add_rates_by_power(
+            add_rates_by_speckle_power(
                 magnitude * magnitude * scale,
                 _end_correction_factor(offset),
                 speckle_rates,
                 relative_rates_of_far_bins,
             )
     for i in range(n_points):
-        add_rates_by_power(
+        add_rates_by_speckle_power(
             2.0 * integral.half_square[i],
             integral.weight[i],
             speckle_rates,
             relative_rates_of_far_bins,
         )
     first_index, end_index = (
-        INTEGRAL_END_CORRECTION_BINS if goes_on_below else ZERO,
+        INTEGRAL_END_CORRECTION_BINS if goes_on_below else INTEGER_ZERO,
         n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
     return _mean_leakage_over_speckle(
@@ -960,7 +963,7 @@ def _end_correction_factor(offset):
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _fill_far_powers(
-    n_points, centre_bin, bundle, log_accuracy, shape, layout, tangents, workspace
+    n_points, centre_bin, bundle, log_accuracy, shape, layout, bin_tangents, workspace
 ):
     """Compute the squared magnitude of the spectrum at the leakage integral's points.
 
@@ -978,7 +981,7 @@ def _fill_far_powers(
     for image_pass in range(2 if layout.spectrum_type == REAL_WITH_IMAGES else 1):
         direction = line_direction if image_pass == 0 else -line_direction
         tangent_shift = tangent_at(
-            centre_bin - direction * bundle.origin_bin, layout.fft_size, tangents
+            centre_bin - direction * bundle.origin_bin, layout.fft_size, bin_tangents
         )
         for i in range(n_points):
             tangent = integral.cotangent[i]
@@ -993,16 +996,18 @@ def _fill_far_powers(
                 bundle.highest_position - bundle.lowest_position
             )
             distance_min = max(distance_min, edge_distance - 2.0)
-        n_sources = compute_sources(bundle, distance_min, log_accuracy, layout, field)
+        n_sources = compute_end_strengths_and_far_lines(
+            bundle, distance_min, log_accuracy, layout, field
+        )
         for source in range(n_sources):
             add_line_by_record_ends(
-                ZERO,
+                INTEGER_ZERO,
                 n_points,
-                ZERO,
+                INTEGER_ZERO,
                 field.far_equivalent_lines,
                 source,
                 log_accuracy + FAR_LINE_EXTRA_LOG_ACCURACY,
-                shape.ends,
+                shape.end_polynomials,
                 layout,
                 field,
             )
@@ -1054,7 +1059,7 @@ def _near_end_correction(side, n_bins, span):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _append_gauss_points(
-    side, last_distance, centre_bin, steepness, layout, tangents, cotangents, weights, n_points
+    side, last_distance, centre_bin, steepness, layout, bin_tangents, cotangents, weights, n_points
 ):
     """Append the quadrature points of the leakage integral on one side of the lines.
 
@@ -1073,7 +1078,7 @@ def _append_gauss_points(
         -d ln f / dq of the integrand at the near end [1/bin].
     layout
         :class:`sweep.model.spectrum.lines.SpectrumLayout`.
-    tangents
+    bin_tangents
         tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     cotangents, weights
         Results: cot(pi q / N) at the distance q from ``centre_bin``, and weights of an integral
@@ -1093,9 +1098,9 @@ def _append_gauss_points(
     goes_on = layout.spectrum_type != REAL_WITH_IMAGES and far_distance < nyquist_bin
     ends_half_bin_beyond = ends_half_bin_beyond or goes_on
     far_cotangent = max(
-        _bin_cotangent(far_distance, ends_half_bin_beyond, fft_size, tangents), 1e-9
+        _bin_cotangent(far_distance, ends_half_bin_beyond, fft_size, bin_tangents), 1e-9
     )
-    near_cotangent = _bin_cotangent(last_distance, HALF_BIN_BEYOND, fft_size, tangents)
+    near_cotangent = _bin_cotangent(last_distance, HALF_BIN_BEYOND, fft_size, bin_tangents)
     panel_start, scale_min = near_cotangent, max(far_cotangent, 0.5)
     while panel_start > far_cotangent:
         if panel_start > 8.0 * scale_min:
@@ -1114,7 +1119,7 @@ def _append_gauss_points(
     bin_angle = math.pi / fft_size
     if goes_on:
         for k in range(2):
-            cotangent = _bin_cotangent(far_distance + k, AT_BIN, fft_size, tangents)
+            cotangent = _bin_cotangent(far_distance + k, AT_BIN, fft_size, bin_tangents)
             cotangents[n_points] = side * cotangent
             weights[n_points] = (1.0 - 2.0 * k) / 24.0 * bin_angle * (1.0 + cotangent * cotangent)
             n_points += 1
@@ -1126,13 +1131,13 @@ def _append_gauss_points(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _bin_cotangent(distance, half_bin_beyond, fft_size, tangents):
+def _bin_cotangent(distance, half_bin_beyond, fft_size, bin_tangents):
     """Return cot(pi q / N) for q bins, with the FFT size N and 0 < q <= N/2.
 
-    q is ``distance``, or half a bin more if ``half_bin_beyond``. ``tangents`` holds tan(pi k / N)
-    of bins k = 0 .. N/2.
+    q is ``distance``, or half a bin more if ``half_bin_beyond``. ``bin_tangents`` holds tan(pi k /
+    N) of bins k = 0 .. N/2.
     """
-    tangent_at_bin = tangents[distance]
+    tangent_at_bin = bin_tangents[distance]
     if not half_bin_beyond:
         return 1.0 / tangent_at_bin
     half_bin_tangent = 0.5 * math.pi / fft_size

@@ -69,11 +69,28 @@ DECONVOLUTION_TAPS = np.array([
 """Coefficients of a symmetric filter over table cells that divides a table by the kernel's
 transform. Its relative error is 1e-13 below a phase of pi / 2 per cell."""
 
-MODE_TIERS = ((24, 20, 64), (48, 56, 96), (128, 200, 256))
-"""Three integers for each accuracy tier of line shapes. First: maximum number of Chebyshev modes of
-exp(2 pi i psi), psi being the phase error. Second: distance [bins of fs/L, L samples] beyond which
-the record's ends determine the shape. Third: bins of fs/L that the table holds on each side of the
-line, if few points share it."""
+
+class LineShapeTier(NamedTuple):
+    """Sizes of the tables of line shapes whose phase errors need up to a number of modes.
+
+    Distances are in bins of fs/L, with the sample rate fs and L samples in the record.
+    """
+
+    n_modes_max: int
+    """Maximum number of Chebyshev modes of exp(2 pi i psi), with the phase error psi [cycles]."""
+    clearance_bins: int
+    """Distance from the line beyond which the record's ends alone determine the shape."""
+    table_half_width_bins: int
+    """Distance from the line up to which a table holds the shape, if few points share it."""
+
+
+LINE_SHAPE_TIERS = (
+    LineShapeTier(24, 20, 64),
+    LineShapeTier(48, 56, 96),
+    LineShapeTier(128, 200, 256),
+)
+"""Sizes of line-shape tables, from few modes to many. A line shape uses the first tier with enough
+modes."""
 
 SHARED_TABLE_BINS = 256
 """Half-width [bins of fs/L, L samples] of a line-shape table that many points share. It is wide
@@ -86,7 +103,7 @@ N_END_COEFFICIENTS = END_DERIVATIVES_MAX + 2
 """Number of coefficients of each polynomial, of the record's start or end, that gives a line's
 spectrum far from the line."""
 
-MODE_SIZE_MIN = 1e-13
+MODE_COEFFICIENT_MIN = 1e-13
 """Smallest Chebyshev coefficient of a phase error's phasor that counts as a mode. The last modes
 with smaller coefficients are left out. The phasor has magnitude 1."""
 
@@ -111,7 +128,7 @@ ZERO_WEIGHT_CELLS = 2
 """Number of cells of weight 0 after the KERNEL_CELLS cells of a line. They fill the processor's
 vectors."""
 
-LENGTH_CLASS_RATIO = math.sqrt(2.0)
+ECHO_LENGTH_CLASS_RATIO = math.sqrt(2.0)
 """Largest ratio between the numbers of samples of two late echoes that share a line-shape table. A
 late echo fills only the last samples of its record."""
 
@@ -183,11 +200,11 @@ class LineShape(NamedTuple):
     """(..., cells * columns): imaginary part of the line's spectrum; 0 if powers add."""
     envelope: LineEnvelope
     """Upper envelope of the magnitude of the line's spectrum."""
-    ends: EndPolynomials
+    end_polynomials: EndPolynomials
     """Polynomials for the spectrum far from the line; unused if the table holds all bins."""
 
 
-class ShapeModes(NamedTuple):
+class PhaseErrorModes(NamedTuple):
     """Chebyshev coefficients of exp(2 pi i psi), for the phase error psi [cycles] of each shape."""
 
     line_shift: np.ndarray
@@ -201,15 +218,15 @@ class ShapeModes(NamedTuple):
     needed than the arrays hold.
     """
 
-    def select(self, is_selected: np.ndarray) -> "ShapeModes":
+    def select(self, is_selected: np.ndarray) -> "PhaseErrorModes":
         """Return the modes of the shapes for which ``is_selected`` is true."""
-        return ShapeModes(*(np.ascontiguousarray(values[:, is_selected]) for values in self))
+        return PhaseErrorModes(*(np.ascontiguousarray(values[:, is_selected]) for values in self))
 
 
-def zero_modes(segments: int, n_shapes: int, n_modes_max: int) -> ShapeModes:
-    """Allocate :class:`ShapeModes` with all values 0."""
+def zero_phase_error_modes(segments: int, n_shapes: int, n_modes_max: int) -> PhaseErrorModes:
+    """Allocate :class:`PhaseErrorModes` with all values 0."""
     shape = segments, n_shapes
-    return ShapeModes(
+    return PhaseErrorModes(
         np.zeros(shape),
         np.zeros((*shape, n_modes_max)),
         np.zeros((*shape, n_modes_max)),
@@ -239,7 +256,7 @@ class LineShapeTables(NamedTuple):
     """(places,): the window's first sample times sin(pi L y / N) at y bins from the line. L is the
     number of samples, N the FFT size. The array is empty for late echoes.
     """
-    mode_ends: EndPolynomials
+    mode_end_polynomials: EndPolynomials
     """Polynomials of each Chebyshev mode for its spectrum far from the line, (modes,
     N_END_COEFFICIENTS).
     """
@@ -267,14 +284,14 @@ class LineShapeTables(NamedTuple):
     """
 
 
-_NO_ENDS = EndPolynomials(*(np.empty((0, 1)) for _ in EndPolynomials._fields))
-_NO_TABLE = np.empty((0, 0))
-_NO_LENGTHS = np.empty((0, 0), np.int64)
+_NO_END_POLYNOMIALS = EndPolynomials(*(np.empty((0, 1)) for _ in EndPolynomials._fields))
+_NO_LINE_SHAPE_TABLE = np.empty((0, 0))
+_NO_ECHO_LENGTHS = np.empty((0, 0), np.int64)
 
 
 def _no_full_envelope(distance: np.ndarray) -> LineEnvelope:
     """Return an empty :class:`LineEnvelope` for tables that do not hold all bins."""
-    return LineEnvelope(distance, _NO_TABLE, _NO_TABLE)
+    return LineEnvelope(distance, _NO_LINE_SHAPE_TABLE, _NO_LINE_SHAPE_TABLE)
 
 
 _gauss_legendre = lru_cache(maxsize=8)(roots_legendre)
@@ -295,11 +312,11 @@ def line_shape_tables(
     adds_powers
         True if the powers of lines add, False if their amplitudes do.
     tier
-        Index in :data:`MODE_TIERS`.
+        Index in :data:`LINE_SHAPE_TIERS`.
     shared
         True if many points share a shape, which then has a wide table.
     """
-    n_modes, clearance_bins, table_half_width = MODE_TIERS[tier]
+    n_modes, clearance_bins, table_half_width = LINE_SHAPE_TIERS[tier]
     table_half_width = SHARED_TABLE_BINS if shared else table_half_width
     ratio, length = window.length / fft_size, window.length
     table_bins = math.ceil(table_half_width / ratio)
@@ -346,25 +363,25 @@ def line_shape_tables(
         mode_transforms=mode_transforms,
         first_sample_cosine=first_sample_cosine,
         first_sample_sine=first_sample_sine,
-        mode_ends=_end_polynomials(taylor_coefficients, length),
+        mode_end_polynomials=_end_polynomials(taylor_coefficients, length),
         envelope_distance=distance,
         cotangent_at_envelope_distance=_cotangents(distance, fft_size),
-        full_table_re=_NO_TABLE,
-        full_table_im=_NO_TABLE,
+        full_table_re=_NO_LINE_SHAPE_TABLE,
+        full_table_im=_NO_LINE_SHAPE_TABLE,
         full_envelope=_no_full_envelope(distance),
-        echo_lengths=_NO_LENGTHS,
-        taylor_coefficients=_NO_TABLE,
+        echo_lengths=_NO_ECHO_LENGTHS,
+        taylor_coefficients=_NO_LINE_SHAPE_TABLE,
     )
 
 
-def late_length_class(window: Window, length_min: np.ndarray) -> np.ndarray:
+def late_echo_length_classes(window: Window, length_min: np.ndarray) -> np.ndarray:
     """Return the length classes of late echoes of ``length_min`` samples, (n,) int64.
 
     Late echoes of one class share a table. With a record of L samples, those of class c have at
-    most L / :data:`LENGTH_CLASS_RATIO` ** (c - 1) samples.
+    most L / :data:`ECHO_LENGTH_CLASS_RATIO` ** (c - 1) samples.
     """
     ratio = window.length / np.maximum(length_min, 1)
-    return np.ceil(np.log(ratio) / math.log(LENGTH_CLASS_RATIO) - 1e-9).astype(np.int64)
+    return np.ceil(np.log(ratio) / math.log(ECHO_LENGTH_CLASS_RATIO) - 1e-9).astype(np.int64)
 
 
 def late_echo_has_modes(
@@ -373,16 +390,16 @@ def late_echo_has_modes(
     """Return true for late echoes whose line shapes may be sums of Chebyshev modes, (n,) bool.
 
     ``length_min`` and ``length_max`` (n,) are the least and the largest number of samples of the
-    echo in any segment. ``tier`` is an index in :data:`MODE_TIERS`.
+    echo in any segment. ``tier`` is an index in :data:`LINE_SHAPE_TIERS`.
     """
     if window.name not in COSINE_SUM_COEFFICIENTS:
         return np.zeros(length_min.shape, np.bool_)
-    table_half_width = MODE_TIERS[tier][1] + _LATE_TABLE_MARGIN_BINS
+    table_half_width = LINE_SHAPE_TIERS[tier].clearance_bins + _LATE_TABLE_MARGIN_BINS
     is_long_enough = (length_min >= _LATE_SAMPLES_PER_BIN_MIN * table_half_width) & (
         length_min * _LATE_PADDING_MAX >= fft_size
     )
-    class_length_max = window.length * LENGTH_CLASS_RATIO ** (
-        1.0 - late_length_class(window, length_min)
+    class_length_max = window.length * ECHO_LENGTH_CLASS_RATIO ** (
+        1.0 - late_echo_length_classes(window, length_min)
     )
     return np.asarray(is_long_enough & (length_max <= 1.01 * class_length_max))
 
@@ -412,11 +429,12 @@ def late_line_shape_tables(
 ) -> LineShapeTables:
     """Prepare the tables for late echoes of one length class whose shapes are sums of modes.
 
-    Parameters are those of :func:`line_shape_tables`, with the class (:func:`late_length_class`).
+    Parameters are those of :func:`line_shape_tables`, with the class
+    (:func:`late_echo_length_classes`).
     """
-    clearance_bins = MODE_TIERS[tier][1]
+    clearance_bins = LINE_SHAPE_TIERS[tier].clearance_bins
     table_half_width = clearance_bins + _LATE_TABLE_MARGIN_BINS
-    filled_fraction = window.length * LENGTH_CLASS_RATIO ** (-float(length_class)) / fft_size
+    filled_fraction = window.length * ECHO_LENGTH_CLASS_RATIO ** (-float(length_class)) / fft_size
     table_bins = math.ceil(table_half_width / filled_fraction)
     transforms = _late_mode_transforms(tier)
     distance = _envelope_distances(table_bins, fft_size)
@@ -433,13 +451,13 @@ def late_line_shape_tables(
         mode_transforms=transforms.mode_transforms,
         first_sample_cosine=np.empty(0),
         first_sample_sine=np.empty(0),
-        mode_ends=_NO_ENDS,
+        mode_end_polynomials=_NO_END_POLYNOMIALS,
         envelope_distance=distance,
         cotangent_at_envelope_distance=_cotangents(distance, fft_size),
-        full_table_re=_NO_TABLE,
-        full_table_im=_NO_TABLE,
+        full_table_re=_NO_LINE_SHAPE_TABLE,
+        full_table_im=_NO_LINE_SHAPE_TABLE,
         full_envelope=_no_full_envelope(distance),
-        echo_lengths=_NO_LENGTHS,
+        echo_lengths=_NO_ECHO_LENGTHS,
         taylor_coefficients=transforms.taylor_coefficients,
     )
 
@@ -448,20 +466,20 @@ class LateModeTransforms(NamedTuple):
     """Fourier transforms and Taylor coefficients of the Chebyshev modes of late echoes."""
 
     mode_transforms: np.ndarray
-    """(modes, places): half the integral of T_j(x) exp(-i pi u x) over x = -1 .. 1. T_j is the
-    Chebyshev polynomial of mode j, u the distance from the line [bins of fs/L']. L' is the echo's
-    number of samples. The spreading kernel's transform is divided out.
+    """(modes, distances): half the integral of T_j(x) exp(-i pi u x) over x = -1 .. 1, divided by
+    the spreading kernel's transform. T_j is the Chebyshev polynomial of mode j, and u the distance
+    from the line [bins of fs/L'], with the echo's L' samples.
     """
     taylor_coefficients: np.ndarray
     """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of the modes at the record's end."""
 
 
-@lru_cache(maxsize=len(MODE_TIERS))
+@lru_cache(maxsize=len(LINE_SHAPE_TIERS))
 def _late_mode_transforms(tier: int) -> LateModeTransforms:
-    """Compute the :class:`LateModeTransforms` for an index ``tier`` in :data:`MODE_TIERS`."""
-    n_modes, clearance_bins, _ = MODE_TIERS[tier]
+    """Compute the :class:`LateModeTransforms` for an index ``tier`` in :data:`LINE_SHAPE_TIERS`."""
+    n_modes, clearance_bins, _ = LINE_SHAPE_TIERS[tier]
     half_count = math.ceil(
-        (1.02 * LENGTH_CLASS_RATIO * (clearance_bins + _LATE_TABLE_MARGIN_BINS) + 14)
+        (1.02 * ECHO_LENGTH_CLASS_RATIO * (clearance_bins + _LATE_TABLE_MARGIN_BINS) + 14)
         * _LATE_VALUES_PER_BIN
         + KERNEL_CELLS
     )
@@ -529,7 +547,7 @@ def full_line_shape_tables(
         record = w * np.exp(2j * np.pi * (psi - np.rint(psi)))
         record[: first_samples[s]] = 0.0
         squared_magnitude = np.abs(np.fft.fft(record, n_cells)) ** 2
-        _fill_full_envelope(
+        _fill_full_line_envelope(
             squared_magnitude, cells_per_bin, envelope.magnitude[s], envelope.square_integral[s]
         )
         if adds_powers:
@@ -555,21 +573,21 @@ def full_line_shape_tables(
             holds_all_bins=True,
             clearance_bins=nyquist_bin,
         ),
-        mode_transforms=_NO_TABLE,
+        mode_transforms=_NO_LINE_SHAPE_TABLE,
         first_sample_cosine=np.empty(0),
         first_sample_sine=np.empty(0),
-        mode_ends=_NO_ENDS,
+        mode_end_polynomials=_NO_END_POLYNOMIALS,
         envelope_distance=distance,
         cotangent_at_envelope_distance=_cotangents(distance, fft_size),
         full_table_re=table_re,
         full_table_im=table_im,
         full_envelope=envelope,
-        echo_lengths=_NO_LENGTHS,
-        taylor_coefficients=_NO_TABLE,
+        echo_lengths=_NO_ECHO_LENGTHS,
+        taylor_coefficients=_NO_LINE_SHAPE_TABLE,
     )
 
 
-def _fill_full_envelope(
+def _fill_full_line_envelope(
     squared_magnitude: np.ndarray,
     cells_per_bin: int,
     envelope_magnitude: np.ndarray,
@@ -647,7 +665,7 @@ def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
 @njit(cache=True, error_model="numpy", forceinline=True)
 def select_segment(shapes, segment):
     """Return the :class:`LineShape` of one segment; its arrays are views of ``shapes``."""
-    envelope, ends = shapes.envelope, shapes.ends
+    envelope, ends = shapes.envelope, shapes.end_polynomials
     return LineShape(
         shapes.table_re[segment],
         shapes.table_im[segment],
@@ -681,10 +699,10 @@ def copy_line_shape(shapes, from_segment, to_segment):
     _copy_values(source.table_im, target.table_im)
     _copy_values(source.envelope.magnitude, target.envelope.magnitude)
     _copy_values(source.envelope.square_integral, target.envelope.square_integral)
-    _copy_values(source.ends.start_re, target.ends.start_re)
-    _copy_values(source.ends.start_im, target.ends.start_im)
-    _copy_values(source.ends.end_re, target.ends.end_re)
-    _copy_values(source.ends.end_im, target.ends.end_im)
+    _copy_values(source.end_polynomials.start_re, target.end_polynomials.start_re)
+    _copy_values(source.end_polynomials.start_im, target.end_polynomials.start_im)
+    _copy_values(source.end_polynomials.end_re, target.end_polynomials.end_re)
+    _copy_values(source.end_polynomials.end_im, target.end_polynomials.end_im)
 
 
 def chebyshev_nodes(n_nodes: int) -> np.ndarray:
@@ -858,9 +876,9 @@ _POWER_SUMS_RE, _POWER_SUMS_IM = (
 )
 
 _CORRECTION_FACTORS = np.zeros((_EULER_MACLAURIN_ORDER_MAX + 1, _EULER_MACLAURIN_ORDER_MAX + 1))
-"""Factors in the Euler-Maclaurin correction of one end of the record, (d, i). The correction is a
-polynomial in -i theta, with the phase theta per sample. Its coefficient of power d is a sum over
-Taylor coefficients i."""
+"""Matrix (d, i) of the Euler-Maclaurin correction for one end of the record. It turns the Taylor
+coefficients i of the phasor there into the coefficients d of the correction, a polynomial in
+-i theta. theta is the phase per sample [rad]."""
 
 for _m, _coefficient in EULER_MACLAURIN_COEFFICIENTS.items():
     for _i in range(_m + 1):
@@ -909,7 +927,8 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
     coefficient_matrix
         :func:`chebyshev_coefficient_matrix`.
     modes
-        Output, :class:`ShapeModes` for up to nodes / 2 modes. ``n_modes`` is 0 if more are needed.
+        Output, :class:`PhaseErrorModes` for up to nodes / 2 modes. ``n_modes`` is 0 if more are
+        needed.
     """
     n_nodes = coefficient_matrix.shape[0]
     coefficients_re, coefficients_im = np.empty(n_nodes), np.empty(n_nodes)
@@ -933,7 +952,7 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
             while (
                 count > 1
                 and abs(coefficients_re[count - 1]) + abs(coefficients_im[count - 1])
-                < MODE_SIZE_MIN
+                < MODE_COEFFICIENT_MIN
             ):
                 count -= 1
             modes.n_modes[s, i] = count if count <= n_nodes // 2 else 0
@@ -942,7 +961,7 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def build_line_shape(segment, shape_index, previous_index, modes, tables, shape):
+def build_line_shape(segment, line_shape_index, previous_index, modes, tables, shape):
     """Compute one segment's line shape, the spectrum of a line of amplitude 1.
 
     The line shape is a sum of Chebyshev modes, or a copy of a table of all bins.
@@ -951,12 +970,12 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
     ----------
     segment
         Index of the segment: 0 up, 1 Doppler, 2 down.
-    shape_index
+    line_shape_index
         Index of the shape in ``modes``.
     previous_index
         Index of the shape that is in ``shape`` already, or -1. If both are equal, ``shape`` stays.
     modes
-        :class:`ShapeModes`.
+        :class:`PhaseErrorModes`.
     tables
         :class:`LineShapeTables`.
     shape
@@ -973,9 +992,13 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
     The transforms count both ends of the record half, but it has the sample at its start and not
     that at its end.
     """
-    layout, mode_transforms, mode_ends = tables.layout, tables.mode_transforms, tables.mode_ends
-    mode_re, mode_im = modes.re[segment, shape_index], modes.im[segment, shape_index]
-    n_modes = modes.n_modes[segment, shape_index]
+    layout, mode_transforms, mode_end_polynomials = (
+        tables.layout,
+        tables.mode_transforms,
+        tables.mode_end_polynomials,
+    )
+    mode_re, mode_im = modes.re[segment, line_shape_index], modes.im[segment, line_shape_index]
+    n_modes = modes.n_modes[segment, line_shape_index]
     if (
         previous_index >= 0
         and n_modes == 1
@@ -992,7 +1015,7 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
         _copy_values(envelope.square_integral[segment], shape.envelope.square_integral)
         return
     even_re, even_im, odd_re, odd_im = 0.0, 0.0, 0.0, 0.0  # T_j is 1 at the end, +-1 at the start
-    n_values, ends = mode_transforms.shape[1], shape.ends
+    n_values, ends = mode_transforms.shape[1], shape.end_polynomials
     transform_re, transform_im = np.zeros(n_values), np.zeros(n_values)
     _clear_end_polynomials(ends)
     for j in range(n_modes):
@@ -1006,11 +1029,11 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
             transform_re[i] += a * mode_transforms[j, i]
             transform_im[i] += b * mode_transforms[j, i]
         for d in range(N_END_COEFFICIENTS):
-            re, im = mode_ends.start_re[j, d], mode_ends.start_im[j, d]
+            re, im = mode_end_polynomials.start_re[j, d], mode_end_polynomials.start_im[j, d]
             ends.start_re[d] += mode_re[j] * re - mode_im[j] * im
             ends.start_im[d] += mode_re[j] * im + mode_im[j] * re
         for d in range(N_END_COEFFICIENTS):
-            re, im = mode_ends.end_re[j, d], mode_ends.end_im[j, d]
+            re, im = mode_end_polynomials.end_re[j, d], mode_end_polynomials.end_im[j, d]
             ends.end_re[d] += mode_re[j] * re - mode_im[j] * im
             ends.end_im[d] += mode_re[j] * im + mode_im[j] * re
     # The record's first sample counts whole, its end not at all.
@@ -1030,8 +1053,8 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
     for i in range(n_cells):
         squared_magnitude[i] = transform_re[i] * transform_re[i] + transform_im[i] * transform_im[i]
     if layout.adds_powers:
-        _fill_table(squared_magnitude, layout, shape.table_re)
-    _fill_envelope(squared_magnitude, layout, tables.cotangent_at_envelope_distance, shape)
+        _fill_line_shape_table(squared_magnitude, layout, shape.table_re)
+    _fill_line_envelope(squared_magnitude, layout, tables.cotangent_at_envelope_distance, shape)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1042,30 +1065,32 @@ def _clear_end_polynomials(ends):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def first_segment_of_same_shape(segment, shape_index, modes, echo_lengths, segment_exists):
+def first_segment_of_same_line_shape(
+    segment, line_shape_index, modes, echo_lengths, segment_exists
+):
     """Return the first segment before ``segment`` with the same line shape; -1 if there is none.
 
-    Two shapes are the same if their modes (:class:`ShapeModes`) and their numbers of samples in
-    ``echo_lengths`` (segments, shapes) are equal.
+    Two shapes are the same if their modes (:class:`PhaseErrorModes`) and their numbers of samples
+    in ``echo_lengths`` (segments, shapes) are equal.
     """
-    n_modes = modes.n_modes[segment, shape_index]
+    n_modes = modes.n_modes[segment, line_shape_index]
     for s in range(segment):
         if (
             not segment_exists[s]
-            or echo_lengths[s, shape_index] != echo_lengths[segment, shape_index]
+            or echo_lengths[s, line_shape_index] != echo_lengths[segment, line_shape_index]
         ):
             continue
-        is_same = modes.n_modes[s, shape_index] == n_modes
+        is_same = modes.n_modes[s, line_shape_index] == n_modes
         for j in range(n_modes):
-            is_same &= modes.re[s, shape_index, j] == modes.re[segment, shape_index, j]
-            is_same &= modes.im[s, shape_index, j] == modes.im[segment, shape_index, j]
+            is_same &= modes.re[s, line_shape_index, j] == modes.re[segment, line_shape_index, j]
+            is_same &= modes.im[s, line_shape_index, j] == modes.im[segment, line_shape_index, j]
         if is_same:
             return s
     return -1
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def build_late_line_shape(segment, shape_index, modes, tables, shape):
+def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
     """Compute the line shape of an echo that arrives after its record has begun.
 
     The line shape is the spectrum of a line of amplitude 1. The echo has ``tables.echo_lengths``
@@ -1084,9 +1109,9 @@ def build_late_line_shape(segment, shape_index, modes, tables, shape):
     """
     layout, mode_transforms = tables.layout, tables.mode_transforms
     taylor_coefficients = tables.taylor_coefficients
-    record_length = tables.echo_lengths[segment, shape_index]
-    mode_re, mode_im = modes.re[segment, shape_index], modes.im[segment, shape_index]
-    n_modes, ends = modes.n_modes[segment, shape_index], shape.ends
+    record_length = tables.echo_lengths[segment, line_shape_index]
+    mode_re, mode_im = modes.re[segment, line_shape_index], modes.im[segment, line_shape_index]
+    n_modes, ends = modes.n_modes[segment, line_shape_index], shape.end_polynomials
     half_length, sample_step = 0.5 * record_length, 2.0 / record_length
     length_ratio = record_length / layout.fft_size
     n_values, n_derivatives = mode_transforms.shape[1], END_DERIVATIVES_MAX + 1
@@ -1171,18 +1196,18 @@ def build_late_line_shape(segment, shape_index, modes, tables, shape):
             2.0 * half_length * sum_im + (a * sine + b * cosine) + (e * cosine - c * sine)
         )
     if not layout.adds_powers:
-        _fill_table(transform_re, layout, shape.table_re)
-        _fill_table(transform_im, layout, shape.table_im)
+        _fill_line_shape_table(transform_re, layout, shape.table_re)
+        _fill_line_shape_table(transform_im, layout, shape.table_im)
     squared_magnitude = transform_re
     for i in range(n_cells):
         squared_magnitude[i] = transform_re[i] * transform_re[i] + transform_im[i] * transform_im[i]
     if layout.adds_powers:
-        _fill_table(squared_magnitude, layout, shape.table_re)
-    _fill_envelope(squared_magnitude, layout, tables.cotangent_at_envelope_distance, shape)
+        _fill_line_shape_table(squared_magnitude, layout, shape.table_re)
+    _fill_line_envelope(squared_magnitude, layout, tables.cotangent_at_envelope_distance, shape)
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_table(values, layout, table):
+def _fill_line_shape_table(values, layout, table):
     """Divide a table by the spreading kernel's transform, then sort it by cell of a bin and by bin.
 
     ``values`` are at the distances of :func:`_cell_distances`. The result goes to ``table``.
@@ -1202,7 +1227,7 @@ def _fill_table(values, layout, table):
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_envelope(squared_magnitude, layout, cotangent_at_envelope_distance, shape):
+def _fill_line_envelope(squared_magnitude, layout, cotangent_at_envelope_distance, shape):
     """Fill the envelope of a shape from squared magnitudes at cells and from its end polynomials.
 
     The polynomials are used at distances outside the table. The squared magnitude varies over
@@ -1210,7 +1235,7 @@ def _fill_envelope(squared_magnitude, layout, cotangent_at_envelope_distance, sh
     values that are half a bin apart.
     """
     table_bins, cells_per_bin = layout.table_bins, layout.cells_per_bin
-    distance, ends = shape.envelope.distance, shape.ends
+    distance, ends = shape.envelope.distance, shape.end_polynomials
     magnitude, square_integral = shape.envelope.magnitude, shape.envelope.square_integral
     line_cell = table_bins * cells_per_bin + cells_per_bin - 1 + _TAP_REACH_CELLS
     half_bin_cells = cells_per_bin // 2

@@ -185,9 +185,11 @@ class PointParameters(NamedTuple):
     record_start: np.ndarray
     """Time from the start of a segment to the first sample of its record [s]."""
     up_carrier: np.ndarray
-    """Frequency at the start of the up segment [Hz]; its product with a delay is a phase."""
+    """Optical frequency at the start of the up segment [Hz]. Times a delay, it gives the echo's
+    phase [cycles]."""
     down_carrier: np.ndarray
-    """Frequency at the start of the down segment [Hz]; its product with a delay is a phase."""
+    """Optical frequency at the start of the down segment [Hz]. Times a delay, it gives the echo's
+    phase [cycles]."""
     noise_sigma: np.ndarray
     """Noise standard deviation per quadrature in a bin [V, summed over the record]."""
     threshold: np.ndarray
@@ -226,7 +228,8 @@ class SegmentParameters(NamedTuple):
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
+    """Optical frequency at the segment's start [Hz]. Times a delay, it gives the echo's phase
+    [cycles]."""
     whitening_gain: np.ndarray
     """Factor on the signal's amplitude in the spectrum whose noise is whitened."""
     range_decrease: np.ndarray
@@ -251,7 +254,8 @@ class BeatParameters(NamedTuple):
     chirp_rate: float
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: float
-    """Frequency at the segment's start [Hz]; its product with a delay is a phase."""
+    """Optical frequency at the segment's start [Hz]. Times a delay, it gives the echo's phase
+    [cycles]."""
     amplitude: float
     """Amplitude [V] of the beat of a line of relative amplitude 1, in the whitened spectrum."""
     detector_bandwidth: float

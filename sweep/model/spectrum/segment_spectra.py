@@ -60,7 +60,7 @@ from sweep.model.spectrum.leakage import (
     leakage_of_bins,
     leakage_of_bins_in_speckle,
 )
-from sweep.model.spectrum.line_shape import LineShapeTables, ShapeModes
+from sweep.model.spectrum.line_shape import LineShapeTables, PhaseErrorModes
 from sweep.model.spectrum.lines import (
     AMPLITUDE_TOLERANCES,
     COMPLEX_RECORD,
@@ -99,8 +99,8 @@ THRESHOLD_RATIO_STEP = 1e-7
 """Step to which the threshold over the noise sigma is rounded. Rates of false alarms due to leaked
 signal in developed speckle are tabulated per rounded threshold."""
 
-SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
-"""Names of the values that :func:`evaluate_segments` returns for each segment's spectrum."""
+SEGMENT_RESULT_NAMES = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
+"""Names of the results of :func:`evaluate_segments`, in the order of its second axis."""
 
 NO_LEAKAGE, LEAKAGE_BY_INTEGRAL, LEAKAGE_BIN_BY_BIN = range(3)
 """Methods for the probability of false alarms due to leaked signal. The first computes none. The
@@ -173,7 +173,7 @@ class SegmentSpectrum(NamedTuple):
     """(bins,): magnitude of the spectrum without noise [V, summed over the record]."""
 
 
-class ShapeGroup(NamedTuple):
+class LineShapeGroup(NamedTuple):
     """Points whose line shapes are computed from the same tables.
 
     A line shape is the spectrum of a line of amplitude 1.
@@ -181,22 +181,22 @@ class ShapeGroup(NamedTuple):
 
     point_numbers: np.ndarray
     """(m,): indices of the points in the shots."""
-    shape_index: np.ndarray
+    line_shape_index: np.ndarray
     """(m,): index in ``modes`` of each point's line shape."""
     tables: LineShapeTables
     """Tables from which the line shapes are computed."""
-    modes: ShapeModes
+    modes: PhaseErrorModes
     """Chebyshev coefficients of the phase errors of the line shapes."""
     is_late: bool = False
     """True if some echoes arrive after the record has begun and lack its first samples."""
 
 
-class DistinctShapes(NamedTuple):
+class DistinctLineShapes(NamedTuple):
     """One point for each line shape that occurs in a batch of points."""
 
     point_numbers: np.ndarray
     """(shapes,): index in the shots of one point with each line shape."""
-    shape_index: np.ndarray
+    line_shape_index: np.ndarray
     """(m,): index of each point's line shape in ``point_numbers``."""
 
 
@@ -211,17 +211,17 @@ class EvaluationSettings(NamedTuple):
     """
     window_sum: float
     """Sum of the window's samples, the peak of its transform."""
-    rule: DetectionRule
+    detection_rule: DetectionRule
     """Rule by which the bins of an echo detect it."""
     speckle_table: SpeckleTable
     """Speckle of the echoes of all points."""
-    with_pd: bool
+    computes_pd: bool
     """True if probabilities of detection are computed; otherwise they are nan."""
     phase_limits: np.ndarray
     """Table of :func:`sweep.model.spectrum.lines.node_phase_limits` for the record's window. It
     gives the number of equivalent lines that replace all lines.
     """
-    tangents: np.ndarray
+    bin_tangents: np.ndarray
     """(N // 2 + 1,): tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N."""
 
 
@@ -238,9 +238,9 @@ def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
     Returns
     -------
     ndarray (3, fields, n)
-        Values by segment and by SEGMENT_FIELDS; nan for segments that do not exist.
+        Values by segment and by SEGMENT_RESULT_NAMES; nan for segments that do not exist.
     """
-    results = np.full((3, len(SEGMENT_FIELDS), shots.size), np.nan)
+    results = np.full((3, len(SEGMENT_RESULT_NAMES), shots.size), np.nan)
     bin_width = (shots.sample_rate / shots.fft_size) + np.zeros(shots.size)
     for spans in iter_spans(shots, bin_by_bin=bin_by_bin, keeps_magnitudes=False):
         for s in np.flatnonzero(shots.has_segment):
@@ -268,7 +268,7 @@ def iter_spans(
     bin_by_bin: bool = False,
     keeps_magnitudes: bool = True,
     ignores_band: bool = False,
-    with_pd: bool = True,
+    computes_pd: bool = True,
 ) -> Iterator[BinSpans]:
     """Yield the spectra around the lines of all points, some points at a time, in any order.
 
@@ -290,7 +290,7 @@ def iter_spans(
         False if magnitudes are not needed.
     ignores_band : bool
         True to include bins that are not searched.
-    with_pd : bool
+    computes_pd : bool
         False if probabilities of detection are not needed; they are then nan.
 
     Yields
@@ -300,12 +300,12 @@ def iter_spans(
     """
     parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()
     # Else probabilities are set from the final spans.
-    computes_pd_at_once = with_pd and pd_follows_from_computed_spans(shots)
+    computes_pd_at_once = computes_pd and pd_follows_from_computed_spans(shots)
     point_levels = (
         parameters.threshold if level_min is None else np.broadcast_to(level_min, shots.size)
     )
     chosen_points = np.arange(shots.size) if points is None else points
-    for group in _iter_shape_groups(shots, chosen_points):
+    for group in _iter_line_shape_groups(shots, chosen_points):
         leakage_method = _leakage_method(shots, group, bin_by_bin) if leakage else NO_LEAKAGE
         negligible_magnitude = (
             parameters.negligible_signal_ratio * parameters.noise_sigma
@@ -339,7 +339,7 @@ def iter_spans(
             )
             if shots.looks.is_noncoherent and leakage_method:
                 spans = _leakage_in_looks(shots, spans)
-            if with_pd:
+            if computes_pd:
                 spans = detect_in_spans(shots, spans)
             yield (spans if shots.permanent_line is None else apply_permanent_line(shots, spans))
 
@@ -440,7 +440,7 @@ def segment_spectrum(
         level_min=np.array([level_min]),
         leakage=False,
         ignores_band=True,
-        with_pd=False,
+        computes_pd=False,
     )
     first_bin = int(spans.first_bin[segment, 0])
     magnitude = spans.span_magnitudes(segment, 0).copy()
@@ -469,7 +469,7 @@ def spectrum_type(shots: Shots) -> int:
     )
 
 
-def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
+def _leakage_method(shots: Shots, group: LineShapeGroup, bin_by_bin: bool) -> int:
     """Return the method by which the leakage of a group of points is computed, such as NO_LEAKAGE.
 
     ``bin_by_bin`` excludes LEAKAGE_BY_INTEGRAL.
@@ -490,12 +490,12 @@ def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
     return LEAKAGE_BIN_BY_BIN
 
 
-def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
+def _iter_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[LineShapeGroup]:
     """Yield groups of points whose line shapes are computed from the same tables, in any order."""
     if shots.echo_record.n_samples_before is not None:
         segment_exists = shots.has_segment
         is_late = (shots.echo_record.n_samples_before[segment_exists][:, points] > 0).any(axis=0)
-        yield from _iter_late_shape_groups(shots, points[is_late])
+        yield from _iter_late_line_shape_groups(shots, points[is_late])
         points = points[~is_late]
     window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     has_modes = line_shape.window_has_modes(window, fft_size)
@@ -510,33 +510,33 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
     if not shots.echo_record.phase_errors:
         make_tables = line_shape.line_shape_tables if has_modes else _tables_without_phase_error
         tables = make_tables(window, fft_size, adds_powers, 0 if has_modes else segments)
-        modes = line_shape.zero_modes(segments, 1, 1)
+        modes = line_shape.zero_phase_error_modes(segments, 1, 1)
         modes.re[:], modes.n_modes[:] = 1.0, 1
         for batch_begin in range(0, points.size, batch_size):
             batch = points[batch_begin : batch_begin + batch_size]
-            yield ShapeGroup(batch, 0 * batch, tables, modes)
+            yield LineShapeGroup(batch, 0 * batch, tables, modes)
         return
     for batch_begin in range(0, points.size, batch_size):
         batch = points[batch_begin : batch_begin + batch_size]
-        distinct_points, shape_index = _find_distinct_shapes(shots, batch)
+        distinct_points, line_shape_index = _find_distinct_line_shapes(shots, batch)
         remaining = np.arange(distinct_points.size)
-        for tier in range(len(line_shape.MODE_TIERS) if has_modes else 0):
-            n_nodes = 2 * line_shape.MODE_TIERS[tier][0]
+        for tier in range(len(line_shape.LINE_SHAPE_TIERS) if has_modes else 0):
+            n_nodes = 2 * line_shape.LINE_SHAPE_TIERS[tier].n_modes_max
             phase = _phase_errors(
                 shots, distinct_points[remaining], line_shape.chebyshev_nodes(n_nodes)
             )
-            modes = line_shape.zero_modes(segments, phase.shape[1], n_nodes // 2)
+            modes = line_shape.zero_phase_error_modes(segments, phase.shape[1], n_nodes // 2)
             line_shape.decompose_phase_errors(
                 phase, _NO_WINDOW, line_shape.chebyshev_coefficient_matrix(n_nodes), modes
             )
             is_resolved = np.asarray((modes.n_modes > 0).all(axis=0))
             table_index = np.full(distinct_points.size, -1)
             table_index[remaining[is_resolved]] = np.arange(np.count_nonzero(is_resolved))
-            members = table_index[shape_index] >= 0
+            members = table_index[line_shape_index] >= 0
             if members.any():
-                yield _sort_by_shape(
+                yield _sort_by_line_shape(
                     batch[members],
-                    table_index[shape_index[members]],
+                    table_index[line_shape_index[members]],
                     line_shape.line_shape_tables(
                         window,
                         fft_size,
@@ -554,12 +554,12 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
             phase = _phase_errors(
                 shots, distinct_points[distinct : distinct + 1], record_positions
             )[:, 0]
-            members = batch[shape_index == distinct]
-            yield ShapeGroup(
+            members = batch[line_shape_index == distinct]
+            yield LineShapeGroup(
                 members,
                 0 * members,
                 line_shape.full_line_shape_tables(window, fft_size, adds_powers, phase),
-                _unused_modes(segments),
+                _unused_phase_error_modes(segments),
             )
 
 
@@ -567,14 +567,14 @@ _NO_WINDOW = np.empty((0, 0, 0))
 """Empty array of window values, for Chebyshev modes that do not include the window."""
 
 
-def _unused_modes(segments: int) -> ShapeModes:
+def _unused_phase_error_modes(segments: int) -> PhaseErrorModes:
     """Return one Chebyshev mode of amplitude 0, for line shapes that are not sums of modes."""
-    modes = line_shape.zero_modes(segments, 1, 1)
+    modes = line_shape.zero_phase_error_modes(segments, 1, 1)
     modes.n_modes[:] = 1
     return modes
 
 
-def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
+def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[LineShapeGroup]:
     """Yield groups of points with late echoes and common tables of line shapes, in any order."""
     window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     segment_exists, segments = shots.has_segment, len(shots.waveform_segments)
@@ -585,29 +585,31 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
     if lacks_echo.any():
         tables = _tables_without_echo(window, fft_size, adds_powers, segments)
         batch = points[lacks_echo]
-        yield ShapeGroup(batch, 0 * batch, tables, _unused_modes(segments), is_late=True)
+        yield LineShapeGroup(
+            batch, 0 * batch, tables, _unused_phase_error_modes(segments), is_late=True
+        )
         points = points[~lacks_echo]
     for batch_begin in range(0, points.size, POINTS_PER_BATCH):
         batch = points[batch_begin : batch_begin + POINTS_PER_BATCH]
-        distinct_points, shape_index = _find_distinct_shapes(shots, batch)
+        distinct_points, line_shape_index = _find_distinct_line_shapes(shots, batch)
         echo_lengths = window.length - shots.echo_record.n_samples_before[:, distinct_points]
         echo_lengths[~segment_exists] = echo_lengths[segment_exists][0]
         length_min, length_max = echo_lengths.min(axis=0), echo_lengths.max(axis=0)
-        length_classes = line_shape.late_length_class(window, length_min)
+        length_classes = line_shape.late_echo_length_classes(window, length_min)
         is_remaining = np.ones(distinct_points.size, np.bool_)
-        for tier in range(len(line_shape.MODE_TIERS)):
+        for tier in range(len(line_shape.LINE_SHAPE_TIERS)):
             is_tried = is_remaining & line_shape.late_echo_has_modes(
                 window, fft_size, tier, length_min, length_max
             )
             for length_class in np.unique(length_classes[is_tried]).tolist():
                 selected = np.flatnonzero(is_tried & (length_classes == length_class))
-                n_nodes = 2 * line_shape.MODE_TIERS[tier][0]
+                n_nodes = 2 * line_shape.LINE_SHAPE_TIERS[tier].n_modes_max
                 record_positions = line_shape.chebyshev_nodes(n_nodes)
                 phase = _phase_errors(shots, distinct_points[selected], record_positions)
                 window_values = line_shape.late_window_samples(
                     window, record_positions, echo_lengths[:, selected]
                 )
-                modes = line_shape.zero_modes(segments, phase.shape[1], n_nodes // 2)
+                modes = line_shape.zero_phase_error_modes(segments, phase.shape[1], n_nodes // 2)
                 line_shape.decompose_phase_errors(
                     phase, window_values, line_shape.chebyshev_coefficient_matrix(n_nodes), modes
                 )
@@ -615,7 +617,7 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
                 table_index = np.full(distinct_points.size, -1)
                 table_index[selected[is_resolved]] = np.arange(np.count_nonzero(is_resolved))
                 is_remaining[selected[is_resolved]] = False
-                members = table_index[shape_index] >= 0
+                members = table_index[line_shape_index] >= 0
                 if members.any():
                     tables = line_shape.late_line_shape_tables(
                         window, fft_size, adds_powers, tier, length_class
@@ -623,15 +625,15 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
                     tables = tables._replace(
                         echo_lengths=np.ascontiguousarray(echo_lengths[:, selected[is_resolved]])
                     )
-                    group = _sort_by_shape(
+                    group = _sort_by_line_shape(
                         batch[members],
-                        table_index[shape_index[members]],
+                        table_index[line_shape_index[members]],
                         tables,
                         modes.select(is_resolved),
                     )
                     yield group._replace(is_late=True)
         for distinct in np.flatnonzero(is_remaining):  # shapes whose tables hold all bins
-            selected = batch[shape_index == distinct]
+            selected = batch[line_shape_index == distinct]
             first_sample = window.length - echo_lengths[:, distinct]
             phase = np.zeros((segments, window.length))
             for s in np.flatnonzero(segment_exists & (echo_lengths[:, distinct] > 0)):
@@ -641,13 +643,13 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
                 phase[s, first_sample[s] :] = _phase_errors(
                     shots, distinct_points[distinct : distinct + 1], record_positions
                 )[s, 0]
-            yield ShapeGroup(
+            yield LineShapeGroup(
                 selected,
                 0 * selected,
                 line_shape.full_line_shape_tables(
                     window, fft_size, adds_powers, phase, first_sample
                 ),
-                _unused_modes(segments),
+                _unused_phase_error_modes(segments),
                 is_late=True,
             )
 
@@ -671,21 +673,21 @@ def _tables_without_echo(
     return line_shape.full_line_shape_tables(window, fft_size, adds_powers, phase, first_sample)
 
 
-def _sort_by_shape(
+def _sort_by_line_shape(
     points: np.ndarray,
-    shape_index: np.ndarray,
+    line_shape_index: np.ndarray,
     tables: LineShapeTables,
-    modes: ShapeModes,
-) -> ShapeGroup:
-    """Return a :class:`ShapeGroup` whose points are sorted by line shape.
+    modes: PhaseErrorModes,
+) -> LineShapeGroup:
+    """Return a :class:`LineShapeGroup` whose points are sorted by line shape.
 
     Each line shape is then computed only once.
     """
-    order = np.argsort(shape_index, kind="stable")
-    return ShapeGroup(points[order], shape_index[order], tables, modes)
+    order = np.argsort(line_shape_index, kind="stable")
+    return LineShapeGroup(points[order], line_shape_index[order], tables, modes)
 
 
-def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
+def _find_distinct_line_shapes(shots: Shots, batch: np.ndarray) -> DistinctLineShapes:
     """Return one point for each line shape that occurs in a batch of points.
 
     A line shape is the spectrum of a line of amplitude 1.
@@ -712,11 +714,11 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
     )
     first_varying = next(varying, None)
     if first_varying is None:
-        return DistinctShapes(batch[:1], np.zeros(batch.size, np.int64))
+        return DistinctLineShapes(batch[:1], np.zeros(batch.size, np.int64))
     if not shots.echo_record.shares_phase_errors:
-        return DistinctShapes(batch, np.arange(batch.size))
-    first_of_shape, shape_index = distinct_rows([first_varying, *varying])
-    return DistinctShapes(batch[first_of_shape], shape_index)
+        return DistinctLineShapes(batch, np.arange(batch.size))
+    first_of_shape, line_shape_index = distinct_rows([first_varying, *varying])
+    return DistinctLineShapes(batch[first_of_shape], line_shape_index)
 
 
 def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray) -> np.ndarray:
@@ -739,11 +741,11 @@ def _evaluate_batch(
     parameters: PointParameters,
     parameters_by_segment: SegmentParameters,
     lowest_levels: np.ndarray,
-    group: ShapeGroup,
+    group: LineShapeGroup,
     leakage_method: int,
     batch_begin: int,
     keeps_magnitudes: bool,
-    with_pd: bool,
+    computes_pd: bool,
 ) -> BinSpans:
     """Compute the spectra around the lines for the next batch of points of a group.
 
@@ -780,7 +782,7 @@ def _evaluate_batch(
         lowest_levels,
         beamlet_arrays(shots.beamlet_table),
         np.ascontiguousarray(shots.footprint.row_of_point, np.int64),
-        np.ascontiguousarray(group.shape_index[batch_begin:]),
+        np.ascontiguousarray(group.line_shape_index[batch_begin:]),
         shifts,
         group.modes,
         tables._replace(layout=tables.layout._replace(spectrum_type=spectrum_type(shots))),
@@ -790,11 +792,11 @@ def _evaluate_batch(
                 [leakage_method * segment.includes_leakage for segment in shots.waveform_segments]
             ),
             window_sum=shots.window.sum,
-            rule=shots.detection_rule,
+            detection_rule=shots.detection_rule,
             speckle_table=shots.speckle_table,
-            with_pd=with_pd,
+            computes_pd=computes_pd,
             phase_limits=_group_node_limits(shots, group),
-            tangents=bin_tangents(shots.fft_size),
+            bin_tangents=bin_tangents(shots.fft_size),
         ),
         line_shape.allocate_line_shapes(tables, segments),
         allocate_workspace(width),
@@ -818,7 +820,7 @@ def _evaluate_batch(
     )
 
 
-def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
+def _group_node_limits(shots: Shots, group: LineShapeGroup) -> np.ndarray:
     """Return the table that gives the number of equivalent lines for a group of points.
 
     The table is that of :func:`sweep.model.spectrum.lines.node_phase_limits`. For late echoes it
@@ -878,7 +880,7 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def _copy_lines(lines, n_lines, shifts):
+def _copy_lines_to_shifts(lines, n_lines, shifts):
     """Copy lines to several shifted frequencies; return the number of all copies.
 
     The powers of the lines add. The copies average the power spectrum over the shifts.
@@ -902,7 +904,7 @@ def _copy_lines(lines, n_lines, shifts):
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def _prepare_lines(
+def _compute_equivalent_lines(
     beat,
     segment,
     footprint_row,
@@ -982,7 +984,7 @@ def _prepare_lines(
     n_copies = shifts.offset.size if adds_powers else 0
     for copy_pass in range(2 if n_copies else 1):
         if copy_pass == 1:
-            n_lines = _copy_lines(lines, n_lines, shifts)
+            n_lines = _copy_lines_to_shifts(lines, n_lines, shifts)
             summary = summarise_lines(lines, n_lines, adds_powers, scratch.batch)
         half_width = 0.5 * (summary.highest_position - summary.lowest_position)
         if n_lines > 2 and bin_error_allowed > 0.0:
@@ -1020,7 +1022,7 @@ def _store_span(start, n_bins, span, magnitudes, is_exempt):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _late_beat(beat, n_missing_samples):
+def _beat_parameters_of_late_echo(beat, n_missing_samples):
     """Return the beat parameters of an echo that lacks the record's first ``n_missing_samples``."""
     return BeatParameters(
         beat.range,
@@ -1038,7 +1040,7 @@ def _late_beat(beat, n_missing_samples):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _late_layout(layout, n_samples):
+def _layout_of_late_echo(layout, n_samples):
     """Return the layout of a spectrum for an echo with ``n_samples`` of the record's samples."""
     return SpectrumLayout(
         layout.fft_size,
@@ -1053,11 +1055,11 @@ def _late_layout(layout, n_samples):
 
 
 @njit(cache=True, error_model="numpy")
-def _build_shapes(shape_index, built_index, modes, tables, segment_exists, shapes):
+def _build_line_shapes(line_shape_index, built_index, modes, tables, segment_exists, shapes):
     """Compute the line shapes of all segments of a point into ``shapes``.
 
-    ``shape_index`` is the index of the line shape in ``modes``. ``built_index`` is that of the line
-    shape that is in ``shapes`` already, or -1.
+    ``line_shape_index`` is the index of the line shape in ``modes``. ``built_index`` is that of the
+    line shape that is in ``shapes`` already, or -1.
     """
     is_late = tables.echo_lengths.size > 0
     for s in range(segment_exists.size):
@@ -1065,15 +1067,15 @@ def _build_shapes(shape_index, built_index, modes, tables, segment_exists, shape
             continue
         shape = line_shape.select_segment(shapes, s)
         if not is_late:
-            line_shape.build_line_shape(s, shape_index, built_index, modes, tables, shape)
+            line_shape.build_line_shape(s, line_shape_index, built_index, modes, tables, shape)
             continue
-        same_segment = line_shape.first_segment_of_same_shape(
-            s, shape_index, modes, tables.echo_lengths, segment_exists
+        same_segment = line_shape.first_segment_of_same_line_shape(
+            s, line_shape_index, modes, tables.echo_lengths, segment_exists
         )
         if same_segment >= 0:
             line_shape.copy_line_shape(shapes, same_segment, s)
         else:
-            line_shape.build_late_line_shape(s, shape_index, modes, tables, shape)
+            line_shape.build_late_line_shape(s, line_shape_index, modes, tables, shape)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
@@ -1086,7 +1088,7 @@ def _evaluate_segment(
     lowest_levels,
     beamlets,
     footprint_row,
-    shape_index,
+    line_shape_index,
     averaging_shifts,
     modes,
     tables,
@@ -1109,7 +1111,7 @@ def _evaluate_segment(
     next_start
         Index of the next span's first bin; SPAN_DOES_NOT_FIT if this span does not fit.
     """
-    point, rule, span = spans.point_numbers[i], settings.rule, workspace.span
+    point, rule, span = spans.point_numbers[i], settings.detection_rule, workspace.span
     leakage_method = settings.leakage_methods[s]
     noise_sigma, threshold = parameters.noise_sigma[point], parameters.threshold[point]
     image_gain = parameters.image_gain[point]
@@ -1135,9 +1137,9 @@ def _evaluate_segment(
     beat = beat_parameters_at(parameters, parameters_by_segment, s, point)
     layout = tables.layout
     if tables.echo_lengths.size > 0:  # the samples that a late echo has are a record of their own
-        n_samples = tables.echo_lengths[s, shape_index[i]]
-        beat = _late_beat(beat, layout.record_length - n_samples)
-        layout = _late_layout(layout, n_samples)
+        n_samples = tables.echo_lengths[s, line_shape_index[i]]
+        beat = _beat_parameters_of_late_echo(beat, layout.record_length - n_samples)
+        layout = _layout_of_late_echo(layout, n_samples)
     n_shifts = 0
     while (
         n_shifts < averaging_shifts.weight.shape[2] and averaging_shifts.weight[i, s, n_shifts] != 0
@@ -1146,12 +1148,12 @@ def _evaluate_segment(
     shifts = AveragingShifts(
         averaging_shifts.offset[i, s, :n_shifts], averaging_shifts.weight[i, s, :n_shifts]
     )
-    bundle = _prepare_lines(
+    bundle = _compute_equivalent_lines(
         beat,
         s,
         footprint_row[point],
         beamlets,
-        modes.line_shift[s, shape_index[i]],
+        modes.line_shift[s, line_shape_index[i]],
         shifts,
         image_gain,
         settings.window_sum,
@@ -1170,7 +1172,7 @@ def _evaluate_segment(
             lobe_half_width,
             shape,
             layout,
-            settings.tangents,
+            settings.bin_tangents,
             workspace,
             crossing_series,
             speckle_rates,
@@ -1186,7 +1188,7 @@ def _evaluate_segment(
             AveragingShifts(shifts.offset[:n_averaged], shifts.weight[:n_averaged]),
             shape,
             layout,
-            settings.tangents,
+            settings.bin_tangents,
             workspace,
         )
     first_bin, n_bins = detected.first_bin, detected.n_bins
@@ -1205,7 +1207,7 @@ def _evaluate_segment(
         spans.span_start[s, i] = next_start
         next_start = _store_span(next_start, n_bins, span, spans.magnitudes, spans.is_exempt)
     detection = Detection(np.nan, np.nan)
-    if settings.with_pd:
+    if settings.computes_pd:
         detection = pd_and_miss(
             EchoBins(span.magnitude[:n_bins], span.is_exempt[:n_bins], first_bin),
             detected.peak_index,
@@ -1261,7 +1263,7 @@ def _evaluate_points(
     lowest_levels,
     beamlets,
     footprint_row,
-    shape_index,
+    line_shape_index,
     averaging_shifts,
     modes,
     tables,
@@ -1288,13 +1290,13 @@ def _evaluate_points(
         :class:`sweep.model.spectrum.lines.BeamletArrays` of all footprints.
     footprint_row
         (n,): row of each point's footprint in ``beamlets``.
-    shape_index
+    line_shape_index
         (m,): index of each point's line shape in ``modes``.
     averaging_shifts
         :class:`sweep.model.spectrum.bin_spectrum.AveragingShifts` (m, segments, shifts). Shifts of
         weight 0 are the last ones.
     modes
-        :class:`sweep.model.spectrum.line_shape.ShapeModes`.
+        :class:`sweep.model.spectrum.line_shape.PhaseErrorModes`.
     tables
         :class:`sweep.model.spectrum.line_shape.LineShapeTables`, whose layout has the type of the
         spectra.
@@ -1312,16 +1314,16 @@ def _evaluate_points(
         :class:`BinSpans` of the m points in ``spans.point_numbers``; the other fields are results.
         If ``spans.magnitudes`` is empty, no magnitudes are stored.
     """
-    next_start, rule = np.int64(0), settings.rule
+    next_start, rule = np.int64(0), settings.detection_rule
     rate_grid = RateTableGrid(0.0, 1.0, np.int64(0), np.int64(0))
     previous_ratio, built_index = -1.0, np.int64(-1)  # numba would compile anew for a literal -1
     for i in range(spans.point_numbers.size):
         point = spans.point_numbers[i]
-        if shape_index[i] != built_index:
-            _build_shapes(
-                shape_index[i], built_index, modes, tables, settings.segment_exists, shapes
+        if line_shape_index[i] != built_index:
+            _build_line_shapes(
+                line_shape_index[i], built_index, modes, tables, settings.segment_exists, shapes
             )
-            built_index = shape_index[i]
+            built_index = line_shape_index[i]
         threshold_ratio = parameters.threshold[point] / parameters.noise_sigma[point]
         if rule.in_speckle:
             threshold_ratio = _rounded_threshold_ratio(threshold_ratio)
@@ -1341,7 +1343,7 @@ def _evaluate_points(
                     lowest_levels,
                     beamlets,
                     footprint_row,
-                    shape_index,
+                    line_shape_index,
                     averaging_shifts,
                     modes,
                     tables,

@@ -46,14 +46,14 @@ from sweep.model.spectrum.search_restriction import span_leakage_probability
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 GAUSS_ORDER = 4
-"""Number of Gauss quadrature points in each interval of INTERVAL_EDGES."""
-INTERVAL_EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7.5, 9.5, 12, 15, 19, 24, 30, 37.0])
+"""Number of Gauss quadrature points in each interval of QUADRATURE_INTERVAL_EDGES."""
+QUADRATURE_INTERVAL_EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7.5, 9.5, 12, 15, 19, 24, 30, 37.0])
 """Edges of the quadrature intervals of z^2 / (2 sigma^2), with the magnitude z and the noise sigma.
 They count from the threshold, or from ln n - 4 if that is larger. Below it n bins of noise
 certainly contain a larger magnitude."""
 UP, DOPPLER, DOWN = range(3)
 """Indices of the segments in arrays by segment."""
-THRESHOLD_LEVEL = 0
+THRESHOLD_LEVEL_INDEX = 0
 """Index of the detection threshold among the magnitude levels of a segment."""
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(GAUSS_ORDER)
@@ -222,7 +222,8 @@ def _level_half_squares(shots: Shots, spans: BinSpans, threshold_ratio: np.ndarr
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)
     first_half_square = np.maximum(threshold_half_square, np.log(np.maximum(n_bins, 1.0)) - 4)
     inner = (
-        INTERVAL_EDGES[:-1, None] + np.diff(INTERVAL_EDGES)[:, None] * 0.5 * (_GAUSS_NODES + 1)
+        QUADRATURE_INTERVAL_EDGES[:-1, None]
+        + np.diff(QUADRATURE_INTERVAL_EDGES)[:, None] * 0.5 * (_GAUSS_NODES + 1)
     ).ravel()
     first = np.broadcast_to(threshold_half_square, first_half_square.shape)[..., None]
     return np.concatenate([first, first_half_square[..., None] + inner], axis=-1)
@@ -356,7 +357,7 @@ def _evaluate_levels(
                         ),
                         bin_speckle_at(speckle_table, s, spans.point_numbers[j]),
                     )
-                    if k == THRESHOLD_LEVEL:
+                    if k == THRESHOLD_LEVEL_INDEX:
                         at_threshold = at_level
                     # The difference of the smaller probabilities keeps its digits.
                     loss_at_level = at_threshold.pd - at_level.pd
@@ -370,7 +371,7 @@ def _evaluate_levels(
                         level,
                         bin_threshold.noise_without_pedestal,
                         negligible_signal_ratio[j],
-                        levels[s, j, THRESHOLD_LEVEL],
+                        levels[s, j, THRESHOLD_LEVEL_INDEX],
                         rule.sidelobe_correlation,
                     )
                     p_leak = min(p_leak, 1.0 - 1e-16)
@@ -393,13 +394,13 @@ def _fill_joint_excess(up, down, squared_correlation, joint_excess):
         (m,): result.
     """
     for j in range(joint_excess.size):
-        up_alarm = 1.0 - up.probability[j, THRESHOLD_LEVEL]
-        down_alarm, total = 1.0 - down.probability[j, THRESHOLD_LEVEL], 0.0
+        up_alarm = 1.0 - up.probability[j, THRESHOLD_LEVEL_INDEX]
+        down_alarm, total = 1.0 - down.probability[j, THRESHOLD_LEVEL_INDEX], 0.0
         for k in range(up.probability.shape[1]):
-            for i in range(1 if k == THRESHOLD_LEVEL else 0, down.probability.shape[1]):
+            for i in range(1 if k == THRESHOLD_LEVEL_INDEX else 0, down.probability.shape[1]):
                 probability = up.probability[j, k] * down.probability[j, i]
-                if probability > 1e-9 * (up_alarm if k != THRESHOLD_LEVEL else 1.0) * (
-                    down_alarm if i != THRESHOLD_LEVEL else 1.0
+                if probability > 1e-9 * (up_alarm if k != THRESHOLD_LEVEL_INDEX else 1.0) * (
+                    down_alarm if i != THRESHOLD_LEVEL_INDEX else 1.0
                 ):
                     squared_product = min(
                         squared_correlation[j] * up.echo_fraction[j, k] * down.echo_fraction[j, i],

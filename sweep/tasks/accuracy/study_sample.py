@@ -37,7 +37,7 @@ from sweep.spec import Axis, GridSpec, SceneSpec
 from sweep.storage.accuracy_setting_kinds import AS_WRITTEN_KIND
 from sweep.tasks.accuracy.settings import AccuracySetting, AnySpec
 from sweep.tasks.engine.blocks import Results
-from sweep.tasks.studies.eyepoint_study import build_world
+from sweep.tasks.studies.eyepoint_study import get_built_scene
 from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy, SelectedEffects, evaluate_points
 from sweep.tasks.studies.parameter_grid import (
@@ -619,7 +619,7 @@ class FlightSample(StudySample):
         """Return the flight study that an accuracy setting gives."""
         spec: Any = setting.apply_to(self.spec)
         # all studies share a scene, as building it can take seconds
-        study = FlightStudy(spec, Path("nowhere.zarr"), build_world(self.spec))
+        study = FlightStudy(spec, Path("nowhere.zarr"), get_built_scene(self.spec))
         if setting.rays_error_max:
             study.ray_error_budget = ErrorBudget(setting.rays_error_max, rays_tolerance_min=0.0)
         return study

@@ -50,16 +50,16 @@ RAYS_PER_CAST_MAX = 1 << 18
 SAMPLED_RAYS_MAX = 1 << 19
 
 #: Number of nodes of a scene's map along the longer side, and least number along the shorter side.
-MAP_NODES_MAX = 256
-MAP_NODES_MIN = 16
+TERRAIN_MAP_NODES_MAX = 256
+TERRAIN_MAP_NODES_MIN = 16
 
 #: Number of shots of each scanner, or of times, that sample the extent of a flight; and the margin
 #: of the map around it, as a fraction of the extent.
-FLIGHT_SAMPLE_POINTS = 512
-MAP_MARGIN_FRACTION = 0.08
+SAMPLED_FLIGHT_TIMES = 512
+TERRAIN_MAP_MARGIN_FRACTION = 0.08
 
 #: Height above scene and flight from which rays are cast down to map the ground [m].
-MAP_VIEWPOINT_CLEARANCE = 1.0
+TERRAIN_MAP_VIEWPOINT_CLEARANCE = 1.0
 
 #: Largest height above ground at which a platform counts as standing on it [m].
 GROUND_CONTACT_DISTANCE_MAX = 1e-6
@@ -71,7 +71,7 @@ VECTOR_DIM_SIZES = {"xyz": 3, "xyz_again": 3}
 class EyepointStudy(BlockStudy):
     """Study of the eyepoints (geometry found by rays) of a flight's shots through one scanner.
 
-    `n_beamlets` and `world` are by default those of the spec.
+    `n_beamlets` and `built_scene` are by default those of the spec.
     """
 
     points_noun = "shots"
@@ -82,9 +82,9 @@ class EyepointStudy(BlockStudy):
         spec: SceneSpec,
         scanner: str,
         n_beamlets: int | None = None,
-        world: BuiltScene | None = None,
+        built_scene: BuiltScene | None = None,
     ) -> None:
-        self.spec, self.scanner, self._world = spec, scanner, world
+        self.spec, self.scanner, self._built_scene = spec, scanner, built_scene
         self.n_cycles = spec.number_of_cycles(scanner)
         self.shots_per_cycle = spec.shots_per_cycle(scanner)
         self.n_beamlets = n_beamlets or int(spec.parameters()["footprint.beamlets"])
@@ -240,11 +240,11 @@ class EyepointStudy(BlockStudy):
         """
         from sweep.model.pointcloud.eyepoints import compute_eyepoints
 
-        world = self.world
+        built_scene = self.built_scene
         return compute_eyepoints(
             shot_numbers,
-            caster=world.caster,
-            body_motions=world.body_motions,
+            caster=built_scene.caster,
+            body_motions=built_scene.body_motions,
             **self._observation_arguments,
         )
 
@@ -259,13 +259,13 @@ class EyepointStudy(BlockStudy):
         return {
             "cycle_time": time,
             "true_velocity": velocity.mean(axis=1),
-            "true_altitude": height_above_surface(self.world, position, time),
+            "true_altitude": height_above_surface(self.built_scene, position, time),
         }
 
     @property
-    def world(self) -> BuiltScene:
+    def built_scene(self) -> BuiltScene:
         """Scene of the study, built when it is first needed."""
-        return self._world or build_world(self.spec)
+        return self._built_scene or get_built_scene(self.spec)
 
     @cached_property
     def _observation_arguments(self) -> dict[str, Any]:
@@ -289,13 +289,13 @@ def _middles_of_equal_parts(n_items: int, n_parts: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def build_world(spec: SceneSpec) -> BuiltScene:
+def get_built_scene(spec: SceneSpec) -> BuiltScene:
     """Return the scene of a study, built or from the cache; the last one is kept in memory."""
     return load_or_build_scene(spec, spec.build_scene)
 
 
 def height_above_surface(
-    world: BuiltScene, position: np.ndarray, time: float | np.ndarray
+    built_scene: BuiltScene, position: np.ndarray, time: float | np.ndarray
 ) -> np.ndarray:
     """Return the height of positions (n, 3) above the surface straight below them [m].
 
@@ -304,24 +304,24 @@ def height_above_surface(
     """
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(
-        world.caster.cast_bundles(position, down, poses=_body_poses(world, time)).range
+        built_scene.caster.cast_bundles(position, down, poses=_body_poses(built_scene, time)).range
     )
 
 
 def below_surface_warning(spec: SceneSpec) -> str:
     """Return a warning if the flight is below its scene at times; '' if it is not."""
-    world, flight = build_world(spec), spec.build_flight()
-    time = np.linspace(flight.start, flight.stop, FLIGHT_SAMPLE_POINTS)
+    built_scene, flight = get_built_scene(spec), spec.build_flight()
+    time = np.linspace(flight.start, flight.stop, SAMPLED_FLIGHT_TIMES)
     position = flight.state(time).position
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
-    hits_above = world.caster.cast_bundles(position, up, poses=_body_poses(world, time))
+    hits_above = built_scene.caster.cast_bundles(position, up, poses=_body_poses(built_scene, time))
     # For a platform on the ground, rounding may place the ground just above it.
     is_covered = np.isfinite(hits_above.range) & (hits_above.range > GROUND_CONTACT_DISTANCE_MAX)
-    is_low = is_covered & np.isinf(height_above_surface(world, position, time))
+    is_low = is_covered & np.isinf(height_above_surface(built_scene, position, time))
     if not is_low.any():
         return ""
     times_below, depth = time[is_low], np.where(is_low, hits_above.range, 0.0)
-    surface = world.surfaces[hits_above.surface_index[depth.argmax(), 0]].name
+    surface = built_scene.surfaces[hits_above.surface_index[depth.argmax(), 0]].name
     return (
         f"the platform is beneath {surface} from time {times_below[0]:.4g} to "
         f"{times_below[-1]:.4g} s, by "
@@ -330,7 +330,7 @@ def below_surface_warning(spec: SceneSpec) -> str:
     )
 
 
-def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
+def _body_poses(built_scene: BuiltScene, time: float | np.ndarray) -> list[Any]:
     """Return position and attitude of each body of the scene; None for bodies at rest.
 
     `time` [s] is one time, or one time per ray.
@@ -338,7 +338,8 @@ def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
     from sweep.model.geometry.ray_casting import Pose
 
     states = [
-        None if body is None else body.state(np.atleast_1d(time)) for body in world.body_motions
+        None if body is None else body.state(np.atleast_1d(time))
+        for body in built_scene.body_motions
     ]
     return [None if state is None else Pose(state.position, state.attitude) for state in states]
 
@@ -379,21 +380,25 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
 
     It covers the flight path and what the beams hit.
     """
-    world = build_world(spec)
-    positions = np.concatenate([_sampled_positions(spec, world, name) for name in spec.scanners])
+    built_scene = get_built_scene(spec)
+    positions = np.concatenate(
+        [_sampled_positions(spec, built_scene, name) for name in spec.scanners]
+    )
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
-    margin = MAP_MARGIN_FRACTION * max(*(high - low), 1.0)
-    x, y = _map_nodes(low - margin, high + margin)
+    margin = TERRAIN_MAP_MARGIN_FRACTION * max(*(high - low), 1.0)
+    x, y = _terrain_map_nodes(low - margin, high + margin)
     mesh_tops = [
         float(mesh.vertices[:, 2].max() + mesh.origin[2])
-        for mesh, body in zip(world.caster.meshes, world.body_motions, strict=True)
+        for mesh, body in zip(built_scene.caster.meshes, built_scene.body_motions, strict=True)
         if body is None
     ]
-    view_height = max(max(mesh_tops, default=0.0), positions[:, 2].max()) + MAP_VIEWPOINT_CLEARANCE
+    view_height = (
+        max(max(mesh_tops, default=0.0), positions[:, 2].max()) + TERRAIN_MAP_VIEWPOINT_CLEARANCE
+    )
     view_points = np.stack(
         [*np.meshgrid(x, y), np.full((len(y), len(x)), view_height)], axis=-1
     ).reshape(-1, 3)
-    depth = height_above_surface(world, view_points, spec.build_flight().start)
+    depth = height_above_surface(built_scene, view_points, spec.build_flight().start)
     height = np.where(np.isfinite(depth), view_height - depth, np.nan).reshape(len(y), len(x))
     return [
         ArrayLayout.from_values(
@@ -411,29 +416,29 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
     ]
 
 
-def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.ndarray:
+def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -> np.ndarray:
     """Return sampled positions of the platform, and of points that its beams hit, (n, 3) [m]."""
     from sweep.model.geometry.quaternion import rotate
 
     n_shots = spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)
     scan = spec.scan_pattern(scanner).shots(
-        np.unique(np.linspace(0, n_shots - 1, FLIGHT_SAMPLE_POINTS).astype(int))
+        np.unique(np.linspace(0, n_shots - 1, SAMPLED_FLIGHT_TIMES).astype(int))
     )
     flight = spec.build_flight()
     state = flight.state(flight.start + scan.time)
     direction = rotate(state.attitude, scan.direction)
     # Moving bodies are placed at their position at the start of the flight, as in the map.
-    poses = _body_poses(world, flight.start)
-    hits = world.caster.cast_bundles(state.position, direction[:, None], poses=poses)
+    poses = _body_poses(built_scene, flight.start)
+    hits = built_scene.caster.cast_bundles(state.position, direction[:, None], poses=poses)
     hit = np.isfinite(hits.range)
     ground = state.position[hit] + direction[hit] * hits.range[hit, None]
     return np.concatenate([state.position, ground])
 
 
-def _map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _terrain_map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the x and y coordinates of the nodes of square cells that cover a rectangle [m]."""
-    step = float((high - low).max()) / (MAP_NODES_MAX - 1)
-    count = np.maximum(np.ceil((high - low) / step).astype(int) + 1, MAP_NODES_MIN)
+    step = float((high - low).max()) / (TERRAIN_MAP_NODES_MAX - 1)
+    count = np.maximum(np.ceil((high - low) / step).astype(int) + 1, TERRAIN_MAP_NODES_MIN)
     centre = (low + high) / 2
     x, y = (
         axis_centre + step * (np.arange(n_nodes) - (n_nodes - 1) / 2)

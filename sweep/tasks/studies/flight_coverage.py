@@ -10,7 +10,7 @@ import numpy as np
 
 from sweep.messages import number_with_noun
 from sweep.scenes.scene_files import SceneError
-from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world
+from sweep.tasks.studies.eyepoint_study import EyepointStudy, get_built_scene
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec
@@ -85,12 +85,12 @@ class FlightCoverage(NamedTuple):
 @lru_cache(maxsize=1)
 def sample_coverage(spec: SceneSpec) -> FlightCoverage:
     """Cast the rays of sampled shots of each scanner, and return where they hit (cached)."""
-    world, flight = build_world(spec), spec.build_flight()
+    built_scene, flight = get_built_scene(spec), spec.build_flight()
     times = np.linspace(flight.start, flight.stop, _N_SAMPLED_TIMES)
     positions = flight.state(times).position
     scanners = tuple(_sample_scanner(spec, scanner) for scanner in spec.scanners)
     return FlightCoverage(
-        scanners, _bounding_box(positions), _bounding_box(_body_corners(world, times))
+        scanners, _bounding_box(positions), _bounding_box(_body_corners(built_scene, times))
     )
 
 
@@ -143,10 +143,10 @@ def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
     )
 
 
-def _body_corners(world: BuiltScene, times: np.ndarray) -> np.ndarray:
+def _body_corners(built_scene: BuiltScene, times: np.ndarray) -> np.ndarray:
     """Return corners (n, 3) [m] of boxes that contain all bodies, moving ones at all times."""
     corners = []
-    for mesh, body in zip(world.caster.meshes, world.body_motions, strict=True):
+    for mesh, body in zip(built_scene.caster.meshes, built_scene.body_motions, strict=True):
         box = _bounding_box(mesh.vertices) + mesh.origin
         if body is not None:
             radius = np.sqrt((np.abs(box).max(axis=0) ** 2).sum())

@@ -41,7 +41,7 @@ from sweep.tasks.studies.extendable_study import ExtendableStudy
 from sweep.tasks.studies.eyepoint_study import (
     VECTOR_DIM_SIZES,
     EyepointStudy,
-    build_world,
+    get_built_scene,
     refine_rays,
     terrain_map_layouts,
 )
@@ -220,11 +220,11 @@ class FlightStudy(ExtendableStudy):
     points_noun = "shots"
 
     def __init__(
-        self, spec: SceneSpec, store_path: Location, world: BuiltScene | None = None
+        self, spec: SceneSpec, store_path: Location, built_scene: BuiltScene | None = None
     ) -> None:
         super().__init__(spec)
         self.store_path = store_path
-        self.get_eyepoint_study = cache(partial(EyepointStudy, spec, world=world))
+        self.get_eyepoint_study = cache(partial(EyepointStudy, spec, built_scene=built_scene))
         self.scanner_grids = {scanner: ScannerGrid(spec, scanner) for scanner in spec.scanners}
         self._get_eyepoint_arrays = cache(self._open_eyepoints)
 
@@ -276,7 +276,7 @@ class FlightStudy(ExtendableStudy):
             "spec": self.spec.to_json(),
             "surfaces": [surface.name for surface in self.surfaces],
             "scanners": list(self.spec.scanners),
-            "origin": np.asarray(build_world(self.spec).origin, float).tolist(),
+            "origin": np.asarray(get_built_scene(self.spec).origin, float).tolist(),
             "projection": scene_projection_wkt(self.spec.scene, self.spec.files),
             "time_origin": f"{self.spec.files.time_origin.normalize():f}",
         }
@@ -592,7 +592,7 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _read_reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
-        """Return the smaller study's results of the shots of a block that have the same effects."""
+        """Read results of a block that the smaller study has computed with the same effects."""
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
             self.reuse_source,

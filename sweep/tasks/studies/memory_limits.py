@@ -54,9 +54,9 @@ def block_bytes_max(study: GridStudy | FlightStudy) -> int:
 
 def scene_memory_bytes(spec: SceneSpec) -> int:
     """Return the size of a scene's triangles and search trees [bytes]. Each process has a copy."""
-    from sweep.tasks.studies.eyepoint_study import build_world
+    from sweep.tasks.studies.eyepoint_study import get_built_scene
 
-    return build_world(spec).caster.nbytes
+    return get_built_scene(spec).caster.nbytes
 
 
 def refuse_too_large_point(spec: GridSpec | SceneSpec, worker_memory: WorkerMemory) -> None:

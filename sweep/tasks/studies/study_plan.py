@@ -21,7 +21,7 @@ from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.storage.locations import Location, eyepoint_store_location
 from sweep.tasks.engine.session import RunOptions
 from sweep.tasks.engine.worker_memory import process_memory
-from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world, terrain_map_layouts
+from sweep.tasks.studies.eyepoint_study import EyepointStudy, get_built_scene, terrain_map_layouts
 from sweep.tasks.studies.flight_coverage import sample_coverage
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import (
@@ -56,7 +56,7 @@ TIMED_RAYS_MAX = 1 << 17
 TIMED_SHOT_DRAWS_MAX = 1 << 14
 
 #: Number of shots, spread over the flight, that load kernels and tables before any is timed.
-LOADING_SHOTS = 32
+UNTIMED_FIRST_SHOTS_MAX = 32
 
 #: Largest number of shots of a cycle of which whole cycles are timed, with their navigation.
 TIMED_CYCLE_SHOTS_MAX = 128
@@ -241,7 +241,7 @@ def _plan_flight(
     """Return plans of a flight's scanners, parts of its time, and reports of its scene."""
     spec, eyepoint_studies = study.spec, study.eyepoint_studies()
     times = [time.process_time()]
-    world = build_world(spec)
+    built_scene = get_built_scene(spec)
     times.append(time.process_time())
     sample_coverage(spec)
     terrain_map_layouts(spec)
@@ -282,7 +282,7 @@ def _plan_flight(
             TimePart(name=name, cpu_seconds=seconds, n_parallel=n_parallel)
             for n_parallel, seconds in seconds_by_n_parallel.items()
         ]
-    return scanners, tuple(parts), world.mesh_reports
+    return scanners, tuple(parts), built_scene.mesh_reports
 
 
 def are_flight_kernels_compiled(spec: SceneSpec) -> bool:
@@ -514,7 +514,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     seconds_max = FLIGHT_TIMING_SECONDS / len(study.spec.scanners)
     # The first shots load kernels and tables, which other places in the flight may need too.
     _, first_casting_seconds, first_seconds = timer.time_shots(
-        min(LOADING_SHOTS, timer.n_shots_max)
+        min(UNTIMED_FIRST_SHOTS_MAX, timer.n_shots_max)
     )
     start = time.process_time()
     n_timed, samples = 1, [timer.time_shots(1)]

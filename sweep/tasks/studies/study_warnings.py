@@ -16,7 +16,7 @@ from sweep.spec import SceneSpec
 from sweep.spec.grid_checks import describe_narrow_beam
 from sweep.spec.noise_alarms import iter_false_alarm_warnings
 from sweep.tasks.studies.echo_warnings import echo_warnings
-from sweep.tasks.studies.eyepoint_study import below_surface_warning, build_world
+from sweep.tasks.studies.eyepoint_study import below_surface_warning, get_built_scene
 from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits, sample_coverage
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def iter_spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
     if beam_warning := describe_narrow_beam(spec.parameters_off_axes(), spec.axes):
         yield beam_warning
     if isinstance(spec, SceneSpec):
-        yield from build_world(spec).warnings
+        yield from get_built_scene(spec).warnings
         if path_warning := below_surface_warning(spec):
             yield path_warning
         refuse_flight_without_hits(spec)
