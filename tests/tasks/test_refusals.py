@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import dask
 import pytest
@@ -18,6 +19,7 @@ from sweep.tasks.engine.journal import StoreLock
 from sweep.tasks.engine.progress import ClusterError, StoreError
 from sweep.tasks.engine.study_store import current_software_versions
 from sweep.tasks.studies import parameter_grid
+from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.store_summary import status
 
 
@@ -165,4 +167,19 @@ def test_a_store_that_is_cut_into_other_blocks_is_refused(tmp_path, monkeypatch)
     ):
         with pytest.raises(StoreError, match=r"has blocks of .* in \w+, and this version of sweep"):
             refused()
+    assert file_contents(store) == before
+
+
+def test_a_store_without_an_array_that_is_computed_now_is_refused(tmp_path, monkeypatch):
+    """As begun before a variable was added to the model without another version."""
+    store = run_serially(small_spec(), tmp_path / "s.zarr").store
+    before, known_layouts = file_contents(store), GridStudy.output_layouts
+
+    def with_another(study):
+        layouts = known_layouts(study)
+        return [*layouts, replace(layouts[0], name="another")]
+
+    monkeypatch.setattr(GridStudy, "output_layouts", with_another)
+    with pytest.raises(StoreError, match="has no array another, which this version of sweep"):
+        resume(store, progress=False, scheduler="none")
     assert file_contents(store) == before

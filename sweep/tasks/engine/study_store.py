@@ -541,12 +541,18 @@ def refuse_damaged_template(store_path: Location) -> None:
 
 
 def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
-    """Raise a StoreError if a store is cut into other blocks than the study is here.
+    """Raise a StoreError if a store has other arrays or blocks than the study has here.
 
     Receipts and chunks of another version of this program would be taken for those of other points.
     """
     nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
     for layout in study.output_layout_by_name.values():
+        if layout.name not in nodes:
+            raise StoreError(
+                f"{store_path} has no array {layout.name}, which this version of sweep computes. "
+                "Install the version that began it to resume it, or run the study anew into "
+                "another store."
+            )
         chunk_shape = tuple(nodes[layout.name]["chunk_grid"]["configuration"]["chunk_shape"])
         if chunk_shape != layout.chunks:
             raise StoreError(
