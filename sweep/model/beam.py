@@ -526,9 +526,10 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
     )
     fill_step = np.arccos(1 - 2 * fill_fraction) * (_FILL_RATIO_STEPS / np.pi)
     phase_step = np.sqrt(np.minimum(rim_phase, _RIM_PHASE_MAX)) / _ROOT_PHASE_STEP
+    table_position = np.stack([fill_step.ravel(), phase_step.ravel()])
     efficiency = map_coordinates(
-        _truncation_table(), [fill_step, phase_step], mode="mirror", prefilter=False
-    )
+        _truncation_table(), table_position, mode="mirror", prefilter=False
+    ).reshape(fill_ratio.shape)
     return np.where(fill_ratio > _UNTRUNCATED_FILL_RATIO_MAX, efficiency, 1.0)
 
 

@@ -29,3 +29,8 @@ def test_an_unknown_coordinate_gives_an_unknown_value():
         grids, [np.ones((2, 2))], ([0.5, np.nan, 0.1], [1.0, 1.0, np.nan])
     )
     assert values == pytest.approx([1.0, np.nan, np.nan], nan_ok=True)
+
+
+def test_a_single_point_has_a_value_without_axes():
+    (value,) = interpolate_tables([np.array([0.0, 2.0])], [np.array([1.0, 3.0])], [0.5])
+    assert value.shape == () and value == 1.5
