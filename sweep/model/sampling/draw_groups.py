@@ -3,15 +3,15 @@
 Draws of random effects come in groups of :data:`GROUP_SIZE` consecutive numbers. Each draw is as
 random as one that is alone: its numbers are uniform and independent. The draws of a group, however,
 depend on each other. A pair of numbers, such as those of one complex amplitude, visits every cell
-of equal area among 64 once: cells of 1/64 by 1, 1/32 by 1/2, and so on to 1 by 1/64. That is a
-scrambled net [1]_. Different pairs visit their cells in independent random orders (Latin supercube
-sampling [2]_). Different groups are independent.
+of equal area among 64 once: cells of 1/64 by 1, 1/32 by 1/2, and so on to 1 by 1/64. Such a set of
+points is a scrambled net [1]_. Different pairs visit their cells in independent random orders
+(Latin supercube sampling [2]_). Different groups are independent.
 
 The mean of a group is therefore unbiased. If a probability is a smooth function of one pair, the
 variance of the mean is far below that of independent draws. For any function it is about that of
 independent draws at most. Of a pair of radius and angle, half the angle's circle is spread evenly,
 and the sign is random. An interval of a mean over many groups follows from the variance of the
-groups' means (:func:`sweep.model.error_budget.grouped_mean_interval`).
+groups' means (:func:`sweep.model.error_budget.grouped_mean_half_width`).
 
 Cells and orders are addressed by point, group, cause and index, as all random numbers are
 (:mod:`sweep.model.sampling.philox`). So the first draws stay the same if more are added.
