@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling plan-honesty validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy draw-groups stopping frozen promise detectors peers scaling plan-honesty validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -143,6 +143,9 @@ detectors: $(READY)
 
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy_page.py
+
+draw-groups: $(READY)
+	$(BIN)/python benchmarks/draw_groups.py
 
 # docs/validation.md from the stores in results/; those that are missing are computed first.
 validation: $(READY)

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
+import draw_groups
 from benchmark_helpers import DOCS, EXPERIMENTS, markdown_table
 
 from sweep.analysis import accuracy_results, canvas
@@ -203,7 +204,7 @@ def main() -> None:
     if arguments.names:
         print("\n".join(sections))
     else:
-        page = "\n".join([PAGE_HEAD, *sections]) + PAGE_TAIL
+        page = "\n".join([PAGE_HEAD, *sections, draw_groups.page_section()]) + PAGE_TAIL
         (DOCS / "accuracy.md").write_text(page, encoding="utf-8")
 
 

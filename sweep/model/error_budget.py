@@ -32,6 +32,17 @@ With s^2 = 0 the half-width is q z^2 / n (3.8 q / n for 95 %), as wide as what n
 With many draws it is z s / sqrt(n). For values of only 0 and 1 it is the score interval, except for
 terms of z^2 / n of its width.
 
+If draws come in groups of g that are spread evenly (:mod:`sweep.model.sampling.draw_groups`), the
+means of groups vary less than those of independent draws. Let S^2 be g times the sample variance of
+the means of R groups, and t the quantile of Student's distribution with R - 1 degrees of freedom.
+Of n draws, n - R g are in a group that is not yet whole; they have the variance s^2 at most. Rare
+values raise the mean at single cells of a group, where the value may be as low as 0. The variance
+is then higher by up to d. Hence
+
+    n d^2 = (R g / n) min(t^2 S^2, z^2 s^2) + (1 - R g / n) z^2 s^2 + z^2 d.
+
+This half-width is at least z^2 / n. With fewer than two groups that of independent draws is used.
+
 References
 ----------
 .. [1] Wilson, J. Am. Stat. Assoc. 22, 209, 1927.
@@ -44,7 +55,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import betaincinv, ndtri
+from scipy.special import betaincinv, ndtri, stdtrit
 
 AUTOMATIC = -1.0
 """Value of an error setting in :class:`ErrorBudget` that means: compute it from the tolerance."""
@@ -243,7 +254,7 @@ def wilson_interval(
     .. [1] Wilson, J. Am. Stat. Assoc. 22, 209, 1927.
     """
     k, n = np.asarray(successes, float), np.asarray(trials, float)
-    z = _two_sided_normal_quantile(confidence)
+    z = two_sided_normal_quantile(confidence)
     mean, squared_z = k / n, z * z
     centre = (k + squared_z / 2) / (n + squared_z)
     half_length = z * np.sqrt(k * (1 - mean) + squared_z / 4) / (n + squared_z)
@@ -314,7 +325,7 @@ def bounded_mean_interval(
     The module's description derives the interval.
     """
     m, n = np.asarray(mean, float), np.asarray(n_values, float)
-    z = _two_sided_normal_quantile(confidence)
+    z = two_sided_normal_quantile(confidence)
     variance_term = z * z * n * np.where(n > 1, variance, 0.0)
 
     def half_length(distance_to_end: np.ndarray) -> np.ndarray:
@@ -327,6 +338,47 @@ def bounded_mean_interval(
         return (linear_term + np.sqrt(variance_term + linear_term * linear_term)) / n
 
     return _clip_interval(m - half_length(m), m + half_length(1 - m))
+
+
+def grouped_mean_half_width(
+    *,
+    variance: ArrayLike,
+    n_values: ArrayLike,
+    group_variance: ArrayLike,
+    n_groups: ArrayLike,
+    group_size: int,
+    confidence: ArrayLike,
+) -> np.ndarray:
+    """Compute the half-width of an interval for an expectation from evenly spread groups of values.
+
+    Parameters
+    ----------
+    variance : array_like
+        Unbiased variance of a single value within 0..1.
+    n_values : array_like
+        Number of values, in whole groups and in one that is not yet whole.
+    group_variance : array_like
+        Unbiased variance of the mean of a whole group; it is not used with fewer than two groups.
+    n_groups : array_like
+        Number of whole groups.
+    group_size : int
+        Number of values in a whole group.
+    confidence : array_like
+        Confidence, two-sided, 0..1.
+
+    Notes
+    -----
+    The module's description derives the half-width.
+    """
+    n, groups = np.asarray(n_values, float), np.asarray(n_groups, float)
+    z = two_sided_normal_quantile(confidence)
+    t = stdtrit(np.maximum(groups - 1, 1), 0.5 + np.asarray(confidence, float) / 2)
+    independent_term = z * z * np.where(n > 1, variance, 0.0)
+    group_term = np.where(groups > 1, t * t * group_size * group_variance, independent_term)
+    n_grouped = groups * group_size
+    variance_term = n_grouped * np.minimum(group_term, independent_term)
+    variance_term = variance_term + (n - n_grouped) * independent_term
+    return np.asarray((z * z / 2 + np.sqrt(variance_term + z**4 / 4)) / n)
 
 
 def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np.ndarray:
@@ -343,7 +395,7 @@ def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np
     return np.maximum(interval.high - estimate, estimate - interval.low)
 
 
-def _two_sided_normal_quantile(confidence: ArrayLike) -> np.ndarray:
+def two_sided_normal_quantile(confidence: ArrayLike) -> np.ndarray:
     """Return the z for which a standard normal variable lies within +-z with a given probability.
 
     ``confidence`` is this probability, 0..1.

@@ -245,11 +245,19 @@ OUTPUT_HAS_SQUARED_DEVIATIONS = OUTPUT_IS_LOGARITHM | np.array(
 """(outputs,) bool: True for those of GRID_OUTPUTS whose squared deviations from the mean are summed
 over draws."""
 
+N_GROUP_SUMS = 3 * len(PD_OUTPUTS)
+"""Number of values in a row of running sums that describe the means of groups of draws: mean, sum
+of squared deviations, and sum over the unfinished group, of each probability of detection."""
+
 N_RUNNING_SUMS = (
-    len(GRID_OUTPUTS) + int(OUTPUT_HAS_SQUARED_DEVIATIONS.sum()) + int(OUTPUT_IS_LOGARITHM.sum())
+    len(GRID_OUTPUTS)
+    + int(OUTPUT_HAS_SQUARED_DEVIATIONS.sum())
+    + int(OUTPUT_IS_LOGARITHM.sum())
+    + N_GROUP_SUMS
 )
 """Number of values in a row of running sums. The row contains what further draws need in addition
-to the stored means: numbers of values, sums of squared deviations, and the largest logarithms."""
+to the stored means: numbers of values, sums of squared deviations, the largest logarithms, and the
+sums over groups of draws."""
 
 DETECTOR_INDEPENDENT_OUTPUTS = (
     "snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance", "misread",

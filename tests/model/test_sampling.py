@@ -18,6 +18,7 @@ from sweep.model.outputs import (
     STANDARD_ERROR_OUTPUTS,
 )
 from sweep.model.sampling import philox, realisations, samplers
+from sweep.model.sampling.draw_groups import GROUP_SIZE
 from sweep.model.sampling.samplers import draw_until_accurate, simulate_draws, stopping_checks
 
 SPECKLED = (*DEFAULT_EFFECTS, "speckle")
@@ -62,7 +63,8 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
     drawn = {*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
     assert set(found) == (drawn | {RUNNING_SUMS} if effects is SPECKLED else drawn)
     numbers = found["n_draws"]
-    assert np.isin(numbers, list(stopping_checks(20, 400))).all()
+    group_size = GROUP_SIZE if effects is SPECKLED else 1
+    assert np.isin(numbers, list(stopping_checks(20, 400, group_size))).all()
     assert np.unique(numbers).size > 1 or (method, effects) == ("probabilities", DEFAULT_EFFECTS)
     for point, number in enumerate(numbers.tolist()):
         fixed = simulate_draws(parameters, effects, batch_sizes=[number], **chosen)
@@ -78,7 +80,7 @@ def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_
     for name in PD_OUTPUTS:
         assert (found[f"{name}_half_width"] <= 0.06).all()
     for point, number in enumerate(found["n_draws"].tolist()):
-        for before in [n for n in stopping_checks(20, 10_000) if n < number]:
+        for before in [n for n in stopping_checks(20, 10_000, GROUP_SIZE) if n < number]:
             fixed = simulate_draws(parameters, SPECKLED, batch_sizes=[before], **chosen)
             widths = [fixed[f"{name}_half_width"][point] for name in PD_OUTPUTS]
             assert max(widths) > 0.06

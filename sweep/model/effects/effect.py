@@ -119,6 +119,24 @@ class DrawAddresses(NamedTuple):
     """(n, 2) uint64: key of each point's own random stream."""
     draw_numbers: np.ndarray
     """(n,) int64: number of each point's draw, that is of one realisation of all that is random."""
+    are_grouped: bool = False
+    """True if consecutive draws of a point form groups over which random numbers are spread evenly
+    (:mod:`sweep.model.sampling.draw_groups`); False for independent draws."""
+
+    def uniforms(self, stream: int, count: int, *, are_polar: bool = False) -> np.ndarray:
+        """Return the first uniform numbers of a stream in each draw, (n, count).
+
+        ``stream`` is the number of the physical cause. ``are_polar`` is True if the second number
+        of each pair is an angle in cycles.
+        """
+        from sweep.model.sampling.draw_groups import grouped_uniforms
+        from sweep.model.sampling.philox import uniforms
+
+        if not self.are_grouped:
+            return uniforms(self.point_keys, self.draw_numbers, stream, count)
+        return grouped_uniforms(
+            self.point_keys, self.draw_numbers, stream, count, are_polar=are_polar
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -52,11 +52,9 @@ class PerturbedGeometry(NamedTuple):
 
 def draw_jitter_angles(draw_addresses: DrawAddresses, sigma: np.ndarray) -> np.ndarray:
     """Draw the deflection angles (a, b) of beams for a standard deviation [rad], (n, 2) [rad]."""
-    from sweep.model.sampling.philox import STREAM_POINTING_JITTER, to_normals_by_row, uniforms
+    from sweep.model.sampling.philox import STREAM_POINTING_JITTER, to_normals_by_row
 
-    uniform_draws = uniforms(
-        draw_addresses.point_keys, draw_addresses.draw_numbers, STREAM_POINTING_JITTER, 2
-    )
+    uniform_draws = draw_addresses.uniforms(STREAM_POINTING_JITTER, 2, are_polar=True)
     return to_normals_by_row(uniform_draws) * np.asarray(sigma, float)[..., None]
 
 

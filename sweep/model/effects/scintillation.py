@@ -250,9 +250,7 @@ def draw_scintillation_factors(
     """
     from sweep.model.sampling import philox
 
-    uniform_draws = philox.uniforms(
-        draw_addresses.point_keys, draw_addresses.draw_numbers, philox.STREAM_SCINTILLATION, 4
-    )
+    uniform_draws = draw_addresses.uniforms(philox.STREAM_SCINTILLATION, 4)
     factor = np.ones(draw_addresses.draw_numbers.size)
     for i, variance in enumerate(v for leg in legs for v in leg):
         factor *= _inverse_distribution(

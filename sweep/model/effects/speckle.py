@@ -124,8 +124,7 @@ def draw_speckle_factors(
     point_fraction = np.asarray(coherent_fraction, float) + np.zeros(
         draw_addresses.draw_numbers.size
     )
-    point_keys, draw_numbers = draw_addresses.point_keys, draw_addresses.draw_numbers
-    uniform_draws = philox.uniforms(point_keys, draw_numbers, philox.STREAM_SPECKLE, 2 * n_beamlets)
+    uniform_draws = draw_addresses.uniforms(philox.STREAM_SPECKLE, 2 * n_beamlets, are_polar=True)
     # Contiguous copies, so that bits do not depend on the number of draws.
     exceedance, cycles = (np.ascontiguousarray(uniform_draws[:, lane::2]) for lane in range(2))
     coherent_amplitude, diffuse_amplitude = (
@@ -137,9 +136,7 @@ def draw_speckle_factors(
         return radius, cycles
     angle = np.zeros(())
     if random_phases:
-        phases = philox.uniforms(
-            point_keys, draw_numbers, philox.STREAM_FOOTPRINT_PHASE, n_beamlets
-        )
+        phases = draw_addresses.uniforms(philox.STREAM_FOOTPRINT_PHASE, n_beamlets)
         angle = 2.0 * np.pi * np.ascontiguousarray(phases)
     re = radius * np.cos(2.0 * np.pi * cycles) + coherent_amplitude * np.cos(angle)
     im = radius * np.sin(2.0 * np.pi * cycles) + coherent_amplitude * np.sin(angle)

@@ -52,6 +52,10 @@ STREAM_ERROR_FLOOR = 24
 """Stream number of an instrument's random errors that do not depend on the echo."""
 STREAM_LEAKAGE = (25, 27, 26)
 """Stream numbers, for up, Doppler and down segment, of false peaks due to leaked signal."""
+GROUP_STREAM_OFFSET = 1000
+"""Difference between the number of a stream and that of the random words that spread its numbers
+over a group of draws (:mod:`sweep.model.sampling.draw_groups`). The words' address has the number
+of the group in place of that of the draw."""
 
 _MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _MULTIPLIER_0, _MULTIPLIER_1 = (np.uint64(m) for m in _MULTIPLIERS)

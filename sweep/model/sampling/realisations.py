@@ -4,7 +4,8 @@ All combinations of points and draws form one sequence, which is cut into batche
 memory. A batch is prepared as any points are. Random effects change its parameters before all other
 effects, and its shots after them. The probabilities of each draw over its noise are closed
 forms (docs/draws.md). Their mean over the draws converges far faster than the fraction of
-detections would.
+detections would. The random numbers of consecutive draws are spread evenly
+(:mod:`sweep.model.sampling.draw_groups`).
 
 Every random number is addressed by point, draw and cause (:mod:`sweep.model.sampling.philox`), and
 sums run over a point's draws in their order. So neither the division into batches nor other points
@@ -64,6 +65,7 @@ def iter_realisations(
     keys: np.ndarray,
     first_draw: int = 0,
     draws: int,
+    are_grouped: bool = True,
 ) -> Iterator[RealisedShots]:
     """Yield prepared shots of every draw of n points on a flat plane, batch by batch.
 
@@ -80,6 +82,8 @@ def iter_realisations(
         alone.
     draws
         Number of draws of each point.
+    are_grouped
+        True to spread random numbers evenly over groups of draws; False for independent draws.
     """
     all_parameters = PARAMETER_DEFAULTS | dict(parameters)
     # One parameter has n values, so that there are n points even if they differ in nothing.
@@ -102,7 +106,9 @@ def iter_realisations(
                 point_indices,
                 draw_numbers,
                 _realise_batch(
-                    batch_parameters, effects, DrawAddresses(keys[point_indices], draw_numbers)
+                    batch_parameters,
+                    effects,
+                    DrawAddresses(keys[point_indices], draw_numbers, are_grouped),
                 ),
             )
 
@@ -207,7 +213,7 @@ class RunningMeans:
     def running_sums(self) -> np.ndarray:
         """Return the sums, besides the means, from which further draws continue.
 
-        The result is (n, N_RUNNING_SUMS).
+        The result is (n, columns).
         """
         arrays = (
             self.n_values,
@@ -220,10 +226,11 @@ class RunningMeans:
         """Restore means and sums from the results of earlier draws, so that draws can be added.
 
         `results` are those of :meth:`results` by name, with the array of :meth:`running_sums` as
-        RUNNING_SUMS. Points without draws have zeros there.
+        RUNNING_SUMS; further columns are not used. Points without draws have zeros there.
         """
-        split_rows = np.cumsum([len(self.names), OUTPUT_HAS_SQUARED_DEVIATIONS.sum()])
-        n_values, squared_deviations, largest_logarithms = np.split(
+        sizes = [a.sum() for a in (OUTPUT_HAS_SQUARED_DEVIATIONS, OUTPUT_IS_LOGARITHM)]
+        split_rows = np.cumsum([len(self.names), *sizes])
+        n_values, squared_deviations, largest_logarithms, _ = np.split(
             results[RUNNING_SUMS].T, split_rows
         )
         self.n_values[...] = n_values

@@ -14,9 +14,13 @@ Drawing until the tolerance is met goes in rounds over all points that do not me
 sequential test stops sooner, on average, if the draws happen to vary little. This reduces coverage
 and adds bias. :func:`stopping_checks` tests seldom enough to keep both small;
 ``benchmarks/stopping_rule.py`` measures them. Tests come at the same numbers of draws for every
-point. The draws of a point depend on nothing but the point: other points, blocks and workers change
-no bit of the result. A detector processes the draws of one point and segment together, in parts
-that depend on the FFT size and on numbers of draws alone.
+point. With random effects these are whole groups of draws, over which random numbers are spread
+evenly (:mod:`sweep.model.sampling.draw_groups`). The half-width then follows from the variance of
+the groups' means.
+
+The draws of a point depend on nothing but the point: other points, blocks and workers change no bit
+of the result. A detector processes the draws of one point and segment together, in parts that
+depend on the FFT size and on numbers of draws alone.
 """
 
 import math
@@ -32,16 +36,20 @@ from sweep.model.error_budget import (
     COUNT_INTERVALS,
     ErrorBudget,
     bounded_mean_interval,
+    grouped_mean_half_width,
     interval_half_width,
+    two_sided_normal_quantile,
 )
 from sweep.model.evaluation import evaluate, prepare_shots, shot_statistics
 from sweep.model.outputs import (
     DETECTOR_INDEPENDENT_OUTPUTS,
     DRAW_COUNT_OUTPUTS,
+    N_GROUP_SUMS,
     PD_OUTPUTS,
     RUNNING_SUMS,
 )
 from sweep.model.preparation import Parameters, Shots
+from sweep.model.sampling.draw_groups import GROUP_SIZE, GroupMeans
 from sweep.model.sampling.draws import DrawRanges, count_by_probability, count_in_noise
 from sweep.model.sampling.noisy_spectra import (
     AVERAGED_VALUE_NAMES,
@@ -228,17 +236,23 @@ def never_stop() -> bool:
     return False
 
 
-def stopping_checks(batch_size: int, draws_max: int) -> Iterator[int]:
+def stopping_checks(batch_size: int, draws_max: int, group_size: int = 1) -> Iterator[int]:
     """Yield the numbers of draws at which accuracy is tested, in rising order.
 
     Accuracy is the half-width of the confidence intervals of detection probabilities.
 
     The first numbers are one batch apart. Later numbers grow by a quarter, rounded to whole
-    batches. The last is `draws_max`.
+    batches. From two groups of `group_size` draws on, they are rounded up to whole groups. The last
+    is `draws_max`.
     """
-    n_batches = 1
+    n_batches, previous = 1, 0
     while n_batches * batch_size < draws_max:
-        yield n_batches * batch_size
+        n_draws = n_batches * batch_size
+        if n_draws >= 2 * group_size:
+            n_draws = min(-(-n_draws // group_size) * group_size, draws_max)
+        if previous < n_draws < draws_max:
+            yield n_draws
+        previous = n_draws
         n_batches = max(n_batches + 1, int(n_batches * ErrorBudget.stopping_check_growth))
     yield draws_max
 
@@ -275,7 +289,8 @@ def simulate_draws(
         Numbers of draws to count separately; each point then has their sum. Without them a point
         has as many draws as `error_budget` needs, in one count.
     batch
-        Number of draws in a batch. Whole batches are made between tests against `error_budget`.
+        Number of draws in a batch. Whole batches are made between tests against `error_budget`,
+        with random effects rounded up to whole groups of draws.
     limit
         Largest number of draws of a point without `batch_sizes`.
     error_budget
@@ -312,9 +327,13 @@ def simulate_draws(
         draw_until_accurate(sampler, point_indices, [sum(batch_sizes)], None, should_stop)
         counts = sampler.counts
     else:
-        draw_until_accurate(
-            sampler, point_indices, stopping_checks(batch, limit), error_budget, should_stop
-        )
+        group_size = GROUP_SIZE if random_effects(effects) and method != SPECTRA_METHOD else 1
+        check_draws = [
+            n_draws
+            for n_draws in stopping_checks(batch, limit, group_size)
+            if n_draws == limit or group_size == 1 or _can_be_accurate(n_draws, error_budget)
+        ]
+        draw_until_accurate(sampler, point_indices, check_draws, error_budget, should_stop)
         counts = sampler.counts[..., 0]
     return sampler.results(error_budget) | dict(zip(DRAW_COUNT_OUTPUTS, counts, strict=True))
 
@@ -364,8 +383,24 @@ def draw_until_accurate(
                 return
 
 
+def _can_be_accurate(n_draws: int, error_budget: ErrorBudget) -> bool:
+    """Return False if no point with random effects can meet its tolerance with ``n_draws`` draws.
+
+    Half-widths are z^2 / n at least, if there are two whole groups, else half of that
+    (:mod:`sweep.model.error_budget`).
+    """
+    least_width = two_sided_normal_quantile(error_budget.confidence) ** 2 / n_draws
+    if n_draws < 2 * GROUP_SIZE:
+        least_width = least_width / 2
+    return bool((least_width <= np.asarray(error_budget.tolerance)).any())
+
+
 class DetectionSampler(Sampler):
     """Sampler of detections in draws, by probabilities or by noise in the bins of echoes."""
+
+    draws_are_grouped = True
+    """True if random effects are drawn in groups of draws; False for independent draws, with which
+    benchmarks compare."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, method: str,
@@ -374,11 +409,13 @@ class DetectionSampler(Sampler):
         super().__init__(parameters, effects, prior_draws=prior_draws, **base_arguments)
         self._draws_noise, n_points = method == "noise", self.n_draws.size
         self._running_means = RunningMeans(n_points) if random_effects(effects) else None
+        self._group_means = GroupMeans(n_points, PD_OUTPUTS)
         if self._running_means is None:
             values = evaluate(parameters, effects)
             self._outputs = {name: np.broadcast_to(v, (n_points,)) for name, v in values.items()}
         elif prior_draws is not None:
             self._running_means.resume(prior_draws.means)
+            self._group_means.restore_state(prior_draws.means[RUNNING_SUMS][:, -N_GROUP_SUMS:].T)
 
     def draws_per_step(self, n_points: int) -> int:
         """Return the number of draws of each point that are made in one step."""
@@ -405,9 +442,13 @@ class DetectionSampler(Sampler):
                 keys=keys,
                 first_draw=first_draw,
                 draws=end_draw - first_draw,
+                are_grouped=self.draws_are_grouped,
             ):
                 draw_statistics = shot_statistics(shots)
                 self._running_means.add(point_indices[members], draw_statistics)
+                self._group_means.add(
+                    point_indices[members], draw_numbers - self.batch_edges[0], draw_statistics
+                )
                 draw_ranges = DrawRanges(members, keys[members], draw_numbers, draw_numbers + 1)
                 if self._draws_noise:
                     count_in_noise(draw_ranges, self.batch_edges, shots, counts)
@@ -432,11 +473,24 @@ class DetectionSampler(Sampler):
         """
         confidence = error_budget.select(point_indices, self.n_draws.size).confidence
         if self._running_means is not None:
-            mean, variance, n_draws = self._running_means.moments(PD_OUTPUTS, point_indices)
-            interval = bounded_mean_interval(
-                mean=mean, variance=variance, n_values=np.maximum(n_draws, 1), confidence=confidence
+            mean, variance, n_values = self._running_means.moments(PD_OUTPUTS, point_indices)
+            groups = self._group_means.statistics(point_indices, n_values)
+            common_inputs: dict[str, Any] = {
+                "variance": variance,
+                "n_values": np.maximum(n_values, 1),
+                "confidence": confidence,
+            }
+            independent_width = interval_half_width(
+                mean, bounded_mean_interval(mean=mean, **common_inputs)
             )
-            return interval_half_width(mean, interval)
+            grouped_width = grouped_mean_half_width(
+                group_variance=groups.group_variance,
+                n_groups=groups.n_groups,
+                group_size=GROUP_SIZE,
+                **common_inputs,
+            )
+            has_groups = (groups.n_groups > 1) & self.draws_are_grouped
+            return np.where(has_groups, grouped_width, independent_width)
         zero_or_nan = np.stack([0.0 * self._outputs[name][point_indices] for name in PD_OUTPUTS])
         return zero_or_nan + (
             self.count_half_widths(point_indices, error_budget) if self._draws_noise else 0.0
@@ -447,10 +501,30 @@ class DetectionSampler(Sampler):
         if self._running_means is None:
             outputs = self._outputs | zero_standard_errors(self._outputs)
         else:
-            outputs = self._running_means.results() | {
-                RUNNING_SUMS: self._running_means.running_sums()
-            }
+            group_sums = self._group_means.state().T
+            running_sums = np.concatenate([self._running_means.running_sums(), group_sums], axis=1)
+            outputs = self._running_means.results() | self._standard_errors()
+            outputs[RUNNING_SUMS] = running_sums
         return outputs | self.accuracy_outputs(error_budget)
+
+    def _standard_errors(self) -> dict[str, np.ndarray]:
+        """Return the standard errors of mean probabilities of detection, (n,) by name.
+
+        Draws in whole groups have the variance of the groups' means if there are two groups or
+        more. All others have that of independent draws.
+        """
+        assert self._running_means is not None
+        point_indices = np.arange(self.n_draws.size)
+        _, variance, n = self._running_means.moments(PD_OUTPUTS, point_indices)
+        n_groups, group_variance = self._group_means.statistics(point_indices, n)
+        n_grouped = GROUP_SIZE * n_groups
+        squared_sum_error = n * variance
+        is_grouped = n_groups > 1
+        squared_sum_error[is_grouped] = (
+            n_grouped * np.fmin(GROUP_SIZE * group_variance, variance) + (n - n_grouped) * variance
+        )[is_grouped]
+        errors = np.sqrt(squared_sum_error) / np.where(n > 0, n, np.nan)
+        return {f"{name}_error": row for name, row in zip(PD_OUTPUTS, errors, strict=True)}
 
 
 class SpectraSampler(Sampler):

@@ -37,7 +37,7 @@ def factors(draws, beamlets, share=0.0, random_phases=False, seeded=None):
     """Factors g of draws of a point, (draws, beamlets)."""
     chosen = np.repeat(make_point_keys(1) if seeded is None else seeded, draws, axis=0)
     magnitude, cycles = speckle.draw_speckle_factors(
-        DrawAddresses(chosen, np.arange(draws)), n_beamlets=beamlets,
+        DrawAddresses(chosen, np.arange(draws), are_grouped=True), n_beamlets=beamlets,
         coherent_fraction=np.full(draws, share), random_phases=random_phases,
     )  # fmt: skip
     return magnitude * np.exp(2j * np.pi * cycles)
