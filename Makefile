@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers peers-physics scaling plan-honesty validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy accuracy-terrain stopping frozen promise detectors peers peers-physics scaling plan-honesty validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -147,6 +147,10 @@ detectors: $(READY)
 
 accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy_page.py
+
+# Beamlets in a flight over rough terrain, a section of docs/accuracy.md; ten minutes.
+accuracy-terrain: $(READY)
+	$(BIN)/python benchmarks/rough_terrain_beamlets.py
 
 # docs/validation.md from the stores in results/; those that are missing are computed first.
 validation: $(READY)
