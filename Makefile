@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy draw-groups stopping frozen promise detectors peers scaling plan-honesty validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy accuracy-terrain draw-groups stopping frozen promise detectors peers peers-physics scaling plan-honesty validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -94,6 +94,10 @@ peers: $(READY)
 	$(BIN)/pip install --quiet joblib xyzpy
 	$(BIN)/python benchmarks/engine_comparison.py
 
+# Points a second and memory side by side with drawn records by NumPy, docs/peers.md; ten minutes.
+peers-physics: $(READY)
+	$(BIN)/python benchmarks/peers_physics.py
+
 scaling: $(READY)
 	$(BIN)/python benchmarks/worker_scaling.py
 
@@ -146,6 +150,10 @@ accuracy: $(READY)
 
 draw-groups: $(READY)
 	$(BIN)/python benchmarks/draw_groups.py
+
+# Beamlets in a flight over rough terrain, a section of docs/accuracy.md; ten minutes.
+accuracy-terrain: $(READY)
+	$(BIN)/python benchmarks/rough_terrain_beamlets.py
 
 # docs/validation.md from the stores in results/; those that are missing are computed first.
 validation: $(READY)

@@ -1,7 +1,8 @@
 """Write docs/accuracy.md and its figures: the cost of accuracy in time, by `sweep accuracy`.
 
 Run with `make accuracy`, some quarter of an hour. Names of studies below as arguments measure
-those alone and print their sections; --time-limit SECONDS is that of each (180).
+those alone and print their sections; --time-limit SECONDS is that of each (180). The section of
+beamlets over rough terrain is that of `make accuracy-terrain` and stays as it is.
 """
 
 import argparse
@@ -190,6 +191,13 @@ def study_section(name: str, study: MeasuredStudy, time_limit: float) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def read_page_part(path: Path, name: str) -> str:
+    """Return a part of a page that another script writes, with its marks."""
+    begin_mark, end_mark = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    part = path.read_text(encoding="utf-8").partition(begin_mark)[2].partition(end_mark)[0]
+    return f"{begin_mark}{part}{end_mark}\n"
+
+
 def main() -> None:
     """Write the page, or print the sections of the studies named as arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -204,8 +212,10 @@ def main() -> None:
     if arguments.names:
         print("\n".join(sections))
     else:
-        page = "\n".join([PAGE_HEAD, *sections, draw_groups.page_section()]) + PAGE_TAIL
-        (DOCS / "accuracy.md").write_text(page, encoding="utf-8")
+        path = DOCS / "accuracy.md"
+        terrain_section = read_page_part(path, "rough_terrain_section")
+        parts = [PAGE_HEAD, *sections, draw_groups.page_section(), terrain_section]
+        path.write_text("\n".join(parts) + PAGE_TAIL, encoding="utf-8")
 
 
 if __name__ == "__main__":
