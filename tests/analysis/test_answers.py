@@ -141,8 +141,11 @@ def test_the_roc_of_a_speckled_target_is_swerlings(speckled):
     expected = pfa ** (1 / (1 + snr))
     assert curve.simulated
     assert (np.diff(curve.pd) > 0).all()
-    # five standard errors
-    assert curve.pd.values == pytest.approx(expected, abs=5 / 1.96 * float(curve.half_width.max()))
+    # five standard errors; an echo between two bins loses part of its SNR, here less than 1 dB
+    lowest = pfa ** (1 / (1 + 0.79 * snr))
+    allowed = 5 / 1.96 * float(curve.half_width.max())
+    assert (curve.pd.values >= lowest - allowed).all()
+    assert (curve.pd.values <= expected + allowed).all()
     assert float(curve.half_width.max()) < 0.02
 
 
