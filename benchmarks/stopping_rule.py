@@ -75,29 +75,29 @@ class RepeatedPoint:
 
     def __init__(self, number: int, values: Sampler, method: str) -> None:
         self._values, self._method = values, method
-        self.number = np.zeros(number, np.int64)
+        self.n_draws = np.zeros(number, np.int64)
         self.mean, self.squared_deviations = np.zeros(number), np.zeros(number)
 
-    def at_once(self, points: int) -> int:
-        """Return the number of draws of each trial that `take` should add at once."""
+    def draws_per_step(self, n_points: int) -> int:
+        """Return the number of draws of each trial that `draw` should add at once."""
         return NOISE_DRAWS_PER_STEP
 
-    def take(self, points: np.ndarray, n_more: int) -> None:
+    def draw(self, points: np.ndarray, n_more: int) -> None:
         """Add draws to trials; update their moments [Chan, Golub, LeVeque, Am. Stat. 37, 1983]."""
         for batch in np.array_split(points, -(-points.size * n_more // VALUES_AT_ONCE)):
             values = self._values((batch.size, n_more))
-            mean, n_before = values.mean(axis=1), self.number[batch]
+            mean, n_before = values.mean(axis=1), self.n_draws[batch]
             mean_difference = mean - self.mean[batch]
             self.squared_deviations[batch] += ((values - mean[:, None]) ** 2).sum(axis=1)
             self.squared_deviations[batch] += (
                 mean_difference**2 * n_before * n_more / (n_before + n_more)
             )
             self.mean[batch] += mean_difference * n_more / (n_before + n_more)
-            self.number[batch] += n_more
+            self.n_draws[batch] += n_more
 
     def half_widths(self, points: np.ndarray) -> np.ndarray:
         """Return the half-widths of the intervals of some trials."""
-        mean, n = self.mean[points], self.number[points]
+        mean, n = self.mean[points], self.n_draws[points]
         interval: ConfidenceInterval
         if self._method == "means":
             variance = self.squared_deviations[points] / np.maximum(n - 1, 1)
@@ -111,9 +111,9 @@ class RepeatedPoint:
             )
         return interval_half_width(mean, interval)
 
-    def missed(self, points: np.ndarray, accuracy: ErrorBudget) -> np.ndarray:
+    def half_width_excess(self, points: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return by how much the half-widths of trials exceed the tolerance; 0 if they do not."""
-        return np.maximum(self.half_widths(points) - accuracy.tolerance, 0.0)
+        return np.maximum(self.half_widths(points) - error_budget.tolerance, 0.0)
 
 
 class StoppingResult(NamedTuple):
@@ -138,7 +138,7 @@ def simulate_stopping(
     )
     draw_until_accurate(trials, points, check_numbers, ErrorBudget(tolerance, CONFIDENCE_LEVEL))
     is_within = abs(trials.mean - pd) <= trials.half_widths(points)
-    return StoppingResult(pd, is_within.mean(), trials.mean.mean() - pd, trials.number.mean())
+    return StoppingResult(pd, is_within.mean(), trials.mean.mean() - pd, trials.n_draws.mean())
 
 
 SAMPLER_KINDS = {
