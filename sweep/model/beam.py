@@ -496,7 +496,7 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
     Returns
     -------
     ndarray
-        Efficiency of transmission and reception together, 0..1, to 1e-4. Beams of unequal
+        Efficiency of transmission and reception together, 0..1.01, to 1e-4. Beams of unequal
         radii take the geometric mean of the two efficiencies.
 
     Notes
@@ -530,6 +530,7 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
     efficiency = map_coordinates(
         _truncation_table(), table_position, mode="mirror", prefilter=False
     ).reshape(fill_ratio.shape)
+    efficiency = np.where(np.isnan(rim_phase), np.nan, efficiency)
     return np.where(fill_ratio > _UNTRUNCATED_FILL_RATIO_MAX, efficiency, 1.0)
 
 

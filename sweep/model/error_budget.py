@@ -35,11 +35,16 @@ terms of z^2 / n of its width.
 If draws come in groups of g that are spread evenly (:mod:`sweep.model.sampling.draw_groups`), the
 means of groups vary less than those of independent draws. Let S^2 be g times the sample variance of
 the means of R groups, and t the quantile of Student's distribution with R - 1 degrees of freedom.
-Of n draws, n - R g are in a group that is not yet whole; they have the variance s^2 at most. Rare
-values raise the mean at single cells of a group, where the value may be as low as 0. The variance
-is then higher by up to d. Hence
+S^2 takes the place of s^2 only if groups help much, as the lesser of two estimates of one variance
+would be too small on average. So draws in whole groups count with the variance
 
-    n d^2 = (R g / n) min(t^2 S^2, z^2 s^2) + (1 - R g / n) z^2 s^2 + z^2 d.
+    T^2 = t^2 S^2 / z^2    if that is less than s^2 / 4, else s^2.
+
+Of n draws, n - R g are in a group that is not yet whole; they count with s^2. Rare values raise the
+mean at single cells of a group, where the value may be as low as 0. The variance is then higher by
+up to d. Hence
+
+    n d^2 = z^2 (T^2 R g / n + s^2 (1 - R g / n) + d).
 
 This half-width is at least z^2 / n. With fewer than two groups that of independent draws is used.
 
@@ -370,15 +375,46 @@ def grouped_mean_half_width(
     -----
     The module's description derives the half-width.
     """
-    n, groups = np.asarray(n_values, float), np.asarray(n_groups, float)
+    n = np.asarray(n_values, float)
+    z = two_sided_normal_quantile(confidence)
+    own_variance = np.where(n > 1, variance, 0.0)
+    grouped_variance = variance_of_grouped_draws(
+        variance=own_variance,
+        group_variance=group_variance,
+        n_groups=n_groups,
+        group_size=group_size,
+        confidence=confidence,
+    )
+    n_grouped = np.asarray(n_groups, float) * group_size
+    variance_sum = n_grouped * grouped_variance + (n - n_grouped) * own_variance
+    return np.asarray((z * z / 2 + np.sqrt(z * z * variance_sum + z**4 / 4)) / n)
+
+
+GROUPED_VARIANCE_RATIO_MAX = 0.25
+"""Largest variance of a draw by the means of groups, over that of independent draws, with which
+these means count. Nearer to 1 the lesser of both estimates would be too small on average."""
+
+
+def variance_of_grouped_draws(
+    *,
+    variance: ArrayLike,
+    group_variance: ArrayLike,
+    n_groups: ArrayLike,
+    group_size: int,
+    confidence: ArrayLike,
+) -> np.ndarray:
+    """Return the variance with which a draw of a whole group counts for a mean over groups.
+
+    Parameters are those of :func:`grouped_mean_half_width`; the result is T^2 of the module's
+    description.
+    """
+    groups = np.asarray(n_groups, float)
     z = two_sided_normal_quantile(confidence)
     t = stdtrit(np.maximum(groups - 1, 1), 0.5 + np.asarray(confidence, float) / 2)
-    independent_term = z * z * np.where(n > 1, variance, 0.0)
-    group_term = np.where(groups > 1, t * t * group_size * group_variance, independent_term)
-    n_grouped = groups * group_size
-    variance_term = n_grouped * np.minimum(group_term, independent_term)
-    variance_term = variance_term + (n - n_grouped) * independent_term
-    return np.asarray((z * z / 2 + np.sqrt(variance_term + z**4 / 4)) / n)
+    of_groups = np.square(t / z) * group_size * np.asarray(group_variance, float)
+    # A group variance that is not known is nan, and not less.
+    groups_help = (groups > 1) & (of_groups < GROUPED_VARIANCE_RATIO_MAX * np.asarray(variance))
+    return np.where(groups_help, of_groups, variance)
 
 
 def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np.ndarray:

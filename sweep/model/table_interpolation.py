@@ -46,7 +46,9 @@ def interpolate_tables(
     is_defined = np.isfinite(indices).all(axis=0)
     flat_indices = np.where(is_defined, indices, 0.0).reshape(len(indices), -1)
     values_of_tables = (
-        map_coordinates(table, flat_indices, order=1, mode="nearest").reshape(is_defined.shape)
+        map_coordinates(np.asarray(table, float), flat_indices, order=1, mode="nearest").reshape(
+            is_defined.shape
+        )
         for table in tables
     )
     return tuple(np.where(is_defined, values, np.nan) for values in values_of_tables)

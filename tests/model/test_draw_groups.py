@@ -15,6 +15,7 @@ from sweep.model.error_budget import (
     bounded_mean_interval,
     grouped_mean_half_width,
     two_sided_normal_quantile,
+    variance_of_grouped_draws,
 )
 from sweep.model.sampling import philox
 from sweep.model.sampling.draw_groups import (
@@ -219,3 +220,51 @@ def test_tests_come_after_whole_groups(batch, limit):
     assert (late % GROUP_SIZE == 0).all()
     early = ends[(ends < 2 * GROUP_SIZE) & (ends < limit)]
     assert (early % batch == 0).all()
+
+
+@pytest.mark.parametrize("n_groups", [4, 6, 10, 20])
+@pytest.mark.parametrize("ratio", [1.0, 0.3, 0.01])
+def test_standard_errors_of_few_groups_are_not_too_small(n_groups, ratio):
+    """Means of groups with `ratio` times the variance of independent draws, 20,000 times.
+
+    A normal mean is beyond 1.96 of its standard errors in 5 % of the cases, and beyond 5 of them in
+    none. Student's law for four groups has 0.4 % there.
+    """
+    rng = np.random.default_rng([n_groups, int(100 * ratio)])
+    variance = 0.04
+    means = rng.normal(0.0, np.sqrt(ratio * variance / GROUP_SIZE), (20_000, n_groups))
+    counted = variance_of_grouped_draws(
+        variance=variance, group_variance=means.var(axis=1, ddof=1), n_groups=n_groups,
+        group_size=GROUP_SIZE, confidence=CONFIDENCE,
+    )  # fmt: skip
+    errors = np.abs(means.mean(axis=1)) / np.sqrt(counted / (n_groups * GROUP_SIZE))
+    assert (errors > 1.96).mean() < 0.07
+    assert (errors > 5).mean() < 0.006
+
+
+@pytest.mark.parametrize(("pd", "tolerance"), [(0.5, 0.05), (0.5, 0.03), (0.2, 0.03)])
+def test_stopping_is_as_sure_as_promised_where_groups_do_not_help(pd, tolerance):
+    """Draws of 0 and 1 that are independent in spite of their groups, until accurate, 4,000 times.
+
+    Three sigma of 4,000 trials are 1 %.
+    """
+    rng, n_trials, draws_max = np.random.default_rng(int(1000 * tolerance)), 4000, 3200
+    values = rng.random((n_trials, draws_max)) < pd
+    sums = np.cumsum(values, axis=1, dtype=np.int32)
+    group_means = values.reshape(n_trials, -1, GROUP_SIZE).mean(axis=2)
+    is_open, is_covered = np.ones(n_trials, bool), np.zeros(n_trials, bool)
+    for n in stopping_checks(100, draws_max, GROUP_SIZE):
+        n_groups = n // GROUP_SIZE
+        if n_groups < 2:
+            continue
+        mean = sums[:, n - 1] / n
+        half_width = grouped_mean_half_width(
+            variance=mean * (1 - mean) * n / (n - 1), n_values=n,
+            group_variance=group_means[:, :n_groups].var(axis=1, ddof=1), n_groups=n_groups,
+            group_size=GROUP_SIZE, confidence=CONFIDENCE,
+        )  # fmt: skip
+        stops = is_open & (half_width <= tolerance)
+        is_covered[stops] = np.abs(mean - pd)[stops] <= half_width[stops]
+        is_open &= ~stops
+    assert not is_open.any()
+    assert is_covered.mean() > 0.94

@@ -34,3 +34,8 @@ def test_an_unknown_coordinate_gives_an_unknown_value():
 def test_a_single_point_has_a_value_without_axes():
     (value,) = interpolate_tables([np.array([0.0, 2.0])], [np.array([1.0, 3.0])], [0.5])
     assert value.shape == () and value == 1.5
+
+
+def test_tables_of_whole_numbers_are_interpolated_between_them():
+    (values,) = interpolate_tables([np.arange(3.0)], [np.array([0, 1, 2])], [[0.5, 1.5]])
+    assert values.tolist() == [0.5, 1.5]

@@ -8,10 +8,11 @@ points is a scrambled net [1]_. Different pairs visit their cells in independent
 (Latin supercube sampling [2]_). Different groups are independent.
 
 The mean of a group is therefore unbiased. If a probability is a smooth function of one pair, the
-variance of the mean is far below that of independent draws. For any function it is about that of
-independent draws at most. Of a pair of radius and angle, half the angle's circle is spread evenly,
-and the sign is random. An interval of a mean over many groups follows from the variance of the
-groups' means (:func:`sweep.model.error_budget.grouped_mean_half_width`).
+variance of the mean is far below that of independent draws. For any function it is at most twice
+that of independent draws, which only functions as fine as the cells come near. Of a pair of radius
+and angle, half the angle's circle is spread evenly, and the sign is random. An interval of a mean
+over many groups follows from the variance of the groups' means
+(:func:`sweep.model.error_budget.grouped_mean_half_width`).
 
 Cells and orders are addressed by point, group, cause and index, as all random numbers are
 (:mod:`sweep.model.sampling.philox`). So the first draws stay the same if more are added.

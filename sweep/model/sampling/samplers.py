@@ -39,6 +39,7 @@ from sweep.model.error_budget import (
     grouped_mean_half_width,
     interval_half_width,
     two_sided_normal_quantile,
+    variance_of_grouped_draws,
 )
 from sweep.model.evaluation import evaluate, prepare_shots, shot_statistics
 from sweep.model.outputs import (
@@ -87,6 +88,15 @@ PD_COUNT_ROWS = [
 ]
 """Rows of arrays of counts that hold numbers of detections, in the order of ``PD_OUTPUTS``. The
 rows of such an array are in the order of ``DRAW_COUNT_OUTPUTS``."""
+
+
+GROUPS_OF_STANDARD_ERROR_MIN = 4
+"""Smallest number of groups of draws whose means are used for a standard error. Fewer groups do not
+tell their variance: with two, one error in fifty would exceed five standard errors. With four it is
+one in 250."""
+
+STANDARD_ERROR_CONFIDENCE = 0.95
+"""Confidence at which standard errors by the means of groups count Student's quantile."""
 
 
 class PriorDraws(NamedTuple):
@@ -510,19 +520,23 @@ class DetectionSampler(Sampler):
     def _standard_errors(self) -> dict[str, np.ndarray]:
         """Return the standard errors of mean probabilities of detection, (n,) by name.
 
-        Draws in whole groups have the variance of the groups' means if there are two groups or
-        more. All others have that of independent draws.
+        Draws in whole groups count with the variance of the groups' means, as in half-widths, if
+        there are at least :data:`GROUPS_OF_STANDARD_ERROR_MIN` groups. All others count with that
+        of independent draws.
         """
         assert self._running_means is not None
         point_indices = np.arange(self.n_draws.size)
         _, variance, n = self._running_means.moments(PD_OUTPUTS, point_indices)
         n_groups, group_variance = self._group_means.statistics(point_indices, n)
-        n_grouped = GROUP_SIZE * n_groups
-        squared_sum_error = n * variance
-        is_grouped = n_groups > 1
-        squared_sum_error[is_grouped] = (
-            n_grouped * np.fmin(GROUP_SIZE * group_variance, variance) + (n - n_grouped) * variance
-        )[is_grouped]
+        grouped_variance = variance_of_grouped_draws(
+            variance=variance,
+            group_variance=group_variance,
+            n_groups=n_groups,
+            group_size=GROUP_SIZE,
+            confidence=STANDARD_ERROR_CONFIDENCE,
+        )
+        n_grouped = GROUP_SIZE * np.where(n_groups >= GROUPS_OF_STANDARD_ERROR_MIN, n_groups, 0)
+        squared_sum_error = n_grouped * grouped_variance + (n - n_grouped) * variance
         errors = np.sqrt(squared_sum_error) / np.where(n > 0, n, np.nan)
         return {f"{name}_error": row for name, row in zip(PD_OUTPUTS, errors, strict=True)}
 
