@@ -190,7 +190,7 @@ class PhaseError(NamedTuple):
 class EchoRecord(NamedTuple):
     """Number of samples before the echo arrives, and phase errors of the echo over the record."""
 
-    n_samples_before: np.ndarray | None = None
+    n_samples_before_echo: np.ndarray | None = None
     """(3, n) int64: number of the record's samples before the echo arrives, at most all. It is None
     if echoes fill their records.
     """

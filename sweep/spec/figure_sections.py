@@ -238,7 +238,7 @@ FIGURE_QUANTITIES = (
 )  # fmt: skip
 """Names of the quantities of shots and of points that a scene's figure can show."""
 
-SEVERAL_SURFACES_KEYWORD = "several_surfaces"
+SHOT_WITH_SEVERAL_SURFACES_KEYWORD = "several_surfaces"
 """Word that may replace a shot's number in a figure.
 
 It selects the first shot whose footprint has several surfaces.
@@ -358,7 +358,8 @@ class ShotSpectraFigure(SceneFigureBase):
     scanner: str | None = _SCANNER_FIELD
     shot: int | str = declare.integer_field(
         "Number of the shot, from 0, or the first whose footprint has several surfaces",
-        "0", "0", "1e15", keyword=SEVERAL_SURFACES_KEYWORD, default=SEVERAL_SURFACES_KEYWORD,
+        "0", "0", "1e15", keyword=SHOT_WITH_SEVERAL_SURFACES_KEYWORD,
+        default=SHOT_WITH_SEVERAL_SURFACES_KEYWORD,
     )  # fmt: skip
     draw: int = _DRAW_FIELD
 
