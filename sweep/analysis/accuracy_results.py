@@ -443,9 +443,11 @@ def _fixed_setting_sentences(
 def _slowdown_text(
     worst_comparison: SettingComparison, comparisons: Sequence[SettingComparison], attributes: dict
 ) -> str:
-    """Return a text on how much slower adaptive settings are where a fixed setting is faster.
+    """Return a text that says by how much adaptive settings miss the speed of fixed settings.
 
-    `worst_comparison` is the comparison with the smallest speed-up among `comparisons`.
+    It gives the extra time for the whole study, the time of planning, and the smallest speed-up if
+    the time to store results counts too. `worst_comparison` is the comparison of smallest speed-up
+    among `comparisons`.
     """
     n_points = attributes["study_points"]
     extra_seconds = worst_comparison.adaptive.fastest_round_seconds * (

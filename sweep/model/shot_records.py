@@ -167,14 +167,19 @@ class PhaseError(NamedTuple):
     """Arguments of ``phase`` by name, (n,) or scalars; a tuple has one element for each segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the arguments of selected points in one segment, (points,) each.
+        """Return the arguments of ``phase`` for selected points in one segment.
 
         Parameters
         ----------
         segment : int
             Index of the segment.
         point_indices : ndarray of int
-            Selected points.
+            Indices of the m selected points.
+
+        Returns
+        -------
+        dict
+            Arguments by name, (m,) each; scalars are repeated for each point.
         """
         selected = {}
         for name, value in self.arguments.items():

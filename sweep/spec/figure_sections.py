@@ -302,7 +302,8 @@ def _crop_field(axis: str) -> Any:
 
 _SCANNER_FIELD = declare.object_name_field("Scanner; the first by default", None)
 _RANGES_FIELD = declare.choice_field(
-    "Ranges quantised to bins, or interpolated between bins", ("quantised", "interpolated")
+    "Range shown for each point: quantised to FFT bins, or interpolated between bins",
+    ("quantised", "interpolated"),
 )
 _DRAW_FIELD = declare.integer_field("Number of the draw, from 0", "0", "0", "1e9", default=0)
 _TIME_FIELD = declare.list_field(

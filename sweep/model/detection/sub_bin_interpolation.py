@@ -70,13 +70,15 @@ class NoiseMixing(NamedTuple):
     """
 
     from_centre: float
-    """Factor of the centre bin's number in the noise of either neighbour."""
+    """Factor on z0, the number of the centre bin, in the noise of both neighbours."""
     above_own: float
-    """Factor of the upper bin's own number in its noise."""
+    """Factor on z1 in the noise of the bin above: the part independent of the centre bin's noise.
+    """
     below_from_above: float
-    """Factor of the upper bin's number in the noise of the lower bin."""
+    """Factor on z1 in the noise of the bin below."""
     below_own: float
-    """Factor of the lower bin's own number in its noise."""
+    """Factor on z2 in the noise of the bin below: the part independent of the noise of both other
+    bins."""
 
 
 class NeighbourWeights(NamedTuple):

@@ -98,9 +98,9 @@ LOG_SPECKLE_POWER_MIN_FAINT = -5.0
 sum of rates is at most FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX. The part below this limit is
 extrapolated."""
 FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX = 0.1
-"""Largest sum of a segment's rates -ln(1 - c), at mean speckle power, for which the integral over
-speckle begins at LOG_SPECKLE_POWER_MIN_FAINT. c is the probability that a bin crosses the
-threshold."""
+"""Limit below which leaked signal counts as faint, so that the integral over speckle may begin at
+LOG_SPECKLE_POWER_MIN_FAINT. It applies to the sum of -ln(1 - c) over the bins of a segment at mean
+speckle power, with the probability c that leaked signal lifts a bin above the threshold."""
 
 LOG_SPECKLE_POWER_STEP_MAX = 0.25
 """Largest step in ln(speckle power) of the integral over speckle. The relative error of the mean is

@@ -248,8 +248,8 @@ class Returns(NamedTuple):
     """uint8: bits that compare the return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """int32: index of the beamlet whose surface a true or misread return measures; -1 for other
-    returns."""
+    """int32: index of the beamlet to which the peaks of a return belong, if its flag is true or
+    misread (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); else -1."""
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group (adjacent bins above the threshold) of the
     up, Doppler and down peak; -1 for no peak or a false peak."""
@@ -565,8 +565,8 @@ class DrawInputs(NamedTuple):
     last_searched_bin: np.ndarray
     """(n, 3) int64: last bin in which noise alone may raise a false peak."""
     line_grid: SpeckleLineGrid
-    """Lines that represent the footprints in developed speckle; without speckle a grid of no
-    points."""
+    """Lines that represent each point's footprint in developed speckle. Without developed speckle
+    the arrays have no points (length 0 instead of n)."""
     line_centre: np.ndarray
     """(n, 3, groups): mean position of the beamlets' lines in a group of adjacent bins [bins]."""
     echo_fraction: np.ndarray
@@ -652,8 +652,9 @@ class DrawnPeaks(NamedTuple):
     """(n, draws, returns) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """(n, draws, returns) int32: index of the beamlet whose surface a true or misread return
-    measures; -1 for other returns."""
+    """(n, draws, returns) int32: index of the beamlet to which the peaks of a return belong, if it
+    is true or misread; else -1. The peaks of a misread return were converted to a wrong range or
+    velocity."""
 
     @classmethod
     def empty(cls, bin_groups: BinGroups, draws: int) -> "DrawnPeaks":
@@ -685,8 +686,8 @@ class ListedReturns(NamedTuple):
     """(m,) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`)."""
     beamlet: np.ndarray
-    """(m,) int32: index of the beamlet whose surface a true or misread return measures; -1 for
-    other returns."""
+    """(m,) int32: index of the beamlet to which the peaks of a return belong, if it is true or
+    misread; else -1. The peaks of a misread return were converted to a wrong range or velocity."""
 
     @classmethod
     def from_drawn_peaks(cls, drawn_peaks: DrawnPeaks) -> "ListedReturns":

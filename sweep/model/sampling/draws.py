@@ -53,8 +53,8 @@ from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import iter_spans
 
 PD_BOTH_CHIRPS = "pd_both_chirps"
-"""Name of the output that holds the probability of a detection in both chirps. It exists if any two
-segments detect a shot."""
+"""Name of the output with the probability that both chirps, up and down, detect the echo. It exists
+only if any two segments suffice to detect a shot; otherwise ``pd_shot`` is this probability."""
 
 _DRAWS_PER_STEP = 256
 """Number of draws of one point whose random numbers are generated in one step."""

@@ -158,8 +158,10 @@ class SegmentSignal(NamedTuple):
     """Number of bins on either side of an echo's strongest bin that the echo occupies, if a shot
     has several echoes."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """Record from which the speckle of each echo is drawn. The tuple is empty if lines spread over
-    more than a bin or the echo has no samples, and None before :func:`add_footprint_records`."""
+    """For each echo the record from which its speckle is drawn; None until
+    :func:`add_footprint_records` sets it. The tuple is empty if speckle is not drawn from records,
+    because the lines spread over more than RECORD_LINE_DEVIATION_MAX_BINS or the echo has no
+    samples in the record."""
     record_scalings: tuple[np.ndarray, ...] = ()
     """(bins,) complex for each echo: factors from the transform of a drawn record to the speckle by
     which the bins of ``spectrum`` are multiplied."""
@@ -947,7 +949,9 @@ def prepare_point_spectra(
 def flag_detected_bins(
     spectra: Sequence[np.ndarray], point_spectra: PointSpectra, segment: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Apply the detector to the spectra of a segment, and combine looks (records).
+    """Flag the bins of a segment in which the detector finds a signal, with its looks combined.
+
+    A look is one record of the segment.
 
     Parameters
     ----------

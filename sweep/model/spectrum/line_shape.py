@@ -257,8 +257,8 @@ class LineShapeTables(NamedTuple):
     number of samples, N the FFT size. The array is empty for late echoes.
     """
     mode_end_polynomials: EndPolynomials
-    """Polynomials of each Chebyshev mode for its spectrum far from the line, (modes,
-    N_END_COEFFICIENTS).
+    """(modes, N_END_COEFFICIENTS) in each field: for each Chebyshev mode, the coefficients of the
+    polynomials that give its spectrum far from the line.
     """
     envelope_distance: np.ndarray
     """(m,): distances from the line at which envelopes are tabulated [bins of fs/N]."""
