@@ -230,7 +230,11 @@ def _option_flag(option: str) -> str:
 
 
 def _python_literal(value: object) -> str:
-    """Return a value as Python source text; a placeholder as a variable's name."""
+    """Return the Python source text that stands for a value in an example of a call.
+
+    A placeholder such as STORE becomes the name of a variable, ``store``. Values other than
+    booleans, numbers and lists become string literals.
+    """
     if isinstance(value, Placeholder):
         return value.lower()
     return repr(value if isinstance(value, bool | int | float | list) else str(value))

@@ -228,7 +228,7 @@ def segment_detections(spectra: SegmentSpectra, shots) -> dict[str, np.ndarray]:
 
 def shot_detections(detected: dict[str, np.ndarray], shots) -> np.ndarray:
     """Detection of each drawn shot, (draws,) bool: by any two segments, or by both chirps."""
-    if shots.any_two:
+    if shots.detects_by_any_two_segments:
         return np.sum(list(detected.values()), axis=0) >= 2
     return detected["up"] & detected["down"]
 

@@ -315,7 +315,7 @@ def stated_error(quantity: str, shots: Shots, facet: Facet) -> float:
             return STATED_ERRORS.alike_looks if quantity == "shot" else STATED_ERRORS.peak_bin
         return STATED_ERRORS.moving_looks if quantity == "shot" else STATED_ERRORS.moving_looks / 2
     if shots.detection_settings.echo_bins == "peak_bin":
-        is_any_two_shot = quantity == "shot" and shots.any_two
+        is_any_two_shot = quantity == "shot" and shots.detects_by_any_two_segments
         return STATED_ERRORS.peak_bin_any_two if is_any_two_shot else STATED_ERRORS.peak_bin
     line_deviation_bins, is_padded = line_deviation(facet), shots.fft_size > shots.window.length
     errors = [STATED_ERRORS.any_bin]
@@ -350,7 +350,7 @@ def detection_rule_text(shots: Shots) -> str:
         )
         votes = f"{looks.votes} of" if looks.combine == "binary" else "mean of"
         rule = f"{votes} {looks.number} {speckle}"
-    return rule + (" any_two" if shots.any_two else "")
+    return rule + (" any_two" if shots.detects_by_any_two_segments else "")
 
 
 def distance_from_end(facet: Facet) -> float:

@@ -26,13 +26,13 @@ from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
     AS_WRITTEN_KIND,
+    BEAMLET_ROW_KIND,
     BEAMLETS_KIND,
     CLOSED_FORM_KIND,
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
     FIXED_EFFECTS_KIND,
     IMPROVED_THESIS_KIND,
-    LINE_PATTERN_KIND,
     MEAN_OF_DRAWS_KIND,
     REFERENCE_KIND,
     THESIS_KIND,
@@ -53,7 +53,7 @@ The reference, to which they are compared, has errors of this size itself.
 FIXED_SETTING_KINDS = (
     FIXED_EFFECTS_KIND,
     BEAMLETS_KIND,
-    LINE_PATTERN_KIND,
+    BEAMLET_ROW_KIND,
     CLOSED_FORM_KIND,
     ALL_EFFECTS_KIND,
     MEAN_OF_DRAWS_KIND,
@@ -443,9 +443,11 @@ def _fixed_setting_sentences(
 def _slowdown_text(
     worst_comparison: SettingComparison, comparisons: Sequence[SettingComparison], attributes: dict
 ) -> str:
-    """Return a text on how much slower adaptive settings are where a fixed setting is faster.
+    """Return a text that says by how much adaptive settings miss the speed of fixed settings.
 
-    `worst_comparison` is the comparison with the smallest speed-up among `comparisons`.
+    It gives the extra time for the whole study, the time of planning, and the smallest speed-up if
+    the time to store results counts too. `worst_comparison` is the comparison of smallest speed-up
+    among `comparisons`.
     """
     n_points = attributes["study_points"]
     extra_seconds = worst_comparison.adaptive.fastest_round_seconds * (
@@ -576,7 +578,7 @@ def format_error(value: float) -> str:
 
 NUMBERED_SETTING_KINDS = (
     BEAMLETS_KIND,
-    LINE_PATTERN_KIND,
+    BEAMLET_ROW_KIND,
     MEAN_OF_DRAWS_KIND,
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
@@ -593,7 +595,7 @@ MARK_BY_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
     FIXED_EFFECTS_KIND: ("s", canvas.LINE_COLOURS[2], "the same effects everywhere"),
     BEAMLETS_KIND: ("^", canvas.LINE_COLOURS[1], "number of beamlets in a lattice"),
-    LINE_PATTERN_KIND: ("<", canvas.LINE_COLOURS[7], "number of beamlets in a line"),
+    BEAMLET_ROW_KIND: ("<", canvas.LINE_COLOURS[7], "number of beamlets in a line"),
     ALL_EFFECTS_KIND: ("D", canvas.LINE_COLOURS[3], "all effects on"),
     MEAN_OF_DRAWS_KIND: ("P", canvas.LINE_COLOURS[5], "mean over so many draws"),
     COUNTED_DRAWS_KIND: ("^", canvas.LINE_COLOURS[1], "detections in so many draws"),

@@ -374,7 +374,7 @@ def _split_crowded_panels(panels: Sequence[Panel]) -> tuple[Sequence[Panel], boo
     is_split : bool
         True if the panels were split.
     """
-    is_reduced = any(line.points_per_value > 1 for panel in panels for line in panel.lines)
+    is_reduced = any(line.n_averaged_points > 1 for panel in panels for line in panel.lines)
     split_panels = [
         (panel, [line for line in panel.lines if line.style != "level"],
          [line for line in panel.lines if line.style == "level"])
@@ -397,7 +397,7 @@ def _draw_line_panel(axes: Axes, panel: Panel) -> None:
     """Draw the lines, axes and title of a panel."""
     has_stated = any(line.style == "stated" for line in panel.lines)
     for line in panel.lines:
-        _draw_line(axes, line, solid=has_stated or line.points_per_value > 1)
+        _draw_line(axes, line, solid=has_stated or line.n_averaged_points > 1)
     _set_axis(axes, "x", panel.x_axis)
     _set_axis(axes, "y", panel.y_axis)
     if panel.x_axis.kind != CATEGORY_SCALE:
@@ -439,7 +439,7 @@ def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
             return
         axes.fill_between(
             line.x, line.low, line.high, color=plot_options["color"], alpha=0.22, linewidth=0,
-            step="mid" if line.points_per_value > 1 else None,
+            step="mid" if line.n_averaged_points > 1 else None,
         )  # fmt: skip
     axes.plot(
         line.x,

@@ -74,7 +74,7 @@ class ChartLine:
     It is ``line``, ``stated`` (dashed), ``dots``, ``bars`` (error bars), ``level`` (horizontal
     line) or ``area`` (stacked on the areas before it).
     """
-    points_per_value: int = 1
+    n_averaged_points: int = 1
     """Number of points of the study that are averaged for each value of the line."""
     hover_texts: Sequence[str] = ()
     """Texts that a page shows when the reader points at a value of the line, one per value."""
@@ -672,14 +672,14 @@ def read_lines_along(
         reductions, dask.compute(*lazy_arrays), strict=True
     ):
         mean, *ends = (np.asarray(a, float) for a in arrays)
-        points_per_value = coordinate.points_per_cell(cells_max)
+        n_averaged_points = coordinate.points_per_cell(cells_max)
         band: dict[str, Any] = dict(zip(("low", "high"), ends, strict=False))
         chart_lines.append(
             ChartLine(
-                coordinate.cell_means(cells_max), mean, points_per_value=points_per_value, **band
+                coordinate.cell_means(cells_max), mean, n_averaged_points=n_averaged_points, **band
             )
         )
-        remarks.append(_band_remark(points_per_value, confidence, has_ends))
+        remarks.append(_band_remark(n_averaged_points, confidence, has_ends))
     return chart_lines, list(dict.fromkeys(remarks))
 
 
@@ -709,13 +709,13 @@ def _value_and_interval_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dat
     return dataset_with_ends, float(dataset_with_ends[CELL_LOWEST].attrs.get("confidence", 0.0))
 
 
-def _band_remark(points_per_value: int, confidence: float, has_ends: bool) -> str:
+def _band_remark(n_averaged_points: int, confidence: float, has_ends: bool) -> str:
     """Return a caption phrase on the reduction and band of a line; '' for a line without them."""
     interval_text = f"{100 * confidence:g} % confidence interval" if confidence else "interval"
-    if points_per_value > 1:
+    if n_averaged_points > 1:
         ends_note = f", their {interval_text}s included" if confidence else ""
         return (
-            f"line: mean of {points_per_value} neighbouring points; band: from the lowest of them "
+            f"line: mean of {n_averaged_points} neighbouring points; band: from the lowest of them "
             f"to the highest{ends_note}, so that no narrow dip is hidden"
         )
     return f"band: {interval_text} of each point" if has_ends else ""

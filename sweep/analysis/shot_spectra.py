@@ -125,7 +125,7 @@ class SimulatedShot:
     @property
     def is_detected(self) -> bool:
         """True if the shot is detected: both chirps, or any two segments, exceed the threshold."""
-        if self.prepared_shot.any_two:
+        if self.prepared_shot.detects_by_any_two_segments:
             return sum(bool(segment.bin_groups) for segment in self.segments) >= 2
         return all(
             segment.bin_groups

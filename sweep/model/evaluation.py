@@ -255,7 +255,7 @@ def shot_statistics(
         "radial_velocity_error": measured.radial_velocity - shots.target.radial_velocity,
         "misread": (is_range_misread | is_velocity_misread).astype(float),
     }
-    if shots.any_two:
+    if shots.detects_by_any_two_segments:
         pd_up, _, pd_down = pd
         magnitude_up, _, magnitude_down = magnitude
         results["pd_both_chirps"] = joint_detection_probability(

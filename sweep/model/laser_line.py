@@ -58,7 +58,7 @@ the sample rate, L the number of samples."""
 _gauss_legendre = lru_cache(maxsize=1)(np.polynomial.legendre.leggauss)
 
 _DECAY_EXPONENT_MAX = 40.0
-"""Exponent from which on the decay exp(-exponent) of the laser's coherence is neglected."""
+"""Exponent x above which the factor exp(-x), by which the laser loses coherence, counts as 0."""
 
 _DECAY_PER_SAMPLE_MIN = 0.1
 """Decay exponent of the laser's coherence per sample above which lags are summed one by one. After

@@ -223,20 +223,20 @@ class Shots:
         return self.to_signed_bins(np.arange(self.n_bins) - self.bin_indices(np.zeros((), int)))
 
     @property
-    def echo_record_times(self) -> dict[str, Any]:
+    def echo_interval_in_record(self) -> dict[str, Any]:
         """Start and duration [s] of the part of the record that contains the echo.
 
         ``start`` counts from the segment's start. Both are (n,) or scalars. If the echo does not
         fill the record, both are tuples by segment.
         """
-        if self.echo_record.n_samples_before is None:
+        if self.echo_record.n_samples_before_echo is None:
             return {"start": self.record.acquisition_delay, "duration": self.record.duration}
         missing_times = [
-            n_missing / self.sample_rate for n_missing in self.echo_record.n_samples_before
+            n_missing / self.sample_rate for n_missing in self.echo_record.n_samples_before_echo
         ]
         echo_durations = [
             (self.window.length - n_missing) / self.sample_rate
-            for n_missing in self.echo_record.n_samples_before
+            for n_missing in self.echo_record.n_samples_before_echo
         ]
         return {
             "start": tuple(self.record.acquisition_delay + time for time in missing_times),
@@ -245,9 +245,11 @@ class Shots:
 
     def echo_window_energy(self, segment: int) -> np.ndarray:
         """Return the sum of the squared window over one segment's samples with the echo, (n,)."""
-        if self.echo_record.n_samples_before is None:
+        if self.echo_record.n_samples_before_echo is None:
             return np.full(self.size, self.window.energy)
-        return window_energy_from_sample(self.window)[self.echo_record.n_samples_before[segment]]
+        return window_energy_from_sample(self.window)[
+            self.echo_record.n_samples_before_echo[segment]
+        ]
 
     @cached_property
     def total_relative_echo(self) -> np.ndarray:
@@ -428,7 +430,7 @@ class Shots:
         return np.where(stated_floor == AUTOMATIC, automatic_floor, stated_floor)
 
     @property
-    def any_two(self) -> bool:
+    def detects_by_any_two_segments(self) -> bool:
         """True if a shot counts as detected when any two of its three segments detect it."""
         return (
             self.detection_settings.shot_rule == waveform.ANY_TWO
@@ -663,7 +665,7 @@ class Shots:
         from sweep.model.detection.joint_tail import joint_tail_quadrature
         from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
         from sweep.model.detection.speckle_modes import NO_MODES, mode_table
-        from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
+        from sweep.model.detection.sub_bin_interpolation import sidelobe_bin_noise_correlation
 
         in_speckle, any_bin = (
             self.speckle.segment_correlations is not None,
@@ -691,7 +693,9 @@ class Shots:
             neighbour_crossing_quadrature=joint_tail_quadrature(self.noise_bin_correlation),
             noise_pseudo_variance_ratio=noise_ratio,
             mode_table=modes,
-            sidelobe_correlation=sidelobe_correlation(self.window, self.fft_size),
+            sidelobe_bin_noise_correlation=sidelobe_bin_noise_correlation(
+                self.window, self.fft_size
+            ),
         )
 
     @cached_property

@@ -167,14 +167,19 @@ class PhaseError(NamedTuple):
     """Arguments of ``phase`` by name, (n,) or scalars; a tuple has one element for each segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the arguments of selected points in one segment, (points,) each.
+        """Return the arguments of ``phase`` for selected points in one segment.
 
         Parameters
         ----------
         segment : int
             Index of the segment.
         point_indices : ndarray of int
-            Selected points.
+            Indices of the m selected points.
+
+        Returns
+        -------
+        dict
+            Arguments by name, (m,) each; scalars are repeated for each point.
         """
         selected = {}
         for name, value in self.arguments.items():
@@ -190,7 +195,7 @@ class PhaseError(NamedTuple):
 class EchoRecord(NamedTuple):
     """Number of samples before the echo arrives, and phase errors of the echo over the record."""
 
-    n_samples_before: np.ndarray | None = None
+    n_samples_before_echo: np.ndarray | None = None
     """(3, n) int64: number of the record's samples before the echo arrives, at most all. It is None
     if echoes fill their records.
     """

@@ -228,7 +228,7 @@ def analytic_record(
     )
     amplitude = amplitude * shots.whitening_gain[segment][point]
     record = amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start_phase))
-    if shots.echo_record.n_samples_before is not None:
+    if shots.echo_record.n_samples_before_echo is not None:
         has_arrived = (
             t >= start_delay + delay_change - SAMPLE_TIME_TOLERANCE / shots.sample_rate[point]
         )

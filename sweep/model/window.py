@@ -181,7 +181,7 @@ def get_window(name: str, length: int) -> Window:
     return _window_from_samples(name, length)
 
 
-ZEROED_STEPS_PER_RECORD = 32
+ZEROING_STEPS_PER_RECORD = 32
 """Number of equal steps of a record, to which :func:`zero_first_samples` rounds the missing
 samples."""
 
@@ -195,7 +195,7 @@ def zero_first_samples(window: Window, n_missing: int) -> Window:
         Window of the full record.
     n_missing : int
         Number of first samples that are 0. It is rounded to a multiple of the record's length over
-        :data:`ZEROED_STEPS_PER_RECORD`, so that few windows are computed.
+        :data:`ZEROING_STEPS_PER_RECORD`, so that few windows are computed.
 
     Returns
     -------
@@ -203,18 +203,18 @@ def zero_first_samples(window: Window, n_missing: int) -> Window:
         Window with its own sums; the envelope is that of the full window.
     """
     step = min(
-        round(ZEROED_STEPS_PER_RECORD * n_missing / window.length), ZEROED_STEPS_PER_RECORD - 1
+        round(ZEROING_STEPS_PER_RECORD * n_missing / window.length), ZEROING_STEPS_PER_RECORD - 1
     )
     return _zero_first_steps(window, step) if step else window
 
 
-@lru_cache(maxsize=2 * ZEROED_STEPS_PER_RECORD)
+@lru_cache(maxsize=2 * ZEROING_STEPS_PER_RECORD)
 def _zero_first_steps(window: Window, step: int) -> Window:
-    """Return a window whose first steps are 0; a record has :data:`ZEROED_STEPS_PER_RECORD`.
+    """Return a window whose first steps are 0; a record has :data:`ZEROING_STEPS_PER_RECORD`.
 
     ``step`` is the number of zeroed steps.
     """
-    shortened = replace(window, n_missing=step * window.length // ZEROED_STEPS_PER_RECORD)
+    shortened = replace(window, n_missing=step * window.length // ZEROING_STEPS_PER_RECORD)
     w = shortened.samples()
     return replace(shortened, sum=float(w.sum()), energy=float((w**2).sum()))
 

@@ -187,9 +187,9 @@ name of its field."""
 class MeshCleaningReport:
     """Numbers of vertices and faces of a mesh, and of the repairs by `clean_mesh`."""
 
-    n_vertices: int
+    n_vertices_before: int
     """Number of vertices before cleaning."""
-    n_faces: int
+    n_faces_before: int
     """Number of faces before cleaning."""
     n_non_finite_faces: int = 0
     """Number of faces dropped because a vertex is not finite."""
@@ -211,7 +211,7 @@ class MeshCleaningReport:
             for name, template in _REPAIR_TEXT_BY_REPORT_FIELD.items()
         ]
         repairs = [template.format(count) for template, count in counts if count]
-        input_text = f"{self.n_faces:,} faces on {self.n_vertices:,} vertices"
+        input_text = f"{self.n_faces_before:,} faces on {self.n_vertices_before:,} vertices"
         return "; ".join([input_text, *self.notes, *(repairs or ["nothing to mend"])])
 
 
@@ -249,7 +249,7 @@ def clean_mesh(
     positions, face_corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
     surfaces = np.full(len(face_corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
     require_consistent_mesh(positions, face_corners, surfaces)
-    n_vertices, n_faces = len(positions), len(face_corners)
+    n_vertices_before, n_faces_before = len(positions), len(face_corners)
     has_data = np.isfinite(positions)[face_corners].all(axis=(1, 2))
     face_corners, surfaces = face_corners[has_data], surfaces[has_data]
     _require_faces(len(face_corners), len(has_data))
@@ -274,13 +274,13 @@ def clean_mesh(
         origin,
     )
     return mesh, MeshCleaningReport(
-        n_vertices=n_vertices,
-        n_faces=n_faces,
+        n_vertices_before=n_vertices_before,
+        n_faces_before=n_faces_before,
         n_non_finite_faces=int((~has_data).sum()),
         n_degenerate_faces=len(face_corners) - len(has_area),
         n_duplicate_faces=len(has_area) - len(kept_faces),
         n_merged_vertices=n_merged_vertices,
-        n_unreferenced_vertices=n_vertices - n_merged_vertices - len(kept_vertices),
+        n_unreferenced_vertices=n_vertices_before - n_merged_vertices - len(kept_vertices),
     )
 
 

@@ -120,7 +120,10 @@ def axis_identity(axis: Axis) -> dict[str, Any]:
 
 
 def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
-    """Return the content of one parameter along an axis that counts for the study's identity."""
+    """Return the values of one parameter of an axis, in the form that enters the study's identity.
+
+    Many values are replaced by their number, the first and last value, and a digest of all.
+    """
     n_values, has_words = len(parameter.values), isinstance(parameter.values, tuple)
     if n_values <= _VALUES_LISTED_IN_IDENTITY_MAX:
         return {

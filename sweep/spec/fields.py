@@ -648,7 +648,10 @@ class SpecFiles:
 
 
 def iter_file_paths(section: BaseModel) -> Iterator[tuple[KeyPath, FilePathRule, str]]:
-    """Yield path, rule and written file path of every field of a section that names a file."""
+    """Yield all fields of a section that name a file.
+
+    Each item has the field's key path, its rule, and the file's path as written in the spec.
+    """
     for key_path, rule, value in iter_section_values(section):
         if isinstance(rule, FilePathRule):
             yield key_path, rule, value

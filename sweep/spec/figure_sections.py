@@ -238,7 +238,7 @@ FIGURE_QUANTITIES = (
 )  # fmt: skip
 """Names of the quantities of shots and of points that a scene's figure can show."""
 
-SEVERAL_SURFACES_KEYWORD = "several_surfaces"
+SHOT_WITH_SEVERAL_SURFACES_KEYWORD = "several_surfaces"
 """Word that may replace a shot's number in a figure.
 
 It selects the first shot whose footprint has several surfaces.
@@ -302,7 +302,8 @@ def _crop_field(axis: str) -> Any:
 
 _SCANNER_FIELD = declare.object_name_field("Scanner; the first by default", None)
 _RANGES_FIELD = declare.choice_field(
-    "Ranges quantised to bins, or interpolated between bins", ("quantised", "interpolated")
+    "Range shown for each point: quantised to FFT bins, or interpolated between bins",
+    ("quantised", "interpolated"),
 )
 _DRAW_FIELD = declare.integer_field("Number of the draw, from 0", "0", "0", "1e9", default=0)
 _TIME_FIELD = declare.list_field(
@@ -358,7 +359,8 @@ class ShotSpectraFigure(SceneFigureBase):
     scanner: str | None = _SCANNER_FIELD
     shot: int | str = declare.integer_field(
         "Number of the shot, from 0, or the first whose footprint has several surfaces",
-        "0", "0", "1e15", keyword=SEVERAL_SURFACES_KEYWORD, default=SEVERAL_SURFACES_KEYWORD,
+        "0", "0", "1e15", keyword=SHOT_WITH_SEVERAL_SURFACES_KEYWORD,
+        default=SHOT_WITH_SEVERAL_SURFACES_KEYWORD,
     )  # fmt: skip
     draw: int = _DRAW_FIELD
 

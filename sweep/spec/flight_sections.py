@@ -375,7 +375,7 @@ def beam_rule(beam: object) -> ListRule:
 
 _NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
 """Smallest and largest angle between a beam and the downward vertical (nadir), with units."""
-_CYCLE_RATE_FIELD = declare.frequency_field("Measurement cycles a second")
+_CYCLE_RATE_FIELD = declare.frequency_field("Number of measurement cycles per second")
 _INTERVAL_FIELD_ZERO_BY_DEFAULT = declare.duration_field(
     "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
 )

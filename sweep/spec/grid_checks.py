@@ -342,10 +342,11 @@ def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
 
 
 def _segment_samples_min(grid: GridValues) -> float | None:
-    """Return the smallest number of samples of a segment over the grid; None if it is not known.
+    """Return the smallest number of samples of a segment over the grid, not rounded.
 
-    The number is (chirp duration - acquisition delay) * sample rate. An axis over the sample rate
-    is evaluated in full; all other axes enter by the smallest difference of the two times.
+    The number is (chirp duration - acquisition delay) * sample rate. It is evaluated at each value
+    of an axis over the sample rate. Each other axis contributes its smallest difference of the two
+    times. The result is None if one of the three parameters is not given.
     """
     if not grid.has_values(CHIRP_DURATION_PATH, ACQUISITION_DELAY_PATH, SAMPLE_RATE_PATH):
         return None

@@ -367,8 +367,8 @@ class Navigation(SpecSection):
         "0.001", "0", "0.5", default=0.0,
     )  # fmt: skip
     ground_slope: float = declare.number_field(
-        "Standard deviation of the ground's slope, as far as it is known beforehand; 10 leaves "
-        "the slope to the points, 0 says that the ground is level",
+        "Prior standard deviation of the ground's slope (height over distance): 0 means that the "
+        "ground is level, 10 that only the points tell its slope",
         "0.1", "0", "10", default=10.0,
     )  # fmt: skip
     relief: float = declare.length_field(

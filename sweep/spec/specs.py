@@ -409,7 +409,10 @@ class BaseSpec(SpecSection):
         return read_in_unit(rule, raw_value, parameter.units)
 
     def unstated_error_sentences(self) -> list[str]:
-        """Return sentences about errors whose size the spec does not state; none for grids."""
+        """Return sentences about sources of error of unstated size; [] for a grid.
+
+        A flight overrides this method.
+        """
         return []
 
     def identity(self) -> dict[str, Any]:
@@ -771,10 +774,11 @@ class SceneSpec(BaseSpec):
         return any(self.shots_per_cycle(name) >= NAVIGATION_SHOTS_MIN for name in self.scanners)
 
     def unstated_error_sentences(self) -> list[str]:
-        """Return sentences about errors whose size the spec does not state.
+        """Return sentences for the user about sources of error whose size the spec leaves open.
 
-        The sentences concern an error floor that comes with the instrument or is missing, the drift
-        of lines within a record, and relief that navigation does not take into account.
+        The sources are an error floor that the instrument brings along or that is missing, the
+        drift of lines within a record by acceleration, and relief of the ground for which the
+        navigation has no standard deviation.
         """
         sentences = []
         floor_values, rules = (

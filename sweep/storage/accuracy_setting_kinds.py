@@ -16,7 +16,7 @@ BEAMLETS_KIND = "beamlets"
 
 Beamlets are the rays that sample the cross-section of a beam.
 """
-LINE_PATTERN_KIND = "in a line"
+BEAMLET_ROW_KIND = "in a line"
 """Kind of settings with a fixed number of beamlets in a line."""
 CLOSED_FORM_KIND = "closed form"
 """Kind of settings that compute the thesis's effects in closed form."""

@@ -22,10 +22,10 @@ from sweep.model.detection.echo_detection import (
     threshold_from_tnr,
 )
 from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
-from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
+from sweep.model.detection.sub_bin_interpolation import sidelobe_bin_noise_correlation
 from sweep.model.error_budget import AUTOMATIC
 from sweep.model.spectrum.bin_spectrum import SpanArrays
-from sweep.model.spectrum.leakage import LeakageLimits, leakage_of_bins
+from sweep.model.spectrum.leakage import LeakageLimits, false_peak_probability_of_bins
 from sweep.model.spectrum.segment_spectra import segment_spectrum as segment_spectrum
 from sweep.model.window import window_samples
 
@@ -78,7 +78,7 @@ def assess(magnitude, sigma, level, floor, correlation=0.0):
     assert exempted == exempt.sum()
     marked = set(np.flatnonzero(exempt))
     limits = LeakageLimits(sigma, level, 0.0, correlation)
-    return peak, marked, leakage_of_bins(count, limits, floor, span, series)
+    return peak, marked, false_peak_probability_of_bins(count, limits, floor, span, series)
 
 
 def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
@@ -171,7 +171,7 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
         pfa, alarms = np.exp(-0.5 * (level / sigma) ** 2), {}
         for segment, name in ((0, "up"), (2, "down")):
             exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
-            near = sidelobe_correlation(shots.window, shots.fft_size)
+            near = sidelobe_bin_noise_correlation(shots.window, shots.fft_size)
             peak, excluded, leakage = by_brute_force(exact, sigma, level, 0.0, near)
             assert results[f"snr_{name}"][0] == pytest.approx(
                 exact[peak] ** 2 / (2 * sigma**2), rel=1e-8

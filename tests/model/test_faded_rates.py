@@ -95,7 +95,7 @@ def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
     magnitude, exempt = run_at_random(seed, level)
     span = SpanArrays(magnitude.copy(), exempt, *np.zeros((2, magnitude.size + 8)))
     limits = leakage.LeakageLimits(1.0, level, 0.0, correlation)
-    told = leakage.leakage_of_bins_in_speckle(
+    told = leakage.false_peak_probability_of_bins_in_speckle(
         np.int64(magnitude.size), limits, 0.0, span, table_of(level)
     )
 

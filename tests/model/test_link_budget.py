@@ -102,7 +102,7 @@ def test_the_planner_has_the_link_budget_of_the_shots(case, table_4_1):
     beats = existing(shots, shots.beat_frequencies)
     assert_equal(points.beat_frequency, beats, shape)
     n_missing = 0 if points.missing_samples is None else points.missing_samples.n_missing
-    before_echo = shots.echo_record.n_samples_before
+    before_echo = shots.echo_record.n_samples_before_echo
     expected = 0 if before_echo is None else before_echo[shots.has_segment]
     assert np.array_equal(np.broadcast_to(n_missing, shape), np.broadcast_to(expected, shape))
 
@@ -115,7 +115,7 @@ def test_the_planner_has_the_link_budget_of_the_shots(case, table_4_1):
     )
     magnitude = shots.echo_scales.beat_amplitude * axis_amplitude(shots) * shots.window.sum / 2
     signal_ratio = magnitude * pole_gain * shots.whitening_gain[shots.has_segment]
-    assert_equal(points.line_signal_ratio, signal_ratio / shots.bin_noise_sigma, shape)
+    assert_equal(points.line_magnitude_over_sigma, signal_ratio / shots.bin_noise_sigma, shape)
 
 
 def axis_amplitude(shots):

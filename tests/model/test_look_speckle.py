@@ -109,7 +109,7 @@ def test_looks_detect_as_often_as_in_drawn_records(case, table_4_1):
     outputs = shot_statistics(shots)
     found = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
     shot = found["up"] & found["down"]
-    if shots.any_two:
+    if shots.detects_by_any_two_segments:
         shot = sum(found[segment].astype(int) for segment in found) >= 2
     shares = {"pd_up": found["up"].mean(), "pd_down": found["down"].mean(), "pd_shot": shot.mean()}
     for name, share in shares.items():

@@ -18,7 +18,7 @@ from sweep.model.sampling.noisy_spectra import (
     SpectrumMethods,
     draw_noise_spectra,
     draw_signal_spectra,
-    flag_bins,
+    flag_detected_bins,
     noiseless_signal,
     prepare_point_spectra,
 )
@@ -207,7 +207,7 @@ def test_cells_of_an_iq_spectrum_have_neighbours_all_round(table_4_1, kind):
     ((_, shots),) = prepare_shots(parameters, EFFECTS)
     view = prepare_point_spectra(shots, 0, parameters, make_point_keys(1)[0], SpectrumMethods())
     noise = draw_noise_spectra(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(10_000))
-    _, flags = flag_bins([noise], view, 0)
+    _, flags = flag_detected_bins([noise], view, 0)
     assert flags.shape == (10_000, 64)
     np.testing.assert_allclose(flags.mean(axis=0), 0.02, atol=5 * np.sqrt(0.02 * 0.98 / 10_000))
 

@@ -131,7 +131,7 @@ def test_facets_become_a_mesh_at_the_same_place():
         np.sort(facets.vertices + facets.origin, axis=0),
         atol=1e-8,
     )
-    assert (mesh.surface_index == 3).all() and report.n_faces == len(mesh.faces) == 32
+    assert (mesh.surface_index == 3).all() and report.n_faces_before == len(mesh.faces) == 32
 
 
 def test_refining_keeps_the_given_heights_and_reproduces_cubics():

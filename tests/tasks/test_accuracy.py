@@ -13,9 +13,9 @@ from sweep.model.effects.catalogue import EFFECT_NAMES
 from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     AS_WRITTEN_KIND,
+    BEAMLET_ROW_KIND,
     BEAMLETS_KIND,
     FIXED_EFFECTS_KIND,
-    LINE_PATTERN_KIND,
     REFERENCE_KIND,
 )
 from sweep.tasks.accuracy import measurement, settings
@@ -91,7 +91,7 @@ def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
     adaptive = [rung for rung in ladder.settings if rung.kind == ADAPTIVE_KIND]
     tolerances = [rung.overrides["accuracy.tolerance"] for rung in adaptive]
     assert tolerances == [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
-    fixed = [rung for rung in ladder.settings if rung.kind in (BEAMLETS_KIND, LINE_PATTERN_KIND)]
+    fixed = [rung for rung in ladder.settings if rung.kind in (BEAMLETS_KIND, BEAMLET_ROW_KIND)]
     numbers = [rung.overrides["footprint.beamlets"] for rung in fixed]
     assert numbers == [*settings.TRIED_BEAMLET_COUNTS, *settings.TRIED_LINE_BEAMLET_COUNTS]
     assert all(r.overrides["footprint.beamlets"] == "auto" for r in adaptive)

@@ -153,7 +153,7 @@ def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray
     weights
         (n_bins, NOISE_FILTER_TAPS): weights of the numbers in each bin; their squares have the sum
         1.
-    first_number
+    first_number_index
         (n_bins,): index of the first number in each bin.
 
     Notes
@@ -165,10 +165,12 @@ def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray
     filter_length = min(window.length, 512) // 2 * 2
     window_values = window_samples(window.name, max(filter_length, 1))
     position = np.arange(n_bins) * (window.length / fft_size)
-    first_number = np.rint(position).astype(np.int64) - NOISE_FILTER_TAPS // 2
-    offset, offset_index = np.unique(np.round(position - first_number, 9), return_inverse=True)
+    first_number_index = np.rint(position).astype(np.int64) - NOISE_FILTER_TAPS // 2
+    offset, offset_index = np.unique(
+        np.round(position - first_number_index, 9), return_inverse=True
+    )
     record_position = (np.arange(window_values.size) - window_values.size // 2) / window_values.size
     cycles = (offset[:, None] - np.arange(NOISE_FILTER_TAPS))[..., None] * record_position
     weights = (np.cos(2 * np.pi * cycles) * window_values).sum(axis=-1)
     weights /= np.sqrt((weights**2).sum(axis=1, keepdims=True))
-    return weights[offset_index.ravel()], first_number
+    return weights[offset_index.ravel()], first_number_index

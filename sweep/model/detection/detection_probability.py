@@ -504,7 +504,7 @@ def shot_pd_and_miss(
         (n,): probabilities pd that a shot is detected, and miss that it is not. miss is not
         computed as 1 - pd, so that both keep their precision.
     """
-    if shots.any_two:
+    if shots.detects_by_any_two_segments:
         return _pd_and_miss_any_two(shots, pd, miss, magnitudes)
     pd_up, _, pd_down = pd
     miss_up, _, miss_down = miss

@@ -70,13 +70,15 @@ class NoiseMixing(NamedTuple):
     """
 
     from_centre: float
-    """Factor of the centre bin's number in the noise of either neighbour."""
+    """Factor on z0, the number of the centre bin, in the noise of both neighbours."""
     above_own: float
-    """Factor of the upper bin's own number in its noise."""
+    """Factor on z1 in the noise of the bin above: the part independent of the centre bin's noise.
+    """
     below_from_above: float
-    """Factor of the upper bin's number in the noise of the lower bin."""
+    """Factor on z1 in the noise of the bin below."""
     below_own: float
-    """Factor of the lower bin's own number in its noise."""
+    """Factor on z2 in the noise of the bin below: the part independent of the noise of both other
+    bins."""
 
 
 class NeighbourWeights(NamedTuple):
@@ -118,7 +120,7 @@ class Interpolator(NamedTuple):
     holds if the centre bin's |X| equals the noise per quadrature, and falls as 1/|X|."""
     noise_mixing: NoiseMixing
     """Factors that make the noise of three adjacent bins from independent normal numbers."""
-    sidelobe_correlation: float
+    sidelobe_bin_noise_correlation: float
     """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Of N
     successive sidelobe bins, L change sign from one to the next. N is the FFT size, L the number of
     samples in the record."""
@@ -141,10 +143,10 @@ def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, 
     return correlation_1 / window.energy, correlation_2 / window.energy
 
 
-def sidelobe_correlation(window: Window, fft_size: int) -> float:
+def sidelobe_bin_noise_correlation(window: Window, fft_size: int) -> float:
     """Return the correlation of adjacent bins' noise components in phase with a tone's sidelobes.
 
-    See :attr:`Interpolator.sidelobe_correlation`.
+    See :attr:`Interpolator.sidelobe_bin_noise_correlation`.
     """
     correlation_1, _ = neighbour_noise_correlations(window, fft_size)
     return correlation_1 * (1.0 - 2.0 * window.length / fft_size)
@@ -183,7 +185,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         weights=NeighbourWeights(*(0 * weight if neighbours_vanish else weight)),
         error_at_sigma=error,
         noise_mixing=_noise_mixing(correlation_1, correlation_2),
-        sidelobe_correlation=sidelobe_correlation(window, fft_size),
+        sidelobe_bin_noise_correlation=sidelobe_bin_noise_correlation(window, fft_size),
         spread_error_factor=np.zeros(0),
     )
     return interpolation._replace(

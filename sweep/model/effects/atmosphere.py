@@ -258,7 +258,7 @@ def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
     transmission = np.exp(
         -optical_depth(profile, **_path_geometry(points.parameters, points.range))
     )
-    light_noise_ratio = points.echo_noise_ratio
+    light_noise_ratio = points.echo_shot_noise_ratio
     if (solar_bound := noise_sources.solar_background_bound(points)) is not None:
         light_noise_ratio = light_noise_ratio + solar_bound.noise_variance_change
     # The threshold follows the sunlight's part, not the echo's. The worse case is assumed for both.

@@ -109,7 +109,7 @@ def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
     times the a^2 of the nearest.
     """
     image_ratio = (
-        points.line_signal_ratio
+        points.line_magnitude_over_sigma
         * points.footprint_extent.amplitude_gain_max
         * points.magnitude_max_beyond(points.bins_to_image)
     )
@@ -140,7 +140,7 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
         points.line_spread.largest_magnitude + points.phase_error_shift_bins, nyquist_bin
     )
     total_ratio = np.maximum(
-        points.line_signal_ratio * points.footprint_extent.amplitude_gain_max, 1e-300
+        points.line_magnitude_over_sigma * points.footprint_extent.amplitude_gain_max, 1e-300
     )
     threshold_distance = np.minimum(
         response.distance_below(points.threshold_ratio / total_ratio), nyquist_bin
@@ -225,7 +225,7 @@ def leakage_bound(points: PlannerInputs) -> ErrorBound:
     """
     threshold_ratio, is_near_image = points.threshold_ratio, points.is_near_image
     ratio_to_threshold = (
-        points.line_signal_ratio
+        points.line_magnitude_over_sigma
         * points.footprint_extent.amplitude_gain_max
         * np.where(is_near_image, 2.0, _IMAGE_FACTOR)
         / threshold_ratio

@@ -29,10 +29,10 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     if not (beam.is_single_mode(points.parameters) and points.any_nonzero(*paths)):
         return None
     lost_fraction = 1 - beam.axis_offset_transmission(points.parameters, points.range)
-    echo_noise_ratio = points.echo_noise_ratio
+    echo_shot_noise_ratio = points.echo_shot_noise_ratio
     return ErrorBound(
         magnitude_change=magnitude_change_from_power(lost_fraction),
-        noise_variance_change=-lost_fraction * echo_noise_ratio / (1 + echo_noise_ratio),
+        noise_variance_change=-lost_fraction * echo_shot_noise_ratio / (1 + echo_shot_noise_ratio),
         threshold_follows_noise=False,
     )
 

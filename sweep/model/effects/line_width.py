@@ -17,7 +17,7 @@ from sweep.model.effects.error_bounds import (
     PhaseErrorBound,
     magnitude_change_from_power,
 )
-from sweep.model.effects.phase_errors import coherent_phase_change, window_moments
+from sweep.model.effects.phase_errors import coherent_sum_change, window_moments
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.laser_line import (
     DEVIATION_PER_FWHM,
@@ -107,7 +107,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     if not points.amplitudes_may_add:
         return ErrorBound(magnitude_change=magnitude_change)
     half_reach = 0.5 * _LINE_REACH_DEVIATIONS * line_deviation
-    coherent_change = coherent_phase_change(
+    coherent_change = coherent_sum_change(
         points, PhaseErrorBound((half_reach, 0.0, 0.0, 0.0), constant=half_reach)
     )
     return ErrorBound(
@@ -147,9 +147,9 @@ def _line_fraction_and_pedestal(
     Both are those of the samples of the record that hold the echo.
     """
     looks = shots.looks.n_coherent
-    if shots.echo_record.n_samples_before is None:
+    if shots.echo_record.n_samples_before_echo is None:
         return apparent_line_and_pedestal(window=shots.window, looks=looks, **timing)
-    n_before_echo = shots.echo_record.n_samples_before[0]
+    n_before_echo = shots.echo_record.n_samples_before_echo[0]
     windows = [zero_first_samples(shots.window, n_missing) for n_missing in n_before_echo.tolist()]
     line_fraction, in_phase_pedestal = np.empty((2, shots.size))
     timing = {name: np.broadcast_to(values, shots.size) for name, values in timing.items()}
@@ -200,10 +200,10 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     line_fraction, in_phase_pedestal = _line_fraction_and_pedestal(shots, timing)
     line_power = (shots.echo_scales.beat_amplitude / 2) ** 2 * shots.total_relative_echo
     side_pedestal = pedestal_power_under_line(window=shots.window, **timing)
-    if shots.echo_record.n_samples_before is not None:
+    if shots.echo_record.n_samples_before_echo is not None:
         side_pedestal = (
             side_pedestal
-            * window_energy_from_sample(shots.window)[shots.echo_record.n_samples_before[0]]
+            * window_energy_from_sample(shots.window)[shots.echo_record.n_samples_before_echo[0]]
             / shots.window.energy
         )
     return replace(

@@ -35,7 +35,9 @@ def signal_shot_noise_bound(points: PlannerInputs) -> ErrorBound:
 
     The threshold is set without it, because it comes with the echo.
     """
-    return ErrorBound(noise_variance_change=points.echo_noise_ratio, threshold_follows_noise=False)
+    return ErrorBound(
+        noise_variance_change=points.echo_shot_noise_ratio, threshold_follows_noise=False
+    )
 
 
 def apply_signal_shot_noise(shots: Shots, context: EffectContext) -> Shots:

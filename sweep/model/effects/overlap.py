@@ -163,15 +163,18 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     0..L. tau_0 is the delay of the echo, beta its Doppler ratio, t_0 the start of the record and
     f_s the sample rate (:meth:`sweep.model.link_budget.RecordSettings.count_samples_before_echo`).
     """
-    n_samples_before = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
+    n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     for segment_index in np.flatnonzero(shots.has_segment):
         segment = shots.waveform_segments[segment_index]
-        n_samples_before[segment_index] = shots.record.count_samples_before_echo(
+        n_samples_before_echo[segment_index] = shots.record.count_samples_before_echo(
             segment, shots.range
         )
     return (
-        replace(shots, echo_record=shots.echo_record._replace(n_samples_before=n_samples_before))
-        if n_samples_before.any()
+        replace(
+            shots,
+            echo_record=shots.echo_record._replace(n_samples_before_echo=n_samples_before_echo),
+        )
+        if n_samples_before_echo.any()
         else shots
     )
 

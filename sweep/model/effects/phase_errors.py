@@ -210,7 +210,7 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
     return np.minimum(_RADIANS_PER_CYCLE * total, 2 * moments.magnitude_sum)
 
 
-def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
+def coherent_sum_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
     """Return the change that a phase error makes to sums of lines and images as amplitudes.
 
     The change is :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters
@@ -311,7 +311,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     lone_change = np.where(points.amplitudes_may_cancel, 0.0, magnitude_change)
     return ErrorBound(
         magnitude_change=lone_change,
-        coherent_sum_change=coherent_phase_change(points, own_bound),
+        coherent_sum_change=coherent_sum_change(points, own_bound),
         shift_bins=shift_bins,
     )
 
@@ -323,7 +323,7 @@ def _add_phase_error(
 
     ``phase_function`` gives the phase [cycles] at positions in the record, from ``values``.
     """
-    phase_error = PhaseError(phase_function, values | shots.echo_record_times)
+    phase_error = PhaseError(phase_function, values | shots.echo_interval_in_record)
     return replace(
         shots,
         echo_record=shots.echo_record._replace(
@@ -454,16 +454,16 @@ def chirp_drift_time(shots: Shots) -> np.ndarray:
     the middle.
     """
     drift_time = 2 * shots.record.acquisition_delay + shots.record.duration
-    if shots.echo_record.n_samples_before is None:
+    if shots.echo_record.n_samples_before_echo is None:
         return np.asarray(drift_time)
-    slope = _square_slope_by_first_sample(shots.window)[
-        shots.echo_record.n_samples_before[::2]
+    slope = _slope_of_square_by_first_sample(shots.window)[
+        shots.echo_record.n_samples_before_echo[::2]
     ].mean(axis=0)
     return np.asarray(drift_time + 0.5 * shots.record.duration * slope)
 
 
 @lru_cache(maxsize=8)
-def _square_slope_by_first_sample(window: Window) -> np.ndarray:
+def _slope_of_square_by_first_sample(window: Window) -> np.ndarray:
     """Return the slope of the best straight line to x^2 without the first k samples, (L + 1,).
 
     x is the position in the record, -1..1, and element k = 0 .. L of the result is for the samples

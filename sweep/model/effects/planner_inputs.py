@@ -239,7 +239,7 @@ class PlannerInputs(LinkBudget):
         )
 
     @cached_property
-    def echo_noise_ratio(self) -> np.ndarray:
+    def echo_shot_noise_ratio(self) -> np.ndarray:
         """Variance of the echo's shot noise over that of the receiver's noise."""
         total_echo = self.footprint_extent.axis_echo * np.maximum(
             self.footprint_extent.total_echo_ratio, 1.0
@@ -365,7 +365,7 @@ class PlannerInputs(LinkBudget):
         return np.asarray(sum(1 / bandwidth for bandwidth in bandwidths) * self.record.bin_width)
 
     @cached_property
-    def line_signal_ratio(self) -> np.ndarray:
+    def line_magnitude_over_sigma(self) -> np.ndarray:
         """|X| of the line on the beam's axis if it lay on a bin, over the noise per quadrature.
 
         There is a value for each segment.
@@ -386,7 +386,9 @@ class PlannerInputs(LinkBudget):
 
         There is a value for each segment.
         """
-        return self.line_signal_ratio * self.window_response.scalloping_gain(self.bin_offset)
+        return self.line_magnitude_over_sigma * self.window_response.scalloping_gain(
+            self.bin_offset
+        )
 
     @cached_property
     def bins_per_relative_range(self) -> np.ndarray:

@@ -355,7 +355,7 @@ def residual_errors(
         # Relative to the magnitude itself, and to that of all lines together in a full record.
         coherent_change = (
             bounds[name].residual_coherent_sum_change
-            * points.line_signal_ratio
+            * points.line_magnitude_over_sigma
             * points.looks.amplitude_gain_max
         )
         pd_change = np.minimum(relative_change * slope, 0.5 * coherent_change) * near_threshold

@@ -173,7 +173,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     return ErrorBound(
         magnitude_change=np.where(is_unknown, 1.0, magnitude_change_from_power(power_change)),
         coherent_sum_change=coherent_change,
-        noise_variance_change=np.minimum(echo_change, 1e6) * points.echo_noise_ratio,
+        noise_variance_change=np.minimum(echo_change, 1e6) * points.echo_shot_noise_ratio,
         threshold_follows_noise=False,
     )
 

@@ -103,10 +103,29 @@ def _phase_quadrature(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.n
 
 
 def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean that x + n loses when it is clipped, and its remaining variance; x >= 0.
+    """Return the mean loss of a noisy voltage by clipping, and the variance of the clipped voltage.
 
-    In units of s, with a = (V - x)/s and b = (-V - x)/s, clipped noise is a above a, and b below b.
-    The mean loss above is f(a) - a Q(a), and likewise below.
+    Parameters
+    ----------
+    x
+        Voltage without noise, >= 0 [V].
+    s
+        Standard deviation of the Gaussian noise n that is added to it [V].
+    v
+        Full scale V: the sum x + n is clipped at -V and V [V].
+
+    Returns
+    -------
+    mean_loss
+        Mean of x + n minus its mean after clipping [V], at least 0.
+    variance
+        Variance of the clipped voltage [V^2].
+
+    Notes
+    -----
+    Clipping limits n/s to b = (-V - x)/s .. a = (V - x)/s. The mean loss over s is
+    f(a) - a Q(a) at the upper limit, with the standard normal density f and its upper tail
+    probability Q. The gain at the lower limit, f(b) + b Q(-b), is subtracted.
     """
     a, b = (v - x) / s, (-v - x) / s
     density_above, density_below = (np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi) for z in (a, b))

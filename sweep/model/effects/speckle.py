@@ -398,7 +398,9 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
         zip(SEGMENT_PAIRS, segment_phase_differences(shots), strict=True)
     ):
         first, second = pair
-        if not shots.has_segment[list(pair)].all() or (pair_index != 1 and not shots.any_two):
+        if not shots.has_segment[list(pair)].all() or (
+            pair_index != 1 and not shots.detects_by_any_two_segments
+        ):
             continue
         squared_sum = zeros
         for lag in range(1 - n_looks, n_looks):
@@ -603,8 +605,8 @@ def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
     delay = 2 * shots.range / SPEED_OF_LIGHT
     middle_shift = (
         0.0
-        if shots.echo_record.n_samples_before is None
-        else centroid_delay(shots.window)[shots.echo_record.n_samples_before]
+        if shots.echo_record.n_samples_before_echo is None
+        else centroid_delay(shots.window)[shots.echo_record.n_samples_before_echo]
     )
     middle_shift = (
         np.broadcast_to(middle_shift, (len(shots.waveform.carriers), shots.size))

@@ -98,9 +98,9 @@ LOG_SPECKLE_POWER_MIN_FAINT = -5.0
 sum of rates is at most FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX. The part below this limit is
 extrapolated."""
 FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX = 0.1
-"""Largest sum of a segment's rates -ln(1 - c), at mean speckle power, for which the integral over
-speckle begins at LOG_SPECKLE_POWER_MIN_FAINT. c is the probability that a bin crosses the
-threshold."""
+"""Limit below which leaked signal counts as faint, so that the integral over speckle may begin at
+LOG_SPECKLE_POWER_MIN_FAINT. It applies to the sum of -ln(1 - c) over the bins of a segment at mean
+speckle power, with the probability c that leaked signal lifts a bin above the threshold."""
 
 LOG_SPECKLE_POWER_STEP_MAX = 0.25
 """Largest step in ln(speckle power) of the integral over speckle. The relative error of the mean is
@@ -215,7 +215,7 @@ class LeakageBins(NamedTuple):
     amplitude_gain_max: float
     """Factor from |X| / sigma in one look (record) to |X| / sigma in the single record that is
     equivalent to all looks."""
-    sidelobe_correlation: float
+    sidelobe_bin_noise_correlation: float
     """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
     the signal."""
 
@@ -252,7 +252,7 @@ class LeakageBins(NamedTuple):
             log_amplitude_step=np.zeros(1),
             threshold_ratio=np.zeros(1),
             amplitude_gain_max=1.0,
-            sidelobe_correlation=0.0,
+            sidelobe_bin_noise_correlation=0.0,
         )
 
     def select(self, points: np.ndarray) -> "LeakageBins":
@@ -556,7 +556,7 @@ def _add_crossing_rate_tables(
         log_amplitude_step=np.array([table.log_amplitude_step for table in tables]),
         threshold_ratio=shots.looks.equivalent_threshold_ratio(threshold_ratios),
         amplitude_gain_max=float(shots.looks.amplitude_gain_max),
-        sidelobe_correlation=shots.detection_rule.sidelobe_correlation,
+        sidelobe_bin_noise_correlation=shots.detection_rule.sidelobe_bin_noise_correlation,
     )
     _fill_rate_sums(
         leakage_bins,
@@ -889,12 +889,13 @@ class SpeckleQuadrature(NamedTuple):
     weights: np.ndarray
     """(nodes,): weights of the trapezoidal rule. Node i has the speckle power e^(2 node_stride step
     (i - n_below_mean)), with the ``step`` of the table's ln(amplitude)."""
-    interleaved_rates: np.ndarray
-    """(node_stride * columns,): rates -ln(1 - c) at ln(amplitude), from ``n_below_mean`` strides
-    below the table on.
+    rates_by_node_phase: np.ndarray
+    """(node_stride * columns,): rates -ln(1 - c) at evenly spaced ln(amplitude), one row after the
+    other.
 
-    The rate at the step node_stride c + p from there is at index p columns + c, so that the nodes
-    of a bin are adjacent in memory.
+    Step 0 is ``n_below_mean`` strides below the table. The row p (phase of the nodes) has the rates
+    at the steps p, p + node_stride, p + 2 node_stride .. in its columns. The nodes of a bin lie in
+    one row, so that they are adjacent in memory.
     """
 
 
@@ -931,14 +932,14 @@ def _make_speckle_quadrature(rate_table):
         weights[i] = log_power_step * power * math.exp(-power)
     # From `n_below_mean` strides beyond the table a bin crosses even at the faintest node.
     n_columns = 2 * n_below_mean + n_above_mean + log_crossing_rates.size // node_stride + 4
-    interleaved_rates = np.empty(node_stride * n_columns)
-    for k in range(interleaved_rates.size):
+    rates_by_node_phase = np.empty(node_stride * n_columns)
+    for k in range(rates_by_node_phase.size):
         table_position = float(k - n_below_mean * node_stride - 1)
         rate = _crossing_rate(
             rate_table.first_log_amplitude + table_position * log_amplitude_step, rate_table
         )
-        interleaved_rates[k % node_stride * n_columns + k // node_stride] = rate
-    return SpeckleQuadrature(node_stride, n_below_mean, weights, interleaved_rates)
+        rates_by_node_phase[k % node_stride * n_columns + k // node_stride] = rate
+    return SpeckleQuadrature(node_stride, n_below_mean, weights, rates_by_node_phase)
 
 
 @njit(cache=True, error_model="numpy")
@@ -956,12 +957,12 @@ def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
     )
     if table_position < 0.0:  # rate proportional to the amplitude squared
         power_fraction, table_position = math.exp(2.0 * log_amplitude_above_first), 0.0
-    n_columns = quadrature.interleaved_rates.size // quadrature.node_stride
+    n_columns = quadrature.rates_by_node_phase.size // quadrature.node_stride
     table_index = int(
         min(
             table_position,
             float(
-                quadrature.interleaved_rates.size
+                quadrature.rates_by_node_phase.size
                 - quadrature.node_stride * quadrature.weights.size
                 - 4
             ),
@@ -982,18 +983,18 @@ def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
     row_4 = (table_index + 3) % quadrature.node_stride * n_columns + (
         table_index + 3
     ) // quadrature.node_stride
-    interleaved_rates, node_end, node_begin = (
-        quadrature.interleaved_rates,
+    rates_by_node_phase, node_end, node_begin = (
+        quadrature.rates_by_node_phase,
         quadrature.weights.size,
         quadrature.weights.size - rate_sums.size,
     )
     rates_1, rates_2 = (
-        interleaved_rates[row_1 + node_begin : row_1 + node_end],
-        interleaved_rates[row_2 + node_begin : row_2 + node_end],
+        rates_by_node_phase[row_1 + node_begin : row_1 + node_end],
+        rates_by_node_phase[row_2 + node_begin : row_2 + node_end],
     )
     rates_3, rates_4 = (
-        interleaved_rates[row_3 + node_begin : row_3 + node_end],
-        interleaved_rates[row_4 + node_begin : row_4 + node_end],
+        rates_by_node_phase[row_3 + node_begin : row_3 + node_end],
+        rates_by_node_phase[row_4 + node_begin : row_4 + node_end],
     )
     for i in range(rate_sums.size):
         rate_sums[i] += (weight_1 * rates_1[i] + weight_2 * rates_2[i]) + (
@@ -1109,7 +1110,7 @@ def _evaluate_joining_bins(
             edge_ratio * root_power,
             neighbour_ratio * root_power,
             leakage_bins.threshold_ratio[threshold_index],
-            leakage_bins.sidelobe_correlation,
+            leakage_bins.sidelobe_bin_noise_correlation,
         )
         p_edge_slope = (p_edge_after - p_edge_before) / nodes_per_step
         if step_begin < 0:
@@ -1318,7 +1319,7 @@ def draw_leaked_peaks(
             rate_table,
             threshold_ratio,
             n_looks,
-            interpolation.sidelobe_correlation,
+            interpolation.sidelobe_bin_noise_correlation,
             peak_bins,
             peak_ratios,
             n_peaks,

@@ -95,9 +95,9 @@ class OppositeBeamletPairs(NamedTuple):
     density_change: np.ndarray
     """(h,): relative difference (u - w) / w of two fractions of the beam's power: u in the area
     about a beamlet, and w, the beamlet's weight."""
-    first_neighbour: np.ndarray
+    first_neighbouring_pair: np.ndarray
     """(m,) int64: index of the first of two neighbouring pairs of beamlets."""
-    second_neighbour: np.ndarray
+    second_neighbouring_pair: np.ndarray
     """(m,) int64: index of the second of two neighbouring pairs of beamlets."""
     neighbour_weight: np.ndarray
     """(m,): product of the power fractions of two neighbours, summed over both sides of the beam,
@@ -468,9 +468,9 @@ def _fill_power_errors(powers, beamlet_pairs, relative_errors):
         beamlet_pairs.polynomials,
         beamlet_pairs.weighted_polynomials,
     )
-    first_neighbour, second_neighbour = (
-        beamlet_pairs.first_neighbour,
-        beamlet_pairs.second_neighbour,
+    first_neighbouring_pair, second_neighbouring_pair = (
+        beamlet_pairs.first_neighbouring_pair,
+        beamlet_pairs.second_neighbouring_pair,
     )
     neighbour_weight = beamlet_pairs.neighbour_weight
     residual = np.empty(beamlet.size)
@@ -491,7 +491,9 @@ def _fill_power_errors(powers, beamlet_pairs, relative_errors):
                 residual[f] -= projection * polynomials[j, f]
         roughness = 0.0
         for k in range(neighbour_weight.size):
-            difference = residual[first_neighbour[k]] - residual[second_neighbour[k]]
+            difference = (
+                residual[first_neighbouring_pair[k]] - residual[second_neighbouring_pair[k]]
+            )
             roughness += neighbour_weight[k] * difference * difference
         relative_errors[i] = (
             min((math.sqrt(roughness) + abs(bias)) / total_power, 1.0) if total_power > 0.0 else 1.0

@@ -248,8 +248,8 @@ class Returns(NamedTuple):
     """uint8: bits that compare the return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """int32: index of the beamlet whose surface a true or misread return measures; -1 for other
-    returns."""
+    """int32: index of the beamlet to which the peaks of a return belong, if its flag is true or
+    misread (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); else -1."""
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group (adjacent bins above the threshold) of the
     up, Doppler and down peak; -1 for no peak or a false peak."""
@@ -565,8 +565,8 @@ class DrawInputs(NamedTuple):
     last_searched_bin: np.ndarray
     """(n, 3) int64: last bin in which noise alone may raise a false peak."""
     line_grid: SpeckleLineGrid
-    """Lines that represent the footprints in developed speckle; without speckle a grid of no
-    points."""
+    """Lines that represent each point's footprint in developed speckle. Without developed speckle
+    the arrays have no points (length 0 instead of n)."""
     line_centre: np.ndarray
     """(n, 3, groups): mean position of the beamlets' lines in a group of adjacent bins [bins]."""
     echo_fraction: np.ndarray
@@ -652,8 +652,9 @@ class DrawnPeaks(NamedTuple):
     """(n, draws, returns) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """(n, draws, returns) int32: index of the beamlet whose surface a true or misread return
-    measures; -1 for other returns."""
+    """(n, draws, returns) int32: index of the beamlet to which the peaks of a return belong, if it
+    is true or misread; else -1. The peaks of a misread return were converted to a wrong range or
+    velocity."""
 
     @classmethod
     def empty(cls, bin_groups: BinGroups, draws: int) -> "DrawnPeaks":
@@ -685,8 +686,8 @@ class ListedReturns(NamedTuple):
     """(m,) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`)."""
     beamlet: np.ndarray
-    """(m,) int32: index of the beamlet whose surface a true or misread return measures; -1 for
-    other returns."""
+    """(m,) int32: index of the beamlet to which the peaks of a return belong, if it is true or
+    misread; else -1. The peaks of a misread return were converted to a wrong range or velocity."""
 
     @classmethod
     def from_drawn_peaks(cls, drawn_peaks: DrawnPeaks) -> "ListedReturns":
@@ -1005,7 +1006,8 @@ def _measure_listed_returns(
     )
     listed_returns = _add_drift_errors(shots, listed_returns, motion)
     measure = _measure_by_fit if uses_fit else _measure_by_reading
-    if from_three_bins and shots.echo_record.n_samples_before is not None:  # errors by noise alone
+    # Errors by noise alone.
+    if from_three_bins and shots.echo_record.n_samples_before_echo is not None:
         listed_returns = _correct_late_echoes(
             shots, listed_returns, measure(shots, listed_returns, None)
         )
@@ -1581,7 +1583,7 @@ class GroupSpeckle(NamedTuple):
     independent_amplitudes: np.ndarray
     """(sets, 3, bins): independent complex factors by speckle, which are mixed into the partly
     correlated speckle of looks (records of a segment)."""
-    detection_weights: np.ndarray
+    pd_amplitude_bin_weights: np.ndarray
     """(groups, 3, bins): weights of the bins in one amplitude of mean power 1, which is compared
     with the probability of detection."""
 
@@ -1604,7 +1606,7 @@ def empty_group_speckle(groups_max):
         factor_rank=factor_rank,
         factor=no_amplitudes,
         independent_amplitudes=no_independent,
-        detection_weights=powers,
+        pd_amplitude_bin_weights=powers,
     )
 
 
@@ -1672,7 +1674,7 @@ def prepare_group_speckle(point, config, inputs, spectra):
     amplitudes = np.zeros((groups_max, n_looks, 3, n_bins_max), np.complex128)
     _, _, _, n_independent_sets = inputs.look_covariance_root.shape
     independent_amplitudes = np.zeros((n_independent_sets, 3, n_bins_max), np.complex128)
-    rms_ratio, detection_weights = (
+    rms_ratio, pd_amplitude_bin_weights = (
         np.zeros((groups_max, 3, n_bins_max)),
         np.zeros((groups_max, 3, n_bins_max)),
     )
@@ -1680,7 +1682,7 @@ def prepare_group_speckle(point, config, inputs, spectra):
         for s in range(3):
             if n_bins[g, s] == 0 or config.in_noise:
                 continue
-            fill_detection_weights(
+            fill_pd_amplitude_bin_weights(
                 point,
                 s,
                 g,
@@ -1690,7 +1692,7 @@ def prepare_group_speckle(point, config, inputs, spectra):
                 mean_power,
                 factor_rank,
                 factor,
-                detection_weights[g, s],
+                pd_amplitude_bin_weights[g, s],
             )
             strongest_index, noise_sigma = (
                 inputs.strongest_bin[point, s, g] - first_bin[g, s],
@@ -1716,12 +1718,12 @@ def prepare_group_speckle(point, config, inputs, spectra):
         factor_rank=factor_rank,
         factor=factor,
         independent_amplitudes=independent_amplitudes,
-        detection_weights=detection_weights,
+        pd_amplitude_bin_weights=pd_amplitude_bin_weights,
     )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def fill_detection_weights(
+def fill_pd_amplitude_bin_weights(
     point, segment, group, config, inputs, first_bin, mean_power, factor_rank, factor, weights
 ):
     """Compute the weights (bins,) of an echo's bins in the amplitude that decides on its detection.
@@ -2128,7 +2130,7 @@ def list_noisy_leaked_peaks(
     """
     key_0, key_1, draw = address
     n_peaks, previous_bin, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
-    correlation, is_echo = interpolation.sidelobe_correlation, False
+    correlation, is_echo = interpolation.sidelobe_bin_noise_correlation, False
     independent_part = math.sqrt(1.0 - correlation * correlation)
     for n in range(spectra.leaked_begin[point, segment], spectra.leaked_end[point, segment]):
         re, im = philox.normal_pair(
@@ -2337,7 +2339,7 @@ def detect_in_speckle(
         for k in range(n_bins):
             magnitude_ratio, bin_weight = (
                 speckle.rms_ratio[group, segment, k],
-                echo_weight * speckle.detection_weights[group, segment, k],
+                echo_weight * speckle.pd_amplitude_bin_weights[group, segment, k],
             )
             re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * noise.in_phase[k]
             im = (

@@ -61,7 +61,7 @@ from sweep.model.sampling.noisy_spectra import (
     centre_bins,
     centring_shift,
     estimate_positions,
-    flag_bins,
+    flag_detected_bins,
     iter_look_spectra,
     prepare_point_spectra,
     zero_frequency_index,
@@ -267,7 +267,7 @@ def list_flagged_peaks(
     peaks_max
         Largest number of peaks.
     """
-    (all_power,), (flags,) = flag_bins(spectra, point_spectra, signal.segment)
+    (all_power,), (flags,) = flag_detected_bins(spectra, point_spectra, signal.segment)
     shots, shift = point_spectra.shots, centring_shift(point_spectra.shots, signal.strongest_bin)
     power, flags = (
         centre_bins(shots, values, signal.strongest_bin) for values in (all_power, flags)

@@ -53,8 +53,8 @@ from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import iter_spans
 
 PD_BOTH_CHIRPS = "pd_both_chirps"
-"""Name of the output that holds the probability of a detection in both chirps. It exists if any two
-segments detect a shot."""
+"""Name of the output with the probability that both chirps, up and down, detect the echo. It exists
+only if any two segments suffice to detect a shot; otherwise ``pd_shot`` is this probability."""
 
 _DRAWS_PER_STEP = 256
 """Number of draws of one point whose random numbers are generated in one step."""
@@ -73,7 +73,7 @@ class DrawRanges(NamedTuple):
     """(m,) int64: number of the last draw of the range, plus 1."""
 
 
-class CountConfig(NamedTuple):
+class DrawCountConfig(NamedTuple):
     """Settings and tables for counting detections and false alarms, common to all points."""
 
     in_noise: bool
@@ -82,7 +82,7 @@ class CountConfig(NamedTuple):
     noise_filter: "NoiseFilter"
     """Filter that makes the correlated noise of an echo's bins. It has no bins if only the
     strongest bin may detect the echo."""
-    sidelobe_correlation: float
+    sidelobe_bin_noise_correlation: float
     """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
     the signal."""
     pseudo_variance_ratio: np.ndarray
@@ -92,7 +92,7 @@ class CountConfig(NamedTuple):
     """Number of the bin at the Nyquist frequency: N/2, with N the FFT size."""
 
 
-class CountInputs(NamedTuple):
+class DrawCountInputs(NamedTuple):
     """Quantities of m points on which counts of detections and false alarms depend.
 
     Segments are up, Doppler and down. sigma is the noise of a bin per quadrature.
@@ -115,15 +115,15 @@ class CountInputs(NamedTuple):
     pd_if_condition_holds: np.ndarray
     """(3, m): probability that each segment detects the echo if the condition of
     :class:`EventProbabilities` is met; unused if noise is drawn."""
-    any_two: np.ndarray
+    detects_by_any_two_segments: np.ndarray
     """(m,) bool: True if a shot counts as detected by any two of its segments."""
     speckle_cholesky_factors: np.ndarray
     """(6, m): Cholesky factor of the correlation of speckle in the three segments
     (:meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`); (0, m)
     without speckle."""
     pseudo_variance_row: np.ndarray
-    """(3, m) int64: row of ``CountConfig.pseudo_variance_ratio`` for each segment; 0 for an echo
-    far from frequency 0 and Nyquist."""
+    """(3, m) int64: row of ``DrawCountConfig.pseudo_variance_ratio`` for each segment; 0 for an
+    echo far from frequency 0 and Nyquist."""
     line_grid: SpeckleLineGrid
     """Lines that represent the footprints in developed speckle."""
     line_centre: np.ndarray
@@ -144,7 +144,7 @@ class DrawCounts(NamedTuple):
     """Number of draws with a detection in the Doppler segment."""
     shot_detections: np.ndarray
     """Number of draws with a detection of the shot: in up and down segment, or in any two segments
-    if these detect the point (``CountInputs.any_two``)."""
+    if these detect the point (``DrawCountInputs.detects_by_any_two_segments``)."""
     up_alarms: np.ndarray
     """Number of draws with a false alarm in the up segment."""
     down_alarms: np.ndarray
@@ -234,14 +234,16 @@ def count_by_probability(
     """
     n_rows, probabilities = draw_ranges.point_index.size, _event_probabilities(outputs)
     no_filter = NoiseFilter(np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0)
-    inputs = CountInputs(
+    inputs = DrawCountInputs(
         threshold_ratio=np.zeros(n_rows),
         line_noise_ratio=np.zeros(n_rows),
         bin_thresholds=BinThresholds(*np.zeros((7, n_rows))),
         pfa=probabilities.alarm,
         pd_if_condition_fails=probabilities.pd_if_condition_fails,
         pd_if_condition_holds=probabilities.pd_if_condition_holds,
-        any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
+        detects_by_any_two_segments=np.isfinite(
+            outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))
+        ),
         speckle_cholesky_factors=np.empty((0, n_rows)),
         pseudo_variance_row=np.zeros((3, n_rows), np.int64),
         line_grid=SpeckleLineGrid.empty(),
@@ -250,7 +252,7 @@ def count_by_probability(
     _count_draws(
         draw_ranges,
         batch_edges,
-        CountConfig(False, no_filter, 0.0, np.zeros((1, 0)), 0),
+        DrawCountConfig(False, no_filter, 0.0, np.zeros((1, 0)), 0),
         inputs,
         NoiselessSpectra.empty(n_rows),
         DrawCounts(*counts),
@@ -286,14 +288,14 @@ def count_in_noise(
     for indices, spectra in iter_noiseless_spectra(shots):
         pfa_elsewhere = at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins.T)
         no_probabilities = np.zeros(pfa_elsewhere.shape)
-        inputs = CountInputs(
+        inputs = DrawCountInputs(
             threshold_ratio=threshold_ratio[indices],
             line_noise_ratio=line_noise_ratio[indices],
             bin_thresholds=shots.bin_thresholds.select(indices),
             pfa=np.ascontiguousarray(pfa_elsewhere),
             pd_if_condition_fails=no_probabilities,
             pd_if_condition_holds=no_probabilities,
-            any_two=np.full(indices.size, shots.any_two),
+            detects_by_any_two_segments=np.full(indices.size, shots.detects_by_any_two_segments),
             speckle_cholesky_factors=speckle_cholesky_factors[:, indices].copy(),
             pseudo_variance_row=speckle_table.pseudo_variance_row[:, indices].copy(),
             line_grid=line_grid.select(indices),
@@ -301,10 +303,10 @@ def count_in_noise(
                 mean_line_positions(shots, indices, spectra.first_bin + spectra.peak_index)
             ),
         )
-        config = CountConfig(
+        config = DrawCountConfig(
             True,
             make_echo_noise_filter(shots, spectra),
-            shots.detection_rule.sidelobe_correlation,
+            shots.detection_rule.sidelobe_bin_noise_correlation,
             speckle_table.pseudo_variance_ratio,
             shots.fft_size // 2,
         )
@@ -318,7 +320,7 @@ class NoiseFilter(NamedTuple):
     weights: np.ndarray
     """(bins, NOISE_FILTER_TAPS): weights of the independent normal numbers whose weighted sum is a
     bin's noise. The squares of a bin's weights sum to 1."""
-    first_number: np.ndarray
+    first_number_index: np.ndarray
     """(bins,) int64: index of the first independent number that each bin uses, minus the index at
     the first bin."""
     real_fft_size: int
@@ -378,7 +380,7 @@ def make_echo_noise_filter(
     )
 
 
-ROOT_BINS_MAX = 16
+COVARIANCE_ROOT_BINS_MAX = 16
 """Largest number of adjacent bins whose correlated noise is made by a Cholesky factor, from one
 independent number for each bin."""
 
@@ -387,11 +389,11 @@ def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
     """Return the triangular matrix (k, k) that makes the noise of k adjacent bins from k numbers.
 
     The matrix is the Cholesky factor of the covariance that a filter of
-    :func:`make_echo_noise_filter` gives, for at most ROOT_BINS_MAX bins. Frequency 0 and Nyquist,
-    where the noise is real, need :func:`draw_bin_noise` instead.
+    :func:`make_echo_noise_filter` gives, for at most COVARIANCE_ROOT_BINS_MAX bins.
+    Frequency 0 and Nyquist, where the noise is real, need :func:`draw_bin_noise` instead.
     """
-    weights, start = filter_rule.weights, filter_rule.first_number
-    n_bins = min(weights.shape[0], ROOT_BINS_MAX)
+    weights, start = filter_rule.weights, filter_rule.first_number_index
+    n_bins = min(weights.shape[0], COVARIANCE_ROOT_BINS_MAX)
     number_weights = np.zeros(
         (n_bins, int(start[n_bins - 1] - start[0]) + NOISE_FILTER_TAPS if n_bins else 0)
     )
@@ -659,9 +661,9 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
         (batches + 1,): numbers of the draws at which batches begin, and the number after the last
         draw.
     config
-        :class:`CountConfig`.
+        :class:`DrawCountConfig`.
     inputs
-        :class:`CountInputs` of the rows.
+        :class:`DrawCountInputs` of the rows.
     spectra
         :class:`NoiselessSpectra` of the rows.
     counts
@@ -807,7 +809,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     s,
                     spectra,
                     threshold_ratio,
-                    config.sidelobe_correlation,
+                    config.sidelobe_bin_noise_correlation,
                     segment_factors[s],
                     random_words,
                     has_alarm[s],
@@ -820,7 +822,11 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     is_detected[1, d],
                     is_detected[2, d],
                 )
-                by_doppler = inputs.any_two[j] & doppler_detects & (up_detects | down_detects)
+                by_doppler = (
+                    inputs.detects_by_any_two_segments[j]
+                    & doppler_detects
+                    & (up_detects | down_detects)
+                )
                 counts.up_detections[i, batch] += up_detects
                 counts.down_detections[i, batch] += down_detects
                 counts.doppler_detections[i, batch] += doppler_detects
@@ -838,7 +844,7 @@ def _mark_leakage_alarms(
     segment,
     spectra,
     threshold_ratio,
-    sidelobe_correlation,
+    sidelobe_bin_noise_correlation,
     magnitude_factors,
     random_words,
     has_alarm,
@@ -859,7 +865,7 @@ def _mark_leakage_alarms(
         :class:`NoiselessSpectra`.
     threshold_ratio
         Threshold [sigma].
-    sidelobe_correlation
+    sidelobe_bin_noise_correlation
         Correlation of the noise of neighbouring bins in phase with the signal.
     magnitude_factors
         (draws,): factors that speckle puts on magnitudes.
@@ -870,7 +876,9 @@ def _mark_leakage_alarms(
     """
     key_0, key_1, first_draw = address
     stream = STREAM_NOISE[segment]
-    independent_part = math.sqrt(1.0 - sidelobe_correlation * sidelobe_correlation)
+    independent_part = math.sqrt(
+        1.0 - sidelobe_bin_noise_correlation * sidelobe_bin_noise_correlation
+    )
     zeros, joins_echo = np.zeros(n_draws), np.zeros(n_draws, np.bool_)
     begin, end = spectra.leaked_begin[point, segment], spectra.leaked_end[point, segment]
     # A group that begins or ends next to an echo belongs to the echo as a whole. So an alarm
@@ -919,10 +927,10 @@ def _mark_leakage_alarms(
                 )
                 in_phase = (
                     spectra.exempt_neighbour_ratio[leaked_bin] * magnitude_factors[d]
-                    + sidelobe_correlation * re
+                    + sidelobe_bin_noise_correlation * re
                     + independent_part * re_edge
                 )
-                in_quadrature = sidelobe_correlation * im + independent_part * im_edge
+                in_quadrature = sidelobe_bin_noise_correlation * im + independent_part * im_edge
                 joins_echo[d] |= math.hypot(in_phase, in_quadrature) >= threshold_ratio
             is_pending[d] = not joins_echo[d]
     for d in range(n_draws):
@@ -1043,7 +1051,7 @@ def _draw_echo_amplitudes(address, n_draws, row, spectra, line_grid, line_centre
     footprint. Bins that no line reaches have the factor of the strongest bin. ``segment_factors``
     (3, draws) is set to the magnitude of the strongest bin's factor. ``address`` is that of the
     first of ``n_draws`` draws. ``line_grid`` and ``line_centres`` are those of
-    :class:`CountInputs`.
+    :class:`DrawCountInputs`.
     """
     line_centre = line_centres[row].copy()
     first_bin, n_bins_max = np.zeros(3, np.int64), 0
@@ -1182,7 +1190,7 @@ def draw_bin_noise(address, stream, first_index, first_bin, n_bins, filter_rule,
     record the noise is real, and bins on either side are complex conjugates.
     """
     key_0, key_1, draw = address
-    weights, start = filter_rule.weights, filter_rule.first_number
+    weights, start = filter_rule.weights, filter_rule.first_number_index
     real_fft_size = filter_rule.real_fft_size
     n_taps = weights.shape[1]
     is_from_nyquist = (

@@ -158,8 +158,10 @@ class SegmentSignal(NamedTuple):
     """Number of bins on either side of an echo's strongest bin that the echo occupies, if a shot
     has several echoes."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """Record from which the speckle of each echo is drawn. The tuple is empty if lines spread over
-    more than a bin or the echo has no samples, and None before :func:`add_footprint_records`."""
+    """For each echo the record from which its speckle is drawn; None until
+    :func:`add_footprint_records` sets it. The tuple is empty if speckle is not drawn from records,
+    because the lines spread over more than RECORD_LINE_DEVIATION_MAX_BINS or the echo has no
+    samples in the record."""
     record_scalings: tuple[np.ndarray, ...] = ()
     """(bins,) complex for each echo: factors from the transform of a drawn record to the speckle by
     which the bins of ``spectrum`` are multiplied."""
@@ -219,9 +221,9 @@ def noiseless_signal(
         "line_width"
     ] > 0:  # magnitude before the phase walk, which draws apply
         echo_window = shots.window
-        if shots.echo_record.n_samples_before is not None:
+        if shots.echo_record.n_samples_before_echo is not None:
             echo_window = zero_first_samples(
-                echo_window, int(shots.echo_record.n_samples_before[0, point])
+                echo_window, int(shots.echo_record.n_samples_before_echo[0, point])
             )
         (line_power_fraction, *_), *_ = apparent_line_and_pedestal(
             window=echo_window, looks=shots.looks.n_coherent, **phase_noise_arguments
@@ -269,8 +271,8 @@ def noiseless_signal(
         first_bin, last_bin = max(first_bin, margin), min(last_bin, last_index - margin)
     first_sample = (
         0
-        if shots.echo_record.n_samples_before is None
-        else int(shots.echo_record.n_samples_before[segment, point])
+        if shots.echo_record.n_samples_before_echo is None
+        else int(shots.echo_record.n_samples_before_echo[segment, point])
     )
     phases = _tone_phases(peak_position, shots, first_sample)
     if (
@@ -631,8 +633,8 @@ def draw_bin_speckle(
             # Refer their phases to the record's middle, as those of the noise are.
             first_sample = (
                 0
-                if shots.echo_record.n_samples_before is None
-                else int(shots.echo_record.n_samples_before[segment, point])
+                if shots.echo_record.n_samples_before_echo is None
+                else int(shots.echo_record.n_samples_before_echo[segment, point])
             )
             record_middle_phases = np.exp(
                 -1j * np.pi * bins * ((shots.window.length + first_sample) / shots.fft_size)
@@ -664,8 +666,8 @@ def add_footprint_records(
         return signal._replace(footprint_records=())
     first_sample = (
         0
-        if shots.echo_record.n_samples_before is None
-        else int(shots.echo_record.n_samples_before[segment, point])
+        if shots.echo_record.n_samples_before_echo is None
+        else int(shots.echo_record.n_samples_before_echo[segment, point])
     )
     if not cached_window_samples(shots.window)[first_sample:].any():
         return signal._replace(footprint_records=())
@@ -706,7 +708,7 @@ def _draw_speckle_from_records(
             slice(None) if signal.nearest_echo is None else signal.nearest_echo == echo_number
         )
         for row, draw in enumerate(draws):
-            drawn_record = record.draw_record(key, int(draw), echo_number)
+            drawn_record = record.draw_speckled_record(key, int(draw), echo_number)
             drawn_record = drawn_record if shots.complex_record else drawn_record.real
             scaling = signal.record_scalings[echo_number]
             factors[row, echo_bins] = (record_spectrum(shots, drawn_record) * scaling)[echo_bins]
@@ -726,7 +728,7 @@ def iter_look_spectra(
     looks, look_sum = point_spectra.shots.looks, np.zeros(1, complex)
     for look, shots in enumerate(point_spectra.look_shots):
         look_draws = draws + look * LOOK_DRAW_STRIDE
-        draw_arguments = {"key": point_spectra.key, "draws": look_draws}
+        draw_arguments = {"key": point_spectra.random_key, "draws": look_draws}
         signal = point_spectra.get_signal_in_look(segment, look)
         factors = _draw_look_speckle(point_spectra, shots, segment, look, draws, signal)
         spectra = (
@@ -760,7 +762,7 @@ def _draw_look_speckle(
     of independent realisations, with other coefficients in each look.
     """
     draw_arguments: dict[str, Any] = {
-        "key": point_spectra.key,
+        "key": point_spectra.random_key,
         "line_grid": point_spectra.line_grid,
     }
     if shots.speckle.look_speckle is None:
@@ -796,7 +798,7 @@ class PointSpectra(NamedTuple):
     """Prepared shots."""
     point: int
     """Index of the point in ``shots``."""
-    key: np.ndarray
+    random_key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[SegmentSignal | None, ...]
     """Noiseless signal of each segment, as in ``shots``; None for a segment that does not exist."""
@@ -944,10 +946,12 @@ def prepare_point_spectra(
     return point_spectra._replace(signals=signals)
 
 
-def flag_bins(
+def flag_detected_bins(
     spectra: Sequence[np.ndarray], point_spectra: PointSpectra, segment: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Apply the detector to the spectra of a segment, and combine looks (records).
+    """Flag the bins of a segment in which the detector finds a signal, with its looks combined.
+
+    A look is one record of the segment.
 
     Parameters
     ----------
@@ -1007,7 +1011,7 @@ def detect_and_estimate(
     point_spectra
         Point to which the spectra belong.
     """
-    power, flags = flag_bins(spectra, point_spectra, signal.segment)
+    power, flags = flag_detected_bins(spectra, point_spectra, signal.segment)
     shots, shift = point_spectra.shots, centring_shift(point_spectra.shots, signal.strongest_bin)
     power, flags = (centre_bins(shots, values, signal.strongest_bin) for values in (power, flags))
     strongest_index, first_index, last_index = (
@@ -1110,7 +1114,7 @@ def count_detections(
     shot_detected = up.is_detected & down.is_detected
     _, doppler_signal, _ = point_spectra.signals
     is_resolved = shot_detected & (doppler.is_detected | (doppler_signal is None))
-    if point_spectra.shots.any_two:
+    if point_spectra.shots.detects_by_any_two_segments:
         shot_detected = is_resolved = is_detected.sum(axis=0) >= 2
     events = DrawCounts(
         up_detections=up.is_detected,
@@ -1131,7 +1135,7 @@ def count_detections(
         np.square(least_deviations.range) + speckle_errors.range,
         np.square(least_deviations.radial_velocity) + speckle_errors.radial_velocity,
     ]
-    if point_spectra.shots.any_two:  # bounds depend on the detected segments
+    if point_spectra.shots.detects_by_any_two_segments:  # bounds depend on the detected segments
         squared_bounds = [np.where(is_resolved, bound, np.nan) for bound in squared_bounds]
     errors = [
         np.where(is_resolved, error, np.nan)
@@ -1156,7 +1160,7 @@ def _error_bounds_by_draw(
             for deviation in measurement_bound(point_spectra)
         )
     )
-    if point_spectra.shots.any_two:
+    if point_spectra.shots.detects_by_any_two_segments:
         for is_missing in np.eye(3, dtype=bool):
             has_pattern = (is_detected == ~is_missing[:, None]).all(axis=0)
             pattern_bound = measurement_bound(point_spectra, ~is_missing)
@@ -1223,9 +1227,9 @@ def measurement_bound(
         _phase_noise_arguments(shots, point),
     )
     record_lengths = np.full(len(point_spectra.signals), shots.window.length)
-    if shots.echo_record.n_samples_before is not None:
+    if shots.echo_record.n_samples_before_echo is not None:
         record_lengths = np.maximum(
-            record_lengths - shots.echo_record.n_samples_before[:, point], 2
+            record_lengths - shots.echo_record.n_samples_before_echo[:, point], 2
         )
         phase_noise_arguments["duration"] = record_lengths[0] / np.asarray(sample_rate)
     laser_deviation = phase_noise_deviation(**phase_noise_arguments)
@@ -1285,7 +1289,7 @@ def _measurement_errors(
     )  # to the shot's start
     measured_range = measured.range + range_walk
     uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or (
-        shots.any_two & ~is_detected.all(axis=0)
+        shots.detects_by_any_two_segments & ~is_detected.all(axis=0)
     )
     if np.any(uses_fit):
         cnr = np.array([[0.0 if s is None else s.cnr] for s in point_spectra.signals])

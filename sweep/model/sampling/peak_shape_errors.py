@@ -27,7 +27,8 @@ _SPREAD_GRID_CELLS = np.array([0.01, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.
 """Tabulated spreads of a footprint's lines, as standard deviations in units of fs/L, the sample
 rate over the number of samples in the record."""
 _QUADRATURE_SHIFT_VARIANCES = np.concatenate([[1e-4], np.geomspace(3e-3, 30.0, 13)])
-"""Tabulated variances of the imaginary part of the complex shift [(fs/L)^2]."""
+"""Tabulated variances of Im s [(fs/L)^2], with the complex shift s by which speckle deforms a peak
+(:class:`PeakShapeErrors`), the sample rate fs and the number L of samples in the record."""
 _SHAPE_OFFSETS_BINS = np.linspace(0.0, 1.0, 33)
 """Tabulated offsets of a peak from the bin about which it is estimated [bins]."""
 _SHAPE_SAMPLES_MAX = 2048

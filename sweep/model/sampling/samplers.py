@@ -247,13 +247,25 @@ def never_stop() -> bool:
 
 
 def stopping_checks(batch_size: int, draws_max: int, group_size: int = 1) -> Iterator[int]:
-    """Yield the numbers of draws at which accuracy is tested, in rising order.
+    """Yield, in rising order, the numbers of draws after which sampling may stop.
 
-    Accuracy is the half-width of the confidence intervals of detection probabilities.
+    At each of them the half-widths of the confidence intervals of the detection probabilities are
+    compared with the tolerance.
 
-    The first numbers are one batch apart. Later numbers grow by a quarter, rounded to whole
-    batches. From two groups of `group_size` draws on, they are rounded up to whole groups. The last
-    is `draws_max`.
+    Parameters
+    ----------
+    batch_size
+        Number of draws in a batch. Numbers below two groups are whole batches.
+    draws_max
+        Largest number of draws, the last that is yielded.
+    group_size
+        Number of draws that are made together. Numbers of two groups or more are rounded up to
+        whole groups.
+
+    Notes
+    -----
+    The first numbers are one batch apart. Later numbers grow by the factor
+    `ErrorBudget.stopping_check_growth`, 1.25.
     """
     n_batches, previous = 1, 0
     while n_batches * batch_size < draws_max:

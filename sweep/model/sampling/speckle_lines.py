@@ -754,7 +754,9 @@ class FootprintRecord(NamedTuple):
             mean_bin_power,
         )
 
-    def draw_record(self, key: np.ndarray, draw_number: int, echo_number: int) -> np.ndarray:
+    def draw_speckled_record(
+        self, key: np.ndarray, draw_number: int, echo_number: int
+    ) -> np.ndarray:
         """Draw the complex windowed record (L,) of an echo in speckle.
 
         `key` (2,) uint64 is the random key of the point. The random numbers are those of

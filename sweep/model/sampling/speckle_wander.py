@@ -57,7 +57,12 @@ def wander_variance(
         shots.speckle.line_gradients.select(point_indices), peaks, shots, from_three_bins=False
     )
     is_resolved = np.array(
-        [True, shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or shots.any_two, True]
+        [
+            True,
+            shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
+            or shots.detects_by_any_two_segments,
+            True,
+        ]
     )
     carriers, chirp_rates = (values[:, point_indices] for values in shots.beat_coefficients)
     response_arguments = {

@@ -95,10 +95,10 @@ class LineBundle(NamedTuple):
     """
 
 
-class VisibleLineRange(NamedTuple):
-    """Lowest and highest bin at which lines appear in a spectrum.
+class FoldedLineRange(NamedTuple):
+    """Lowest and highest bin of lines in a spectrum, after negative frequencies are folded at DC.
 
-    A spectrum that folds frequencies shows them within 0 .. N/2, where N is the FFT size.
+    In a spectrum that is not folded, lines of negative frequency keep it.
     """
 
     lowest_position: float
@@ -883,27 +883,27 @@ def is_mirrored(origin_bin, lowest_position, highest_position, spectrum_type):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def visible_line_range(origin_bin, lowest_position, highest_position, layout):
-    """Return the :class:`VisibleLineRange`, the bins from DC at which lines appear in the spectrum.
+def folded_line_range(origin_bin, lowest_position, highest_position, layout):
+    """Return the :class:`FoldedLineRange` of lines, in bins from DC.
 
     The given positions are counted from ``origin_bin`` [bins].
     """
     if is_mirrored(origin_bin, lowest_position, highest_position, layout.spectrum_type):
-        return VisibleLineRange(-origin_bin - highest_position, -origin_bin - lowest_position)
-    return VisibleLineRange(origin_bin + lowest_position, origin_bin + highest_position)
+        return FoldedLineRange(-origin_bin - highest_position, -origin_bin - lowest_position)
+    return FoldedLineRange(origin_bin + lowest_position, origin_bin + highest_position)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def bins_around_lines(margin_bins, visible_range, layout):
+def bins_around_lines(margin_bins, folded_range, layout):
     """Return the :class:`BinRange` from ``margin_bins`` below the lines to as many bins above.
 
-    ``visible_range`` is the :class:`VisibleLineRange`. If the margin extends beyond DC or Nyquist,
+    ``folded_range`` is the :class:`FoldedLineRange`. If the margin extends beyond DC or Nyquist,
     the part beyond is folded back.
     """
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     margin_bins = min(margin_bins, 2.0 * fft_size)
-    first_bin = math.floor(visible_range.lowest_position - margin_bins)
-    last_bin = math.ceil(visible_range.highest_position + margin_bins)
+    first_bin = math.floor(folded_range.lowest_position - margin_bins)
+    last_bin = math.ceil(folded_range.highest_position + margin_bins)
     if layout.spectrum_type == COMPLEX_RECORD:
         if last_bin - first_bin >= fft_size:
             first_bin = (first_bin + last_bin + 1 - fft_size) // 2
@@ -919,14 +919,14 @@ def bins_around_lines(margin_bins, visible_range, layout):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def distance_below_level_with_images(level, weight_sum, visible_range, envelope, layout):
+def distance_below_level_with_images(level, weight_sum, folded_range, envelope, layout):
     """Return the distance [bins] beyond which the spectrum of lines and images is below ``level``.
 
-    Parameters are those of :func:`distance_below_level`, with the :class:`VisibleLineRange`.
+    Parameters are those of :func:`distance_below_level`, with the :class:`FoldedLineRange`.
     """
     if layout.spectrum_type == REAL_WITH_IMAGES:
         image_distance = min(
-            visible_range.lowest_position, 0.5 * layout.fft_size - visible_range.highest_position
+            folded_range.lowest_position, 0.5 * layout.fft_size - folded_range.highest_position
         )  # no bin is nearer to an image
         level_fraction = (
             0.5 if image_distance < distance_below_level(0.1 * level, weight_sum, envelope) else 0.9
@@ -987,14 +987,14 @@ def detect_in_span(
     shift_min, shift_max = 0.0, 0.0
     for m in range(shifts.offset.size):
         shift_min, shift_max = min(shift_min, shifts.offset[m]), max(shift_max, shifts.offset[m])
-    visible_range = visible_line_range(
+    folded_range = folded_line_range(
         bundle.origin_bin,
         bundle.lowest_position + shift_min,
         bundle.highest_position + shift_max,
         layout,
     )
     margin_bins = distance_below_level_with_images(
-        lowest_level, weight_sum, visible_range, shape.envelope, layout
+        lowest_level, weight_sum, folded_range, shape.envelope, layout
     )
     if not lowest_level > 0.0:
         margin_bins = np.inf
@@ -1012,14 +1012,14 @@ def detect_in_span(
         )
         margin_bins = max(
             distance_below_level_with_images(
-                lowest_level, far_weight, visible_range, shape.envelope, layout
+                lowest_level, far_weight, folded_range, shape.envelope, layout
             ),
             2.0 * layout.clearance_bins,
         )
     negligible_ratio = negligible_magnitude / max(weight_sum, 1e-300)
     margin_bins = max(margin_bins, 2.0 * lobe_half_width)  # main lobes of bins of half the largest
     while True:
-        bins = bins_around_lines(margin_bins, visible_range, layout)
+        bins = bins_around_lines(margin_bins, folded_range, layout)
         n_bins = bins.last_bin - bins.first_bin + 1
         compute_magnitudes(
             bins.first_bin,
@@ -1039,7 +1039,7 @@ def detect_in_span(
         if largest >= lowest_level or n_bins >= n_bins_max:
             return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0)
         margin_needed = distance_below_level_with_images(
-            largest, weight_sum, visible_range, shape.envelope, layout
+            largest, weight_sum, folded_range, shape.envelope, layout
         )
         if margin_needed <= margin_bins:
             return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0)

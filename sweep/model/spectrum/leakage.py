@@ -69,9 +69,9 @@ from sweep.model.spectrum.bin_spectrum import (
     distance_below_level_with_images,
     envelope_index,
     far_line_weight,
+    folded_line_range,
     is_mirrored,
     tangent_at,
-    visible_line_range,
 )
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
@@ -137,7 +137,7 @@ class LeakageLimits(NamedTuple):
     """Detection threshold on a bin's magnitude [V, summed over the record]."""
     tolerance: float
     """Leakage that may be neglected [probability of at least one false alarm]."""
-    sidelobe_correlation: float
+    sidelobe_bin_noise_correlation: float
     """Correlation coefficient of the noise of adjacent bins, in phase with a line's sidelobes."""
 
 
@@ -223,22 +223,22 @@ def detect_with_leakage(
         limits.noise_sigma * inverse_root,
         limits.threshold * inverse_root,
         limits.tolerance,
-        limits.sidelobe_correlation,
+        limits.sidelobe_bin_noise_correlation,
     )
     nyquist_bin, clearance, far_weight = layout.fft_size // 2, layout.clearance_bins, weight_sum
     if lobe_half_width > clearance // 2:  # an echo whose pedestal reaches far
         clearance += lobe_half_width
-    visible_range = visible_line_range(
+    folded_range = folded_line_range(
         bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout
     )
     image_distance = (
-        max(min(visible_range.lowest_position, nyquist_bin - visible_range.highest_position), 0.0)
+        max(min(folded_range.lowest_position, nyquist_bin - folded_range.highest_position), 0.0)
         if layout.spectrum_type == REAL_WITH_IMAGES
         else math.inf
     )
     distance_min = crossing_distance = max(
         distance_below_level_with_images(
-            brightest_limits.threshold, weight_sum, visible_range, envelope, layout
+            brightest_limits.threshold, weight_sum, folded_range, envelope, layout
         ),
         float(clearance),
     )
@@ -254,7 +254,7 @@ def detect_with_leakage(
         )
         crossing_distance = max(
             distance_below_level_with_images(
-                brightest_limits.threshold, far_weight, visible_range, envelope, layout
+                brightest_limits.threshold, far_weight, folded_range, envelope, layout
             ),
             float(clearance),
         )
@@ -272,7 +272,7 @@ def detect_with_leakage(
     # Wide enough if the integral may be left out, else a first guess.
     is_integral_negligible = tolerance_left >= 0.0
     near_bins = bins_around_lines(
-        distance_min if is_integral_negligible else float(clearance), visible_range, layout
+        distance_min if is_integral_negligible else float(clearance), folded_range, layout
     )
     extra_bins = INTEGER_ZERO
     if not is_integral_negligible:
@@ -321,7 +321,7 @@ def detect_with_leakage(
         result = _leakage_of_all_bins(
             DetectedSpan(first_bin, n_bins, peak_index, n_exempt, 0.0),
             bundle,
-            visible_range,
+            folded_range,
             limits,
             speckle_power_max,
             shape,
@@ -344,12 +344,12 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
     developed speckle if ``speckle_power_max`` is above 1.
     """
     if speckle_power_max > 1.0:
-        return _mean_leakage_of_bins(n_bins, limits, span, speckle_rates)
+        return _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates)
     return _further_group_probability(n_bins, limits, span, crossing_series)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def leakage_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_series):
+def false_peak_probability_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_series):
     """Return the probability of a false peak that leaked signal raises in the bins of a span.
 
     A span is the computed bins around a segment's lines. Magnitudes below
@@ -374,15 +374,17 @@ def leakage_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_seri
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def leakage_of_bins_in_speckle(n_bins, limits, negligible_signal_ratio, span, speckle_rates):
-    """Return the mean of :func:`leakage_of_bins` over developed speckle.
+def false_peak_probability_of_bins_in_speckle(
+    n_bins, limits, negligible_signal_ratio, span, speckle_rates
+):
+    """Return the mean of :func:`false_peak_probability_of_bins` over developed speckle.
 
     ``speckle_rates`` are the
     :class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates` of the threshold over
     the noise sigma.
     """
     _clear_negligible_bins(n_bins, limits.noise_sigma, negligible_signal_ratio, span)
-    return _mean_leakage_of_bins(n_bins, limits, span, speckle_rates)
+    return _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -412,13 +414,13 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
         span.is_exempt,
         limits.noise_sigma,
         limits.threshold,
-        limits.sidelobe_correlation,
+        limits.sidelobe_bin_noise_correlation,
     )
     return any_crossing_probability(span.crossing_probability, INTEGER_ZERO, n_bins)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
+def _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates):
     """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
     The bins are the computed ones around a segment's lines (a span).
@@ -506,7 +508,7 @@ def _mean_leakage_over_speckle(
                 is_echo,
                 noise_sigma / root_power,
                 threshold / root_power,
-                limits.sidelobe_correlation,
+                limits.sidelobe_bin_noise_correlation,
             )
             for i in range(n_listed):
                 rate += crossing_rate(probabilities[i])
@@ -778,7 +780,7 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
 def _leakage_of_all_bins(
     detected,
     bundle,
-    visible_range,
+    folded_range,
     limits,
     speckle_power_max,
     shape,
@@ -791,7 +793,7 @@ def _leakage_of_all_bins(
     """Compute the :class:`LeakageResult` of the bins around the lines and of all other bins.
 
     Parameters are those of :func:`detect_with_leakage`, with the :class:`DetectedSpan` and the
-    :class:`sweep.model.spectrum.bin_spectrum.VisibleLineRange`. If the echo is in developed
+    :class:`sweep.model.spectrum.bin_spectrum.FoldedLineRange`. If the echo is in developed
     speckle, the leakage is the mean over the speckle.
     """
     span, integral = workspace.span, workspace.leakage_quadrature
@@ -809,7 +811,7 @@ def _leakage_of_all_bins(
         )
     _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
     centre_bin = abs(
-        math.floor(0.5 * (visible_range.lowest_position + visible_range.highest_position) + 0.5)
+        math.floor(0.5 * (folded_range.lowest_position + folded_range.highest_position) + 0.5)
     )
     centre_bin = fft_size - centre_bin if centre_bin > nyquist_bin else centre_bin
     far_rate, last_terms, n_points = 0.0, 0.0, INTEGER_ZERO
@@ -849,7 +851,7 @@ def _leakage_of_all_bins(
         span.is_exempt,
         noise_sigma,
         threshold,
-        limits.sidelobe_correlation,
+        limits.sidelobe_bin_noise_correlation,
     )
     span_leakage = any_crossing_probability(span.crossing_probability, first_index, end_index)
     while n_points % 8:  # whole vectors: a remainder takes as long

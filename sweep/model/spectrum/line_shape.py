@@ -257,8 +257,8 @@ class LineShapeTables(NamedTuple):
     number of samples, N the FFT size. The array is empty for late echoes.
     """
     mode_end_polynomials: EndPolynomials
-    """Polynomials of each Chebyshev mode for its spectrum far from the line, (modes,
-    N_END_COEFFICIENTS).
+    """(modes, N_END_COEFFICIENTS) in each field: for each Chebyshev mode, the coefficients of the
+    polynomials that give its spectrum far from the line.
     """
     envelope_distance: np.ndarray
     """(m,): distances from the line at which envelopes are tabulated [bins of fs/N]."""
@@ -1017,7 +1017,7 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
     even_re, even_im, odd_re, odd_im = 0.0, 0.0, 0.0, 0.0  # T_j is 1 at the end, +-1 at the start
     n_values, ends = mode_transforms.shape[1], shape.end_polynomials
     transform_re, transform_im = np.zeros(n_values), np.zeros(n_values)
-    _clear_end_polynomials(ends)
+    _zero_end_polynomials(ends)
     for j in range(n_modes):
         a, b = mode_re[j], mode_im[j]
         if j & 1:
@@ -1058,7 +1058,7 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _clear_end_polynomials(ends):
+def _zero_end_polynomials(ends):
     """Set all coefficients of an :class:`EndPolynomials` to 0."""
     for d in range(N_END_COEFFICIENTS):
         ends.start_re[d], ends.start_im[d], ends.end_re[d], ends.end_im[d] = 0.0, 0.0, 0.0, 0.0
@@ -1137,7 +1137,7 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
         start_re[i], end_re[i] = start_re[i] * scale, end_re[i] * scale
         start_im[i], end_im[i] = start_im[i] * scale, end_im[i] * scale
         scale *= sample_step
-    _clear_end_polynomials(ends)
+    _zero_end_polynomials(ends)
     for i in range(n_derivatives):
         for d in range(N_END_COEFFICIENTS):
             p, q = _POWER_SUMS_RE[i, d], _POWER_SUMS_IM[i, d]

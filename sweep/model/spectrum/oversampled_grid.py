@@ -58,7 +58,7 @@ class GridOptions(NamedTuple):
 
     degree: int
     """Degree of the polynomial that spreads each line over cells; 0 for the nearest cell."""
-    real: bool
+    uses_real_transform: bool
     """True to transform powers as real numbers. It has effect only if the powers of the lines add.
     """
     folded: bool

@@ -129,7 +129,7 @@ def line_of_point(
     half_amplitude = 0.5 * amplitude * abs(complex(transfer_gain)) * whitening_gain
     line_bin = beat_frequency * shots.fft_size / sample_rate
     n_missing = 0
-    if shots.echo_record.n_samples_before is not None:
+    if shots.echo_record.n_samples_before_echo is not None:
         n_missing = int(
             count_samples_before_echo(
                 delay=np.array(delay),

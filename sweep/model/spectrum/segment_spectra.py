@@ -57,8 +57,8 @@ from sweep.model.spectrum.leakage import (
     SPECKLE_POWER_MAX,
     LeakageLimits,
     detect_with_leakage,
-    leakage_of_bins,
-    leakage_of_bins_in_speckle,
+    false_peak_probability_of_bins,
+    false_peak_probability_of_bins_in_speckle,
 )
 from sweep.model.spectrum.line_shape import LineShapeTables, PhaseErrorModes
 from sweep.model.spectrum.lines import (
@@ -349,10 +349,10 @@ def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
 
     No bin of these segments is searched for the echo.
     """
-    if shots.echo_record.n_samples_before is None:
+    if shots.echo_record.n_samples_before_echo is None:
         return spans
     lacks_echo = (
-        shots.echo_record.n_samples_before[:, spans.point_numbers] >= shots.window.length
+        shots.echo_record.n_samples_before_echo[:, spans.point_numbers] >= shots.window.length
     ) & (spans.n_bins > 0)
     if not lacks_echo.any():
         return spans
@@ -406,7 +406,10 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
         equivalent_threshold_ratio = float(
             looks.equivalent_threshold_ratio(threshold[column] / noise_sigma[column])
         )
-        sidelobe_correlation, mean_leakage = shots.detection_rule.sidelobe_correlation, 0.0
+        sidelobe_bin_noise_correlation, mean_leakage = (
+            shots.detection_rule.sidelobe_bin_noise_correlation,
+            0.0,
+        )
         for root_power, weight, probabilities in zip(
             root_powers, weights, crossing_probabilities, strict=True
         ):
@@ -418,7 +421,7 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
                 is_exempt,
                 1 / (looks.amplitude_gain_max * root_power),
                 equivalent_threshold_ratio / (looks.amplitude_gain_max * root_power),
-                sidelobe_correlation,
+                sidelobe_bin_noise_correlation,
             )
             mean_leakage += weight * any_crossing_probability(probabilities, 0, probabilities.size)
         leakage_in_looks[s, column] = mean_leakage
@@ -492,9 +495,11 @@ def _leakage_method(shots: Shots, group: LineShapeGroup, bin_by_bin: bool) -> in
 
 def _iter_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[LineShapeGroup]:
     """Yield groups of points whose line shapes are computed from the same tables, in any order."""
-    if shots.echo_record.n_samples_before is not None:
+    if shots.echo_record.n_samples_before_echo is not None:
         segment_exists = shots.has_segment
-        is_late = (shots.echo_record.n_samples_before[segment_exists][:, points] > 0).any(axis=0)
+        is_late = (shots.echo_record.n_samples_before_echo[segment_exists][:, points] > 0).any(
+            axis=0
+        )
         yield from _iter_late_line_shape_groups(shots, points[is_late])
         points = points[~is_late]
     window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
@@ -578,9 +583,9 @@ def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[L
     """Yield groups of points with late echoes and common tables of line shapes, in any order."""
     window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     segment_exists, segments = shots.has_segment, len(shots.waveform_segments)
-    assert shots.echo_record.n_samples_before is not None
+    assert shots.echo_record.n_samples_before_echo is not None
     lacks_echo = (
-        shots.echo_record.n_samples_before[segment_exists][:, points] >= window.length
+        shots.echo_record.n_samples_before_echo[segment_exists][:, points] >= window.length
     ).all(axis=0)
     if lacks_echo.any():
         tables = _tables_without_echo(window, fft_size, adds_powers, segments)
@@ -592,7 +597,7 @@ def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[L
     for batch_begin in range(0, points.size, POINTS_PER_BATCH):
         batch = points[batch_begin : batch_begin + POINTS_PER_BATCH]
         distinct_points, line_shape_index = _find_distinct_line_shapes(shots, batch)
-        echo_lengths = window.length - shots.echo_record.n_samples_before[:, distinct_points]
+        echo_lengths = window.length - shots.echo_record.n_samples_before_echo[:, distinct_points]
         echo_lengths[~segment_exists] = echo_lengths[segment_exists][0]
         length_min, length_max = echo_lengths.min(axis=0), echo_lengths.max(axis=0)
         length_classes = line_shape.late_echo_length_classes(window, length_min)
@@ -694,8 +699,8 @@ def _find_distinct_line_shapes(shots: Shots, batch: np.ndarray) -> DistinctLineS
     """
     first_samples = (
         ()
-        if shots.echo_record.n_samples_before is None
-        else shots.echo_record.n_samples_before[shots.has_segment]
+        if shots.echo_record.n_samples_before_echo is None
+        else shots.echo_record.n_samples_before_echo[shots.has_segment]
     )
     values_of_points = (
         np.broadcast_to(np.asarray(entry, float), shots.size)[batch]
@@ -1131,7 +1136,10 @@ def _evaluate_segment(
         ),
     )
     limits = LeakageLimits(
-        noise_sigma, threshold, parameters.leakage_tolerance[point], rule.sidelobe_correlation
+        noise_sigma,
+        threshold,
+        parameters.leakage_tolerance[point],
+        rule.sidelobe_bin_noise_correlation,
     )
     lobe_half_width = max(rule.lobe_half_width, int(bin_threshold.pedestal.reach_bins))
     beat = beat_parameters_at(parameters, parameters_by_segment, s, point)
@@ -1217,7 +1225,7 @@ def _evaluate_segment(
         )
     if leakage_method == LEAKAGE_BIN_BY_BIN:
         if rule.in_speckle:
-            leakage = leakage_of_bins_in_speckle(
+            leakage = false_peak_probability_of_bins_in_speckle(
                 n_bins,
                 limits,
                 negligible_signal_ratio / math.sqrt(SPECKLE_POWER_MAX),
@@ -1225,7 +1233,7 @@ def _evaluate_segment(
                 speckle_rates,
             )
         else:
-            leakage = leakage_of_bins(
+            leakage = false_peak_probability_of_bins(
                 n_bins, limits, negligible_signal_ratio, span, crossing_series
             )
             if image_gain > 0.0 and rule.neighbour_crossing_quadrature.sine.size > 0:

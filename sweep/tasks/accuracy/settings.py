@@ -18,13 +18,13 @@ from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
     AS_WRITTEN_KIND,
+    BEAMLET_ROW_KIND,
     BEAMLETS_KIND,
     CLOSED_FORM_KIND,
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
     FIXED_EFFECTS_KIND,
     IMPROVED_THESIS_KIND,
-    LINE_PATTERN_KIND,
     MEAN_OF_DRAWS_KIND,
     REFERENCE_KIND,
     THESIS_KIND,
@@ -290,7 +290,7 @@ def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
     for n_beamlets in () if is_flight else TRIED_LINE_BEAMLET_COUNTS:
         overrides = {_BEAMLETS_FIELD: n_beamlets, _PATTERN_FIELD: _LINE_PATTERN}
         yield AccuracySetting(
-            name=f"{n_beamlets} in a line", kind=LINE_PATTERN_KIND, overrides=overrides
+            name=f"{n_beamlets} in a line", kind=BEAMLET_ROW_KIND, overrides=overrides
         )
 
 

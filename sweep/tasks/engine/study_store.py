@@ -669,9 +669,11 @@ def refuse_foreign_files(store_path: Location) -> None:
 
 
 def find_pending_replacement(store_path: Location) -> Path | None:
-    """Return the unfinished store that will replace the one at a path; None without one.
+    """Return the path of an unfinished store that will replace the store at ``store_path``.
 
-    StoreError is raised if the unfinished store was begun to replace another store.
+    The result is None if no replacement is under way. Replacements that dead
+    processes left behind are first completed or undone. StoreError is raised if the unfinished
+    store was begun to replace another study's store than the one now at ``store_path``.
     """
     recover_interrupted_replace(store_path)
     if (

@@ -72,10 +72,11 @@ def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> Wo
 
 
 def _smallest_worker_memory_limit(client: Client) -> float:
-    """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit.
+    """Return the smallest memory limit among a client's workers [bytes].
 
-    inf also if the client is closed or its scheduler is gone. A study with missing blocks then
-    fails when it connects to the workers, and a complete one needs none.
+    The result is inf if there are no workers or none has a limit, and also if the client is closed
+    or its scheduler is gone. In the latter case a study with missing blocks fails later, when it
+    connects to the workers; a complete study needs no workers.
     """
     if client.status != "running":
         return np.inf

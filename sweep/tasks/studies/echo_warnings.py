@@ -476,10 +476,12 @@ def _iter_exchange_warnings(
     is_absent: np.ndarray,
     points_noun: str,
 ) -> Iterator[str]:
-    """Yield a warning about points where the assumption for two beats exchanges range and velocity.
+    """Yield a warning about points at which range and velocity are exchanged.
 
-    No warning is given if the target is fast at some points and far at others, and assumed to be
-    fast.
+    An up and a down beat that no Doppler beat confirms have two readings, for a far and for a fast
+    target. The wrong one gives range and velocity exchanged. The setting processing.two_beats,
+    ``far`` or ``fast``, chooses the reading. No warning is given if it is ``fast``, and ``far``
+    would exchange range and velocity at other points.
     """
     is_range_velocity_exchanged, is_exchanged_by_other_assumption = (
         diagnosis.is_range_velocity_exchanged & ~is_absent,

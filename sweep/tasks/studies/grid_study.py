@@ -672,8 +672,10 @@ def iter_block_results(
     """Yield the results of a block's points that are not done, in groups with the same effects.
 
     ``reused_results`` are from another study, ``checkpoint_results`` from an earlier task. Finished
-    points in them are not computed again, and unfinished points are continued. `UnfinishedBlock` is
-    raised at the deadline; a later call continues to the same bits.
+    points in them are not computed again, and unfinished points are continued.
+
+    At the deadline `UnfinishedBlock` is raised, which holds the results so far. A later call that
+    continues from them gives bit for bit the results of a call without a deadline.
     """
     parameters, order = grid.parameters_of_block(block), grid.point_order_by_geometry(block)
     order = order[

@@ -461,7 +461,7 @@ class Status:
     points_done: int
     blocks: int
     blocks_done: int
-    done_blocks: np.ndarray  # numbers of the blocks that are done
+    done_blocks: np.ndarray  # int: block numbers of the blocks that are done, rising
     points_in_unfinished_blocks: float  # number of points done in unfinished blocks
     failures: dict[int, dict[str, Any]]  # last failure by block that is not done
     lock_holder: journal.LockHolder | None  # process that holds the lock

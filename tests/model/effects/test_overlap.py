@@ -71,7 +71,7 @@ def test_lines_are_those_of_the_samples_that_the_echo_has(table_4_1, number):
         scene["instrument.receiver.architecture"] = "homodyne"
     moving = () if number % 3 else ("range_walk", "segment_motion")
     shots = shots_of(scene, *moving)
-    assert shots.echo_record.n_samples_before is not None
+    assert shots.echo_record.n_samples_before_echo is not None
     for segment in np.flatnonzero(shots.has_segment).tolist():
         off = difference(shots, 0, segment, with_range_walk=bool(moving))
         assert off < (1e-7 if moving else AGREEMENT), scene
@@ -98,8 +98,8 @@ def test_lines_with_a_phase_error_are_those_of_the_samples_that_the_echo_has(
     whole = shots_of(bent, "chirp_nonlinearity")
     (error,) = whole.echo_record.phase_errors
     first = (
-        int(whole.echo_record.n_samples_before[0, 0])
-        if whole.echo_record.n_samples_before is not None
+        int(whole.echo_record.n_samples_before_echo[0, 0])
+        if whole.echo_record.n_samples_before_echo is not None
         else 0
     )
     length = 2**16 - first
@@ -346,7 +346,7 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
         "footprint.speckle": "none",
     }  # fmt: skip
     shots, plain = shots_of(scene, "line_width"), shots_of(scene)
-    first = int(shots.echo_record.n_samples_before[0, 0])
+    first = int(shots.echo_record.n_samples_before_echo[0, 0])
     share = float((shots.echo_scales.beat_amplitude / plain.echo_scales.beat_amplitude)[0] ** 2)
     rng = np.random.default_rng(3)
     delay, rate = 2 * far / SPEED_OF_LIGHT, 600e6
