@@ -83,7 +83,9 @@ class Instrument(NamedTuple):
         """Shares of draws in which the echo is detected, and in which another bin alarms.
 
         (3,) of up, down and both; (2,) of up and down. In developed speckle each beamlet has a
-        random complex amplitude, one for all segments.
+        random complex amplitude, one for all segments. A footprint of one beamlet has amplitudes
+        that correlate between segments as those of its scatterers do; drawn scatterers test that
+        correlation (`tests/validate_speckle.py`).
         """
         shots, rng = self.shots, np.random.default_rng(seed)
         lines, level = shots.footprint.n_beamlets, float(shots.threshold[0])
@@ -91,9 +93,12 @@ class Instrument(NamedTuple):
         edge = first_circular_bin(shots.window, self.size)
         speckle = np.ones((DRAWS, lines), complex)
         if shots.speckle.segment_correlations is not None:
-            speckle = rng.normal(size=(DRAWS, lines, 2)) @ [1, 1j] / np.sqrt(2)
+            speckle, of_down_alone = rng.normal(size=(2, DRAWS, lines, 2)) @ [1, 1j] / np.sqrt(2)
         found, alarms = [], []
         for segment in (0, 2):
+            if segment == 2 and lines == 1 and shots.speckle.segment_correlations is not None:
+                shared = abs(shots.speckle.segment_correlations.up_down[0])
+                speckle = shared * speckle + np.sqrt(1 - shared**2) * of_down_alone
             beats = np.array(
                 [time_domain_truth.analytic_record(shots, 0, segment, b) for b in range(lines)]
             ) / shots.whitening_gain[segment, 0]  # fmt: skip
