@@ -32,7 +32,7 @@ FIXED_TOLERANCE = 1e-3
 """Tolerance of the effects, with a fixed number of beamlets."""
 
 REFERENCE_TOLERANCE = 1e-6
-SLOWNESS_MAX = 1.1
+TIME_RATIO_MAX = 1.1
 """Largest ratio of the time of auto to that of a fixed number that is as accurate."""
 
 SPECKLES = {"none": "Without speckle", "developed": "In developed speckle"}
@@ -278,7 +278,7 @@ def conclusion(settings: Sequence[Measured]) -> str:
     lines, is_met = [], True
     for auto in filter(is_auto, settings):
         rival = fastest_within(fixed, auto.largest_error)
-        is_met &= rival is None or auto.seconds <= SLOWNESS_MAX * rival.seconds
+        is_met &= rival is None or auto.seconds <= TIME_RATIO_MAX * rival.seconds
         at_error = comparison_sentence(auto, rival)
         at_tolerance = comparison_sentence(auto, fastest_within(fixed, auto.setting.tolerance))
         lines.append(

@@ -166,7 +166,7 @@ class ConfirmingPeak(NamedTuple):
     doppler_index: int
     """Index of the Doppler peak in the list of the segment's peaks; -1 if no peak fits."""
     reading: int
-    """Which reading of the beats gives range and velocity, as numbered by
+    """Number of the reading of the beats that gives range and velocity, counted as in
     :func:`sweep.model.waveform.beats_of_reading`; -1 if no peak fits."""
 
 

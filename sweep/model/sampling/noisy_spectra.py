@@ -158,7 +158,7 @@ class SegmentSignal(NamedTuple):
     """Number of bins on either side of an echo's strongest bin that the echo occupies, if a shot
     has several echoes."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """For each echo the record from which its speckle is drawn; None until
+    """Record of each echo, from which its speckle is drawn; None until
     :func:`add_footprint_records` sets it. The tuple is empty if speckle is not drawn from records,
     because the lines spread over more than RECORD_LINE_DEVIATION_MAX_BINS or the echo has no
     samples in the record."""
