@@ -12,8 +12,9 @@ Each version runs in a process of its own, with its own compiled kernels and exp
 `sweep.load` and `sweep.run(scheduler="none")` alone. A study is run whole and as a small part of
 itself; the processor's time for a point is the difference of the two over the points that the small
 one lacks, so that what a run costs once (reading, ground, the store) does not count. The versions
-change places each round. Others on the machine only ever add to a time, so that the ratio is that
-of the least times of all rounds; those of single rounds are from .. to.
+change places each round. Others on the machine only ever add to a time, so that the ratio follows
+from the least times of the whole and of the part over all rounds; those of single rounds are from
+.. to.
 """
 
 import argparse
@@ -24,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -193,6 +195,28 @@ def serve_runs() -> None:
         print(json.dumps([cpu_seconds, outcome.points]), flush=True)
 
 
+class SecondsAndPoints(NamedTuple):
+    """Processor times of a whole study and of its part, and the points that only the whole has."""
+
+    whole_seconds: float
+    part_seconds: float
+    n_points_between: int
+
+    @property
+    def per_point(self) -> float:
+        """Processor time of a point that only the whole study has [s]."""
+        return (self.whole_seconds - self.part_seconds) / self.n_points_between
+
+
+def least_seconds(rounds: Sequence[SecondsAndPoints]) -> SecondsAndPoints:
+    """Return the least time of the whole study and of its part over all rounds."""
+    return SecondsAndPoints(
+        min(times.whole_seconds for times in rounds),
+        min(times.part_seconds for times in rounds),
+        rounds[0].n_points_between,
+    )
+
+
 class Version:
     """A process that runs studies with the version in a check-out's folder."""
 
@@ -223,8 +247,8 @@ class Version:
         cpu_seconds, points = json.loads(answer_line)
         return cpu_seconds, points
 
-    def seconds_per_point(self, study: TimedStudy, folder: Path) -> float:
-        """Return the processor time per point [s], of the points that only the whole study has."""
+    def seconds_of_whole_and_part(self, study: TimedStudy, folder: Path) -> SecondsAndPoints:
+        """Run the whole study and its part; return processor times [s] and numbers of points."""
         results = []
         for name, overrides in (("whole", study.whole_overrides), ("part", study.part_overrides)):
             file = folder / f"{name}_{self.name}.yaml"
@@ -232,7 +256,7 @@ class Version:
             file.write_text(yaml.safe_dump(spec, sort_keys=False))
             results.append(self.run(file))
         (whole_seconds, whole_points), (part_seconds, part_points) = results
-        return (whole_seconds - part_seconds) / (whole_points - part_points)
+        return SecondsAndPoints(whole_seconds, part_seconds, whole_points - part_points)
 
     def close(self) -> None:
         """Stop the process."""
@@ -251,17 +275,18 @@ def check_out_commit(commit: str) -> Path:
     return checkout
 
 
-def measure_versions(versions: list[Version], study: TimedStudy, rounds: int) -> list[list[float]]:
-    """Return times per point [s], (rounds, versions), without a first round that may compile."""
+def measure_versions(
+    versions: list[Version], study: TimedStudy, rounds: int
+) -> list[list[SecondsAndPoints]]:
+    """Return the times of each version by round, without a first round that may compile."""
     with tempfile.TemporaryDirectory() as folder:
-        seconds_by_round = []
+        times_by_version: dict[str, list[SecondsAndPoints]] = {v.name: [] for v in versions}
         for count in range(rounds + 1):
-            order = versions if count % 2 else versions[::-1]
-            seconds_by_version = {
-                version.name: version.seconds_per_point(study, Path(folder)) for version in order
-            }
-            seconds_by_round.append([seconds_by_version[version.name] for version in versions])
-        return seconds_by_round[1:]
+            for version in versions if count % 2 else versions[::-1]:
+                times_by_version[version.name].append(
+                    version.seconds_of_whole_and_part(study, Path(folder))
+                )
+        return [times[1:] for times in times_by_version.values()]
 
 
 def show_row(
@@ -302,10 +327,13 @@ def main() -> None:
     least: dict[str, float] = {}
     for name in arguments.studies or group:
         study = group[name]
-        seconds_by_round = measure_versions(versions, study, arguments.rounds)
-        earlier, now = (1e6 * min(column) for column in zip(*seconds_by_round, strict=True))
+        times_by_version = measure_versions(versions, study, arguments.rounds)
+        earlier, now = (1e6 * least_seconds(times).per_point for times in times_by_version)
         least[name] = now
-        ratios = sorted(after / before for before, after in seconds_by_round)
+        ratios = sorted(
+            after.per_point / before.per_point
+            for before, after in zip(*times_by_version, strict=True)
+        )
         show_row(
             name, earlier, now, now / earlier, ratios[0], ratios[-1], study.ratio_max, study.against
         )

@@ -1,5 +1,6 @@
 """Studies of scenes from spec to store: same bytes anywhere, rays cast once, nothing lost."""
 
+import math
 import os
 import shutil
 import subprocess
@@ -35,6 +36,7 @@ from sweep.tasks.engine.study_store import create_store
 from sweep.tasks.studies import eyepoint_study
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, flight_block_size
 from sweep.tasks.studies.store_summary import flight_summary, status
 from sweep.tasks.studies.study_plan import plan_study
 
@@ -336,3 +338,14 @@ def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
     assert 0.5 < unseen.mean() < 1 and np.isfinite(found.true_altitude.values).all()
     assert np.isnan(found.pd_shot.values[unseen]).all()
     assert not (found.flags.values[unseen] & 1).any()
+
+
+@pytest.mark.parametrize("n_draws", [1, 10, 64, 65, 100, 1000])
+@pytest.mark.parametrize("n_shots", [40, 300, 3008])
+def test_default_blocks_hold_about_equal_numbers_of_draws(n_draws: int, n_shots: int) -> None:
+    spec = small_scene_spec(draws={"number": n_draws}, storage={})
+    block_shots, block_draws = flight_block_size(spec, 1, n_shots, n_draws)
+    n_blocks = math.ceil(n_draws / block_draws)
+    assert block_draws <= 64
+    assert n_blocks * block_draws - n_draws < n_blocks
+    assert block_shots % SHOTS_PER_TILE == 0

@@ -103,8 +103,8 @@ def flight_block_size(
     """Return the largest numbers of shots and of draws of a flight's block.
 
     The spec's section `storage` states both numbers. If they are defaults, blocks are cut further
-    to have work for all cores. They are cut along the draws first, because the effects of 256
-    consecutive shots are planned together.
+    to have work for all cores. They are cut along the draws first, and along the shots between
+    tiles, because the effects of a tile's 256 shots are planned together.
 
     Parameters
     ----------
@@ -123,8 +123,12 @@ def flight_block_size(
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
     study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
     shot_draws = default_block_cpu_seconds(study_cpu_seconds) / seconds_per_draw
-    block_draws = min(max(int(shot_draws / min(n_shots, SHOTS_PER_TILE)), 1), n_draws, block_draws)
-    block_shots = min(max(int(shot_draws / block_draws), SHOTS_PER_TILE), block_shots)
+    draws_per_tile = shot_draws / min(n_shots, SHOTS_PER_TILE)
+    # Blocks of about equal numbers of draws, without a few left over for another one.
+    n_draw_blocks = max(round(n_draws / draws_per_tile), math.ceil(n_draws / block_draws), 1)
+    block_draws = math.ceil(n_draws / n_draw_blocks)
+    n_tiles = max(round(shot_draws / block_draws / SHOTS_PER_TILE), 1)
+    block_shots = min(n_tiles * SHOTS_PER_TILE, block_shots)
     return block_shots, block_draws
 
 
