@@ -182,8 +182,7 @@ def test_a_flights_blocks_are_cut_for_all_cores(draws, rate):
     seconds = grid.n_points * worst_cpu_seconds_per_draw(spec)
     assert (grid.n_blocks == 1) == (seconds < 0.5) or grid.n_points // draws <= 256
     if seconds > 60:
-        # Blocks are of whole tiles of shots, hence not always 32 or more.
-        assert grid.n_blocks >= 24 or grid.count_block_points(0) // grid.block_shape[-2] >= 4000
+        assert grid.n_blocks >= 32 or grid.count_block_points(0) // grid.block_shape[-2] >= 4000
     largest = max(grid.count_block_points(block) for block in range(min(grid.n_blocks, 50)))
     assert largest * worst_cpu_seconds_per_draw(spec) < max(1.2 * seconds / 32, 1.0)
 

@@ -36,7 +36,11 @@ from sweep.tasks.engine.study_store import create_store
 from sweep.tasks.studies import eyepoint_study
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightStudy
-from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, flight_block_size
+from sweep.tasks.studies.parameter_grid import (
+    SHOTS_PER_TILE,
+    flight_block_size,
+    worst_cpu_seconds_per_draw,
+)
 from sweep.tasks.studies.store_summary import flight_summary, status
 from sweep.tasks.studies.study_plan import plan_study
 
@@ -349,3 +353,5 @@ def test_default_blocks_hold_about_equal_numbers_of_draws(n_draws: int, n_shots:
     assert block_draws <= 64
     assert n_blocks * block_draws - n_draws < n_blocks
     assert block_shots % SHOTS_PER_TILE == 0
+    if block_shots < min(n_shots, 4096):  # there are shots for a longer block
+        assert block_shots * block_draws * worst_cpu_seconds_per_draw(spec) >= 0.5

@@ -122,12 +122,15 @@ def flight_block_size(
         return block_shots, block_draws
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
     study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
-    shot_draws = default_block_cpu_seconds(study_cpu_seconds) / seconds_per_draw
-    draws_per_tile = shot_draws / min(n_shots, SHOTS_PER_TILE)
-    # Blocks of about equal numbers of draws, without a few left over for another one.
-    n_draw_blocks = max(round(n_draws / draws_per_tile), math.ceil(n_draws / block_draws), 1)
-    block_draws = math.ceil(n_draws / n_draw_blocks)
-    n_tiles = max(round(shot_draws / block_draws / SHOTS_PER_TILE), 1)
+    tile_draw_seconds = min(n_shots, SHOTS_PER_TILE) * seconds_per_draw
+    draws_in_time = max(default_block_cpu_seconds(study_cpu_seconds) / tile_draw_seconds, 1)
+    n_draw_blocks = math.ceil(n_draws / min(block_draws, draws_in_time))
+    block_draws = math.ceil(n_draws / n_draw_blocks)  # equal numbers, no few left over
+    tile_seconds = tile_draw_seconds * block_draws
+    n_tiles = max(
+        int(study_cpu_seconds / DEFAULT_BLOCKS_MIN / tile_seconds),
+        math.ceil(DEFAULT_BLOCK_CPU_SECONDS_MIN / tile_seconds),
+    )
     block_shots = min(n_tiles * SHOTS_PER_TILE, block_shots)
     return block_shots, block_draws
 
