@@ -196,24 +196,27 @@ def serve_runs() -> None:
 
 
 class SecondsAndPoints(NamedTuple):
-    """Processor times of a whole study and of its part, and the points that only the whole has."""
+    """Processor times of a whole study and of its part, and how many points more the whole has."""
 
     whole_seconds: float
     part_seconds: float
-    n_points_between: int
+    n_points_more: int
 
     @property
     def per_point(self) -> float:
         """Processor time of a point that only the whole study has [s]."""
-        return (self.whole_seconds - self.part_seconds) / self.n_points_between
+        return (self.whole_seconds - self.part_seconds) / self.n_points_more
 
 
-def least_seconds(rounds: Sequence[SecondsAndPoints]) -> SecondsAndPoints:
-    """Return the least time of the whole study and of its part over all rounds."""
+def least_of_rounds(rounds: Sequence[SecondsAndPoints]) -> SecondsAndPoints:
+    """Return the least whole time and the least part time, each over all rounds of one study.
+
+    The two may come from different rounds.
+    """
     return SecondsAndPoints(
         min(times.whole_seconds for times in rounds),
         min(times.part_seconds for times in rounds),
-        rounds[0].n_points_between,
+        rounds[0].n_points_more,
     )
 
 
@@ -328,7 +331,7 @@ def main() -> None:
     for name in arguments.studies or group:
         study = group[name]
         times_by_version = measure_versions(versions, study, arguments.rounds)
-        earlier, now = (1e6 * least_seconds(times).per_point for times in times_by_version)
+        earlier, now = (1e6 * least_of_rounds(times).per_point for times in times_by_version)
         least[name] = now
         ratios = sorted(
             after.per_point / before.per_point

@@ -100,18 +100,19 @@ def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
 def flight_block_size(
     spec: SceneSpec, n_axis_points: int, n_shots: int, n_draws: int
 ) -> tuple[int, int]:
-    """Return the largest numbers of shots and of draws of a flight's block.
+    """Return upper limits on the shots and on the draws of any block of a flight.
 
-    The spec's section `storage` states both numbers. If they are defaults, blocks are cut further
-    to have work for all cores. They are cut along the draws first, and along the shots between
-    tiles, because the effects of a tile's 256 shots are planned together.
+    A section `storage` that differs from its defaults states both. By default a study has at least
+    DEFAULT_BLOCKS_MIN blocks, or fewer if each would take less than DEFAULT_BLOCK_CPU_SECONDS_MIN.
+    A block then has a part of the draws of each shot if a tile's shots with all draws take longer.
+    Its shots are whole tiles, because the effects of a tile's shots are chosen together.
 
     Parameters
     ----------
     spec
         Flight.
     n_axis_points
-        Number of points of the flight's axes.
+        Number of points of the grid that the flight's axes span.
     n_shots
         Number of shots of one scanner.
     n_draws
@@ -123,15 +124,15 @@ def flight_block_size(
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
     study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
     tile_draw_seconds = min(n_shots, SHOTS_PER_TILE) * seconds_per_draw
-    draws_in_time = max(default_block_cpu_seconds(study_cpu_seconds) / tile_draw_seconds, 1)
-    n_draw_blocks = math.ceil(n_draws / min(block_draws, draws_in_time))
-    block_draws = math.ceil(n_draws / n_draw_blocks)  # equal numbers, no few left over
+    draws_per_block_max = max(default_block_cpu_seconds(study_cpu_seconds) / tile_draw_seconds, 1)
+    n_draw_blocks = math.ceil(n_draws / min(block_draws, draws_per_block_max))
+    block_draws = math.ceil(n_draws / n_draw_blocks)  # a last block is not much smaller
     tile_seconds = tile_draw_seconds * block_draws
-    n_tiles = max(
+    tiles_per_block = max(
         int(study_cpu_seconds / DEFAULT_BLOCKS_MIN / tile_seconds),
         math.ceil(DEFAULT_BLOCK_CPU_SECONDS_MIN / tile_seconds),
     )
-    block_shots = min(n_tiles * SHOTS_PER_TILE, block_shots)
+    block_shots = min(tiles_per_block * SHOTS_PER_TILE, block_shots)
     return block_shots, block_draws
 
 
