@@ -141,7 +141,7 @@ def speckle_studies() -> dict[str, TimedStudy]:
             for speckle in ("none", "developed"):
                 ranges = (
                     {RANGE_AXIS: {"linear": ["500 m", "6 km"], "number": number}}
-                    for number in (30_000, 3_000)
+                    for number in (60_000, 6_000)
                 )
                 study = TimedStudy(speckle_grid(rule, speckle, angle), 1.0, *ranges)
                 if speckle == "developed":

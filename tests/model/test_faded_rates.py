@@ -135,9 +135,9 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     told = echo_detection._mean_over_mode_power(bins_given_mode, run, False, 1024)
 
     ratio = steady[1] / steady[0]
-    first = np.min(np.maximum(steady[1] - echo_detection._THRESHOLD_REACH_SIGMA, 0.0) / steady[0])
+    first = np.min(np.maximum(steady[1] - echo_detection._IMPOSSIBLE_BELOW_SIGMA, 0.0) / steady[0])
     last = min(
-        np.min((steady[1] + echo_detection._THRESHOLD_REACH_SIGMA) / steady[0]),
+        np.min((steady[1] + echo_detection._CERTAIN_ABOVE_SIGMA) / steady[0]),
         echo_detection._MODE_MAGNITUDE_MAX,
     )
     first, last = (min(v, echo_detection._MODE_MAGNITUDE_MAX) for v in (first, last))
@@ -152,6 +152,8 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     found, missed = (weight * np.array(of_nodes).T).sum(axis=1)
     found += np.exp(-last * last)
     whole = found + missed
-    assert told[0] == pytest.approx(found / whole, rel=3e-5, abs=0)
-    assert told[1] == pytest.approx(missed / whole, rel=3e-5, abs=0)
-    assert told[0] == pytest.approx(found / whole, abs=3e-7)
+    # No more than 7 nodes leave out no more than 8 bins each: a half of all that is the most seen.
+    relative = 30 * echo_detection._NEGLIGIBLE_FRACTION
+    assert told[0] == pytest.approx(found / whole, rel=relative, abs=0)
+    assert told[1] == pytest.approx(missed / whole, rel=relative, abs=0)
+    assert told[0] == pytest.approx(found / whole, abs=30 * echo_detection._NEGLIGIBLE_PROBABILITY)

@@ -1065,18 +1065,19 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     return Detection(pd + miss * bin_run.pd, miss * bin_run.miss)
 
 
-_GAUSS_ORDER = 7
+_GAUSS_ORDER = 6
 """Number of nodes, in each interval, of the Gauss-Legendre quadrature over the magnitude of the
 strongest speckle mode."""
-_THRESHOLD_REACH_SIGMA = 4.5
-"""Distance of the noiseless |X| from the threshold beyond which a crossing counts as certain or
-impossible, in units of the noise per quadrature."""
+_IMPOSSIBLE_BELOW_SIGMA, _CERTAIN_ABOVE_SIGMA = 4.5, 2.7
+"""Distances of the noiseless |X| below and above the threshold beyond which the quadrature ends, in
+units of the noise per quadrature. A bin is missed there with a probability of 2e-3, and crosses with
+a rare one, which small pd need. With the nodes, the error of pd is at most 2e-3 and mostly 1e-4."""
 _MODE_MAGNITUDE_MAX = 6.0
 """Upper end of the quadrature over the magnitude of the strongest speckle mode, in units of its
 root mean square."""
-_RARE_CROSSING_MAX = 1e-6
+_RARE_CROSSING_MAX = 1e-5
 """Crossing probability below which a bin counts as independent of its neighbours."""
-_NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION = 1e-8, 1e-6
+_NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION = 1e-6, 1e-4
 """Largest contribution of a bin to the probability of detection pd that may be neglected. The first
 is absolute, the second relative to the smaller of pd and 1 - pd."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
@@ -1226,7 +1227,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
     for k in range(is_echo.size):
         pedestal_ratio_max = max(pedestal_ratio_max, bins_given_mode.pedestal[k])
         if is_echo[k] and bins_given_mode.signal[k] > 0.0:
-            pedestal_reach = _THRESHOLD_REACH_SIGMA * math.sqrt(bins_given_mode.pedestal[k])
+            pedestal_deviation = math.sqrt(bins_given_mode.pedestal[k])
             if bins_given_mode.threshold[k] < z_middle * bins_given_mode.signal[k]:
                 z_middle, strongest_index = (
                     bins_given_mode.threshold[k] / bins_given_mode.signal[k],
@@ -1234,14 +1235,16 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
                 )
             z_first = min(
                 z_first,
-                max(bins_given_mode.threshold[k] - _THRESHOLD_REACH_SIGMA, 0.0)
-                / (bins_given_mode.signal[k] + pedestal_reach),
+                max(bins_given_mode.threshold[k] - _IMPOSSIBLE_BELOW_SIGMA, 0.0)
+                / (bins_given_mode.signal[k] + _IMPOSSIBLE_BELOW_SIGMA * pedestal_deviation),
             )
-            if bins_given_mode.signal[k] > pedestal_reach:
+            signal_over_pedestal = (
+                bins_given_mode.signal[k] - _CERTAIN_ABOVE_SIGMA * pedestal_deviation
+            )
+            if signal_over_pedestal > 0.0:
                 z_last = min(
                     z_last,
-                    (bins_given_mode.threshold[k] + _THRESHOLD_REACH_SIGMA)
-                    / (bins_given_mode.signal[k] - pedestal_reach),
+                    (bins_given_mode.threshold[k] + _CERTAIN_ABOVE_SIGMA) / signal_over_pedestal,
                 )
     z_last = min(z_last, math.sqrt(z_middle * z_middle + 10.0))  # 5e-5 of the mean lies beyond
     interval_ends = (z_first, z_last, z_last)
@@ -1385,7 +1388,7 @@ def _pd_and_miss_given_mode(
             # That both of a pair cross is at most as likely.
             pd, miss, previous_p_stay = pd + miss * p_cross, miss * p_stay, -1.0
             continue
-        deviate = _normal_deviate_of_tails(tails)
+        deviate = _rough_normal_deviate_of_tails(tails)
         conditional_cross, conditional_stay = p_cross, p_stay
         correlation = bins_given_mode.correlation[k]
         if previous_p_stay > 0.0 and correlation != 0.0:
@@ -1425,6 +1428,30 @@ def _normal_deviate(probability):
     tail = 0.5 * math.erfc(t * math.sqrt(0.5))
     slope = math.exp(-0.5 * t * t) / math.sqrt(2.0 * math.pi)
     return t + math.log(tail / probability) * tail / slope
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _rough_normal_deviate_of_tails(tails):
+    """Compute :func:`_normal_deviate_of_tails` with an error of at most 4.5e-4.
+
+    Notes
+    -----
+    The approximation [1]_ costs a third of :func:`_normal_deviate`, and the quadrature over a
+    speckle mode needs many.
+
+    References
+    ----------
+    .. [1] M. Abramowitz, I. A. Stegun, "Handbook of Mathematical Functions," 26.2.23, 1964.
+    """
+    probability = min(tails.above, tails.below)
+    if probability < 1e-300:
+        deviate = 37.0
+    else:
+        s = math.sqrt(-2.0 * math.log(probability))
+        deviate = s - (2.515517 + s * (0.802853 + s * 0.010328)) / (
+            1.0 + s * (1.432788 + s * (0.189269 + s * 0.001308))
+        )
+    return deviate if tails.above < tails.below else -deviate
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
