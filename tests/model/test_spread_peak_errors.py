@@ -138,15 +138,14 @@ def test_places_of_spread_peaks_err_as_stated(shape, rule, angle):
     assert lowest < of_velocity < 1.1
 
 
-@pytest.mark.parametrize("angle", [5, 10, 20, 30, 60, 90])
+@pytest.mark.parametrize("angle", [5, 7, 10, 20, 30, 60, 90])
 @pytest.mark.parametrize("rule", ["any_bin", "peak_bin"])
-def test_places_by_two_bins_err_about_as_stated(rule, angle):
-    """Noise, and speckle in quadrature, decide on the side of a peak in the rectangular window.
+def test_places_by_two_bins_err_as_stated(rule, angle):
+    """Noise and speckle decide on the side of a peak in the rectangular window, and move it less.
 
-    By the errors of noise in phase with the line alone, scores were up to 3.4.
+    With the linear wander of other windows, scores of velocities were up to 1.42, and of ranges
+    down to 0.83.
     """
-    of_range, of_velocity = scores("rectangular", rule, angle)
-    assert of_range == pytest.approx(1.0, abs=0.1 if angle >= 60 else 0.2)
-    if angle >= 60:
-        assert of_velocity == pytest.approx(1.0, abs=0.1)
-    assert 0.9 < of_velocity < 1.5
+    of_range, of_velocity = scores("rectangular", rule, angle, draws=8000, places=40)
+    assert of_range == pytest.approx(1.0, abs=0.1)
+    assert of_velocity == pytest.approx(1.0, abs=0.15)

@@ -193,8 +193,14 @@ _TWO_BIN_OFFSETS_BINS = np.array(
 )
 """Coordinates of the tables of :func:`_two_bin_error_tables`: spread of the lines [fs/L], echo
 fraction over relative power, noise per quadrature over the peak's |X|, and estimated offset."""
-_TWO_BIN_DRAWS = 8192
+_TWO_BIN_DRAWS = 4096
 """Number of drawn peaks from which each entry of these tables is averaged."""
+_TWO_BIN_LINES, _TWO_BIN_LINE_POWERS = np.polynomial.hermite_e.hermegauss(24)
+"""Places y_j of the lines of a drawn footprint, in units of the spread, and their powers a_j^2."""
+_TWO_BIN_SEARCH_BINS = 5
+"""Largest distance [bins] from bin 0 at which the mean echo of a drawn footprint may be largest."""
+_LEAST_TABLE_VARIANCE = 1e-10
+"""Smallest tabulated variance [bins^2]."""
 _EMPTY_TABLE_ENTRY_DRAWS = 2.0
 """Number of draws below which the value of a neighbouring offset is taken."""
 
@@ -205,28 +211,29 @@ def estimates_by_two_bins(shots: "Shots") -> bool:
 
 
 class TwoBinErrors(NamedTuple):
-    """Errors, beyond wander, of positions by the strongest bin and its larger neighbour, (m, 3).
+    """Errors of positions by the strongest bin and its larger neighbour, (m, 3).
 
     Notes
     -----
-    In windows whose neighbours of a tone on a bin vanish, noise and speckle in quadrature with the
-    line decide on the side of a peak near a bin. The error on the wrong side is twice the offset.
-    Even on the right side, a complex shift D of a tone gives the estimate |D|, and not its real
-    part. The errors are not small against the offset. So they are averages over draws, for peaks
-    that have the estimated offset. Tones are anywhere between bins with equal density. To second
-    order in the lines' spread b, the bin at the distance x from the tone is
+    In windows whose neighbours of a tone on a bin vanish, noise and speckle decide on the side of a
+    peak near a bin, and the error on the wrong side is twice the offset. A dim peak is the slope of
+    its neighbours' light, and wanders by less than the linear law says. None of these errors is
+    small against the offset. So they are averages over drawn lines, given the power of the peak
+    bin and the estimated offset. Line j has the place b y_j about the tone, the spread b, the
+    weight a_j and a complex Gaussian amplitude z_j. Tones are anywhere between bins with equal
+    density. Noise is independent from bin to bin, as it is in the rectangular window.
 
-        A (H(x) - i Im(s) H'(x) + Q H''(x) / 2).
-
-    H is the broadened line of :class:`PeakShapeErrors`, s the complex shift, and Q = sum a z b^2
-    (y^2 - 1) / A a circular Gaussian number of the variance 2 b^4 v / q^2. Noise is independent
-    from bin to bin, as it is in the rectangular window.
+    Two segments share speckle, so their errors are correlated. The common part is the linear
+    wander w = b Re(sum a z y / X) of the peak X, times a gain: the regression of the error on w.
     """
 
     mean: np.ndarray
     """(m, 3): mean error [bins]."""
+    wander_gain: np.ndarray
+    """(m, 3): error over linear wander, by regression."""
     excess_variance: np.ndarray
-    """(m, 3): variance about the mean [bins^2], beyond the standard error by noise that
+    """(m, 3): variance about the mean [bins^2], beyond that of the wander times its gain, and
+    beyond that of the standard error by noise that
     :func:`sweep.model.detection.sub_bin_interpolation.sub_bin_standard_error` states."""
 
     @classmethod
@@ -265,75 +272,184 @@ class TwoBinErrors(NamedTuple):
                 (noise_ratio, _TWO_BIN_NOISE_RATIOS),
             )
         )
-        relative_mean, log_mean_square = interpolate_tables(
+        relative_mean, log_variance, wander_gain = interpolate_tables(
             _two_bin_error_grids(), tables, (*log_coordinates, np.abs(offset))
         )
-        mean_square = np.exp(log_mean_square)
-        mean = relative_mean * np.sqrt(mean_square)
+        variance = np.exp(log_variance)
+        mean = relative_mean * np.sqrt(variance)
         error_at_sigma = interpolator(shots.window, shots.fft_size).error_at_sigma
         noise_error = noise_ratio * np.interp(
             np.abs(offset), np.linspace(0, 1, error_at_sigma.size), error_at_sigma
         )
-        variance = mean_square - mean**2 - np.minimum(noise_error, 0.5) ** 2
-        return cls(np.sign(offset) * mean, np.maximum(variance, 0.0))
+        variance -= np.minimum(noise_error, 0.5) ** 2
+        return cls(np.sign(offset) * mean, wander_gain, np.maximum(variance, 0.0))
+
+
+class TwoBinErrorTables(NamedTuple):
+    """Tables of :class:`TwoBinErrors`.
+
+    Coordinates are the logarithms of spread, shift ratio and noise ratio, and the offset.
+    """
+
+    relative_mean: np.ndarray
+    """Mean error, over the root of the variance beyond wander."""
+    log_variance: np.ndarray
+    """Logarithm of the variance about the mean, beyond that of the wander times its gain [bins^2].
+    It includes noise."""
+    wander_gain: np.ndarray
+    """Error over linear wander, by regression."""
 
 
 @lru_cache(maxsize=8)
 def _two_bin_error_tables(
     window: Window, fft_size: int, keeps_strongest_bin: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate moments of :class:`TwoBinErrors`.
+) -> TwoBinErrorTables:
+    """Tabulate moments of the errors of drawn peaks.
 
     ``keeps_strongest_bin`` is True if peaks are estimated about the bin that is strongest without
     noise and speckle; else they are estimated about the largest bin.
-
-    Returns
-    -------
-    relative_mean : ndarray
-        Mean error over its root mean square, by the logarithms of spread, shift ratio and noise
-        ratio, and by offset.
-    log_mean_square : ndarray
-        Logarithm of the mean square error [bins^2], by the same coordinates.
     """
     interpolation, padding = interpolator(window, fft_size), fft_size / window.length
-    n_samples = min(window.length, _SHAPE_SAMPLES_MAX)
-    window_values = window_samples(window.name, n_samples)
-    sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding
-    distance = np.linspace(-2.0, 1.0, 385)
-    cosine, sine = (f(np.outer(distance, sample_phase)) for f in (np.cos, np.sin))
+    bins = np.arange(-1, 2) if keeps_strongest_bin else np.arange(-2, 3)
+    centre = bins.size // 2
+    # About the bin that is strongest without speckle, a neighbour may be the largest of the three.
+    largest_bins = range(bins.size) if keeps_strongest_bin else (centre,)
     rng = np.random.default_rng(0)
-    position = rng.uniform(0.0, 1.0 if keeps_strongest_bin else 0.75, _TWO_BIN_DRAWS)
-    imaginary_shift = rng.normal(size=_TWO_BIN_DRAWS)
-    curvature, noise_below, noise_above = rng.normal(size=(3, _TWO_BIN_DRAWS)) + 1j * rng.normal(
-        size=(3, _TWO_BIN_DRAWS)
-    )
-    mean, mean_square = np.empty((2, *(grid.size for grid in _two_bin_error_grids())))
+    shape = tuple(grid.size for grid in _two_bin_error_grids())
+    mean, log_variance, gain = np.empty((3, *shape))
     for i, spread in enumerate(_TWO_BIN_SPREADS_CELLS * padding):
-        taper = window_values * np.exp(-0.5 * (spread * sample_phase) ** 2)
-        line, slope, second_slope = (
-            np.stack([np.interp(k - position, distance, values) for k in (-1, 0, 1)])
-            for values in (
-                cosine @ taper,
-                -(sine @ (taper * sample_phase)),
-                -(cosine @ (taper * sample_phase**2)),
-            )
+        place_max = 0.5 if keeps_strongest_bin else 1.5 + spread
+        footprints = _DrawnFootprints.from_random(rng, window, padding, spread, place_max, bins)
+        for k, noise_ratio in enumerate(_TWO_BIN_NOISE_RATIOS):
+            known_moments = None
+            for j, shift_ratio in enumerate(_TWO_BIN_SHIFT_RATIOS):
+                peaks = [
+                    footprints.weighted_errors(shift_ratio, noise_ratio, index, interpolation)
+                    for index in largest_bins
+                ]
+                moments = _moments_by_offset(*np.concatenate(peaks, axis=1))
+                # A wide footprint hardly ever has a largest bin that is very dim.
+                known_moments = moments if moments is not None else known_moments
+                assert known_moments is not None
+                mean[i, j, k], log_variance[i, j, k], gain[i, j, k] = known_moments
+    return TwoBinErrorTables(mean / np.exp(0.5 * log_variance), log_variance, gain)
+
+
+class _DrawnFootprints(NamedTuple):
+    """Random lines about tones at random places, and their echo and noise in bins about 0.
+
+    There are m draws. All numbers are of unit mean power; |X| is relative to the peak bin's.
+    """
+
+    bins: np.ndarray
+    """(bins,): numbers of the bins."""
+    place: np.ndarray
+    """(m,): place of the tone [bins]."""
+    echo: np.ndarray
+    """(bins, m) complex: echo of the lines."""
+    echo_covariance: np.ndarray
+    """(bins, bins, m): covariance of the echo over draws of the amplitudes."""
+    noise: np.ndarray
+    """(bins, m) complex: noise."""
+    shift: np.ndarray
+    """(m,): spread times the real part of the sum of a_j y_j z_j [bins]."""
+    shift_covariance: np.ndarray
+    """(bins, m): covariance of that sum, as a complex number, with the echo [bins]."""
+    strongest_mean: np.ndarray
+    """(m,): mean power of the echo in the bin where it is largest."""
+
+    @classmethod
+    def from_random(
+        cls,
+        rng: np.random.Generator,
+        window: Window,
+        padding: float,
+        spread: float,
+        place_max: float,
+        bins: np.ndarray,
+    ) -> "_DrawnFootprints":
+        """Draw footprints of a given spread [bins], with tones at most ``place_max`` from 0."""
+        n_samples = min(window.length, _SHAPE_SAMPLES_MAX)
+        window_values = window_samples(window.name, n_samples)
+        sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding
+        powers = _TWO_BIN_LINE_POWERS / _TWO_BIN_LINE_POWERS.sum()
+        place = rng.uniform(-place_max, place_max, _TWO_BIN_DRAWS)
+        line_places = place + spread * _TWO_BIN_LINES[:, None]
+        reach = np.abs(line_places).max() + _TWO_BIN_SEARCH_BINS
+        distance = np.linspace(-reach, reach, int(128 * reach))
+        transform = np.cos(np.outer(distance, sample_phase)) @ window_values / window_values.sum()
+        mean_powers = [
+            powers @ np.interp(bin_ - line_places, distance, transform) ** 2
+            for bin_ in range(-_TWO_BIN_SEARCH_BINS, _TWO_BIN_SEARCH_BINS + 1)
+        ]
+        shapes = np.interp(bins[:, None, None] - line_places, distance, transform)
+        amplitudes, noise = (
+            (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
+            for shape in ((powers.size, _TWO_BIN_DRAWS), (bins.size, _TWO_BIN_DRAWS))
         )
-        for j, ratio in enumerate(_TWO_BIN_SHIFT_RATIOS):
-            shift = spread * np.sqrt(ratio / 2) * imaginary_shift
-            bins = line - 1j * shift * slope
-            bins += 0.5 * spread**2 * np.sqrt(ratio) * curvature * second_slope
-            centre = np.abs(bins[1])
-            for k, noise_ratio in enumerate(_TWO_BIN_NOISE_RATIOS):
-                noise = noise_ratio * centre
-                below = np.abs(bins[0] + noise * noise_below)
-                above = np.abs(bins[2] + noise * noise_above)
-                estimate = _offsets_of_magnitudes(np.stack([below, centre, above]), interpolation)
-                is_peak = keeps_strongest_bin | (np.maximum(below, above) <= centre)
-                error = np.abs(estimate) - np.where(estimate < 0, -position, position)
-                mean[i, j, k], mean_square[i, j, k] = _mean_errors_by_offset(
-                    np.abs(estimate)[is_peak], error[is_peak]
-                )
-    return mean / np.sqrt(mean_square), np.log(mean_square)
+        weighted_places = spread * np.sqrt(powers) * _TWO_BIN_LINES
+        return cls(
+            bins=bins,
+            place=place,
+            echo=np.einsum("l,klm,lm->km", np.sqrt(powers), shapes, amplitudes),
+            echo_covariance=np.einsum("l,jlm,klm->jkm", powers, shapes, shapes),
+            noise=noise,
+            shift=weighted_places @ amplitudes.real,
+            shift_covariance=np.einsum("l,klm->km", weighted_places * np.sqrt(powers), shapes),
+            strongest_mean=np.max(mean_powers, axis=0),
+        )
+
+    def weighted_errors(
+        self,
+        shift_ratio: float,
+        noise_ratio: float,
+        largest_index: int,
+        interpolation: Interpolator,
+    ) -> np.ndarray:
+        """Return the errors of peaks whose largest bin is X = 1, and the weights of the draws.
+
+        Parameters
+        ----------
+        shift_ratio
+            Mean power of the echo in the bin where it is largest, v / q^2.
+        noise_ratio
+            Noise per quadrature.
+        largest_index
+            Index of the largest bin.
+        interpolation
+            Estimator by the strongest bin and its larger neighbour.
+
+        Returns
+        -------
+        numpy.ndarray
+            (4, m): size of the estimated offset [bins]; error [bins], and linear wander [bins],
+            both positive away from the middle bin on the side of the estimate; and weight.
+
+        Notes
+        -----
+        Echo and noise were drawn without regard to X, and are moved to X = 1: a Gaussian number Y
+        becomes Y + cov(Y, X) (1 - X) / var(X). The weight is the density exp(-1 / var(X)) / var(X)
+        of X at 1, and 0 if another bin is larger. The wander has the variance b^2 v / (2 q^2).
+        """
+        ratio, noise_power = shift_ratio / self.strongest_mean, 2 * noise_ratio**2
+        drawn = np.sqrt(ratio) * self.echo + np.sqrt(noise_power) * self.noise
+        variance = ratio * self.echo_covariance[largest_index, largest_index] + noise_power
+        correction = ratio * (1 - drawn[largest_index]) / variance
+        spectrum = drawn + self.echo_covariance[largest_index] * correction
+        spectrum[largest_index] = 1.0
+        magnitude, middle = np.abs(spectrum), self.bins.size // 2
+        shift = np.sqrt(ratio) * self.shift + self.shift_covariance[largest_index] * correction.real
+        estimate = _offsets_of_magnitudes(magnitude[middle - 1 : middle + 2], interpolation)
+        density = np.exp(1 / variance.max() - 1 / variance) / variance
+        side = np.where(estimate < 0, -1.0, 1.0)
+        return np.stack(
+            [
+                np.abs(estimate),
+                side * (estimate - self.place),
+                side * shift * np.sqrt(self.strongest_mean),
+                np.where(magnitude.max(axis=0) <= 1, density, 0.0),
+            ]
+        )
 
 
 def _two_bin_error_grids() -> tuple[np.ndarray, ...]:
@@ -346,26 +462,40 @@ def _two_bin_error_grids() -> tuple[np.ndarray, ...]:
     )
 
 
-def _mean_errors_by_offset(offset: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and mean square of errors (m,) at the tabulated offsets, from peaks near each."""
+def _moments_by_offset(
+    offset: np.ndarray, error: np.ndarray, shift: np.ndarray, draw_weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return mean error, logarithm of the variance beyond the shift's, and gain, at the offsets.
+
+    The gain is the regression of the error on the shift. Arguments are (m,), by draw: estimated
+    offset, error, shift and weight. Draws near a tabulated offset count there. None if no offset
+    has _EMPTY_TABLE_ENTRY_DRAWS.
+    """
     n_offsets = _TWO_BIN_OFFSETS_BINS.size
     position = np.interp(offset, _TWO_BIN_OFFSETS_BINS, np.arange(n_offsets))
     index = np.minimum(position.astype(int), n_offsets - 2)
     above = position - index
-    weight, weighted_error, weighted_square = (
-        np.bincount(index, values * (1 - above), n_offsets)
-        + np.bincount(index + 1, values * above, n_offsets)
-        for values in (np.ones_like(error), error, error**2)
+
+    def sums(values: np.ndarray) -> np.ndarray:
+        return np.asarray(
+            np.bincount(index, values * (1 - above), n_offsets)
+            + np.bincount(index + 1, values * above, n_offsets)
+        )
+
+    weight = sums(draw_weight)
+    is_known = weight**2 > _EMPTY_TABLE_ENTRY_DRAWS * sums(draw_weight**2)
+    if not is_known.any():
+        return None
+    mean_error, mean_shift, squared_error, squared_shift, product = (
+        sums(draw_weight * values)[is_known] / weight[is_known]
+        for values in (error, shift, error**2, shift**2, error * shift)
     )
-    is_known = weight > _EMPTY_TABLE_ENTRY_DRAWS
-    known_weight = weight[is_known]
-    return (
-        np.interp(
-            _TWO_BIN_OFFSETS_BINS, _TWO_BIN_OFFSETS_BINS[is_known],
-            weighted_error[is_known] / known_weight,
-        ),
-        np.interp(
-            _TWO_BIN_OFFSETS_BINS, _TWO_BIN_OFFSETS_BINS[is_known],
-            weighted_square[is_known] / known_weight + 1e-14,
-        ),
-    )  # fmt: skip
+    gain = (product - mean_error * mean_shift) / (squared_shift - mean_shift**2)
+    variance = squared_error - mean_error**2 - gain * (product - mean_error * mean_shift)
+    log_variance = np.log(np.maximum(variance, 0.0) + _LEAST_TABLE_VARIANCE)
+    known_offsets = _TWO_BIN_OFFSETS_BINS[is_known]
+    mean_error, log_variance, gain = (
+        np.interp(_TWO_BIN_OFFSETS_BINS, known_offsets, values)
+        for values in (mean_error, log_variance, gain)
+    )
+    return mean_error, log_variance, gain

@@ -1035,10 +1035,10 @@ def position_error_moments(
     y^2 / A - s^2 of the lines about the complex shift s. Re V has the mean b^2 and the variance
     b^4 (v / q^2 + v^2 / q^4). Here b is the spread of the lines [bins], q^2 the peak's power over
     its mean, and v the echo fraction. In wider footprints the error has the same relative
-    deviation. Positions by two bins have the errors of :class:`TwoBinErrors` in its place. If only
-    the strongest bin is tested, the wander's deviation is divided by sqrt(1 + variance /
-    WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the
-    variance.
+    deviation. If only the strongest bin is tested, the wander's deviation is divided by sqrt(1 +
+    variance / WANDER_MAX_BINS^2). Positions by two bins have the errors of :class:`TwoBinErrors`
+    in the place of all this: the wander times its gain, and the rest, which is independent from
+    segment to segment. The mean over L looks of independent speckle has 1 / L of the variance.
     """
     squared_shift = (gradients.line_shift**2).sum(axis=-1)
     has_peak = np.isfinite(peaks.relative_power) & np.isfinite(peaks.offset)
@@ -1048,6 +1048,7 @@ def position_error_moments(
     squared_spread = np.where(echo_fraction > 0, squared_shift, 0.0)
     offset, shift_ratio = np.where(has_peak, peaks.offset, 0.0), echo_fraction / relative_power
     shape_deviation, quadrature_deviation, own_variance = np.zeros((3, *variance.shape))
+    wander_factor = np.ones(variance.shape)
     if from_three_bins and estimates_by_two_bins(shots):
         noise_ratio = np.sqrt((1 - echo_fraction) / (2 * relative_power))
         side_errors = TwoBinErrors.from_offset(
@@ -1055,15 +1056,15 @@ def position_error_moments(
         )
         mean_error = np.where(has_peak, peaks.folding_sign * side_errors.mean, 0.0)
         own_variance = np.where(echo_fraction > 0, side_errors.excess_variance, 0.0)
+        wander_factor = side_errors.wander_gain
     else:
         shape_errors = PeakShapeErrors.from_offset(offset, squared_spread, variance, shots)
         spread_error = peaks.folding_sign * shape_errors.spread_error
         mean_error = spread_error + peaks.folding_sign * shape_errors.quadrature_error
         shape_deviation = np.sqrt(shift_ratio * (1 + shift_ratio)) * spread_error
         quadrature_deviation = peaks.folding_sign * shape_errors.quadrature_deviation
-    wander_factor = np.ones(variance.shape)
-    if shots.detection_settings.echo_bins == "peak_bin":
-        wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
+        if shots.detection_settings.echo_bins == "peak_bin":
+            wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
     n_looks = (
         shots.looks.number
         if shots.looks.is_noncoherent and shots.looks.has_independent_speckle
