@@ -104,8 +104,9 @@ def flight_block_size(
 
     A section `storage` that differs from its defaults states both. By default a study has at least
     DEFAULT_BLOCKS_MIN blocks, or fewer if each would take less than DEFAULT_BLOCK_CPU_SECONDS_MIN.
-    A block then has a part of the draws of each shot if a tile's shots with all draws take longer.
-    Its shots are whole tiles, because the effects of a tile's shots are chosen together.
+    A block then has a part of the draws of each shot if a tile's shots with all draws take longer,
+    and twice DEFAULT_BLOCK_CPU_SECONDS_MIN: each part computes the spectra of its shots anew. Its
+    shots are whole tiles, because the effects of a tile's shots are chosen together.
 
     Parameters
     ----------
@@ -124,7 +125,10 @@ def flight_block_size(
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
     study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
     tile_draw_seconds = min(n_shots, SHOTS_PER_TILE) * seconds_per_draw
-    draws_per_block_max = max(default_block_cpu_seconds(study_cpu_seconds) / tile_draw_seconds, 1)
+    cut_tile_seconds = max(
+        study_cpu_seconds / DEFAULT_BLOCKS_MIN, 2 * DEFAULT_BLOCK_CPU_SECONDS_MIN
+    )
+    draws_per_block_max = max(cut_tile_seconds / tile_draw_seconds, 1)
     n_draw_blocks = math.ceil(n_draws / min(block_draws, draws_per_block_max))
     block_draws = math.ceil(n_draws / n_draw_blocks)  # a last block is not much smaller
     tile_seconds = tile_draw_seconds * block_draws
