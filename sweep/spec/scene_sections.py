@@ -490,7 +490,9 @@ class SceneStorage(SpecSection):
         "defaults and so many take long",
         "4096", default=4096,
     )  # fmt: skip
-    block_draws: int = declare.integer_field("Largest number of draws in a block", "128", default=128)
+    block_draws: int = declare.integer_field(
+        "Largest number of draws in a block", "128", default=128
+    )
 
 
 # The built scene: objects as bodies at which rays can be cast

@@ -164,6 +164,7 @@ def test_a_store_that_is_cut_into_other_blocks_is_refused(tmp_path, monkeypatch)
     for refused in (
         lambda: resume(store, progress=False, scheduler="none"),
         lambda: extend(store, small_spec(storage={}, draws={"number": 10}), scheduler="none"),
+        lambda: status(store),
     ):
         with pytest.raises(StoreError, match=r"has blocks of .* in \w+, and this version of sweep"):
             refused()

@@ -541,25 +541,34 @@ def refuse_damaged_template(store_path: Location) -> None:
 
 
 def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
-    """Raise a StoreError if a store has other arrays or blocks than the study has here.
+    """Raise a StoreError if a store has other blocks, or lacks an array that the study has here."""
+    nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
+    for name in study.output_layout_by_name:
+        if name not in nodes:
+            raise StoreError(
+                f"{store_path} has no array {name}, which this version of sweep computes. "
+                "Install the version that began it to resume it, or run the study anew into "
+                "another store."
+            )
+    refuse_other_block_shapes(store_path, study)
+
+
+def refuse_other_block_shapes(store_path: Location, study: BlockStudy) -> None:
+    """Raise a StoreError if an unpacked store has blocks of another shape than the study here.
 
     Receipts and chunks of another version of this program would be taken for those of other points.
     """
     nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
     for layout in study.output_layout_by_name.values():
         if layout.name not in nodes:
-            raise StoreError(
-                f"{store_path} has no array {layout.name}, which this version of sweep computes. "
-                "Install the version that began it to resume it, or run the study anew into "
-                "another store."
-            )
+            continue
         chunk_shape = tuple(nodes[layout.name]["chunk_grid"]["configuration"]["chunk_shape"])
         if chunk_shape != layout.chunks:
             raise StoreError(
                 f"{store_path} has blocks of {_shape_text(chunk_shape)} in {layout.name}, and this "
                 f"version of sweep cuts the study into blocks of {_shape_text(layout.chunks)}. "
-                "Install the version that began it to resume it, or run the study anew into "
-                "another store."
+                "Install the version that began it to go on with it, or run the study anew into "
+                "another store; its results can be read with xarray."
             )
 
 

@@ -31,7 +31,7 @@ from sweep.spec.grid_checks import is_detector_or_estimator_parameter
 from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
 from sweep.storage import store_format
-from sweep.storage.locations import Location, parse_location, resolve_links
+from sweep.storage.locations import PACKED_ATTRIBUTE, Location, parse_location, resolve_links
 from sweep.storage.verified_store import open_verified_group
 from sweep.tasks.engine import study_store
 from sweep.tasks.engine.blocks import Results
@@ -92,14 +92,21 @@ def _find_reuse_source(
 
 
 def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
-    """Return the attributes of a store, and its study; raise StoreError if it can't be read."""
+    """Return the attributes of a store, and its study; raise StoreError if it can't be read.
+
+    A store whose blocks have another shape than here can't: its receipts would be taken for those
+    of other points.
+    """
     attributes = store_format.read_attributes(store_path)
     if attributes["kind"] == store_format.ACCURACY_STORE_KIND:
         figures_command = shell_command("figures", store_path)
         raise StoreError(
             f"{store_path} holds what accuracy costs, no study: `{figures_command}` draws it"
         )
-    return attributes, load_study(store_path, attributes)
+    study = load_study(store_path, attributes)
+    if PACKED_ATTRIBUTE not in attributes:  # a packed copy joins blocks in its chunks
+        study_store.refuse_other_block_shapes(store_path, study)
+    return attributes, study
 
 
 def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
