@@ -21,6 +21,7 @@ from sweep.tasks.engine.study_store import current_software_versions
 from sweep.tasks.studies import parameter_grid
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.store_summary import status
+from sweep.tasks.studies.store_verification import verify
 
 
 def altered(store, **changes):
@@ -165,6 +166,8 @@ def test_a_store_that_is_cut_into_other_blocks_is_refused(tmp_path, monkeypatch)
         lambda: resume(store, progress=False, scheduler="none"),
         lambda: extend(store, small_spec(storage={}, draws={"number": 10}), scheduler="none"),
         lambda: status(store),
+        lambda: verify(store),
+        lambda: verify(store, repair=True),
     ):
         with pytest.raises(StoreError, match=r"has blocks of .* in \w+, and this version of sweep"):
             refused()

@@ -10,6 +10,7 @@ import math
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -166,11 +167,18 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
         or PACKED_ATTRIBUTE in attributes
     ):
         return None
-    return (
+    study = (
         study_loading.make_study(spec, store_path)
         if spec
         else study_loading.load_study(store_path, attributes)
     )
+    if not _is_root_damaged(store_path):
+        # Receipts of other blocks would all be taken for damaged, and withdrawn.
+        with suppress(
+            store_format.NotAStoreError
+        ):  # what can't be read is told with the other damages
+            study_store.refuse_other_block_shapes(store_path, study)
+    return study
 
 
 def _verify_store(
@@ -362,13 +370,19 @@ def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
     if manifest_attributes := store_format.read_manifest_attributes(store_path):
         return store_format.check_attributes(store_path, manifest_attributes)
     attributes = store_format.read_attributes(store_path)
-    if (
-        expected_digest := study_store.read_manifest_digests(store_path).get("zarr.json")
-    ) and describe_template_object_damage(store_path, "zarr.json", expected_digest):
+    if _is_root_damaged(store_path):
         raise StoreError(
             f"{store_path / 'zarr.json'} is damaged{store_format.repair_hint(store_path)}"
         )
     return attributes
+
+
+def _is_root_damaged(store_path: Location) -> bool:
+    """Return True if the root metadata of a store differ from what its manifest says."""
+    expected_digest = study_store.read_manifest_digests(store_path).get("zarr.json")
+    return expected_digest is not None and bool(
+        describe_template_object_damage(store_path, "zarr.json", expected_digest)
+    )
 
 
 def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
