@@ -234,8 +234,8 @@ RUNNING_SUM_OUTPUTS: dict[str, OutputVariable] = {
         "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
     ),
 }
-"""Output variable of the sums over draws of random effects, one row for each point. Later draws can
-be added to these sums."""
+"""The one output variable, by its name, that stores sums over draws of random effects. It has one
+row for each point, and later draws can be added to these sums."""
 
 OUTPUT_IS_LOGARITHM = np.array([name.startswith("log10_") for name in GRID_OUTPUTS])
 """(outputs,) bool: True for those of GRID_OUTPUTS that are logarithms."""

@@ -56,10 +56,7 @@ They are points along a coordinate of a grid, or shots along a flight.
 """
 
 ROC_POINT_PDS = (0.999, 0.9, 0.5, 0.1, 0.01)
-"""Probabilities of detection for which points are chosen, whose ROC curves are drawn.
-
-The point whose pd is closest to each of these is chosen.
-"""
+"""Probabilities of detection pd. For each, the ROC curve of the point of closest pd is drawn."""
 
 ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
 """Probabilities of a false alarm in a bin at which ROC curves are computed."""

@@ -59,9 +59,9 @@ PAGE_SIZE_LIMITS = ChartSizeLimits(
     cells_max=400_000,
     maps_per_row=1,
 )
-"""Limits of the charts on a page: parts, rows, columns and cells.
+"""Limits of the charts on a page: parts of the study that are shown, and size of heat maps.
 
-The limit of cells applies to all heat maps of the page together, which keeps it to a few megabytes.
+The limit of cells applies to all heat maps together, and keeps the page to a few megabytes.
 """
 
 TABLE_POINTS_MAX = 1000

@@ -419,7 +419,7 @@ class ErrorFloor(SpecSection):
     )
 
 
-_CLIPPING_NOTE = "what lies beyond is clipped and reported as invalid"
+_LIMIT_NOTE = "what lies beyond is clipped and reported as invalid"
 
 
 class Interface(SpecSection):
@@ -438,17 +438,17 @@ class Interface(SpecSection):
         "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
     )  # fmt: skip
     min_range: float | None = declare.length_field(
-        f"Smallest range that a report can hold; {_CLIPPING_NOTE}", "10 m", "0 m", default=None
+        f"Smallest range that a report can hold; {_LIMIT_NOTE}", "10 m", "0 m", default=None
     )
     max_range: float | None = declare.length_field(
-        f"Largest range that a report can hold; {_CLIPPING_NOTE}", "5 km", "0 m", default=None
+        f"Largest range that a report can hold; {_LIMIT_NOTE}", "5 km", "0 m", default=None
     )
     min_radial_velocity: float | None = declare.quantity_field(
-        f"Smallest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
+        f"Smallest radial velocity that a report can hold, positive when closing; {_LIMIT_NOTE}",
         "m/s", "-60 m/s", default=None,
     )  # fmt: skip
     max_radial_velocity: float | None = declare.quantity_field(
-        f"Largest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
+        f"Largest radial velocity that a report can hold, positive when closing; {_LIMIT_NOTE}",
         "m/s", "220 m/s", default=None,
     )  # fmt: skip
     rate: float | None = declare.quantity_field(

@@ -49,7 +49,7 @@ YAML_NODES_MAX = 200_000
 _INSTRUMENT_LOCATION: Location = ("instrument",)
 _EXAMPLE_INSTRUMENT = "settembrini_2026"
 """Instrument of the library that remedies use as an example."""
-_ERROR_FLOOR_SECTION = "error_floor"
+_ERROR_FLOOR_KEY = "error_floor"
 """Name of the section with an instrument's error floor."""
 _INSTRUMENT_FILE_SECTIONS = frozenset(
     {
@@ -59,7 +59,7 @@ _INSTRUMENT_FILE_SECTIONS = frozenset(
         "published",
         "assumed",
         "numbers",
-        _ERROR_FLOOR_SECTION,
+        _ERROR_FLOOR_KEY,
         "instrument",
     }
 )
@@ -543,10 +543,8 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
     document.content["instrument"] = merge_mappings(
         _drop_overridden_threshold(instrument_fields, overrides), overrides
     )
-    if takes_floor and _ERROR_FLOOR_SECTION in instrument_document.content:
-        _merge_error_floor(
-            document, instrument_document.content[_ERROR_FLOOR_SECTION], str(reference)
-        )
+    if takes_floor and _ERROR_FLOOR_KEY in instrument_document.content:
+        _merge_error_floor(document, instrument_document.content[_ERROR_FLOOR_KEY], str(reference))
     kept_positions = {
         value_location: position
         for value_location, position in document.positions.items()
@@ -555,7 +553,7 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
     instrument_positions = {
         value_location: position
         for value_location, position in instrument_document.positions.items()
-        if value_location[:1] in (_INSTRUMENT_LOCATION, (_ERROR_FLOOR_SECTION,))
+        if value_location[:1] in (_INSTRUMENT_LOCATION, (_ERROR_FLOOR_KEY,))
         and value_location != _INSTRUMENT_LOCATION
     }
     document.positions = document.positions | instrument_positions | kept_positions
@@ -565,15 +563,15 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
 
 def _merge_error_floor(document: Document, instrument_floor: object, instrument_name: str) -> None:
     """Add the fields of an instrument's error floor that the study does not state."""
-    study_floor = document.content.get(_ERROR_FLOOR_SECTION, {})
+    study_floor = document.content.get(_ERROR_FLOOR_KEY, {})
     if not isinstance(study_floor, Mapping):  # validation reports this mistake
         return
     if not isinstance(instrument_floor, Mapping):
         document.content.setdefault(
-            _ERROR_FLOOR_SECTION, instrument_floor
+            _ERROR_FLOOR_KEY, instrument_floor
         )  # mistakes in it are reported as the study's
         return
-    document.content[_ERROR_FLOOR_SECTION] = merge_mappings(instrument_floor, study_floor)
+    document.content[_ERROR_FLOOR_KEY] = merge_mappings(instrument_floor, study_floor)
     if added_fields := {
         name: value for name, value in instrument_floor.items() if name not in study_floor
     }:
@@ -641,15 +639,15 @@ def _normalise_instrument_file(document: Document) -> Document:
     """
     if "instrument" not in document.content:
         floor_section = (
-            {_ERROR_FLOOR_SECTION: document.content.pop(_ERROR_FLOOR_SECTION)}
-            if _ERROR_FLOOR_SECTION in document.content
+            {_ERROR_FLOOR_KEY: document.content.pop(_ERROR_FLOOR_KEY)}
+            if _ERROR_FLOOR_KEY in document.content
             else {}
         )
 
         def move_below_instrument(location: Location) -> Location:
             return (
                 location
-                if location[:1] == (_ERROR_FLOOR_SECTION,)
+                if location[:1] == (_ERROR_FLOOR_KEY,)
                 else (*_INSTRUMENT_LOCATION, *location)
             )
 

@@ -216,8 +216,8 @@ def centroid_delay(window: Window) -> np.ndarray:
 def _half_maximum_distance(window: Window) -> float:
     """Return the distance at which a window's normalised transform falls to 1/2.
 
-    The distance is in units of the sample rate over the number of samples, at most 2
-    TRANSFORM_REACH_BINS.
+    The distance is in units of the sample rate over the number of samples. It is at most
+    twice TRANSFORM_REACH_BINS.
     """
     distances, transform = transform_table(window)
     is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as in Hann's of two

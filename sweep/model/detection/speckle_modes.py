@@ -47,7 +47,7 @@ _NODE_DISTANCE = 0.4
 _NODE_DEVIATIONS_MAX = 4.5
 """Distance from the centre of the outermost line that represents a Gaussian density, in standard
 deviations of the density."""
-_TABLE_DEVIATION_MAX = 3.0
+_FULL_REACH_LINE_DEVIATION_MAX = 3.0
 """Largest standard deviation, in units of LINE_DEVIATIONS, for which tables reach two deviations
 beyond the main lobe."""
 
@@ -103,7 +103,7 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
         )
     deviations = LINE_DEVIATIONS * max(1.0, lobe_half_width / 2)
     half_bins = math.ceil(
-        (lobe_half_width + 2 * _TABLE_DEVIATION_MAX * max(1.0, lobe_half_width / 2))
+        (lobe_half_width + 2 * _FULL_REACH_LINE_DEVIATION_MAX * max(1.0, lobe_half_width / 2))
         * padding_factor
     )
     bin_positions = np.arange(-half_bins, half_bins + 1) / padding_factor

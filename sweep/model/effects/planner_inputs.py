@@ -159,7 +159,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def window_response(self) -> WindowResponse:
-        """Response of the window over the FFT's bins."""
+        """Magnitude response of the window at FFT bins around a line."""
         return window_response(self.window.name, self.window.length, self.fft_size)
 
     @property

@@ -728,9 +728,10 @@ def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _tabulate_log_crossing_rates(looks: Looks, threshold_ratio: float) -> CrossingRateTable:
-    """Tabulate the rates of bins at a threshold [sigma].
+    """Tabulate the logarithm of the crossing rate of a bin by the amplitude of its signal.
 
-    Several looks (records) count as they are combined.
+    The rate is -ln(1 - c), where signal adds c to the probability that the bin crosses the
+    threshold [sigma]. If looks are summed noncoherently, c is that of their sum.
     """
     log_crossing_rates = np.empty(N_TABLE_AMPLITUDES)
     first_log_amplitude, log_amplitude_step = _fill_log_crossing_rates(

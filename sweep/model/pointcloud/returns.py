@@ -1581,8 +1581,8 @@ class GroupSpeckle(NamedTuple):
     """(groups, rows, 3, bins): factor of the covariance of the bins' speckle, by which the speckle
     is drawn from few random numbers."""
     independent_amplitudes: np.ndarray
-    """(sets, 3, bins): independent complex factors by speckle, which are mixed into the partly
-    correlated speckle of looks (records of a segment)."""
+    """(sets, 3, bins): complex factors by speckle, by draw, segment and bin. The draws (sets) are
+    independent, and are mixed into the partly correlated speckle of the looks."""
     pd_amplitude_bin_weights: np.ndarray
     """(groups, 3, bins): weights of the bins in one amplitude of mean power 1, which is compared
     with the probability of detection."""

@@ -1169,7 +1169,7 @@ def _mark_any_bin_crossings(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_bin_noise(address, stream, first_index, first_bin, n_bins, filter_rule, noise):
-    """Draw the noise of adjacent bins over sigma, correlated by window and zero padding.
+    """Draw the noise of adjacent bins in units of sigma, correlated by window and zero padding.
 
     Parameters
     ----------

@@ -668,7 +668,7 @@ class FootprintRecord(NamedTuple):
     series_coefficients: np.ndarray
     """(lines, k) complex: coefficients of each line's part of the Chebyshev series, for a line of
     amplitude 1."""
-    series_positions: np.ndarray
+    chebyshev_arguments: np.ndarray
     """(L,): argument of the Chebyshev polynomials at each of the L samples. It is -1..1 over the
     samples that contain the echo."""
     windowed_tone: np.ndarray
@@ -772,7 +772,7 @@ class FootprintRecord(NamedTuple):
         record = self.windowed_tone.copy()
         _multiply_by_chebyshev_series(
             (line_amplitudes[:, None] * self.series_coefficients).sum(axis=0),
-            self.series_positions,
+            self.chebyshev_arguments,
             record,
         )
         return record

@@ -239,7 +239,7 @@ class LineShapeTables(NamedTuple):
 
     layout: SpectrumLayout
     """Sizes of the spectrum and of a line-shape table."""
-    mode_transforms: np.ndarray
+    chebyshev_transforms: np.ndarray
     """(modes, places): Fourier transform of each Chebyshev mode without the record's first sample.
     It is real for even modes; for odd modes it is the imaginary part.
 
@@ -335,9 +335,9 @@ def line_shape_tables(
     weighted_modes = np.cos(np.outer(np.arange(n_modes), np.arccos(node))) * (
         w.sum(axis=1) * weight * length / 2
     )
-    mode_transforms = _mode_integrals(weighted_modes, node, ratio * cell_distances)
+    chebyshev_transforms = _mode_integrals(weighted_modes, node, ratio * cell_distances)
     taylor_coefficients = _taylor_coefficients(COSINE_SUM_COEFFICIENTS[window.name], n_modes)
-    mode_transforms += _euler_maclaurin_corrections(
+    chebyshev_transforms += _euler_maclaurin_corrections(
         taylor_coefficients, ratio * cell_distances, length
     )
     first_sample_cosine, first_sample_sine = (
@@ -345,9 +345,9 @@ def line_shape_tables(
         for circular_function in (np.cos, np.sin)
     )
     if not adds_powers:
-        mode_transforms, first_sample_cosine, first_sample_sine = (
+        chebyshev_transforms, first_sample_cosine, first_sample_sine = (
             np.concatenate([values, _deconvolve_into_rows(values, cell_density)], axis=-1)
-            for values in (mode_transforms, first_sample_cosine, first_sample_sine)
+            for values in (chebyshev_transforms, first_sample_cosine, first_sample_sine)
         )
     distance = _envelope_distances(table_bins, fft_size)
     return LineShapeTables(
@@ -360,7 +360,7 @@ def line_shape_tables(
             holds_all_bins=False,
             clearance_bins=math.ceil(clearance_bins / ratio),
         ),
-        mode_transforms=mode_transforms,
+        chebyshev_transforms=chebyshev_transforms,
         first_sample_cosine=first_sample_cosine,
         first_sample_sine=first_sample_sine,
         mode_end_polynomials=_end_polynomials(taylor_coefficients, length),
@@ -448,7 +448,7 @@ def late_line_shape_tables(
             holds_all_bins=False,
             clearance_bins=math.ceil(clearance_bins / filled_fraction),
         ),
-        mode_transforms=transforms.mode_transforms,
+        chebyshev_transforms=transforms.chebyshev_transforms,
         first_sample_cosine=np.empty(0),
         first_sample_sine=np.empty(0),
         mode_end_polynomials=_NO_END_POLYNOMIALS,
@@ -465,7 +465,7 @@ def late_line_shape_tables(
 class LateModeTransforms(NamedTuple):
     """Fourier transforms and Taylor coefficients of the Chebyshev modes of late echoes."""
 
-    mode_transforms: np.ndarray
+    chebyshev_transforms: np.ndarray
     """(modes, distances): half the integral of T_j(x) exp(-i pi u x) over x = -1 .. 1, divided by
     the spreading kernel's transform. T_j is the Chebyshev polynomial of mode j, and u the distance
     from the line [bins of fs/L'], with the echo's L' samples.
@@ -573,7 +573,7 @@ def full_line_shape_tables(
             holds_all_bins=True,
             clearance_bins=nyquist_bin,
         ),
-        mode_transforms=_NO_LINE_SHAPE_TABLE,
+        chebyshev_transforms=_NO_LINE_SHAPE_TABLE,
         first_sample_cosine=np.empty(0),
         first_sample_sine=np.empty(0),
         mode_end_polynomials=_NO_END_POLYNOMIALS,
@@ -992,9 +992,9 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
     The transforms count both ends of the record half, but it has the sample at its start and not
     that at its end.
     """
-    layout, mode_transforms, mode_end_polynomials = (
+    layout, chebyshev_transforms, mode_end_polynomials = (
         tables.layout,
-        tables.mode_transforms,
+        tables.chebyshev_transforms,
         tables.mode_end_polynomials,
     )
     mode_re, mode_im = modes.re[segment, line_shape_index], modes.im[segment, line_shape_index]
@@ -1015,7 +1015,7 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
         _copy_values(envelope.square_integral[segment], shape.envelope.square_integral)
         return
     even_re, even_im, odd_re, odd_im = 0.0, 0.0, 0.0, 0.0  # T_j is 1 at the end, +-1 at the start
-    n_values, ends = mode_transforms.shape[1], shape.end_polynomials
+    n_values, ends = chebyshev_transforms.shape[1], shape.end_polynomials
     transform_re, transform_im = np.zeros(n_values), np.zeros(n_values)
     _zero_end_polynomials(ends)
     for j in range(n_modes):
@@ -1026,8 +1026,8 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
         else:
             even_re, even_im = even_re + a, even_im + b
         for i in range(n_values):
-            transform_re[i] += a * mode_transforms[j, i]
-            transform_im[i] += b * mode_transforms[j, i]
+            transform_re[i] += a * chebyshev_transforms[j, i]
+            transform_im[i] += b * chebyshev_transforms[j, i]
         for d in range(N_END_COEFFICIENTS):
             re, im = mode_end_polynomials.start_re[j, d], mode_end_polynomials.start_im[j, d]
             ends.start_re[d] += mode_re[j] * re - mode_im[j] * im
@@ -1107,14 +1107,14 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
 
     whose derivatives are polynomials in theta.
     """
-    layout, mode_transforms = tables.layout, tables.mode_transforms
+    layout, chebyshev_transforms = tables.layout, tables.chebyshev_transforms
     taylor_coefficients = tables.taylor_coefficients
     record_length = tables.echo_lengths[segment, line_shape_index]
     mode_re, mode_im = modes.re[segment, line_shape_index], modes.im[segment, line_shape_index]
     n_modes, ends = modes.n_modes[segment, line_shape_index], shape.end_polynomials
     half_length, sample_step = 0.5 * record_length, 2.0 / record_length
     length_ratio = record_length / layout.fft_size
-    n_values, n_derivatives = mode_transforms.shape[1], END_DERIVATIVES_MAX + 1
+    n_values, n_derivatives = chebyshev_transforms.shape[1], END_DERIVATIVES_MAX + 1
     mode_sum_re, mode_sum_im = np.zeros(n_values), np.zeros(n_values)
     # Taylor coefficients of f at the start and at the end, by order of the derivative.
     start_re, start_im = np.zeros(n_derivatives), np.zeros(n_derivatives)
@@ -1130,8 +1130,8 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
         if j & 1:
             a, b = -b, a
         for i in range(n_values):
-            mode_sum_re[i] += a * mode_transforms[j, i]
-            mode_sum_im[i] += b * mode_transforms[j, i]
+            mode_sum_re[i] += a * chebyshev_transforms[j, i]
+            mode_sum_im[i] += b * chebyshev_transforms[j, i]
     scale = 1.0
     for i in range(n_derivatives):
         start_re[i], end_re[i] = start_re[i] * scale, end_re[i] * scale

@@ -121,14 +121,14 @@ class EchoDiagnosis(NamedTuple):
     has_phase_walk: np.ndarray
     """True (n,) where the laser's phase noise exceeds the limits of the model of detection."""
     is_range_velocity_exchanged: np.ndarray
-    """True (n,) where up and down beat alone give range and velocity exchanged.
+    """True (n,) where up and down beat give range and velocity exchanged, as the spec reads them.
 
-    The other assumption for two beats would give them correctly.
+    The spec assumes a far or a fast target. The opposite assumption would give both correctly.
     """
     is_exchanged_by_other_assumption: np.ndarray
-    """True (n,) where the other assumption for two beats would exchange range and velocity.
+    """True (n,) where the opposite of the spec's assumption would exchange range and velocity.
 
-    Points at which the present assumption exchanges them too are not marked.
+    Points at which the spec's own assumption exchanges them too are not marked.
     """
     crosses_spectrum_edge: np.ndarray
     """True (n,) where an echo in developed speckle spreads across DC or Nyquist.
@@ -137,7 +137,7 @@ class EchoDiagnosis(NamedTuple):
     """
 
 
-class FootprintDeviations(NamedTuple):
+class FootprintSpreads(NamedTuple):
     """Standard deviations of range and radial velocity over the illuminated spots of n points."""
 
     range: np.ndarray
@@ -146,7 +146,7 @@ class FootprintDeviations(NamedTuple):
     """Standard deviation of the radial velocity (n,) [m/s]."""
 
     @classmethod
-    def of_plane_footprint(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
+    def of_plane_footprint(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintSpreads:
         """Return the deviations of footprints on a plane at ranges `range_` (n,) [m].
 
         Text parameters in `p` are the same at all points.
@@ -158,7 +158,7 @@ class FootprintDeviations(NamedTuple):
         return cls(*(np.nan_to_num(v + 0 * range_) for v in (range_deviation, velocity_deviation)))
 
     @classmethod
-    def on_ground(cls, eyepoints: Eyepoints) -> FootprintDeviations:
+    def on_ground(cls, eyepoints: Eyepoints) -> FootprintSpreads:
         """Return the deviations of ray-traced footprints; 0 for footprints on several surfaces.
 
         Surfaces at different ranges are separate echoes.
@@ -172,13 +172,13 @@ class FootprintDeviations(NamedTuple):
         has_one_surface = (eyepoints.surface == eyepoints.surface[:, :1]).all(axis=1)
         return cls(*(np.where(has_one_surface, v, 0.0) for v in deviations))
 
-    def select(self, points: np.ndarray) -> FootprintDeviations:
+    def select(self, points: np.ndarray) -> FootprintSpreads:
         """Return the deviations of the footprints with given indices."""
-        return FootprintDeviations(self.range[points], self.radial_velocity[points])
+        return FootprintSpreads(self.range[points], self.radial_velocity[points])
 
 
 def diagnose_echoes(
-    parameters: Mapping[str, Any], footprint: FootprintDeviations | None = None
+    parameters: Mapping[str, Any], footprint: FootprintSpreads | None = None
 ) -> EchoDiagnosis:
     """Find out when the echoes of points arrive, and which range and velocity their beats give.
 
@@ -244,7 +244,7 @@ def _crosses_spectrum_edge(
     p: Mapping[str, Any],
     range_: np.ndarray,
     velocity: np.ndarray,
-    footprint: FootprintDeviations | None,
+    footprint: FootprintSpreads | None,
 ) -> np.ndarray:
     """Return where echoes in developed speckle spread across DC or Nyquist, (n,) of bool.
 
@@ -258,9 +258,7 @@ def _crosses_spectrum_edge(
         or not is_speckled
     ):
         return np.zeros(range_.shape, bool)
-    footprint = (
-        FootprintDeviations.of_plane_footprint(p, range_) if footprint is None else footprint
-    )
+    footprint = FootprintSpreads.of_plane_footprint(p, range_) if footprint is None else footprint
     budget = LinkBudget(p)
     settings, record = budget.waveform, budget.record
     chirp_rate, record_length = settings.chirp_rate, record.window.length
@@ -288,9 +286,10 @@ def _crosses_spectrum_edge(
 def _is_misread(
     p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, assumption: str | None = None
 ) -> np.ndarray:
-    """Return True (n,) where the beats that spectra show give another target than the true one.
+    """Return True (n,) where the beats, folded as in spectra, give another range or velocity.
 
-    All three beats are used; with an ``assumption`` only up and down beat.
+    All three beats are used. With an ``assumption`` about the target, ``far`` or ``fast``, only up
+    and down beat are.
     """
     budget = LinkBudget(p)
     settings, record, slopes = budget.waveform, budget.record, waveform.chirp_slopes(p)
@@ -598,7 +597,7 @@ def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
                 hitting_eyepoints, parameters, study.surfaces
             )
             diagnoses.append(
-                diagnose_echoes(shot_parameters, FootprintDeviations.on_ground(hitting_eyepoints))
+                diagnose_echoes(shot_parameters, FootprintSpreads.on_ground(hitting_eyepoints))
             )
     return (
         EchoDiagnosis(*map(np.concatenate, zip(*diagnoses, strict=True)))

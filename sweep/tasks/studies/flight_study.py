@@ -119,7 +119,7 @@ class FlightBlock(NamedTuple):
     cycles: range
 
 
-class ScannerGrid(ParameterGrid, BlockGrid):
+class ScannerBlockGrid(ParameterGrid, BlockGrid):
     """Grid of the blocks of one scanner.
 
     Its dimensions are axes, draws and cycles, the last fastest.
@@ -225,11 +225,11 @@ class FlightStudy(ExtendableStudy):
         super().__init__(spec)
         self.store_path = store_path
         self.get_eyepoint_study = cache(partial(EyepointStudy, spec, built_scene=built_scene))
-        self.scanner_grids = {scanner: ScannerGrid(spec, scanner) for scanner in spec.scanners}
+        self.scanner_grids = {scanner: ScannerBlockGrid(spec, scanner) for scanner in spec.scanners}
         self._get_eyepoint_arrays = cache(self._open_eyepoints)
 
     @property
-    def grids(self) -> list[ScannerGrid]:
+    def grids(self) -> list[ScannerBlockGrid]:
         """Grids of blocks, one for each scanner."""
         return list(self.scanner_grids.values())
 
@@ -243,7 +243,7 @@ class FlightStudy(ExtendableStudy):
             or has_numerics_set_by_tolerance(self.spec.parameters())
         )
 
-    def locate_flight_block(self, block: int) -> tuple[ScannerGrid, FlightBlock]:
+    def locate_flight_block(self, block: int) -> tuple[ScannerBlockGrid, FlightBlock]:
         """Return the grid of a block's scanner, and the block within this grid.
 
         IndexError is raised if there is no such block.
@@ -455,7 +455,9 @@ class FlightStudy(ExtendableStudy):
                 _insert_results(results, cycles, draw_slice, part_results)
         return results
 
-    def _empty_cloud(self, scanner_grid: ScannerGrid, n_shots: int, n_draws: int) -> ReusedCloud:
+    def _empty_cloud(
+        self, scanner_grid: ScannerBlockGrid, n_shots: int, n_draws: int
+    ) -> ReusedCloud:
         """Return the arrays of results of shots, filled with their fill values."""
         outputs = (
             SHOT_STATISTIC_VARIABLES

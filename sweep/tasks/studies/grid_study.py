@@ -402,7 +402,7 @@ class EffectPlanner:
         )
 
 
-def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
+def block_output_variables(spec: GridSpec) -> dict[str, OutputVariable]:
     """Return the output variables that blocks write, by name in sorted order.
 
     Their dimensions do not include the study's axes.
@@ -492,7 +492,7 @@ class GridStudy(ExtendableStudy):
             if f"accuracy.{name}" in off_axes
         }
         layouts = []
-        for name, output in block_outputs(self.spec).items():
+        for name, output in block_output_variables(self.spec).items():
             layout = make_output_layout(
                 self.grid, name, output, self.grid.dims + output.dims, sizes
             )
