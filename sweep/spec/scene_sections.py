@@ -491,8 +491,9 @@ class SceneStorage(SpecSection):
         "4096", default=4096,
     )  # fmt: skip
     block_draws: int = declare.integer_field(
-        "Largest number of draws in a block", "128", default=128
-    )
+        "Largest number of draws in a block; up to 128 if this and block_shots have their defaults",
+        "64", default=64,
+    )  # fmt: skip
 
 
 # The built scene: objects as bodies at which rays can be cast

@@ -152,7 +152,7 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     found, missed = (weight * np.array(of_nodes).T).sum(axis=1)
     found += np.exp(-last * last)
     whole = found + missed
-    # No more than 7 nodes leave out no more than 8 bins each: a half of all that is the most seen.
+    # 7 nodes leave out up to 8 bins each: 56, if each were as large as may be neglected.
     relative = 30 * echo_detection._NEGLIGIBLE_FRACTION
     assert told[0] == pytest.approx(found / whole, rel=relative, abs=0)
     assert told[1] == pytest.approx(missed / whole, rel=relative, abs=0)

@@ -211,7 +211,7 @@ def test_a_line_sweeps_its_fan_from_side_to_side():
 def test_defaults_are_those_that_the_specs_promise():
     spec = spec_of()
     assert (spec.draws.number, spec.draws.method, spec.draws.returns) == (1, "probabilities", 4)
-    assert (spec.storage.block_shots, spec.storage.block_draws) == (4096, 128)
+    assert (spec.storage.block_shots, spec.storage.block_draws) == (4096, 64)
     assert spec.pointing_jitter() is None and spec.beamlet_pattern == "hexagonal"
     assert spec.parameters()["target.solar_irradiance"] == 0.0
     assert not any(p.startswith("target.") for p in spec.parameters() if "solar" not in p)

@@ -37,6 +37,7 @@ from sweep.tasks.studies import eyepoint_study
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.parameter_grid import (
+    DEFAULT_BLOCK_DRAWS_MAX,
     SHOTS_PER_TILE,
     flight_block_size,
     worst_cpu_seconds_per_draw,
@@ -350,7 +351,7 @@ def test_default_blocks_hold_about_equal_numbers_of_draws(n_draws: int, n_shots:
     spec = small_scene_spec(draws={"number": n_draws}, storage={})
     block_shots, block_draws = flight_block_size(spec, 1, n_shots, n_draws)
     n_blocks = math.ceil(n_draws / block_draws)
-    assert block_draws <= 128
+    assert block_draws <= DEFAULT_BLOCK_DRAWS_MAX
     assert n_blocks * block_draws - n_draws < n_blocks
     assert block_shots % SHOTS_PER_TILE == 0
     if block_shots < min(n_shots, 4096):  # there are shots for a longer block

@@ -1070,9 +1070,9 @@ _GAUSS_ORDER = 6
 strongest speckle mode."""
 _IMPOSSIBLE_BELOW_SIGMA, _CERTAIN_ABOVE_SIGMA = 4.5, 2.7
 """Distances of the noiseless |X| below and above the threshold beyond which the quadrature ends, in
-units of the noise per quadrature. A bin misses with a probability of 2e-3 at the upper end, and
-crosses with 3e-6 at the lower one, as small pd require. The quadrature changes pd by at most 2e-3,
-and mostly by 1e-4."""
+units of the noise per quadrature. A bin misses with a probability of 3e-3 at the upper end, and
+crosses with 3e-5 or less at the lower one, as small pd require. The error of pd is at most 2e-3,
+and mostly 1e-4."""
 _MODE_MAGNITUDE_MAX = 6.0
 """Upper end of the quadrature over the magnitude of the strongest speckle mode, in units of its
 root mean square."""

@@ -54,6 +54,9 @@ SHOT_DRAW_CPU_SECONDS = 2e-5
 DEFAULT_BLOCKS_MIN = 32
 DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
 
+#: Largest number of draws in a block of a flight, if the spec does not state one.
+DEFAULT_BLOCK_DRAWS_MAX = 128
+
 
 def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
     """Return an upper estimate of the time of one draw of a point or shot on one core [s].
@@ -102,11 +105,12 @@ def flight_block_size(
 ) -> tuple[int, int]:
     """Return upper limits on the shots and on the draws of any block of a flight.
 
-    A section `storage` that differs from its defaults states both. By default a study has at least
-    DEFAULT_BLOCKS_MIN blocks, or fewer if each would take less than DEFAULT_BLOCK_CPU_SECONDS_MIN.
-    A block then has a part of the draws of each shot if a tile's shots with all draws take longer,
-    and twice DEFAULT_BLOCK_CPU_SECONDS_MIN: each part computes the spectra of its shots anew. Its
-    shots are whole tiles, because the effects of a tile's shots are chosen together.
+    A section `storage` that differs from its defaults states both. By default a study is cut into
+    DEFAULT_BLOCKS_MIN blocks or more, or into fewer that take DEFAULT_BLOCK_CPU_SECONDS_MIN or
+    more. The shots of a block are whole tiles, because the effects of a tile's shots are chosen
+    together. A block has only a part of the draws of its shots if a tile with all draws takes
+    longer than such a block, and than twice DEFAULT_BLOCK_CPU_SECONDS_MIN: each part computes the
+    spectra of its shots anew. It never has more than DEFAULT_BLOCK_DRAWS_MAX.
 
     Parameters
     ----------
@@ -122,6 +126,7 @@ def flight_block_size(
     block_shots, block_draws = int(spec.storage.block_shots), int(spec.storage.block_draws)
     if spec.storage != type(spec.storage)():
         return block_shots, block_draws
+    block_draws = DEFAULT_BLOCK_DRAWS_MAX
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
     study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
     tile_draw_seconds = min(n_shots, SHOTS_PER_TILE) * seconds_per_draw

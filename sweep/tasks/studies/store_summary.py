@@ -87,7 +87,7 @@ def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], f
     grid.
     """
     store_path = parse_location(store)
-    _, study = study_loading.read_study(store_path)
+    _, study = study_loading.read_study_of_blocks(store_path)
     if not isinstance(study, GridStudy):
         raise StoreError(f"{store_path} holds no study over a grid")
     blocks, block_fraction = _sample_blocks(store_path, study, None)
@@ -122,7 +122,7 @@ def count_unsupported_points(
 ) -> tuple[int, str]:
     """Count unsupported points in a sample. Return the count, and the reason for the first."""
     store_path = parse_location(store)
-    _, study = study_loading.read_study(store_path)
+    _, study = study_loading.read_study_of_blocks(store_path)
     if not isinstance(study, GridStudy):
         return 0, ""
     (blocks, _), n_unsupported, first_reason = _sample_blocks(store_path, study, done_blocks), 0, ""
@@ -237,7 +237,7 @@ class ScannerRow:
 def flight_summary(store: str | Location) -> list[ScannerRow]:
     """Return a row for each scanner and point of the axes; one per scanner if points are many."""
     store_path = parse_location(store)
-    _, study = study_loading.read_study(store_path)
+    _, study = study_loading.read_study_of_blocks(store_path)
     if not isinstance(study, FlightStudy):
         raise StoreError(f"{store_path} holds no study of a scene")
     axis_points = list(np.ndindex(tuple(int(axis.size) for axis in study.spec.axes)))
@@ -361,7 +361,7 @@ def accuracy_rows_of_draws(
     The result is empty without draws or results.
     """
     store_path = parse_location(store)
-    _, study = study_loading.read_study(store_path)
+    _, study = study_loading.read_study_of_blocks(store_path)
     if not isinstance(study, GridStudy) or not study.spec.draws.has_draws:
         return []
     error_arrays = {name: f"{name}_half_width" for name in PD_OUTPUTS}
@@ -382,7 +382,7 @@ def accuracy_rows_of_rays(
     A grid has one row, and only if the largest number of beamlets does not suffice.
     """
     store_path = parse_location(store)
-    _, study = study_loading.read_study(store_path)
+    _, study = study_loading.read_study_of_blocks(store_path)
     if isinstance(study, GridStudy):
         tolerance_limit = np.maximum(
             ErrorBudget(_tolerance_over_grid(study)).allowed_beamlets_error,
@@ -510,7 +510,7 @@ def status(store: str | Location) -> Status:
         If there is no store of sweep, or if its study can't be read.
     """
     store_path = parse_location(store)
-    attributes, study = study_loading.read_study(store_path)
+    attributes, study = study_loading.read_study_of_blocks(store_path)
     last_run = journal.read_last_run(store_path)
     receipts = read_receipt_totals(store_path, study.n_blocks, since=last_run.start_time)
     packed_bytes = (

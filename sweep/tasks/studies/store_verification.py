@@ -496,7 +496,7 @@ def pack_store(
         the copy can't be written and read back.
     """
     store_path, output = parse_location(store_path).absolute(), parse_location(output).absolute()
-    attributes, study = study_loading.read_study(store_path)
+    attributes, study = study_loading.read_study_of_blocks(store_path)
     n_missing = study.n_blocks - int(np.count_nonzero(committed_blocks(store_path, study)))
     if attributes.get(PACKED_ATTRIBUTE) or n_missing:
         reason = (

@@ -86,24 +86,32 @@ def _find_reuse_source(
             source_spec, target_study.spec
         ):
             return None  # a grid needs no such test, as its points have unique parameters
-        return ReuseSource(source_path, make_study(source_spec, source_path), target_study)
+        source_study = make_study(source_spec, source_path)
+        if PACKED_ATTRIBUTE not in attributes:
+            study_store.refuse_other_block_shapes(source_path, source_study)
+        return ReuseSource(source_path, source_study, target_study)
     except (StoreError, SceneError):
         return None
 
 
 def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
-    """Return the attributes of a store, and its study; raise StoreError if it can't be read.
-
-    A store whose blocks have another shape than here can't: its receipts would be taken for those
-    of other points.
-    """
+    """Return the attributes of a store, and its study; raise StoreError if it can't be read."""
     attributes = store_format.read_attributes(store_path)
     if attributes["kind"] == store_format.ACCURACY_STORE_KIND:
         figures_command = shell_command("figures", store_path)
         raise StoreError(
             f"{store_path} holds what accuracy costs, no study: `{figures_command}` draws it"
         )
-    study = load_study(store_path, attributes)
+    return attributes, load_study(store_path, attributes)
+
+
+def read_study_of_blocks(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
+    """Compute :func:`read_study` for a reader of receipts, which count the study's blocks.
+
+    StoreError is also raised if the store's blocks have another shape than the study has here: its
+    receipts would be taken for those of other points.
+    """
+    attributes, study = read_study(store_path)
     if PACKED_ATTRIBUTE not in attributes:  # a packed copy joins blocks in its chunks
         study_store.refuse_other_block_shapes(store_path, study)
     return attributes, study
