@@ -43,7 +43,7 @@ BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
 #: Time on one core of a point of a grid without draws, or of one of its draws, and what a point in
 #: developed speckle takes longer [s].
 POINT_DRAW_CPU_SECONDS = 4e-5
-SPECKLE_CPU_SECONDS = 6e-5
+SPECKLE_CPU_SECONDS = 1.6e-4
 
 #: Time on one core of a flight's shot, and of each of its draws [s].
 SHOT_CPU_SECONDS = 7e-5
