@@ -52,7 +52,7 @@ USE_DATE_RENEWAL_INTERVAL = 86400.0
 NUMBA_SETTINGS_OUTSIDE_FINGERPRINT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
 """Numba settings that do not change the compiled code, so the fingerprint leaves them out."""
 
-DEFAULT_NJIT_OPTIONS = {"nogil": True}
+DEFAULT_NJIT_OPTIONS = {"nogil": True, "no_cfunc_wrapper": True}
 """Default options of `numba.njit` for every kernel."""
 
 _numba_settings: Any = numba.config

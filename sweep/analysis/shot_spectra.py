@@ -51,7 +51,7 @@ class BinGroup:
 
 
 @dataclass(frozen=True)
-class SegmentSpectrum:
+class DisplayedSegment:
     """Spectrum of one segment (chirp) of a shot, with n bins, and its detections."""
 
     name: str
@@ -95,7 +95,7 @@ class SimulatedShot:
     """All that the shot's spectra depend on (lines, noise, threshold), as arrays of one shot."""
     outputs: dict[str, float]
     """Results of the model for the shot, by the name of the output variable."""
-    segments: tuple[SegmentSpectrum, ...]
+    segments: tuple[DisplayedSegment, ...]
     """Spectra of the segments that the shot has."""
     reported_range: float
     """Range that the strongest bins give [m]."""
@@ -200,7 +200,7 @@ def _segment_spectrum(
     segment_result: np.ndarray,
     segment_index: int,
     seed: int | None,
-) -> SegmentSpectrum:
+) -> DisplayedSegment:
     """Return the spectrum of a segment with its detections.
 
     `segment_result` are the results of the model for the segment. Noise is drawn if `seed` is
@@ -236,7 +236,7 @@ def _segment_spectrum(
         range=prepared_shot.range[0] - np.ravel(segment.range_decrease)[0],
         radial_velocity=np.ravel(segment.doppler_ratio)[0] * SPEED_OF_LIGHT / 2,
     )
-    return SegmentSpectrum(
+    return DisplayedSegment(
         name=SEGMENT_DISPLAY_NAMES[segment_index],
         slope=segment.chirp_slope,
         bins=signed_bins,
@@ -297,7 +297,7 @@ def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, 
 
 
 def range_or_velocity_at(
-    shot: SimulatedShot, segment: SegmentSpectrum, frequency: np.ndarray
+    shot: SimulatedShot, segment: DisplayedSegment, frequency: np.ndarray
 ) -> np.ndarray:
     """Convert frequencies in a segment's spectrum to range or radial velocity.
 
@@ -427,7 +427,7 @@ def _level_axis_limits_db(shots: Sequence[SimulatedShot]) -> tuple[float, float]
 
 
 def _draw_spectrum(
-    axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum, view: slice, line_width: float
+    axes: Axes, shot: SimulatedShot, segment: DisplayedSegment, view: slice, line_width: float
 ) -> None:
     """Draw a slice of a segment's spectrum, with threshold, noise level and detections."""
     frequency_mhz = segment.frequency[view] / 1e6
@@ -461,7 +461,7 @@ def _draw_spectrum(
     axes.set_xlim(float(frequency_mhz[0]), float(frequency_mhz[-1]))
 
 
-def _annotate_snr_and_pd(axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum) -> None:
+def _annotate_snr_and_pd(axes: Axes, shot: SimulatedShot, segment: DisplayedSegment) -> None:
     """Write SNR and pd into a corner of the axes, and add a top axis of range or velocity."""
     annotation_lines = (
         [f"signal-to-noise {10 * np.log10(segment.snr):.1f} dB"] if segment.snr > 0 else []
@@ -506,7 +506,7 @@ def peak_bin_slice(magnitude: np.ndarray) -> slice:
     return slice(max(peak - half_width, 0), min(peak + half_width + 1, magnitude.size))
 
 
-def detection_bin_slice(segment: SegmentSpectrum) -> slice:
+def detection_bin_slice(segment: DisplayedSegment) -> slice:
     """Return the slice of bins around a segment's peak that contains all detections near it."""
     view, n_bins = peak_bin_slice(segment.signal_magnitude), segment.signal_magnitude.size
     peak = int(np.argmax(segment.signal_magnitude))

@@ -95,7 +95,7 @@ def status(store: Location) -> None:
         retry_command = shell_command("resume", store, retry_failed=True)
         click.echo(f"{retry_command}  tries failed blocks again.")
     if store_status.blocks_done:
-        print_accuracy(store, store_status.done_blocks)
+        print_accuracy(store, store_status.done_block_numbers)
 
 
 def _print_pending_replacement(store: Location) -> None:

@@ -467,13 +467,13 @@ def print_inconsistency_warnings(store: Location, scanner: str | None = None) ->
 
     if study_loading.read_study(store)[0]["kind"] != "scene":
         return
-    from sweep.analysis.scene_results.consistency import inconsistency_messages
+    from sweep.analysis.scene_results.consistency import understated_error_messages
 
-    for sentence in inconsistency_messages(store, scanner):
+    for sentence in understated_error_messages(store, scanner):
         echo_wrapped(f"warning: {sentence}", err=True)
 
 
-def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> None:
+def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None) -> None:
     """Print points without results, the uncertainty of draws, and the error of few beamlets."""
     from sweep.tasks.studies import study_loading
     from sweep.tasks.studies.store_summary import (
@@ -482,14 +482,14 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
         count_unsupported_points,
     )
 
-    n_unsupported, reason = count_unsupported_points(store, done_blocks)
+    n_unsupported, reason = count_unsupported_points(store, done_block_numbers)
     if n_unsupported:
         message = (
             f"points beyond the model, which have no results: {n_unsupported:,}; the first: "
             f"{reason}"
         )
         echo_wrapped(f"warning: {message}", err=True)
-    if rows := accuracy_rows_of_draws(store, done_blocks):
+    if rows := accuracy_rows_of_draws(store, done_block_numbers):
         print_table(
             "Half-widths of pd by its draws, and where accuracy.tolerance is met"
             + _sampled_share_text(rows[0].block_fraction),
@@ -510,7 +510,7 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
         )
     if reason := unchecked_beamlets_reason(study_loading.read_study(store)[1].spec):
         echo_wrapped(f"Not checked: {reason}.")
-    if rays := accuracy_rows_of_rays(store, done_blocks):
+    if rays := accuracy_rows_of_rays(store, done_block_numbers):
         ray_noun, unit_noun = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
             f"What more {ray_noun} may change{_sampled_share_text(rays[0].block_fraction)}",

@@ -248,7 +248,9 @@ class FootprintAngles(NamedTuple):
     """
 
 
-def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> FootprintAngles:
+def footprint_full_angles(
+    parameters: Parameters, range: ArrayLike | None = None
+) -> FootprintAngles:
     """Compute the full 1/e^2 angles of the effective footprint, seen from the instrument.
 
     All points must have the same text parameters.

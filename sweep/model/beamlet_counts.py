@@ -107,7 +107,7 @@ _CHEBYSHEV_MULTIPLES = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
 best of the resulting bounds is used."""
 
 
-class LineSpreadBins(NamedTuple):
+class LineSpreadCoefficients(NamedTuple):
     """Spread of the frequencies of a footprint's lines, s y + c (x^2 + y^2) [bins of fs/L].
 
     x and y are the two coordinates in the beam, in its standard deviations, y along the slope. s is
@@ -320,8 +320,8 @@ def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
     return np.asarray(_N_SEGMENTS * slope_max / 2)
 
 
-def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSpreadBins:
-    """Compute the :class:`LineSpreadBins` of the footprints of n points [bins of fs/L].
+def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSpreadCoefficients:
+    """Compute the :class:`LineSpreadCoefficients` of the footprints of n points [bins of fs/L].
 
     `beamlets_max` is the largest number of beamlets. It determines the largest distance of a
     beamlet from the axis.
@@ -331,7 +331,7 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         parameters["target.grazing_angle"],
         np.asarray(parameters["target.radial_velocity"], float),
     )
-    position_spread_angles, direction_spread_angles = beam.footprint_angles(parameters)
+    position_spread_angles, direction_spread_angles = beam.footprint_full_angles(parameters)
     transverse_velocity = np.asarray(parameters["target.transverse_velocity"], float)
     position_sigma, slope, direction_sigma = (
         position_spread_angles / 4,
@@ -369,7 +369,7 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
     )
     # Chirp slopes weight the contribution of ranges to the beats.
     chirp_slopes, zeros = np.array(waveform.chirp_slopes(parameters))[:, None], np.zeros(n_points)
-    spread = LineSpreadBins(
+    spread = LineSpreadCoefficients(
         deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
         + bins_per_speed * velocity_moments.rms
         + zeros,
@@ -421,7 +421,7 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         )
         + zeros
     )
-    return LineSpreadBins(np.maximum(spread.deviation, phase_deviation), slope, quadratic)
+    return LineSpreadCoefficients(np.maximum(spread.deviation, phase_deviation), slope, quadratic)
 
 
 def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
@@ -440,7 +440,10 @@ def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
 
 
 def required_nodes(
-    window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, error_budget: ErrorBudget
+    window_name: str,
+    spread: LineSpreadCoefficients,
+    tolerance: np.ndarray,
+    error_budget: ErrorBudget,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose the number of quadrature nodes, and of parallel lines of nodes, by tolerance.
 
@@ -450,7 +453,7 @@ def required_nodes(
     ----------
     window_name : str
         Name of the window.
-    spread : LineSpreadBins
+    spread : LineSpreadCoefficients
         Positions of the footprint's lines.
     tolerance : ndarray (n,)
         Tolerated error of the largest bin's power relative to that power, wherever the lines lie.
@@ -483,7 +486,9 @@ def required_nodes(
         single_line_error > error_budget.single_node_line_fraction * tolerance
     )
     if needs_lines.any():
-        spread_subset = LineSpreadBins(*(np.asarray(values)[..., needs_lines] for values in spread))
+        spread_subset = LineSpreadCoefficients(
+            *(np.asarray(values)[..., needs_lines] for values in spread)
+        )
         line_count_index, line_counts, line_errors = _choose_node_lines(
             window_name, spread_subset, tolerance[needs_lines], error_budget.beamlets_max
         )
@@ -524,7 +529,7 @@ def _cheapest_within_tolerance(
 
 
 def _choose_node_lines(
-    window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, beamlets_max: int
+    window_name: str, spread: LineSpreadCoefficients, tolerance: np.ndarray, beamlets_max: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose the numbers of nodes and lines of nodes where a single line is too inaccurate.
 
@@ -577,7 +582,7 @@ def _choose_node_lines(
     )
 
 
-def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
+def _single_node_line_error(window_name: str, spread: LineSpreadCoefficients) -> np.ndarray:
     """Return the quadrature error of a single line of nodes due to curvature, (n,).
 
     The error is in units of the power of a bin on which a spectral line is centred. The factor 2

@@ -159,7 +159,7 @@ class FlatGround:
         self._reflectance_law = str(parameters["target.reflectance_law"])
         self._n_beamlets = int(parameters["footprint.beamlets"])
         self._beamlet_pattern = beamlet_pattern(parameters)
-        position_spread_angles, direction_spread_angles = beam.footprint_angles(parameters)
+        position_spread_angles, direction_spread_angles = beam.footprint_full_angles(parameters)
         velocity_paths = "target.radial_velocity", "target.transverse_velocity"
         velocities = [parameters[name] if has_velocities else 0.0 for name in velocity_paths]
         single_mode_columns = (

@@ -648,7 +648,7 @@ class Shots:
 
     @property
     def first_searched_bin(self) -> int:
-        """Number of the first bin that is searched for false alarms, from DC and from Nyquist."""
+        """Distance of the first bin searched for false alarms from DC and from Nyquist [bins]."""
         return bin_noise.first_circular_bin(self.window, self.fft_size) if self.real_fft_size else 1
 
     @property

@@ -16,7 +16,7 @@ import numpy as np
 from sweep.model import waveform
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.link_budget import PROCESSING_PREFIX
-from sweep.model.spectrum.search_band import search_band_bins
+from sweep.model.spectrum.search_band import search_band_start_and_size
 
 if TYPE_CHECKING:
     from sweep.model.detection.echo_detection import SegmentCorrelations
@@ -124,7 +124,7 @@ class DetectionSettings(NamedTuple):
             two_beat_assumption=str(parameters[waveform.TWO_BEAT_ASSUMPTION_PATH]),
             noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
             bins_counted=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
-            search_band=search_band_bins(parameters, n_points),
+            search_band=search_band_start_and_size(parameters, n_points),
         )
 
 

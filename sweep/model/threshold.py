@@ -23,7 +23,7 @@ import numpy as np
 
 from sweep.model.detection import bin_noise
 from sweep.model.detection.looks import Looks, solve_threshold_ratio
-from sweep.model.spectrum.search_band import n_alarm_bins, search_band_bins
+from sweep.model.spectrum.search_band import n_alarm_bins, search_band_start_and_size
 from sweep.model.waveform import (
     SEGMENT_NAMES,
     SEGMENT_ORDER_PATH,
@@ -97,7 +97,7 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
     log_pfa, looks = np.log(value), Looks.from_parameters(parameters)
     if given_path == DESIGN_PFA_BIN_PATH:
         return looks.threshold_ratio_from_log_pfa(log_pfa) / RAYLEIGH_DEVIATION
-    band_bins, segments = search_band_bins(parameters), ["up"]
+    band_bins, segments = search_band_start_and_size(parameters), ["up"]
     if given_path == DESIGN_PFA_SHOT_PATH:  # segments are independent
         segment_order = existing_segments(
             str(parameters["instrument.receiver.architecture"]),
@@ -196,7 +196,7 @@ def _noise_bins(parameters: Mapping[str, Any], segment: str) -> NoiseBins:
     counts_all_bins = is_complex_record or (
         str(parameters[PROCESSING_PREFIX + "bins_counted"]) == "all"
     )
-    band_bins, segment_index = search_band_bins(parameters), SEGMENT_NAMES.index(segment)
+    band_bins, segment_index = search_band_start_and_size(parameters), SEGMENT_NAMES.index(segment)
     if str(parameters[PROCESSING_PREFIX + "noise_bins"]) == "independent":
         if band_bins is None:
             return NoiseBins(float(fft_size if counts_all_bins else fft_size // 2), 0.0)

@@ -47,8 +47,8 @@ DOPPLER_SEGMENT_SLOPE_PATH = "instrument.chirp.doppler_slope"
 DOWN_SEGMENT_SLOPE_PATH = "instrument.chirp.down_slope"
 """Parameter path of the chirp rate of the down segment, over that of the up-chirp."""
 SHOT_DETECTION_PATH = "instrument.processing.shot_detection"
-"""Parameter path of the rule by which a shot is detected, one of `SHOT_DETECTION_RULES`."""
-BOTH_CHIRPS, ANY_TWO = SHOT_DETECTION_RULES = ("both_chirps", "any_two")
+"""Parameter path of the rule by which a shot is detected, one of `SHOT_DETECTION_OPTIONS`."""
+BOTH_CHIRPS, ANY_TWO = SHOT_DETECTION_OPTIONS = ("both_chirps", "any_two")
 """Names of detection rules: a shot is detected if both chirps detect the echo, or any two segments.
 """
 TWO_BEAT_ASSUMPTION_PATH = "instrument.processing.two_beats"

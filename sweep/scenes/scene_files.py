@@ -221,7 +221,7 @@ def read_waypoints(path: str | Path, time_origin: Decimal = Decimal(0)) -> Waypo
 
 
 def read_first_waypoint_time(path: str | Path) -> Decimal:
-    """Return the first time [s] in a CSV table of waypoints, with all its digits.
+    """Return the first time [s] in a CSV table of waypoints as an exact decimal number.
 
     Raises
     ------

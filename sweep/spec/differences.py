@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from decimal import Context, Decimal
 from fractions import Fraction
 from functools import cache
 from types import MappingProxyType
@@ -11,7 +12,7 @@ from typing import Any
 import sweep.spec.fields as spec_fields
 from sweep.spec.flight_sections import AnyScanner, Platform, beam_rule
 from sweep.spec.rules import Rule
-from sweep.spec.scene_sections import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.scene_sections import ErrorFloorSection, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.sections import MODEL_BY_SECTION
 from sweep.units import read_unit
 
@@ -19,10 +20,12 @@ LISTED_VALUES_MAX = 8
 """Largest number of values of a field that a line of differences lists in full."""
 SHOWN_CHARACTERS_MAX = 200
 """Largest number of characters of a text that a line of differences shows."""
+_EXACT_TEXT_CONTEXT = Context(prec=20)
+"""Decimal arithmetic with more digits than a float has."""
 SCENE_SECTION_MODELS: spec_fields.ModelClasses = (
     Scene,
     Platform,
-    ErrorFloor,
+    ErrorFloorSection,
     Navigation,
     SceneDraws,
     SceneStorage,
@@ -141,14 +144,17 @@ def _unit_suffix(rule: Rule | None) -> str:
 
 
 def _format_number(rule: Rule | None, value: Any) -> str:
-    """Return an SI value as a number in the unit in which its field is shown.
+    """Return the text of an SI value in the unit in which its field is shown, without the unit.
 
-    The text of an angle reads back as exactly the same value.
+    A value whose unit differs from the SI unit (an angle) reads back as exactly the same value.
     """
     unit_name = _unit_suffix(rule).strip()
     if rule is None or unit_name == rule.value_unit or isinstance(value, str):
         return repr(value) if isinstance(value, float) else str(value)
     unit = read_unit(unit_name, si_unit=rule.value_unit, example=rule.example)
-    number = value / float(unit.factor)
-    text = f"{number:.15g}"
-    return text if unit.to_si(Fraction(text)) == value else repr(number)
+    text = f"{value / float(unit.factor):.15g}"
+    if unit.to_si(Fraction(text)) != value:
+        exact_number = Fraction(value) / unit.factor
+        numerator, denominator = map(Decimal, exact_number.as_integer_ratio())
+        text = str(_EXACT_TEXT_CONTEXT.divide(numerator, denominator))
+    return text

@@ -848,7 +848,8 @@ EFFECT_PARAMETER_REQUIREMENTS = (
         "set it to 1 au or so",
     ),
 )
-"""Requirements of effect parameters on other parameters: values that exclude each other."""
+"""Pairs of parameter values that a spec must not combine, with problem and remedy. One parameter of
+each pair belongs to an effect."""
 
 
 def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:

@@ -393,7 +393,7 @@ class Navigation(SpecSection):
     )  # fmt: skip
 
 
-class ErrorFloor(SpecSection):
+class ErrorFloorSection(SpecSection):
     """Standard deviations of instrument errors that do not decrease with signal strength."""
 
     pointing_error: float = declare.angle_field(

@@ -257,7 +257,7 @@ def _search_limit_field(description: str, *rule_arguments: str) -> Any:
     return declare.quantity_field(full_description, *rule_arguments, default=None)
 
 
-class SearchBand(SpecSection):
+class SearchBandSection(SpecSection):
     """Band of ranges and radial velocities in which echoes are searched.
 
     It selects bins by their beats.
@@ -320,7 +320,7 @@ class Processing(SpecSection):
     shot_detection: str = declare.choice_field(
         "Segments in which a shot is detected: both chirps; or any two of three, which still give "
         "range and velocity if the third is missed",
-        waveform.SHOT_DETECTION_RULES,
+        waveform.SHOT_DETECTION_OPTIONS,
     )
     peaks: str = declare.choice_field(
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
@@ -339,7 +339,7 @@ class Processing(SpecSection):
         "Nyquist; or independent and circular, as the thesis takes it",
         ("correlated", "independent"),
     )
-    search: SearchBand = SearchBand()
+    search: SearchBandSection = SearchBandSection()
     detector: Detector = Detector()
     estimator: Estimator = Estimator()
 

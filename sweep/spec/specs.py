@@ -639,7 +639,7 @@ class SceneSpec(BaseSpec):
     platform: Platform
     scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
     draws: scene_sections.SceneDraws = scene_sections.SceneDraws()
-    error_floor: scene_sections.ErrorFloor = scene_sections.ErrorFloor()
+    error_floor: scene_sections.ErrorFloorSection = scene_sections.ErrorFloorSection()
     navigation: scene_sections.Navigation = scene_sections.Navigation()
     interface: scene_sections.Interface = Field(default_factory=scene_sections.Interface)
     storage: scene_sections.SceneStorage = scene_sections.SceneStorage()
@@ -783,7 +783,7 @@ class SceneSpec(BaseSpec):
         sentences = []
         floor_values, rules = (
             dict(self.error_floor),
-            declare.rules_by_path(scene_sections.ErrorFloor, ""),
+            declare.rules_by_path(scene_sections.ErrorFloorSection, ""),
         )
         instrument_floor = self._instrument_floor
         if instrument_floor and any(floor_values[name] for name in instrument_floor.fields):
@@ -861,7 +861,7 @@ class SceneSpec(BaseSpec):
         """Arrangement of the beamlets: a pattern of `sweep.model.beamlets.place_beamlets`."""
         return beamlet_pattern(self.parameters())
 
-    def footprint_angles(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
+    def footprint_full_angles(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
         """Return the function that computes the angles of a footprint from its range [m].
 
         The result is None if the divergence is constant.
@@ -870,7 +870,7 @@ class SceneSpec(BaseSpec):
         return (
             None
             if beam.has_constant_divergence(parameters)
-            else partial(beam.footprint_angles, parameters)
+            else partial(beam.footprint_full_angles, parameters)
         )
 
     def interface_with_overrides(self, overrides: Mapping[str, object]) -> scene_sections.Interface:

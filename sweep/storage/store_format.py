@@ -562,7 +562,7 @@ MERGED_LOG_OBJECT_BYTES = 16 << 20
 _NO_LOG_ERRNOS = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
 
 _DIGEST_FIELD = b',"sum":"'
-_LOG_LINE_END = b'"}\n'
+_LOG_RECORD_END = b'"}\n'
 
 _RECEIPT_HEAD_PATTERN = re.compile(
     rb'\{"block":(\d{1,18}),"(?:points":(\d{1,18})(?:,"bytes":(\d{1,18}))?|withdrawn")'
@@ -581,7 +581,7 @@ def encode_record(record: dict[str, Any]) -> bytes:
 
 def append_line_digest(line_body: bytes) -> bytes:
     """Return a log line: the encoded fields without the closing brace, and their digest."""
-    return line_body + _DIGEST_FIELD + _line_digest(line_body) + _LOG_LINE_END
+    return line_body + _DIGEST_FIELD + _line_digest(line_body) + _LOG_RECORD_END
 
 
 def decode_record(line: bytes) -> dict[str, Any] | None:
@@ -603,7 +603,9 @@ def verified_line_body(line: bytes) -> bytes | None:
     """
     line_body, digest_field, line_end = line.rpartition(_DIGEST_FIELD)
     return (
-        line_body if digest_field and line_end == _line_digest(line_body) + _LOG_LINE_END else None
+        line_body
+        if digest_field and line_end == _line_digest(line_body) + _LOG_RECORD_END
+        else None
     )
 
 

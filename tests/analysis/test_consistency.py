@@ -5,7 +5,10 @@ import pytest
 import xarray as xr
 from click.testing import CliRunner
 
-from sweep.analysis.scene_results.consistency import check_error_consistency, inconsistency_messages
+from sweep.analysis.scene_results.consistency import (
+    check_error_consistency,
+    understated_error_messages,
+)
 from sweep.analysis.scene_results.point_export import export
 from sweep.cli import main
 from sweep.model.pointcloud.pairing import TRUE_FLAG
@@ -97,9 +100,9 @@ def over_hills(tmp_path_factory):
 
 
 def test_run_report_and_export_say_what_is_inconsistent(over_hills, tmp_path):
-    (told,) = inconsistency_messages(over_hills)
+    (told,) = understated_error_messages(over_hills)
     assert told.startswith("four: altitude is inconsistent: residuals are ")
-    assert inconsistency_messages(over_hills, "none of these") == []
+    assert understated_error_messages(over_hills, "none of these") == []
     assert (
         "four: altitude is inconsistent"
         in write_report(over_hills, tmp_path / "p.html").read_text()

@@ -12,7 +12,7 @@ from sweep.analysis.scene_results.recordings import (
     read_eyepoints,
 )
 from sweep.analysis.selection import parameters_at
-from sweep.analysis.shot_spectra import BinGroup, SegmentSpectrum, simulate_prepared_shot
+from sweep.analysis.shot_spectra import BinGroup, DisplayedSegment, simulate_prepared_shot
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import unpack_effect_flags
 from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
@@ -114,7 +114,7 @@ def test_views_reach_over_all_detections_but_not_to_those_far_away():
     signal = np.full(4000, 1e-9)
     signal[1000] = 1.0
     groups = tuple(BinGroup(k, k, k) for k in (950, 1000, 1140, 3900))
-    segment = SegmentSpectrum(
+    segment = DisplayedSegment(
         "up-chirp",
         1,
         np.arange(4000),

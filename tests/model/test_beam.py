@@ -72,7 +72,7 @@ def test_light_moves_as_the_moving_product_of_both_fields_says():
     spectrum = np.abs(np.fft.fft2(propagated(6e-3, 8.0) ** 2)) ** 2
     f = np.fft.fftfreq(NUMBER, SIDE / NUMBER)
     rms = np.sqrt((spectrum.sum(axis=1) * f**2).sum() / spectrum.sum()) * WAVELENGTH / 2
-    places, directions = beam.footprint_angles(p)
+    places, directions = beam.footprint_full_angles(p)
     assert directions / 4 == pytest.approx(rms, rel=1e-6) and places > 9 * directions
     plane = FlatGround(p | {"target.transverse_velocity": np.array(100.0)}, 1)
     _, _, doppler, echo = plane.beamlets
@@ -219,7 +219,7 @@ def test_a_flight_sees_a_plane_as_a_grid_does(table_4_1):
         caster=RayCaster([level_plate()]),
         beam_divergence=0.0,
         n_beamlets=37,
-        footprint_angles=partial(beam.footprint_angles, one),
+        footprint_full_angles=partial(beam.footprint_full_angles, one),
     )
     seen = evaluation.shot_statistics(
         prepare_eyepoint_shots(eyepoints, one, [SurfaceMaterial("ground", 1.0, "lambert")])
@@ -247,7 +247,7 @@ def test_leaves_before_the_focus_dim_and_shine_as_the_overlap_says(table_4_1):
         caster=RayCaster([level_plate(), leaf]),
         beam_divergence=0.0,
         n_beamlets=109,
-        footprint_angles=partial(beam.footprint_angles, one),
+        footprint_full_angles=partial(beam.footprint_full_angles, one),
     )
     surfaces = [SurfaceMaterial(name, 1.0, "thesis") for name in ("ground", "leaf")]
     shots = prepare_eyepoint_shots(eyepoints, one, surfaces, DEFAULT_EFFECTS)

@@ -61,7 +61,9 @@ def flown(p, method, draws):
     seen = observe_shots(
         straight_flight(position=tuple(-distance * along), velocity=tuple(velocity)),
         beams=along[None],
-        footprint_angles=lambda far: beam.footprint_angles(p, np.where(np.isfinite(far), far, 1.0)),
+        footprint_full_angles=lambda far: beam.footprint_full_angles(
+            p, np.where(np.isfinite(far), far, 1.0)
+        ),
     )
     instrument = {path: value for path, value in p.items() if not path.startswith("target.")}
     sun = "target.solar_irradiance"

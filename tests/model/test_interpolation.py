@@ -8,10 +8,10 @@ from shot_helpers import parametrize_product
 from sweep.model.detection.estimators import beat_frequency_bound, carrier_to_noise_ratio
 from sweep.model.detection.sub_bin_interpolation import (
     estimate_sub_bin_offset,
+    in_phase_noise_correlations,
     interpolator,
     late_echo_correction,
     line_spread_error,
-    neighbour_noise_correlations,
     sub_bin_standard_error,
 )
 from sweep.model.window import direct_transform, get_window, window_samples
@@ -133,7 +133,7 @@ def test_the_noise_of_three_bins_is_correlated_as_by_the_window(length, fft_size
     turns = np.outer(np.arange(99, 102), np.arange(length) - length / 2) / fft_size
     bins = (noise @ np.exp(-2j * np.pi * turns).T).real
     measured = np.corrcoef(bins.T)
-    near, far = neighbour_noise_correlations(get_window("hamming", length), fft_size)
+    near, far = in_phase_noise_correlations(get_window("hamming", length), fft_size)
     expected = np.array([[1, near, far], [near, 1, near], [far, near, 1]])
     np.testing.assert_allclose(measured, expected, atol=5 / np.sqrt(DRAWS))
     tables = interpolator(get_window("hamming", length), fft_size)

@@ -19,7 +19,7 @@ from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.model.pointcloud.returns import draw_free_bin, draw_returns
 from sweep.model.sampling.samplers import simulate_draws
-from sweep.model.spectrum.search_band import search_band_bins
+from sweep.model.spectrum.search_band import search_band_start_and_size
 from sweep.model.threshold import DESIGN_PFA_SEGMENT_PATH, DESIGN_PFA_SHOT_PATH, TNR_PATH
 from sweep.model.waveform import SEARCH_BAND_PATHS
 from sweep.model.window import window_samples
@@ -52,7 +52,9 @@ def test_bins_are_those_nearest_to_any_beat(table_4_1, near, deep, slow, spread,
     # Twice as close as bins, in range and in velocity; from edge to edge.
     far, fast = np.linspace(near, near + deep, 6000), np.linspace(slow, slow + spread, 2000)
     beta = 2 * fast / 299792458
-    for band, sign, extra in zip(search_band_bins(scene), (1, 0, -1), (0, 0, 1e9), strict=True):
+    for band, sign, extra in zip(
+        search_band_start_and_size(scene), (1, 0, -1), (0, 0, 1e9), strict=True
+    ):
         carrier = 299792458 / 1550e-9 + extra
         beats = [
             carrier * b - sign * 5e13 * 2 * r / 299792458 * (1 + b)

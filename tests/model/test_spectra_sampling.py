@@ -6,7 +6,7 @@ from shot_helpers import make_point_keys
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.estimators import SPECTRUM_METHOD_DEFAULTS
-from sweep.model.detection.sub_bin_interpolation import neighbour_noise_correlations
+from sweep.model.detection.sub_bin_interpolation import in_phase_noise_correlations
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.evaluation import evaluate, prepare_shots
 from sweep.model.laser_line import n_phase_walk_steps, phase_walk
@@ -66,7 +66,7 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(
     turn = np.exp(1j * np.pi * shots.window.length / shots.fft_size)
     near = np.mean((noise[:, 1:] * noise[:, :-1].conj()).real * turn.real
                    - (noise[:, 1:] * noise[:, :-1].conj()).imag * turn.imag) / power  # fmt: skip
-    expected, _ = neighbour_noise_correlations(shots.window, shots.fft_size)
+    expected, _ = in_phase_noise_correlations(shots.window, shots.fft_size)
     assert near == pytest.approx(expected, abs=5 / np.sqrt(independent))
 
 

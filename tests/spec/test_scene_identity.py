@@ -5,6 +5,7 @@ import json
 import math
 import pickle
 import shutil
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -16,14 +17,18 @@ from base_scene_spec import (
     changed_scene,
     scene_with_object,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sweep.scenes.scene_files import SceneError
-from sweep.spec import SceneSpec, describe_differences, from_stored
+from sweep.spec import SceneSpec, describe_differences, differences, from_stored
 from sweep.spec.axes import remove_fields_on_axes
 from sweep.spec.differences import SCENE_SECTION_MODELS, rules_by_field_name
 from sweep.spec.fields import fields_by_name, iter_section_values, reachable_models, rule_of_field
 from sweep.spec.ground_sections import OPTICAL_FIELDS
+from sweep.spec.rules import NumericRule
 from sweep.spec.sections import MODEL_BY_SECTION
+from sweep.units import read_unit
 
 
 def spec_of(mapping, base="."):
@@ -306,6 +311,15 @@ def test_a_gltf_counts_with_the_buffers_that_it_names(tmp_path):
         buffer.unlink()
     with pytest.raises(SceneError, match="does not exist"):
         file_digest(tmp_path / "b/model.gltf")
+
+
+@given(st.sampled_from(["deg", "mrad", "urad"]), st.floats(1e-7, 6.0))
+def test_an_angle_in_a_difference_reads_back_as_the_same_value(unit_name, value):
+    example = f"1 {unit_name}"
+    unit = read_unit(unit_name, si_unit="rad", example=example)
+    rule = NumericRule(description="Angle", si_unit="rad", example=example)
+    text = differences._format_number(rule, value)
+    assert unit.to_si(Fraction(text)) == value
 
 
 def test_differences_are_told_with_units():

@@ -39,7 +39,7 @@ from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.parameter_grid import (
     DEFAULT_BLOCK_DRAWS_MAX,
     SHOTS_PER_TILE,
-    flight_block_size,
+    flight_block_size_max,
     worst_cpu_seconds_per_draw,
 )
 from sweep.tasks.studies.store_summary import flight_summary, status
@@ -349,7 +349,7 @@ def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
 @pytest.mark.parametrize("n_shots", [40, 300, 3008])
 def test_default_blocks_hold_about_equal_numbers_of_draws(n_draws: int, n_shots: int) -> None:
     spec = small_scene_spec(draws={"number": n_draws}, storage={})
-    block_shots, block_draws = flight_block_size(spec, 1, n_shots, n_draws)
+    block_shots, block_draws = flight_block_size_max(spec, 1, n_shots, n_draws)
     n_blocks = math.ceil(n_draws / block_draws)
     assert block_draws <= DEFAULT_BLOCK_DRAWS_MAX
     assert n_blocks * block_draws - n_draws < n_blocks

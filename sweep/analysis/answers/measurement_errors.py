@@ -26,11 +26,10 @@ from sweep.model.effects.catalogue import (
 )
 from sweep.model.evaluation import prepare_shots
 from sweep.model.sampling.speckle_wander import mean_wander_variance
+from sweep.model.waveform import SEGMENT_NAMES
 from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
 
-_SEGMENT_NAMES = ("up", "doppler", "down")
-"""Names of the segments (chirps) of a shot, as they occur in names of variables."""
 _INSTRUMENT_PATH_PREFIX = "instrument."
 """Beginning of the dotted paths of all instrument parameters."""
 _PATH_BY_PARAMETER = {
@@ -110,7 +109,7 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
         statistics = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
         return xr.Dataset(statistics).assign_attrs(dataset.attrs)
     spec = grid_spec_of_dataset(dataset)
-    snr_names = [f"snr_{name}" for name in _SEGMENT_NAMES]
+    snr_names = [f"snr_{name}" for name in SEGMENT_NAMES]
     require_variables(dataset, *snr_names, "effects", f"{quantity}_error")
     parameters = {
         n: parameter_in_si(dataset, _INSTRUMENT_PATH_PREFIX + p, spec)
@@ -178,7 +177,7 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
         for axis in spec.axes
         for axis_parameter in axis.parameters
     }
-    pds, snrs = ([dataset[f"{kind}_{name}"] for name in _SEGMENT_NAMES] for kind in ("pd", "snr"))
+    pds, snrs = ([dataset[f"{kind}_{name}"] for name in SEGMENT_NAMES] for kind in ("pd", "snr"))
 
     def point_deviation(flags: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
         shape = np.broadcast_shapes(flags.shape, *(array.shape for array in arrays))

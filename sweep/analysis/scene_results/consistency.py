@@ -123,7 +123,7 @@ def check_error_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
     return results
 
 
-def inconsistency_messages(store: str | Location, scanner: str | None = None) -> list[str]:
+def understated_error_messages(store: str | Location, scanner: str | None = None) -> list[str]:
     """Return a sentence for each quantity of a store whose errors are far larger than stated.
 
     ``scanner`` is the only scanner to check; None stands for all. The store of a grid has no such

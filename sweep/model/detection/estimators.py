@@ -500,8 +500,8 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
     of three bins, the variance is g' C g / (dR / d delta)^2.
     """
     from sweep.model.detection.sub_bin_interpolation import (
+        in_phase_noise_correlations,
         interpolator,
-        neighbour_noise_correlations,
         tone_spectrum,
     )
 
@@ -518,7 +518,7 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
         return windowed_peak_deviation(cnr=cnr, window=window, sample_rate=fft_size)
     if estimator != "candan":
         return None
-    correlation_1, correlation_2 = neighbour_noise_correlations(window, fft_size)
+    correlation_1, correlation_2 = in_phase_noise_correlations(window, fft_size)
     covariance = np.array(
         [
             [1, correlation_1, correlation_2],

@@ -64,7 +64,7 @@ class Tails(NamedTuple):
     """Probability that |X| is below the threshold, 0..1."""
 
 
-class MarcumQ(NamedTuple):
+class RiceTails(NamedTuple):
     """Both tails of the Rice distribution of a magnitude in noise, arrays of one shape."""
 
     q: np.ndarray
@@ -74,7 +74,7 @@ class MarcumQ(NamedTuple):
     is near 1."""
 
 
-def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
+def marcum_q1(a: ArrayLike, b: ArrayLike) -> RiceTails:
     """Compute the first-order Marcum Q function and its complement [T 3.3].
 
     Parameters
@@ -84,14 +84,14 @@ def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
 
     Returns
     -------
-    MarcumQ
+    RiceTails
         Of the broadcast shape; nan outside the domain and where both arguments are infinite. The
         relative error is at most 2e-15 for results above float64's smallest normal number.
     """
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     tails = np.empty((2, a.size))
     _fill_tails(a.ravel(), b.ravel(), *tails)
-    return MarcumQ(*tails.reshape(2, *a.shape))
+    return RiceTails(*tails.reshape(2, *a.shape))
 
 
 @njit(cache=True, error_model="numpy")

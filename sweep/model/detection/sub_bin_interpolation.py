@@ -130,7 +130,7 @@ class Interpolator(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, float]:
+def in_phase_noise_correlations(window: Window, fft_size: int) -> tuple[float, float]:
     """Return the noise correlations of two bins that are one bin apart, and two bins apart.
 
     The correlations are those of the noise components in phase with the main lobe of a tone.
@@ -148,7 +148,7 @@ def sidelobe_bin_noise_correlation(window: Window, fft_size: int) -> float:
 
     See :attr:`Interpolator.sidelobe_bin_noise_correlation`.
     """
-    correlation_1, _ = neighbour_noise_correlations(window, fft_size)
+    correlation_1, _ = in_phase_noise_correlations(window, fft_size)
     return correlation_1 * (1.0 - 2.0 * window.length / fft_size)
 
 
@@ -169,7 +169,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         if neighbours_vanish
         else (above - below) / (tone_magnitudes.sum(0) + centre)
     )
-    correlation_1, correlation_2 = neighbour_noise_correlations(window, fft_size)
+    correlation_1, correlation_2 = in_phase_noise_correlations(window, fft_size)
     weight, error = _least_squares_weights(
         tone_magnitudes, offset, correlation_1, correlation_2, two_bins=bool(neighbours_vanish)
     )

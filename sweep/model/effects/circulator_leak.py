@@ -133,7 +133,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Add the noise and the line of the leaked light.
+    """Return the shots with the noise sources and the permanent line of the leaked light added.
 
     Notes
     -----

@@ -368,7 +368,11 @@ def leakage_table(
 def _added_crossing_probability(
     signal: np.ndarray, threshold_ratio: float, noise_crossing: float, looks: Looks
 ) -> np.ndarray:
-    """Return the increase of a bin's probability to cross the threshold that a signal causes."""
+    """Return the probability that a signal lifts a bin above the threshold that noise alone misses.
+
+    ``signal`` (...) and ``threshold_ratio`` are magnitudes over the noise per quadrature;
+    ``noise_crossing`` is the probability that the bin crosses by noise alone.
+    """
     crossing = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio)).pd
     return np.maximum(crossing - noise_crossing, 0.0) / max(1 - noise_crossing, 1e-12)
 

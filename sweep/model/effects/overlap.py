@@ -49,7 +49,7 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.preparation import Shots
 from sweep.model.window_response import window_max_near
 
-_LINE_FRACTION_WITH_IMAGE_MIN = 0.9
+_REMAINING_AMPLITUDE_WITH_IMAGE_MIN = 0.9
 """Smallest fraction of a line's amplitude that remains when the sidelobes of its image, at the
 opposite frequency far away, are added to it."""
 
@@ -72,7 +72,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         / np.where(points.is_near_image, 2.0, 1.01)
         / (1 + points.total_phase_error_bound.extra_shift_window_bins)
     )
-    line_amplitude_min = _LINE_FRACTION_WITH_IMAGE_MIN * np.sqrt(power_min) - phase_bound
+    line_amplitude_min = _REMAINING_AMPLITUDE_WITH_IMAGE_MIN * np.sqrt(power_min) - phase_bound
     magnitude_change = np.where(
         missing.lost_fraction > 0,
         np.where(line_amplitude_min > 0, missing.lost_fraction / line_amplitude_min, np.inf),

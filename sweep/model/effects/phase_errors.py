@@ -83,7 +83,7 @@ _N_NODES = 256
 """Number of positions in the record at which the window is sampled, for means weighted by it."""
 _RADIANS_PER_CYCLE = 2 * math.pi
 """Factor 2 pi that converts a phase from cycles to radians."""
-_LINE_FRACTION_WITH_IMAGE_MIN = 0.9
+_REMAINING_AMPLITUDE_WITH_IMAGE_MIN = 0.9
 """Smallest fraction of a line's amplitude that remains when the sidelobes of its image, at the
 opposite frequency far away, are added to it."""
 
@@ -294,7 +294,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
         / np.where(points.is_near_image, 2.0, 1.01)
         / (1 + other_bounds.extra_shift_window_bins)
     )
-    c = _LINE_FRACTION_WITH_IMAGE_MIN * np.sqrt(power_min) - others_phase
+    c = _REMAINING_AMPLITUDE_WITH_IMAGE_MIN * np.sqrt(power_min) - others_phase
     magnitude_change = np.where(
         c > 0, (a + b * moments.first_sample_weight / c) / c + 0.5 * (b / c) ** 2, np.inf
     )

@@ -191,9 +191,9 @@ class PlannerInputs(LinkBudget):
         return self.target.range
 
     @cached_property
-    def footprint_angles(self) -> beam.FootprintAngles:
+    def footprint_full_angles(self) -> beam.FootprintAngles:
         """Full angles of the beam that the footprint covers [rad]."""
-        return beam.footprint_angles(self.parameters)
+        return beam.footprint_full_angles(self.parameters)
 
     @cached_property
     def footprint_extent(self) -> FootprintExtent:
@@ -205,13 +205,13 @@ class PlannerInputs(LinkBudget):
         if self.n_beamlets == 1:
             return FootprintExtent(axis_echo, 1.0, NO_SPREAD, NO_SPREAD, NO_SPREAD)
         geometry: dict[str, Any] = {
-            "grazing_angle": grazing_angle, "beam_divergence": self.footprint_angles.positions,
+            "grazing_angle": grazing_angle, "beam_divergence": self.footprint_full_angles.positions,
             "n_beamlets": self.n_beamlets, "pattern": self.beamlet_pattern,
         }  # fmt: skip
         range_moments, velocity_moments = plane_offset_moment_bounds(
             transverse_velocity=self["target.transverse_velocity"],
             radial_velocity=self.target.radial_velocity,
-            direction_spread_angle=self.footprint_angles.directions,
+            direction_spread_angle=self.footprint_full_angles.directions,
             **geometry,
         )
         echo_ratio = plane_echo_ratio_bound(

@@ -112,7 +112,7 @@ def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndar
     if points.n_beamlets > 1:
         rim_angle = (
             pattern_radius(points.n_beamlets, points.beamlet_pattern)
-            * points.footprint_angles.positions
+            * points.footprint_full_angles.positions
             / 4
         )
     lowest_grazing = points["target.grazing_angle"] - rim_angle

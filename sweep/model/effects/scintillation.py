@@ -56,7 +56,7 @@ class TurbulenceProfile(NamedTuple):
     uniform: float = 0.0
     """Part of C_n^2 that is the same at all heights [m^(-2/3)]. If the other fields are 0, it is
     C_n^2."""
-    surface_layer: float = 0.0
+    surface_layer_strength: float = 0.0
     """Coefficient A of Hufnagel and Valley's surface layer [m^(-2/3)]: C_n^2 of the layer on the
     ground, 1.7e-14 in the 5/7 model. It falls by the factor e over a height of 100 m."""
     wind_speed: float = 0.0
@@ -66,7 +66,9 @@ class TurbulenceProfile(NamedTuple):
     model. The term falls by the factor e over a height of 1500 m."""
 
 
-HUFNAGEL_VALLEY = TurbulenceProfile(surface_layer=1.7e-14, wind_speed=21.0, mid_altitude=2.7e-16)
+HUFNAGEL_VALLEY = TurbulenceProfile(
+    surface_layer_strength=1.7e-14, wind_speed=21.0, mid_altitude=2.7e-16
+)
 """Hufnagel and Valley's 5/7 model of turbulence [Valley 1980]. At a wavelength of 0.5 um its
 coherence length is 5 cm, and its isoplanatic angle 7 urad."""
 
@@ -98,12 +100,17 @@ def structure_constant(turbulence: TurbulenceProfile, height: ArrayLike) -> np.n
     Notes
     -----
     Hufnagel and Valley's model, with the wind speed v: 0.00594 (v / 27)^2 (1e-5 h)^10 exp(-h /
-    1000) + mid_altitude exp(-h / 1500) + surface_layer exp(-h / 100); and a uniform part.
+    1000) + mid_altitude exp(-h / 1500) + surface_layer_strength exp(-h / 100); and a uniform part.
     """
     h = np.maximum(np.asarray(height, float), 0.0)
     aloft = 0.00594 * (turbulence.wind_speed / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
     mid_altitude = turbulence.mid_altitude * np.exp(-h / 1.5e3)
-    return turbulence.uniform + aloft + mid_altitude + turbulence.surface_layer * np.exp(-h / 100)
+    return (
+        turbulence.uniform
+        + aloft
+        + mid_altitude
+        + turbulence.surface_layer_strength * np.exp(-h / 100)
+    )
 
 
 def rytov_variance(

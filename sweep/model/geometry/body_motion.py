@@ -279,7 +279,7 @@ def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarra
 class ConstantAcceleration:
     """Trajectory of a point under constant acceleration; a straight line if that is 0."""
 
-    position: FloatSequence
+    initial_position: FloatSequence
     """(3,): position of the point at time 0 [m], in the world's frame."""
     velocity: FloatSequence
     """(3,): velocity of the point at time 0 [m/s], in the world's frame."""
@@ -302,7 +302,7 @@ class ConstantAcceleration:
     def motion(self, times: np.ndarray) -> Motion:
         """Return position, velocity and acceleration at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, 0.0, self.duration)[:, None]
-        x0, v0, a = np.array([self.position, self.velocity, self.acceleration], float)
+        x0, v0, a = np.array([self.initial_position, self.velocity, self.acceleration], float)
         return Motion(x0 + (v0 + 0.5 * a * times) * times, v0 + a * times, a + 0 * times)
 
 

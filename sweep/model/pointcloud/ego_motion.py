@@ -19,10 +19,10 @@ V.d'.
 
 **Known motion.** Inertial sensors and the scanner give the instrument its velocity V, its
 acceleration V' and the rate d' at which the beam d turns. So it knows a = V'.d + V.d' for ground at
-rest. It assumes that the ground is level (:func:`ego_motion_of_beams`). A beam that points down
-then meets the ground at a range that falls by u = (V + R d').z / d.z. A beam that does not point
-down is assumed to meet a surface that faces it, along which nothing slides. Range and velocity are
-corrected for both u and a.
+rest. It assumes that the ground is level (:func:`assumed_motion_along_beams`). A beam that points
+down then meets the ground at a range that falls by u = (V + R d').z / d.z. A beam that does not
+point down is assumed to meet a surface that faces it, along which nothing slides. Range and
+velocity are corrected for both u and a.
 
 **Unknown motion.** The instrument does not know the slope of the surface that a beam meets, nor the
 motion of this surface. It has prior standard deviations of both (:class:`MotionPriors`), which the
@@ -170,13 +170,13 @@ def ego_motion_of_eyepoints(
 
     The ground is assumed to be level and at rest.
     """
-    return ego_motion_of_beams(
+    return assumed_motion_along_beams(
         eyepoints.direction, eyepoints.velocity, eyepoints.direction_rate,
         eyepoints.platform_acceleration, priors,
     )  # fmt: skip
 
 
-def ego_motion_of_beams(
+def assumed_motion_along_beams(
     direction: np.ndarray,
     velocity: np.ndarray,
     direction_rate: np.ndarray,

@@ -131,7 +131,7 @@ def compute_eyepoints(
     body_motions: Sequence[MovingBody | None] | None = None,
     jitter: PointingJitter | None = None,
     bodies_rotate: bool = True,
-    footprint_angles: Callable[[np.ndarray], beam.FootprintAngles] | None = None,
+    footprint_full_angles: Callable[[np.ndarray], beam.FootprintAngles] | None = None,
 ) -> Eyepoints:
     """Compute the geometry (eyepoints) of n shots of a flight by ray casting.
 
@@ -149,7 +149,7 @@ def compute_eyepoints(
     caster
         Ray caster of the scene.
     beam_divergence
-        Full 1/e^2 angle of the beam [rad], if `footprint_angles` is None.
+        Full 1/e^2 angle of the beam [rad], if `footprint_full_angles` is None.
     n_beamlets, pattern
         Number and pattern of beamlets (:func:`sweep.model.beamlets.place_beamlets`).
     body_motions
@@ -159,10 +159,10 @@ def compute_eyepoints(
         velocity and `direction` of the result are those without jitter.
     bodies_rotate
         False to neglect the velocity of surfaces by the rotation of their body.
-    footprint_angles
+    footprint_full_angles
         Function that returns the angles of the footprint, as
-        :func:`sweep.model.beam.footprint_angles`. Its argument is the range (n,) of the beam's axis
-        [m], infinite if the axis hits nothing.
+        :func:`sweep.model.beam.footprint_full_angles`. Its argument is the range (n,) of the beam's
+        axis [m], infinite if the axis hits nothing.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def compute_eyepoints(
     body_states = [None if body is None else body.state(time) for body in body_motions or ()]
     poses = [None if body is None else Pose(body.position, body.attitude) for body in body_states]
     make_rays = partial(beamlet_rays, attitude, shots.direction)
-    if footprint_angles is None:
+    if footprint_full_angles is None:
         light_directions = ray_directions = make_rays(across, along, beam_divergence / 4)
     else:  # the range of the axis determines the width of the footprint
         zero_angle = np.zeros(1)
@@ -196,7 +196,7 @@ def compute_eyepoints(
         )
         ray_directions, light_directions = (
             make_rays(across, along, np.reshape(full_angle, (-1, 1)) / 4)
-            for full_angle in footprint_angles(axis_bundle.range)
+            for full_angle in footprint_full_angles(axis_bundle.range)
         )
     bundle = caster.cast_bundles(
         state.position, ray_directions, poses=poses or None, range_min=HIT_RANGE_MIN

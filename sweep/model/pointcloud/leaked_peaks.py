@@ -255,7 +255,7 @@ class LeakageBins(NamedTuple):
             sidelobe_bin_noise_correlation=0.0,
         )
 
-    def select(self, points: np.ndarray) -> "LeakageBins":
+    def select_points(self, points: np.ndarray) -> "LeakageBins":
         """Return the record for selected points, by indices or a mask.
 
         Arrays of bins are shared with this record, not copied.

@@ -59,7 +59,7 @@ from sweep.model.pointcloud.ego_motion import (
     DEPRESSION_SINE_MIN,
     EgoMotion,
     MotionPriors,
-    ego_motion_of_beams,
+    assumed_motion_along_beams,
 )
 from sweep.model.pointcloud.error_floor import NO_ERROR_FLOOR, ErrorFloor
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
@@ -642,7 +642,7 @@ def solve_navigation(
         beam_motion = BeamMotion(
             *(shot_arrays[name][shot_slice] for name in _BEAM_MOTION_VARIABLES)
         )
-        known_motion = ego_motion_of_beams(
+        known_motion = assumed_motion_along_beams(
             beam_motion.direction,
             beam_motion.velocity,
             beam_motion.direction_rate,

@@ -88,7 +88,7 @@ class OppositeBeamletPairs(NamedTuple):
     inverse_weight: np.ndarray
     """(h,): 1 divided by the fraction of the beam's power in both beamlets of a pair."""
     polynomials: np.ndarray
-    """(k, h): values at each pair of k even polynomials of the beamlets' position. They are
+    """(k, h): k even polynomials of beamlet position, evaluated at each of the h pairs. They are
     orthonormal with the power fractions of the pairs as weights."""
     weighted_polynomials: np.ndarray
     """(k, h): ``polynomials`` times the power fractions of the pairs."""

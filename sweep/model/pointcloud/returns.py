@@ -316,7 +316,7 @@ def draw_returns(
         DrawConfig.from_shots(shots, first_draw, in_noise),
         interpolator(shots.window, shots.fft_size),
     )
-    window_bins = int(2 * inputs.line_grid.peak_search_bins.max(initial=0) + 1)
+    window_bins = int(2 * inputs.line_grid.peak_search_half_width.max(initial=0) + 1)
     _, _, groups_max = bin_groups.strongest_bin.shape
     noise_roots: dict[int, np.ndarray] = {}
     for indices, spectra, part_leakage_bins in _iter_spectra(
@@ -400,7 +400,7 @@ def _iter_spectra(
         leakage_bins_by_part = (
             (indices, leakage_bins)
             if is_leaking.all()
-            else (indices[is_leaking], leakage_bins.select(is_leaking))
+            else (indices[is_leaking], leakage_bins.select_points(is_leaking))
             for indices, leakage_bins in known_leakage_bins
             if (is_leaking := is_leaking_point[indices]).any()
         )
@@ -1638,8 +1638,8 @@ def prepare_group_speckle(point, config, inputs, spectra):
                 )
                 first_bin[g, s], n_bins[g, s] = span_first_bin + begin, end - begin + 1
             else:
-                first_bin[g, s] = strongest_bin - inputs.line_grid.peak_search_bins[point]
-                n_bins[g, s] = 2 * inputs.line_grid.peak_search_bins[point] + 1
+                first_bin[g, s] = strongest_bin - inputs.line_grid.peak_search_half_width[point]
+                n_bins[g, s] = 2 * inputs.line_grid.peak_search_half_width[point] + 1
             n_bins_max = max(n_bins_max, n_bins[g, s])
     mean_power, pseudo_variance_ratio = (
         np.zeros((groups_max, 3, n_bins_max)),

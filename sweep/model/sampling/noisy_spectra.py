@@ -151,7 +151,7 @@ class SegmentSignal(NamedTuple):
     nearest_echo: np.ndarray | None = None
     """(bins,) int64: number of the echo nearest to each bin, if a shot has several; None with a
     single echo."""
-    echo_peaks: "EchoPeaks | None" = None
+    multiple_echo_peaks: "EchoPeaks | None" = None
     """Strongest bins and positions of the echoes, if a shot has several; None with a single echo.
     """
     echo_half_width: int = 0
@@ -284,13 +284,13 @@ def noiseless_signal(
         )
     if not is_searched(shots, segment, point, strongest_bin - zero_frequency_index(shots)):
         first_bin, last_bin = 1, 0
-    nearest_echo, echo_peaks = None, None
+    nearest_echo, multiple_echo_peaks = None, None
     if len(echo_bins) > 1:
         bin_offset = np.arange(magnitude.size)[:, None] - np.asarray(echo_bins)
         if shots.complex_record:
             bin_offset -= shots.fft_size * np.rint(bin_offset / shots.fft_size).astype(np.int64)
         nearest_echo = np.abs(bin_offset).argmin(axis=1)
-        echo_peaks = EchoPeaks(
+        multiple_echo_peaks = EchoPeaks(
             np.asarray(echo_bins),
             np.array(
                 [
@@ -316,7 +316,7 @@ def noiseless_signal(
         cnr=float(signal_power / shots.noise_variance[point]),
         segment=segment,
         nearest_echo=nearest_echo,
-        echo_peaks=echo_peaks,
+        multiple_echo_peaks=multiple_echo_peaks,
         echo_half_width=lobe_half_width,
         is_exempt=_exempt_bin_mask(
             shots, magnitude, strongest_bin, first_bin, last_bin, fixed_threshold
@@ -591,7 +591,7 @@ def draw_bin_speckle(
             signal.strongest_bin, signal.frequency + zero_index, signal.first_bin, signal.last_bin
         )
     ]
-    if signal.nearest_echo is not None and signal.echo_peaks is not None:
+    if signal.nearest_echo is not None and signal.multiple_echo_peaks is not None:
         echo_windows = [
             EchoWindow(
                 int(echo_bin),
@@ -601,7 +601,7 @@ def draw_bin_speckle(
             )
             if (echo_bin - signal.first_bin) % n_bins > signal.last_bin - signal.first_bin
             else EchoWindow(int(echo_bin), position, signal.first_bin, signal.last_bin)
-            for echo_bin, position in zip(*signal.echo_peaks, strict=True)
+            for echo_bin, position in zip(*signal.multiple_echo_peaks, strict=True)
         ]
     for echo_number, (strongest_bin, position, first_bin, last_bin) in enumerate(echo_windows):
         first_bin, last_bin = min(first_bin, strongest_bin - 1), max(last_bin, strongest_bin + 1)
@@ -673,8 +673,10 @@ def add_footprint_records(
         return signal._replace(footprint_records=())
     strongest_bins = np.full((1, 3), signal.strongest_bin - zero_index)
     positions = [float(mean_line_positions(shots, np.array([point]), strongest_bins)[0, segment])]
-    if signal.echo_peaks is not None:
-        positions = [float(position) - zero_index for position in signal.echo_peaks.tone_position]
+    if signal.multiple_echo_peaks is not None:
+        positions = [
+            float(position) - zero_index for position in signal.multiple_echo_peaks.tone_position
+        ]
     records = tuple(
         FootprintRecord.from_line_grid(
             line_grid, point, segment, position, shots.window, first_sample, shots.fft_size

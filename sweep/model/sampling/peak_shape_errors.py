@@ -230,7 +230,7 @@ class TwoBinErrors(NamedTuple):
     mean: np.ndarray
     """(m, 3): mean error [bins]."""
     wander_gain: np.ndarray
-    """(m, 3): error over linear wander, by regression."""
+    """(m, 3): slope of the regression of the position error on the linear wander w."""
     excess_variance: np.ndarray
     """(m, 3): variance about the mean [bins^2], beyond that of the wander times its gain, and
     beyond that of the standard error by noise that

@@ -110,7 +110,7 @@ class SpeckleLineGrid(NamedTuple):
     quadrature_index: np.ndarray
     """(n, 2) int64: index, in :data:`QUADRATURE_NODE_COUNTS`, of the Gaussian quadrature along each
     coordinate of the beam."""
-    peak_search_bins: np.ndarray
+    peak_search_half_width: np.ndarray
     """(n,) int64: number of bins on either side of the strongest noiseless bin among which the peak
     of a draw is searched."""
     node: np.ndarray
@@ -160,7 +160,7 @@ class SpeckleLineGrid(NamedTuple):
             line_shift=self.line_shift[points],
             phase=self.phase[points],
             quadrature_index=self.quadrature_index[points],
-            peak_search_bins=self.peak_search_bins[points],
+            peak_search_half_width=self.peak_search_half_width[points],
         )
 
 
@@ -193,15 +193,17 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     phase_max = phase_max + np.pi * np.abs(line_shift).max(axis=1) / padding_factor
     quadrature_index = np.searchsorted(_QUADRATURE_PHASE_MAX, phase_max)
     line_shift_max = np.sqrt((line_shift**2).sum(axis=-1)).max(axis=1)
-    peak_search_bins = np.ones(n_points, np.int64)
+    peak_search_half_width = np.ones(n_points, np.int64)
     if shots.detection_settings.echo_bins == "any_bin":
         is_wide = line_shift_max > 0.02 * padding_factor
-        peak_search_bins = np.where(is_wide, 1 + np.ceil(2.5 * line_shift_max), 1).astype(np.int64)
+        peak_search_half_width = np.where(is_wide, 1 + np.ceil(2.5 * line_shift_max), 1).astype(
+            np.int64
+        )
     return SpeckleLineGrid(
         np.ascontiguousarray(line_shift * folding_signs(shots)[..., None][:n_points]),
         np.ascontiguousarray(phase),
         quadrature_index.astype(np.int64),
-        peak_search_bins,
+        peak_search_half_width,
         node,
         weight,
         QUADRATURE_NODE_COUNTS,

@@ -27,11 +27,11 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.echo_detection import mark_exempt_bins
 from sweep.model.elementary_functions import sincos_cycles
 from sweep.model.spectrum.line_shape import (
-    CELLS_PER_BIN,
     KERNEL_BASIS,
     KERNEL_CELLS,
     KERNEL_DEGREE,
     N_END_COEFFICIENTS,
+    TABLE_CELLS_PER_BIN,
     ZERO_WEIGHT_CELLS,
 )
 from sweep.model.spectrum.lines import (
@@ -58,19 +58,21 @@ FAR_LINE_EXTRA_LOG_ACCURACY = 11.0
 """Extra accuracy of the polynomials A and B, added to -ln of the equivalent lines' relative error.
 A and B give a line's spectrum far from it (:mod:`sweep.model.spectrum.line_shape`)."""
 
-LINE_BATCH_BINS = 8
+LINE_BATCH_WIDTH_BINS = 8
 """Width [bins] of a frequency interval whose lines are spread over table cells in one pass. A bin
 is computed from the table only if the table of every line in the interval contains it."""
 
-LINE_BATCH_EDGE_BINS = KERNEL_CELLS // 2 // min(CELLS_PER_BIN) + 1
-"""Greatest distance [bins] outside an interval of LINE_BATCH_BINS at which its lines occupy cells.
-"""
+LINE_BATCH_EDGE_BINS = KERNEL_CELLS // 2 // min(TABLE_CELLS_PER_BIN) + 1
+"""Greatest distance [bins] outside an interval of LINE_BATCH_WIDTH_BINS at which its lines occupy
+cells."""
 
-LINE_BATCH_CELLS_MAX = LINE_BATCH_BINS * max(CELLS_PER_BIN) + KERNEL_CELLS + ZERO_WEIGHT_CELLS
-"""Maximum number of table cells over which the lines of one interval of LINE_BATCH_BINS are spread.
-"""
+LINE_BATCH_CELLS_MAX = (
+    LINE_BATCH_WIDTH_BINS * max(TABLE_CELLS_PER_BIN) + KERNEL_CELLS + ZERO_WEIGHT_CELLS
+)
+"""Maximum number of table cells over which the lines of one interval of LINE_BATCH_WIDTH_BINS are
+spread."""
 
-TABLE_SHORTFALL_BINS = LINE_BATCH_BINS + LINE_BATCH_EDGE_BINS + 1
+TABLE_SHORTFALL_BINS = LINE_BATCH_WIDTH_BINS + LINE_BATCH_EDGE_BINS + 1
 """Margin [bins] by which the usable half-width of a line's table is below its stored half-width.
 Lines are processed in intervals, so a line may not use the table's outermost bins."""
 
@@ -334,17 +336,21 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
     """
     fft_size, cells_per_bin = layout.fft_size, layout.cells_per_bin
     lines, last_line_bin = field.lines, math.floor(bundle.highest_position)
-    table_reach = layout.table_bins + LINE_BATCH_BINS
-    for batch_bin in range(math.floor(bundle.lowest_position), last_line_bin + 1, LINE_BATCH_BINS):
+    table_reach = layout.table_bins + LINE_BATCH_WIDTH_BINS
+    for batch_bin in range(
+        math.floor(bundle.lowest_position), last_line_bin + 1, LINE_BATCH_WIDTH_BINS
+    ):
         n_periods_min = -((table_reach + batch_bin - first_bin) // fft_size)
         n_periods_max = (first_bin + n_bins - batch_bin + table_reach) // fft_size
         if n_periods_min > n_periods_max:  # the table holds none of these bins
             continue
-        n_cells = min(LINE_BATCH_BINS, last_line_bin + 1 - batch_bin) * cells_per_bin + KERNEL_CELLS
+        n_cells = (
+            min(LINE_BATCH_WIDTH_BINS, last_line_bin + 1 - batch_bin) * cells_per_bin + KERNEL_CELLS
+        )
         for c in range(n_cells + ZERO_WEIGHT_CELLS):
             field.cell_re[c], field.cell_im[c] = 0.0, 0.0
         for line in range(bundle.n_lines):
-            if batch_bin <= lines.position[line] < batch_bin + LINE_BATCH_BINS:
+            if batch_bin <= lines.position[line] < batch_bin + LINE_BATCH_WIDTH_BINS:
                 cell_position = (lines.position[line] - batch_bin) * cells_per_bin
                 _spread_line(
                     cell_position, lines.re[line], lines.im[line], field.cell_re, field.cell_im
@@ -376,7 +382,7 @@ def _first_bin_in_table(batch_bin, n_periods, layout):
     ``n_periods`` is the number of FFT lengths by which the periodic spectrum is shifted.
     """
     return (
-        batch_bin + n_periods * layout.fft_size + LINE_BATCH_BINS + LINE_BATCH_EDGE_BINS
+        batch_bin + n_periods * layout.fft_size + LINE_BATCH_WIDTH_BINS + LINE_BATCH_EDGE_BINS
     ) - layout.table_bins
 
 
@@ -681,7 +687,9 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
     first_batch_bin = math.floor(lowest_position)
     last_batch_bin = (
         first_batch_bin
-        + (math.floor(highest_position) - first_batch_bin) // LINE_BATCH_BINS * LINE_BATCH_BINS
+        + (math.floor(highest_position) - first_batch_bin)
+        // LINE_BATCH_WIDTH_BINS
+        * LINE_BATCH_WIDTH_BINS
     )
     current, end_bin = first_bin, first_bin + n_bins
     while current < end_bin:
@@ -714,8 +722,8 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
                 batch_bin = (
                     first_batch_bin
                     + int(field.lines.position[line] - first_batch_bin)
-                    // LINE_BATCH_BINS
-                    * LINE_BATCH_BINS
+                    // LINE_BATCH_WIDTH_BINS
+                    * LINE_BATCH_WIDTH_BINS
                 )
                 start = current
                 for n_periods in range(-1, 3):

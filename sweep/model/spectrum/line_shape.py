@@ -47,7 +47,7 @@ from sweep.model.elementary_functions import sincos_cycles
 from sweep.model.spectrum.lines import SpectrumLayout
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, Window, window_samples
 
-CELLS_PER_BIN = (2, 4)
+TABLE_CELLS_PER_BIN = (2, 4)
 """Number of table cells in a bin of width fs/N: if amplitudes add, and if powers add. fs is the
 sample rate, N the FFT size."""
 
@@ -321,7 +321,7 @@ def line_shape_tables(
     ratio, length = window.length / fft_size, window.length
     table_bins = math.ceil(table_half_width / ratio)
     cell_density, cell_distances = (
-        CELLS_PER_BIN[adds_powers],
+        TABLE_CELLS_PER_BIN[adds_powers],
         _cell_distances(table_bins, adds_powers),
     )
     n_nodes = 4 * ((math.ceil(math.pi * table_half_width) + n_modes) // 4) + 64
@@ -443,7 +443,7 @@ def late_line_shape_tables(
             fft_size=fft_size,
             record_length=window.length,
             table_bins=table_bins,
-            cells_per_bin=CELLS_PER_BIN[adds_powers],
+            cells_per_bin=TABLE_CELLS_PER_BIN[adds_powers],
             adds_powers=adds_powers,
             holds_all_bins=False,
             clearance_bins=math.ceil(clearance_bins / filled_fraction),
@@ -530,7 +530,11 @@ def full_line_shape_tables(
     first_sample
         (segments,): index of the first sample with the echo, by default 0.
     """
-    cells_per_bin, nyquist_bin, length = CELLS_PER_BIN[adds_powers], fft_size // 2, window.length
+    cells_per_bin, nyquist_bin, length = (
+        TABLE_CELLS_PER_BIN[adds_powers],
+        fft_size // 2,
+        window.length,
+    )
     n_cells = cells_per_bin * fft_size
     cell_index = (np.arange(fft_size) - nyquist_bin) * cells_per_bin - np.arange(cells_per_bin)[
         :, None
@@ -729,7 +733,7 @@ def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
 
     Cells that the filter DECONVOLUTION_TAPS needs on each side are included.
     """
-    cells_per_bin = CELLS_PER_BIN[adds_powers]
+    cells_per_bin = TABLE_CELLS_PER_BIN[adds_powers]
     return (
         np.arange(
             -table_bins * cells_per_bin - cells_per_bin + 1 - _TAP_REACH_CELLS,

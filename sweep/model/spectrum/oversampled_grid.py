@@ -9,8 +9,9 @@ Studies do not use them.
 frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
 16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
 follows, a product with the transform of the window's own, and the way back. The improvements
-`real`, `folded` and `degree` are those of docs/accuracy.md. Changes of lines within a record (range
-walk, line width) are skipped, and leakage beyond the grid.
+`uses_real_transform` ("real" in docs/accuracy.md), `transforms_to_bins_only` ("folded") and
+`degree` are described there. Changes of lines within a record (range walk, line width) are skipped,
+and leakage beyond the grid.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from sweep.model.spectrum.lines import (
     fold_lines,
 )
 
-CELLS_PER_BIN = 16
+GRID_CELLS_PER_BIN = 16
 """Number of cells of the frequency grid per FFT bin."""
 
 GRID_CELLS_MIN = 1 << 12
@@ -61,7 +62,7 @@ class GridOptions(NamedTuple):
     uses_real_transform: bool
     """True to transform powers as real numbers. It has effect only if the powers of the lines add.
     """
-    folded: bool
+    transforms_to_bins_only: bool
     """True to transform back to the FFT bins alone, not to all cells."""
 
 
@@ -71,16 +72,16 @@ class GridSpectra(NamedTuple):
     first_bin: np.ndarray
     """(m,): FFT bin number of the first bin of each spectrum."""
     magnitude: np.ndarray
-    """(m, cells / CELLS_PER_BIN): magnitude of each bin [V, summed over the record]."""
+    """(m, cells / GRID_CELLS_PER_BIN): magnitude of each bin [V, summed over the record]."""
 
 
 def find_peaks_on_grid(
     shots: Shots,
     *,
     degree: int = 0,
-    size: int = GRID_CELLS_MIN,
-    real: bool = False,
-    folded: bool = False,
+    n_cells_min: int = GRID_CELLS_MIN,
+    uses_real_transform: bool = False,
+    transforms_to_bins_only: bool = False,
 ) -> np.ndarray:
     """Find the largest bins of each segment's spectrum by FFT on an oversampled grid.
 
@@ -91,12 +92,12 @@ def find_peaks_on_grid(
     degree
         Degree of the polynomial that shares each line out among cells: 0 puts it into the nearest
         cell, 9 shares it among ten cells.
-    size
+    n_cells_min
         Least number of cells of a grid, a power of two. Points whose lines spread farther get more
         cells.
-    real
+    uses_real_transform
         Whether to transform powers as real numbers, if the powers of the lines add.
-    folded
+    transforms_to_bins_only
         Whether to transform back to the bins alone, not to all cells.
 
     Returns
@@ -108,8 +109,8 @@ def find_peaks_on_grid(
     """
     peaks = np.full((3, 6, shots.size), np.nan)
     parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()
-    n_cells_of_point = cells_per_point(shots, size)
-    grid_options = GridOptions(degree, real, folded)
+    n_cells_of_point = cells_per_point(shots, n_cells_min)
+    grid_options = GridOptions(degree, uses_real_transform, transforms_to_bins_only)
     segments = np.flatnonzero(shots.has_segment).tolist()
     for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
         members = np.flatnonzero(n_cells_of_point == cells)
@@ -149,7 +150,7 @@ def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray
     ]
     line_spread = beat_per_ratio * (offset_max + doppler_max) + carrier_max * doppler_max
     line_spread_bins = line_spread * shots.fft_size / shots.sample_rate
-    cells_needed = np.ceil(np.log2(4 * CELLS_PER_BIN * (line_spread_bins + CLEARANCE_BINS)))
+    cells_needed = np.ceil(np.log2(4 * GRID_CELLS_PER_BIN * (line_spread_bins + CLEARANCE_BINS)))
     return np.maximum(cells_min, 2 ** cells_needed.astype(np.int64))
 
 
@@ -177,10 +178,10 @@ def grid_magnitudes(
     grid_options
         Options of :func:`find_peaks_on_grid`.
     """
-    degree, real, folded = grid_options
+    degree, uses_real_transform, transforms_to_bins_only = grid_options
     adds_powers, record_length = shots.footprint.adds_powers, shots.window.length
-    real = real and adds_powers
-    grid = np.zeros((points.size, n_cells), float if real else complex)
+    uses_real_transform = uses_real_transform and adds_powers
+    grid = np.zeros((points.size, n_cells), float if uses_real_transform else complex)
     centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
     _deposit_lines(
         points,
@@ -209,59 +210,72 @@ def grid_magnitudes(
         grid.view(float).reshape(points.size, n_cells, -1),
     )
     window_transform = _window_transform(
-        shots.window.name, record_length, shots.fft_size, n_cells, adds_powers, real
+        shots.window.name, record_length, shots.fft_size, n_cells, adds_powers, uses_real_transform
     )
-    convolved = _convolve_with_window(grid, window_transform, real, folded)
+    convolved = _convolve_with_window(
+        grid, window_transform, uses_real_transform, transforms_to_bins_only
+    )
     # Rounding may make a small sum of squares negative.
     magnitude = np.sqrt(np.maximum(convolved.real, 0.0)) if adds_powers else np.abs(convolved)
-    return GridSpectra(centre_bin - n_cells // (2 * CELLS_PER_BIN), magnitude)
+    return GridSpectra(centre_bin - n_cells // (2 * GRID_CELLS_PER_BIN), magnitude)
 
 
 def _convolve_with_window(
-    grid: np.ndarray, window_transform: np.ndarray, real: bool, folded: bool
+    grid: np.ndarray,
+    window_transform: np.ndarray,
+    uses_real_transform: bool,
+    transforms_to_bins_only: bool,
 ) -> np.ndarray:
     """Convolve powers or amplitudes (rows, cells) with the window; return one value per bin."""
-    n_bins = grid.shape[1] // CELLS_PER_BIN
-    forward_transform, inverse_transform = (fft.rfft, fft.irfft) if real else (fft.fft, fft.ifft)
+    n_bins = grid.shape[1] // GRID_CELLS_PER_BIN
+    forward_transform, inverse_transform = (
+        (fft.rfft, fft.irfft) if uses_real_transform else (fft.fft, fft.ifft)
+    )
     transform = forward_transform(grid, axis=1, overwrite_x=True)
     transform *= window_transform
-    if not folded:
+    if not transforms_to_bins_only:
         return np.asarray(
             inverse_transform(transform, grid.shape[1], axis=1, overwrite_x=True)[
-                :, ::CELLS_PER_BIN
+                :, ::GRID_CELLS_PER_BIN
             ]
         )
-    if real:  # the upper half of the transform is the conjugate of the lower half
-        upper_half = transform[:, :-1].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
+    if uses_real_transform:  # the upper half of the transform is the conjugate of the lower half
+        upper_half = transform[:, :-1].reshape(-1, GRID_CELLS_PER_BIN // 2, n_bins)[
             :, :, : n_bins // 2 + 1
         ]
-        lower_half = transform[:, 1:].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
+        lower_half = transform[:, 1:].reshape(-1, GRID_CELLS_PER_BIN // 2, n_bins)[
             :, :, : n_bins // 2 - 2 : -1
         ]
         transform = upper_half.sum(axis=1) + lower_half.sum(axis=1).conj()
     else:
-        transform = transform.reshape(-1, CELLS_PER_BIN, n_bins).sum(axis=1)
+        transform = transform.reshape(-1, GRID_CELLS_PER_BIN, n_bins).sum(axis=1)
     return (
-        np.asarray(inverse_transform(transform, n_bins, axis=1, overwrite_x=True)) / CELLS_PER_BIN
+        np.asarray(inverse_transform(transform, n_bins, axis=1, overwrite_x=True))
+        / GRID_CELLS_PER_BIN
     )
 
 
 @lru_cache(maxsize=32)
 def _window_transform(
-    window_name: str, length: int, fft_size: int, n_cells: int, adds_powers: bool, real: bool
+    window_name: str,
+    length: int,
+    fft_size: int,
+    n_cells: int,
+    adds_powers: bool,
+    uses_real_transform: bool,
 ) -> np.ndarray:
     """Return the FFT, over the grid's cells, of the window's spectrum with phase 0 at mid-record.
 
     The window's spectrum is an FFT of its samples. If `adds_powers`, its squared magnitude is used.
     """
     cell_offsets = np.concatenate([np.arange(n_cells // 2), np.arange(-n_cells // 2, 0)])
-    transform = fft.fft(windows.window_samples(window_name, length), CELLS_PER_BIN * fft_size)[
+    transform = fft.fft(windows.window_samples(window_name, length), GRID_CELLS_PER_BIN * fft_size)[
         cell_offsets
     ]
-    transform *= np.exp(1j * np.pi * cell_offsets * (length / fft_size / CELLS_PER_BIN))
+    transform *= np.exp(1j * np.pi * cell_offsets * (length / fft_size / GRID_CELLS_PER_BIN))
     if adds_powers:
         transform = np.abs(transform) ** 2
-    return np.asarray(fft.rfft(transform) if real else fft.fft(transform))
+    return np.asarray(fft.rfft(transform) if uses_real_transform else fft.fft(transform))
 
 
 @njit(cache=True, error_model="numpy")
@@ -335,7 +349,7 @@ def _deposit_lines(
             fold_lines(images, n_beamlets, layout)
         for beamlet in range(n_beamlets):
             for line in range(beamlet, n_lines, n_beamlets):
-                cell_position = n_cells // 2 + CELLS_PER_BIN * lines.position[line]
+                cell_position = n_cells // 2 + GRID_CELLS_PER_BIN * lines.position[line]
                 if lowest_cell < cell_position < highest_cell:
                     _deposit_line(
                         grid[i],

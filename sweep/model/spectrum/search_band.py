@@ -22,7 +22,7 @@ from sweep.model import waveform
 from sweep.model.waveform import SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
 
 
-def search_band_bins(
+def search_band_start_and_size(
     parameters: Mapping[str, Any], n_points: int | None = None
 ) -> np.ndarray | None:
     """Return the first bin and the number of bins that are searched, or None if all bins are.
@@ -103,8 +103,8 @@ def n_alarm_bins(
 ) -> np.ndarray:
     """Return the number of bins of a search band that may raise a false alarm, (3, ...).
 
-    ``band_bins`` (3, 2, ...) is the result of :func:`search_band_bins`. In real records (not
-    ``is_signed``) bins closer than ``first_alarm_bin`` to DC or Nyquist raise no alarm.
+    ``band_bins`` (3, 2, ...) is the result of :func:`search_band_start_and_size`. In real records
+    (not ``is_signed``) bins closer than ``first_alarm_bin`` to DC or Nyquist raise no alarm.
     """
     if is_signed:
         return band_bins[:, 1].astype(float)

@@ -727,9 +727,10 @@ def _find_distinct_line_shapes(shots: Shots, batch: np.ndarray) -> DistinctLineS
 
 
 def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray) -> np.ndarray:
-    """Return the phase errors [cycles] of points, (segments, points, positions).
+    """Return the phase errors of the echoes' beats [cycles], summed over all causes.
 
-    ``record_positions`` from -1 to 1 cover the samples of the record that contain the echo.
+    The shape is (segments, points, positions). ``record_positions`` from -1 to 1 are positions in
+    the part of the record that contains the echo.
     """
     phase = np.zeros((len(shots.waveform_segments), points.size, record_positions.size))
     for segment in np.flatnonzero(shots.has_segment):

@@ -48,9 +48,9 @@ from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 GAUSS_ORDER = 4
 """Number of Gauss quadrature points in each interval of QUADRATURE_INTERVAL_EDGES."""
 QUADRATURE_INTERVAL_EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7.5, 9.5, 12, 15, 19, 24, 30, 37.0])
-"""Edges of the quadrature intervals of z^2 / (2 sigma^2), with the magnitude z and the noise sigma.
-They count from the threshold, or from ln n - 4 if that is larger. Below it n bins of noise
-certainly contain a larger magnitude."""
+"""Edges of the quadrature intervals, as increases of u = z^2 / (2 sigma^2) above the lower limit; z
+is the magnitude, sigma the noise per quadrature. The lower limit is the threshold's u, or ln n - 4
+if that is larger: the largest of n bins of noise is almost certainly above ln n - 4."""
 UP, DOPPLER, DOWN = range(3)
 """Indices of the segments in arrays by segment."""
 THRESHOLD_LEVEL_INDEX = 0
@@ -204,7 +204,7 @@ def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> SpanPr
             LevelProbabilities(level_probabilities[s], level_exponents[s], echo_fractions[s])
             for s in (UP, DOWN)
         )
-        _fill_joint_excess(up, down, squared_correlation, joint_excess)
+        _fill_joint_probability_increase(up, down, squared_correlation, joint_excess)
     total_loss = (weight * pd_loss[..., 1:]).sum(axis=-1)
     return SpanProbabilities(
         np.where(segment_exists, total_loss, np.nan),
@@ -379,7 +379,7 @@ def _evaluate_levels(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_joint_excess(up, down, squared_correlation, joint_excess):
+def _fill_joint_probability_increase(up, down, squared_correlation, joint_excess):
     """Compute the increase, due to shared speckle, of the probability that both peaks are right.
 
     Only combinations of levels count in which bins without the echo cross in either segment.

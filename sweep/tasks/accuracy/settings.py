@@ -300,23 +300,28 @@ def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterato
     variants: list[tuple[str, str, int, dict[str, Any]]] = [
         *((THESIS_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),
         *(
-            (IMPROVED_THESIS_KIND, ", real", log2_cells, {"real": True})
+            (IMPROVED_THESIS_KIND, ", real", log2_cells, {"uses_real_transform": True})
             for log2_cells in (11, 12)
             if adds_powers
         ),
         *(
-            (IMPROVED_THESIS_KIND, ", folded", log2_cells, {"folded": True, "real": adds_powers})
+            (
+                IMPROVED_THESIS_KIND,
+                ", folded",
+                log2_cells,
+                {"transforms_to_bins_only": True, "uses_real_transform": adds_powers},
+            )
             for log2_cells in (11, 12)
         ),
         (
             IMPROVED_THESIS_KIND,
             ", folded, degree 9",
             12,
-            {"folded": True, "real": adds_powers, "degree": 9},
+            {"transforms_to_bins_only": True, "uses_real_transform": adds_powers, "degree": 9},
         ),
     ]
     for kind, variant_text, log2_cells, options in variants:
-        grid_options = {"size": 1 << log2_cells} | options
+        grid_options = {"n_cells_min": 1 << log2_cells} | options
         yield AccuracySetting(
             name=f"thesis 2^{log2_cells}{variant_text}",
             kind=kind,

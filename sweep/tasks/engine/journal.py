@@ -422,7 +422,7 @@ def write_checkpoint(
         "seconds": checkpoint.seconds,
         "digest": _content_digest(content),
     }
-    atomic_write(_checkpoint_path(store_path, block), encode_record(header) + content)
+    atomic_write(_block_checkpoint_path(store_path, block), encode_record(header) + content)
 
 
 def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoint:
@@ -497,7 +497,7 @@ def delete_checkpoints(store_path: Location, block: int | str = "*") -> None:
         file.unlink(missing_ok=True)
 
 
-def _checkpoint_path(store_path: Location, block: int) -> Location:
+def _block_checkpoint_path(store_path: Location, block: int) -> Location:
     """Return the path of a block's checkpoint."""
     return store_path / JOURNAL_DIR / f"{CHECKPOINT_FILE_PREFIX}{block}"
 

@@ -152,7 +152,7 @@ class FootprintSpreads(NamedTuple):
         Text parameters in `p` are the same at all points.
         """
         with np.errstate(all="ignore"):
-            places, directions = beam.footprint_angles(p, range_)
+            places, directions = beam.footprint_full_angles(p, range_)
             range_deviation = range_ * places / 4 / np.tan(p["target.grazing_angle"])
         velocity_deviation = np.abs(p["target.transverse_velocity"]) * directions / 4
         return cls(*(np.nan_to_num(v + 0 * range_) for v in (range_deviation, velocity_deviation)))

@@ -39,7 +39,7 @@ class ExtendableStudy(BlockStudy):
         return str(self.spec.id)
 
     @abstractmethod
-    def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
+    def depends_on_tolerance_beyond_effects(self, block: int) -> np.ndarray | bool:
         """Return which points of a block are computed more accurately if the tolerance is smaller.
 
         The result is a mask (points,), or one bool for all points.

@@ -277,7 +277,7 @@ class EyepointStudy(BlockStudy):
             "n_beamlets": self.n_beamlets,
             "pattern": self.spec.beamlet_pattern,
             "jitter": self.spec.pointing_jitter(),
-            "footprint_angles": self.spec.footprint_angles(),
+            "footprint_full_angles": self.spec.footprint_full_angles(),
             "bodies_rotate": self.spec.effect_modes()["rotation"] != "off",
         }
 

@@ -55,7 +55,7 @@ from sweep.tasks.studies.output_layouts import make_output_layout
 from sweep.tasks.studies.parameter_grid import (
     SHOTS_PER_TILE,
     ParameterGrid,
-    flight_block_size,
+    flight_block_size_max,
 )
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
         )
         self.n_draws = int(spec.draws.number)
         _refuse_too_many_shots(spec, self.n_cycles * self.shots_per_cycle)
-        block_shots, block_draws = flight_block_size(
+        block_shots, block_draws = flight_block_size_max(
             spec,
             math.prod(self.axes_shape),
             self.n_cycles * self.shots_per_cycle,
@@ -233,7 +233,7 @@ class FlightStudy(ExtendableStudy):
         """Grids of blocks, one for each scanner."""
         return list(self.scanner_grids.values())
 
-    def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
+    def depends_on_tolerance_beyond_effects(self, block: int) -> np.ndarray | bool:
         """Return True if a smaller tolerance changes shots by more than the choice of effects.
 
         The number of rays, or of the steps of computation, may depend on it too.
@@ -434,7 +434,7 @@ class FlightStudy(ExtendableStudy):
         is_reused, results = reused_cloud or self._empty_cloud(
             scanner_grid, selected_effects.effect_flags.size, n_draws
         )
-        for rows, draw_slice in _iter_missing_draws(~is_reused):
+        for rows, draw_slice in _iter_shots_missing_draws(~is_reused):
             simulate_cloud = partial(self._simulate_cloud, flight_block, draw_slice)
             for shot_rows, part_results in self.iter_simulated_groups(
                 flight_block.scanner,
@@ -447,7 +447,7 @@ class FlightStudy(ExtendableStudy):
                 _insert_results(results, shot_rows, draw_slice, part_results)
         if scanner_grid.has_navigation_solution and solves_navigation:
             is_missing = (~is_reused).reshape(-1, shots_per_cycle, n_draws).any(axis=1)
-            for cycles, draw_slice in _iter_missing_draws(np.asarray(is_missing)):
+            for cycles, draw_slice in _iter_shots_missing_draws(np.asarray(is_missing)):
                 rows = (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel()
                 part_results = self._solve_navigation(
                     shots_per_cycle, shot_arrays, results, rows, draw_slice
@@ -746,7 +746,7 @@ class FlightStudy(ExtendableStudy):
         return [self.get_eyepoint_study(scanner) for scanner in self.scanner_grids]
 
 
-def _iter_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
+def _iter_shots_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
     """Yield groups of shots that lack the same draws, by index, and a slice of these draws."""
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):

@@ -444,7 +444,7 @@ class GridStudy(ExtendableStudy):
         """Grid of the study's points, in a tuple of one."""
         return (self.grid,)
 
-    def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
+    def depends_on_tolerance_beyond_effects(self, block: int) -> np.ndarray | bool:
         """Return which points of a block are computed more accurately if the tolerance is smaller.
 
         The result is a mask (points,), or one bool for all points.
@@ -771,7 +771,7 @@ def _points_per_call(spec: GridSpec) -> int:
 
 
 def batch_sizes(spec: GridSpec) -> list[int]:
-    """Return the number of draws in each batch of a fixed number; the last may be smaller."""
+    """Return the size of each batch of a point's `draws.number` draws; the last may be smaller."""
     n_draws, draws_per_batch = spec.draws.number, spec.draws.batch
     return [min(draws_per_batch, n_draws - first) for first in range(0, n_draws, draws_per_batch)]
 

@@ -100,7 +100,7 @@ def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
     return max(study_cpu_seconds / DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_CPU_SECONDS_MIN)
 
 
-def flight_block_size(
+def flight_block_size_max(
     spec: SceneSpec, n_axis_points: int, n_shots: int, n_draws: int
 ) -> tuple[int, int]:
     """Return upper limits on the shots and on the draws of any block of a flight.
@@ -129,14 +129,14 @@ def flight_block_size(
     block_draws = DEFAULT_BLOCK_DRAWS_MAX
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
     study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
-    tile_draw_seconds = min(n_shots, SHOTS_PER_TILE) * seconds_per_draw
-    cut_tile_seconds = max(
+    seconds_per_draw_of_tile = min(n_shots, SHOTS_PER_TILE) * seconds_per_draw
+    whole_tile_seconds_max = max(
         study_cpu_seconds / DEFAULT_BLOCKS_MIN, 2 * DEFAULT_BLOCK_CPU_SECONDS_MIN
     )
-    draws_per_block_max = max(cut_tile_seconds / tile_draw_seconds, 1)
+    draws_per_block_max = max(whole_tile_seconds_max / seconds_per_draw_of_tile, 1)
     n_draw_blocks = math.ceil(n_draws / min(block_draws, draws_per_block_max))
     block_draws = math.ceil(n_draws / n_draw_blocks)  # a last block is not much smaller
-    tile_seconds = tile_draw_seconds * block_draws
+    tile_seconds = seconds_per_draw_of_tile * block_draws
     tiles_per_block = max(
         int(study_cpu_seconds / DEFAULT_BLOCKS_MIN / tile_seconds),
         math.ceil(DEFAULT_BLOCK_CPU_SECONDS_MIN / tile_seconds),

@@ -14,6 +14,7 @@ from sweep.messages import option_text
 from sweep.model.detection.detectors import cached_window_samples
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, Looks
 from sweep.model.effects.catalogue import EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.waveform import SEGMENT_NAMES
 from sweep.storage.locations import can_create_store, write_path_atomically
 from sweep.storage.size_checks import SingleWriterLocalStore
 from sweep.tasks.engine.progress import StoreError
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
     from sweep.spec import GridSpec
 
-SEGMENT_NAMES = ("up", "doppler", "down")
 FILE_SUFFIXES = (".zarr", ".npz")
 
 

@@ -118,14 +118,18 @@ def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], f
 
 
 def count_unsupported_points(
-    store: str | Location, done_blocks: np.ndarray | None = None
+    store: str | Location, done_block_numbers: np.ndarray | None = None
 ) -> tuple[int, str]:
     """Count unsupported points in a sample. Return the count, and the reason for the first."""
     store_path = parse_location(store)
     _, study = study_loading.read_study_of_blocks(store_path)
     if not isinstance(study, GridStudy):
         return 0, ""
-    (blocks, _), n_unsupported, first_reason = _sample_blocks(store_path, study, done_blocks), 0, ""
+    (blocks, _), n_unsupported, first_reason = (
+        _sample_blocks(store_path, study, done_block_numbers),
+        0,
+        "",
+    )
     for block, (_, (pd_shot,)) in zip(
         blocks, iter_block_values(store_path, study, ("pd_shot",), blocks), strict=True
     ):
@@ -150,23 +154,25 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
 
 
 def _sample_blocks(
-    store: Location, study: BlockStudy, done_blocks: np.ndarray | None
+    store: Location, study: BlockStudy, done_block_numbers: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
     """Return a random sample of the stored blocks, and the fraction of them that it holds.
 
     Equal calls give equal samples.
     """
-    done_blocks = (
-        np.flatnonzero(blocks_with_receipt(store, study)) if done_blocks is None else done_blocks
+    done_block_numbers = (
+        np.flatnonzero(blocks_with_receipt(store, study))
+        if done_block_numbers is None
+        else done_block_numbers
     )
     n_sampled = min(
         SAMPLED_BLOCKS_MAX, max(SAMPLED_POINTS_MAX * study.n_blocks // study.n_points, 1)
     )
-    if len(done_blocks) <= n_sampled:
-        return done_blocks, 1.0
+    if len(done_block_numbers) <= n_sampled:
+        return done_block_numbers, 1.0
     return np.sort(
-        np.random.default_rng(0).choice(done_blocks, n_sampled, replace=False)
-    ), n_sampled / len(done_blocks)
+        np.random.default_rng(0).choice(done_block_numbers, n_sampled, replace=False)
+    ), n_sampled / len(done_block_numbers)
 
 
 def _axis_range_label(axis: Axis, start: int, end: int) -> str:
@@ -354,7 +360,7 @@ class AccuracyRow:
 
 
 def accuracy_rows_of_draws(
-    store: str | Location, done_blocks: np.ndarray | None = None
+    store: str | Location, done_block_numbers: np.ndarray | None = None
 ) -> list[AccuracyRow]:
     """Return a row of errors for each probability whose error the tolerance bounds.
 
@@ -368,14 +374,19 @@ def accuracy_rows_of_draws(
     return [
         row
         for row in _accuracy_rows(
-            store_path, study, done_blocks, error_arrays, "n_draws", _tolerance_over_grid(study)
+            store_path,
+            study,
+            done_block_numbers,
+            error_arrays,
+            "n_draws",
+            _tolerance_over_grid(study),
         )
         if row.n_points
     ]
 
 
 def accuracy_rows_of_rays(
-    store: str | Location, done_blocks: np.ndarray | None = None
+    store: str | Location, done_block_numbers: np.ndarray | None = None
 ) -> list[AccuracyRow]:
     """Return a row of errors by the finite number of rays for each scanner.
 
@@ -389,7 +400,12 @@ def accuracy_rows_of_rays(
             ErrorBudget.rays_tolerance_min,
         )
         rows = _accuracy_rows(
-            store_path, study, done_blocks, {"": "beamlets_error"}, "beamlets", tolerance_limit
+            store_path,
+            study,
+            done_block_numbers,
+            {"": "beamlets_error"},
+            "beamlets",
+            tolerance_limit,
         )
         return [row for row in rows if row.excess]
     if not isinstance(study, FlightStudy) or not study.spec.is_ray_number_set_by_tolerance:
@@ -398,7 +414,12 @@ def accuracy_rows_of_rays(
     for name in study.scanner_grids:
         error_arrays, tolerance = {name: f"{name}/beamlets_error"}, study.spec.accuracy.tolerance
         for row in _accuracy_rows(
-            store_path, study, done_blocks, error_arrays, f"{name}/beamlets", np.asarray(tolerance)
+            store_path,
+            study,
+            done_block_numbers,
+            error_arrays,
+            f"{name}/beamlets",
+            np.asarray(tolerance),
         ):
             if row.n_points:
                 shot_times: Any = group[f"{name}/time"]
@@ -415,7 +436,7 @@ def accuracy_rows_of_rays(
 def _accuracy_rows(
     store_path: Location,
     study: GridStudy | FlightStudy,
-    done_blocks: np.ndarray | None,
+    done_block_numbers: np.ndarray | None,
     error_arrays: Mapping[str, str],
     samples_array: str,
     tolerance: np.ndarray,
@@ -424,7 +445,10 @@ def _accuracy_rows(
 
     ``samples_array`` holds the numbers of draws or rays.
     """
-    (blocks, block_fraction), axes = _sample_blocks(store_path, study, done_blocks), study.spec.axes
+    (blocks, block_fraction), axes = (
+        _sample_blocks(store_path, study, done_block_numbers),
+        study.spec.axes,
+    )
     rows = [AccuracyRow(name, block_fraction=block_fraction) for name in error_arrays]
     tolerance = np.broadcast_to(tolerance, study.output_layout_by_name[samples_array].shape)
     for region, (samples, *error_values) in iter_block_values(
@@ -461,7 +485,7 @@ class Status:
     points_done: int
     blocks: int
     blocks_done: int
-    done_blocks: np.ndarray  # int: block numbers of the blocks that are done, rising
+    done_block_numbers: np.ndarray  # int: block numbers of the blocks that are done, rising
     points_in_unfinished_blocks: float  # number of points done in unfinished blocks
     failures: dict[int, dict[str, Any]]  # last failure by block that is not done
     lock_holder: journal.LockHolder | None  # process that holds the lock
@@ -528,7 +552,7 @@ def status(store: str | Location) -> Status:
         points_done=points_done,
         blocks=study.n_blocks,
         blocks_done=receipts.n_committed_blocks,
-        done_blocks=np.flatnonzero(receipts.points_by_block),
+        done_block_numbers=np.flatnonzero(receipts.points_by_block),
         points_in_unfinished_blocks=sum(read_checkpoint_points(store_path, study.id).values()),
         failures=journal.read_permanent_failures(store_path, study.n_blocks),
         lock_holder=holder,

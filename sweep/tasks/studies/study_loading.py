@@ -231,7 +231,9 @@ class ReuseSource:
         )
         is_reusable = source_grid_indices >= 0
         if self._has_other_tolerance:
-            is_reusable = is_reusable & ~np.asarray(self._target_study.depends_on_tolerance(block))
+            is_reusable = is_reusable & ~np.asarray(
+                self._target_study.depends_on_tolerance_beyond_effects(block)
+            )
         local_indices = np.flatnonzero(is_reusable)
         source_blocks, source_local_indices = source_grid.locate_points(
             source_grid_indices[local_indices]
@@ -292,14 +294,14 @@ class ReuseSource:
         """Arrays of the smaller study's store, opened once."""
         return open_verified_group(self._source_path)
 
-    def reuse_remark(self) -> str:
+    def reuse_obstacle_remark(self) -> str:
         """Return a remark if some of the stored results can't be reused as they are; else ''."""
         if not (self.has_final_results or self.has_first_draws):
             return "whole spectra are drawn anew"
         remarks = ["points that are there are drawn further"] if self.has_first_draws else []
         spec = self._target_study.spec
         has_closer_points = self._has_other_tolerance and np.any(
-            self._target_study.depends_on_tolerance(0)
+            self._target_study.depends_on_tolerance_beyond_effects(0)
         )
         if self._has_other_tolerance and isinstance(spec, SceneSpec) and not has_closer_points:
             remarks.append("shots that call for more effects with the tolerance are computed anew")
@@ -324,7 +326,7 @@ def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
         n_points_there += sum(
             study.count_reusable_points_of_block(int(block)) for block in np.flatnonzero(~is_done)
         )
-        remark = study.reuse_source.reuse_remark()
+        remark = study.reuse_source.reuse_obstacle_remark()
     count_text = f"{n_points_there:,} of {study.n_points:,} {study.points_noun} are there; "
     count_text += f"{study.n_points - n_points_there:,} to compute"
     return f"{count_text} ({remark})" if remark else count_text
