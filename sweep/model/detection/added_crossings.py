@@ -25,6 +25,7 @@ import math
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
+from sweep.model.kernel_integers import INTEGER_ZERO, STEP_DOWN, STEP_UP
 
 BINS_PER_BATCH = 256
 """Number of spectrum bins in one call of the evaluation of the crossing series."""
@@ -337,9 +338,10 @@ def exclude_bins_joining_echo(
         while gap_end < end_index and not is_exempt[gap_end]:
             gap_end += 1
         n_bins = gap_end - gap_begin
-        n_joining_below, n_joining_above, p_join_below, p_join_above = 0, 0, 0.0, 0.0
+        n_joining_below, n_joining_above = INTEGER_ZERO, INTEGER_ZERO
+        p_join_below, p_join_above = 0.0, 0.0
         if n_bins > 0 and gap_begin > first_index and probabilities[gap_begin] > 0.0:
-            n_joining_below = _count_joining_bins(probabilities, gap_begin, 1, n_bins)
+            n_joining_below = _count_joining_bins(probabilities, gap_begin, STEP_UP, n_bins)
             p_join_below = edge_crossing_probability(
                 magnitudes[gap_begin - 1] / noise_sigma,
                 magnitudes[gap_begin] / noise_sigma,
@@ -347,7 +349,7 @@ def exclude_bins_joining_echo(
                 sidelobe_bin_noise_correlation,
             )
         if n_bins > 0 and gap_end < end_index and probabilities[gap_end - 1] > 0.0:
-            n_joining_above = _count_joining_bins(probabilities, gap_end - 1, -1, n_bins)
+            n_joining_above = _count_joining_bins(probabilities, gap_end - 1, STEP_DOWN, n_bins)
             p_join_above = edge_crossing_probability(
                 magnitudes[gap_end] / noise_sigma,
                 magnitudes[gap_end - 1] / noise_sigma,
@@ -356,14 +358,14 @@ def exclude_bins_joining_echo(
             )
         if n_joining_below + n_joining_above > n_bins:
             _fill_further_group_probability(
-                probabilities, gap_begin, 1, n_bins, p_join_below, p_join_above
+                probabilities, gap_begin, STEP_UP, n_bins, p_join_below, p_join_above
             )
         else:
             _fill_further_group_probability(
-                probabilities, gap_begin, 1, n_joining_below, p_join_below, 0.0
+                probabilities, gap_begin, STEP_UP, n_joining_below, p_join_below, 0.0
             )
             _fill_further_group_probability(
-                probabilities, gap_end - 1, -1, n_joining_above, p_join_above, 0.0
+                probabilities, gap_end - 1, STEP_DOWN, n_joining_above, p_join_above, 0.0
             )
         gap_end += 1
 

@@ -30,6 +30,7 @@ from sweep.model.detection.speckle_modes import (
     locate_in_mode_table,
     power_asymmetry,
 )
+from sweep.model.kernel_integers import INTEGER_ONE, INTEGER_ZERO, NO_INDEX
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
 """Standard deviation of |X| in a bin of noise alone, in units of the noise deviation per
@@ -823,7 +824,7 @@ def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_s
     root mean square |X| of the bin's signal [V], ``bin_`` its number.
     """
     noise = bin_threshold.noise_without_pedestal
-    bins_given_mode = _zero_bins_given_mode(1)
+    bins_given_mode = _zero_bins_given_mode(INTEGER_ONE)
     bins_given_mode.signal[:] = magnitude / noise
     bins_given_mode.threshold[:] = bin_threshold.threshold / noise
     bins_given_mode.pedestal[:] = (bin_threshold.line_noise / noise) ** 2 - 1.0
@@ -1041,7 +1042,7 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     largest = 0.0
     for i in range(magnitude.size):
         largest = max(largest, magnitude[i] if is_echo[i] else 0.0)
-    pd, miss, run_begin, i, n_runs = 0.0, 1.0, 0, 0, 0
+    pd, miss, run_begin, i, n_runs = 0.0, 1.0, INTEGER_ZERO, INTEGER_ZERO, 0
     while i < magnitude.size:
         echo_begin, has_strong_bin = i, False
         while i < magnitude.size and is_echo[i]:
@@ -1224,7 +1225,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
     """
     is_echo = echo.is_echo
     z_first = z_last = z_middle = _MODE_MAGNITUDE_MAX
-    pedestal_ratio_max, strongest_index = 0.0, -1
+    pedestal_ratio_max, strongest_index = 0.0, NO_INDEX
     for k in range(is_echo.size):
         pedestal_ratio_max = max(pedestal_ratio_max, bins_given_mode.pedestal[k])
         if is_echo[k] and bins_given_mode.signal[k] > 0.0:

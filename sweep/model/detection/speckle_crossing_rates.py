@@ -21,6 +21,7 @@ import numpy as np
 from sweep.kernel_cache import njit
 from sweep.model.detection.added_crossings import crossing_rate, fill_added_crossings
 from sweep.model.detection.marcum import marcum_q1_tails
+from sweep.model.kernel_integers import INTEGER_ZERO
 
 SPECKLE_POWER_MAX = 16.0
 """Largest speckle power (mean 1) in averages over the fading of leaked signal. A fraction e^-16 of
@@ -202,7 +203,7 @@ def fill_rate_table(threshold_ratio, crossing_series, arrays):
         arrays.rates,
     )
     n_entries = grid.entries_per_power * grid.n_columns
-    n_below_threshold = 0
+    n_below_threshold = INTEGER_ZERO
     for k in range(n_entries):
         amplitude = math.exp(grid.log_amplitude_first + grid.log_amplitude_step * k)
         squared_amplitudes[k] = amplitude * amplitude

@@ -26,6 +26,7 @@ import numpy as np
 from sweep.kernel_cache import njit
 from sweep.model.detection.echo_detection import mark_exempt_bins
 from sweep.model.elementary_functions import sincos_cycles
+from sweep.model.kernel_integers import INTEGER_ZERO
 from sweep.model.spectrum.line_shape import (
     KERNEL_BASIS,
     KERNEL_CELLS,
@@ -42,10 +43,6 @@ from sweep.model.spectrum.lines import (
     LineScratch,
     replace_lines_by_nodes,
 )
-
-INTEGER_ZERO = np.int64(0)
-"""The integer 0 as an argument of compiled functions. Numba would compile them anew for a literal
-0."""
 
 FAR_BINS_PER_BATCH = 128
 """Number of frequency bins per pass of the calculation far from the lines."""

@@ -56,10 +56,10 @@ from sweep.model.detection.speckle_crossing_rates import (
     count_entry_weights,
     rate_at_brightest_speckle,
 )
+from sweep.model.kernel_integers import INTEGER_ZERO, STEP_DOWN, STEP_UP
 from sweep.model.spectrum.bin_spectrum import (
     FAR_LINE_EXTRA_LOG_ACCURACY,
     FAR_LINE_LOG_ACCURACY,
-    INTEGER_ZERO,
     AveragingShifts,
     DetectedSpan,
     add_line_by_record_ends,
@@ -463,7 +463,7 @@ def _mean_leakage_over_speckle(
         np.zeros(n_listed_max),
     )
     magnitudes, is_echo = np.zeros(n_listed_max), np.zeros(n_listed_max, np.bool_)
-    n_listed, is_gap_listed = 0, True
+    n_listed, is_gap_listed = INTEGER_ZERO, True
     entry_weights = np.zeros(count_entry_weights(speckle_rates))
     for i in range(first_index, end_index):
         squared_ratio = span.magnitude[i] * span.magnitude[i] * scale
@@ -533,11 +533,11 @@ def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates)
             gap_end += 1
         if gap_end > gap_begin and gap_begin > first_index:
             n_listed_max += 2 + _mark_bins_that_may_all_cross(
-                gap_begin, 1, gap_end - gap_begin, noise_sigma, span, speckle_rates
+                gap_begin, STEP_UP, gap_end - gap_begin, noise_sigma, span, speckle_rates
             )
         if gap_end > gap_begin and gap_end < end_index:
             n_listed_max += 2 + _mark_bins_that_may_all_cross(
-                gap_end - 1, -1, gap_end - gap_begin, noise_sigma, span, speckle_rates
+                gap_end - 1, STEP_DOWN, gap_end - gap_begin, noise_sigma, span, speckle_rates
             )
         gap_end += 1
     return n_listed_max

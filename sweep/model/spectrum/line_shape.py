@@ -415,7 +415,7 @@ def late_window_samples(
     fraction = np.asarray(n_samples)[..., None] / window.length
     record_position = 1.0 - fraction * (1.0 - late_position)
     coefficients = [float(coefficient) for coefficient in COSINE_SUM_COEFFICIENTS[window.name]]
-    return np.asarray(
+    return np.ascontiguousarray(  # kernels are compiled anew for other orders of dimensions
         sum(
             coefficient * np.cos(np.pi * m * record_position)
             for m, coefficient in enumerate(coefficients)

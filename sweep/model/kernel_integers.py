@@ -1,0 +1,18 @@
+"""Integers as arguments of compiled functions.
+
+Numba compiles a function anew for each literal integer among its arguments, and for a variable that
+begins as a literal. A constant from here, or a variable that begins as one, has the type of all
+other integers.
+
+>>> STEP_UP + STEP_DOWN == INTEGER_ZERO
+np.True_
+"""
+
+import numpy as np
+
+INTEGER_ZERO = np.int64(0)
+INTEGER_ONE = np.int64(1)
+NO_INDEX = np.int64(-1)
+"""Index that stands for none."""
+STEP_UP, STEP_DOWN = np.int64(1), np.int64(-1)
+"""Steps from a bin to the next one above and below."""
