@@ -26,11 +26,18 @@ from sweep.model.detection.estimators import (
     ESTIMATOR_PREFIX,
     SPECTRUM_METHOD_DEFAULTS,
 )
-from sweep.model.effects import circulator_leak, iq_imbalance
+from sweep.model.effects import circulator_leak
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
-from sweep.model.effects.noise_sources import SUN_RADIUS
 from sweep.model.effects.phase_errors import ERROR_TABLE_PATH, NO_TABLE
+from sweep.model.effects.requirements import (
+    ValueCondition,
+    condition_different_from,
+    condition_equal_to,
+    exceeds_one,
+    is_positive,
+    is_zero,
+)
 from sweep.model.effects.sweep_error_table import fit_sweep_frequency_error
 from sweep.model.link_budget import RECORD_PATH
 from sweep.model.waveform import SEARCH_BAND_PATHS, SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
@@ -51,8 +58,6 @@ FFT_SIZE_PATH = "instrument.processing.fft_size"
 WINDOW_PATH = "instrument.processing.window"
 RESPONSIVITY_PATH = "instrument.receiver.responsivity"
 ANTIALIAS_BANDWIDTH_PATH = "instrument.receiver.antialias_bandwidth"
-EXTINCTION_PATH = "atmosphere.extinction"
-FULL_SCALE_PATH = "instrument.processing.full_scale"
 DETECTION_PATH = "instrument.processing.detection"
 BINS_COUNTED_PATH = "instrument.processing.bins_counted"
 LINE_WIDTH_PATH, LINE_SHAPE_PATH = "instrument.laser.line_width", "instrument.laser.line_shape"
@@ -74,9 +79,6 @@ exists with more.
 """
 _SPECTRUM_BINS_MIN = 8
 """Minimum number of bins of a spectrum for detectors that examine the whole spectrum."""
-
-ValueCondition = Callable[[Any], Any]
-"""Function that maps a parameter's values (n,) to bool (n,): True where a condition is met."""
 
 
 @dataclass(frozen=True)
@@ -195,26 +197,6 @@ def _meets_conditions(axis: Axis, conditions: Mapping[str, ValueCondition]) -> n
         if parameter.path in conditions:
             is_met &= conditions[parameter.path](np.asarray(parameter.values))
     return is_met
-
-
-def _condition_equal_to(expected: str | float) -> ValueCondition:
-    """Return the condition that values equal `expected`."""
-    return lambda values: values == expected
-
-
-def _condition_different_from(unwanted: str | float) -> ValueCondition:
-    """Return the condition that values differ from `unwanted`."""
-    return lambda values: values != unwanted
-
-
-def _is_positive(values: np.ndarray) -> np.ndarray:
-    """Return a mask (n,) of values above 0."""
-    return values > 0
-
-
-def _is_zero(values: np.ndarray) -> np.ndarray:
-    """Return a mask (n,) of values equal to 0."""
-    return values == 0
 
 
 def grid_findings(grid: GridValues) -> list[Finding]:
@@ -437,8 +419,8 @@ def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
 # Beams
 
 _SINGLE_MODE_CONDITIONS = {
-    beam.COUPLING_PATH: _condition_equal_to(beam.SINGLE_MODE),
-    beam.ARCHITECTURE_PATH: _condition_different_from("direct"),
+    beam.COUPLING_PATH: condition_equal_to(beam.SINGLE_MODE),
+    beam.ARCHITECTURE_PATH: condition_different_from("direct"),
 }
 """Conditions on parameters under which a coherent receiver couples to a single spatial mode."""
 
@@ -449,10 +431,10 @@ def _beam_findings(grid: GridValues) -> Iterator[Finding]:
         beam.WAVELENGTH_PATH, beam.APERTURE_DIAMETER_PATH, beam.DIVERGENCE_PATH, beam.WAIST_PATH
     ):
         return
-    if grid.any_point_meets({beam.DIVERGENCE_PATH: _is_zero, beam.WAIST_PATH: _is_zero}):
+    if grid.any_point_meets({beam.DIVERGENCE_PATH: is_zero, beam.WAIST_PATH: is_zero}):
         problem = "must be given, or beam_waist in its place"
         yield grid.make_finding(beam.DIVERGENCE_PATH, problem, "write e.g. '50 urad'")
-    elif grid.any_point_meets({beam.DIVERGENCE_PATH: _is_positive, beam.WAIST_PATH: _is_positive}):
+    elif grid.any_point_meets({beam.DIVERGENCE_PATH: is_positive, beam.WAIST_PATH: is_positive}):
         problem = "is given in addition to beam_divergence, and each follows from the other"
         yield grid.make_finding(beam.WAIST_PATH, problem, "leave one of them out")
     else:
@@ -480,7 +462,7 @@ def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
         widest = _argmax_of_product(
             grid,
             {path: 1.0, beam.APERTURE_DIAMETER_PATH: -1.0},
-            _SINGLE_MODE_CONDITIONS | {path: _is_positive},
+            _SINGLE_MODE_CONDITIONS | {path: is_positive},
         )
         if widest and widest[path] > widest[beam.APERTURE_DIAMETER_PATH] / 2:
             problem = (
@@ -491,7 +473,7 @@ def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
                 path, problem, f"take a smaller one, or a larger aperture, {remedy}"
             )
         powers = {beam.QUALITY_PATH: 1.0, beam.WAVELENGTH_PATH: 1.0, path: -1.0}
-        narrowest_waist = _argmax_of_product(grid, powers, {path: _is_positive})
+        narrowest_waist = _argmax_of_product(grid, powers, {path: is_positive})
         if narrowest_waist and narrowest_waist[path] < (
             waist_min := _divergence_or_waist(narrowest_waist, beam.FOOTPRINT_ANGLE_MAX)
         ):
@@ -522,8 +504,8 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
         M^2, wavelength lambda and aperture diameter D.
     """
     for conditions in (
-        {beam.COUPLING_PATH: _condition_equal_to(beam.APERTURE)},
-        {beam.ARCHITECTURE_PATH: _condition_equal_to("direct")},
+        {beam.COUPLING_PATH: condition_equal_to(beam.APERTURE)},
+        {beam.ARCHITECTURE_PATH: condition_equal_to("direct")},
     ):
         if narrowest := _narrowest_impossible_beam(GridValues(values, axes), conditions):
             narrow_beam, limit = narrowest
@@ -552,7 +534,7 @@ def _narrowest_impossible_beam(
         (beam.DIVERGENCE_PATH, beam.APERTURE_DIAMETER_PATH),
     )
     powers = dict.fromkeys(rising, 1.0) | dict.fromkeys(falling, -1.0)
-    narrowest = _argmax_of_product(grid, powers, {**conditions, beam.DIVERGENCE_PATH: _is_positive})
+    narrowest = _argmax_of_product(grid, powers, {**conditions, beam.DIVERGENCE_PATH: is_positive})
     if narrowest and narrowest[beam.DIVERGENCE_PATH] < (
         limit := _divergence_or_waist(narrowest, narrowest[beam.APERTURE_DIAMETER_PATH] / 2)
     ):
@@ -598,30 +580,25 @@ A look is one record of each segment (chirp).
 """
 
 
-def _exceeds_one(number: np.ndarray) -> np.ndarray:
-    """Return a mask (n,) of values above 1."""
-    return number > 1
-
-
 def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in the settings of several looks, the repeated records of each segment.
 
     The settings contradict each other, or their detection probability is unknown.
     """
-    several_looks: dict[str, ValueCondition] = {looks.LOOKS_NUMBER_PATH: _exceeds_one}
+    several_looks: dict[str, ValueCondition] = {looks.LOOKS_NUMBER_PATH: exceeds_one}
     combined_by_bin: dict[str, ValueCondition] = {
-        looks.LOOKS_COMBINE_PATH: _condition_different_from(looks.COMBINE_COHERENT),
+        looks.LOOKS_COMBINE_PATH: condition_different_from(looks.COMBINE_COHERENT),
         **several_looks,
     }
     added_in_amplitude: dict[str, ValueCondition] = {
-        looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_COHERENT),
+        looks.LOOKS_COMBINE_PATH: condition_equal_to(looks.COMBINE_COHERENT),
         **several_looks,
     }
     voted_on: dict[str, ValueCondition] = {
-        looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_BINARY),
+        looks.LOOKS_COMBINE_PATH: condition_equal_to(looks.COMBINE_BINARY),
         **several_looks,
     }
-    if grid.any_point_meets(combined_by_bin | {DETECTION_PATH: _condition_equal_to("any_bin")}):
+    if grid.any_point_meets(combined_by_bin | {DETECTION_PATH: condition_equal_to("any_bin")}):
         problem = "detects by the largest bin of an echo where several records are not added in "
         problem += "amplitude: the chance that any of its bins does is known for one record alone"
         yield grid.make_finding(
@@ -650,21 +627,21 @@ def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
         yield grid.make_finding(looks.LOOKS_VOTES_PATH, problem, "lower it, or take more looks")
     if grid.any_point_meets(
         added_in_amplitude
-        | {looks.LOOKS_SPECKLE_PATH: _condition_equal_to(looks.SPECKLE_INDEPENDENT)}
+        | {looks.LOOKS_SPECKLE_PATH: condition_equal_to(looks.SPECKLE_INDEPENDENT)}
     ):
         problem = "gives each record a phase of its own, in which amplitudes do not add up"
         yield grid.make_finding(looks.LOOKS_SPECKLE_PATH, problem, "take common, or combine: power")
     if grid.any_point_meets(
         added_in_amplitude
-        | {LINE_WIDTH_PATH: _is_positive, LINE_SHAPE_PATH: _condition_equal_to("gaussian")}
+        | {LINE_WIDTH_PATH: is_positive, LINE_SHAPE_PATH: condition_equal_to("gaussian")}
     ):
         problem = "does not determine the phase from one record to the next, which the sum needs"
         yield grid.make_finding(LINE_SHAPE_PATH, problem, "take lorentzian, or combine: power")
     if grid.any_point_meets(
         combined_by_bin
         | {
-            looks.LOOKS_SPECKLE_PATH: _condition_equal_to(looks.SPECKLE_INDEPENDENT),
-            ROUGHNESS_PATH: _is_positive,
+            looks.LOOKS_SPECKLE_PATH: condition_equal_to(looks.SPECKLE_INDEPENDENT),
+            ROUGHNESS_PATH: is_positive,
         }
     ):
         problem = "is drawn once a shot for a surface of stated roughness, for all its records"
@@ -672,9 +649,9 @@ def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
         yield grid.make_finding(looks.LOOKS_SPECKLE_PATH, problem, remedy)
     if grid.any_point_meets(
         {
-            looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_POWER),
+            looks.LOOKS_COMBINE_PATH: condition_equal_to(looks.COMBINE_POWER),
             **several_looks,
-            DETECTOR_PREFIX + "kind": _condition_different_from(FIXED_THRESHOLD),
+            DETECTOR_PREFIX + "kind": condition_different_from(FIXED_THRESHOLD),
         }
     ):
         problem = "sets its threshold by the noise of one record, and here powers are averaged"
@@ -688,14 +665,14 @@ def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
     Looks are repeated records of each segment.
     """
     if method != "probabilities" and grid.any_point_meets(
-        {circulator_leak.LEAK_LENGTH_PATH: _is_positive}
+        {circulator_leak.LEAK_LENGTH_PATH: is_positive}
     ):
         problem = "draws noise, and instrument.telescope.leak_path has a line that is not drawn"
         yield Finding(("draws", "method"), problem, "take draws.method: probabilities", method)
     if method == "noise" and grid.any_point_meets(
         {
-            looks.LOOKS_NUMBER_PATH: _exceeds_one,
-            looks.LOOKS_COMBINE_PATH: _condition_different_from(looks.COMBINE_COHERENT),
+            looks.LOOKS_NUMBER_PATH: exceeds_one,
+            looks.LOOKS_COMBINE_PATH: condition_different_from(looks.COMBINE_COHERENT),
         }
     ):
         problem = (
@@ -721,7 +698,7 @@ def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
             yield grid.make_finding(
                 high, f"must exceed {low}, and is {-least_span:.6g} below", "raise it"
             )
-    if not missing_ends and grid.any_point_meets({BINS_COUNTED_PATH: _condition_equal_to("all")}):
+    if not missing_ends and grid.any_point_meets({BINS_COUNTED_PATH: condition_equal_to("all")}):
         problem = "counts bins that instrument.processing.search leaves out"
         yield grid.make_finding(
             BINS_COUNTED_PATH, problem, "write 'bins_counted: half', or leave the band out"
@@ -729,127 +706,6 @@ def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 # Effects
-
-
-class ParameterRequirement(NamedTuple):
-    """Requirement of one parameter on another: values of one exclude values of the other."""
-
-    path: str
-    """Dotted path of the parameter that has the requirement."""
-    applies_to: ValueCondition
-    """Condition on its values for which the requirement applies."""
-    other_path: str
-    """Dotted path of the required parameter."""
-    is_broken_by: ValueCondition
-    """Condition on the values of the required parameter that break the requirement."""
-    problem: str
-    """Text of the finding: the end of a sentence about `path`."""
-    remedy: str
-    """Text of the remedy, as an imperative clause."""
-    applies_if_forced_on: bool = False
-    """True if the requirement applies, at any value of the parameter, when its effect is ``on``."""
-
-
-def _positive_value_requirement(
-    path: str, applies_to: ValueCondition, other_path: str
-) -> ParameterRequirement:
-    """Return the requirement that another parameter is not 0."""
-    return ParameterRequirement(
-        path,
-        applies_to,
-        other_path,
-        _is_zero,
-        f"needs {other_path}, which is 0",
-        f"set {other_path}",
-    )
-
-
-_SINGLE_MODE_PROBLEM_AND_REMEDY = (
-    "counts by the mode that a coherent receiver sees, and here all light in the aperture does",
-    "take a coherent receiver of coupling: single_mode",
-)
-EFFECT_PARAMETER_REQUIREMENTS = (
-    *(
-        ParameterRequirement(
-            path,
-            lambda value: value != 0,
-            other,
-            _condition_equal_to(word),
-            *_SINGLE_MODE_PROBLEM_AND_REMEDY,
-        )
-        for path in (beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH)
-        for other, word in ((beam.COUPLING_PATH, beam.APERTURE), (beam.ARCHITECTURE_PATH, "direct"))
-    ),
-    *(
-        ParameterRequirement(
-            path,
-            _condition_different_from(default),
-            RECORD_PATH,
-            _condition_equal_to("real"),
-            "is one of I and Q, and the record is real",
-            "set instrument.receiver.record: complex",
-        )
-        for path, default in (
-            (iq_imbalance.GAIN_IMBALANCE_PATH, 1.0),
-            (iq_imbalance.PHASE_IMBALANCE_PATH, 0.0),
-        )
-    ),
-    _positive_value_requirement("instrument.processing.bits", _is_positive, FULL_SCALE_PATH),
-    ParameterRequirement(
-        circulator_leak.LEAK_LENGTH_PATH,
-        _is_positive,
-        circulator_leak.ISOLATION_PATH,
-        lambda ratio: ratio >= 1e30,
-        "is that of light which leaks, and none does at an isolation of 300 dB",
-        "set instrument.telescope.isolation",
-    ),
-    ParameterRequirement(
-        circulator_leak.LEAK_LENGTH_PATH,
-        _is_positive,
-        looks.LOOKS_NUMBER_PATH,
-        _exceeds_one,
-        "is that of a line which is known in one record of each segment alone",
-        "take instrument.looks.number: 1",
-    ),
-    ParameterRequirement(
-        circulator_leak.LEAK_LENGTH_PATH,
-        _is_positive,
-        SEARCH_RANGE_PATHS[0],
-        _is_positive,
-        "is that of a line which masks bins, and no law joins that with a search band",
-        "leave instrument.processing.search out",
-    ),
-    _positive_value_requirement(
-        "atmosphere.profile", lambda p: np.isin(p, ("exponential", "layer")), EXTINCTION_PATH
-    ),
-    ParameterRequirement(
-        "target.roughness",
-        _is_positive,
-        beam.ARCHITECTURE_PATH,
-        _condition_equal_to("direct"),
-        "makes speckle, and direct detection averages an unknown number of speckle grains",
-        "take a coherent receiver",
-        applies_if_forced_on=True,
-    ),
-    ParameterRequirement(
-        "target.roughness",
-        _is_positive,
-        "footprint.speckle",
-        _condition_equal_to("developed"),
-        "states the roughness of the target, which is unlimited in developed speckle",
-        "set footprint.speckle: none",
-    ),
-    ParameterRequirement(
-        "target.sun_distance",
-        lambda distance: (distance > 0) & (distance < SUN_RADIUS),
-        beam.WAVELENGTH_PATH,
-        _is_positive,
-        f"must be 0, for no sun, or at least the sun's radius, {SUN_RADIUS:g} m",
-        "set it to 1 au or so",
-    ),
-)
-"""Pairs of parameter values that a spec must not combine, with problem and remedy. One parameter of
-each pair belongs to an effect."""
 
 
 def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:
@@ -865,27 +721,24 @@ def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:
 
 def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding for each broken requirement of an effect that is not off."""
-    for requirement in EFFECT_PARAMETER_REQUIREMENTS:
-        owning_effect = next(
-            effect
-            for effect in EFFECTS
-            if any(parameter.path == requirement.path for parameter in effect.parameters)
-        )
-        mode = grid.effect_modes.get(owning_effect.name, OFF)
-        remedy = f"{requirement.remedy}, or effects.{owning_effect.name}: off"
-        if mode != OFF and grid.any_point_meets(
-            {
-                requirement.path: requirement.applies_to,
-                requirement.other_path: requirement.is_broken_by,
-            }
-        ):
-            yield grid.make_finding(requirement.path, requirement.problem, remedy)
-        elif (
-            requirement.applies_if_forced_on
-            and mode == ON
-            and grid.any_point_meets({requirement.other_path: requirement.is_broken_by})
-        ):
-            yield _mode_finding(owning_effect.name, requirement.problem, remedy)
+    for effect in EFFECTS:
+        mode = grid.effect_modes.get(effect.name, OFF)
+        if mode == OFF:
+            continue
+        for parameter in effect.parameters:
+            for requirement in parameter.requirements:
+                applies_to = requirement.applies_to or condition_different_from(parameter.default)
+                remedy = f"{requirement.remedy}, or effects.{effect.name}: off"
+                if grid.any_point_meets(
+                    {parameter.path: applies_to, requirement.other_path: requirement.is_broken_by}
+                ):
+                    yield grid.make_finding(parameter.path, requirement.problem, remedy)
+                elif (
+                    requirement.applies_if_forced_on
+                    and mode == ON
+                    and grid.any_point_meets({requirement.other_path: requirement.is_broken_by})
+                ):
+                    yield _mode_finding(effect.name, requirement.problem, remedy)
 
 
 def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
@@ -896,8 +749,8 @@ def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
     """
     if grid.any_point_meets(
         {
-            RECORD_PATH: _condition_equal_to("complex"),
-            beam.ARCHITECTURE_PATH: _condition_equal_to("direct"),
+            RECORD_PATH: condition_equal_to("complex"),
+            beam.ARCHITECTURE_PATH: condition_equal_to("direct"),
         }
     ):
         problem = "samples I and Q, and direct detection has only one of them"
@@ -913,8 +766,8 @@ def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
         )
     if grid.any_point_meets(
         {
-            ANTIALIAS_BANDWIDTH_PATH: _is_positive,
-            "instrument.receiver.noise_shape": _condition_equal_to("white"),
+            ANTIALIAS_BANDWIDTH_PATH: is_positive,
+            "instrument.receiver.noise_shape": condition_equal_to("white"),
         }
     ):
         problem = "shapes the noise, which noise_shape: white leaves as it is"
@@ -965,23 +818,23 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
             )
             yield _mode_finding(effect.name, problem, f"leave it out{instead_text}")
     yield from spectrum_method_findings(draws, grid)
-    if grid.any_point_meets({waveform.SHOT_DETECTION_PATH: _condition_equal_to(waveform.ANY_TWO)}):
+    if grid.any_point_meets({waveform.SHOT_DETECTION_PATH: condition_equal_to(waveform.ANY_TWO)}):
         problem, remedy = "is not known to flights, which pair peaks", "take both_chirps"
         yield grid.make_finding(
             waveform.SHOT_DETECTION_PATH, problem, f"{remedy}, or study a flat target"
         )
     if not draws.draws_whole_spectra and grid.any_point_meets(
-        {waveform.PEAKS_PATH: _condition_equal_to(waveform.STRONGEST_PEAK)}
+        {waveform.PEAKS_PATH: condition_equal_to(waveform.STRONGEST_PEAK)}
     ):
         problem = f"is found in whole spectra, which draws.method {draws.method!r} does not draw"
         yield grid.make_finding(
             waveform.PEAKS_PATH, problem, f"set draws.method: {SPECTRA_METHOD}, or take all"
         )
     voted_on = {
-        looks.LOOKS_NUMBER_PATH: _exceeds_one,
-        looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_BINARY),
+        looks.LOOKS_NUMBER_PATH: exceeds_one,
+        looks.LOOKS_COMBINE_PATH: condition_equal_to(looks.COMBINE_BINARY),
     }
-    if grid.any_point_meets(voted_on | {"footprint.speckle": _condition_equal_to("developed")}):
+    if grid.any_point_meets(voted_on | {"footprint.speckle": condition_equal_to("developed")}):
         problem = "counts records, and flights draw no powers of echoes that fade in several"
         yield grid.make_finding(
             looks.LOOKS_COMBINE_PATH, problem, "take power, or footprint.speckle: none"
@@ -1000,7 +853,7 @@ def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parame
             for parameter in effect.parameters:
                 # A parameter whose default is not neutral (0, 0 dB, none) configures its effect
                 # only.
-                is_not_default = _condition_different_from(parameter.default)  # type: ignore[arg-type]
+                is_not_default = condition_different_from(parameter.default)  # type: ignore[arg-type]
                 if parameter.enables_effect and grid.any_point_meets(
                     {parameter.path: is_not_default}
                 ):

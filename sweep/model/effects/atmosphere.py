@@ -32,6 +32,7 @@ from sweep.model.effects import noise_sources
 from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.effects.requirements import positive_value_requirement
 from sweep.model.link_budget import BEAM_ELEVATION_PATH, LASER_PREFIX, TELESCOPE_PREFIX
 from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
@@ -284,6 +285,12 @@ EXTINCTION = Effect(
             "layer",
             default="none",
             options=("none", *EXTINCTION_PROFILES, "exponential", "layer"),
+            requirements=(
+                positive_value_requirement(
+                    "atmosphere.extinction",
+                    applies_to=lambda profile: np.isin(profile, ("exponential", "layer")),
+                ),
+            ),
         ),
         Parameter(
             path="atmosphere.extinction",

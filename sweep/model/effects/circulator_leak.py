@@ -38,12 +38,15 @@ import numpy as np
 
 from sweep.model import receiver_chain
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection.looks import LOOKS_NUMBER_PATH
 from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.effects.requirements import ParameterRequirement, exceeds_one, is_positive
 from sweep.model.link_budget import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX, beat_current
 from sweep.model.preparation import Shots
 from sweep.model.shot_records import PermanentLine
+from sweep.model.waveform import SEARCH_RANGE_PATHS
 
 LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
 """Dotted paths of two parameters of the leaked light. The first is its optical path less that of
@@ -168,6 +171,7 @@ CIRCULATOR_LEAK = Effect(
     stage="noise",
     error_bound=error_bound,
     apply=apply,
+    is_in_time_domain_truth=False,
     parameters=(
         Parameter(
             path=LEAK_LENGTH_PATH,
@@ -178,6 +182,26 @@ CIRCULATOR_LEAK = Effect(
             "hide echoes",
             example="2 m",
             limits=("0 m", "1 km"),
+            requirements=(
+                ParameterRequirement(
+                    ISOLATION_PATH,
+                    lambda ratio: ratio >= 1e30,
+                    "is that of light which leaks, and none does at an isolation of 300 dB",
+                    "set instrument.telescope.isolation",
+                ),
+                ParameterRequirement(
+                    LOOKS_NUMBER_PATH,
+                    exceeds_one,
+                    "is that of a line which is known in one record of each segment alone",
+                    "take instrument.looks.number: 1",
+                ),
+                ParameterRequirement(
+                    SEARCH_RANGE_PATHS[0],
+                    is_positive,
+                    "is that of a line which masks bins, and no law joins that with a search band",
+                    "leave instrument.processing.search out",
+                ),
+            ),
         ),
     ),
 )

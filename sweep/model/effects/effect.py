@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sweep.model.effects.error_bounds import ErrorBound, PhaseErrorBound
+from sweep.model.effects.requirements import ParameterRequirement
 from sweep.model.ground import Ground
 from sweep.model.preparation import Parameters, Shots
 
@@ -53,6 +54,9 @@ class Parameter:
     is_category_key: bool = False
     """True if only points with an equal value can be computed together. This always holds for text
     fields, whatever the flag."""
+    requirements: tuple[ParameterRequirement, ...] = ()
+    """Requirements on other parameters of a spec. A spec that breaks one is refused unless the
+    effect is off."""
 
     @property
     def unit(self) -> str:
@@ -189,6 +193,9 @@ class Effect:
     defines_scene_if_off: bool = False
     """True if ``off`` is a rule of the scene, such as "all segments begin at one range", and not
     the omission of something that is there. ``off`` then counts as no error."""
+    is_in_time_domain_truth: bool = True
+    """False if :func:`sweep.model.time_domain_truth.evaluate_segments_in_time_domain` leaves the
+    effect out. Comparisons with it then leave the effect out as well."""
     required_effects: tuple[str, ...] = ()
     """Names of effects that are simulated with this one, however small their own change is."""
 

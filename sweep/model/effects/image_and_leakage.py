@@ -397,5 +397,6 @@ LEAKAGE = Effect(
     stage="detection",
     error_bound=leakage_bound,
     apply=apply_leakage,
+    is_in_time_domain_truth=False,
 )
 """Effect that evaluates false peaks: bins that cross the threshold because of sidelobes."""

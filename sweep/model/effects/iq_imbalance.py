@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.link_budget import RECEIVER_PREFIX
+from sweep.model.effects.requirements import ParameterRequirement, condition_equal_to
+from sweep.model.link_budget import RECEIVER_PREFIX, RECORD_PATH
 from sweep.model.preparation import Shots
 
 GAIN_IMBALANCE_PATH, PHASE_IMBALANCE_PATH = (
@@ -83,6 +84,14 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     return replace(shots, images=shots.images._replace(iq_gain=image_amplitude))
 
 
+_COMPLEX_RECORD_REQUIREMENT = ParameterRequirement(
+    RECORD_PATH,
+    condition_equal_to("real"),
+    "is one of I and Q, and the record is real",
+    "set instrument.receiver.record: complex",
+)
+
+
 IQ_IMBALANCE = Effect(
     name="iq_imbalance",
     description="unequal I and Q: images at negative frequencies in a complex record",
@@ -96,6 +105,7 @@ IQ_IMBALANCE = Effect(
             default=1.0,
             example="0.5 dB",
             limits=("-60 dB", "60 dB"),
+            requirements=(_COMPLEX_RECORD_REQUIREMENT,),
         ),
         Parameter(
             path=PHASE_IMBALANCE_PATH,
@@ -103,6 +113,7 @@ IQ_IMBALANCE = Effect(
             example="3 deg",
             limits=("-90 deg", "90 deg"),
             si_unit="rad",
+            requirements=(_COMPLEX_RECORD_REQUIREMENT,),
         ),
     ),
 )

@@ -16,6 +16,7 @@ from sweep.model import beam
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import ErrorBound, magnitude_change_from_power
 from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.effects.requirements import ParameterRequirement, condition_equal_to
 from sweep.model.preparation import Shots
 
 
@@ -55,6 +56,20 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     return replace(shots, echo_scales=echo_scales)
 
 
+_SINGLE_MODE_REQUIREMENTS = tuple(
+    ParameterRequirement(
+        other_path,
+        condition_equal_to(word),
+        "counts by the mode that a coherent receiver sees, and here all light in the aperture does",
+        "take a coherent receiver of coupling: single_mode",
+    )
+    for other_path, word in (
+        (beam.COUPLING_PATH, beam.APERTURE),
+        (beam.ARCHITECTURE_PATH, "direct"),
+    )
+)
+
+
 LAG = Effect(
     name="lag",
     description="a receiver that looks beside the sent beam: lag of a scan, parallax, misalignment",
@@ -69,6 +84,7 @@ LAG = Effect(
             "single_mode only, as the two that follow, which add to its lag where signs agree",
             example="100 deg/s",
             limits=("-1e6 rad/s", "1e6 rad/s"),
+            requirements=_SINGLE_MODE_REQUIREMENTS,
         ),
         Parameter(
             path=beam.SEPARATION_PATH,
@@ -77,6 +93,7 @@ LAG = Effect(
             example="40 mm",
             limits=("-1 km", "1 km"),
             si_unit="m",
+            requirements=_SINGLE_MODE_REQUIREMENTS,
         ),
         Parameter(
             path=beam.MISALIGNMENT_PATH,
@@ -84,6 +101,7 @@ LAG = Effect(
             example="5 urad",
             limits=("-10 deg", "10 deg"),
             si_unit="rad",
+            requirements=_SINGLE_MODE_REQUIREMENTS,
         ),
     ),
 )

@@ -224,6 +224,7 @@ LINE_WIDTH = Effect(
     error_bound=error_bound,
     phase_error_bound=phase_error_bound,
     apply=apply,
+    is_in_time_domain_truth=False,
     parameters=(
         Parameter(
             path=_WIDTH_PATH,

@@ -15,6 +15,11 @@ from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.effects.requirements import (
+    ParameterRequirement,
+    is_positive,
+    positive_value_requirement,
+)
 from sweep.model.link_budget import (
     ADC_NOISE_SOURCE,
     LASER_PREFIX,
@@ -176,6 +181,15 @@ SOLAR_BACKGROUND = Effect(
             description="Distance of the target from the sun, which then lights it; 0 for none",
             example="1.52 au",
             limits=("0 m", "1e18 m"),
+            requirements=(
+                ParameterRequirement(
+                    beam.WAVELENGTH_PATH,
+                    is_positive,  # always: the requirement is on the distance alone
+                    f"must be 0, for no sun, or at least the sun's radius, {SUN_RADIUS:g} m",
+                    "set it to 1 au or so",
+                    applies_to=lambda distance: (distance > 0) & (distance < SUN_RADIUS),
+                ),
+            ),
         ),
         Parameter(
             path=_SUN_ELEVATION_PATH,
@@ -329,6 +343,7 @@ QUANTISATION = Effect(
             description="Effective number of bits of the ADC; 0 for one without steps",
             example="12",
             limits=("0", "64"),
+            requirements=(positive_value_requirement(PROCESSING_PREFIX + "full_scale"),),
         ),
     ),
 )

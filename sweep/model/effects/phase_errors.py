@@ -604,6 +604,7 @@ ACCELERATION = Effect(
     error_bound=acceleration_bound,
     phase_error_bound=acceleration_phase_bound,
     apply=apply_acceleration,
+    is_in_time_domain_truth=False,
     parameters=(
         Parameter(
             path=_ACCELERATION_PATH,
@@ -883,6 +884,7 @@ CHIRP_NONLINEARITY = Effect(
     error_bound=partial(phase_omission_bound, name="chirp_nonlinearity"),
     phase_error_bound=chirp_nonlinearity_phase_bound,
     apply=apply_chirp_nonlinearity,
+    is_in_time_domain_truth=False,
     parameters=(
         *(
             Parameter(

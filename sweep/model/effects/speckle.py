@@ -44,6 +44,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model.beam import ARCHITECTURE_PATH
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.speckle_correlation import (
     LINE_SHIFT_MIN_BINS,
@@ -57,6 +58,7 @@ from sweep.model.detection.speckle_correlation import (
 from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.effects.requirements import ParameterRequirement, condition_equal_to
 from sweep.model.ground import BeamGradients, FlatGround, Ground, RayTracedGround
 from sweep.model.preparation import Shots
 from sweep.model.shot_records import EchoSpeckle
@@ -807,6 +809,22 @@ SPECKLE = Effect(
             description="Standard deviation of the surface's height along the line of sight",
             example="10 um",
             limits=("0 m", "1 km"),
+            requirements=(
+                ParameterRequirement(
+                    ARCHITECTURE_PATH,
+                    condition_equal_to("direct"),
+                    "makes speckle, and direct detection averages an unknown number of speckle "
+                    "grains",
+                    "take a coherent receiver",
+                    applies_if_forced_on=True,
+                ),
+                ParameterRequirement(
+                    _SPECKLE_PATH,
+                    condition_equal_to("developed"),
+                    "states the roughness of the target, which is unlimited in developed speckle",
+                    "set footprint.speckle: none",
+                ),
+            ),
         ),
     ),
 )

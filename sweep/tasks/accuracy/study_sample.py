@@ -70,8 +70,7 @@ They move or scale a spectral line as a whole.
 """
 
 TIME_DOMAIN_EFFECT_FLAGS = ~_effect_flags_of_names(
-    ["acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"]
-    + [effect.name for effect in EFFECTS if effect.is_random]
+    [effect.name for effect in EFFECTS if effect.is_random or not effect.is_in_time_domain_truth]
 )
 """Effects that simulated time-domain records contain, one bit each."""
 
