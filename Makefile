@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy accuracy-terrain draw-groups stopping frozen promise detectors peers peers-physics scaling plan-honesty validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy accuracy-terrain draw-groups stopping frozen promise detectors peers peers-physics scaling plan-honesty validation instruments docs pictures fields ids scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -173,6 +173,11 @@ docs: $(READY)
 fields: $(READY)
 	$(BIN)/python docs/field_reference.py
 	$(BIN)/python docs/variable_reference.py
+	$(BIN)/python docs/effect_reference.py
+
+# The ids of the shipped experiments that a test compares, after a change of fields.
+ids: $(READY)
+	$(BIN)/python tests/spec/write_experiment_ids.py
 
 clean:
 	rm -rf .venv results build *.egg-info

@@ -90,12 +90,12 @@ def test_every_field_estimator_and_array_of_detectors_is_listed():
 
 
 def test_every_effect_is_listed_in_the_order_in_which_it_acts():
-    listed = [(name.strip("`"), stage) for name, stage, _ in rows(EFFECTS_PAGE)]
+    listed = [(name.strip("`"), stage) for name, stage, _, _ in rows(EFFECTS_PAGE)]
     assert listed == [(effect.name, effect.stage) for effect in EFFECTS]
 
 
 def test_every_field_that_an_effect_brings_is_listed_with_it():
-    for (_, _, told), effect in zip(rows(EFFECTS_PAGE), EFFECTS, strict=True):
+    for (_, _, _, told), effect in zip(rows(EFFECTS_PAGE), EFFECTS, strict=True):
         names = {name.rsplit(".", 1)[-1] for name in re.findall(r"`([^`]*)`", told)}
         brought = {parameter.path.rsplit(".", 1)[-1] for parameter in effect.parameters}
         assert brought <= names, effect.name

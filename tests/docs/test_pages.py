@@ -196,6 +196,7 @@ def test_a_target_of_make_starts_programs_that_are_there(target, monkeypatch):
     [
         ("field", ["| `wavelength` | Optical wavelength; at least 1 nm", "## scene", "`kind`"]),
         ("variable", ["| `radial_velocity_error` | m s-1 | axes | float64 |", "| `weight` |"]),
+        ("effect", ["| `backscatter` | noise | shot noise of light that the air sends back |"]),
     ],
 )
 def test_a_generated_reference_is_as_the_models_are(name, needles):
