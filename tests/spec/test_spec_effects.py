@@ -35,11 +35,18 @@ from sweep.spec.sections import Effects, Laser, parameter_rules
 from sweep.spec.yaml_document import read_document
 
 BROUGHT = pytest.mark.parametrize("parameter", EFFECT_PARAMETERS, ids=lambda p: p.path)
-RANDOM = {"target.roughness": "speckle", "target.pointing_jitter": "pointing_jitter",
-          "atmosphere.turbulence": "scintillation"}  # fmt: skip
+RANDOM = {
+    parameter.path: effect.name
+    for effect in EFFECTS if effect.is_random
+    for parameter in effect.parameters if parameter.enables_effect
+}  # fmt: skip
 """Parameters that bring a random effect."""
-THERE = {"target.roughness": "1 um", "target.pointing_jitter": "1 urad",
-         "atmosphere.turbulence": "uniform"}  # fmt: skip
+THERE = {
+    parameter.path: parameter.example or parameter.options[1]
+    for parameter in EFFECT_PARAMETERS if parameter.path in RANDOM
+} | {"target.roughness": "1 um", "target.pointing_jitter": "1 urad",
+     "atmosphere.turbulence": "uniform"}  # fmt: skip
+"""A value of each of them with which the effect is there."""
 RECORD = "instrument.receiver.record"
 NEEDED = {"instrument.processing.full_scale": "1 V", "atmosphere.extinction": "0.1 1/km",
           "draws.number": 1, "instrument.telescope.isolation": "50 dB",
@@ -220,6 +227,7 @@ def test_a_stored_study_without_effects_reads_as_one_that_leaves_all_to_the_scen
 
 def test_the_random_effects_are_those_looked_at_here():
     assert set(RANDOM.values()) == {effect.name for effect in EFFECTS if effect.is_random}
+    assert {"target.roughness", "target.pointing_jitter", "atmosphere.turbulence"} <= set(RANDOM)
 
 
 @pytest.mark.parametrize("path", RANDOM)

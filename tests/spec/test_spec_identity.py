@@ -21,6 +21,7 @@ from sweep.spec import GridSpec, describe_differences
 from sweep.spec.grid_checks import is_detector_or_estimator_parameter
 from sweep.spec.rules import ChoiceRule
 from sweep.spec.sections import MODEL_BY_SECTION, default_value, parameter_rules
+from sweep.units import QuantityError
 
 AXES = {"target.range": {"step": ["1 m", "100 m", "1 m"]}, "instrument.laser.power": ["1 W", "3 W"]}
 
@@ -166,7 +167,14 @@ def other_value(path):
         return next(
             word for word in rule.options if word not in (default_value(path), EVERY.get(path))
         )
-    return special.get(path) or f"77 {rule.si_unit}".strip()
+    if path in special:
+        return special[path]
+    value = f"77 {rule.si_unit}".strip()
+    try:
+        rule.read(value)
+    except QuantityError:  # beyond the limits
+        return rule.example
+    return value
 
 
 @pytest.mark.parametrize("path", sorted(parameter_rules()))
