@@ -83,7 +83,8 @@ def _value(described: dict[str, Any]) -> str:
 
 
 def _words(name: str) -> str:
-    """Return a model's name in words."""
+    """Return a model's name in words, without "section"."""
+    name = name.removesuffix("Section")
     return "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in name).strip()
 
 
