@@ -1,6 +1,8 @@
 """Plans on the model itself: no effect changes more than its size, what is left out no more than
 the tolerance."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from random_planner_points import (
@@ -16,6 +18,7 @@ from sweep.model import evaluation
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.evaluation import evaluate_segments, prepare_ray_traced_shots
 from sweep.model.ground import BeamletTable, RayTracedGround, ray_traced_footprint_extent
+from sweep.spec.sections import parameter_rules
 
 POINTS = 30
 CHOICE = [effect for effect in EFFECTS if effect.name in DEFAULT_EFFECTS]
@@ -111,13 +114,40 @@ def sizes_of_many(rng, low, high):
     return rng.choice([-1, 1], POINTS) * 10 ** rng.uniform(low, high, POINTS)
 
 
-FURTHER = {
+def values_of_parameters(effect, rng=None):
+    """Values that bring an effect, from its parameters: the last option, or the example.
+
+    With random numbers an example is scaled by 1e-3 to 10 at each point, with both signs where
+    the limits have them.
+    """
+    values = {}
+    for parameter in effect.parameters:
+        rule = parameter_rules()[parameter.path]
+        if parameter.options or parameter.is_table:
+            values[parameter.path] = [parameter.default, *parameter.options][-1]
+            continue
+        value = float(rule.read(parameter.example))
+        if rng is not None and parameter.enables_effect:
+            low, high = (
+                float(rule.read(limit)) if limit else default
+                for limit, default in zip(parameter.limits, (0.0, np.inf), strict=True)
+            )
+            n_values = 1 if parameter.is_category_key else POINTS
+            scale = 10 ** rng.uniform(-3, 1, n_values)
+            if low < 0:
+                scale *= rng.choice([-1, 1], n_values)
+            value = np.clip(scale * value, low, high)
+            value = float(value[0]) if parameter.is_category_key else value
+        values[parameter.path] = value
+    return values
+
+
+FURTHER_OVERRIDES = {
     "segment_motion": lambda rng: {
         "target.acceleration": sizes_of_many(rng, -9, 2),
         "target.radial_velocity": sizes_of_many(rng, -9, 1),
         "target.transverse_velocity": sizes_of_many(rng, -9, 1),
     },
-    "range_walk": lambda rng: {},
     "acceleration": lambda rng: {"target.acceleration": sizes_of_many(rng, -3, 3)},
     "chirp_nonlinearity": lambda rng: {
         "instrument.chirp.quadratic_error": sizes_of_many(rng, 1, 5),
@@ -137,25 +167,35 @@ FURTHER = {
         "instrument.telescope.coupling": "single_mode",
         "instrument.telescope.misalignment": sizes_of_many(rng, -7, -4),
     },
-    "overlap": lambda rng: {},
     "saturation": lambda rng: {
         "instrument.processing.full_scale": 10 ** rng.uniform(-3, 0, POINTS)
     },
 }
-"""What brings the effects that are not at hand in every scene."""
+"""Parameters of effects that bring them better than the examples in their own parameters do."""
+
+OF_OTHER_SCENES = {"rotation", "iq_imbalance", "fading"}
+"""Effects that need a turning body, a complex record or developed speckle, with tests of their
+own."""
+FURTHER = [
+    effect for effect in EFFECTS
+    if not effect.is_random and effect.stage != "noise"
+    and effect.name not in OF_OTHER_SCENES.union(DEFAULT_EFFECTS)
+]  # fmt: skip
+"""Effects that are not at hand in every scene."""
 
 
 @pytest.mark.parametrize("kind", [0, 1, 3, 4])
-@pytest.mark.parametrize("name", FURTHER)
-def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
-    noticed = 0
+@pytest.mark.parametrize("effect", FURTHER, ids=lambda effect: effect.name)
+def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, effect):
+    noticed, name = 0, effect.name
+    override = FURTHER_OVERRIDES.get(name, partial(values_of_parameters, effect))
     for seed in range(4):
         rng = np.random.default_rng((seed, kind, 5))
         slow = rng.choice([-1, 1], POINTS) * 10 ** rng.uniform(-2, 2.5, POINTS)
         parameters = random_parameters(
             table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
             **{"beamlets": 7, "radial_velocity": slow} | KINDS[kind],
-        ) | FURTHER[name](rng)  # fmt: skip
+        ) | override(rng)  # fmt: skip
         others = some_of(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set())
         others = (others | ({"overlap"} if seed > 1 else set())) - {name}
         made = plan_points(planner_inputs(parameters), {}, 1.0)
@@ -297,7 +337,8 @@ def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
 
 
 STRONG_NOISE = {
-    "signal_shot_noise": {},
+    effect.name: values_of_parameters(effect) for effect in EFFECTS if effect.stage == "noise"
+} | {
     "solar_background": {
         "target.solar_irradiance": 1e13, "instrument.receiver.optical_passband": 1e-8,
         "instrument.receiver.field_of_view": 1e-2,
@@ -313,11 +354,14 @@ STRONG_NOISE = {
     },
     "quantisation": {"instrument.processing.bits": 2.0},
 }  # fmt: skip
-"""Parameters of each effect that adds noise, so that it has much of it."""
+"""Parameters of each effect that adds noise, so that it has much of it; else its examples."""
 
 
-def test_every_effect_that_adds_noise_is_tried_with_saturation():
-    assert {effect.name for effect in EFFECTS if effect.stage == "noise"} == set(STRONG_NOISE)
+def test_effects_with_parameters_of_their_own_are_there():
+    names = {effect.name for effect in EFFECTS}
+    assert set(STRONG_NOISE) == {effect.name for effect in EFFECTS if effect.stage == "noise"}
+    assert set(FURTHER_OVERRIDES) <= {effect.name for effect in FURTHER}
+    assert names >= OF_OTHER_SCENES
 
 
 @pytest.mark.parametrize("name", STRONG_NOISE)
