@@ -124,10 +124,12 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
         parameters[name] = (dataset["effects"] & (1 << EFFECT_NAMES.index(effect))) > 0
     snr = [dataset[name] for name in snr_names]
 
-    def point_bounds(*arrays: np.ndarray) -> np.ndarray:
-        point_parameters = dict(zip(parameters, arrays[3:], strict=True))
+    def point_bounds(
+        up: np.ndarray, doppler: np.ndarray, down: np.ndarray, *parameter_values: np.ndarray
+    ) -> np.ndarray:
+        point_parameters = dict(zip(parameters, parameter_values, strict=True))
         quantity_bound: np.ndarray = getattr(
-            _cramer_rao_bounds(arrays[:3], point_parameters), quantity
+            _cramer_rao_bounds((up, doppler, down), point_parameters), quantity
         )
         return quantity_bound
 
@@ -177,14 +179,23 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
         for axis in spec.axes
         for axis_parameter in axis.parameters
     }
-    pds, snrs = ([dataset[f"{kind}_{name}"] for name in SEGMENT_NAMES] for kind in ("pd", "snr"))
+    pd_names, snr_names = ([f"{kind}_{name}" for name in SEGMENT_NAMES] for kind in ("pd", "snr"))
+    arguments = {
+        "effects": dataset["effects"],
+        **{name: dataset[name] for name in (*pd_names, *snr_names)},
+        **varying_parameters,
+    }
 
-    def point_deviation(flags: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
-        shape = np.broadcast_shapes(flags.shape, *(array.shape for array in arrays))
-        columns = [np.broadcast_to(array, shape).ravel() for array in (flags, *arrays)]
-        variance = np.zeros(columns[0].size)
-        for flag_bits in np.unique(columns[0]):
-            rows = np.flatnonzero(columns[0] == flag_bits)
+    def point_deviation(*arrays: np.ndarray) -> np.ndarray:
+        shape = np.broadcast_shapes(*(array.shape for array in arrays))
+        columns = {
+            name: np.broadcast_to(array, shape).ravel()
+            for name, array in zip(arguments, arrays, strict=True)
+        }
+        flags = columns["effects"]
+        variance = np.zeros(flags.size)
+        for flag_bits in np.unique(flags):
+            rows = np.flatnonzero(flags == flag_bits)
             effects = [
                 name
                 for name in unpack_effect_flags(int(flag_bits))
@@ -192,19 +203,18 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
             ]
             if "fading" not in effects:
                 continue
-            varying_values = dict(
-                zip(varying_parameters, (column[rows] for column in columns[7:]), strict=True)
+            varying_values = {path: columns[path][rows] for path in varying_parameters}
+            pd, snr = (
+                np.array([columns[name][rows] for name in names]) for names in (pd_names, snr_names)
             )
-            pd, snr = (np.array([c[rows] for c in columns[k : k + 3]]) for k in (1, 4))
             for batch_rows, shots in prepare_shots(fixed_parameters | varying_values, effects):
                 estimate_errors = mean_wander_variance(shots, pd[:, batch_rows], snr[:, batch_rows])
                 variance[rows[batch_rows]] = getattr(estimate_errors, quantity)
         return np.sqrt(variance).reshape(shape)
 
     return xr.apply_ufunc(
-        point_deviation, dataset["effects"], *pds, *snrs, *varying_parameters.values(),
-        dask="parallelized", output_dtypes=[float],
-    )  # fmt: skip
+        point_deviation, *arguments.values(), dask="parallelized", output_dtypes=[float]
+    )
 
 
 def _cramer_rao_bounds(
