@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from sweep.model.effects.catalogue import EFFECT_PARAMETERS
 from sweep.spec.axes import remove_fields_on_axes
+from sweep.spec.sections import default_value, parameter_rules
 
 BASE_SPEC: dict[str, Any] = {
     "title": "A study",
@@ -42,6 +44,23 @@ def changed_spec(changes: dict[str, Any] | None = None, **sections: Any) -> dict
         else:
             parent_section[name] = value
     return remove_fields_on_axes(mapping)
+
+
+def required_values(path: str) -> dict[str, Any]:
+    """Values of other fields that the requirements of an effect's parameter ask for, by path."""
+    values = {}
+    for parameter in EFFECT_PARAMETERS:
+        for requirement in parameter.requirements if parameter.path == path else ():
+            default = default_value(requirement.other_path)
+            if default is None or not requirement.is_broken_by(default):
+                continue
+            rule = parameter_rules()[requirement.other_path]
+            values[requirement.other_path] = next(
+                value
+                for value in (*getattr(rule, "options", ()), rule.example)
+                if not requirement.is_broken_by(rule.read(value))
+            )
+    return values
 
 
 def axis_member_content(member: Any) -> tuple[Any, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from base_scene_spec import changed_scene as flight
-from base_spec import changed_spec
+from base_spec import changed_spec, required_values
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -85,7 +85,7 @@ def test_a_parameter_of_an_effect_is_a_field_by_itself(parameter, validator):
     default = spec(plain).parameters()[parameter.path]
     assert default == parameter.default and type(default) is type(parameter.default)
     for value in values(parameter):
-        mapping = changed_spec(NEEDED | {parameter.path: value})
+        mapping = changed_spec(NEEDED | required_values(parameter.path) | {parameter.path: value})
         validator.validate(mapping)
         read = GridSpec.from_mapping(mapping)
         assert parameter.path in read.identity()["parameters"]
@@ -100,7 +100,8 @@ def test_a_parameter_of_an_effect_may_be_an_axis(parameter, validator):
     if parameter.is_table:  # one for a whole study (test_spec_reading)
         return
     written_values = values(parameter)
-    mapping = changed_spec(NEEDED, axes={parameter.path: written_values})
+    needed = NEEDED | required_values(parameter.path)
+    mapping = changed_spec(needed, axes={parameter.path: written_values})
     validator.validate(mapping)
     (axis,) = GridSpec.from_mapping(mapping).axes
     rule = parameter_rules()[parameter.path]

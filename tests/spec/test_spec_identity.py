@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from base_spec import axis_member_content, changed_spec
+from base_spec import axis_member_content, changed_spec, required_values
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -192,10 +192,7 @@ def test_every_parameter_is_part_of_the_id(path):
         every |= {"instrument.processing.detection": "peak_bin"}
     if path == "footprint.speckle":
         every |= {"target.roughness": "0 um"}  # a stated one asks for no developed speckle
-    if "receiver.iq_" in path:
-        every |= {"instrument.receiver.record": "complex"}
-    if path == "instrument.telescope.leak_path":
-        every |= {"instrument.telescope.isolation": "60 dB"}
+    every |= required_values(path)
     if path in SEARCH_BAND_PATHS:
         every |= BAND
     if path == PEAKS_PATH:  # of closed forms, without draws
