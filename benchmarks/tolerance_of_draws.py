@@ -86,7 +86,7 @@ def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
     for index, shots in prepare_shots(parameters, certain_effects):
         if shots.footprint.n_beamlets != 1 or np.any(shots.laser_line.pedestal_variance_under_line):
             raise ValueError("only of one beamlet, without a pedestal, the mean is known")
-        signal = evaluate_segments(shots)[:, 2] / shots.line_noise_sigma
+        signal = evaluate_segments(shots).magnitude / shots.line_noise_sigma
         level = shots.threshold / shots.line_noise_sigma
         kappa = np.broadcast_to(
             coherent_echo_fraction(

@@ -60,7 +60,9 @@ def with_signal_over_threshold(parameters, threshold_over_signal):
     """Parameters with a laser power for which the up-chirp's |X| is the threshold over a ratio."""
     shots = prepare_single_category(parameters)
     amplitude_factor = (
-        float(shots.threshold[0]) * threshold_over_signal / float(evaluate_segments(shots)[0, 2, 0])
+        float(shots.threshold[0])
+        * threshold_over_signal
+        / float(evaluate_segments(shots).magnitude[0, 0])
     )
     return parameters | {
         "instrument.laser.power": parameters["instrument.laser.power"] * amplitude_factor**2

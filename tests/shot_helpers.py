@@ -14,7 +14,6 @@ from sweep.model.spectrum.lines import (
     REAL_WITH_IMAGES,
     LineArrays,
     SpectrumLayout,
-    beamlet_arrays,
     beat_parameters_at,
     compute_lines,
 )
@@ -96,7 +95,7 @@ def segment_lines(shots, i, segment):
     lines = LineArrays(*np.empty((3, n)))
     beat = beat_parameters_at(shots.point_parameters(), shots.segment_parameters(), segment, i)
     origin = compute_lines(
-        beat, segment, beamlet_arrays(shots.beamlet_table), row, layout, lines, *np.empty((2, n))
+        beat, segment, shots.beamlet_arrays, row, layout, lines, *np.empty((2, n))
     )
     return origin, lines.position, lines.re + 1j * lines.im
 

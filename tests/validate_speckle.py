@@ -157,7 +157,7 @@ def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
     """The spec with the laser power for which a chirp's |X| is so many times the threshold."""
     study = GridStudy(GridSpec.from_mapping(with_units(mapping)))
     shots = prepare_single_category(study.grid.parameters_of_block(0), COMPARED_EFFECTS)
-    magnitude = np.nanmax(evaluate_segments(shots)[[0, 2], 2, 0])
+    magnitude = np.nanmax(evaluate_segments(shots).magnitude[[0, 2], 0])
     mapping["instrument"]["laser"]["power"] = (
         ratio * first_value(shots.threshold) / magnitude
     ) ** 2

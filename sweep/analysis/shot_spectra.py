@@ -24,7 +24,7 @@ from sweep.model.effects.catalogue import DEFAULT_EFFECTS, EFFECTS
 from sweep.model.evaluation import prepare_shots
 from sweep.model.pointcloud.eyepoints import Eyepoints
 from sweep.model.pointcloud.returns import beamlet_line_positions
-from sweep.model.spectrum.segment_spectra import full_segment_spectrum
+from sweep.model.spectrum.segment_spectra import SegmentResults, full_segment_spectrum
 from sweep.model.threshold import THRESHOLD_PATHS
 from sweep.spec import GridSpec, SpecError
 from sweep.spec.rules import Mistake
@@ -171,16 +171,18 @@ def simulate_prepared_shot(
     """
     segment_results = shot_model.evaluate_segments(prepared_shot)
     segments = tuple(
-        _segment_spectrum(prepared_shot, segment_results[k, :, 0], k, seed)
+        _segment_spectrum(prepared_shot, segment_results, k, seed)
         for k in range(3)
         if prepared_shot.has_segment[k]
     )
-    peak_results = segment_results.copy()
+    peak_frequency = segment_results.frequency.copy()
     for segment in segments:
-        peak_results[SEGMENT_DISPLAY_NAMES.index(segment.name), 3, 0] = segment.frequency[
+        peak_frequency[SEGMENT_DISPLAY_NAMES.index(segment.name), 0] = segment.frequency[
             segment.peak_index
         ]
-    measurement = shot_model.measure_range_velocity(prepared_shot, peak_results)
+    measurement = shot_model.measure_range_velocity(
+        prepared_shot, segment_results._replace(frequency=peak_frequency)
+    )
     return SimulatedShot(
         label=label,
         parameters=parameters,
@@ -197,14 +199,14 @@ def simulate_prepared_shot(
 
 def _segment_spectrum(
     prepared_shot: shot_model.Shots,
-    segment_result: np.ndarray,
+    segment_results: SegmentResults,
     segment_index: int,
     seed: int | None,
 ) -> DisplayedSegment:
     """Return the spectrum of a segment with its detections.
 
-    `segment_result` are the results of the model for the segment. Noise is drawn if `seed` is
-    given.
+    `segment_results` are the results of the model for the shot's segments. Noise is drawn if `seed`
+    is given.
     """
     signed_bins, signal_magnitude = (
         prepared_shot.all_signed_bins,
@@ -246,8 +248,8 @@ def _segment_spectrum(
         beat_frequency=np.asarray(beat_frequency).item(),
         carrier_frequency=carrier_frequency,
         bin_groups=find_bin_groups(magnitude, float(prepared_shot.threshold[0])),
-        snr=float(prepared_shot.snr(segment_result[2])[0]),
-        pd=float(segment_result[0]),
+        snr=float(prepared_shot.snr(segment_results.magnitude[segment_index])[0]),
+        pd=float(segment_results.pd[segment_index, 0]),
     )
 
 

@@ -34,7 +34,7 @@ from sweep.model.preparation import (
     prepare_axis_line,
     require_finite,
 )
-from sweep.model.spectrum.segment_spectra import evaluate_segments
+from sweep.model.spectrum.segment_spectra import SegmentResults, evaluate_segments
 from sweep.model.spectrum.strongest_peak import strongest_peak_probabilities
 
 __all__ = [
@@ -182,7 +182,7 @@ def evaluate(
     parameters: Parameters,
     effects: Collection[str] = DEFAULT_EFFECTS,
     *,
-    segment_evaluator: Callable[[Shots], np.ndarray] = evaluate_segments,
+    segment_evaluator: Callable[[Shots], SegmentResults] = evaluate_segments,
 ) -> dict[str, np.ndarray]:
     """Compute detection, false-alarm and other statistics of n shots on a flat plane.
 
@@ -213,7 +213,7 @@ def evaluate(
 
 
 def shot_statistics(
-    shots: Shots, segment_results: np.ndarray | None = None
+    shots: Shots, segment_results: SegmentResults | None = None
 ) -> dict[str, np.ndarray]:
     """Compute the output variables of prepared shots.
 
@@ -221,7 +221,7 @@ def shot_statistics(
     ----------
     shots : Shots
         Prepared shots.
-    segment_results : ndarray (3, fields, n), optional
+    segment_results : SegmentResults, optional
         Result of :func:`evaluate_segments`; computed if it is not given.
 
     Returns
@@ -230,7 +230,7 @@ def shot_statistics(
         Outputs by name; nan for those that are undefined without an echo.
     """
     segment_results = evaluate_segments(shots) if segment_results is None else segment_results
-    pd, miss, magnitude, frequency, n_exempt, leakage = np.moveaxis(segment_results, 1, 0)
+    pd, miss, magnitude, frequency, n_exempt, leakage = segment_results
     leakage_up, _, leakage_down = leakage
     n_beamlets = shots.footprint.n_beamlets
     snr = shots.snr(magnitude)
@@ -272,18 +272,17 @@ def shot_statistics(
     }
 
 
-def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> waveform.RangeVelocity:
+def measure_range_velocity(shots: Shots, segment_results: SegmentResults) -> waveform.RangeVelocity:
     """Return the range and radial velocity that the strongest bins of the segments give.
 
     Parameters
     ----------
     shots : Shots
         Prepared shots.
-    segment_results : ndarray (3, fields, n)
+    segment_results : SegmentResults
         Result of :func:`evaluate_segments`.
     """
-    _, _, magnitudes, peak_frequencies, _, _ = np.moveaxis(segment_results, 1, 0)
-    weights = magnitudes**2
+    peak_frequencies, weights = segment_results.frequency, segment_results.magnitude**2
     if shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
         return fit_peaks(
             shots, peak_frequencies, np.where(shots.has_segment[:, None], weights, 0.0)

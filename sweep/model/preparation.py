@@ -54,7 +54,7 @@ from sweep.model.window import Window
 
 if TYPE_CHECKING:
     from sweep.model.detection.echo_detection import BinThresholds, DetectionRule, SpeckleTable
-    from sweep.model.spectrum.lines import PointParameters, SegmentParameters
+    from sweep.model.spectrum.lines import BeamletArrays, PointParameters, SegmentParameters
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
@@ -445,21 +445,22 @@ class Shots:
         return self.record.bin_noise_sigma(variance, self.looks)
 
     @cached_property
-    def beamlet_table(self) -> np.ndarray:
-        """Beamlets' ranges, Doppler ratios, amplitudes and phases, relative to the beam's axis.
+    def beamlet_arrays(self) -> "BeamletArrays":
+        """Ranges, Doppler ratios, amplitudes and phases of all beamlets, relative to the axis."""
+        from sweep.model.spectrum.lines import BeamletArrays
 
-        Rows are (R_b - R_0) / R_0 of the range R, the difference of the Doppler ratio, the relative
-        amplitude, and three phases if there are any. The shape is (3 or 6, rows, beamlets).
-        """
-        phases = self.footprint.phase_cycles if self.footprint.phase_cycles.size else ()
-        return np.stack(
-            [
+        range_offset, doppler_offset, amplitude = (
+            np.array(values, float, order="C")  # kernels take writable arrays in C order
+            for values in (
                 self.footprint.relative_range_offset,
                 self.footprint.doppler_ratio_offset,
                 self.footprint.relative_amplitude,
-                *phases,
-            ]
+            )
         )
+        phase_cycles = np.array(self.footprint.phase_cycles, float, order="C")
+        if not phase_cycles.size:
+            phase_cycles = np.empty((0, *range_offset.shape))
+        return BeamletArrays(range_offset, doppler_offset, amplitude, phase_cycles)
 
     @cached_property
     def waveform_segments(self) -> tuple[WaveformSegment, ...]:

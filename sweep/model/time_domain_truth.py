@@ -18,7 +18,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.detection_probability import pd_and_miss_in_looks
 from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.preparation import Shots
-from sweep.model.spectrum.segment_spectra import SEGMENT_RESULT_NAMES
+from sweep.model.spectrum.segment_spectra import SegmentResults, allocate_segment_results
 from sweep.model.waveform import SAMPLE_TIME_TOLERANCE
 
 
@@ -84,7 +84,9 @@ def time_domain_spectrum(
     return np.abs(np.fft.rfft(w * record_sum.real, shots.fft_size))
 
 
-def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = True) -> np.ndarray:
+def evaluate_segments_in_time_domain(
+    shots: Shots, *, with_range_walk: bool = True
+) -> SegmentResults:
     """Detect echoes in spectra that are computed in the time domain.
 
     Parameters
@@ -96,18 +98,14 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
 
     Returns
     -------
-    ndarray (3, fields, n)
-        Results by segment, field and point, with the fields of
-        :data:`sweep.model.spectrum.segment_spectra.SEGMENT_RESULT_NAMES`. Leakage is 0.
+    SegmentResults
+        Arrays (3, n). Leakage is 0.
 
     Notes
     -----
     Range walk is the only change of frequency within a record that is included.
     """
-    pd_row, miss_row, magnitude_row, frequency_row = map(
-        SEGMENT_RESULT_NAMES.index, ("pd", "miss", "magnitude", "frequency")
-    )
-    segment_results = np.full((3, len(SEGMENT_RESULT_NAMES), shots.size), np.nan)
+    results = allocate_segment_results(shots.size)
     for point in range(shots.size):
         for segment in map(int, np.flatnonzero(shots.has_segment)):
             look_magnitudes = [
@@ -126,21 +124,19 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
                 shots.bin_thresholds.select(np.array([point])),
                 shots.speckle_table.select(segment, np.array([point])),
             )
-            segment_results[segment, :, point] = np.array(detections)[:, 0]
+            for name, (value,) in detections._asdict().items():
+                getattr(results, name)[segment, point] = value
             if shots.complex_record:
-                segment_results[segment, frequency_row, point] -= (
-                    float(shots.sample_rate[point]) / 2
-                )
-    if shots.looks.is_noncoherent:
-        peak_bins = np.rint(
-            segment_results[:, frequency_row] / (shots.sample_rate / shots.fft_size)
-        )
-        segment_results[:, pd_row], segment_results[:, miss_row] = pd_and_miss_in_looks(
-            shots,
-            segment_results[:, magnitude_row],
-            np.where(np.isnan(peak_bins), -1, peak_bins).astype(np.int64),  # no segment: no bin
-        )
-    return segment_results
+                results.frequency[segment, point] -= float(shots.sample_rate[point]) / 2
+    if not shots.looks.is_noncoherent:
+        return results
+    peak_bins = np.rint(results.frequency / (shots.sample_rate / shots.fft_size))
+    pd, miss = pd_and_miss_in_looks(
+        shots,
+        results.magnitude,
+        np.where(np.isnan(peak_bins), -1, peak_bins).astype(np.int64),  # no segment: no bin
+    )
+    return results._replace(pd=pd, miss=miss)
 
 
 def analytic_record(

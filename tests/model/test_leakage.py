@@ -25,10 +25,8 @@ from sweep.model.spectrum.bin_spectrum import (
     compute_end_strengths_and_far_lines,
     far_line_weight,
 )
-from sweep.model.spectrum.segment_spectra import segment_spectrum
+from sweep.model.spectrum.segment_spectra import SegmentResults, segment_spectrum
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, direct_transform, get_window
-
-PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED, LEAKAGE = range(6)
 
 ACCURACY = 1e-6
 """What the module states, relative to the leakage."""
@@ -40,29 +38,29 @@ EVERY_FORM = tuple(COSINE_SUM_COEFFICIENTS)
 def compare(shots):
     """Largest relative differences of what is found, fast against bin by bin."""
     fast, slow = evaluate_segments(shots), evaluate_segments(shots, bin_by_bin=True)
-    exists = np.isfinite(slow)
-    np.testing.assert_array_equal(np.isfinite(fast), exists)
-    scale = np.abs(slow)
-    # A tone on a bin leaks nothing but rounding, which bin by bin is left out under 1e-12 sigma.
-    scale[:, LEAKAGE] = np.maximum(scale[:, LEAKAGE], 1e-20)
-    scale = np.maximum(scale, 1e-290)
-    error = np.nanmax(np.abs(fast - slow) / scale, axis=(0, 2))
+    error = {}
+    for name in SegmentResults._fields:
+        fast_values, slow_values = getattr(fast, name), getattr(slow, name)
+        np.testing.assert_array_equal(np.isfinite(fast_values), np.isfinite(slow_values))
+        # A tone on a bin leaks nothing but rounding: left out bin by bin, under 1e-12 sigma.
+        scale = np.maximum(np.abs(slow_values), 1e-20 if name == "leakage" else 1e-290)
+        error[name] = np.nanmax(np.abs(fast_values - slow_values) / scale)
     # Of the Doppler segment only draws need to know what leaks.
     listed, every = (
         list_bin_groups(shots, groups_max=1, every_bin=k).leakage[:, 1] for k in (False, True)
     )
     apart = np.nanmax(np.abs(listed - every) / np.maximum(every, 1e-20), initial=0.0)
-    error[LEAKAGE] = max(error[LEAKAGE], apart)
-    return error, slow
+    error["leakage"] = max(error["leakage"], apart)
+    return SegmentResults(**error), slow
 
 
 def held(shots):
     """The module's accuracy, and that of everything else that both report."""
     error, slow = compare(shots)
-    assert error[LEAKAGE] < ACCURACY
-    assert error[MAGNITUDE] < 1e-9 and error[PD] < 1e-7
-    assert error[FREQUENCY] == 0 and error[EXEMPTED] == 0
-    return slow[:, LEAKAGE]
+    assert error.leakage < ACCURACY
+    assert error.magnitude < 1e-9 and error.pd < 1e-7
+    assert error.frequency == 0 and error.n_exempt == 0
+    return slow.leakage
 
 
 def strengths_without_moments(places, degree, generator):
@@ -127,10 +125,12 @@ def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
             shots, tolerances=shots.tolerances._replace(leakage_probability=np.asarray(allowed))
         )
     )
-    missed = whole[:, LEAKAGE] - some[:, LEAKAGE]
-    assert (missed <= allowed).all() and (missed >= -1e-6 * whole[:, LEAKAGE]).all()
-    others = [PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED]
-    np.testing.assert_allclose(some[:, others], whole[:, others], rtol=1e-9, atol=1e-300)
+    missed = whole.leakage - some.leakage
+    assert (missed <= allowed).all() and (missed >= -1e-6 * whole.leakage).all()
+    for name in ("pd", "miss", "magnitude", "frequency", "n_exempt"):
+        np.testing.assert_allclose(
+            getattr(some, name), getattr(whole, name), rtol=1e-9, atol=1e-300
+        )
     assert (missed > 0).any()
 
 

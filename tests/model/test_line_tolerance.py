@@ -9,7 +9,6 @@ from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.evaluation import evaluate_segments, prepare_shots
 
 POINTS = 200
-PD, MAGNITUDE = 0, 2
 
 
 def some_shots(table_4_1, phases, effects, seed):
@@ -40,10 +39,10 @@ def test_bins_are_within_what_is_allowed_and_pd_within_half_of_it(table_4_1, pha
                     shots, tolerances=shots.tolerances._replace(line_error=np.asarray(tolerance))
                 )
             )
-            apart = abs(found[:, MAGNITUDE] - exact[:, MAGNITUDE]) / shots.bin_noise_sigma
-            rounding = 1e-11 * exact[:, MAGNITUDE] / shots.bin_noise_sigma
+            apart = abs(found.magnitude - exact.magnitude) / shots.bin_noise_sigma
+            rounding = 1e-11 * exact.magnitude / shots.bin_noise_sigma
             assert (apart <= tolerance + rounding).all()
-            assert abs(found[:, PD] - exact[:, PD]).max() <= 0.5 * tolerance + 1e-9
+            assert abs(found.pd - exact.pd).max() <= 0.5 * tolerance + 1e-9
             changed += (apart > 10 * rounding).sum()
     assert changed > 100
 

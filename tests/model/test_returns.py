@@ -117,15 +117,15 @@ def test_groups_are_runs_of_bins_above_the_threshold_in_the_true_spectrum(table_
 
 def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
     shots = prepare_single_category(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
-    found, expected = list_bin_groups(shots), np.moveaxis(evaluate_segments(shots), 1, 0)
-    np.testing.assert_array_equal(found.pd[:, :, 0].T, expected[0])
-    np.testing.assert_array_equal(found.magnitude[:, :, 0].T, expected[2])
+    found, expected = list_bin_groups(shots), evaluate_segments(shots)
+    np.testing.assert_array_equal(found.pd[:, :, 0].T, expected.pd)
+    np.testing.assert_array_equal(found.magnitude[:, :, 0].T, expected.magnitude)
     np.testing.assert_array_equal(
-        found.strongest_bin[:, :, 0].T, np.rint(expected[3] * 2**17 / 600e6)
+        found.strongest_bin[:, :, 0].T, np.rint(expected.frequency * 2**17 / 600e6)
     )
-    np.testing.assert_array_equal(found.n_exempt.T, expected[4])
-    np.testing.assert_array_equal(found.leakage.T[[0, 2]], expected[5][[0, 2]])
-    assert not expected[5][1].any()  # of the Doppler segment only draws need to know
+    np.testing.assert_array_equal(found.n_exempt.T, expected.n_exempt)
+    np.testing.assert_array_equal(found.leakage.T[[0, 2]], expected.leakage[[0, 2]])
+    assert not expected.leakage[1].any()  # of the Doppler segment only draws need to know
 
 
 def test_fewer_groups_listed_are_the_strongest_of_all(table_4_1):

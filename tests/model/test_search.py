@@ -90,7 +90,7 @@ def noisy_spectra(shots, segment, rng):
 def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table_4_1):
     """The strongest bin of the up beat lies some bins within the band's far end, or beyond it."""
     whole = prepare_single_category(scene_of(table_4_1, record=record))
-    place = time_domain_truth.evaluate_segments_in_time_domain(whole)[0, 3, 0] / (
+    place = time_domain_truth.evaluate_segments_in_time_domain(whole).frequency[0, 0] / (
         600e6 / SIZE
     )  # of the echo [bins]
     metre = 299792458 * 600e6 / SIZE / (2 * 50e12)

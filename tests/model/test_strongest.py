@@ -53,7 +53,7 @@ def spectra(shots, segment, echo, rng):
 
 def reported(shots, segment, echo, rng):
     """Count a segment's draws: (right, wrong), bool by draw."""
-    place = time_domain_truth.evaluate_segments_in_time_domain(shots)[segment, 3, 0] / (
+    place = time_domain_truth.evaluate_segments_in_time_domain(shots).frequency[segment, 0] / (
         600e6 / SIZE
     )
     magnitude = spectra(shots, segment, echo, rng)
@@ -155,7 +155,7 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
         law, reach = stats.rayleigh(scale=scale), 20 * scale
         missed = law.cdf(level)
     alarm = crosses["pfa_segment"][0]
-    bins = SIZE // 2 - evaluate_segments(shots)[0, 4, 0]  # but those that the echo occupies
+    bins = SIZE // 2 - evaluate_segments(shots).n_exempt[0, 0]  # but those that the echo occupies
     lost = of_one_bin(law, bins, level, min(reach, 40))
     wrong = alarm * missed + lost
     assert found["pd_up"][0] == pytest.approx(1 - missed - lost, abs=1e-6)

@@ -278,4 +278,4 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
         assert bins.size == 4096
         assert magnitude_error(shots, magnitude, exact[bins % 4096]) <= AGREEMENT
         peak = (exact.argmax() + half) % 4096 - half
-        assert found[segment, 3, 0] == peak * shots.sample_rate / 4096
+        assert found.frequency[segment, 0] == peak * shots.sample_rate / 4096

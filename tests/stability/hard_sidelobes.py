@@ -261,8 +261,9 @@ def leakage_of_2000_bins() -> float:
 def leakage_error(window_name: str, size: int, range_m: float) -> float:
     """Relative error of the leakage of a shot's up segment."""
     single_shot = prepare_shot(LEAKAGE_EFFECTS, window=window_name, fft_size=size, range=range_m)
-    results = evaluate_segments(single_shot)[0]
-    return abs(results[5, 0] / exact_leakage(single_shot, int(results[4, 0])) - 1)
+    results = evaluate_segments(single_shot)
+    n_exempt, leakage = int(results.n_exempt[0, 0]), results.leakage[0, 0]
+    return abs(leakage / exact_leakage(single_shot, n_exempt) - 1)
 
 
 def exact_leakage(single_shot: Any, n_exempted: int) -> float:

@@ -159,12 +159,6 @@ class BeamletArrays(NamedTuple):
     """
 
 
-def beamlet_arrays(beamlet_table: np.ndarray) -> BeamletArrays:
-    """Return the rows of :attr:`sweep.model.preparation.Shots.beamlet_table` as named fields."""
-    range_offset, doppler_offset, amplitude = beamlet_table[:3]
-    return BeamletArrays(range_offset, doppler_offset, amplitude, beamlet_table[3:])
-
-
 class PointParameters(NamedTuple):
     """Parameters of points that all segments share, (n,) each."""
 

@@ -34,11 +34,11 @@ from sweep.model.spectrum.lines import (
     SegmentParameters,
     SpectrumLayout,
     add_image_lines,
-    beamlet_arrays,
     beat_parameters_at,
     compute_lines,
     fold_lines,
 )
+from sweep.model.spectrum.segment_spectra import SegmentResults, allocate_segment_results
 
 GRID_CELLS_PER_BIN = 16
 """Number of cells of the frequency grid per FFT bin."""
@@ -82,7 +82,7 @@ def find_peaks_on_grid(
     n_cells_min: int = GRID_CELLS_MIN,
     uses_real_transform: bool = False,
     transforms_to_bins_only: bool = False,
-) -> np.ndarray:
+) -> SegmentResults:
     """Find the largest bins of each segment's spectrum by FFT on an oversampled grid.
 
     Parameters
@@ -102,12 +102,10 @@ def find_peaks_on_grid(
 
     Returns
     -------
-    numpy.ndarray
-        Peaks (3, 6, n) by segment, quantity and shot, as
-        :func:`sweep.model.evaluation.evaluate_segments` returns them; nan in segments that the
-        waveform lacks.
+    SegmentResults
+        Arrays (3, n), as of :func:`sweep.model.evaluation.evaluate_segments`. Leakage is 0.
     """
-    peaks = np.full((3, 6, shots.size), np.nan)
+    results = allocate_segment_results(shots.size)
     parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()
     n_cells_of_point = cells_per_point(shots, n_cells_min)
     grid_options = GridOptions(degree, uses_real_transform, transforms_to_bins_only)
@@ -130,8 +128,9 @@ def find_peaks_on_grid(
                 shots.speckle_table.select(segment, points),
             )
             detections.frequency[:] *= np.broadcast_to(shots.sample_rate, shots.size)[points]
-            peaks[segment][:, points] = np.array(detections)
-    return peaks
+            for name, values in detections._asdict().items():
+                getattr(results, name)[segment, points] = values
+    return results
 
 
 def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray:
@@ -188,7 +187,7 @@ def grid_magnitudes(
         parameters,
         parameters_by_segment,
         shots.footprint.row_of_point[points],
-        beamlet_arrays(shots.beamlet_table),
+        shots.beamlet_arrays,
         segment,
         SpectrumLayout(
             fft_size=shots.fft_size,

@@ -74,7 +74,6 @@ from sweep.model.spectrum.lines import (
     SpectrumLayout,
     add_image_lines,
     allowed_relative_error,
-    beamlet_arrays,
     beat_parameters_at,
     compute_lines,
     count_nodes,
@@ -99,9 +98,6 @@ THRESHOLD_RATIO_STEP = 1e-7
 """Step to which the threshold over the noise sigma is rounded. Rates of false alarms due to leaked
 signal in developed speckle are tabulated per rounded threshold."""
 
-SEGMENT_RESULT_NAMES = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
-"""Names of the results of :func:`evaluate_segments`, in the order of its second axis."""
-
 NO_LEAKAGE, LEAKAGE_BY_INTEGRAL, LEAKAGE_BIN_BY_BIN = range(3)
 """Methods for the probability of false alarms due to leaked signal. The first computes none. The
 second counts all bins of the spectrum, with an integral over bins far from the lines. The third
@@ -110,6 +106,31 @@ counts only the computed bins that exceed a level."""
 
 SPAN_DOES_NOT_FIT = np.int64(-1)
 """Result of :func:`_evaluate_segment` if a segment's bins exceed the allocated memory."""
+
+
+class SegmentResults(NamedTuple):
+    """Detection and false alarms in the noiseless spectra of the segments of n points.
+
+    Arrays are (3, n): up, Doppler and down segment. They are nan in segments that do not exist.
+    """
+
+    pd: np.ndarray
+    """Probability that the echo is detected, 0..1."""
+    miss: np.ndarray
+    """Probability that the echo is missed, 1 - pd, accurate even where it is small."""
+    magnitude: np.ndarray
+    """|X| of the echo's largest bin without noise [V, summed over the record]."""
+    frequency: np.ndarray
+    """Frequency of that bin [Hz]; nan if the search band does not contain it."""
+    n_exempt: np.ndarray
+    """Number of bins that belong to the echo or are masked, and so cannot raise a false alarm."""
+    leakage: np.ndarray
+    """Probability that leaked signal raises at least one extra false peak, over noise alone."""
+
+
+def allocate_segment_results(n_points: int) -> SegmentResults:
+    """Return results of ``n_points`` points that are nan in every segment."""
+    return SegmentResults(*(np.full((3, n_points), np.nan) for _ in SegmentResults._fields))
 
 
 class BinSpans(NamedTuple):
@@ -225,7 +246,7 @@ class EvaluationSettings(NamedTuple):
     """(N // 2 + 1,): tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N."""
 
 
-def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
+def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> SegmentResults:
     """Compute detection and false alarms due to leaked signal in each segment's spectrum.
 
     Parameters
@@ -237,10 +258,10 @@ def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
 
     Returns
     -------
-    ndarray (3, fields, n)
-        Values by segment and by SEGMENT_RESULT_NAMES; nan for segments that do not exist.
+    SegmentResults
+        Arrays (3, n).
     """
-    results = np.full((3, len(SEGMENT_RESULT_NAMES), shots.size), np.nan)
+    results = allocate_segment_results(shots.size)
     bin_width = (shots.sample_rate / shots.fft_size) + np.zeros(shots.size)
     for spans in iter_spans(shots, bin_by_bin=bin_by_bin, keeps_magnitudes=False):
         for s in np.flatnonzero(shots.has_segment):
@@ -248,14 +269,14 @@ def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
                 shots.to_signed_bins(spans.first_bin[s] + spans.peak_index[s])
                 * bin_width[spans.point_numbers]
             )
-            results[s][:, spans.point_numbers] = (
-                spans.pd[s],
-                spans.miss[s],
-                spans.peak_magnitude[s],
-                np.where(spans.peak_is_searched[s], frequency, np.nan),
-                spans.n_exempt[s],
-                spans.leakage[s],
+            results.pd[s, spans.point_numbers] = spans.pd[s]
+            results.miss[s, spans.point_numbers] = spans.miss[s]
+            results.magnitude[s, spans.point_numbers] = spans.peak_magnitude[s]
+            results.frequency[s, spans.point_numbers] = np.where(
+                spans.peak_is_searched[s], frequency, np.nan
             )
+            results.n_exempt[s, spans.point_numbers] = spans.n_exempt[s]
+            results.leakage[s, spans.point_numbers] = spans.leakage[s]
     return results
 
 
@@ -786,7 +807,7 @@ def _evaluate_batch(
         parameters,
         parameters_by_segment,
         lowest_levels,
-        beamlet_arrays(shots.beamlet_table),
+        shots.beamlet_arrays,
         np.ascontiguousarray(shots.footprint.row_of_point, np.int64),
         np.ascontiguousarray(group.line_shape_index[batch_begin:]),
         shifts,

@@ -31,6 +31,7 @@ from sweep.model.pointcloud.eyepoints import Eyepoints, parameters_and_ground_of
 from sweep.model.pointcloud.ray_error import estimate_ray_error
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.oversampled_grid import find_peaks_on_grid
+from sweep.model.spectrum.segment_spectra import SegmentResults
 from sweep.model.waveform import SEGMENT_NAMES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import Axis, GridSpec, SceneSpec
@@ -45,11 +46,8 @@ from sweep.tasks.studies.parameter_grid import (
     ParameterBlockGrid,
 )
 
-PeakFinder = Callable[[Shots], np.ndarray]
-"""Function that finds the largest bins in the spectrum of each segment (chirp) of some shots.
-
-It returns what :func:`sweep.model.evaluation.evaluate_segments` returns.
-"""
+PeakFinder = Callable[[Shots], SegmentResults]
+"""Function that finds the largest bins in the spectrum of each segment (chirp) of some shots."""
 
 PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
 """Coordinates that identify sampled points: by name, the values at the points, and the attributes.
@@ -677,9 +675,9 @@ def _simulate_shot_statistics(
     peaks = find_peaks(shots)
     outputs = evaluation.shot_statistics(shots, peaks) | {"beamlets": np.full(shots.size, n_rays)}
     if study.ray_error_budget is not None:
-        peak_bins = peaks[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
+        peak_bins = peaks.frequency.T * (shots.fft_size / shots.sample_rate[:, None])
         outputs["beamlets_error"] = estimate_ray_error(
-            shots, ground.beamlets, peak_bins, peaks[:, 2].T
+            shots, ground.beamlets, peak_bins, peaks.magnitude.T
         )
     all_outputs = {name: np.full(shot_numbers.size, np.nan) for name in outputs}
     for name, values in outputs.items():

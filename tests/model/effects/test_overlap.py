@@ -138,9 +138,9 @@ def test_an_echo_in_the_last_part_of_a_record_has_what_is_left_of_the_window(tab
     assert loss == pytest.approx(20 * np.log10(left), abs=1.43)
     shots = shots_of(triangle(table_4_1, range=ranges))
     exact = time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False)
-    for row, name in enumerate(("pd_up", "miss_up")):
-        assert found[name] == pytest.approx(exact[0, row], abs=1e-9)
-    assert np.sqrt(2 * found["snr_up"]) * shots.bin_noise_sigma == pytest.approx(exact[0, 2])
+    assert found["pd_up"] == pytest.approx(exact.pd[0], abs=1e-9)
+    assert found["miss_up"] == pytest.approx(exact.miss[0], abs=1e-9)
+    assert np.sqrt(2 * found["snr_up"]) * shots.bin_noise_sigma == pytest.approx(exact.magnitude[0])
     assert loss[1] == pytest.approx(-6.0, abs=1.0) and loss[2] < -18
 
 
@@ -231,8 +231,10 @@ def test_plans_of_random_instruments_keep_the_tolerance_of_the_truth(table_4_1, 
                 *(s for _, s in evaluation.prepare_shots(one, effects_kept_in_tile(made, i)))
             )
             allowed = tolerance + made.total_error[i]
-            assert np.nansum(abs(found[:, 0] - exact[:, 0])) <= allowed + 1e-9
-            off = abs(found[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_noise_sigma)
+            assert np.nansum(abs(found.pd - exact.pd)) <= allowed + 1e-9
+            off = abs(found.magnitude - exact.magnitude) / np.maximum(
+                exact.magnitude, shots.bin_noise_sigma
+            )
             assert np.nanmax(off) <= allowed + 1e-9
     # A sample at the start of the chirp never has an echo: 2e-4 of a rectangular record of 4096.
     assert kept > 5 and (dropped > 5 or tolerance < 1e-4)
@@ -254,9 +256,9 @@ def test_what_beamlets_at_other_ranges_leave_is_bounded(table_4_1):
     made = plan_points(planner_inputs(scene), {}, 0.0)
     left = overlap.residual_bound(planner_inputs(scene))
     assert (left > 0).any() and (made.total_error > 0).any()
-    off = abs(fast[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_noise_sigma)
+    off = abs(fast.magnitude - exact.magnitude) / np.maximum(exact.magnitude, shots.bin_noise_sigma)
     assert (np.nanmax(off, axis=0) <= made.total_error + 1e-9).all()
-    assert (np.nansum(abs(fast[:, 0] - exact[:, 0]), axis=0) <= made.total_error + 1e-9).all()
+    assert (np.nansum(abs(fast.pd - exact.pd), axis=0) <= made.total_error + 1e-9).all()
 
 
 @pytest.mark.parametrize("number", range(24))
@@ -310,12 +312,12 @@ def test_leakage_of_an_echo_that_begins_with_a_step_is_within_its_size(table_4_1
         made = plan_points(planner_inputs(scene), {}, 0.0)
         most = made.omission_error[made.effect_names.index("leakage")]
         found = evaluation.evaluate_segments(shots_of(scene))
-        extra = np.nansum(found[:, 5], axis=0)
+        extra = np.nansum(found.leakage, axis=0)
         assert (np.minimum(extra, 1) <= most * (1 + 1e-9) + 1e-12).all()
         whole = evaluation.evaluate_segments(
             *(s for _, s in evaluation.prepare_shots(scene, DEFAULT_EFFECTS))
         )
-        assert np.nansum(found[:, 5]) > np.nansum(whole[:, 5])
+        assert np.nansum(found.leakage) > np.nansum(whole.leakage)
         noticed += ((most < 0.5) & (most > 1e-9)).sum()
     assert noticed > 10
 

@@ -60,12 +60,12 @@ def counted(parameters, seed):
 
 def changed(on, off):
     """Sum over segments of what pd changes by; direct detection has two of them."""
-    return np.nansum(abs(on[:, 0] - off[:, 0]), axis=0)
+    return np.nansum(abs(on.pd - off.pd), axis=0)
 
 
 def magnitudes_moved(on, off, sigma):
     """Largest change of a segment's |X|, in relation to it or to sigma if that is larger."""
-    return np.nanmax(abs(on[:, 2] - off[:, 2]) / np.maximum(off[:, 2], sigma), axis=0)
+    return np.nanmax(abs(on.magnitude - off.magnitude) / np.maximum(off.magnitude, sigma), axis=0)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, 
             )
             assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all(), (name, others)
             if name == "leakage":
-                extra = np.nansum(on[:, 5], axis=0)
+                extra = np.nansum(on.leakage, axis=0)
                 assert (np.minimum(extra, 1) <= most[name] * (1 + 1e-9) + 1e-12).all()
             if name == "signal_shot_noise":
                 seen = [
@@ -316,7 +316,7 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
             of_kept = evaluate_segments(
                 prepare_ray_traced_shots(parameters, ground, effects_kept_in_tile(made, i))
             )
-            error = abs(of_kept[0, 0] * of_kept[2, 0] - truth[0, 0] * truth[2, 0])
+            error = abs(of_kept.pd[0] * of_kept.pd[2] - truth.pd[0] * truth.pd[2])
             assert (error[tile == i] <= 0.05 + ROUNDING).all()
         has_beside = made.omission_error[DEFAULT_EFFECTS.index("several_returns")].any()
         assert has_beside == (beside is not None)

@@ -104,9 +104,9 @@ def test_a_target_that_starts_from_rest_walks_in_the_down_segment(table_4_1, acc
     parameters |= {"target.acceleration": acceleration, "target.range": 50.0}
     effects = *DEFAULT_EFFECTS, "segment_motion", "acceleration"
     found = [
-        evaluation.evaluate_segments(*(shots for _, shots in prepare_shots(parameters, some)))[
-            :, 2, 0
-        ]
+        evaluation.evaluate_segments(
+            *(shots for _, shots in prepare_shots(parameters, some))
+        ).magnitude[:, 0]
         for some in (effects, (*effects, "range_walk"))
     ]
     changed = np.abs(found[0] / found[1] - 1)

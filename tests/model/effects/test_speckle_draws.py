@@ -88,7 +88,7 @@ def test_a_draws_peak_is_that_of_its_record(scene, table_4_1):
     found = evaluate_segments(drawn.shots)
     for segment in range(3):
         exact = true_magnitudes(true_spectra(shots, segment), g).max(axis=1)
-        np.testing.assert_allclose(found[segment, 2], exact, rtol=AGREEMENT)
+        np.testing.assert_allclose(found.magnitude[segment], exact, rtol=AGREEMENT)
 
 
 def test_detection_over_several_bins_is_that_of_plain_sums(table_4_1):
