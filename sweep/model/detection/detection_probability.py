@@ -33,7 +33,6 @@ import numpy as np
 from sweep.kernel_cache import njit
 from sweep.model.detection import echo_detection
 from sweep.model.detection.echo_detection import (
-    Detection,
     EchoBins,
     EchoSpans,
     at_least_two_of_three,
@@ -85,13 +84,20 @@ def detect_in_spans(shots: "Shots", spans: Any) -> Any:
     -------
     BinSpans
         Spans with the probabilities pd of detection and miss, its complement. An echo whose
-        strongest bin lies outside the search band is not detected. Both are nan in segments that do
-        not exist.
+        strongest bin lies outside the search band, or is masked by a permanent line, is not
+        detected. Both are nan in segments that do not exist.
     """
     pd, miss = spans.pd, spans.miss
     if shots.looks.is_noncoherent:
+        peak_magnitude = spans.peak_magnitude
+        if shots.permanent_line is not None:  # it adds to |X| of the bins, not to the echo's own
+            has_bins = spans.n_bins > 0
+            peak_magnitude = peak_magnitude.copy()
+            peak_magnitude[has_bins] = spans.magnitudes[
+                (spans.span_start + spans.peak_index)[has_bins]
+            ]
         pd, miss = pd_and_miss_in_looks(
-            shots, spans.peak_magnitude, spans.first_bin + spans.peak_index, spans.point_numbers
+            shots, peak_magnitude, spans.first_bin + spans.peak_index, spans.point_numbers
         )
     elif not pd_follows_from_computed_spans(shots):
         pd, miss = np.full((2, *spans.first_bin.shape), np.nan)
@@ -116,9 +122,9 @@ def detect_in_spans(shots: "Shots", spans: Any) -> Any:
             pd,
             miss,
         )
+    is_detectable = spans.peak_is_searched & ~spans.peak_is_masked
     return spans._replace(
-        pd=np.where(spans.peak_is_searched, pd, 0.0),
-        miss=np.where(spans.peak_is_searched, miss, 1.0),
+        pd=np.where(is_detectable, pd, 0.0), miss=np.where(is_detectable, miss, 1.0)
     )
 
 
@@ -157,43 +163,6 @@ def _fill_span_pd_and_miss(spans, point_indices, rule, bin_thresholds, speckle_t
                 bin_speckle_at(speckle_table, s, point_indices[j]),
             )
             pd[s, j], miss[s, j] = detection.pd, detection.miss
-
-
-def detect_in_bins(
-    shots: "Shots",
-    magnitudes: np.ndarray,
-    is_echo: np.ndarray,
-    *,
-    first_bin: int,
-    peak_index: int,
-    segment: int,
-    point: int,
-) -> Detection:
-    """Return the probabilities that the bins of one segment of one point detect an echo, or not.
-
-    Parameters
-    ----------
-    shots : Shots
-        Prepared shots.
-    magnitudes : ndarray (bins,)
-        |X| of adjacent bins [V].
-    is_echo : ndarray (bins,) bool
-        True for bins of the echo; others do not detect it.
-    first_bin : int
-        Number of the first of these bins.
-    peak_index : int
-        Index of the strongest bin among them.
-    segment, point : int
-        Indices of the segment and of the point.
-    """
-    detection: Detection = pd_and_miss(
-        EchoBins(magnitudes, is_echo, first_bin),
-        peak_index,
-        shots.detection_rule,
-        bin_threshold_at(shots.bin_thresholds, point),
-        bin_speckle_at(shots.speckle_table, segment, point),
-    )
-    return detection
 
 
 def pd_and_miss_in_looks(

@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.model import receiver_chain
-from sweep.model.detection.detection_probability import detect_in_bins, pd_and_miss_in_looks
 from sweep.model.detection.looks import Looks
 from sweep.model.preparation import Shots
 from sweep.model.waveform import count_samples_before_echo
@@ -271,7 +270,9 @@ def echo_magnitude_with_line(
 def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
     """Apply a permanent line to spectra: mask some bins and raise the magnitude of others.
 
-    The line is light other than the echo that is in every record.
+    The line is light other than the echo that is in every record. Probabilities of detection are
+    those before; :func:`sweep.model.detection.detection_probability.detect_in_spans` computes them
+    from the changed bins.
 
     Parameters
     ----------
@@ -283,15 +284,18 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
     Returns
     -------
     BinSpans
-        Spectra with changed magnitudes, probabilities, exempt bins and leakage.
+        Spectra with changed magnitudes, masked peaks, exempt bins and leakage. The magnitude of the
+        peak remains that of the echo alone.
     """
-    magnitudes = bin_spans.magnitudes.copy()
-    pd, miss, exempted, leakage = (
+    magnitudes, peak_is_masked, n_exempt, leakage = (
         values.copy()
-        for values in (bin_spans.pd, bin_spans.miss, bin_spans.n_exempt, bin_spans.leakage)
+        for values in (
+            bin_spans.magnitudes,
+            bin_spans.peak_is_masked,
+            bin_spans.n_exempt,
+            bin_spans.leakage,
+        )
     )
-    peak_magnitude = bin_spans.peak_magnitude.copy()
-    is_detectable = bin_spans.peak_is_searched.copy()
     noise_sigma, line_noise_sigma, threshold = (
         np.broadcast_to(values, shots.size)[bin_spans.point_numbers]
         for values in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
@@ -334,19 +338,8 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
         )
         equivalent_magnitudes[is_masked[bins]] = 0.0
         magnitudes[bin_slice] = equivalent_magnitudes
-        peak_magnitude[segment_index, i] = equivalent_magnitudes[peak]
-        is_detectable[segment_index, i] &= not is_masked[bins[peak]]
-        if not shots.looks.is_noncoherent:
-            pd[segment_index, i], miss[segment_index, i] = detect_in_bins(
-                shots,
-                equivalent_magnitudes,
-                is_echo,
-                first_bin=bin_spans.first_bin[segment_index, i],
-                peak_index=peak,
-                segment=segment_index,
-                point=bin_spans.point_numbers[i],
-            )
-        exempted[segment_index, i] += np.count_nonzero(is_masked & is_searched)
+        peak_is_masked[segment_index, i] = is_masked[bins[peak]]
+        n_exempt[segment_index, i] += np.count_nonzero(is_masked & is_searched)
         if shots.waveform_segments[segment_index].includes_leakage:
             alarm_probability = line_alarm_probability(
                 shots.looks,
@@ -356,17 +349,6 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
                 threshold_ratio=threshold[i] / noise_sigma[i],
             )
             leakage[segment_index, i] += (1 - leakage[segment_index, i]) * alarm_probability
-    if shots.looks.is_noncoherent:
-        pd, miss = pd_and_miss_in_looks(
-            shots,
-            peak_magnitude,
-            bin_spans.first_bin + bin_spans.peak_index,
-            bin_spans.point_numbers,
-        )
     return bin_spans._replace(
-        magnitudes=magnitudes,
-        pd=np.where(is_detectable, pd, 0.0),
-        miss=np.where(is_detectable, miss, 1.0),
-        n_exempt=exempted,
-        leakage=leakage,
+        magnitudes=magnitudes, peak_is_masked=peak_is_masked, n_exempt=n_exempt, leakage=leakage
     )

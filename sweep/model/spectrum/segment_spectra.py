@@ -174,6 +174,9 @@ class BinSpans(NamedTuple):
     """Bool: true if the largest bin of the echo is in the search band. Otherwise no span contains
     it.
     """
+    peak_is_masked: np.ndarray
+    """Bool: true if a permanent line masks the largest bin of the echo, which is then not detected.
+    """
 
     def span_magnitudes(self, segment: int, column: int) -> np.ndarray:
         """Return the magnitudes without noise around one segment's lines, (bins,) [V].
@@ -360,9 +363,9 @@ def iter_spans(
             )
             if shots.looks.is_noncoherent and leakage_method:
                 spans = _leakage_in_looks(shots, spans)
-            if computes_pd:
-                spans = detect_in_spans(shots, spans)
-            yield (spans if shots.permanent_line is None else apply_permanent_line(shots, spans))
+            if shots.permanent_line is not None:
+                spans = apply_permanent_line(shots, spans)
+            yield detect_in_spans(shots, spans) if computes_pd else spans
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
@@ -802,6 +805,7 @@ def _evaluate_batch(
         magnitudes=np.empty(n_kept),
         is_exempt=np.empty(n_kept, np.bool_),
         peak_is_searched=np.ones(shape, np.bool_),
+        peak_is_masked=np.zeros(shape, np.bool_),
     )
     n_done = _evaluate_points(
         parameters,
