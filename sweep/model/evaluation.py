@@ -237,14 +237,18 @@ def shot_statistics(
     false_alarms = _false_alarm_probabilities(shots, n_exempt)
     measured = measure_range_velocity(shots, segment_results)
     is_range_misread, is_velocity_misread = find_misread(shots, measured)
-    pd_shot, miss_shot = shot_pd_and_miss(shots, pd, miss, magnitude)
+    if shots.detection_settings.reported_peaks == waveform.STRONGEST_PEAK:
+        strongest_peaks = strongest_peak_probabilities(shots, pd, miss, magnitude, is_range_misread)
+        by_segment, of_shot = (result._asdict() for result in strongest_peaks)
+    else:
+        by_segment = {"pd": pd, "miss": miss}
+        of_shot = shot_pd_and_miss(shots, pd, miss, magnitude)._asdict()
     results = {
         f"{name}_{segment}": values[s]
-        for name, values in {"pd": pd, "miss": miss, "snr": snr}.items()
+        for name, values in (by_segment | {"snr": snr}).items()
         for s, segment in enumerate(waveform.SEGMENT_NAMES)
     } | {
-        "pd_shot": pd_shot,
-        "miss_shot": miss_shot,
+        **{f"{name}_shot": values for name, values in of_shot.items()},
         **false_alarms,
         "p_leakage_up": leakage_up,
         "p_leakage_down": leakage_down,
@@ -261,11 +265,6 @@ def shot_statistics(
         results["pd_both_chirps"] = joint_detection_probability(
             shots, pd_up, pd_down, (magnitude_up, magnitude_down)
         )
-    if shots.detection_settings.reported_peaks == waveform.STRONGEST_PEAK:
-        results |= strongest_peak_probabilities(shots, pd, miss, magnitude)
-        # Both peaks are the echo's, but they are resolved to another range.
-        pd_misread = np.where(is_range_misread, results["pd_shot"], 0.0)
-        results["p_wrong_range_shot"] = results["p_wrong_range_shot"] + pd_misread
     has_no_echo = (shots.echo_power == 0) | np.isnan(frequency[shots.has_segment]).any(axis=0)
     return results | {
         name: np.where(has_no_echo, np.nan, results[name]) for name in NAN_WITHOUT_ECHO_OUTPUTS

@@ -6,11 +6,21 @@ from shot_helpers import prepare_single_category
 
 from sweep.model.detection.detection_probability import (
     detect_in_spans,
+    doppler_pd_given_chirps,
+    down_pd_given_up,
     pd_follows_from_computed_spans,
     shot_pd_and_miss,
+    strongest_peak_of_segments,
+    strongest_peak_of_shot,
+)
+from sweep.model.detection.echo_detection import (
+    independent_bin_pd,
+    independent_bin_pd_kernel,
+    pd_of_independent_bins,
 )
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
-from sweep.model.spectrum.segment_spectra import iter_spans
+from sweep.model.effects.circulator_leak import ISOLATION_PATH, LEAK_LENGTH_PATH
+from sweep.model.spectrum.segment_spectra import evaluate_segments, iter_spans
 from sweep.model.waveform import SEARCH_BAND_PATHS
 
 RECORD_PATH = "instrument.receiver.record"
@@ -68,3 +78,67 @@ def test_pd_and_miss_of_a_shot_without_speckle_are_complements(table_4_1):
     pd, miss = shot_pd_and_miss(shots, spans.pd, spans.miss, spans.peak_magnitude)
     np.testing.assert_allclose(pd, spans.pd[0] * spans.pd[2], rtol=1e-14)
     np.testing.assert_allclose(pd + miss, 1.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize("detection", ["peak_bin", "any_bin"])
+def test_a_permanent_line_masks_the_peak_and_pd_is_computed_on_demand(detection, table_4_1):
+    """Leaked light over a path of 240 m beats as the echo from 120 m does, of the first point."""
+    parameters = table_4_1(**SMALL, detection=detection) | {
+        LEAK_LENGTH_PATH: 240.0, ISOLATION_PATH: 1e6,
+    }  # fmt: skip
+    shots = prepare_single_category(parameters, (*DEFAULT_EFFECTS, "circulator_leak"))
+    (spans,) = iter_spans(shots)
+    (without_pd,) = iter_spans(shots, computes_pd=False)
+    np.testing.assert_array_equal(without_pd.peak_is_masked, spans.peak_is_masked)
+    assert np.isnan(without_pd.pd).all() and np.isnan(without_pd.miss).all()
+    assert spans.peak_is_masked[[0, 2], 0].all() and not spans.peak_is_masked[[0, 2], 1:].any()
+    assert (spans.pd[spans.peak_is_masked] == 0).all()
+    assert (spans.miss[spans.peak_is_masked] == 1).all()
+    assert (spans.pd[[0, 2], 1:] > 0).all()
+    results = evaluate_segments(shots)  # the echo is there, though it is not detected
+    assert (results.magnitude[[0, 2], 0] > 0).all() and np.isfinite(results.frequency).all()
+
+
+def test_pd_given_other_segments_adds_up_to_pd():
+    """P(B) = P(A) P(B | A) + P(not A) P(B | not A)."""
+    pd_up, pd_down = np.array([0.0, 0.2, 0.7, 1.0]), np.array([0.5, 0.6, 0.4, 0.3])
+    pd_both = pd_up * pd_down + np.array([0.0, 0.05, 0.1, 0.0])
+    down = down_pd_given_up(pd_up, pd_down, pd_both)
+    np.testing.assert_allclose(pd_up * down.if_holds + (1 - pd_up) * down.if_fails, pd_down)
+    np.testing.assert_allclose(pd_up[1:] * down.if_holds[1:], pd_both[1:])
+    one, doppler = pd_up + pd_down - 2 * pd_both, np.array([0.4, 0.5, 0.6, 0.7])
+    added = one * np.array([0.5, 0.6, 0.7, 0.8])
+    given = doppler_pd_given_chirps(doppler, one, added, np.array([True, True, True, False]))
+    np.testing.assert_allclose(given.if_holds, [0.5, 0.6, 0.7, 0.7])
+    np.testing.assert_allclose(one * given.if_holds + (1 - one) * given.if_fails, doppler)
+
+
+def test_a_segment_reports_the_echo_or_another_peak_or_none():
+    pd = np.array([[0.3, 0.9], [0.5, 0.5], [0.6, 0.99]])
+    loss, alarm = 0.2 * pd, np.array([[0.1, 0.5], [0.2, 0.2], [0.3, 0.0]])
+    segments = strongest_peak_of_segments(pd, 1 - pd, loss, alarm)
+    none = (1 - alarm) * (1 - pd)
+    np.testing.assert_allclose(segments.pd + segments.p_wrong_range + none, 1.0)
+    np.testing.assert_allclose(segments.pd + segments.miss, 1.0)
+    shot = strongest_peak_of_shot(
+        segments,
+        alarm,
+        shared_speckle_gain=np.zeros(2),
+        speckle_covariance=None,
+        is_range_misread=np.array([False, True]),
+    )
+    reported = (1 - none[0]) * (1 - none[2])  # by both chirps
+    right = segments.pd[0] * segments.pd[2]
+    np.testing.assert_allclose(shot.pd, right)
+    np.testing.assert_allclose(shot.miss, 1 - right)
+    np.testing.assert_allclose(shot.p_wrong_range, reported - right * np.array([1.0, 0.0]))
+
+
+@pytest.mark.parametrize("n_bins", [1.0, 1.7, 12.0])
+def test_independent_bins_together_are_detected_as_the_echo(n_bins):
+    pd = np.array([1e-30, 1e-9, 0.2, 0.999])
+    bin_pd = independent_bin_pd(pd, n_bins)
+    np.testing.assert_allclose(bin_pd[2:], 1 - (1 - pd[2:]) ** (1 / n_bins), rtol=1e-12)
+    for whole, single in zip(pd, bin_pd, strict=True):
+        assert independent_bin_pd_kernel(whole, n_bins) == pytest.approx(single, rel=1e-14)
+        assert pd_of_independent_bins(single, n_bins) == pytest.approx(whole, rel=1e-12)

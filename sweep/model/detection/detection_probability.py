@@ -9,9 +9,14 @@ one echo in one record         :func:`sweep.model.detection.echo_detection.pd_an
 one bin in several looks       :func:`pd_and_miss_in_looks`
 the segments of points         :func:`detect_in_spans`, by one of these two laws. A span is the
                                range of bins around an echo; it is final then: cut to the search
-                               band, and empty in segments that no echo reaches
+                               band, empty in segments that no echo reaches, and with the permanent
+                               line
+a group of bins                :func:`pd_of_bin_group` in one record, :func:`final_group_pd` in all
 both chirps of a shot          :func:`joint_detection_probability`
 a shot                         :func:`shot_pd_and_miss`, by both chirps or any two of three segments
+the strongest peak alone       :func:`strongest_peak_of_segments` and :func:`strongest_peak_of_shot`
+one of M independent bins      :func:`sweep.model.detection.echo_detection.independent_bin_pd`
+a segment, given another one   :func:`down_pd_given_up`, :func:`doppler_pd_given_chirps`
 =============================  ====================================================================
 
 Developed speckle makes the segments of a shot fade together. Far from DC and Nyquist an echo's bins
@@ -20,13 +25,11 @@ are circular complex Gaussian numbers, and the joint laws are those of
 of a real record, lines overlap their images, and the laws are corrected by
 :mod:`sweep.model.detection.pseudo_variance`.
 
-Three callers apply the first two laws to bins of their own: groups of bins
-(:mod:`sweep.model.pointcloud.bin_groups`), permanent lines, which change |X|
-(:mod:`sweep.model.spectrum.permanent_line`, by :func:`detect_in_bins`), and higher thresholds
-(:mod:`sweep.model.spectrum.strongest_peak`).
+:mod:`sweep.model.spectrum.strongest_peak` applies the first law at higher thresholds, to find how
+often another peak is larger than the echo's.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -38,6 +41,8 @@ from sweep.model.detection.echo_detection import (
     at_least_two_of_three,
     bin_speckle_at,
     bin_threshold_at,
+    echo_bounds,
+    echo_half_width,
     pd_and_miss,
 )
 from sweep.model.detection.look_speckle import phase_rotated_look_covariances
@@ -163,6 +168,85 @@ def _fill_span_pd_and_miss(spans, point_indices, rule, bin_thresholds, speckle_t
                 bin_speckle_at(speckle_table, s, point_indices[j]),
             )
             pd[s, j], miss[s, j] = detection.pd, detection.miss
+
+
+@njit(cache=True, error_model="numpy")
+def pd_of_bin_group(magnitude, strongest, first, last, first_bin, rule, bin_threshold, bin_speckle):
+    """Return the probability that noise and signal detect a group of adjacent bins in one record.
+
+    The group counts as an echo of its own, which extends over bins of its lobe below the threshold
+    (:func:`sweep.model.detection.echo_detection.echo_bounds`). The law is
+    :func:`sweep.model.detection.echo_detection.pd_and_miss`.
+
+    Parameters
+    ----------
+    magnitude
+        (bins,): |X| without noise of the span, the adjacent bins around an echo [V].
+    strongest, first, last
+        Indices in the span of the group's strongest, first and last bin.
+    first_bin
+        Number of the span's first bin.
+    rule, bin_threshold, bin_speckle
+        :class:`~sweep.model.detection.echo_detection.DetectionRule`,
+        :class:`~sweep.model.detection.echo_detection.BinThreshold` and
+        :class:`~sweep.model.detection.echo_detection.BinSpeckle` of the point and segment.
+    """
+    first_index, last_index = echo_bounds(
+        magnitude,
+        first,
+        last,
+        bin_threshold.threshold,
+        echo_half_width(rule, bin_threshold.pedestal.reach_bins),
+    )
+    return pd_and_miss(
+        EchoBins(
+            magnitude[first_index : last_index + 1],
+            np.ones(last_index - first_index + 1, np.bool_),
+            first_bin + first_index,
+        ),
+        strongest - first_index,
+        rule,
+        bin_threshold,
+        bin_speckle,
+    ).pd
+
+
+def final_group_pd(
+    shots: "Shots",
+    pd: np.ndarray,
+    magnitude: np.ndarray,
+    strongest_bin: np.ndarray,
+    is_searched: np.ndarray,
+    point_indices: np.ndarray,
+) -> np.ndarray:
+    """Return the probabilities of detection of groups of bins in all records of a segment.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    pd : ndarray (m, 3, groups)
+        Probabilities of detection in one record, by :func:`pd_of_bin_group`.
+    magnitude : ndarray (m, 3, groups)
+        |X| of each group's strongest bin [V].
+    strongest_bin : ndarray (m, 3, groups)
+        Numbers of these bins.
+    is_searched : ndarray (m, 3) bool
+        True if the search band contains any bin of the echo, the first group.
+    point_indices : ndarray (m,)
+        Points to which the rows belong.
+
+    Returns
+    -------
+    ndarray (m, 3, groups)
+        That of :func:`pd_and_miss_in_looks` if several looks are combined, else ``pd``; 0 for an
+        echo that is not searched.
+    """
+    if shots.looks.is_noncoherent:
+        pd = pd_and_miss_in_looks(shots, magnitude.T, strongest_bin.T, point_indices).pd.T
+    pd = pd.copy()
+    pd[..., 0] = np.where(is_searched, pd[..., 0], 0.0)
+    return pd
 
 
 def pd_and_miss_in_looks(
@@ -518,3 +602,186 @@ def _pd_and_miss_any_two(
             ),
         )
     return DetectionArrays(pd_shot, miss_shot)
+
+
+class StrongestPeakProbabilities(NamedTuple):
+    """Probabilities of what is reported if a segment reports its strongest peak alone.
+
+    Arrays are (3, n) by segment, or (n,) of the shot.
+    """
+
+    pd: np.ndarray
+    """Probability that the echo's peak is reported; of a shot, that those of both chirps are."""
+    miss: np.ndarray
+    """1 - pd, with its digits."""
+    p_wrong_range: np.ndarray
+    """Probability that another peak is reported. A shot reports a wrong range if both chirps report
+    a peak, but not both report that of the echo, or if both are resolved to another range."""
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def pd_decrease(at_threshold, at_level):
+    """Return by how much pd falls as the threshold rises to a level, P_b - P_z >= 0.
+
+    It is the difference of the smaller ones of pd and miss, which keeps its digits.
+
+    Parameters
+    ----------
+    at_threshold, at_level
+        :class:`~sweep.model.detection.echo_detection.Detection` of an echo at the threshold b and
+        at the higher level z.
+    """
+    decrease = at_threshold.pd - at_level.pd
+    if at_level.miss < 0.5:
+        decrease = at_level.miss - at_threshold.miss
+    return max(decrease, 0.0)
+
+
+def strongest_peak_of_segments(
+    pd: np.ndarray, miss: np.ndarray, pd_loss: np.ndarray, p_alarm: np.ndarray
+) -> StrongestPeakProbabilities:
+    """Return the probabilities that a segment's strongest peak is the echo's, or another one.
+
+    Parameters
+    ----------
+    pd, miss : ndarray (3, n)
+        Probabilities that any peak of the echo is detected, or none.
+    pd_loss : ndarray (3, n)
+        Probability L that the echo crosses the threshold, but another peak is larger.
+    p_alarm : ndarray (3, n)
+        Probability that any bin outside the echo crosses the threshold.
+
+    Notes
+    -----
+    P(right) = pd - L, and P(wrong) = p_alarm miss + L.
+    """
+    return StrongestPeakProbabilities(
+        pd=np.maximum(pd - pd_loss, 0.0),
+        miss=np.minimum(miss + pd_loss, 1.0),
+        p_wrong_range=np.minimum(p_alarm * miss + pd_loss, 1.0),
+    )
+
+
+def strongest_peak_of_shot(
+    segments: StrongestPeakProbabilities,
+    p_alarm: np.ndarray,
+    *,
+    shared_speckle_gain: np.ndarray,
+    speckle_covariance: np.ndarray | None,
+    is_range_misread: np.ndarray,
+) -> StrongestPeakProbabilities:
+    """Return the probabilities that both chirps report the echo's peak, or a shot a wrong range.
+
+    Parameters
+    ----------
+    segments : StrongestPeakProbabilities
+        Probabilities of the segments, (3, n).
+    p_alarm : ndarray (3, n)
+        Probability that any bin outside the echo crosses the threshold.
+    shared_speckle_gain : ndarray (n,)
+        Increase of the probability that both are right, due to speckle that both chirps share, in
+        cases where bins outside the echo cross the threshold.
+    speckle_covariance : ndarray (n,) or None
+        Probability that the echo is detected in both chirps, minus the product of those in each;
+        None without developed speckle.
+    is_range_misread : ndarray (n,) bool
+        True where the peaks of the echo itself are resolved to a wrong range.
+
+    Notes
+    -----
+    With r, w and a the probabilities of a right peak, a wrong peak and an alarm in up (1) and down
+    segment (2), G ``shared_speckle_gain`` and C ``speckle_covariance``,
+
+        P(right) = min(r1 r2 + G + (1 - a1) (1 - a2) C, r1, r2)
+        P(wrong) = w1 (r2 + w2) + r1 w2 - G, plus P(right) where the range is misread
+        P(miss) = miss1 + r1 - P(right)
+    """
+    right_up, _, right_down = segments.pd
+    miss_up, _, _ = segments.miss
+    wrong_up, _, wrong_down = segments.p_wrong_range
+    p_both_right = right_up * right_down + shared_speckle_gain
+    if speckle_covariance is not None:
+        alarm_up, _, alarm_down = p_alarm
+        p_no_alarm = (1 - alarm_up) * (1 - alarm_down)
+        p_both_right = np.minimum(
+            p_both_right + p_no_alarm * speckle_covariance, np.minimum(right_up, right_down)
+        )
+    p_wrong = wrong_up * (right_down + wrong_down) + right_up * wrong_down
+    return StrongestPeakProbabilities(
+        pd=p_both_right,
+        miss=np.minimum(miss_up + np.maximum(right_up - p_both_right, 0.0), 1.0),
+        p_wrong_range=np.maximum(p_wrong - shared_speckle_gain, 0.0)
+        + np.where(is_range_misread, p_both_right, 0.0),
+    )
+
+
+class ConditionalPd(NamedTuple):
+    """Probabilities of detection in a segment, given the result in other segments of the shot."""
+
+    if_fails: np.ndarray
+    """(...): probability if the condition does not hold."""
+    if_holds: np.ndarray
+    """(...): probability if the condition holds."""
+
+
+def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> ConditionalPd:
+    """Return the probability of detection in the down segment, given the result in the up segment.
+
+    Parameters
+    ----------
+    pd_up, pd_down, pd_both
+        Probability of a detection in the up segment, in the down segment, and in both, (...).
+
+    Returns
+    -------
+    ConditionalPd
+        The condition is a detection in the up segment. Without one the probability is
+        (pd_down - pd_both) / (1 - pd_up), with one pd_both / pd_up.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        without_up = np.where(
+            pd_up < 1, np.clip((pd_down - pd_both) / (1 - pd_up), 0.0, 1.0), pd_down
+        )
+        return ConditionalPd(
+            without_up, np.where(pd_up > 0, np.minimum(pd_both / pd_up, 1.0), pd_down)
+        )
+
+
+def doppler_pd_given_chirps(
+    pd_doppler: np.ndarray,
+    pd_exactly_one: np.ndarray,
+    pd_added_by_doppler: np.ndarray,
+    detects_any_two: np.ndarray,
+) -> ConditionalPd:
+    """Return the probability of detection in the Doppler segment, given the results of both chirps.
+
+    The condition is that exactly one of the up and the down segment detects. If any two of three
+    segments detect a shot, the Doppler segment decides then.
+
+    Parameters
+    ----------
+    pd_doppler
+        (...): probability D of a detection in the Doppler segment.
+    pd_exactly_one
+        (...): probability E that exactly one of the chirps detects.
+    pd_added_by_doppler
+        (...): probability A that the Doppler segment and exactly one chirp detect.
+    detects_any_two
+        (...) bool: True where any two of three segments detect a shot. Elsewhere the Doppler
+        segment decides nothing, and both probabilities are D.
+
+    Returns
+    -------
+    ConditionalPd
+        A / E if the condition holds, (D - A) / (1 - E) if it does not.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if_holds = np.where(
+            detects_any_two & (pd_exactly_one > 0),
+            np.clip(pd_added_by_doppler / pd_exactly_one, 0.0, 1.0),
+            pd_doppler,
+        )
+        if_fails = np.clip((pd_doppler - pd_added_by_doppler) / (1 - pd_exactly_one), 0.0, 1.0)
+    return ConditionalPd(
+        np.where(detects_any_two & (pd_exactly_one < 1), if_fails, pd_doppler), if_holds
+    )

@@ -539,7 +539,7 @@ def joint_pd_in_speckle(
     with np.errstate(divide="ignore"):
         bin_pds = [np.where(is_defined, p, 1.0) for p in (pd_first, pd_second)]
         bin_pd_first, bin_pd_second = (
-            np.where(n_independent_bins > 1, -np.expm1(np.log1p(-p) / n_independent_bins), p)
+            np.where(n_independent_bins > 1, independent_bin_pd(p, n_independent_bins), p)
             for p in bin_pds
         )
         a, b = (np.minimum(-np.log(p), 700.0) for p in (bin_pd_first, bin_pd_second))
@@ -616,6 +616,45 @@ def detection_equivalent_bins(
             -np.minimum(single_bin_pd, 1 - 1e-15)
         )
     return np.clip(np.nan_to_num(n_bins, nan=1.0), 1.0, INDEPENDENT_BINS_MAX)
+
+
+def independent_bin_pd(
+    pd: np.ndarray | float, n_independent_bins: np.ndarray | float
+) -> np.ndarray | float:
+    """Return the probability of detection of each of M equal and independent bins of an echo.
+
+    Parameters
+    ----------
+    pd
+        Probability that any of the bins is detected.
+    n_independent_bins
+        M, not necessarily an integer.
+
+    Returns
+    -------
+    ndarray or float
+        1 - (1 - pd)^(1/M), with its digits.
+
+    Examples
+    --------
+    >>> round(float(independent_bin_pd(0.75, 2.0)), 6)
+    0.5
+    """
+    return -np.expm1(np.log1p(-pd) / n_independent_bins)
+
+
+independent_bin_pd_kernel = njit(cache=True, error_model="numpy", borrows=True)(independent_bin_pd)
+"""The same for a kernel and single numbers."""
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def pd_of_independent_bins(bin_pd, n_bins):
+    """Return the probability 1 - (1 - q)^M that any of M independent bins is detected.
+
+    The inverse of :func:`independent_bin_pd`; ``bin_pd`` is q, and ``n_bins`` M, not necessarily an
+    integer.
+    """
+    return -math.expm1(n_bins * math.log1p(-bin_pd))
 
 
 def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) -> np.ndarray:

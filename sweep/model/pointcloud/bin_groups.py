@@ -10,15 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.detection.detection_probability import pd_and_miss_in_looks
-from sweep.model.detection.echo_detection import (
-    EchoBins,
-    bin_speckle_at,
-    bin_threshold_at,
-    echo_bounds,
-    echo_half_width,
-    pd_and_miss,
-)
+from sweep.model.detection.detection_probability import final_group_pd, pd_of_bin_group
+from sweep.model.detection.echo_detection import bin_speckle_at, bin_threshold_at
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
@@ -143,7 +136,6 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
     bin_groups
         Arrays of :func:`allocate_bin_groups` for all points, in which the groups are written.
     """
-    pd = bin_groups.pd
     nyquist_bin = 0 if shots.complex_record else shots.fft_size // 2
     n_bins, magnitudes = (
         (spans.n_bins, spans.magnitudes)
@@ -165,22 +157,18 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
         shots.speckle_table,
         bin_groups,
     )
-    if shots.looks.is_noncoherent:
-        strongest_bins, peak_magnitudes = (
-            bin_groups.strongest_bin[spans.point_numbers],
-            bin_groups.magnitude[spans.point_numbers],
-        )
-        peak_pd = pd_and_miss_in_looks(
-            shots, peak_magnitudes.T, strongest_bins.T, spans.point_numbers
-        ).pd
-        pd[spans.point_numbers] = peak_pd.T
+    bin_groups.pd[spans.point_numbers] = final_group_pd(
+        shots,
+        bin_groups.pd[spans.point_numbers],
+        bin_groups.magnitude[spans.point_numbers],
+        bin_groups.strongest_bin[spans.point_numbers],
+        spans.peak_is_searched.T | (n_bins.T > 0),
+        spans.point_numbers,
+    )
     lacks_group = (bin_groups.strongest_bin[spans.point_numbers, :, 0] < 0) & shots.has_segment
     strongest_magnitudes = bin_groups.neighbour_magnitudes[spans.point_numbers, :, 0, 1]
     bin_groups.neighbour_magnitudes[spans.point_numbers, :, 0, 1] = np.where(
         lacks_group, spans.peak_magnitude.T, strongest_magnitudes
-    )
-    pd[spans.point_numbers, :, 0] = np.where(
-        spans.peak_is_searched.T | (n_bins.T > 0), pd[spans.point_numbers, :, 0], 0.0
     )
     n_exempt_or_nan = np.where((spans.n_bins > 0) | ~spans.peak_is_searched, spans.n_exempt, np.nan)
     bin_groups.n_exempt[spans.point_numbers], bin_groups.leakage[spans.point_numbers] = (
@@ -250,7 +238,6 @@ def _fill_groups(
     for j in range(point_numbers.size):
         i = point_numbers[j]
         bin_threshold = bin_threshold_at(bin_thresholds, i)
-        threshold = bin_threshold.threshold
         for segment in range(3):
             if n_bins[segment, j] == 0:
                 continue
@@ -263,28 +250,21 @@ def _fill_groups(
                 bin_groups.first_bin[i, segment],
                 bin_groups.last_bin[i, segment],
             )
-            n_groups = _list_groups(magnitude, is_echo, peak_index[segment, j], threshold, bounds)
+            n_groups = _list_groups(
+                magnitude, is_echo, peak_index[segment, j], bin_threshold.threshold, bounds
+            )
             for group in range(n_groups):
                 strongest_index = bounds.strongest[group]
-                lobe_half_width = echo_half_width(rule, bin_threshold.pedestal.reach_bins)
-                first_index, last_index = echo_bounds(
+                bin_groups.pd[i, segment, group] = pd_of_bin_group(
                     magnitude,
+                    strongest_index,
                     bounds.first[group],
                     bounds.last[group],
-                    threshold,
-                    lobe_half_width,
-                )
-                bin_groups.pd[i, segment, group] = pd_and_miss(
-                    EchoBins(
-                        magnitude[first_index : last_index + 1],
-                        np.ones(last_index - first_index + 1, np.bool_),
-                        first_bin[segment, j] + first_index,
-                    ),
-                    strongest_index - first_index,
+                    first_bin[segment, j],
                     rule,
                     bin_threshold,
                     bin_speckle_at(speckle_table, segment, i),
-                ).pd
+                )
                 for side in range(3):
                     bin_groups.neighbour_magnitudes[i, segment, group, side] = _mirrored_magnitude(
                         magnitude, first_bin[segment, j], strongest_index + side - 1, nyquist_bin

@@ -54,6 +54,7 @@ from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.bin_noise import noise_filter
 from sweep.model.detection.detection_probability import (
+    down_pd_given_up,
     joint_detection_probability,
     mean_detection_equivalent_bins,
 )
@@ -62,7 +63,10 @@ from sweep.model.detection.echo_detection import (
     bin_threshold_at,
     echo_bounds,
     fill_pedestal_ratios,
+    independent_bin_pd,
+    independent_bin_pd_kernel,
     is_real_bin,
+    pd_of_independent_bins,
 )
 from sweep.model.detection.estimators import RangeVelocityDeviation, range_velocity_deviation
 from sweep.model.detection.hoyt import hoyt_tails, pseudo_variance_ratio_at
@@ -107,7 +111,6 @@ from sweep.model.sampling.draws import (
     NoiseFilter,
     NoiselessSpectra,
     NoiseScratch,
-    down_pd_given_up,
     draw_bin_noise,
     draw_bin_noise_by_root,
     iter_noiseless_spectra,
@@ -763,8 +766,8 @@ def make_draw_inputs(
         doppler_prediction=DopplerPrediction(
             *(np.array(np.broadcast_to(v, shots.size)) for v in _doppler_prediction(shots, motion))
         ),
-        down_pd_if_up_missed=np.ascontiguousarray(down_pd.up_missed),
-        down_pd_if_up_detected=np.ascontiguousarray(down_pd.up_detected),
+        down_pd_if_up_missed=np.ascontiguousarray(down_pd.if_fails),
+        down_pd_if_up_detected=np.ascontiguousarray(down_pd.if_holds),
         first_searched_bin=first_searched_bin,
         last_searched_bin=last_searched_bin,
         line_grid=speckle_line_grid(shots),
@@ -843,7 +846,7 @@ def _speckle_draw_inputs(
     n_independent = _n_independent_bins(shots, bin_groups, has_noncircular_bins)
     with np.errstate(divide="ignore", invalid="ignore"):
         # Fraction for one bin of equal probability, as in `joint_pd_in_speckle`.
-        single_bin_pd = -np.expm1(np.log1p(-bin_groups.pd) / n_independent)
+        single_bin_pd = independent_bin_pd(bin_groups.pd, n_independent)
         echo_fraction = (
             1
             + np.log(np.where(n_independent > 1, single_bin_pd, bin_groups.pd))
@@ -2305,7 +2308,7 @@ def detect_in_speckle(
     )
     n_independent_bins = inputs.n_independent_bins[point, segment, group]
     if n_independent_bins > 1.0:
-        pd = -math.expm1(math.log1p(-pd) / n_independent_bins)
+        pd = independent_bin_pd_kernel(pd, n_independent_bins)
     echo_fraction, is_noncircular = (
         inputs.echo_fraction[point, segment, group],
         is_near_end(first_bin, n_bins, config),
@@ -2437,7 +2440,7 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
         if math.exp(-power) < (
             single_bin_pd
             if n_bins_left >= 1.0
-            else -math.expm1(n_bins_left * math.log1p(-single_bin_pd))
+            else pd_of_independent_bins(single_bin_pd, n_bins_left)
         ):
             return True
         n_bins_left, random_index = n_bins_left - 1.0, random_index + 1

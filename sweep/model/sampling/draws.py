@@ -24,6 +24,10 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
+from sweep.model.detection.detection_probability import (
+    doppler_pd_given_chirps,
+    down_pd_given_up,
+)
 from sweep.model.detection.echo_detection import (
     BinThresholds,
     bin_threshold_at,
@@ -168,15 +172,6 @@ class EventProbabilities(NamedTuple):
     """(3, n): probability of a detection if the condition is not met."""
     pd_if_condition_holds: np.ndarray
     """(3, n): probability of a detection if the condition is met."""
-
-
-class DownPd(NamedTuple):
-    """Probabilities of detection in the down segment, given the result in the up segment."""
-
-    up_missed: np.ndarray
-    """(...): probability without a detection in the up segment."""
-    up_detected: np.ndarray
-    """(...): probability with a detection in the up segment."""
 
 
 class SegmentAmplitudes(NamedTuple):
@@ -428,22 +423,8 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilitie
     both = np.where(np.isfinite(stated_both), stated_both, pd_shot)
     down_pd = down_pd_given_up(pd_up, pd_down, both)
     pd_doppler = np.nan_to_num(outputs["pd_doppler"])
-    pd_of_exactly_one, pd_added_by_doppler, detects_any_two = (
-        pd_up + pd_down - 2 * both,
-        pd_shot - both,
-        np.isfinite(stated_both),
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        doppler_if_one = np.where(
-            detects_any_two & (pd_of_exactly_one > 0),
-            np.clip(pd_added_by_doppler / pd_of_exactly_one, 0.0, 1.0),
-            pd_doppler,
-        )
-        doppler_if_not_one = np.clip(
-            (pd_doppler - pd_added_by_doppler) / (1 - pd_of_exactly_one), 0.0, 1.0
-        )
-    doppler_otherwise = np.where(
-        detects_any_two & (pd_of_exactly_one < 1), doppler_if_not_one, pd_doppler
+    doppler_pd = doppler_pd_given_chirps(
+        pd_doppler, pd_up + pd_down - 2 * both, pd_shot - both, np.isfinite(stated_both)
     )
     pfa_noise_up = outputs["pfa_segment"]
     both, log_pfa_up = outputs["log10_pfa_both_chirps"], outputs["log10_pfa_segment"]
@@ -455,30 +436,9 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilitie
     alarm_down = 1 - (1 - pfa_noise_down) * (1 - outputs["p_leakage_down"])
     return EventProbabilities(
         alarm=np.array([alarm_up, np.zeros_like(alarm_up), alarm_down]),
-        pd_if_condition_fails=np.array([pd_up, doppler_otherwise, down_pd.up_missed]),
-        pd_if_condition_holds=np.array([pd_up, doppler_if_one, down_pd.up_detected]),
+        pd_if_condition_fails=np.array([pd_up, doppler_pd.if_fails, down_pd.if_fails]),
+        pd_if_condition_holds=np.array([pd_up, doppler_pd.if_holds, down_pd.if_holds]),
     )
-
-
-def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> DownPd:
-    """Return the probability of detection in the down segment, given the result in the up segment.
-
-    Parameters
-    ----------
-    pd_up, pd_down, pd_both
-        Probability of a detection in the up segment, in the down segment, and in both, (...).
-
-    Returns
-    -------
-    DownPd
-        Without a detection in the up segment (pd_down - pd_both) / (1 - pd_up), with one pd_both /
-        pd_up.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        without_up = np.where(
-            pd_up < 1, np.clip((pd_down - pd_both) / (1 - pd_up), 0.0, 1.0), pd_down
-        )
-        return DownPd(without_up, np.where(pd_up > 0, np.minimum(pd_both / pd_up, 1.0), pd_down))
 
 
 def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarray]:

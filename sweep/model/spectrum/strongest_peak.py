@@ -29,9 +29,14 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model import waveform
 from sweep.model.detection import bin_noise
-from sweep.model.detection.detection_probability import joint_detection_probability
+from sweep.model.detection.detection_probability import (
+    StrongestPeakProbabilities,
+    joint_detection_probability,
+    pd_decrease,
+    strongest_peak_of_segments,
+    strongest_peak_of_shot,
+)
 from sweep.model.detection.echo_detection import (
     BinThreshold,
     Detection,
@@ -96,9 +101,22 @@ class LevelProbabilities(NamedTuple):
     """
 
 
+class StrongestPeakResults(NamedTuple):
+    """Probabilities of the segments and of the shot if only the strongest peak is reported."""
+
+    segments: StrongestPeakProbabilities
+    """(3, n), by segment."""
+    shot: StrongestPeakProbabilities
+    """(n,), of the shot."""
+
+
 def strongest_peak_probabilities(
-    shots: Shots, pd: np.ndarray, miss: np.ndarray, magnitude: np.ndarray
-) -> dict[str, np.ndarray]:
+    shots: Shots,
+    pd: np.ndarray,
+    miss: np.ndarray,
+    magnitude: np.ndarray,
+    is_range_misread: np.ndarray,
+) -> StrongestPeakResults:
     """Compute detection and wrong-range probabilities if only the strongest peak is reported.
 
     Parameters
@@ -109,47 +127,36 @@ def strongest_peak_probabilities(
         Probabilities, by segment, that any peak of the echo is detected, or not.
     magnitude : ndarray (3, n)
         |X| of the strongest bin [V, summed over the record].
-
-    Returns
-    -------
-    dict of str to ndarray (n,)
-        ``pd_``, ``miss_`` and ``p_wrong_range_`` of each segment and of the shot.
+    is_range_misread : ndarray (n,) bool
+        True where the peaks of the echo itself are resolved to a wrong range.
     """
     pd_loss, p_alarm, shared_speckle_gain = (
         np.zeros((3, shots.size)),
         np.zeros((3, shots.size)),
         np.zeros(shots.size),
     )
-    for spans in iter_spans(shots, bin_by_bin=True):
+    for spans in iter_spans(shots, bin_by_bin=True, computes_pd=False):
         probabilities = _span_probabilities(shots, spans, pd)
         pd_loss[:, spans.point_numbers] = probabilities.pd_loss
         p_alarm[:, spans.point_numbers] = probabilities.p_alarm
         shared_speckle_gain[spans.point_numbers] = probabilities.shared_speckle_gain
-    pd_right, miss_right = np.maximum(pd - pd_loss, 0.0), np.minimum(miss + pd_loss, 1.0)
-    p_wrong = np.minimum(p_alarm * miss + pd_loss, 1.0)
-    results = {
-        f"{name}_{segment}": values[s]
-        for name, values in {"pd": pd_right, "miss": miss_right, "p_wrong_range": p_wrong}.items()
-        for s, segment in enumerate(waveform.SEGMENT_NAMES)
-    }
-    p_no_alarm = (1 - p_alarm[UP]) * (1 - p_alarm[DOWN])
-    p_both_right = pd_right[UP] * pd_right[DOWN] + shared_speckle_gain
+    segments = strongest_peak_of_segments(pd, miss, pd_loss, p_alarm)
+    speckle_covariance = None
     if shots.speckle.segment_correlations is not None:
         speckle_covariance = (
             joint_detection_probability(shots, pd[UP], pd[DOWN], (magnitude[UP], magnitude[DOWN]))
             - pd[UP] * pd[DOWN]
         )
-        p_both_right = np.minimum(
-            p_both_right + p_no_alarm * speckle_covariance,
-            np.minimum(pd_right[UP], pd_right[DOWN]),
-        )
-    p_reported_wrong = p_wrong[UP] * (pd_right[DOWN] + p_wrong[DOWN]) + pd_right[UP] * p_wrong[DOWN]
-    miss_shot = miss_right[UP] + np.maximum(pd_right[UP] - p_both_right, 0.0)
-    return results | {
-        "pd_shot": p_both_right,
-        "miss_shot": np.minimum(miss_shot, 1.0),
-        "p_wrong_range_shot": np.maximum(p_reported_wrong - shared_speckle_gain, 0.0),
-    }
+    return StrongestPeakResults(
+        segments,
+        strongest_peak_of_shot(
+            segments,
+            p_alarm,
+            shared_speckle_gain=shared_speckle_gain,
+            speckle_covariance=speckle_covariance,
+            is_range_misread=is_range_misread,
+        ),
+    )
 
 
 def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> SpanProbabilities:
@@ -359,11 +366,7 @@ def _evaluate_levels(
                     )
                     if k == THRESHOLD_LEVEL_INDEX:
                         at_threshold = at_level
-                    # The difference of the smaller probabilities keeps its digits.
-                    loss_at_level = at_threshold.pd - at_level.pd
-                    if at_level.miss < 0.5:
-                        loss_at_level = at_level.miss - at_threshold.miss
-                    pd_loss[s, j, k] = max(loss_at_level, 0.0)
+                    pd_loss[s, j, k] = pd_decrease(at_threshold, at_level)
                 if includes_leakage:
                     p_leak = span_leakage_probability(
                         magnitudes,
