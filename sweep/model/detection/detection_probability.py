@@ -56,24 +56,6 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
 
-def pd_follows_from_computed_spans(shots: "Shots") -> bool:
-    """Test if probabilities of detection follow from the bins around an echo as first computed.
-
-    They do not if a search band later removes some of these bins, if leaked light adds a line to
-    them, or if several looks (records of each segment) are combined.
-
-    Parameters
-    ----------
-    shots : Shots
-        Prepared shots.
-    """
-    return (
-        shots.detection_settings.search_band is None
-        and shots.permanent_line is None
-        and not shots.looks.is_noncoherent
-    )
-
-
 def detect_in_spans(shots: "Shots", spans: Any) -> Any:
     """Set the probabilities of detection of each segment from the bins around its echo.
 
@@ -82,8 +64,7 @@ def detect_in_spans(shots: "Shots", spans: Any) -> Any:
     shots : Shots
         Prepared shots.
     spans : BinSpans
-        Spans (ranges of adjacent bins around the echoes) of m points. Their pd and miss are kept
-        if :func:`pd_follows_from_computed_spans` is true.
+        Spans (ranges of adjacent bins around the echoes) of m points.
 
     Returns
     -------
@@ -92,7 +73,6 @@ def detect_in_spans(shots: "Shots", spans: Any) -> Any:
         strongest bin lies outside the search band, or is masked by a permanent line, is not
         detected. Both are nan in segments that do not exist.
     """
-    pd, miss = spans.pd, spans.miss
     if shots.looks.is_noncoherent:
         peak_magnitude = spans.peak_magnitude
         if shots.permanent_line is not None:  # it adds to |X| of the bins, not to the echo's own
@@ -104,7 +84,7 @@ def detect_in_spans(shots: "Shots", spans: Any) -> Any:
         pd, miss = pd_and_miss_in_looks(
             shots, peak_magnitude, spans.first_bin + spans.peak_index, spans.point_numbers
         )
-    elif not pd_follows_from_computed_spans(shots):
+    else:
         pd, miss = np.full((2, *spans.first_bin.shape), np.nan)
         _fill_span_pd_and_miss(
             EchoSpans(

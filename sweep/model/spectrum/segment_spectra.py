@@ -21,19 +21,13 @@ from sweep.model.detection.added_crossings import (
 )
 from sweep.model.detection.detection_probability import (
     detect_in_spans,
-    pd_follows_from_computed_spans,
 )
 from sweep.model.detection.echo_detection import (
     BinThreshold,
-    Detection,
     DetectionRule,
-    EchoBins,
     PedestalShape,
-    SpeckleTable,
     any_crossing_of_chain,
-    bin_speckle_at,
     clear_image_exemptions,
-    pd_and_miss,
 )
 from sweep.model.detection.looks import DRIFT_POSITIONS_MAX
 from sweep.model.detection.speckle_crossing_rates import (
@@ -93,6 +87,9 @@ as many."""
 SPAN_BINS_PER_BATCH = 1 << 21
 """Least number of bins, over all spans, for which memory is allocated in one step. A span is a
 range of bins around a segment's lines."""
+
+POINTS_PER_BATCH_MAX = 1 << 13
+"""Largest number of points whose spans are allocated in one step."""
 
 THRESHOLD_RATIO_STEP = 1e-7
 """Step to which the threshold over the noise sigma is rounded. Rates of false alarms due to leaked
@@ -237,10 +234,6 @@ class EvaluationSettings(NamedTuple):
     """Sum of the window's samples, the peak of its transform."""
     detection_rule: DetectionRule
     """Rule by which the bins of an echo detect it."""
-    speckle_table: SpeckleTable
-    """Speckle of the echoes of all points."""
-    computes_pd: bool
-    """True if probabilities of detection are computed; otherwise they are nan."""
     phase_limits: np.ndarray
     """Table of :func:`sweep.model.spectrum.lines.node_phase_limits` for the record's window. It
     gives the number of equivalent lines that replace all lines.
@@ -266,7 +259,7 @@ def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> SegmentResul
     """
     results = allocate_segment_results(shots.size)
     bin_width = (shots.sample_rate / shots.fft_size) + np.zeros(shots.size)
-    for spans in iter_spans(shots, bin_by_bin=bin_by_bin, keeps_magnitudes=False):
+    for spans in iter_spans(shots, bin_by_bin=bin_by_bin):
         for s in np.flatnonzero(shots.has_segment):
             frequency = (
                 shots.to_signed_bins(spans.first_bin[s] + spans.peak_index[s])
@@ -290,7 +283,6 @@ def iter_spans(
     level_min: np.ndarray | None = None,
     leakage: bool = True,
     bin_by_bin: bool = False,
-    keeps_magnitudes: bool = True,
     ignores_band: bool = False,
     computes_pd: bool = True,
 ) -> Iterator[BinSpans]:
@@ -310,8 +302,6 @@ def iter_spans(
         True to compute leakage.
     bin_by_bin : bool
         True to compute the leakage of each bin, even if an integral over bins is accurate.
-    keeps_magnitudes : bool
-        False if magnitudes are not needed.
     ignores_band : bool
         True to include bins that are not searched.
     computes_pd : bool
@@ -323,8 +313,6 @@ def iter_spans(
         Spans of some points.
     """
     parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()
-    # Else probabilities are set from the final spans.
-    computes_pd_at_once = computes_pd and pd_follows_from_computed_spans(shots)
     point_levels = (
         parameters.threshold if level_min is None else np.broadcast_to(level_min, shots.size)
     )
@@ -340,10 +328,6 @@ def iter_spans(
             negligible_magnitude = negligible_magnitude / math.sqrt(SPECKLE_POWER_MAX)
         lowest_levels, n_done = np.minimum(point_levels, negligible_magnitude), 0
         while n_done < group.point_numbers.size:
-            must_keep = keeps_magnitudes or (shots.looks.is_noncoherent and bool(leakage_method))
-            must_keep |= (
-                shots.permanent_line is not None or shots.detection_settings.search_band is not None
-            )
             spans = _evaluate_batch(
                 shots,
                 parameters,
@@ -352,8 +336,6 @@ def iter_spans(
                 group,
                 leakage_method,
                 n_done,
-                must_keep,
-                computes_pd_at_once,
             )
             n_done += spans.point_numbers.size
             spans = (
@@ -774,22 +756,22 @@ def _evaluate_batch(
     group: LineShapeGroup,
     leakage_method: int,
     batch_begin: int,
-    keeps_magnitudes: bool,
-    computes_pd: bool,
 ) -> BinSpans:
     """Compute the spectra around the lines for the next batch of points of a group.
 
-    The batch begins with the group's point number ``batch_begin``. It has as many points as fit
-    into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
-    shapes. ``parameters`` and ``parameters_by_segment`` are those of all n points.
-    ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be left out.
+    The batch begins with the group's point number ``batch_begin``. It has at most
+    POINTS_PER_BATCH_MAX points, and as many as fit into SPAN_BINS_PER_BATCH bins, at least one. The
+    points of a group share the tables of line shapes. ``parameters`` and ``parameters_by_segment``
+    are those of all n points. ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be
+    left out.
     """
-    points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
+    batch, tables = slice(batch_begin, batch_begin + POINTS_PER_BATCH_MAX), group.tables
+    points = np.ascontiguousarray(group.point_numbers[batch])
     segments, n_points = len(shots.waveform_segments), points.size
     shifts = _averaging_shifts(shots, points)
     n_lines_max = max(2 * shots.footprint.n_beamlets, NODES_MAX) * max(shifts.offset.shape[2], 1)
     width = max(n_lines_max, shots.n_bins, 2 * GAUSS_POINTS_MAX) + 16
-    n_kept = max(SPAN_BINS_PER_BATCH, segments * shots.n_bins) if keeps_magnitudes else 0
+    n_kept = max(SPAN_BINS_PER_BATCH, segments * shots.n_bins)
     shape = segments, n_points
     spans = BinSpans(
         point_numbers=points,
@@ -813,7 +795,7 @@ def _evaluate_batch(
         lowest_levels,
         shots.beamlet_arrays,
         np.ascontiguousarray(shots.footprint.row_of_point, np.int64),
-        np.ascontiguousarray(group.line_shape_index[batch_begin:]),
+        np.ascontiguousarray(group.line_shape_index[batch]),
         shifts,
         group.modes,
         tables._replace(layout=tables.layout._replace(spectrum_type=spectrum_type(shots))),
@@ -824,8 +806,6 @@ def _evaluate_batch(
             ),
             window_sum=shots.window.sum,
             detection_rule=shots.detection_rule,
-            speckle_table=shots.speckle_table,
-            computes_pd=computes_pd,
             phase_limits=_group_node_limits(shots, group),
             bin_tangents=bin_tangents(shots.fft_size),
         ),
@@ -1125,7 +1105,6 @@ def _evaluate_segment(
     tables,
     settings,
     shape,
-    bin_speckle,
     workspace,
     crossing_series,
     speckle_rates,
@@ -1235,20 +1214,10 @@ def _evaluate_segment(
             layout.fft_size,
             image_gain,
         )
-    if spans.magnitudes.size > 0:
-        if next_start + n_bins > spans.magnitudes.size:
-            return SPAN_DOES_NOT_FIT
-        spans.span_start[s, i] = next_start
-        next_start = _store_span(next_start, n_bins, span, spans.magnitudes, spans.is_exempt)
-    detection = Detection(np.nan, np.nan)
-    if settings.computes_pd:
-        detection = pd_and_miss(
-            EchoBins(span.magnitude[:n_bins], span.is_exempt[:n_bins], first_bin),
-            detected.peak_index,
-            rule,
-            bin_threshold,
-            bin_speckle,
-        )
+    if next_start + n_bins > spans.magnitudes.size:
+        return SPAN_DOES_NOT_FIT
+    spans.span_start[s, i] = next_start
+    next_start = _store_span(next_start, n_bins, span, spans.magnitudes, spans.is_exempt)
     if leakage_method == LEAKAGE_BIN_BY_BIN:
         if rule.in_speckle:
             leakage = false_peak_probability_of_bins_in_speckle(
@@ -1270,7 +1239,6 @@ def _evaluate_segment(
         first_bin += layout.fft_size
     spans.first_bin[s, i], spans.n_bins[s, i] = first_bin, n_bins
     spans.peak_index[s, i], spans.n_exempt[s, i] = detected.peak_index, n_exempt
-    spans.pd[s, i], spans.miss[s, i] = detection.pd, detection.miss
     spans.peak_magnitude[s, i] = span.magnitude[detected.peak_index]
     spans.leakage[s, i] = leakage
     return next_start
@@ -1345,8 +1313,8 @@ def _evaluate_points(
     rate_arrays
         :class:`sweep.model.detection.speckle_crossing_rates.RateTableArrays`, overwritten.
     spans
-        :class:`BinSpans` of the m points in ``spans.point_numbers``; the other fields are results.
-        If ``spans.magnitudes`` is empty, no magnitudes are stored.
+        :class:`BinSpans` of the m points in ``spans.point_numbers``. The other fields are results,
+        except the probabilities of detection and the flags of the peaks.
     """
     next_start, rule = np.int64(0), settings.detection_rule
     rate_grid = RateTableGrid(0.0, 1.0, np.int64(0), np.int64(0))
@@ -1383,7 +1351,6 @@ def _evaluate_points(
                     tables,
                     settings,
                     line_shape.select_segment(shapes, s),
-                    bin_speckle_at(settings.speckle_table, s, point),
                     workspace,
                     crossing_series,
                     rate_table(rate_grid, rate_arrays),
