@@ -16,7 +16,7 @@ from decimal import Decimal, localcontext
 from difflib import get_close_matches
 from fractions import Fraction
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 QUANTITY_TEXT_LENGTH_MAX = 100
 """Maximum number of characters of a written quantity."""
@@ -177,13 +177,29 @@ class Unit:
             raise QuantityError("must be a number that a float holds (below 1.8e308)") from None
 
 
+class ExactQuantity(NamedTuple):
+    """A written quantity, before its conversion to SI units."""
+
+    number: Fraction
+    """Exact number in `unit`."""
+    unit: Unit
+    """Unit as written; ``Unit("")`` for a pure number."""
+
+    def to_si(self) -> float:
+        """Return the SI value, correctly rounded.
+
+        QuantityError is raised if it exceeds the range of floats.
+        """
+        return self.unit.to_si(self.number)
+
+
 def read_number(
     raw_value: object,
     description: str = "",
     *,
     is_power_ratio: bool = False,
     is_valid: Callable[[Fraction], bool] = lambda number: True,
-) -> tuple[Fraction, Unit]:
+) -> ExactQuantity:
     """Read a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
 
     Parameters
@@ -199,10 +215,8 @@ def read_number(
 
     Returns
     -------
-    value : Fraction
-        Exact number in `unit`.
-    unit : Unit
-        Percent, decibels or no unit.
+    ExactQuantity
+        The number in percent, in decibels, or without unit.
 
     Raises
     ------
@@ -211,16 +225,16 @@ def read_number(
     """
     value, unit = _split_quantity(raw_value, "must be a number")
     if unit in ("%", "percent"):
-        return value, Unit("%", Fraction(1, 100))
+        return ExactQuantity(value, Unit("%", Fraction(1, 100)))
     if unit == DECIBEL and is_power_ratio:
-        return value, Unit(DECIBEL)
+        return ExactQuantity(value, Unit(DECIBEL))
     if unit:
         description_text = f": {description}" if description else ""
         raise QuantityError(
             f"is a pure number and takes no unit{description_text}",
             _pure_number_suggestion(value, unit, is_valid),
         )
-    return value, Unit("")
+    return ExactQuantity(value, Unit(""))
 
 
 def _pure_number_suggestion(
@@ -257,7 +271,7 @@ def _pure_number_suggestion(
     return f"write {_format_number(value)}" if unit.isalpha() and is_valid(value) else ""
 
 
-def read_quantity(raw_value: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
+def read_quantity(raw_value: object, *, si_unit: str, example: str) -> ExactQuantity:
     """Read a quantity such as ``"25 mm"``.
 
     Parameters
@@ -271,10 +285,8 @@ def read_quantity(raw_value: object, *, si_unit: str, example: str) -> tuple[Fra
 
     Returns
     -------
-    value : Fraction
-        Exact number in `unit`.
-    unit : Unit
-        Unit as written.
+    ExactQuantity
+        The number in the unit as written.
 
     Raises
     ------
@@ -287,7 +299,7 @@ def read_quantity(raw_value: object, *, si_unit: str, example: str) -> tuple[Fra
         if si_unit == DECIBEL and 1e-300 < value < 1e300:  # else no float, or not positive
             remedy += f"; a ratio of {_format_number(value)} is {10 * math.log10(value):.4g} dB"
         raise QuantityError("needs a unit", remedy)
-    return value, read_unit(unit_text, si_unit=si_unit, example=example)
+    return ExactQuantity(value, read_unit(unit_text, si_unit=si_unit, example=example))
 
 
 @lru_cache(maxsize=4096)

@@ -36,7 +36,7 @@ from sweep.spec.sections import (
     parameter_short_name,
     suggest_parameter,
 )
-from sweep.units import QuantityError, Unit
+from sweep.units import ExactQuantity, QuantityError, Unit
 
 RESERVED_DIMENSIONS = (DRAW_BATCH_DIM, "draw", "point", "spec", "study_id")
 """Names of dimensions that a store may have in addition to the axes.
@@ -597,11 +597,12 @@ def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
     float
         The value in `unit_name`.
     """
-    number, unit = rule.read_exact_number(raw_value)
-    single_value = AxisPiece(np.array([unit.to_si(number)]), unit, Progression(number))
-    return float(
-        single_value.to_unit(rule.read_exact_number(f"1 {unit_name}" if unit_name else 1)[1])[0]
+    quantity = rule.read_exact_number(raw_value)
+    single_value = AxisPiece(
+        np.array([quantity.to_si()]), quantity.unit, Progression(quantity.number)
     )
+    target_unit = rule.read_exact_number(f"1 {unit_name}" if unit_name else 1).unit
+    return float(single_value.to_unit(target_unit)[0])
 
 
 # Written values
@@ -687,11 +688,11 @@ def read_single_value(raw_value: object, rule: Rule, location: Location) -> Axis
         value = rule.read(raw_value)
         if not isinstance(rule, NumericRule):
             return AxisPiece(np.array([str(value)]), Unit(""))
-        number, unit = rule.read_exact_number(raw_value)
+        quantity = rule.read_exact_number(raw_value)
     except QuantityError as error:
         raise findings_error(location, error.rule, error.suggestion, raw_value) from None
     dtype = np.int64 if rule.is_integer else np.float64
-    return AxisPiece(np.array([value], dtype=dtype), unit, Progression(number))
+    return AxisPiece(np.array([value], dtype=dtype), quantity.unit, Progression(quantity.number))
 
 
 def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Location) -> AxisPiece:
@@ -766,7 +767,7 @@ def _read_bounds(
             f"write {_GENERATOR_FORMS[form]}",
             raw_bounds,
         )
-    exact_values: list[tuple[Fraction, Unit]] = []
+    exact_values: list[ExactQuantity] = []
     findings = Findings()
     for i, raw_bound in enumerate(raw_bounds):
         with findings.collect((*location, i), raw_bound):
@@ -774,24 +775,20 @@ def _read_bounds(
             if i < 2:
                 rule.read(raw_bound)
     findings.raise_if_any()
-    first_unit = exact_values[0][1]
-    if any(unit.is_logarithmic != first_unit.is_logarithmic for _, unit in exact_values):
+    first_unit = exact_values[0].unit
+    if any(value.unit.is_logarithmic != first_unit.is_logarithmic for value in exact_values):
         raise findings_error(location, "mixes decibels with a plain unit", "take one of them")
     if first_unit.is_logarithmic and any(
-        unit.factor != first_unit.factor for _, unit in exact_values
+        value.unit.factor != first_unit.factor for value in exact_values
     ):
         raise findings_error(
             location, "mixes units of decibels", f"take {first_unit.symbol} for all"
         )
     # An increment is a difference of values, so that the unit's offset cancels.
-    offsets = [
-        exact_values[0][1].offset - first_unit.offset,
-        exact_values[1][1].offset - first_unit.offset,
-        Fraction(0),
-    ]
+    offsets = [*(value.unit.offset - first_unit.offset for value in exact_values[:2]), Fraction(0)]
     return [
-        (number * unit.factor + offset) / first_unit.factor
-        for (number, unit), offset in zip(exact_values, offsets, strict=False)
+        (value.number * value.unit.factor + offset) / first_unit.factor
+        for value, offset in zip(exact_values, offsets, strict=False)
     ], first_unit
 
 
@@ -862,8 +859,10 @@ def _check_bounds(values: AxisPiece, rule: NumericRule, location: Location) -> N
     """Raise `FindingsError` if a value of a generator is outside the bounds of the field."""
     violation = rule.first_out_of_bounds(values.si_values)
     if violation is not None:
-        index, problem = violation
-        value_text = f"{values.to_unit(values.unit)[index]:.12g} {values.unit.symbol}".rstrip()
+        value = values.to_unit(values.unit)[violation.value_index]
+        value_text = f"{value:.12g} {values.unit.symbol}".rstrip()
         raise findings_error(
-            location, f"{problem}, and value {index + 1} of the generator is {value_text}"
+            location,
+            f"{violation.broken_bound}, and value {violation.value_index + 1} of the generator is "
+            f"{value_text}",
         )

@@ -66,8 +66,7 @@ def _read_published_numbers(raw_value: object) -> PublishedNumbers:
 
 def _read_published_number(raw_value: object) -> float:
     """Read one number; return its SI value."""
-    value, unit = read_number(raw_value)
-    return unit.to_si(value)
+    return read_number(raw_value).to_si()
 
 
 _VALUE_SCHEMA = {"type": ["string", "number"]}

@@ -18,7 +18,7 @@ from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
@@ -29,7 +29,7 @@ from sweep.model.effects.phase_errors import NO_TABLE
 from sweep.model.effects.sweep_error_table import fit_sweep_frequency_error
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, WINDOW_NAME_ALIASES
 from sweep.scenes.scene_files import file_digest
-from sweep.units import DECIBEL, QuantityError, Unit, read_number, read_quantity
+from sweep.units import DECIBEL, ExactQuantity, QuantityError, Unit, read_number, read_quantity
 
 # Mistakes in specs
 
@@ -297,6 +297,15 @@ keyword in a JSON Schema.
 """
 
 
+class BoundViolation(NamedTuple):
+    """First of several values that is outside the bounds of a rule."""
+
+    value_index: int
+    """Index of the value among those that were checked."""
+    broken_bound: str
+    """The broken bound in words, such as ``must be at least 1 m``."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class NumericRule(Rule):
     """Rule of a number within bounds; bounds are written as users write values."""
@@ -338,7 +347,7 @@ class NumericRule(Rule):
             name: bound_text for name, bound_text in bound_texts.items() if bound_text is not None
         }
 
-    def read_exact_number(self, raw_value: object) -> tuple[Fraction, Unit]:
+    def read_exact_number(self, raw_value: object) -> ExactQuantity:
         """Return the exact number and the unit of a written value, without a check of the bounds.
 
         Raises
@@ -399,16 +408,16 @@ class NumericRule(Rule):
 
         The value is an int if the rule requires integers.
         """
-        number, unit = self.read_exact_number(raw_value)
-        if self.is_integer and number.denominator != 1:
+        quantity = self.read_exact_number(raw_value)
+        if self.is_integer and quantity.number.denominator != 1:
             raise QuantityError("must be a whole number")
-        value = unit.to_si(number)
+        value = quantity.to_si()
         violation = self.first_out_of_bounds(np.array([value]))
         if violation is not None:
-            raise QuantityError(violation[1])
-        return int(number) if self.is_integer else value
+            raise QuantityError(violation.broken_bound)
+        return int(quantity.number) if self.is_integer else value
 
-    def first_out_of_bounds(self, values: np.ndarray) -> tuple[int, str] | None:
+    def first_out_of_bounds(self, values: np.ndarray) -> BoundViolation | None:
         """Return the index of the first SI value outside the bounds, and the broken bound in words.
 
         Parameters
@@ -418,14 +427,16 @@ class NumericRule(Rule):
 
         Returns
         -------
-        (int, str) or None
+        BoundViolation or None
             None if all values are within the bounds.
         """
         for name, bound_text in self.bound_texts.items():
             comparison, violates, _ = _BOUND_KINDS[name]
             is_outside = violates(values, _bound_in_si(self, bound_text))
             if is_outside.any():
-                return int(np.argmax(is_outside)), f"must be {comparison} {bound_text}"
+                return BoundViolation(
+                    int(np.argmax(is_outside)), f"must be {comparison} {bound_text}"
+                )
         return None
 
     def format(self, value: Any) -> str | int | float:
@@ -472,8 +483,7 @@ def _first_clause(description: str) -> str:
 @lru_cache(maxsize=1024)
 def _bound_in_si(rule: NumericRule, bound_text: str) -> float:
     """Convert a bound of a rule, such as ``1 um``, to SI units."""
-    number, unit = rule.read_exact_number(bound_text)
-    return unit.to_si(number)
+    return rule.read_exact_number(bound_text).to_si()
 
 
 _FUNCTION_PATTERN = r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*:[A-Za-z_][A-Za-z0-9_]*"

@@ -35,7 +35,7 @@ from datetime import timedelta
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from sweep.messages import escape_unprintable
 from sweep.regular_files import check_file_size, open_file_below_root, read_file_below_root
@@ -77,6 +77,16 @@ CLIENT_OPTIONS = {"timeout": "30s", "connect_timeout": "5s"}
 
 ObjectVersion = Any
 """Tag (ETag or version) by which an object store distinguishes the versions of an object."""
+
+
+class VersionedContent(NamedTuple):
+    """Content of an object in an object store, and the version that has this content."""
+
+    content: bytes
+    """Content of the object."""
+    version: ObjectVersion
+    """Version by which a later write tells whether the object has changed since."""
+
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -231,12 +241,12 @@ class ObjectPath:
         """Return the direct children of this key whose name matches a pattern."""
         return [self / name for name in self._list_child_names() if fnmatch(name, pattern)]
 
-    def read_with_version(self) -> tuple[bytes, ObjectVersion] | None:
+    def read_with_version(self) -> VersionedContent | None:
         """Return the content of the object and its version tag, or None if it does not exist."""
 
-        def ask() -> tuple[bytes, ObjectVersion]:
+        def ask() -> VersionedContent:
             response = self.client.get(self.key)
-            return bytes(response.bytes()), _object_version(response.meta)
+            return VersionedContent(bytes(response.bytes()), _object_version(response.meta))
 
         with translate_errors(self), suppress(FileNotFoundError):
             return _retry_if_truncated(ask)

@@ -147,10 +147,10 @@ def parse_to_si(raw_value: object, *, si_unit: str, name: str) -> float:
     if isinstance(raw_value, int | float) and not isinstance(raw_value, bool):
         return float(raw_value)
     try:
-        value, unit = read_quantity(raw_value, si_unit=si_unit, example=f"1 {si_unit}")
+        quantity = read_quantity(raw_value, si_unit=si_unit, example=f"1 {si_unit}")
     except QuantityError as error:
         raise ValueError(f"{name} {error}") from None
-    return unit.to_si(value)
+    return quantity.to_si()
 
 
 def parse_pd_level(pd: object) -> float:
@@ -160,8 +160,7 @@ def parse_pd_level(pd: object) -> float:
     """
     is_number = isinstance(pd, np.number) and np.ndim(pd) == 0
     try:
-        value, unit = read_number(pd.item() if is_number else pd)  # type: ignore[attr-defined]
-        level = unit.to_si(value)
+        level = read_number(pd.item() if is_number else pd).to_si()  # type: ignore[attr-defined]
     except QuantityError as error:
         raise ValueError(f"a level of pd, {pd!r:.60}, {error}") from None
     if not 0 < level < 1:
@@ -204,7 +203,7 @@ def coordinate_in_si(coord: xr.DataArray) -> xr.DataArray:
         )
     if not isinstance(rule, NumericRule) or not units:
         return coord
-    unit = rule.read_exact_number(f"1 {units}")[1]
+    unit = rule.read_exact_number(f"1 {units}").unit
     if unit.is_logarithmic:
         return float(unit.factor) * 10 ** (coord / 10)
     return coord * float(unit.factor) + float(unit.offset)

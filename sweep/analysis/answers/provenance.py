@@ -409,7 +409,7 @@ def _convert_to_display_units(si_values: np.ndarray, path: str, units: str) -> n
     rule = parameter_rules()[path]
     if not isinstance(rule, NumericRule) or not units:
         return si_values
-    return convert_from_si(rule.read_exact_number(f"1 {units}")[1], si_values)
+    return convert_from_si(rule.read_exact_number(f"1 {units}").unit, si_values)
 
 
 def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence[str]) -> Any:

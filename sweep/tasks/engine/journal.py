@@ -52,6 +52,7 @@ from sweep.storage.locations import (
     ObjectPath,
     ObjectStoreError,
     ObjectVersion,
+    VersionedContent,
     atomic_write,
     os_error_reason,
     process_start_id,
@@ -836,52 +837,51 @@ class _ObjectLock:
 
     def read_holder_json(self) -> str | None:
         """Return the JSON text of the holder; None if the lock is free."""
-        content_and_version = self._read_content_and_version()
+        lock_object = self._read_lock_object()
         return (
-            _holder_json_of_content(content_and_version[0])
-            if content_and_version and content_and_version[0]
+            _holder_json_of_content(lock_object.content)
+            if lock_object and lock_object.content
             else None
         )
 
-    def _read_content_and_version(self) -> tuple[bytes, ObjectVersion] | None:
+    def _read_lock_object(self) -> VersionedContent | None:
         """Return the content of the lock and its version, read once more if it is incomplete.
 
         An incomplete content would be taken for the lock of another process. ObjectStoreError is
         raised if it is incomplete twice.
         """
         for _ in range(2):
-            content_and_version = self._lock_path.read_with_version()
+            lock_object = self._lock_path.read_with_version()
             if (
-                content_and_version is None
-                or content_and_version[0].count(b"\n") == 2
-                or not content_and_version[0]
+                lock_object is None
+                or lock_object.content.count(b"\n") == 2
+                or not lock_object.content
             ):
-                return content_and_version
-        if content_and_version:
-            self._lock_path.refuse_truncated_content(content_and_version[0])
-        return content_and_version
+                return lock_object
+        if lock_object:
+            self._lock_path.refuse_truncated_content(lock_object.content)
+        return lock_object
 
     def heartbeat_version(self) -> object:
         """Return a value that changes with every heartbeat; None if there is no lock."""
-        content_and_version = self._read_content_and_version()
-        return content_and_version and content_and_version[0]
+        lock_object = self._read_lock_object()
+        return lock_object and lock_object.content
 
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
         """Acquire the lock for a holder; `check_holder` raises if the present holder lives."""
         for _ in range(LOCK_ATTEMPTS_MAX):
-            content_and_version = self._read_content_and_version()
+            lock_object = self._read_lock_object()
             if (
-                content_and_version
-                and _holder_json_of_content(content_and_version[0]) == holder_json
+                lock_object and _holder_json_of_content(lock_object.content) == holder_json
             ):  # put, but the response was lost
-                self._holder_json, self._tag = holder_json, content_and_version[1]
+                self._holder_json, self._tag = holder_json, lock_object.version
                 return
             check_holder()
             tag = self._lock_path.put_if_unchanged(
                 f"{holder_json}\n0\n".encode(),
-                content_and_version[1] if content_and_version else None,
+                lock_object.version if lock_object else None,
             )
             if tag is not None:
                 self._holder_json, self._tag = holder_json, tag
@@ -901,12 +901,9 @@ class _ObjectLock:
         """Replace the content of the lock, if this process still holds it."""
         tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
         if tag is None:
-            content_and_version = self._read_content_and_version()
-            if (
-                content_and_version
-                and _holder_json_of_content(content_and_version[0]) == self._holder_json
-            ):
-                tag = self._lock_path.put_if_unchanged(content.encode(), content_and_version[1])
+            lock_object = self._read_lock_object()
+            if lock_object and _holder_json_of_content(lock_object.content) == self._holder_json:
+                tag = self._lock_path.put_if_unchanged(content.encode(), lock_object.version)
         if tag is not None:
             self._tag = tag
 
