@@ -676,7 +676,7 @@ def spectra(
     from sweep.tasks.studies.study_loading import read_study
 
     is_file = isinstance(study, Path) and not study.is_dir()
-    spec = load(str(study)) if is_file else read_study(study)[1].spec
+    spec = load(str(study)) if is_file else read_study(study).study.spec
     if not isinstance(spec, GridSpec):
         raise click.UsageError(f"{study} is a study of a scene: spectra are those of a flat target")
     _, parameters = select_shot_parameters(spec, parse_assignments(at))[0]

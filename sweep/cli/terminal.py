@@ -384,11 +384,11 @@ def _print_grid_summary(store: Location) -> None:
     """Print the table of detection probabilities by part of a grid."""
     from sweep.tasks.studies.store_summary import DETECTED_PD_MIN, detection_summary
 
-    part_heading, rows, block_share = detection_summary(store)
+    summary = detection_summary(store)
     print_table(
-        "Probability of detection" + _sampled_share_text(block_share),
+        "Probability of detection" + _sampled_share_text(summary.block_fraction),
         [
-            part_heading,
+            summary.axis_heading,
             "points",
             f"pd_shot > {DETECTED_PD_MIN}",
             "median pd_shot",
@@ -404,7 +404,7 @@ def _print_grid_summary(store: Location) -> None:
                 if row.median_pd_doppler == row.median_pd_doppler
                 else "-",
             ]
-            for row in rows
+            for row in summary.rows
         ],
     )
 
@@ -465,7 +465,7 @@ def print_inconsistency_warnings(store: Location, scanner: str | None = None) ->
     """Warn of quantities of a flight whose errors far exceed their standard errors."""
     from sweep.tasks.studies import study_loading
 
-    if study_loading.read_study(store)[0]["kind"] != "scene":
+    if study_loading.read_study(store).attributes["kind"] != "scene":
         return
     from sweep.analysis.scene_results.consistency import understated_error_messages
 
@@ -482,11 +482,11 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
         count_unsupported_points,
     )
 
-    n_unsupported, reason = count_unsupported_points(store, done_block_numbers)
-    if n_unsupported:
+    unsupported = count_unsupported_points(store, done_block_numbers)
+    if unsupported.n_points:
         message = (
-            f"points beyond the model, which have no results: {n_unsupported:,}; the first: "
-            f"{reason}"
+            f"points beyond the model, which have no results: {unsupported.n_points:,}; the first: "
+            f"{unsupported.first_reason}"
         )
         echo_wrapped(f"warning: {message}", err=True)
     if rows := accuracy_rows_of_draws(store, done_block_numbers):
@@ -508,7 +508,7 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
             ],
             "at",
         )
-    if reason := unchecked_beamlets_reason(study_loading.read_study(store)[1].spec):
+    if reason := unchecked_beamlets_reason(study_loading.read_study(store).study.spec):
         echo_wrapped(f"Not checked: {reason}.")
     if rays := accuracy_rows_of_rays(store, done_block_numbers):
         ray_noun, unit_noun = ("rays", "shot") if rays[0].name else ("beamlets", "point")

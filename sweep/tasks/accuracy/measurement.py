@@ -454,11 +454,9 @@ class AccuracyMeasurement:
                 is_late and len(differences) >= TIME_DOMAIN_POINTS_MIN
             ):
                 break
-            time_domain, simulated = self._sample.compare_with_time_domain(
-                reference_setting, sample_row
-            )
-            if np.isfinite(time_domain.pd).any():
-                differences[sample_row] = np.concatenate(result_differences(time_domain, simulated))
+            comparison = self._sample.compare_with_time_domain(reference_setting, sample_row)
+            if np.isfinite(comparison.time_domain.pd).any():
+                differences[sample_row] = np.concatenate(result_differences(*comparison))
         self._sample.clear_caches()
         return differences, n_beamlets
 

@@ -165,6 +165,24 @@ def merge_trials(trials: Sequence[Trial]) -> Trial:
     )
 
 
+class TimeDomainComparison(NamedTuple):
+    """Results of one point from time-domain records, and by the model."""
+
+    time_domain: SampleResults
+    """Results from simulated time-domain records."""
+    simulated: SampleResults
+    """Results of the model, with the same effects."""
+
+
+class PlannedEffectFlags(NamedTuple):
+    """Effects chosen for n points, and the time that the choice took."""
+
+    effect_flags: np.ndarray
+    """Effects of each point, (n,) of uint32: bit k for the k-th effect of the catalogue."""
+    seconds_per_point: float
+    """Processor time of the choice per point [s]."""
+
+
 class StudySample(ABC):
     """Base of the samples of a study's points. Accuracy settings are tried on these points."""
 
@@ -202,19 +220,21 @@ class StudySample(ABC):
         """Return the names of the effects that a setting simulates at any point of the sample."""
         parts = (self.point_indices[part] for part in self.split_into_parts(self.size))
         effect_flags = [
-            np.bitwise_or.reduce(self._plan_effect_flags(setting, indices)[0]) for indices in parts
+            np.bitwise_or.reduce(self._plan_effect_flags(setting, indices).effect_flags)
+            for indices in parts
         ]
         return frozenset(unpack_effect_flags(int(np.bitwise_or.reduce(effect_flags))))
 
     def compare_with_time_domain(
         self, setting: AccuracySetting, sample_row: int
-    ) -> tuple[SampleResults, SampleResults]:
+    ) -> TimeDomainComparison:
         """Compute one point from time-domain records and by the model. Return both results.
 
         Only effects that the setting plans and that records contain are simulated.
         """
         point_index = self.point_indices[[sample_row]]
-        effect_flags = self._plan_effect_flags(setting, point_index)[0] & TIME_DOMAIN_EFFECT_FLAGS
+        planned_flags = self._plan_effect_flags(setting, point_index).effect_flags
+        effect_flags = planned_flags & TIME_DOMAIN_EFFECT_FLAGS
         # Records contain range walk, whatever effects are named.
         time_domain, simulated = (
             self._collect_results(
@@ -225,7 +245,7 @@ class StudySample(ABC):
                 evaluation.evaluate_segments,
             )
         )
-        return time_domain, simulated
+        return TimeDomainComparison(time_domain, simulated)
 
     def clear_caches(self) -> None:  # noqa: B027
         """Drop results that several trials of one part share.
@@ -236,12 +256,8 @@ class StudySample(ABC):
     @abstractmethod
     def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
-    ) -> tuple[np.ndarray, float]:
-        """Choose the effects at each of n points.
-
-        Return their flags (n,), one bit per effect, and the time that the choice took per point
-        [s].
-        """
+    ) -> PlannedEffectFlags:
+        """Choose the effects at each of n points."""
 
     @abstractmethod
     def _iter_outputs(
@@ -387,21 +403,20 @@ class GridSample(StudySample):
 
     def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
-    ) -> tuple[np.ndarray, float]:
+    ) -> PlannedEffectFlags:
         if setting.has_line_effects_only:
-            return np.full(point_indices.size, self._thesis_effect_flags), 0.0
+            return PlannedEffectFlags(np.full(point_indices.size, self._thesis_effect_flags), 0.0)
         effect_planner = self.study_with_setting(setting).effect_planner
         tiles, tile_of_point = np.unique(
-            effect_planner.tiles.locate_points(point_indices)[0], return_inverse=True
+            effect_planner.tiles.locate_points(point_indices).blocks, return_inverse=True
         )
         effect_flags = np.empty(tiles.size, np.uint32)
         start = thread_time()
         for members, effect_plan in effect_planner.iter_tile_plans(tiles):
             effect_flags[members] = pack_effect_flags(effect_plan.is_kept)
         seconds = thread_time() - start if setting.plans_effects else 0.0
-        return effect_flags[tile_of_point], seconds / sum(
-            map(effect_planner.tiles.count_block_points, tiles.tolist())
-        )
+        n_tile_points = sum(map(effect_planner.tiles.count_block_points, tiles.tolist()))
+        return PlannedEffectFlags(effect_flags[tile_of_point], seconds / n_tile_points)
 
     def _iter_outputs(
         self,
@@ -441,6 +456,24 @@ class GridSample(StudySample):
         return grid.grid_indices(block, point_order_by_geometry.take(order_positions, mode="wrap"))
 
 
+class ShotsOfBlock(NamedTuple):
+    """Some shots of one scanner at one point of a flight's axes."""
+
+    flight_block: FlightBlock
+    """Scanner and point of the axes."""
+    shot_numbers: np.ndarray
+    """Numbers (n,) of the shots in the flight."""
+
+
+class CastShots(NamedTuple):
+    """Geometry of shots, found by rays."""
+
+    eyepoints: Eyepoints
+    """Geometry of each shot."""
+    seconds: float
+    """Processor time of casting the rays [s]."""
+
+
 class FlightSample(StudySample):
     """Sample of the shots of a flight, in complete tiles (runs of consecutive shots).
 
@@ -455,7 +488,7 @@ class FlightSample(StudySample):
     def __init__(self, spec: SceneSpec, n_points: int) -> None:
         self.spec = spec
         self.study_with_setting = cache(self._make_study)
-        self._cast_eyepoints: dict[tuple[str, bytes], tuple[Eyepoints, float]] = {}
+        self._cast_eyepoints: dict[tuple[str, bytes], CastShots] = {}
         # The shots of a block share work that does not depend on their number, such as planning.
         self.timed_points_max = max(int(spec.storage.block_shots), SHOTS_PER_TILE)
         self._flight_blocks, shots_by_part = zip(*self._sample_shots(n_points), strict=True)
@@ -500,11 +533,11 @@ class FlightSample(StudySample):
         point_indices = self.extend_to_complete_tiles(part, n_timed_points)
         trial = self._run_setting(setting, point_indices)
         rows_of_part = np.searchsorted(point_indices, part)
-        _, casting_seconds = self._cast_shots(setting, *self.flight_block_and_shots(point_indices))
+        cast_shots = self._cast_shots(setting, *self.flight_block_and_shots(point_indices))
         results = SampleResults(*(values[rows_of_part] for values in trial.results))
         return Trial(
             results,
-            trial.seconds_per_point + casting_seconds / point_indices.size,
+            trial.seconds_per_point + cast_shots.seconds / point_indices.size,
             trial.planning_seconds_per_point,
         )
 
@@ -538,18 +571,17 @@ class FlightSample(StudySample):
             )
         ]
 
-    def flight_block_and_shots(self, point_indices: np.ndarray) -> tuple[FlightBlock, np.ndarray]:
+    def flight_block_and_shots(self, point_indices: np.ndarray) -> ShotsOfBlock:
         """Return the scanner and axis point of a part of the sample, and its shot numbers."""
-        return self._flight_blocks[self._part_of_row[point_indices[0]]], self._shot_numbers[
-            point_indices
-        ]
+        flight_block = self._flight_blocks[self._part_of_row[point_indices[0]]]
+        return ShotsOfBlock(flight_block, self._shot_numbers[point_indices])
 
     def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
-    ) -> tuple[np.ndarray, float]:
+    ) -> PlannedEffectFlags:
         tile_rows = self.extend_to_complete_tiles(point_indices, 1)
         flight_block, shot_numbers = self.flight_block_and_shots(tile_rows)
-        eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
+        eyepoints = self._cast_shots(setting, flight_block, shot_numbers).eyepoints
         start = thread_time()
         if setting.has_line_effects_only:
             effect_flags = np.where(eyepoints.has_target, self._thesis_effect_flags, 0)
@@ -560,7 +592,9 @@ class FlightSample(StudySample):
                 .effect_flags
             )
         seconds = thread_time() - start if setting.plans_effects else 0.0
-        return effect_flags[np.searchsorted(tile_rows, point_indices)], seconds / tile_rows.size
+        return PlannedEffectFlags(
+            effect_flags[np.searchsorted(tile_rows, point_indices)], seconds / tile_rows.size
+        )
 
     def _iter_outputs(
         self,
@@ -573,7 +607,7 @@ class FlightSample(StudySample):
             self.study_with_setting(setting),
             self.flight_block_and_shots(point_indices),
         )
-        eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
+        eyepoints = self._cast_shots(setting, flight_block, shot_numbers).eyepoints
         selected_effects, hitting_rows = (
             SelectedEffects(effect_flags, np.zeros(effect_flags.size)),
             np.flatnonzero(eyepoints.has_target),
@@ -593,7 +627,7 @@ class FlightSample(StudySample):
             simulate_group,
         )
 
-    def _sample_shots(self, n_points: int) -> Iterator[tuple[FlightBlock, np.ndarray]]:
+    def _sample_shots(self, n_points: int) -> Iterator[ShotsOfBlock]:
         """Yield scanners at points of the axes, with shot numbers spread evenly over the flight."""
         study = self.study_with_setting(AS_WRITTEN_SETTING)
         for scanner, scanner_grid in study.scanner_grids.items():
@@ -610,7 +644,8 @@ class FlightSample(StudySample):
                     if scanner_grid.axes_shape
                     else ()
                 )
-                yield scanner_grid.first_flight_block(tuple(map(int, axis_indices))), shot_numbers
+                flight_block = scanner_grid.first_flight_block(tuple(map(int, axis_indices)))
+                yield ShotsOfBlock(flight_block, shot_numbers)
 
     def _make_study(self, setting: AccuracySetting) -> FlightStudy:
         """Return the flight study that an accuracy setting gives."""
@@ -623,7 +658,7 @@ class FlightSample(StudySample):
 
     def _cast_shots(
         self, setting: AccuracySetting, flight_block: FlightBlock, shot_numbers: np.ndarray
-    ) -> tuple[Eyepoints, float]:
+    ) -> CastShots:
         """Return the geometry of shots found by rays, and the time of casting these rays [s].
 
         The geometry is cached for settings that share it.
@@ -635,7 +670,7 @@ class FlightSample(StudySample):
             eyepoints = eyepoints_from_arrays(
                 eyepoint_study.cast_shots(shot_numbers), eyepoint_study.beamlet_weights
             )
-            self._cast_eyepoints[cache_key] = eyepoints, thread_time() - start
+            self._cast_eyepoints[cache_key] = CastShots(eyepoints, thread_time() - start)
         return self._cast_eyepoints[cache_key]
 
 

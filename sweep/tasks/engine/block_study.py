@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -109,6 +109,24 @@ class StoreTemplate(Protocol):
         """Return the layouts (names, shapes, chunks) of all arrays of the store."""
 
 
+class GridBlock(NamedTuple):
+    """Block of a study, as a block of one of the study's grids."""
+
+    grid: BlockGrid
+    """Grid that contains the block."""
+    block_in_grid: int
+    """Number of the block within the grid."""
+
+
+class GroupGrid(NamedTuple):
+    """Grid of a group of the store, and where its blocks begin."""
+
+    first_block: int
+    """Number, within the study, of the grid's first block."""
+    grid: BlockGrid
+    """Grid of the group's blocks."""
+
+
 class BlockStudy(StoreTemplate, ABC):
     """Study as the engine sees it: blocks of points, numbered grid by grid.
 
@@ -198,7 +216,7 @@ class BlockStudy(StoreTemplate, ABC):
     @property
     def block_nbytes_max(self) -> int:
         """Size of the results of the largest block, before compression [bytes]."""
-        nbytes_by_group = dict.fromkeys(self._first_block_and_grid_by_group, 0)
+        nbytes_by_group = dict.fromkeys(self._grid_by_group, 0)
         for layout in self.output_layout_by_name.values():
             nbytes_by_group[layout.group_path] += layout.nbytes_of_part(layout.chunks)
         return max(nbytes_by_group.values())
@@ -213,7 +231,7 @@ class BlockStudy(StoreTemplate, ABC):
         """Number of blocks in all grids."""
         return sum(grid.n_blocks for grid in self.grids)
 
-    def locate_in_grid(self, block: int) -> tuple[BlockGrid, int]:
+    def locate_in_grid(self, block: int) -> GridBlock:
         """Return the grid that contains a block, and the number of the block within that grid.
 
         IndexError is raised if there is no such block.
@@ -221,22 +239,22 @@ class BlockStudy(StoreTemplate, ABC):
         block_in_grid = block
         for grid in self.grids:
             if 0 <= block_in_grid < grid.n_blocks:
-                return grid, block_in_grid
+                return GridBlock(grid, block_in_grid)
             block_in_grid -= grid.n_blocks
         raise IndexError(f"block {block} of {self.n_blocks}")
 
     @cached_property
-    def _first_block_and_grid_by_group(self) -> dict[str, tuple[int, BlockGrid]]:
-        """Number of the first block of each group of the store, and the group's grid."""
+    def _grid_by_group(self) -> dict[str, GroupGrid]:
+        """Grid of each group of the store, with the number of its first block."""
         last_blocks = np.cumsum([grid.n_blocks for grid in self.grids]).tolist()
         return {
-            block_grid.group: (end - block_grid.n_blocks, block_grid)
+            block_grid.group: GroupGrid(end - block_grid.n_blocks, block_grid)
             for block_grid, end in zip(self.grids, last_blocks, strict=True)
         }
 
     def first_block_of_group(self, group: str) -> int:
         """Return the number, within the study, of the first block of a group of the store."""
-        return self._first_block_and_grid_by_group[group][0]
+        return self._grid_by_group[group].first_block
 
     def count_block_points(self, block: int) -> int:
         """Return the number of points of a block."""
@@ -257,12 +275,11 @@ class BlockStudy(StoreTemplate, ABC):
         The outer keys are groups of the store, the inner keys names of arrays.
         """
         grid_dims: dict[str, dict[str, tuple[int | None, ...]]] = {
-            group: {} for group in self._first_block_and_grid_by_group
+            group: {} for group in self._grid_by_group
         }
         for name, layout in self.output_layout_by_name.items():
-            grid_dims[layout.group_path][name] = self._first_block_and_grid_by_group[
-                layout.group_path
-            ][1].grid_dim_indices(layout)
+            grid = self._grid_by_group[layout.group_path].grid
+            grid_dims[layout.group_path][name] = grid.grid_dim_indices(layout)
         return grid_dims
 
     def chunk_positions(self, block: int) -> dict[str, tuple[int, ...]]:
@@ -297,7 +314,7 @@ class BlockStudy(StoreTemplate, ABC):
         """
         owners_by_array = {}
         for array_name, layout in self.output_layout_by_name.items():
-            first_block, grid = self._first_block_and_grid_by_group[layout.group_path]
+            first_block, grid = self._grid_by_group[layout.group_path]
             owners_by_array[array_name] = first_block + grid.chunk_owner_blocks(layout)
         return owners_by_array
 
@@ -305,8 +322,20 @@ class BlockStudy(StoreTemplate, ABC):
 BlockEvaluator = Callable[[Any, int], Results]
 """Function of a study and a block's number that computes the block in place of the study."""
 
-StudyReader = Callable[["Location"], tuple[dict[str, Any], BlockStudy]]
-"""Function that returns a store's attributes and the study in it, or raises a StoreError.
+Study = TypeVar("Study", bound=BlockStudy, covariant=True)
+
+
+class StoredStudy(NamedTuple, Generic[Study]):
+    """Study that was read from its store."""
+
+    attributes: dict[str, Any]
+    """Root attributes of the store."""
+    study: Study
+    """Study whose results the store holds."""
+
+
+StudyReader = Callable[["Location"], StoredStudy[BlockStudy]]
+"""Function that returns the study in a store, or raises a StoreError.
 
 It must be defined at the top level of a module, because it is sent to workers by name.
 """

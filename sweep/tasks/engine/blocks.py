@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -112,6 +112,15 @@ CF_CONVENTIONS = "CF-1.11"
 """Version of the Climate and Forecast (CF) metadata conventions that all stores follow."""
 
 
+class PointLocations(NamedTuple):
+    """Blocks in which points of a grid are, and where in these blocks."""
+
+    blocks: np.ndarray
+    """Number (n,) of the block of each point."""
+    local_indices: np.ndarray
+    """Index (n,) of each point within its block, in C order."""
+
+
 class BlockGrid:
     """Grid of points, cut into blocks along named dimensions; the last dimension varies fastest.
 
@@ -181,7 +190,7 @@ class BlockGrid:
             counts = counts @ np.minimum(chunk, size - np.arange(0, size, chunk))
         return int(counts) * self.fine_steps
 
-    def locate_points(self, grid_indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def locate_points(self, grid_indices: np.ndarray) -> PointLocations:
         """Return the block of each point, and the index of the point in that block, in C order.
 
         `grid_indices` (n,) are indices of the points, in C order over the whole grid.
@@ -194,7 +203,7 @@ class BlockGrid:
             start = axis_index // chunk * chunk
             blocks = blocks * n_blocks_along + axis_index // chunk
             local_indices = local_indices * np.minimum(chunk, size - start) + axis_index - start
-        return blocks, local_indices
+        return PointLocations(blocks, local_indices)
 
     def grid_indices(self, block: int, local_indices: np.ndarray) -> np.ndarray:
         """Return the indices of some points of a block, in C order over the whole grid.

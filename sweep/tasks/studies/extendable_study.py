@@ -64,5 +64,5 @@ class ExtendableStudy(BlockStudy):
         )
         return (
             sum(shared_points.local_indices.size for shared_points in shared_point_groups)
-            * self.locate_in_grid(block)[0].fine_steps
+            * self.locate_in_grid(block).grid.fine_steps
         )

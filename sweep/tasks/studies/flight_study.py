@@ -134,20 +134,20 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
         )
         self.n_draws = int(spec.draws.number)
         _refuse_too_many_shots(spec, self.n_cycles * self.shots_per_cycle)
-        block_shots, block_draws = flight_block_size_max(
+        block_size_max = flight_block_size_max(
             spec,
             math.prod(self.axes_shape),
             self.n_cycles * self.shots_per_cycle,
             self.n_draws,
         )
-        cycles_per_block = max(1, block_shots // self.shots_per_cycle)
+        cycles_per_block = max(1, block_size_max.shots // self.shots_per_cycle)
         BlockGrid.__init__(
             self,
             (*(axis.name for axis in spec.axes), "draw", "cycle"),
             (*self.axes_shape, self.n_draws, self.n_cycles),
             (
                 *(1 for _ in self.axes_shape),
-                min(self.n_draws, block_draws),
+                min(self.n_draws, block_size_max.draws),
                 min(self.n_cycles, cycles_per_block),
             ),
             group=scanner,
@@ -159,7 +159,7 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
                 f"cuts {self.n_draws:,} draws of {self.n_cycles:,} cycles of {scanner} into "
                 f"{self.n_blocks:.3g} blocks, and a study has at most {BLOCKS_PER_STUDY_MAX:.0e}"
             )
-            size = f"{block_draws}"
+            size = f"{block_size_max.draws}"
             remedy = "raise it or storage.block_shots, or take fewer draws"
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 
@@ -207,6 +207,24 @@ def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
         raise SpecError([Mistake("draws.number", rule, f"{n_draws}", "take fewer draws")])
 
 
+class ScannerBlock(NamedTuple):
+    """Block of a flight, with the grid of its scanner."""
+
+    grid: ScannerBlockGrid
+    """Grid of the scanner's blocks."""
+    flight_block: FlightBlock
+    """Scanner, point of the axes, draws and cycles of the block."""
+
+
+class SimulatedGroup(NamedTuple):
+    """Results of shots that were simulated together."""
+
+    rows: np.ndarray
+    """Indices (m,) of the shots among all shots that are to be simulated."""
+    results: Results
+    """Arrays (m, ...) of results by the name of the output variable."""
+
+
 class ReusedCloud(NamedTuple):
     """Results of a flight's block that are taken from the store of a smaller study."""
 
@@ -243,14 +261,14 @@ class FlightStudy(ExtendableStudy):
             or has_numerics_set_by_tolerance(self.spec.parameters())
         )
 
-    def locate_flight_block(self, block: int) -> tuple[ScannerBlockGrid, FlightBlock]:
+    def locate_flight_block(self, block: int) -> ScannerBlock:
         """Return the grid of a block's scanner, and the block within this grid.
 
         IndexError is raised if there is no such block.
         """
         grid, block_in_grid = self.locate_in_grid(block)
         scanner_grid = self.scanner_grids[grid.group]
-        return scanner_grid, scanner_grid.flight_block(block_in_grid)
+        return ScannerBlock(scanner_grid, scanner_grid.flight_block(block_in_grid))
 
     def first_draw_block(self, block: int) -> int:
         """Return the block of the first draws of the same shots.
@@ -479,7 +497,7 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         rows: np.ndarray,
         simulate_cloud: CloudSimulator,
-    ) -> Iterator[tuple[np.ndarray, Results]]:
+    ) -> Iterator[SimulatedGroup]:
         """Yield indices and results of shots, in groups that are simulated together.
 
         Shots that need more rays are cast and simulated again.
@@ -496,7 +514,7 @@ class FlightStudy(ExtendableStudy):
                 self._refine_rays(
                     scanner, n_rays, shot_numbers[group_rows], effect_flags, results, simulate_group
                 )
-            yield group_rows, results
+            yield SimulatedGroup(group_rows, results)
 
     def _simulate_cloud(
         self,

@@ -126,6 +126,26 @@ PARAMETERS_CONSTANT_IN_TILE = (
 )
 
 
+class EffectGroup(NamedTuple):
+    """Points at which the same effects are simulated."""
+
+    members: np.ndarray
+    """Indices (m,) of the points."""
+    effect_names: tuple[str, ...]
+    """Names of the effects."""
+
+
+class EffectBatch(NamedTuple):
+    """Points that are computed together though their effects may differ."""
+
+    members: np.ndarray
+    """Indices (m,) of the points."""
+    effect_names: tuple[str, ...]
+    """Names of the effects that are simulated at any of the points."""
+    effect_flags: np.ndarray
+    """Effects of each point, (m,) of uint32: bit k for the k-th effect of the catalogue."""
+
+
 class SelectedEffects(NamedTuple):
     """Effects that are simulated at each of n points, one bit per effect."""
 
@@ -136,27 +156,24 @@ class SelectedEffects(NamedTuple):
         """Return the effects of some of the points."""
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
-    def iter_groups_by_effects(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
-        """Yield indices (m,) of points with the same simulated effects, and the names of these."""
+    def iter_groups_by_effects(self) -> Iterator[EffectGroup]:
+        """Yield the groups of points with the same simulated effects."""
         for group_flags in np.unique(self.effect_flags):
-            yield (
+            yield EffectGroup(
                 np.flatnonzero(self.effect_flags == group_flags),
                 unpack_effect_flags(int(group_flags)),
             )
 
     def iter_groups_computed_together(
         self,
-    ) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
-        """Yield groups of points that are computed together though their effects may differ.
-
-        A group has the indices (m,) of its points, the names of all their effects, and one flag per
-        effect and point (m,).
-        """
+    ) -> Iterator[EffectBatch]:
+        """Yield groups of points that are computed together though their effects may differ."""
         separating_flags = self.effect_flags & SEPARATE_BATCHES_MASK
         for shared_flags in np.unique(separating_flags):
             index = np.flatnonzero(separating_flags == shared_flags)
             group_flags = self.effect_flags[index]
-            yield index, unpack_effect_flags(int(np.bitwise_or.reduce(group_flags))), group_flags
+            effect_names = unpack_effect_flags(int(np.bitwise_or.reduce(group_flags)))
+            yield EffectBatch(index, effect_names, group_flags)
 
 
 class TileGroup(NamedTuple):
@@ -174,6 +191,24 @@ class TileGroup(NamedTuple):
     """
 
 
+class BlockTiles(NamedTuple):
+    """Tiles that overlap a block."""
+
+    tiles: np.ndarray
+    """Numbers (m,) of the tiles in the grid."""
+    tile_index: np.ndarray
+    """Index (n,) in `tiles` of the tile of each point of the block, in C order."""
+
+
+class TilePlans(NamedTuple):
+    """Effects that were chosen for a batch of tiles."""
+
+    members: np.ndarray
+    """Indices (m,) of the batch's tiles among the requested tiles."""
+    effect_plan: EffectPlan
+    """Plan of the m tiles."""
+
+
 class TileGrid(BlockGrid):
     """Tiles of a grid: boxes of neighbouring points whose effects are chosen together.
 
@@ -188,8 +223,8 @@ class TileGrid(BlockGrid):
         )
         super().__init__(grid.dims, grid.shape, fit_tile_shape(grid.shape, self._is_constant_axis))
 
-    def tiles_of_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tiles (m,) that overlap a block, and for each point the index of its tile."""
+    def tiles_of_block(self, block: int) -> BlockTiles:
+        """Return the tiles that overlap a block, and for each point the index of its tile."""
         tile_indices = [
             np.arange(block_slice.start, block_slice.stop) // tile_length
             for block_slice, tile_length in zip(
@@ -203,7 +238,7 @@ class TileGrid(BlockGrid):
             else np.zeros((), np.int64)
         )
         tiles, tile_index = np.unique(tile_of_point, return_inverse=True)
-        return tiles, tile_index.ravel()
+        return BlockTiles(tiles, tile_index.ravel())
 
     def group_tiles(self, tiles: np.ndarray, stride: int = 1) -> Iterator[TileGroup]:
         """Yield the groups of tiles that can be planned together, with their points' parameters.
@@ -345,7 +380,7 @@ class EffectPlanner:
             inactive_bits |= np.where(is_inactive, np.uint32(1 << bit), np.uint32(0))
         return inactive_bits
 
-    def iter_tile_plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, EffectPlan]]:
+    def iter_tile_plans(self, tiles: np.ndarray) -> Iterator[TilePlans]:
         """Yield batches of tiles: their indices in the array `tiles`, and their effect plan.
 
         A tile is planned from a few of its points first. If that plan simulates every optional
@@ -373,7 +408,7 @@ class EffectPlanner:
                         | plan.keeps_all_optional
                     )
                     if is_settled.any():
-                        yield (
+                        yield TilePlans(
                             batch[tile_group.requested_indices[is_settled]],
                             plan.select(is_settled),
                         )

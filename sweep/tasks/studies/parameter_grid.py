@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -100,9 +101,18 @@ def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
     return max(study_cpu_seconds / DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_CPU_SECONDS_MIN)
 
 
+class FlightBlockSize(NamedTuple):
+    """Numbers of shots and of draws of a flight's block."""
+
+    shots: int
+    """Number of shots of one scanner."""
+    draws: int
+    """Number of draws of each shot."""
+
+
 def flight_block_size_max(
     spec: SceneSpec, n_axis_points: int, n_shots: int, n_draws: int
-) -> tuple[int, int]:
+) -> FlightBlockSize:
     """Return upper limits on the shots and on the draws of any block of a flight.
 
     A section `storage` that differs from its defaults states both. By default a study is cut into
@@ -125,7 +135,7 @@ def flight_block_size_max(
     """
     block_shots, block_draws = int(spec.storage.block_shots), int(spec.storage.block_draws)
     if spec.storage != type(spec.storage)():
-        return block_shots, block_draws
+        return FlightBlockSize(block_shots, block_draws)
     block_draws = DEFAULT_BLOCK_DRAWS_MAX
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
     study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
@@ -142,7 +152,7 @@ def flight_block_size_max(
         math.ceil(DEFAULT_BLOCK_CPU_SECONDS_MIN / tile_seconds),
     )
     block_shots = min(tiles_per_block * SHOTS_PER_TILE, block_shots)
-    return block_shots, block_draws
+    return FlightBlockSize(block_shots, block_draws)
 
 
 def fit_block_shape(

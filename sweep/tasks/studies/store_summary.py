@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -80,24 +80,33 @@ class DetectionRow:
         )
 
 
-def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], float]:
-    """Summarise detection. Return a heading, rows, and the fraction of the blocks that were read.
+class DetectionSummary(NamedTuple):
+    """Detection along the slowest axis of a grid, and in the whole grid."""
 
-    The heading names the slowest axis. There is a row for each part of it, and one for the whole
-    grid.
-    """
+    axis_heading: str
+    """Name and units of the slowest axis; '' for a grid without axes."""
+    rows: list[DetectionRow]
+    """Rows of the parts of this axis, and last one of the whole grid."""
+    block_fraction: float
+    """Fraction of the stored blocks that were read."""
+
+
+def detection_summary(store: str | Location) -> DetectionSummary:
+    """Summarise detection in the stored blocks of a grid, or in a sample of them."""
     store_path = parse_location(store)
-    _, study = study_loading.read_study_of_blocks(store_path)
+    study = study_loading.read_study_of_blocks(store_path).study
     if not isinstance(study, GridStudy):
         raise StoreError(f"{store_path} holds no study over a grid")
-    blocks, block_fraction = _sample_blocks(store_path, study, None)
+    sample = _sample_blocks(store_path, study, None)
     axis = study.spec.axes[0] if study.spec.axes else None
     n_values = (
         axis.size if axis else 1
     )  # one part per value, or per several values if there are many
     part_edges = np.linspace(0, n_values, min(n_values, SUMMARY_ROWS_MAX) + 1).astype(int)
     values_by_part: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in part_edges[1:]]
-    for region, values in iter_block_values(store_path, study, ("pd_shot", "pd_doppler"), blocks):
+    for region, values in iter_block_values(
+        store_path, study, ("pd_shot", "pd_doppler"), sample.blocks
+    ):
         pd_pair = np.stack(values).reshape(2, -1, *values[0].shape[1:])
         axis_indices = np.arange(pd_pair.shape[1]) + (region[0].start if region else 0)
         for part_values, (first, stop) in zip(values_by_part, pairwise(part_edges), strict=True):
@@ -107,29 +116,36 @@ def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], f
     pd_by_part = [np.concatenate(values_of_part, axis=1) for values_of_part in values_by_part]
     total_row = DetectionRow.from_points("all", *np.concatenate(pd_by_part, axis=1))
     if axis is None:
-        return "", [total_row], block_fraction
+        return DetectionSummary("", [total_row], sample.fraction)
     labels = [_axis_range_label(axis, first, stop) for first, stop in pairwise(part_edges)]
     rows = [
         DetectionRow.from_points(label, *values)
         for label, values in zip(labels, pd_by_part, strict=True)
     ]
     units = axis.parameters[0].units if len(axis.parameters) == 1 else ""
-    return f"{axis.name} [{units}]" if units else axis.name, [*rows, total_row], block_fraction
+    heading = f"{axis.name} [{units}]" if units else axis.name
+    return DetectionSummary(heading, [*rows, total_row], sample.fraction)
+
+
+class UnsupportedPoints(NamedTuple):
+    """Points in a sample of a store that the model does not support."""
+
+    n_points: int
+    """Number of these points."""
+    first_reason: str
+    """Why the first of them is not supported; '' if there is none."""
 
 
 def count_unsupported_points(
     store: str | Location, done_block_numbers: np.ndarray | None = None
-) -> tuple[int, str]:
+) -> UnsupportedPoints:
     """Count unsupported points in a sample. Return the count, and the reason for the first."""
     store_path = parse_location(store)
-    _, study = study_loading.read_study_of_blocks(store_path)
+    study = study_loading.read_study_of_blocks(store_path).study
     if not isinstance(study, GridStudy):
-        return 0, ""
-    (blocks, _), n_unsupported, first_reason = (
-        _sample_blocks(store_path, study, done_block_numbers),
-        0,
-        "",
-    )
+        return UnsupportedPoints(0, "")
+    blocks = _sample_blocks(store_path, study, done_block_numbers).blocks
+    n_unsupported, first_reason = 0, ""
     for block, (_, (pd_shot,)) in zip(
         blocks, iter_block_values(store_path, study, ("pd_shot",), blocks), strict=True
     ):
@@ -137,7 +153,7 @@ def count_unsupported_points(
         if points.size and not n_unsupported:
             first_reason = unsupported_reason(study, int(block), points[:1])
         n_unsupported += points.size
-    return n_unsupported, first_reason
+    return UnsupportedPoints(n_unsupported, first_reason)
 
 
 def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) -> str:
@@ -153,9 +169,18 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
     return "it is not any more"
 
 
+class _BlockSample(NamedTuple):
+    """Random sample of the stored blocks."""
+
+    blocks: np.ndarray
+    """Numbers (m,) of the sampled blocks, in rising order."""
+    fraction: float
+    """Fraction of the stored blocks that are in the sample."""
+
+
 def _sample_blocks(
     store: Location, study: BlockStudy, done_block_numbers: np.ndarray | None
-) -> tuple[np.ndarray, float]:
+) -> _BlockSample:
     """Return a random sample of the stored blocks, and the fraction of them that it holds.
 
     Equal calls give equal samples.
@@ -169,10 +194,9 @@ def _sample_blocks(
         SAMPLED_BLOCKS_MAX, max(SAMPLED_POINTS_MAX * study.n_blocks // study.n_points, 1)
     )
     if len(done_block_numbers) <= n_sampled:
-        return done_block_numbers, 1.0
-    return np.sort(
-        np.random.default_rng(0).choice(done_block_numbers, n_sampled, replace=False)
-    ), n_sampled / len(done_block_numbers)
+        return _BlockSample(done_block_numbers, 1.0)
+    blocks = np.random.default_rng(0).choice(done_block_numbers, n_sampled, replace=False)
+    return _BlockSample(np.sort(blocks), n_sampled / len(done_block_numbers))
 
 
 def _axis_range_label(axis: Axis, start: int, end: int) -> str:
@@ -191,15 +215,24 @@ def _format_value(value: object) -> str:
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
 
 
+class BlockValues(NamedTuple):
+    """Values that a block wrote in some arrays with equal chunks."""
+
+    region: tuple[slice, ...]
+    """Slices of these arrays that the block covers."""
+    values: list[np.ndarray]
+    """Values in this region, one array for each name."""
+
+
 def iter_block_values(
     store: Location, study: BlockStudy, array_names: Sequence[str], blocks: np.ndarray
-) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
+) -> Iterator[BlockValues]:
     """Yield the slices and values that each stored block wrote in arrays with equal chunks."""
     group = open_verified_group(store)
     arrays: list[Any] = [group[array_name] for array_name in array_names]
     for block in blocks:
         if (region := study.chunk_regions(int(block)).get(array_names[0])) is not None:
-            yield region, [np.asarray(array[region or ...]) for array in arrays]
+            yield BlockValues(region, [np.asarray(array[region or ...]) for array in arrays])
 
 
 @dataclass
@@ -243,7 +276,7 @@ class ScannerRow:
 def flight_summary(store: str | Location) -> list[ScannerRow]:
     """Return a row for each scanner and point of the axes; one per scanner if points are many."""
     store_path = parse_location(store)
-    _, study = study_loading.read_study_of_blocks(store_path)
+    study = study_loading.read_study_of_blocks(store_path).study
     if not isinstance(study, FlightStudy):
         raise StoreError(f"{store_path} holds no study of a scene")
     axis_points = list(np.ndindex(tuple(int(axis.size) for axis in study.spec.axes)))
@@ -257,7 +290,7 @@ def flight_summary(store: str | Location) -> list[ScannerRow]:
     }
     group: Any = open_verified_group(store_path)
     for block in np.flatnonzero(blocks_with_receipt(store_path, study)).tolist():
-        _, flight_block = study.locate_flight_block(block)
+        flight_block = study.locate_flight_block(block).flight_block
         regions = study.chunk_regions(block)
         names = (
             f"{flight_block.scanner}/{name}" for name in ("flags", "pd_shot", "velocity_status")
@@ -367,7 +400,7 @@ def accuracy_rows_of_draws(
     The result is empty without draws or results.
     """
     store_path = parse_location(store)
-    _, study = study_loading.read_study_of_blocks(store_path)
+    study = study_loading.read_study_of_blocks(store_path).study
     if not isinstance(study, GridStudy) or not study.spec.draws.has_draws:
         return []
     error_arrays = {name: f"{name}_half_width" for name in PD_OUTPUTS}
@@ -393,7 +426,7 @@ def accuracy_rows_of_rays(
     A grid has one row, and only if the largest number of beamlets does not suffice.
     """
     store_path = parse_location(store)
-    _, study = study_loading.read_study_of_blocks(store_path)
+    study = study_loading.read_study_of_blocks(store_path).study
     if isinstance(study, GridStudy):
         tolerance_limit = np.maximum(
             ErrorBudget(_tolerance_over_grid(study)).allowed_beamlets_error,
@@ -445,14 +478,11 @@ def _accuracy_rows(
 
     ``samples_array`` holds the numbers of draws or rays.
     """
-    (blocks, block_fraction), axes = (
-        _sample_blocks(store_path, study, done_block_numbers),
-        study.spec.axes,
-    )
-    rows = [AccuracyRow(name, block_fraction=block_fraction) for name in error_arrays]
+    sample, axes = _sample_blocks(store_path, study, done_block_numbers), study.spec.axes
+    rows = [AccuracyRow(name, block_fraction=sample.fraction) for name in error_arrays]
     tolerance = np.broadcast_to(tolerance, study.output_layout_by_name[samples_array].shape)
     for region, (samples, *error_values) in iter_block_values(
-        store_path, study, [samples_array, *error_arrays.values()], blocks
+        store_path, study, [samples_array, *error_arrays.values()], sample.blocks
     ):
         for row, errors in zip(rows, error_values, strict=True):
             row.add_points(errors, tolerance[region], samples, tuple(part.start for part in region))

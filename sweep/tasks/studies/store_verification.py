@@ -526,7 +526,7 @@ def _write_packed_store(
     store_path: Location, output: Location, study: BlockStudy, progress: Progress
 ) -> None:
     """Write a copy of a store in few large files (shards), its root metadata last."""
-    attributes = {**study_loading.read_study(store_path)[0], PACKED_ATTRIBUTE: True}
+    attributes = {**study_loading.read_study(store_path).attributes, PACKED_ATTRIBUTE: True}
     with tempfile.TemporaryDirectory() as directory:
         template = Path(directory) / "template"
         study_store.build_template(template, study, attributes, shard_shape_of=shard_shape_of_array)
@@ -542,7 +542,7 @@ def _write_packed_store(
             progress.advance(points=1, failed=0)
     finally:
         progress.end()
-    if study_loading.read_study(store_path)[0]["study_id"] != study.id:
+    if study_loading.read_study(store_path).attributes["study_id"] != study.id:
         raise StoreError(f"{store_path} was extended or replaced while it was copied: try again")
     for name in (*LOG_FILE_NAMES, RECIPE_FILE):
         lines = iter_records(store_path / JOURNAL_DIR / name)

@@ -34,6 +34,7 @@ from sweep.storage import store_format
 from sweep.storage.locations import PACKED_ATTRIBUTE, Location, parse_location, resolve_links
 from sweep.storage.verified_store import open_verified_group
 from sweep.tasks.engine import study_store
+from sweep.tasks.engine.block_study import StoredStudy
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import (
     EXTENDED_STORE_KEY,
@@ -94,7 +95,7 @@ def _find_reuse_source(
         return None
 
 
-def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
+def read_study(store_path: Location) -> StoredStudy[AnyStudy]:
     """Return the attributes of a store, and its study; raise StoreError if it can't be read."""
     attributes = store_format.read_attributes(store_path)
     if attributes["kind"] == store_format.ACCURACY_STORE_KIND:
@@ -102,19 +103,19 @@ def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
         raise StoreError(
             f"{store_path} holds what accuracy costs, no study: `{figures_command}` draws it"
         )
-    return attributes, load_study(store_path, attributes)
+    return StoredStudy(attributes, load_study(store_path, attributes))
 
 
-def read_study_of_blocks(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
+def read_study_of_blocks(store_path: Location) -> StoredStudy[AnyStudy]:
     """Compute :func:`read_study` for a reader of receipts, which count the study's blocks.
 
     StoreError is also raised if the store's blocks have another shape than the study has here: its
     receipts would be taken for those of other points.
     """
-    attributes, study = read_study(store_path)
-    if PACKED_ATTRIBUTE not in attributes:  # a packed copy joins blocks in its chunks
-        study_store.refuse_other_block_shapes(store_path, study)
-    return attributes, study
+    stored_study = read_study(store_path)
+    if PACKED_ATTRIBUTE not in stored_study.attributes:  # a packed copy joins blocks in its chunks
+        study_store.refuse_other_block_shapes(store_path, stored_study.study)
+    return stored_study
 
 
 def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:

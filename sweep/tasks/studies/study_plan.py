@@ -445,6 +445,22 @@ def time_points(
     )
 
 
+class ShotTimes(NamedTuple):
+    """Processor times of some shots."""
+
+    n_shots: int
+    """Number of shots."""
+    casting_seconds: float
+    """Time of casting their rays [s]."""
+    simulation_seconds: float
+    """Time of simulating their draws [s], averaged over points of the axes."""
+
+    @property
+    def total_seconds(self) -> float:
+        """Time of casting and of simulating [s]."""
+        return self.casting_seconds + self.simulation_seconds
+
+
 class _ScannerTimer:
     """Stopwatch of a scanner's shots, spread over the flight and over the points of the axes."""
 
@@ -477,7 +493,7 @@ class _ScannerTimer:
             TIMED_CYCLE_SHOTS_MAX, self.n_shots_max
         )
 
-    def time_shots(self, n_shots: int) -> tuple[int, float, float]:
+    def time_shots(self, n_shots: int) -> ShotTimes:
         """Time some shots. Return their number, and times of casting and of simulating [s].
 
         The time of simulating is that of ``n_draws`` draws, averaged over points of the axes.
@@ -502,7 +518,7 @@ class _ScannerTimer:
                 solves_navigation=self._takes_cycles,
             )
         simulation_seconds = (time.process_time() - cast_at) / len(self._flight_blocks)
-        return len(shot_numbers), cast_at - start, simulation_seconds
+        return ShotTimes(len(shot_numbers), cast_at - start, simulation_seconds)
 
 
 def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
@@ -513,27 +529,25 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     timer = _ScannerTimer(study, eyepoints)
     seconds_max = FLIGHT_TIMING_SECONDS / len(study.spec.scanners)
     # The first shots load kernels and tables, which other places in the flight may need too.
-    _, first_casting_seconds, first_seconds = timer.time_shots(
-        min(UNTIMED_FIRST_SHOTS_MAX, timer.n_shots_max)
-    )
+    first_sample = timer.time_shots(min(UNTIMED_FIRST_SHOTS_MAX, timer.n_shots_max))
     start = time.process_time()
     n_timed, samples = 1, [timer.time_shots(1)]
     while n_timed < timer.n_shots_max and (
-        samples[-1][1] + samples[-1][2] < seconds_max / 4
-        and time.process_time() - start < seconds_max
+        samples[-1].total_seconds < seconds_max / 4 and time.process_time() - start < seconds_max
     ):
-        n_timed = min(4 * samples[-1][0], timer.n_shots_max)
+        n_timed = min(4 * samples[-1].n_shots, timer.n_shots_max)
         samples.append(timer.time_shots(n_timed))
-        if samples[-1][0] == samples[-2][0]:  # the next cycle would be beyond the limit
+        if samples[-1].n_shots == samples[-2].n_shots:  # the next cycle would be beyond the limit
             break
     # Shots elsewhere may need tables of their own, which the second time finds.
-    n_shots, casting_seconds, simulation_seconds = timer.time_shots(n_timed)
-    loading_seconds = first_casting_seconds + first_seconds - samples[0][1] - samples[0][2]
-    loading_seconds += samples[-1][1] + samples[-1][2] - casting_seconds - simulation_seconds
-    n_small, _, small_seconds = samples[0]
+    final_sample, smallest_sample = timer.time_shots(n_timed), samples[0]
+    n_shots, simulation_seconds = final_sample.n_shots, final_sample.simulation_seconds
+    loading_seconds = first_sample.total_seconds - smallest_sample.total_seconds
+    loading_seconds += samples[-1].total_seconds - final_sample.total_seconds
     seconds_per_shot = (
-        max(simulation_seconds - small_seconds, 0.0) / (n_shots - n_small)
-        if n_shots > n_small
+        max(simulation_seconds - smallest_sample.simulation_seconds, 0.0)
+        / (n_shots - smallest_sample.n_shots)
+        if n_shots > smallest_sample.n_shots
         else simulation_seconds / n_shots
     )
     call_seconds = max(simulation_seconds - n_shots * seconds_per_shot, 0.0)
@@ -544,7 +558,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         n_shots=eyepoints.n_points,
         n_rays=eyepoints.n_rays,
         has_eyepoints=eyepoint_store_location(study.store_path, eyepoints.id).exists(),
-        seconds_per_ray=casting_seconds / (n_shots * eyepoints.n_beamlets),
+        seconds_per_ray=final_sample.casting_seconds / (n_shots * eyepoints.n_beamlets),
         seconds_per_draw=block_seconds / (timer.shots_per_block * timer.n_draws),
         n_timed_shots=n_shots,
         loading_seconds=max(loading_seconds, 0.0),
