@@ -13,6 +13,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 _FILE_TYPE_NAMES = {
     stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
@@ -182,10 +183,17 @@ def _read_slice_and_close(
     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
+class FileStream(NamedTuple):
+    """Open file that is read piece by piece."""
+
+    size: int
+    """Size of the file [bytes]."""
+    pieces: Iterator[bytes]
+    """Content of the file in pieces, which are read as they are asked for."""
+
+
 @contextmanager
-def stream_file_below_root(
-    root: str | Path, name: str, bytes_max: int
-) -> Iterator[tuple[int, Iterator[bytes]]]:
+def stream_file_below_root(root: str | Path, name: str, bytes_max: int) -> Iterator[FileStream]:
     """Context manager: yield the size of a file below a directory and its content in pieces.
 
     The file is opened as by :func:`open_file_below_root` and has at most ``bytes_max`` bytes.
@@ -193,7 +201,7 @@ def stream_file_below_root(
     descriptor = open_file_below_root(root, name)
     with open(descriptor, "rb", buffering=0) as file:
         size = file_size_within_limit(descriptor, bytes_max, f"{root}/{name}")
-        yield size, iter(lambda: file.read(READ_BUFFER_BYTES), b"")
+        yield FileStream(size, iter(lambda: file.read(READ_BUFFER_BYTES), b""))
 
 
 def file_size_within_limit(descriptor: int, bytes_max: int, path_in_messages: str) -> int:

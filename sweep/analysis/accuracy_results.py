@@ -734,7 +734,16 @@ def _sheet_caption(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> 
     return labels.join_sentences(phrases)
 
 
-def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetting]]:
+class AccuracyMeasurement(NamedTuple):
+    """Measurement of accuracy, read from its store."""
+
+    dataset: xr.Dataset
+    """Dataset of the store, in memory."""
+    settings: list[MeasuredSetting]
+    """Errors and times of each accuracy setting."""
+
+
+def open_accuracy_store(store: Location) -> AccuracyMeasurement:
     """Load a store of `sweep accuracy`; return its dataset and its settings.
 
     Raise NotAStoreError if the store is of another kind.
@@ -742,7 +751,7 @@ def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetti
     study_id = read_attributes_of_kind(store, ACCURACY_STORE_KIND)["study_id"]
     with xr.open_zarr(open_verified_store(store, study_id), **OPEN_ZARR_KWARGS) as dataset:
         loaded = dataset.load()
-    return loaded, read_settings(loaded)
+    return AccuracyMeasurement(loaded, read_settings(loaded))
 
 
 def write_figure_and_tables(

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps, patheffects, rc_context, rcdefaults, rcParams
@@ -104,13 +104,22 @@ def blank_sheet(width: float, height: float) -> Sheet:
     return new_sheet
 
 
+class SheetWithAxes(NamedTuple):
+    """Sheet with a grid of axes."""
+
+    sheet: Sheet
+    """The sheet."""
+    axes: list[Axes]
+    """Axes, row by row."""
+
+
 def sheet_with_axes(
     width: float, height: float, rows: int, columns: int, **options: Any
-) -> tuple[Sheet, list[Axes]]:
+) -> SheetWithAxes:
     """Return a sheet of the given size [inches] with a grid of axes, listed row by row."""
     new_sheet = blank_sheet(width, height)
     axes = new_sheet.subplots(rows, columns, squeeze=False, **options)
-    return new_sheet, list(axes.ravel())
+    return SheetWithAxes(new_sheet, list(axes.ravel()))
 
 
 def message_sheet(message: str) -> Sheet:

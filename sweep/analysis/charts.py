@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import dask
 import numpy as np
@@ -27,7 +27,9 @@ from sweep.analysis.selection import (
     CELL_HIGHEST,
     CELL_LOWEST,
     CELL_MEAN,
+    NamedPart,
     PointSelection,
+    ShownParts,
     SortedCoordinate,
     split_by_coordinates,
     thin_parts_evenly,
@@ -298,27 +300,20 @@ def worst_statistic(variable: str) -> str:
 
 def split_into_parts(
     points: PointSelection, shown_names: Sequence[str], parts_max: int
-) -> tuple[list[tuple[str, PointSelection]], int]:
-    """Split a selection of points into the parts that panels show.
+) -> ShownParts:
+    """Split a selection of points into at most ``parts_max`` parts, which panels show.
 
     In a part only the coordinates with ``shown_names`` vary.
-
-    Returns
-    -------
-    parts : list of (str, PointSelection)
-        Name and points of at most ``parts_max`` parts.
-    n_omitted : int
-        Number of omitted parts.
     """
     if not points.size:
-        return [], 0
-    all_parts, _ = split_by_coordinates(
+        return ShownParts([], 0)
+    all_parts = split_by_coordinates(
         points, points.distinguishing_coordinates(shown_names), points.size
-    )
+    ).parts
     varied_parts = [
-        (part_label, part)
-        for part_label, part in all_parts
-        if all(len(part.unique_values(n)) > 1 for n in shown_names)
+        part
+        for part in all_parts
+        if all(len(part.points.unique_values(n)) > 1 for n in shown_names)
     ]
     return thin_parts_evenly(varied_parts or all_parts, parts_max)
 
@@ -360,7 +355,7 @@ def surface_chart(
         Values of the variable at which contours are drawn, if both coordinates are numeric.
     """
     parts, n_omitted = split_into_parts(points, [x, y], size_limits.parts_max)
-    planes = [_arrange_on_plane(part, variable, x, y) for _, part in parts]
+    planes = [_arrange_on_plane(part.points, variable, x, y) for part in parts]
     cell_statistics = (
         [CELL_MEAN, worst_statistic(variable)] if worst_statistic(variable) else [CELL_MEAN]
     )
@@ -520,7 +515,7 @@ def slice_chart(
     parts, n_omitted_parts = split_into_parts(points, [x, *line_coordinates], parts_max)
     named_points, n_omitted_lines = split_into_lines(parts, line_coordinates)
     drawn_lines, remarks = read_lines_along(
-        [(line_points, variable) for _, _, line_points in named_points], x
+        [(named_line.points, variable) for named_line in named_points], x
     )
     x_axis = CoordinateAxis.from_points(points, x)
     value_scale = fit_colour_scale(variable, label, [line.y for line in drawn_lines])
@@ -549,22 +544,37 @@ def _horizontal_level_lines(panel: Panel, levels: Sequence[float]) -> list[Chart
     return [ChartLine(x, np.full(x.size, level), f"{level:g}", style="level") for level in levels]
 
 
-LabelledLinePoints = tuple[str, str, PointSelection]
-"""Name of the part (panel) to which a line belongs, name of the line, and points of the line."""
+class LabelledLinePoints(NamedTuple):
+    """Points of a line of a chart."""
+
+    part: str
+    """Name of the part (panel) to which the line belongs."""
+    name: str
+    """Name of the line."""
+    points: PointSelection
+    """Points of the line."""
 
 
-def split_into_lines(
-    parts: Sequence[tuple[str, PointSelection]], line_coordinates: Sequence[str]
-) -> tuple[list[LabelledLinePoints], int]:
-    """Split every part of a chart into lines by the values of coordinates.
+class ShownLines(NamedTuple):
+    """Lines that the panels of a chart have room for."""
 
-    Returns
-    -------
-    named_points : list of LabelledLinePoints
-        Part, name and points of each line.
-    n_omitted : int
-        Number of omitted lines.
-    """
+    named_points: list[LabelledLinePoints]
+    """Part, name and points of each line."""
+    n_omitted: int
+    """Number of omitted lines."""
+
+
+class ReadLines(NamedTuple):
+    """Lines of a chart that were read from a store."""
+
+    lines: list[ChartLine]
+    """Lines, with x in the units of the dataset."""
+    remarks: list[str]
+    """Caption phrases on reduction and bands."""
+
+
+def split_into_lines(parts: Sequence[NamedPart], line_coordinates: Sequence[str]) -> ShownLines:
+    """Split every part of a chart into lines by the values of coordinates."""
     named_points: list[LabelledLinePoints] = []
     n_omitted = 0
     for part_label, part_points in parts:
@@ -573,9 +583,10 @@ def split_into_lines(
         )
         n_omitted += n_omitted_lines
         named_points += [
-            (part_label, line_name, line_points) for line_name, line_points in part_lines
+            LabelledLinePoints(part_label, line_name, line_points)
+            for line_name, line_points in part_lines
         ]
-    return named_points, n_omitted
+    return ShownLines(named_points, n_omitted)
 
 
 def make_line_panels(
@@ -600,7 +611,8 @@ def make_line_panels(
         Choices of further facets, equal for all panels.
     """
     style_by_name = {
-        name: k for k, name in enumerate(dict.fromkeys(name for _, name, _ in named_points))
+        name: k
+        for k, name in enumerate(dict.fromkeys(named_line.name for named_line in named_points))
     }
     lines_by_part: dict[str, list[ChartLine]] = {}
     for (part, name, _), line in zip(named_points, drawn_lines, strict=True):
@@ -624,7 +636,7 @@ def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
 
 def read_lines_along(
     points_and_variables: Sequence[tuple[PointSelection, str]], x: str
-) -> tuple[list[ChartLine], list[str]]:
+) -> ReadLines:
     """Read variables along a coordinate as lines of a chart, in one pass.
 
     Parameters
@@ -636,12 +648,10 @@ def read_lines_along(
 
     Returns
     -------
-    list of ChartLine
+    ReadLines
         Lines in the order of the argument. If a line has many points, it shows the means of
         adjacent points, with a band from the lowest to the highest of them. Otherwise the band is
         the confidence interval of each point, if there is one.
-    list of str
-        Caption phrases on reduction and bands.
     """
     lazy_arrays: list[list[Any]] = []
     reductions: list[tuple[SortedCoordinate, int, float, bool]] = []
@@ -680,7 +690,7 @@ def read_lines_along(
             )
         )
         remarks.append(_band_remark(n_averaged_points, confidence, has_ends))
-    return chart_lines, list(dict.fromkeys(remarks))
+    return ReadLines(chart_lines, list(dict.fromkeys(remarks)))
 
 
 def _value_and_interval_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,16 +36,25 @@ _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
 """Units that may be written with an SI prefix, such as mm."""
 
 
-def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str]:
+class DisplayUnits(NamedTuple):
+    """Units in which values are shown."""
+
+    factor: float
+    """Factor from the units of the values to those that are shown."""
+    units: str
+    """Units that are shown."""
+
+
+def display_factor_and_units(values: np.ndarray, units: str) -> DisplayUnits:
     """Return the factor that converts values to display units, and the display units.
 
     Long distances are shown in km, and angles in degrees.
     """
     if units == "m" and values.size and np.median(np.abs(values)) > KILOMETRE_DISPLAY_MIN:
-        return 1e-3, "km"
+        return DisplayUnits(1e-3, "km")
     if units == "rad":
-        return math.degrees(1.0), "deg"
-    return 1.0, units
+        return DisplayUnits(math.degrees(1.0), "deg")
+    return DisplayUnits(1.0, units)
 
 
 def axis_label(name: str, units: str) -> str:

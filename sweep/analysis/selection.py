@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import dask.array
 import numpy as np
@@ -264,23 +264,33 @@ def select_where(
     return points
 
 
+class NamedPart(NamedTuple):
+    """Part of a selection of points, named by the coordinates that are equal at its points."""
+
+    name: str
+    """Name of the part, such as ``grazing angle 15°``; '' for the whole selection."""
+    points: PointSelection
+    """Points of the part."""
+
+
+class ShownParts(NamedTuple):
+    """Parts of a selection that a figure or table has room for."""
+
+    parts: list[NamedPart]
+    """Parts, evenly spread over all parts."""
+    n_omitted: int
+    """Number of omitted parts."""
+
+
 def split_by_coordinates(
     points: PointSelection, names: Sequence[str], parts_max: int
-) -> tuple[list[tuple[str, PointSelection]], int]:
-    """Split a selection by the values of coordinates.
-
-    Returns
-    -------
-    parts : list of (str, PointSelection)
-        Name and points of at most ``parts_max`` parts, evenly spread over all parts.
-    n_omitted : int
-        Number of omitted parts.
-    """
-    parts = [("", points)]
+) -> ShownParts:
+    """Split a selection by the values of coordinates, into at most ``parts_max`` parts."""
+    parts = [NamedPart("", points)]
     for name in names:
         units = points.coordinate_units(name)
         parts = [
-            (
+            NamedPart(
                 ", ".join(
                     filter(None, [label, labels.format_coordinate_value(name, value, units)])
                 ),
@@ -292,15 +302,12 @@ def split_by_coordinates(
     return thin_parts_evenly(parts, parts_max)
 
 
-def thin_parts_evenly(
-    parts: list[tuple[str, PointSelection]], parts_max: int
-) -> tuple[list[tuple[str, PointSelection]], int]:
+def thin_parts_evenly(parts: list[NamedPart], parts_max: int) -> ShownParts:
     """Return at most ``parts_max`` evenly spread parts, and the number of omitted parts."""
     if len(parts) <= parts_max:
-        return parts, 0
-    return [parts[round(i * (len(parts) - 1) / (parts_max - 1))] for i in range(parts_max)], len(
-        parts
-    ) - parts_max
+        return ShownParts(parts, 0)
+    shown_parts = [parts[round(i * (len(parts) - 1) / (parts_max - 1))] for i in range(parts_max)]
+    return ShownParts(shown_parts, len(parts) - parts_max)
 
 
 def find_axis_parameter(spec: GridSpec, path: str) -> AxisParameter | None:

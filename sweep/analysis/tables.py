@@ -323,8 +323,8 @@ def split_by_setting(
     cut_names = {name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_name)}
     names = [by, *(n for n in points.varying_coordinates() if n != by and n not in cut_names)]
     paths = [spec.axis_parameter(name).path for name in names]
-    parts, _ = split_by_coordinates(points, names, TABLE_ROWS_MAX)
-    parameters_of_parts = [parameters_at(spec, part.first_indices()) for _, part in parts]
+    parts = split_by_coordinates(points, names, TABLE_ROWS_MAX).parts
+    parameters_of_parts = [parameters_at(spec, part.points.first_indices()) for part in parts]
     return [
         (name, {path: parameters[path] for path in paths}, part)
         for (name, part), parameters in zip(parts, parameters_of_parts, strict=True)

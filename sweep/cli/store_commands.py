@@ -314,9 +314,9 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
         )
     if figure is not None:
         click.echo(comparison.save_difference_figure(comparisons, figure))
-    verdict, verdict_text = comparison.agreement_verdict(comparisons.values())
-    echo_wrapped(verdict_text)
-    if code := {"different": EXIT_DIFFERENT, "nothing": EXIT_INCOMPLETE}.get(verdict, 0):
+    agreement = comparison.agreement_verdict(comparisons.values())
+    echo_wrapped(agreement.sentence)
+    if code := {"different": EXIT_DIFFERENT, "nothing": EXIT_INCOMPLETE}.get(agreement.verdict, 0):
         sys.exit(code)
 
 

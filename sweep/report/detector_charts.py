@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas
@@ -25,6 +25,7 @@ from sweep.analysis.charts import (
 from sweep.analysis.selection import (
     GRAZING_ANGLE_PATH,
     RANGE_PATH,
+    NamedPart,
     PointSelection,
     SortedCoordinate,
     find_axis_parameter,
@@ -123,7 +124,16 @@ class GridProfile:
         return np.ravel(self.points.dataset[variable].isel(self.axis_indices(indices)).values)
 
 
-def grid_profiles(results: GridResults) -> tuple[list[GridProfile], int]:
+class GridProfiles(NamedTuple):
+    """Profiles of a grid that charts have room for."""
+
+    profiles: list[GridProfile]
+    """Profiles, evenly spread over all profiles."""
+    n_omitted: int
+    """Number of omitted profiles."""
+
+
+def grid_profiles(results: GridResults) -> GridProfiles:
     """Return the profiles of a grid along its main coordinate, and the number of omitted profiles.
 
     The main coordinate is range if it varies, or else the numeric coordinate with most values.
@@ -144,10 +154,11 @@ def grid_profiles(results: GridResults) -> tuple[list[GridProfile], int]:
     parts, n_omitted = charts.split_into_parts(
         results.points, [name] if name else [], CHART_PARTS_MAX
     )
-    return [
+    profiles = [
         GridProfile(words, p, name, p.sorted_coordinate(name) if name else None)
         for words, p in parts
-    ], n_omitted
+    ]
+    return GridProfiles(profiles, n_omitted)
 
 
 def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: int) -> Chart:
@@ -357,12 +368,14 @@ def false_alarm_chart(
     remarks: list[str] = []
     for variable, alarm_label in _LABEL_BY_ALARM.items():
         variable_points = [
-            (profile.label, alarm_label, replace(profile.points, dataset=alarm_dataset))
+            charts.LabelledLinePoints(
+                profile.label, alarm_label, replace(profile.points, dataset=alarm_dataset)
+            )
             for profile in profiles
         ]
         # One reading pass per variable: in a joint pass chunks would accumulate in memory.
         lines, remarks = charts.read_lines_along(
-            [(points, variable) for _, _, points in variable_points], coordinate_name
+            [(named_line.points, variable) for named_line in variable_points], coordinate_name
         )
         drawn_lines += lines
         named_points += variable_points
@@ -442,15 +455,14 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
     other_names = points.distinguishing_coordinates_along(
         points.dim_of_coordinate(range_parameter.coordinate), [range_parameter.coordinate]
     )
-    parts, _ = split_by_coordinates(points, other_names, points.size)
     varied_parts = [
-        (words, part_points)
-        for words, part_points in parts
-        if len(part_points.unique_values(range_parameter.coordinate)) > 1
+        part
+        for part in split_by_coordinates(points, other_names, points.size).parts
+        if len(part.points.unique_values(range_parameter.coordinate)) > 1
     ]
     shown_parts, n_omitted = thin_parts_evenly(varied_parts, CHART_PARTS_MAX)
     max_ranges = [
-        (
+        NamedPart(
             words,
             _points_with_maximum_range(shown_points, range_parameter.coordinate, range_axis.factor),
         )
@@ -459,7 +471,7 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
     if not max_ranges:
         return None
     words = labels.axis_label("maximum range", range_axis.units)
-    x = _choose_x_coordinate(results, max_ranges[0][1])
+    x = _choose_x_coordinate(results, max_ranges[0].points)
     return (
         _maximum_range_chart(max_ranges, x, words, n_omitted)
         if x
@@ -555,7 +567,7 @@ def _choose_x_coordinate(results: GridResults, points: PointSelection) -> str:
 
 
 def _maximum_range_chart(
-    max_ranges: Sequence[tuple[str, PointSelection]], x: str, range_label: str, n_omitted: int
+    max_ranges: Sequence[NamedPart], x: str, range_label: str, n_omitted: int
 ) -> Chart:
     """Return the chart of the maximum range: panels for each part and kind of maximum range.
 
@@ -570,28 +582,28 @@ def _maximum_range_chart(
     n_omitted
         Number of omitted parts.
     """
-    first_points = max_ranges[0][1]
+    first_points = max_ranges[0].points
     line_coordinates = [
         n
         for n in first_points.distinguishing_coordinates([x])
         if len(first_points.unique_values(n)) <= charts.LINES_PER_PANEL_MAX
     ][:1]
-    parts: list[tuple[str, PointSelection]] = []
+    parts: list[NamedPart] = []
     for part_label, max_range in max_ranges:
         subparts, n_omitted_parts = split_by_coordinates(
             max_range, max_range.distinguishing_coordinates([x, *line_coordinates]), CHART_PARTS_MAX
         )
         parts += [
-            (", ".join(filter(None, (part_label, subpart_label))), part)
+            NamedPart(", ".join(filter(None, (part_label, subpart_label))), part)
             for subpart_label, part in subparts
         ]
         n_omitted += n_omitted_parts
     n_omitted += max(0, len(parts) - CHART_PARTS_MAX)
-    named_points, _ = charts.split_into_lines(parts[:CHART_PARTS_MAX], line_coordinates)
+    named_points = charts.split_into_lines(parts[:CHART_PARTS_MAX], line_coordinates).named_points
     pairs = [
-        (line_points, answer)
+        (named_line.points, answer)
         for answer in LIMIT_VARIABLE_BY_LABEL.values()
-        for _, _, line_points in named_points
+        for named_line in named_points
     ]
     drawn_lines, remarks = charts.read_lines_along(pairs, x)
     x_axis = CoordinateAxis.from_points(first_points, x)
@@ -621,9 +633,7 @@ def _maximum_range_chart(
     )
 
 
-def _maximum_range_table(
-    max_ranges: Sequence[tuple[str, PointSelection]], range_label: str
-) -> HtmlTable:
+def _maximum_range_table(max_ranges: Sequence[NamedPart], range_label: str) -> HtmlTable:
     """Return the table of the maximum range, with a row for each part and kind of maximum range.
 
     Further columns are the interval, if pd is drawn, and the reason why there is no value.

@@ -519,7 +519,7 @@ WGS84_RADIUS, WGS84_FLATTENING = 6_378_137.0, 1 / 298.257223563
 
 def degree_lengths(
     latitude: float, *, radius: float = WGS84_RADIUS, flattening: float = WGS84_FLATTENING
-) -> tuple[float, float]:
+) -> MetresPerUnit:
     """Return the lengths of a degree of longitude and of latitude on an ellipsoid.
 
     Parameters
@@ -533,7 +533,7 @@ def degree_lengths(
 
     Returns
     -------
-    (float, float)
+    MetresPerUnit
         Metres per degree of longitude and per degree of latitude.
 
     Notes
@@ -546,8 +546,9 @@ def degree_lengths(
     curvature_term = 1 - eccentricity_squared * math.sin(latitude_rad) ** 2
     prime_vertical_radius = radius / math.sqrt(curvature_term)
     meridional_radius = radius * (1 - eccentricity_squared) / curvature_term**1.5
-    return math.radians(prime_vertical_radius * math.cos(latitude_rad)), math.radians(
-        meridional_radius
+    return MetresPerUnit(
+        east=math.radians(prime_vertical_radius * math.cos(latitude_rad)),
+        north=math.radians(meridional_radius),
     )
 
 

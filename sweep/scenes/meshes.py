@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -128,7 +128,7 @@ class Facets:
         """
         return replace(self, vertices=rotate(np.asarray(rotation, float), self.vertices * scale))
 
-    def to_mesh(self) -> tuple[Mesh, MeshCleaningReport]:
+    def to_mesh(self) -> CleanedMesh:
         """Clean the triangles; return a mesh for ray casting, and the report of the cleaning.
 
         Raises
@@ -148,10 +148,11 @@ class Facets:
             _require_faces(len(self.faces), len(self.faces))
             centre = exact_centre(self.vertices)
             mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
-            return mesh, MeshCleaningReport(len(self.vertices), len(self.faces), notes=self.notes)
+            report = MeshCleaningReport(len(self.vertices), len(self.faces), notes=self.notes)
+            return CleanedMesh(mesh, report)
         mesh, report = clean_mesh(self.vertices, self.faces, self.surface)
         report = replace(report, notes=self.notes)
-        return replace(mesh, origin=mesh.origin + self.origin), report
+        return CleanedMesh(replace(mesh, origin=mesh.origin + self.origin), report)
 
 
 def join_facets(facets_list: Sequence[Facets]) -> Facets:
@@ -215,9 +216,16 @@ class MeshCleaningReport:
         return "; ".join([input_text, *self.notes, *(repairs or ["nothing to mend"])])
 
 
-def clean_mesh(
-    vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike
-) -> tuple[Mesh, MeshCleaningReport]:
+class CleanedMesh(NamedTuple):
+    """Mesh that is fit for ray casting, and how it was made so."""
+
+    mesh: Mesh
+    """Mesh with the faces that are left, in the given order."""
+    report: MeshCleaningReport
+    """Numbers of vertices and faces, and of repairs."""
+
+
+def clean_mesh(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> CleanedMesh:
     """Clean triangles for ray casting.
 
     Faces that are not finite, have no area or occur twice are dropped. Coincident vertices are
@@ -235,10 +243,8 @@ def clean_mesh(
 
     Returns
     -------
-    mesh : Mesh
-        Mesh with faces in the given order.
-    report : MeshCleaningReport
-        Counts of repairs.
+    CleanedMesh
+        Mesh with faces in the given order, and counts of repairs.
 
     Raises
     ------
@@ -273,7 +279,7 @@ def clean_mesh(
         surfaces[kept_faces],
         origin,
     )
-    return mesh, MeshCleaningReport(
+    report = MeshCleaningReport(
         n_vertices_before=n_vertices_before,
         n_faces_before=n_faces_before,
         n_non_finite_faces=int((~has_data).sum()),
@@ -282,6 +288,7 @@ def clean_mesh(
         n_merged_vertices=n_merged_vertices,
         n_unreferenced_vertices=n_vertices_before - n_merged_vertices - len(kept_vertices),
     )
+    return CleanedMesh(mesh, report)
 
 
 def _require_faces(n_left: int, n_given: int) -> None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,9 +31,16 @@ _ADJACENT_GAP_MAX_CELLS = 2.0
 """Largest gap between two grids that count as adjacent [cells of the coarser grid]."""
 
 
-def extend_tiles_to_neighbours(
-    tiles: Mapping[str, Terrain],
-) -> tuple[dict[str, Terrain], list[str]]:
+class ExtendedTiles(NamedTuple):
+    """Rasters that meet their neighbours without gaps, as far as their grids agree."""
+
+    terrains: dict[str, Terrain]
+    """Extended tiles by name."""
+    warnings: list[str]
+    """Sentences about gaps that remain between adjacent rasters with different grids."""
+
+
+def extend_tiles_to_neighbours(tiles: Mapping[str, Terrain]) -> ExtendedTiles:
     """Extend each tile by the first row and column of its neighbours' nodes, which closes gaps.
 
     Parameters
@@ -42,10 +50,8 @@ def extend_tiles_to_neighbours(
 
     Returns
     -------
-    joined : dict of str to Terrain
-        Extended tiles by name.
-    warnings : list of str
-        Sentences about gaps that remain between adjacent rasters with different grids.
+    ExtendedTiles
+        Extended tiles, and warnings of gaps that remain.
     """
     names = list(tiles)
     joined = {}
@@ -61,7 +67,7 @@ def extend_tiles_to_neighbours(
                     f"scene.objects.{name}: between it and {other} lies a gap of {width:.3g} m "
                     "without ground, as their grids differ: join the files with gdalwarp"
                 )
-    return joined, warnings
+    return ExtendedTiles(joined, warnings)
 
 
 def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:

@@ -36,6 +36,17 @@ _WORKER_COUNT_RULE = NumericRule(
 _WORKER_BOUNDS_REMEDY = "write e.g. {least: 2, most: 40}"
 
 
+class CertificatePaths(NamedTuple):
+    """Paths of the files with which the processes of a cluster identify themselves by TLS."""
+
+    ca: str
+    """Certificate of the authority that signed the certificate."""
+    certificate: str
+    """Certificate of the cluster's processes."""
+    key: str
+    """Private key of the certificate."""
+
+
 class WorkerBounds(NamedTuple):
     """Minimum and maximum number of workers, equal if the number is fixed."""
 
@@ -184,15 +195,14 @@ class ClusterConfig(SpecSection):
             self._base_folder / os.path.expanduser(raw_path)
         )  # an unknown ~user is left as it is
 
-    def certificate_paths(self) -> tuple[str, str, str] | None:
+    def certificate_paths(self) -> CertificatePaths | None:
         """Return the paths of authority, certificate and private key; None without `security`."""
         security = self.security
         if security is None:
             return None
-        ca, certificate, key = map(
-            self.resolve_path, (security.ca, security.certificate, security.key)
+        return CertificatePaths(
+            *map(self.resolve_path, (security.ca, security.certificate, security.key))
         )
-        return ca, certificate, key
 
 
 class SessionStartedClusterConfig(ClusterConfig):

@@ -525,9 +525,29 @@ def _type_adapter(annotation: Any) -> TypeAdapter[Any]:
     return TypeAdapter(annotation)
 
 
-def iter_section_values(
-    section: BaseModel, prefix: KeyPath = ()
-) -> Iterator[tuple[KeyPath, Rule, Any]]:
+class FieldValue(NamedTuple):
+    """Value of a field in a section of a spec."""
+
+    key_path: KeyPath
+    """Keys that lead to the field."""
+    rule: Rule
+    """Rule of the field."""
+    value: Any
+    """Value in SI units."""
+
+
+class FileField(NamedTuple):
+    """Field of a section that names a file."""
+
+    key_path: KeyPath
+    """Keys that lead to the field."""
+    rule: FilePathRule
+    """Rule of the field."""
+    raw_path: str
+    """Path of the file, as written in the spec."""
+
+
+def iter_section_values(section: BaseModel, prefix: KeyPath = ()) -> Iterator[FieldValue]:
     """Yield path, rule and SI value of every value in a section and its nested sections.
 
     Values that are None are skipped.
@@ -536,7 +556,7 @@ def iter_section_values(
         value, key_path = getattr(section, name), (*prefix, yaml_name(name, field))
         rule = KIND_RULE if name == "kind" else rule_of_field(field)
         if rule is not None and value is not None:
-            yield key_path, rule, value
+            yield FieldValue(key_path, rule, value)
         elif isinstance(value, BaseModel):
             yield from iter_section_values(value, key_path)
         elif isinstance(value, dict):
@@ -647,11 +667,8 @@ class SpecFiles:
         return path
 
 
-def iter_file_paths(section: BaseModel) -> Iterator[tuple[KeyPath, FilePathRule, str]]:
-    """Yield all fields of a section that name a file.
-
-    Each item has the field's key path, its rule, and the file's path as written in the spec.
-    """
+def iter_file_paths(section: BaseModel) -> Iterator[FileField]:
+    """Yield all fields of a section that name a file."""
     for key_path, rule, value in iter_section_values(section):
         if isinstance(rule, FilePathRule):
-            yield key_path, rule, value
+            yield FileField(key_path, rule, value)

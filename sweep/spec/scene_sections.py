@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sweep.model.geometry.body_motion import MovingBody
     from sweep.model.geometry.mesh import Mesh, SurfaceMaterial
     from sweep.model.geometry.ray_casting import RayCaster
-    from sweep.scenes.meshes import Facets, MeshCleaningReport
+    from sweep.scenes.meshes import CleanedMesh, Facets
     from sweep.scenes.scattered_objects import SizeFrequencyLaw
     from sweep.scenes.terrain import Terrain
 
@@ -624,7 +624,7 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
     )
 
 
-def _build_mesh(facets: Facets, first_surface: int) -> tuple[Mesh, MeshCleaningReport]:
+def _build_mesh(facets: Facets, first_surface: int) -> CleanedMesh:
     """Return the mesh of facets and its report; surface numbers start at `first_surface`."""
     surface = (facets.surface + first_surface).astype(np.int16)
     return replace(facets, surface=surface).to_mesh()

@@ -668,9 +668,9 @@ class SceneSpec(BaseSpec):
         if base is not None:
             files = SpecFiles(base)
             spec._base_folder = base
-            paths_and_rules = [(file, rule) for _, rule, file in iter_file_paths(spec)]
             spec._file_digests = {
-                file: rule.compute_digest(files.resolve(file)) for file, rule in paths_and_rules
+                field.raw_path: field.rule.compute_digest(files.resolve(field.raw_path))
+                for field in iter_file_paths(spec)
             }
         return spec
 

@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from zarr.storage import StorePath
@@ -613,10 +613,19 @@ def _line_digest(body: bytes) -> bytes:
     return hashlib.blake2b(body, digest_size=8).hexdigest().encode()
 
 
-def iter_lines_and_records(path: Location) -> Iterator[tuple[bytes, dict[str, Any] | None]]:
+class LogLine(NamedTuple):
+    """Line of a log, and what it says."""
+
+    line: bytes
+    """Bytes of the line."""
+    record: dict[str, Any] | None
+    """Record in the line; None if the line is damaged or truncated."""
+
+
+def iter_lines_and_records(path: Location) -> Iterator[LogLine]:
     """Yield each line of a log with its record; the record is None if damaged or truncated."""
     for line in iter_raw_lines(path):
-        yield line, decode_record(line)
+        yield LogLine(line, decode_record(line))
 
 
 def iter_records(path: Location) -> Iterator[dict[str, Any]]:
@@ -642,9 +651,9 @@ def stored_objects_digest(
         return contents_digest(zip(object_names, contents, strict=True))
     hasher = hashlib.blake2b(digest_size=16)
     for name in object_names:
-        with stream_file_below_root(path, name, bytes_max(name)) as (size, pieces):
-            hasher.update(f"{name}\0{size}\0".encode())
-            for piece in pieces:
+        with stream_file_below_root(path, name, bytes_max(name)) as stream:
+            hasher.update(f"{name}\0{stream.size}\0".encode())
+            for piece in stream.pieces:
                 hasher.update(piece)
     return hasher.hexdigest()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas
@@ -503,12 +504,18 @@ def describe_common_shots(differences: xr.Dataset) -> str:
     )
 
 
-def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
-    """Return the verdict of a comparison, and a sentence about it.
+class AgreementVerdict(NamedTuple):
+    """Whether two stores agree."""
 
-    The verdict is ``same`` if all probabilities of detection agree, ``different`` if one does not,
-    and ``nothing`` if no common point is computed.
-    """
+    verdict: Literal["same", "different", "nothing"]
+    """``same`` if all probabilities of detection agree, ``different`` if one does not, and
+    ``nothing`` if no common point is computed."""
+    sentence: str
+    """Sentence about it for the user."""
+
+
+def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> AgreementVerdict:
+    """Return whether the probabilities of detection of two stores agree."""
     n_points, n_different, noun, count_note = 0, 0, "point", ""
     for differences in compared_groups:
         if "shot" in differences.dims:
@@ -522,12 +529,12 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
             (int((array.notnull() & ~agrees).sum()) for array, agrees in pairs), default=0
         )
     if not n_points:
-        return "nothing", "Nothing that both stores have is computed yet."
+        return AgreementVerdict("nothing", "Nothing that both stores have is computed yet.")
     if not n_different:
         phrase = f"agree at {labels.number_with_noun(n_points, noun)}"
-        return "same", f"Probabilities of detection {phrase}{count_note}."
+        return AgreementVerdict("same", f"Probabilities of detection {phrase}{count_note}.")
     phrase = f"differ at {n_different:,} of {labels.number_with_noun(n_points, noun)}"
-    return "different", f"Probabilities of detection {phrase}{count_note}."
+    return AgreementVerdict("different", f"Probabilities of detection {phrase}{count_note}.")
 
 
 PLOTTED_DIFFERENCE_MIN = 1e-16

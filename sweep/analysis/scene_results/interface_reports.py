@@ -111,7 +111,7 @@ def reports(
     if file is not None and Path(file).suffix.lower() != ".csv":
         remedy = "name a .csv, or export points"
         mistakes.append(Mistake("file", "must end in .csv to hold reports", str(file), remedy))
-    recording, _ = resolve_recording(results, scanner, draw, ranges, where or {}, mistakes)
+    recording = resolve_recording(results, scanner, draw, ranges, where or {}, mistakes).recording
     shot_columns = _read_shot_columns(recording, draw, ranges)
     report_columns = make_reports(
         shot_columns, results.spec.interface_with_overrides(interface or {})

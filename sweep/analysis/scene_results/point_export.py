@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -403,6 +404,15 @@ def export(
         )
 
 
+class RequestedRecording(NamedTuple):
+    """Recording that a user requests."""
+
+    recording: Recording
+    """Points and shots of the scanner and the draw."""
+    axis_position: AxisPosition
+    """Position of the recording along the study's axes."""
+
+
 def resolve_recording(
     results: SceneResults,
     scanner: str | None,
@@ -410,7 +420,7 @@ def resolve_recording(
     ranges: str,
     where: Mapping[str, object],
     mistakes: Sequence[Mistake] = (),
-) -> tuple[Recording, AxisPosition]:
+) -> RequestedRecording:
     """Return the recording that a user requests, and its position along the study's axes.
 
     Parameters
@@ -439,7 +449,8 @@ def resolve_recording(
         *_find_request_mistakes(results, scanner, draw, ranges, axis_position),
     ]:
         raise SpecError(all_mistakes)
-    return axis_position.open_recording(results.tree, scanner or results.scanners[0]), axis_position
+    recording = axis_position.open_recording(results.tree, scanner or results.scanners[0])
+    return RequestedRecording(recording, axis_position)
 
 
 def _find_request_mistakes(

@@ -91,11 +91,10 @@ def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
     paths = cluster.certificate_paths()
     if paths is None:
         return {}
-    ca_file, certificate_file, key_file = paths
     role_files: dict[str, str] = {}
     for role in ("client", "scheduler", "worker"):
-        role_files |= {f"tls_{role}_cert": certificate_file, f"tls_{role}_key": key_file}
-    return {"require_encryption": True, "tls_ca_file": ca_file, **role_files}
+        role_files |= {f"tls_{role}_cert": paths.certificate, f"tls_{role}_key": paths.key}
+    return {"require_encryption": True, "tls_ca_file": paths.ca, **role_files}
 
 
 def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
