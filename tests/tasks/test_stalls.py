@@ -9,7 +9,7 @@ from small_studies import file_digests, small_spec, thread_cluster_client
 from test_absence import Told
 
 from sweep.tasks.driver import run
-from sweep.tasks.engine import dispatcher
+from sweep.tasks.engine import dispatcher, stalls, worker
 
 RELEASED = threading.Event()
 
@@ -26,7 +26,7 @@ def impatient(monkeypatch):
     """A client of one worker, whose stalls are told after half a second."""
     RELEASED.clear()
     monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.05)
-    monkeypatch.setattr(dispatcher, "STALL_REPORT_SECONDS", 0.5)
+    monkeypatch.setattr(stalls, "STALL_REPORT_SECONDS", 0.5)
     with thread_cluster_client(1) as client:
         yield client
 
@@ -53,6 +53,58 @@ def test_a_run_that_stalls_shows_its_tasks_and_workers_and_then_goes_on(
     assert f"worker {address}: 1 thread, last answer " in first
     assert "\n" not in second
     assert sum("nothing came back" in record.message for record in caplog.records) == 2
+
+
+class ReleasingNamedBlock(Told):
+    """Progress that lets the blocked block go on once a report names it."""
+
+    def say(self, text):
+        self.lines.append(text)
+        if "block 3: " in text:
+            RELEASED.set()
+
+
+@pytest.mark.parametrize(
+    ("options", "thread"), [({"scheduler": "none"}, "MainThread"), ({"threads": 2}, r"compute-\d")]
+)
+def test_a_block_that_holds_up_this_process_is_named_with_its_thread(
+    undisturbed, tmp_path, monkeypatch, caplog, options, thread
+):
+    RELEASED.clear()
+    monkeypatch.setattr(worker, "IDLE_POLL_SECONDS", 0.05)
+    monkeypatch.setattr(stalls, "STALL_REPORT_SECONDS", 0.5)
+    told = ReleasingNamedBlock(lambda: None)
+    with caplog.at_level(logging.INFO, logger="sweep.stalls"):
+        outcome = run(
+            small_spec(), store=tmp_path / "s.zarr", progress=told, evaluate=blocked_at_block_3,
+            **options,
+        )  # fmt: skip
+    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
+    (report,) = (line for line in told.lines if "block 3: " in line)
+    assert report.startswith("no block has come back for ")
+    assert re.search(
+        r"\d+ blocks? not yet begun, [12] blocks? being computed; \d+ blocks? ", report
+    )
+    assert re.search(rf"block 3: computed by thread {thread} since \d\d:\d\d:\d\d, .* ago", report)
+    logged = [record.message for record in caplog.records if "block 3: " in record.message]
+    assert logged and "nothing came back for " in logged[0]
+
+
+def test_patience_grows_with_the_time_of_a_task_and_waits_for_nothing_that_is_not_computed(
+    monkeypatch,
+):
+    monkeypatch.setattr(stalls, "STALL_REPORT_SECONDS", 0.0)
+    said = []
+    monitor = stalls.InProcessMonitor(said.append, lambda: 7)
+    monitor.report_if_stalled()
+    assert not said
+    with monitor.computing(5):
+        monitor.report_if_stalled()
+        assert "7 blocks not yet begun, 1 block being computed; 0 blocks done" in said[0]
+        assert "block 5: computed by thread MainThread since " in said[0]
+        monitor.record_result(2, 100.0)  # 50 s a block: the patience is 250 s
+        monitor.report_if_stalled()
+    assert len(said) == 1
 
 
 def test_a_run_is_quiet_by_default_and_logs_its_steps_where_asked(tmp_path, caplog, capfd):

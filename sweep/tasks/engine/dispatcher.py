@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import queue
-import textwrap
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from sweep.messages import number_with_noun, option_name
 from sweep.storage.store_format import NotAStoreError
 from sweep.tasks.engine.journal import Receipt
 from sweep.tasks.engine.progress import SchedulerLostError, StoreError, duration_text
+from sweep.tasks.engine.stalls import PrintMessage, StallMonitor
 from sweep.tasks.engine.worker import (
     IDLE_POLL_SECONDS,
     RESULTS_NOT_VISIBLE_MESSAGE,
@@ -57,25 +57,16 @@ WORKER_SILENCE_SECONDS = 30.0
 #: on Linux cache folders for as long.
 FILE_VISIBILITY_SECONDS_MAX = 60.0
 
-#: Time without any result after which a message says that the run stalls [s]. It is longer if tasks
-#: take long.
-STALL_REPORT_SECONDS = 60.0
-
 #: Time for the first result of a run before a message says that it stalls [s]. Workers compile the
 #: model before it.
 COMPILATION_SECONDS_MAX = 600.0
-
-#: Time without any result after which a stall is reported, as a multiple of a task's expected time.
-STALL_TASK_DURATION_FACTOR = 5.0
 
 #: Largest numbers of tasks and of workers that a summary of the state lists.
 TASKS_IN_SUMMARY_MAX, WORKERS_IN_SUMMARY_MAX = 5, 10
 
 SHARED_FOLDER_REMEDY = "workers have to see the store's folder, under the same path"
 
-PrintMessage = Callable[[str], None]
-
-_logger = logging.getLogger("sweep.scheduler")
+_log = logging.getLogger("sweep.dispatcher")
 
 
 @dataclass
@@ -176,9 +167,7 @@ class TaskDispatcher:
             set()
         )  # workers of which a block was found in the store, by its digest
         self._excluded_workers: dict[str, int] = {}  # number of threads by excluded worker
-        self._last_progress_at = time.monotonic()  # time of the last response
-        self._stall_patience = STALL_REPORT_SECONDS  # time after it until the next report [s]
-        self._has_reported_stall = False  # whether a stall was reported since the last response
+        self._stall_monitor = StallMonitor(say, self.state_summary)
 
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
         """Yield results of tasks as they arrive; an empty result after each `IDLE_POLL_SECONDS`.
@@ -242,30 +231,16 @@ class TaskDispatcher:
         return "\n".join(lines)
 
     def _report_stall(self) -> None:
-        """Print a message and log the state of the run if no result arrives for long.
-
-        The intervals between messages increase.
-        """
+        """Print a message and log the state of the run if no result arrives for long."""
         if (
             not self._in_flight or not self._usable_workers()
         ):  # the session reports a lack of workers
-            self._last_progress_at = time.monotonic()
-        seconds_waited = time.monotonic() - self._last_progress_at
-        if seconds_waited < self._stall_patience:
-            return
-        summary = self.state_summary()
-        _logger.info("nothing came back for %s:\n%s", duration_text(seconds_waited), summary)
-        stall_text = f"no block has come back for {duration_text(seconds_waited)}"
-        if not self._last_response and seconds_waited < COMPILATION_SECONDS_MAX:
-            self._stall_patience = min(2 * seconds_waited, COMPILATION_SECONDS_MAX)
-            self._say(
-                f"{stall_text}: workers load the model, or compile it once, which takes minutes "
-                "where the machine is busy"
-            )
-            return
-        is_first = not self._has_reported_stall
-        self._stall_patience, self._has_reported_stall = 2 * seconds_waited, True
-        self._say(f"{stall_text}:\n{textwrap.indent(summary, '  ')}" if is_first else stall_text)
+            self._stall_monitor.restart_waiting()
+        self._stall_monitor.report_if_stalled(
+            explanation="workers load the model, or compile it once, which takes minutes where the "
+            "machine is busy",
+            explained_seconds=0.0 if self._last_response else COMPILATION_SECONDS_MAX,
+        )
 
     def _usable_workers(self) -> list[str]:
         """Return the addresses of connected workers that are not excluded."""
@@ -333,7 +308,7 @@ class TaskDispatcher:
             run_blocks, self._settings, task.blocks, key=key, retries=0, **placement
         )
         task.last_sent_at = time.monotonic()
-        _logger.debug("sent block %s and %s more as %s", first_block, len(task.blocks) - 1, key)
+        _log.debug("sent block %s and %s more as %s", first_block, len(task.blocks) - 1, key)
         task.futures_by_key[future.key] = future
         self._in_flight[future.key] = task
         future.add_done_callback(self._finished_futures.put)
@@ -427,13 +402,10 @@ class TaskDispatcher:
                 key
             ]  # kept, so that its worker counts as busy
         task_result = _collect_task_result(future, task.blocks)
-        self._last_response[task_result.worker_address] = self._last_progress_at = time.monotonic()
+        self._last_response[task_result.worker_address] = time.monotonic()
         self._throughput.add_task_result(task_result)
-        self._stall_patience = max(
-            STALL_REPORT_SECONDS, STALL_TASK_DURATION_FACTOR * self._expected_task_seconds(task)
-        )
-        self._has_reported_stall = False
-        _logger.debug(
+        self._stall_monitor.record_result(self._expected_task_seconds(task))
+        _log.debug(
             "%s answered: %s blocks written, %s failed, %s begun",
             task_result.worker_address or "a lost worker",
             len(task_result.receipts),

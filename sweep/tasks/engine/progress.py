@@ -30,7 +30,7 @@ WIDE_TERMINAL_COLUMNS_MIN = 100
 #: Duration of an activity after which a message about it is shown [s]. Most activities are shorter.
 ACTIVITY_MESSAGE_DELAY_SECONDS = 2.0
 
-_logger = logging.getLogger("sweep")
+_log = logging.getLogger("sweep")
 
 
 class TaskError(EscapedTextError):
@@ -123,7 +123,7 @@ class _GuardedListener(Progress):
             getattr(self._listener, method)(*values, **keywords)
         except Exception as error:
             self._has_failed = True
-            _logger.warning(
+            _log.warning(
                 "the listener to the progress failed in %s (%s: %s): the run goes on without it",
                 method, type(error).__name__, error,
             )  # fmt: skip

@@ -99,7 +99,7 @@ NO_WORKER_WARNING_SECONDS = 20.0
 #: Fields of the receipts of blocks that a session sums.
 SUMMED_RECEIPT_FIELDS = ("points", "reused_points", "bytes", "seconds", "write_seconds")
 
-_logger = logging.getLogger("sweep.session")
+_log = logging.getLogger("sweep.session")
 
 CHECKPOINT_LOST_MESSAGE = (
     "block {} is computed in pieces, and what one worker saved was not found by the next: "
@@ -444,16 +444,22 @@ class ComputeBackend(ExitStack):
                     f"memory suffices for {n_threads} of {n_without_limit} threads: a block takes "
                     f"up to {self.bytes_per_thread / 1e9:,.1f} GB"
                 )
-            in_process = settings, block_queue, lambda: self.interrupts.is_stopping, verify_receipt
+            in_process = (
+                settings,
+                block_queue,
+                lambda: self.interrupts.is_stopping,
+                verify_receipt,
+                self.progress.say,
+            )
             if n_threads == 1:
-                _logger.info("blocks are computed in this process, one after the other")
+                _log.info("blocks are computed in this process, one after the other")
                 return run_serial(*in_process)
-            _logger.info("blocks are computed by %s threads of this process", n_threads)
+            _log.info("blocks are computed by %s threads of this process", n_threads)
             return run_in_threads(*in_process, n_threads)
         from sweep.tasks.engine.dispatcher import TaskDispatcher
 
         client, expected_worker_threads, _ = self.connect()
-        _logger.info("blocks are computed by the workers of %s", client)
+        _log.info("blocks are computed by the workers of %s", client)
         dispatcher = TaskDispatcher(
             client,
             expected_worker_threads,
@@ -592,7 +598,7 @@ class Session:
             if not self._backend.options.retry_failed:
                 is_settled[list(read_permanent_failures(self._store_path, is_done.size))] = True
             n_blocks_skipped = int(np.count_nonzero(is_settled & ~is_done))
-            _logger.info(
+            _log.info(
                 "%s: study %s of %s blocks, %s done before, %s left out for their errors",
                 self._store_path,
                 self._study.id,
@@ -634,7 +640,7 @@ class Session:
             work_seconds=totals["seconds"],
             write_seconds=totals["write_seconds"],
         )
-        _logger.info(
+        _log.info(
             "%s: %s blocks computed in %s, %s failed%s",
             self._store_path,
             outcome.blocks_computed,
@@ -766,7 +772,7 @@ class Session:
             if not block_queue.requeue_failed(failure.block):
                 self._journal.record_failure(failure)
                 self._permanent_failures.append(failure)
-            _logger.info("block %s failed on %s: %s", failure.block, failure.host, failure.error)
+            _log.info("block %s failed on %s: %s", failure.block, failure.host, failure.error)
         for block, saved_points in task_result.checkpoint_points_by_block.items():
             if saved_points <= self._checkpoint_points.get(block, 0.0):
                 raise StoreError(CHECKPOINT_LOST_MESSAGE.format(block))
@@ -790,7 +796,7 @@ class Session:
         if not self._journal.flush(force=force):
             return
         if self._unflushed_receipts:
-            _logger.debug("committed %s blocks", len(self._unflushed_receipts))
+            _log.debug("committed %s blocks", len(self._unflushed_receipts))
         for receipt in self._unflushed_receipts:
             self._receipt_totals["blocks"] += 1
             for quantity in SUMMED_RECEIPT_FIELDS:

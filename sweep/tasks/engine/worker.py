@@ -31,6 +31,7 @@ from sweep.tasks.engine.block_study import BlockEvaluator, Deadline, StudyReader
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import Checkpoint, Failure, Receipt
 from sweep.tasks.engine.progress import CodeError, StoreError
+from sweep.tasks.engine.stalls import InProcessMonitor, PrintMessage
 
 ReturnValue = TypeVar("ReturnValue")
 
@@ -395,15 +396,20 @@ def run_serial(
     block_queue: BlockQueue,
     is_stopping: Callable[[], bool],
     verify_receipt: ReceiptVerifier,
+    say: PrintMessage,
 ) -> Iterator[TaskResult]:
     """Compute blocks in this process one after the other. Yield the result of each.
 
-    Every other way to compute must write the same bytes as this reference.
+    Every other way to compute must write the same bytes as this reference. ``say`` gets messages
+    for the user about a block that takes long.
     """
-    while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
-        yield _accept_result(
-            run_blocks(settings, task_blocks), task_blocks, block_queue, verify_receipt
-        )
+    monitor = InProcessMonitor(say, lambda: block_queue.n_unassigned)
+    with monitor.watching(IDLE_POLL_SECONDS):
+        while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
+            with monitor.computing(task_blocks[0]):
+                task_result = run_blocks(settings, task_blocks)
+            _record_result(monitor, task_result)
+            yield _accept_result(task_result, task_blocks, block_queue, verify_receipt)
 
 
 def run_in_threads(
@@ -411,6 +417,7 @@ def run_in_threads(
     block_queue: BlockQueue,
     is_stopping: Callable[[], bool],
     verify_receipt: ReceiptVerifier,
+    say: PrintMessage,
     n_threads: int,
 ) -> Iterator[TaskResult]:
     """Yield the results of blocks that threads of this process compute, as they arrive.
@@ -429,6 +436,8 @@ def run_in_threads(
         Returns True once the run is to stop. Blocks that run are then finished; no other begins.
     verify_receipt
         Tells whether the block of a receipt is in the store.
+    say
+        Gets messages for the user, if no block is finished for long.
     n_threads
         Number of threads.
 
@@ -439,11 +448,13 @@ def run_in_threads(
     """
     assigned_blocks: queue.SimpleQueue[list[int] | None] = queue.SimpleQueue()
     finished_tasks: queue.SimpleQueue[tuple[list[int], TaskResult]] = queue.SimpleQueue()
+    monitor = InProcessMonitor(say, lambda: block_queue.n_unassigned)
 
     def compute_assigned_blocks() -> None:
         while (task_blocks := assigned_blocks.get()) is not None:
             try:
-                task_result = run_blocks(settings, task_blocks)
+                with monitor.computing(task_blocks[0]):
+                    task_result = run_blocks(settings, task_blocks)
             except BaseException as error:  # else the run would wait for this thread for good
                 task_result = TaskResult(
                     failures=[make_failure(block, error) for block in task_blocks]
@@ -451,8 +462,10 @@ def run_in_threads(
             finished_tasks.put((task_blocks, task_result))
 
     # After a second Ctrl-C the command ends without waiting for them, hence daemon threads.
-    for _ in range(n_threads):
-        threading.Thread(target=compute_assigned_blocks, daemon=True).start()
+    for number in range(n_threads):
+        threading.Thread(
+            target=compute_assigned_blocks, name=f"compute-{number}", daemon=True
+        ).start()
     n_in_flight = 0
     try:
         while True:
@@ -466,15 +479,23 @@ def run_in_threads(
             try:
                 task_blocks, task_result = finished_tasks.get(timeout=IDLE_POLL_SECONDS)
             except queue.Empty:
+                monitor.report_if_stalled()
                 yield TaskResult(n_workers=n_threads)
                 continue
             n_in_flight -= 1
+            _record_result(monitor, task_result)
             accepted_result = _accept_result(task_result, task_blocks, block_queue, verify_receipt)
             accepted_result.n_workers = n_threads
             yield accepted_result
     finally:
         for _ in range(n_threads):
             assigned_blocks.put(None)
+
+
+def _record_result(monitor: InProcessMonitor, task_result: TaskResult) -> None:
+    """Tell the monitor of the blocks that a task has finished, and of the time that they took."""
+    work_seconds = sum(receipt.seconds for receipt in task_result.receipts)
+    monitor.record_result(len(task_result.receipts), work_seconds)
 
 
 def _accept_result(
