@@ -66,7 +66,8 @@ ENGINE_SPEC_MODULES = {
 
 LIDAR_WORDS = re.compile(
     r"(?<![a-z])(lidar|laser|beam|beamlet|chirp|doppler|speckle|shot|scanner|scene|eyepoint"
-    r"|telescope|footprint|spectr(um|a)|fft|radial_velocity|ray)s?(?![a-z])",
+    r"|telescope|footprint|spectr(um|a)|fft|radial_velocity|ray|pd|snr|look|echo(es)?|tile)s?"
+    r"(?![a-z])",
     re.IGNORECASE,
 )
 """Words of the field, which the engine knows none of."""

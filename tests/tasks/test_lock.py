@@ -1,6 +1,7 @@
 import errno
 import fcntl
 import json
+import logging
 import multiprocessing
 import os
 import re
@@ -45,7 +46,8 @@ def test_a_held_lock_refuses_a_second_driver_and_says_who_holds_it(tmp_path):
     StoreLock(tmp_path).release()
 
 
-def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
+def test_the_lock_of_a_dead_process_is_taken_over(tmp_path, caplog):
+    caplog.set_level(logging.DEBUG, logger="sweep.journal")
     code = (
         "import os, sys; from pathlib import Path;"
         "from sweep.tasks.engine.journal import StoreLock;"
@@ -58,6 +60,13 @@ def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
     mine = StoreLock(tmp_path)
     assert mine.is_held()
     mine.release()
+    waited, taken_over, locked, released = (record.getMessage() for record in caplog.records)
+    lock_path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
+    assert waited == f"waiting until no other process acquires {lock_path}"
+    assert taken_over.startswith(f"{lock_path}: taking over from a dead process, ")
+    assert f'"pid": {dead.pid}' in taken_over
+    assert locked == f"{tmp_path}: locked by this process, {os.getpid()}"
+    assert released == f"{tmp_path}: lock released"
 
 
 def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path):

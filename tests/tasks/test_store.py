@@ -1,4 +1,6 @@
 import json
+import logging
+import re
 import warnings
 from pathlib import Path
 
@@ -69,7 +71,8 @@ def test_members_of_a_zipped_axis_and_words_open_as_coordinates(tmp_path):
     assert [str(name) for name in dataset.window.values] == ["hamming", "hann"]
 
 
-def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study):
+def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study, caplog):
+    caplog.set_level(logging.DEBUG, logger="sweep.study_store")
     results = study.evaluate(3)
     arrays = study_store.BlockWriter(path, study)
     objects = study_store.chunk_names_of_block(study, 3)
@@ -78,6 +81,9 @@ def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study
     assert is_whole(path, objects)
     assert written.digest == store_format.stored_objects_digest(path, objects)
     assert written.n_bytes == sum((path / name).stat().st_size for name in objects)
+    (message,) = (record.getMessage() for record in caplog.records)
+    counts = f"{len(objects)} chunks of {written.n_bytes} bytes in all"
+    assert re.fullmatch(rf"{re.escape(str(path))}: wrote block 3, {counts}, in .* s", message)
     dataset = xr.open_zarr(path)
     for name, values in results.items():
         stored = dataset[name].values[study.grid.block_slices(3)]

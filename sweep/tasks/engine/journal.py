@@ -21,6 +21,7 @@ import fcntl
 import hashlib
 import io
 import json
+import logging
 import math
 import os
 import socket
@@ -89,6 +90,8 @@ REPLACED_STUDY_ID_KEY = "replaces"
 
 #: Number of folders on disk that are listed at once; listing on a file server is mostly waiting.
 LISTING_THREADS = 4
+
+_log = logging.getLogger("sweep.journal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,7 +284,7 @@ class ChunkScan:
         n_threads = (
             CONCURRENT_REQUESTS_MAX if isinstance(store_path, ObjectPath) else LISTING_THREADS
         )
-        self._executor = ThreadPoolExecutor(n_threads, thread_name_prefix="look")
+        self._executor = ThreadPoolExecutor(n_threads, thread_name_prefix="chunk-scan")
 
         def blocks_lacking_chunk(array_name: str, owner_blocks: np.ndarray) -> np.ndarray:
             """Return the candidate blocks whose chunk of an array is missing."""
@@ -528,7 +531,7 @@ HEARTBEAT_INTERVAL_SECONDS = 10.0
 HEARTBEAT_AGE_SECONDS_MAX = 120.0
 
 #: Time for which an old heartbeat is watched before its holder counts as dead [s]. A clock that was
-#: set can make a heartbeat look old, but can't stop it from changing.
+#: set can make a heartbeat seem old, but can't stop it from changing.
 HEARTBEAT_WATCH_SECONDS = 35.0
 
 #: Largest size of a lock file [bytes].
@@ -739,6 +742,7 @@ class _FileLock:
             if not stat.S_ISREG(os.fstat(guard_descriptor).st_mode):
                 raise RefusedFileError(errno.EINVAL, "is no plain file", str(guard_path))
             try:
+                _log.debug("waiting until no other process acquires %s", self._lock_path)
                 fcntl.flock(guard_descriptor, fcntl.LOCK_EX)
             except OSError as error:
                 if error.errno not in FLOCK_UNSUPPORTED_ERRNOS:
@@ -757,10 +761,12 @@ class _FileLock:
         """Remove the lock file of a dead holder; put back a newer one that was removed instead."""
         if stale_json is None:
             return
+        _log.debug("%s: taking over from a dead process, %s", self._lock_path, stale_json)
         aside_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
         with suppress(FileNotFoundError):
             os.rename(self._lock_path, aside_path)
             if _read_lock_file(aside_path) != stale_json:  # another process was quicker
+                _log.debug("%s: another process was quicker, and keeps it", self._lock_path)
                 try:
                     os.link(aside_path, self._lock_path)
                 except OSError:
@@ -879,6 +885,12 @@ class _ObjectLock:
                 self._holder_json, self._tag = holder_json, lock_object.version
                 return
             check_holder()
+            if lock_object and lock_object.content:
+                _log.debug(
+                    "%s: taking over from a dead process, %s",
+                    self._lock_path,
+                    _holder_json_of_content(lock_object.content),
+                )
             tag = self._lock_path.put_if_unchanged(
                 f"{holder_json}\n0\n".encode(),
                 lock_object.version if lock_object else None,
@@ -886,6 +898,7 @@ class _ObjectLock:
             if tag is not None:
                 self._holder_json, self._tag = holder_json, tag
                 return
+            _log.debug("%s: another process was quicker, trying again", self._lock_path)
         raise ObjectStoreError(11, "others are quicker to lock it: try again", str(self._lock_path))
 
     def send_heartbeat(self) -> None:
@@ -952,6 +965,7 @@ def _sends_no_heartbeat(
     Return True if the holder sent no heartbeat in this time.
     """
     holder_text = f"process {other_holder.pid} on {escape_to_one_line(other_holder.host)}"
+    _log.debug("%s: watching the heartbeat of %s", store_path, holder_text)
     say(
         f"waiting up to {watch_seconds:.0f} s to see whether {holder_text}, "
         f"which has locked {store_path}, still lives"
@@ -963,7 +977,9 @@ def _sends_no_heartbeat(
             other_holder,
             heartbeat_version,
         ):
+            _log.debug("%s: %s sent a heartbeat, or another took the lock", store_path, holder_text)
             return False
+    _log.debug("%s: no heartbeat of %s in %.0f s", store_path, holder_text, watch_seconds)
     return True
 
 
@@ -983,6 +999,7 @@ class StoreLock:
             self._lock.acquire(
                 json.dumps(asdict(self._own_holder)), self._refuse_living_holder, say
             )
+        _log.debug("%s: locked by this process, %s", store_path, self._own_holder.pid)
         self._heartbeat_thread = threading.Thread(
             target=self._send_heartbeats, name="lock-heartbeat", daemon=True
         )
@@ -1053,7 +1070,7 @@ class StoreLock:
                         "heartbeat",
                         f"the heartbeat of the lock of {self._store_path} can't be written "
                         f"({os_error_reason(error, self._store_path)}): to other hosts this run "
-                        f"looks dead after {HEARTBEAT_AGE_SECONDS_MAX:g} s, so start none of this "
+                        f"seems dead after {HEARTBEAT_AGE_SECONDS_MAX:g} s, so start none of this "
                         "store there",
                     )
 
@@ -1076,3 +1093,4 @@ class StoreLock:
         with suppress(OSError):
             if self.is_held():
                 self._lock.release()
+                _log.debug("%s: lock released", self._store_path)

@@ -11,10 +11,12 @@ from __future__ import annotations
 import ctypes
 import errno
 import json
+import logging
 import os
 import platform
 import shlex
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -95,6 +97,8 @@ CHUNK_CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 
 _ZSTD_ENCODER = Zstd(level=ZSTD_LEVEL)
 
+_log = logging.getLogger("sweep.study_store")
+
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -109,7 +113,7 @@ def create_store(
     """Create a store that holds metadata and arrays with known values, but no results.
 
     On disk the store is built in the same folder and renamed, so that an interrupted creation
-    leaves nothing that looks like a store. For an object store it is built on this machine and
+    leaves nothing that passes for a store. For an object store it is built on this machine and
     uploaded, its root last. StoreError is raised if something is at the path, or the path is not
     writable.
     """
@@ -361,11 +365,19 @@ class BlockWriter:
                 (self.store_path / chunk_path).write_bytes(content)
             return chunk_path, content
 
+        started_at = time.monotonic()
         with translate_errors(self.store_path):
             chunk_contents = map_concurrently(self.store_path, write_chunk, positions)
-        return BlockDigest(
-            contents_digest(chunk_contents), sum(len(content) for _, content in chunk_contents)
+        n_bytes = sum(len(content) for _, content in chunk_contents)
+        _log.debug(
+            "%s: wrote block %s, %s chunks of %s bytes in all, in %.3f s",
+            self.store_path,
+            block,
+            len(chunk_contents),
+            n_bytes,
+            time.monotonic() - started_at,
         )
+        return BlockDigest(contents_digest(chunk_contents), n_bytes)
 
 
 def chunk_names_of_block(study: BlockStudy, block: int) -> list[str]:
@@ -389,8 +401,8 @@ def make_chunk_size_limit(study: BlockStudy) -> Callable[[str], int]:
 def array_name_of_chunk(chunk_path: str) -> str:
     """Return the path, inside the store, of the array of a chunk; '' if an object is no chunk.
 
-    >>> [array_name_of_chunk(name) for name in ("tile/pd_up/c/0/3", "weight/c", "pd_up/zarr.json")]
-    ['tile/pd_up', 'weight', '']
+    >>> [array_name_of_chunk(name) for name in ("east/wind/c/0/3", "weight/c", "wind/zarr.json")]
+    ['east/wind', 'weight', '']
     """
     match = CHUNK_NAME_PATTERN.fullmatch(chunk_path)
     return match[1] if match else ""
