@@ -68,7 +68,7 @@ def test_what_is_kept_of_an_interrupted_measurement_is_told_with_exit_code_3(her
 
     def cut(self):
         found = whole(self)
-        found.stop_reason = "interrupted"
+        found.stop_reason = measurement.StopReason.INTERRUPTED
         return found
 
     monkeypatch.setattr(measurement.AccuracyMeasurement, "run", cut)

@@ -427,9 +427,9 @@ def accuracy(
     has_results = measure_accuracy(
         load(spec), store_path=path, n_points=points, time_limit=time_limit, overwrite=overwrite
     )
-    files, is_complete = print_accuracy_measurement(path, has_results=has_results)
-    _print_paths(files)
-    if not is_complete:
+    printed = print_accuracy_measurement(path, has_results=has_results)
+    _print_paths(printed.files)
+    if not printed.is_complete:
         sys.exit(EXIT_INCOMPLETE)
 
 
@@ -679,7 +679,7 @@ def spectra(
     spec = load(str(study)) if is_file else read_study(study).study.spec
     if not isinstance(spec, GridSpec):
         raise click.UsageError(f"{study} is a study of a scene: spectra are those of a flat target")
-    _, parameters = select_shot_parameters(spec, parse_assignments(at))[0]
+    parameters = select_shot_parameters(spec, parse_assignments(at))[0].parameters
     with show_activity("drawing spectra"):
         dataset = draw_spectra(spec, parameters, n_draws=draws, first_draw=first)
         write_spectra(dataset, output, overwrite=overwrite)

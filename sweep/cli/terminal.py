@@ -11,7 +11,7 @@ import textwrap
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 from click.shell_completion import CompletionItem
@@ -749,8 +749,19 @@ def confirm_large_study(spec: GridSpec | SceneSpec, store: Location, *, yes: boo
     click.confirm(f"This study takes {excess}. Begin it?", abort=True, err=True)
 
 
-def _study_size(spec: GridSpec | SceneSpec, store: Location) -> tuple[int, int, float]:
-    """Return points, bytes and time on one core [s] of a study; time 0 if not estimated.
+class _StudySize(NamedTuple):
+    """Size of a study, of which a user may be asked before it begins."""
+
+    points: int
+    """Number of points."""
+    size_bytes: int
+    """Size of the results before compression [bytes]."""
+    seconds: float
+    """Time on one core [s]; 0 if it is not estimated."""
+
+
+def _study_size(spec: GridSpec | SceneSpec, store: Location) -> _StudySize:
+    """Return the size of a study.
 
     The time is estimated only for many draws, and only if points and bytes raise no question.
     """
@@ -764,8 +775,8 @@ def _study_size(spec: GridSpec | SceneSpec, store: Location) -> tuple[int, int, 
     if points * draws <= MEASURE_TIME_ABOVE_POINT_DRAWS or _excessive_size_text(
         points, size_bytes, 0.0
     ):
-        return points, size_bytes, 0.0
-    return points, size_bytes, plan_study(spec, store_path=store).cpu_seconds
+        return _StudySize(points, size_bytes, 0.0)
+    return _StudySize(points, size_bytes, plan_study(spec, store_path=store).cpu_seconds)
 
 
 def _excessive_size_text(points: int, size_bytes: int, seconds: float) -> str:
@@ -851,18 +862,25 @@ def _effect_row_cells(row: EffectRow) -> list[str]:
     ]
 
 
-def print_accuracy_measurement(
-    store: Location, *, has_results: bool
-) -> tuple[list[Location], bool]:
+class PrintedMeasurement(NamedTuple):
+    """What is left of a measurement of accuracy once it is printed."""
+
+    files: list[Location]
+    """Store, figure and tables."""
+    is_complete: bool
+    """Whether the user has not interrupted the measurement."""
+
+
+def print_accuracy_measurement(store: Location, *, has_results: bool) -> PrintedMeasurement:
     """Print the measured settings and draw their figure.
 
-    Return the written files, and whether the measurement was not interrupted. Exit with the code
-    for incomplete results if nothing was measured.
+    Exit with the code for incomplete results if nothing was measured.
     """
     if not has_results:
         click.echo("Interrupted before any point was through: nothing is kept.", err=True)
         sys.exit(EXIT_INCOMPLETE)
     from sweep.analysis import accuracy_results
+    from sweep.tasks.accuracy.measurement import StopReason
 
     dataset, settings = accuracy_results.open_accuracy_store(store)
     print_table(
@@ -879,6 +897,5 @@ def print_accuracy_measurement(
     )
     for sentence in accuracy_results.conclusion_sentences(dataset, settings):
         echo_wrapped(sentence)
-    return [store, *accuracy_results.write_figure_and_tables(store)], dataset.attrs[
-        "stopped"
-    ] != "interrupted"
+    written_files = [store, *accuracy_results.write_figure_and_tables(store)]
+    return PrintedMeasurement(written_files, dataset.attrs["stopped"] != StopReason.INTERRUPTED)

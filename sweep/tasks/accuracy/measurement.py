@@ -11,6 +11,7 @@ import time
 import timeit
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -278,14 +279,14 @@ class AccuracyMeasurement:
 
         Return the content of the store.
         """
-        first_round, stop_reason = (
-            self._run_round(parts, time_fraction=FIRST_ROUND_TIME_FRACTION),
-            "",
-        )
+        first_round = self._run_round(parts, time_fraction=FIRST_ROUND_TIME_FRACTION)
+        stop_reason = StopReason.NONE
         if not first_round:
             raise NoMeasurementError
         if len(first_round) < len(parts):
-            stop_reason = "interrupted" if self._interrupts.is_stopping else "time limit"
+            stop_reason = (
+                StopReason.INTERRUPTED if self._interrupts.is_stopping else StopReason.TIME_LIMIT
+            )
         parts = parts[: len(first_round)]
         sample_rows = np.concatenate(parts)
         time_domain_differences, n_beamlets = self._compare_with_time_domain(sample_rows)
@@ -537,6 +538,17 @@ def _probability_differences(first: np.ndarray, second: np.ndarray) -> np.ndarra
     return np.where(is_known, np.abs(np.nan_to_num(first) - np.nan_to_num(second)), np.nan)
 
 
+class StopReason(StrEnum):
+    """Reason why a measurement of accuracy has only a part of its sample, as stores state it."""
+
+    NONE = ""
+    """The sample is complete."""
+    INTERRUPTED = "interrupted"
+    """The user has interrupted the measurement."""
+    TIME_LIMIT = "time limit"
+    """The time for the measurement did not suffice."""
+
+
 @dataclass
 class AccuracyStoreTemplate:
     """Content of a store of `sweep accuracy`: errors and times of all settings.
@@ -552,7 +564,7 @@ class AccuracyStoreTemplate:
     time_domain_differences: dict[int, np.ndarray]
     """Differences of the reference from the time domain, by the point's number in the sample."""
     time_domain_beamlets: int  # number of beamlets of both; 0 if that of the reference
-    stop_reason: str  # reason why the sample is incomplete, or ''
+    stop_reason: StopReason  # reason why the sample is incomplete
     storing_seconds: float = math.nan  # processor time of storing the study [s]
 
     @property
@@ -591,7 +603,7 @@ class AccuracyStoreTemplate:
             "thesis_beamlets": int(
                 np.nan_to_num(np.fmax.reduce(thesis_beamlets, axis=None, initial=0))
             ),
-            "stopped": self.stop_reason,
+            "stopped": self.stop_reason.value,
             "coordinates": " ".join(["kind", *self.sample.point_coordinates()]),
             "truth_points": len(self.time_domain_differences),
         }
