@@ -734,7 +734,7 @@ def _sheet_caption(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> 
     return labels.join_sentences(phrases)
 
 
-class AccuracyMeasurement(NamedTuple):
+class AccuracyResults(NamedTuple):
     """Measurement of accuracy, read from its store."""
 
     dataset: xr.Dataset
@@ -743,7 +743,7 @@ class AccuracyMeasurement(NamedTuple):
     """Errors and times of each accuracy setting."""
 
 
-def open_accuracy_store(store: Location) -> AccuracyMeasurement:
+def open_accuracy_store(store: Location) -> AccuracyResults:
     """Load a store of `sweep accuracy`; return its dataset and its settings.
 
     Raise NotAStoreError if the store is of another kind.
@@ -751,7 +751,7 @@ def open_accuracy_store(store: Location) -> AccuracyMeasurement:
     study_id = read_attributes_of_kind(store, ACCURACY_STORE_KIND)["study_id"]
     with xr.open_zarr(open_verified_store(store, study_id), **OPEN_ZARR_KWARGS) as dataset:
         loaded = dataset.load()
-    return AccuracyMeasurement(loaded, read_settings(loaded))
+    return AccuracyResults(loaded, read_settings(loaded))
 
 
 def write_figure_and_tables(

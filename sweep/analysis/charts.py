@@ -564,7 +564,7 @@ class ShownLines(NamedTuple):
     """Number of omitted lines."""
 
 
-class ReadLines(NamedTuple):
+class LinesWithRemarks(NamedTuple):
     """Lines of a chart that were read from a store."""
 
     lines: list[ChartLine]
@@ -636,7 +636,7 @@ def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
 
 def read_lines_along(
     points_and_variables: Sequence[tuple[PointSelection, str]], x: str
-) -> ReadLines:
+) -> LinesWithRemarks:
     """Read variables along a coordinate as lines of a chart, in one pass.
 
     Parameters
@@ -648,7 +648,7 @@ def read_lines_along(
 
     Returns
     -------
-    ReadLines
+    LinesWithRemarks
         Lines in the order of the argument. If a line has many points, it shows the means of
         adjacent points, with a band from the lowest to the highest of them. Otherwise the band is
         the confidence interval of each point, if there is one.
@@ -690,7 +690,7 @@ def read_lines_along(
             )
         )
         remarks.append(_band_remark(n_averaged_points, confidence, has_ends))
-    return ReadLines(chart_lines, list(dict.fromkeys(remarks)))
+    return LinesWithRemarks(chart_lines, list(dict.fromkeys(remarks)))
 
 
 def _value_and_interval_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:

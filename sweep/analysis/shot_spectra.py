@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -671,6 +671,15 @@ _REPORTED_PARAMETER_PATHS = (
 """Dotted paths of the parameters that the report of a shot lists."""
 
 
+class ShotReport(NamedTuple):
+    """Report of the spectra of shots, as text and in files."""
+
+    text: str
+    """Tables as text."""
+    files: list[Path]
+    """Paths of the written files."""
+
+
 def write_shot_report(
     spec: GridSpec,
     coordinate_values: Mapping[str, str],
@@ -679,7 +688,7 @@ def write_shot_report(
     draws_noise: bool = False,
     seed: int = 0,
     picture_format: str = "png",
-) -> tuple[str, list[Path]]:
+) -> ShotReport:
     """Write the spectra and tables of one shot of a grid; return the text and the written files.
 
     Parameters
@@ -728,12 +737,21 @@ def write_shot_report(
         ]
     page = TablePage(spec.title, _shot_tables(shots), [f"Spectra: {remark}."], [])
     paths[1].write_text(page.to_text(), encoding="utf-8")
-    return page.to_text(), paths
+    return ShotReport(page.to_text(), paths)
+
+
+class LabelledParameters(NamedTuple):
+    """Parameters of a shot that is drawn."""
+
+    label: str
+    """Values along the axis; '' for the only shot."""
+    parameters: ParameterValues
+    """SI values of all parameters by dotted path."""
 
 
 def select_shot_parameters(
     spec: GridSpec, coordinate_values: Mapping[str, str]
-) -> list[tuple[str, ParameterValues]]:
+) -> list[LabelledParameters]:
     """Return the label and the parameters of each shot that :func:`write_shot_report` draws."""
     axis_parameters = [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
     path_by_name, rule_by_path = {m.coordinate: m.path for m in axis_parameters}, parameter_rules()
@@ -747,7 +765,7 @@ def select_shot_parameters(
     draws_all_values = (
         not coordinate_values and len(spec.axes) == 1 and spec.axes[0].size <= DRAWN_AXIS_VALUES_MAX
     )
-    labelled_parameters: list[tuple[str, ParameterValues]] = []
+    labelled_parameters: list[LabelledParameters] = []
     for i in range(spec.axes[0].size if draws_all_values else 1):
         raw_values: dict[str, object] = {
             m.path: rule_by_path[m.path].format(m.values[i]) for m in axis_parameters
@@ -761,7 +779,9 @@ def select_shot_parameters(
             for m in axis_parameters
         )
         labelled_parameters.append(
-            (label if draws_all_values else "", spec.parameters_with_overrides(raw_values))
+            LabelledParameters(
+                label if draws_all_values else "", spec.parameters_with_overrides(raw_values)
+            )
         )
     return labelled_parameters
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas
@@ -266,9 +266,19 @@ def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, TableCel
     return records
 
 
+class NoiseAlarmReference(NamedTuple):
+    """Probabilities of false alarms due to noise alone, at one setting of the instrument."""
+
+    record: dict[str, TableCell]
+    """Part of a record: `tnr`, `bins` (independent bins of a chirp), and the probability of a false
+    alarm in both chirps, as `closed_form` and as `noise_only`, by the model."""
+    pfa_bin: float
+    """Probability of a false alarm in a bin, by the model."""
+
+
 def noise_false_alarm_reference(
     spec: GridSpec, setting_parameters: dict[str, Any]
-) -> tuple[dict[str, TableCell], float]:
+) -> NoiseAlarmReference:
     """Return the probabilities of false alarms due to noise alone, in closed form and by the model.
 
     Parameters
@@ -280,11 +290,8 @@ def noise_false_alarm_reference(
 
     Returns
     -------
-    dict
-        Part of a record: `tnr`, `bins` (independent bins of a chirp), and the probability of a
-        false alarm in both chirps, as `closed_form` and as `noise_only`, by the model.
-    float
-        Probability of a false alarm in a bin, by the model.
+    NoiseAlarmReference
+        Probabilities of a false alarm in both chirps and in a bin.
 
     Notes
     -----
@@ -300,25 +307,35 @@ def noise_false_alarm_reference(
     ]
     closed_form = noise_false_alarms.segment_pfa(np.asarray(pfa_bin), n_bins).prod()
     outputs = evaluate(parameters)
-    return {
+    record: dict[str, TableCell] = {
         "tnr": tnr,
         "bins": float(n_bins[0]),
         "closed_form": float(closed_form),
         "noise_only": float(outputs["pfa_both_chirps"].item()),
-    }, float(outputs["pfa_bin"].item())
+    }
+    return NoiseAlarmReference(record, float(outputs["pfa_bin"].item()))
 
 
-def split_by_setting(
-    points: PointSelection, spec: GridSpec, by: str
-) -> list[tuple[str, dict[str, Any], PointSelection]]:
+class SettingPart(NamedTuple):
+    """Points with one setting of the instrument."""
+
+    name: str
+    """Name of the setting."""
+    parameters: dict[str, Any]
+    """SI values of the parameters of the setting by dotted path."""
+    points: PointSelection
+    """Points with this setting."""
+
+
+def split_by_setting(points: PointSelection, spec: GridSpec, by: str) -> list[SettingPart]:
     """Group points by the setting of the instrument: all coordinates except range and angle.
 
     The coordinate `by` comes first in the names of the groups.
 
     Returns
     -------
-    list of (str, dict, PointSelection)
-        Name of each setting, SI values of its parameters by path, and its points.
+    list of SettingPart
+        Name, parameters and points of each setting.
     """
     cut_names = {name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_name)}
     names = [by, *(n for n in points.varying_coordinates() if n != by and n not in cut_names)]
@@ -326,7 +343,7 @@ def split_by_setting(
     parts = split_by_coordinates(points, names, TABLE_ROWS_MAX).parts
     parameters_of_parts = [parameters_at(spec, part.points.first_indices()) for part in parts]
     return [
-        (name, {path: parameters[path] for path in paths}, part)
+        SettingPart(name, {path: parameters[path] for path in paths}, part)
         for (name, part), parameters in zip(parts, parameters_of_parts, strict=True)
     ]
 
@@ -349,7 +366,7 @@ def false_alarm_records(
     """
     setting_parts = split_by_setting(grid_points, spec, by)
     noise_references = [
-        noise_false_alarm_reference(spec, setting)[0] for _, setting, _ in setting_parts
+        noise_false_alarm_reference(spec, part.parameters).record for part in setting_parts
     ]
     cut_groups = [
         (
@@ -466,7 +483,7 @@ def threshold_page(
     records: list[dict[str, TableCell]] = []
     setting_parts = split_by_setting(points, spec, by)
     pfa_statistics = compute_statistics(
-        [select_beyond_range(part, spec, AVERAGED_RANGE_MIN) for _, _, part in setting_parts],
+        [select_beyond_range(part.points, spec, AVERAGED_RANGE_MIN) for part in setting_parts],
         "pfa_bin",
     )
     for i, (name, setting, _) in enumerate(setting_parts):

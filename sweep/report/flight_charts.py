@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas
@@ -113,7 +113,16 @@ class LabelledRecording:
     """Position along the study's axes."""
 
 
-def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], int]:
+class ShownRecordings(NamedTuple):
+    """Recordings that a report has room for."""
+
+    recordings: list[LabelledRecording]
+    """Recordings, evenly spread over all of them."""
+    n_omitted: int
+    """Number of omitted recordings."""
+
+
+def select_recordings(results: SceneResults) -> ShownRecordings:
     """Return the recordings that a report shows, and the number of omitted ones.
 
     There is a recording for each scanner and position along the study's axes.
@@ -133,7 +142,7 @@ def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], i
                 recording_label, axis_position.open_recording(results.tree, scanner), axis_position
             )
         )
-    return labelled_recordings, len(candidates) - len(labelled_recordings)
+    return ShownRecordings(labelled_recordings, len(candidates) - len(labelled_recordings))
 
 
 def cloud_plot(

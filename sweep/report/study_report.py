@@ -206,7 +206,7 @@ def _main_results_section(
         *further_sentences,
     ]
     if alarms := false_alarm_probabilities(spec):
-        alarm_probability_max = max(alarm_probability for alarm_probability, _ in alarms)
+        alarm_probability_max = max(alarm.either_chirp for alarm in alarms)
         alarm_text = f"{alarm_probability_max:.3g}" + " at the most" * (len(alarms) > 1)
         sentences.append(
             f"Noise alone raises a false alarm in either chirp with probability {alarm_text}."

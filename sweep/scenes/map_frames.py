@@ -116,7 +116,7 @@ def metric_projection_wkt_of_crs(wkt: str) -> str:
     """
     crs = _crs_from_wkt(wkt)
     horizontal = _horizontal_crs(crs)
-    if not horizontal.is_projected or _horizontal_axis_unit(horizontal)[1] != 1.0:
+    if not horizontal.is_projected or _horizontal_axis_unit(horizontal).metres != 1.0:
         return ""
     axis = _vertical_axis(crs)
     if axis is None or float(axis.unit_conversion_factor) == 1.0:
@@ -166,11 +166,11 @@ def resolve_metres_per_height(
             raise SceneError(path, problem, "leave height_unit out, or correct the file")
         declared_unit = (stated_unit, factor)
     if declared_unit is None:
-        unit = _horizontal_axis_unit(_horizontal_crs(_crs_from_wkt(wkt))) if wkt else ("metre", 1.0)
-        if unit[1] != 1.0 and not has_height_scale:
-            problem = f"is in units of a {unit[0]}, and does not tell the unit of its heights"
+        unit = _horizontal_axis_unit(_horizontal_crs(_crs_from_wkt(wkt))) if wkt else _METRE
+        if unit.metres != 1.0 and not has_height_scale:
+            problem = f"is in units of a {unit.name}, and does not tell the unit of its heights"
             raise SceneError(
-                path, problem, f"state height_unit, 'm' or '{_short_unit_name(unit[0])}'"
+                path, problem, f"state height_unit, 'm' or '{_short_unit_name(unit.name)}'"
             )
         return 1.0
     if has_height_scale and declared_unit[1] != 1.0:
@@ -304,7 +304,7 @@ def _checked_map_frame(
     """
     unit = "degree" if crs.is_geographic else "unit of its coordinates"
     if stated is None and not crs.is_geographic:
-        factor = _horizontal_axis_unit(crs)[1]
+        factor = _horizontal_axis_unit(crs).metres
         factors = MetresPerUnit(factor, factor)
     elif stated is not None:
         factors = MetresPerUnit(*stated)
@@ -385,19 +385,20 @@ def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray 
     geodesic_step = 1e-4 * max(east - west, north - south)
     try:
         to_degrees = Transformer.from_crs(crs, geographic, always_xy=True).transform
-        azimuth_and_scale = []
+        azimuths, length_scales = [], []
         for dx, dy in ((geodesic_step, 0.0), (0.0, geodesic_step)):
             start, stop = (to_degrees(x + k * dx / 2, y + k * dy / 2) for k in (-1, 1))
             azimuth, _, length = geod.inv(*start, *stop)
-            azimuth_and_scale.append((np.radians(azimuth), np.asarray(length) / geodesic_step))
+            azimuths.append(np.radians(azimuth))
+            length_scales.append(np.asarray(length) / geodesic_step)
     except ProjError as error:
         problem = f"has coordinates that can not be placed on the ground ({error})"
         raise SceneError(path, problem, "check its coordinate reference system") from None
-    scales = np.stack([azimuth_and_scale[0][1], azimuth_and_scale[1][1]], axis=1)
+    scales = np.stack(length_scales, axis=1)
     if not (np.isfinite(scales).all() and (scales > 0).all()):
         problem = "has coordinates that lie outside its coordinate reference system"
         raise SceneError(path, problem, "check that system, or read a window within it")
-    axes_sine = np.abs(np.sin(azimuth_and_scale[0][0] - azimuth_and_scale[1][0]))
+    axes_sine = np.abs(np.sin(azimuths[0] - azimuths[1]))
     return scales, float(np.abs(np.arccos(np.clip(axes_sine, 0.0, 1.0))).max())
 
 
@@ -499,15 +500,28 @@ def _is_same_height_reference(crs: Any, other_crs: Any) -> bool:
     return _height_reference_name(crs) == _height_reference_name(other_crs)
 
 
-def _horizontal_axis_unit(crs: Any) -> tuple[str, float]:
+class LengthUnit(NamedTuple):
+    """Unit of length of a map."""
+
+    name: str
+    """Name of the unit."""
+    metres: float
+    """Length of the unit [m]."""
+
+
+_METRE = LengthUnit("metre", 1.0)
+"""The unit of maps that state none, or that are in degrees."""
+
+
+def _horizontal_axis_unit(crs: Any) -> LengthUnit:
     """Return the name and length [m] of the unit of a map's horizontal axes.
 
     A map in degrees gives 'metre' and 1.
     """
     axes = crs.axis_info
     if crs.is_geographic or not axes:
-        return "metre", 1.0
-    return str(axes[0].unit_name), float(axes[0].unit_conversion_factor)
+        return _METRE
+    return LengthUnit(str(axes[0].unit_name), float(axes[0].unit_conversion_factor))
 
 
 UTM_LATITUDE_MAX = 80.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,16 @@ A setting is a combination of threshold, FFT size and detector.
 """
 
 
-def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]:
+class ShotFalseAlarm(NamedTuple):
+    """Probabilities of false alarms of a shot, due to noise alone."""
+
+    either_chirp: float
+    """Probability of a false alarm in at least one chirp."""
+    both_chirps: float
+    """Probability of a false alarm in both chirps."""
+
+
+def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm]:
     """Compute the false-alarm probabilities of a shot, due to noise alone, over a study's settings.
 
     Parameters
@@ -38,9 +47,9 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, f
 
     Returns
     -------
-    list of (float, float)
-        Probability of a false alarm in at least one chirp, and in both chirps, for each sampled
-        combination. Combinations with a user-defined detector are left out.
+    list of ShotFalseAlarm
+        Probabilities for each sampled combination. Combinations with a user-defined detector are
+        left out.
 
     Notes
     -----
@@ -77,7 +86,7 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, f
             float(segment_pfa(np.asarray(pfa_bin), bins))
             for bins in (n_bins_up, n_bins_down, n_bins_up + n_bins_down)
         )
-        probabilities.append((pfa_any, pfa_up * pfa_down))
+        probabilities.append(ShotFalseAlarm(pfa_any, pfa_up * pfa_down))
     return probabilities
 
 
@@ -86,7 +95,7 @@ def iter_false_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
 
     The sentence states the largest probability over the study's settings and the fields to change.
     """
-    pfa_max = max((pfa_any for pfa_any, _ in false_alarm_probabilities(spec)), default=0.0)
+    pfa_max = max((pfa.either_chirp for pfa in false_alarm_probabilities(spec)), default=0.0)
     if pfa_max > PFA_SHOT_WARNING_ABOVE:
         yield (
             f"noise alone raises a false alarm in either chirp with probability {pfa_max:.3g} "

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -415,16 +415,31 @@ _BEAMLET_POSITION_PATHS = (
     beam.FOCUS_PATH,
 )
 """Dotted paths of the parameters that determine where beamlets (rays of a beam) hit."""
-_MOVES_BEAMLETS_REFUSAL = (
+
+
+class AxisRefusal(NamedTuple):
+    """Why no axis may set a parameter; both texts are empty if an axis may."""
+
+    problem: str
+    """Problem, as the end of a sentence about the parameter's path."""
+    remedy: str
+    """Remedy to suggest."""
+
+
+_NO_REFUSAL = AxisRefusal("", "")
+"""Result for parameters that axes may set."""
+_MOVES_BEAMLETS_REFUSAL = AxisRefusal(
     "moves the beamlets, and a study casts its rays once",
     _OTHER_STUDY_REMEDY,
 )
 """Problem and remedy to state for an axis over a parameter that moves beamlets (rays of a beam)."""
 _AXIS_REFUSALS = {
-    "footprint.speckle": ("", ""),  # moves no beamlet, unlike other fields of footprint
-    "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
+    "footprint.speckle": _NO_REFUSAL,  # moves no beamlet, unlike other fields of footprint
+    "target.": AxisRefusal("is given by the scene, shot by shot", "change the scene or the flight"),
     **dict.fromkeys((*_BEAM_WIDTH_PATHS, "footprint."), _MOVES_BEAMLETS_REFUSAL),
-    "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY),
+    "accuracy.": AxisRefusal(
+        "says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY
+    ),
 }
 """Problem and remedy to state for parameters that no axis may set, by prefix of their path.
 
@@ -432,7 +447,7 @@ The first matching prefix applies.
 """
 
 
-def axis_refusal(path: str) -> tuple[str, str]:
+def axis_refusal(path: str) -> AxisRefusal:
     """Return why no axis may set a parameter, and a remedy; empty texts if an axis may.
 
     Parameters
@@ -442,8 +457,8 @@ def axis_refusal(path: str) -> tuple[str, str]:
 
     Returns
     -------
-    (str, str)
-        Problem, as the end of a sentence about the path, and remedy.
+    AxisRefusal
+        Problem and remedy.
     """
     return next(
         (
@@ -451,7 +466,7 @@ def axis_refusal(path: str) -> tuple[str, str]:
             for path_prefix, refusal in _AXIS_REFUSALS.items()
             if path.startswith(path_prefix)
         ),
-        ("", ""),
+        _NO_REFUSAL,
     )
 
 

@@ -693,7 +693,7 @@ class SceneSpec(BaseSpec):
     @classmethod
     def may_be_on_axis(cls, path: str) -> bool:
         """Return True if an axis may set the parameter at a dotted path: it moves no beamlet."""
-        return not axis_refusal(path)[0]
+        return not axis_refusal(path).problem
 
     def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
         """Return the reasons why a parameter may not take an SI value with fixed rays."""

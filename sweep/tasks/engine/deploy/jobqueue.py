@@ -12,7 +12,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from distributed.core import Status
 
@@ -141,7 +141,7 @@ def count_jobs(cluster: BatchClusterConfig, n_workers: int) -> int:
 def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
     """Return the keyword arguments for the cluster classes of dask-jobqueue."""
     worker, job = cluster.worker, cluster.job
-    lifetime, stagger = worker_lifetime(job.walltime)
+    lifetime = worker_lifetime(job.walltime)
     required_options: dict[str, Any] = {
         "n_workers": 0,
         "cores": job.workers * worker.threads,
@@ -160,7 +160,8 @@ def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
         ],
         "worker_extra_args": [
             *("--preload", local_ssh.PRELOAD_MODULE, "--no-dashboard"),
-            *("--lifetime", f"{lifetime:.0f}s", "--lifetime-stagger", f"{stagger:.0f}s"),
+            *("--lifetime", f"{lifetime.mean:.0f}s"),
+            *("--lifetime-stagger", f"{lifetime.deviation_max:.0f}s"),
         ],
         "security": local_ssh.make_security(cluster),
         "scheduler_options": local_ssh.scheduler_options(cluster.scheduler),
@@ -169,14 +170,23 @@ def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
     return required_options | {name: value for name, value in optional.items() if value}
 
 
-def worker_lifetime(walltime: float) -> tuple[float, float]:
+class WorkerLifetime(NamedTuple):
+    """Time after which a worker leaves its job."""
+
+    mean: float
+    """Mean time [s]."""
+    deviation_max: float
+    """Largest deviation from the mean [s], by which workers leave at different times."""
+
+
+def worker_lifetime(walltime: float) -> WorkerLifetime:
     """Return the mean time after which a worker leaves its job, and the largest deviation [s].
 
     Workers leave at different times. The last one leaves when 5 % of the job's time limit is left,
     at least a minute, but at most a quarter of a very short limit.
     """
     reserve = max(0.05 * walltime, min(60.0, walltime / 4))
-    return walltime - 1.5 * reserve, reserve / 2
+    return WorkerLifetime(mean=walltime - 1.5 * reserve, deviation_max=reserve / 2)
 
 
 def walltime_text(seconds: float) -> str:
