@@ -63,7 +63,7 @@ def test_the_lock_of_a_dead_process_is_taken_over(tmp_path, caplog):
     waited, taken_over, locked, released = (record.getMessage() for record in caplog.records)
     lock_path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
     assert waited == f"waiting until no other process acquires {lock_path}"
-    assert taken_over.startswith(f"{lock_path}: taking over from a dead process, ")
+    assert taken_over.startswith(f"{lock_path}: taking over from ")
     assert f'"pid": {dead.pid}' in taken_over
     assert locked == f"{tmp_path}: locked by this process, {os.getpid()}"
     assert released == f"{tmp_path}: lock released"

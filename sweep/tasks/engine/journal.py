@@ -761,7 +761,7 @@ class _FileLock:
         """Remove the lock file of a dead holder; put back a newer one that was removed instead."""
         if stale_json is None:
             return
-        _log.debug("%s: taking over from a dead process, %s", self._lock_path, stale_json)
+        _log.debug("%s: taking over from %s", self._lock_path, escape_to_one_line(stale_json))
         aside_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
         with suppress(FileNotFoundError):
             os.rename(self._lock_path, aside_path)
@@ -886,10 +886,9 @@ class _ObjectLock:
                 return
             check_holder()
             if lock_object and lock_object.content:
+                stale_json = _holder_json_of_content(lock_object.content)
                 _log.debug(
-                    "%s: taking over from a dead process, %s",
-                    self._lock_path,
-                    _holder_json_of_content(lock_object.content),
+                    "%s: taking over from %s", self._lock_path, escape_to_one_line(stale_json)
                 )
             tag = self._lock_path.put_if_unchanged(
                 f"{holder_json}\n0\n".encode(),
