@@ -53,6 +53,8 @@ def shot_noise_current_variance(
 class ReceiverNoise(NamedTuple):
     """Noise variances at the ADC: by source, per noise current, and per power of light."""
 
+    electrical_bandwidth: np.ndarray
+    """Noise bandwidth B_e of the receiver [Hz] (:func:`electrical_bandwidth`)."""
     variance_per_square_ampere: np.ndarray
     """Variance of the voltage at the ADC per variance of a noise current in the detector [V^2/A^2].
     """
@@ -151,6 +153,7 @@ def receiver_noise(
         squared_transimpedance / 2 if samples_iq else squared_transimpedance
     )
     return ReceiverNoise(
+        bandwidth,
         variance_per_square_ampere,
         np.asarray(shot_noise_variance_per_watt * squared_transimpedance),
         variances,

@@ -35,7 +35,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sweep.model import receiver_chain
 from sweep.model.constants import PLANCK, SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
 from sweep.model.effects.error_bounds import ErrorBound
@@ -66,7 +65,7 @@ def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.nda
 
 
 def emission_beat_current_variance(
-    parameters: Mapping[str, np.ndarray], amplified_light: str
+    parameters: Mapping[str, np.ndarray], amplified_light: str, electrical_bandwidth: np.ndarray
 ) -> np.ndarray:
     """Compute the current variance of the beat of the local oscillator with spontaneous emission.
 
@@ -76,6 +75,8 @@ def emission_beat_current_variance(
         Parameters by dotted path.
     amplified_light : str
         Light that passes the amplifier: `SENT_LIGHT` or `SENT_AND_OSCILLATOR_LIGHT`.
+    electrical_bandwidth : ndarray
+        Electrical bandwidth B_e of the receiver [Hz].
 
     Returns
     -------
@@ -97,8 +98,7 @@ def emission_beat_current_variance(
     beat_power_density = oscillator_power * (
         spontaneous_emission_density(parameters) * mixing_factor
     )
-    bandwidth = receiver_chain.electrical_bandwidth(receiver_chain.receiver_parameters(parameters))
-    return np.asarray(4 * squared_responsivity * beat_power_density * bandwidth)
+    return np.asarray(4 * squared_responsivity * beat_power_density * electrical_bandwidth)
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -110,7 +110,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     if points.waveform.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
         return None
     current_variance = emission_beat_current_variance(
-        points.parameters, points.shared_option(_AMPLIFIED_LIGHT_PATH)
+        points.parameters,
+        points.shared_option(_AMPLIFIED_LIGHT_PATH),
+        points.receiver_noise.electrical_bandwidth,
     )
     return ErrorBound(
         noise_variance_change=current_variance
@@ -129,7 +131,9 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     if shots.waveform.architecture == "direct":
         return shots
     current_variance = emission_beat_current_variance(
-        context.parameters, str(context.parameters[_AMPLIFIED_LIGHT_PATH])
+        context.parameters,
+        str(context.parameters[_AMPLIFIED_LIGHT_PATH]),
+        shots.receiver_noise.electrical_bandwidth,
     )
     return add_noise_sources(
         shots,

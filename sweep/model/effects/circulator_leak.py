@@ -36,7 +36,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sweep.model import receiver_chain
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH
 from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
@@ -62,7 +61,10 @@ def _leaked_power_and_current(
 
 
 def leak_beat_current_variance(
-    parameters: Mapping[str, np.ndarray], architecture: str, line_shape: str
+    parameters: Mapping[str, np.ndarray],
+    architecture: str,
+    line_shape: str,
+    electrical_bandwidth: np.ndarray,
 ) -> np.ndarray:
     """Compute the variance [A^2] of the noise current from the beat of the leaked light.
 
@@ -74,6 +76,8 @@ def leak_beat_current_variance(
         Receiver architecture; direct detection has no beat.
     line_shape : str
         Shape of the laser's line; only ``lorentzian`` has phase noise.
+    electrical_bandwidth : ndarray
+        Electrical bandwidth B_e of the receiver [Hz].
 
     Notes
     -----
@@ -85,10 +89,7 @@ def leak_beat_current_variance(
     responsivity = (
         parameters[RECEIVER_PREFIX + "apd_gain"] * parameters[RECEIVER_PREFIX + "responsivity"]
     )
-    bandwidth, delay = (
-        receiver_chain.electrical_bandwidth(receiver_chain.receiver_parameters(parameters)),
-        parameters[LEAK_LENGTH_PATH] / SPEED_OF_LIGHT,
-    )
+    delay = parameters[LEAK_LENGTH_PATH] / SPEED_OF_LIGHT
     beat_power = np.square(beat_current / responsivity) / 2
     rejected_power = (
         2 * parameters[RECEIVER_PREFIX + "local_oscillator_power"] + leaked_power
@@ -96,7 +97,7 @@ def leak_beat_current_variance(
     rejected_power = rejected_power / parameters[RECEIVER_PREFIX + "common_mode_rejection"]
     variance = (
         parameters[LASER_PREFIX + "relative_intensity_noise"]
-        * bandwidth
+        * electrical_bandwidth
         * (rejected_power + beat_power)
     )
     if line_shape == "lorentzian":
@@ -105,7 +106,7 @@ def leak_beat_current_variance(
             * np.pi
             * parameters[LASER_PREFIX + "line_width"]
             * delay
-            * np.minimum(2 * delay * bandwidth, 1.0)
+            * np.minimum(2 * delay * electrical_bandwidth, 1.0)
         )
         variance = variance + beat_power * phase_noise
     return np.asarray(responsivity**2 * variance)
@@ -126,7 +127,12 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     line_shape = points.shared_option(LASER_PREFIX + "line_shape")
     noise_variance = (
         noise_variance
-        + leak_beat_current_variance(parameters, points.waveform.architecture, line_shape)
+        + leak_beat_current_variance(
+            parameters,
+            points.waveform.architecture,
+            line_shape,
+            receiver_noise.electrical_bandwidth,
+        )
         * receiver_noise.variance_per_square_ampere
     )
     return ErrorBound(
@@ -147,7 +153,10 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     power, beat_current = _leaked_power_and_current(parameters, shots.waveform.architecture)
     beat_noise = (
         leak_beat_current_variance(
-            parameters, shots.waveform.architecture, str(parameters[LASER_PREFIX + "line_shape"])
+            parameters,
+            shots.waveform.architecture,
+            str(parameters[LASER_PREFIX + "line_shape"]),
+            shots.receiver_noise.electrical_bandwidth,
         )
         * shots.receiver_noise.variance_per_square_ampere
     )

@@ -216,16 +216,25 @@ _RIN_PATH, _REJECTION_PATH = (
 )
 
 
-def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+def intensity_noise_current_variance(
+    parameters: Mapping[str, np.ndarray], electrical_bandwidth: np.ndarray
+) -> np.ndarray:
     """Compute the current variance [A^2] due to intensity noise of the local oscillator.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path.
+    electrical_bandwidth : ndarray
+        Electrical bandwidth B_e of the receiver [Hz].
 
     Notes
     -----
     One diode has (M Re P_lo)^2 RIN B_e. M is its gain, Re its responsivity, P_lo the power of the
     local oscillator, RIN the relative intensity noise [1/Hz] and B_e the electrical bandwidth. The
     two diodes of a balanced receiver see the same fluctuation and subtract it, except for their
-    mismatch. The common-mode rejection (in dB 20
-    log10 of the ratio of their currents) divides the variance. Both are assumed to be constant over
+    mismatch. The common-mode rejection (in dB 20 log10 of the ratio of their currents) divides the
+    variance. Both are assumed to be constant over
     the electrical bandwidth. The echo's own intensity noise is neglected: it is smaller by P /
     P_lo.
     """
@@ -234,8 +243,7 @@ def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np
     )
     current = current * parameters[RECEIVER_PREFIX + "local_oscillator_power"]
     intensity_density = parameters[_RIN_PATH] / parameters[_REJECTION_PATH]
-    bandwidth = receiver_chain.electrical_bandwidth(receiver_chain.receiver_parameters(parameters))
-    return np.asarray(current**2 * intensity_density * bandwidth)
+    return np.asarray(current**2 * intensity_density * electrical_bandwidth)
 
 
 def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -245,7 +253,9 @@ def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if points.waveform.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
-    current_variance = intensity_noise_current_variance(points.parameters)
+    current_variance = intensity_noise_current_variance(
+        points.parameters, points.receiver_noise.electrical_bandwidth
+    )
     return ErrorBound(
         noise_variance_change=current_variance
         * points.receiver_noise.variance_per_square_ampere
@@ -262,7 +272,9 @@ def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shot
     """
     if shots.waveform.architecture == "direct":
         return shots
-    current_variance = intensity_noise_current_variance(context.parameters)
+    current_variance = intensity_noise_current_variance(
+        context.parameters, shots.receiver_noise.electrical_bandwidth
+    )
     return add_noise_sources(
         shots, relative_intensity=current_variance * shots.receiver_noise.variance_per_square_ampere
     )

@@ -32,13 +32,12 @@ def _variance():
     """By an amplifier of which so much passes an isolation."""
     receiver = {
         "local_oscillator_power": OSCILLATOR, "mixing_efficiency": 1.0, "apd_gain": GAIN,
-        "responsivity": RESPONSIVITY, "detector_bandwidth": RATE / 2,
-        "amplifier_bandwidth": RATE / 2,
+        "responsivity": RESPONSIVITY,
     }  # fmt: skip
     given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
     given |= LIGHT | {"instrument.laser.amplifier_gain": 1000.0}
     isolation = {"instrument.telescope.isolation": spontaneous_emission_density(given) / DENSITY}
-    return emission_beat_current_variance(given | isolation, "sent")
+    return emission_beat_current_variance(given | isolation, "sent", RATE / 2)
 
 
 def test_emission_beats_with_the_local_oscillator_on_both_diodes_of_a_receiver():

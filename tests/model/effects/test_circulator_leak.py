@@ -74,19 +74,18 @@ def test_the_beats_noise_is_that_of_simulated_records():
         "laser.relative_intensity_noise": rin, "receiver.common_mode_rejection": 1e30,
         "receiver.local_oscillator_power": 1.0,
         "receiver.mixing_efficiency": 1.0, "receiver.apd_gain": 1.0, "receiver.responsivity": 1.0,
-        "receiver.modulation_index": 1.0, "receiver.detector_bandwidth": 1.0,
-        "receiver.amplifier_bandwidth": 1.0,
+        "receiver.modulation_index": 1.0,
     }  # fmt: skip
     given = {f"instrument.{name}": value for name, value in given.items()}
     given |= {leak.LEAK_LENGTH_PATH: steps / rate * LIGHT, leak.ISOLATION_PATH: 1.0}
-    law = leak.leak_beat_current_variance(given, "homodyne", "lorentzian")
+    law = leak.leak_beat_current_variance(given, "homodyne", "lorentzian", 1.0)
     # A bin's power has a relative variance of 1.
     spread = 1 / np.sqrt(records * (last - first) / 2)  # of records with all of either noise
     assert density.mean() == pytest.approx(law, rel=5 * spread)
     quiet = given | {"instrument.laser.relative_intensity_noise": 0.0}
     parts = (
-        leak.leak_beat_current_variance(given, "homodyne", "gaussian"),
-        leak.leak_beat_current_variance(quiet, "homodyne", "lorentzian"),
+        leak.leak_beat_current_variance(given, "homodyne", "gaussian", 1.0),
+        leak.leak_beat_current_variance(quiet, "homodyne", "lorentzian", 1.0),
     )
     assert min(parts) > 0.2 * law  # both are seen
     # All the light of a laser fluctuates together, by what a balanced receiver rejects.
@@ -96,7 +95,7 @@ def test_the_beats_noise_is_that_of_simulated_records():
     }
     leaked = beat**2 / 4
     more = rin * ((1.0 + leaked) ** 2 - 1.0) / 50.0
-    assert leak.leak_beat_current_variance(rejecting, "homodyne", "gaussian") == pytest.approx(
+    assert leak.leak_beat_current_variance(rejecting, "homodyne", "gaussian", 1.0) == pytest.approx(
         more, rel=1e-12
     )
 

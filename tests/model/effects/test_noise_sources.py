@@ -22,12 +22,11 @@ def fluctuating(density, power, *, rejection=1.0, apd_gain=1.0, responsivity=1.1
     """Current variance of a laser's intensity noise [A^2]."""
     receiver = {
         "common_mode_rejection": rejection, "local_oscillator_power": power, "apd_gain": apd_gain,
-        "responsivity": responsivity, "detector_bandwidth": bandwidth,
-        "amplifier_bandwidth": bandwidth,
+        "responsivity": responsivity,
     }  # fmt: skip
     given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
     return intensity_noise_current_variance(
-        given | {"instrument.laser.relative_intensity_noise": density}
+        given | {"instrument.laser.relative_intensity_noise": density}, bandwidth
     )
 
 
