@@ -55,8 +55,9 @@ from sweep.model.beamlets import (
 )
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.link_budget import LASER_PREFIX, LinkBudget, doppler_ratio
+from sweep.model.link_budget import LASER_PREFIX, LinkBudget
 from sweep.model.preparation import BEAMLETS_ERROR_PATH, Parameters, split_by_category
+from sweep.model.shot_settings import doppler_ratio
 from sweep.model.window import window_samples
 from sweep.model.window_response import WindowResponse, window_response
 
@@ -358,6 +359,8 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         * (1 + np.abs(doppler_ratio(radial_velocity)))
     )
     bins_per_range = beat_per_metre * parameters["target.range"] / bin_width
+    # At least every segment's carrier, whatever the chirp slopes, and the optical one even with
+    # direct detection: counts of beamlets thus stay the same.
     carrier = (
         SPEED_OF_LIGHT / parameters[LASER_PREFIX + "wavelength"] + budget.waveform.chirp_bandwidth
     )
@@ -389,13 +392,8 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         return spread
     # Drawn amplitudes rotate relative to each other from segment to segment: by Doppler shifts and,
     # as segments differ in optical frequency, by ranges.
-    starts = waveform.segment_starts(
-        waveform.existing_segments("", str(parameters[waveform.SEGMENT_ORDER_PATH])),
-        duration=budget.waveform.chirp_duration, gap=budget.waveform.segment_gap,
-    )  # fmt: skip
-    last_start_bins = np.maximum.reduce(starts) * bin_width
-    delay = 2 / SPEED_OF_LIGHT * parameters["target.range"]
-    carrier_difference_cycles = _carrier_difference_max(budget) * delay
+    last_start_bins = np.maximum.reduce(budget.waveform.segment_starts) * bin_width
+    carrier_difference_cycles = _carrier_difference_max(budget) * budget.target.delay
     # The factor 2 is for sums over records, in which the ends hardly count.
     slope = np.vstack(
         [
@@ -431,7 +429,7 @@ def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
     """
     settings = budget.waveform
     record_middle = budget.record.acquisition_delay + budget.record.duration / 2
-    time_since_echo = record_middle - 2 / SPEED_OF_LIGHT * budget.parameters["target.range"]
+    time_since_echo = record_middle - budget.target.delay
     frequencies = [
         carrier + chirp_slope * settings.chirp_rate * time_since_echo
         for carrier, chirp_slope in zip(settings.carriers, settings.chirp_slopes, strict=True)

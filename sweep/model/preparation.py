@@ -18,7 +18,7 @@ import numpy as np
 
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import bin_noise
+from sweep.model.detection.bin_noise import SearchedBins, alarm_equivalent_bins
 from sweep.model.detection.detectors import main_lobe_half_width
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH, Looks
 from sweep.model.error_budget import AUTOMATIC
@@ -27,13 +27,9 @@ from sweep.model.laser_line import LaserLine
 from sweep.model.link_budget import (
     PROCESSING_PREFIX,
     EchoScales,
-    LineMotion,
     LinkBudget,
     NoiseBudget,
     ReceiverFilter,
-    RecordSettings,
-    TargetState,
-    WaveformSettings,
     relative_amplitude,
     threshold,
 )
@@ -47,7 +43,7 @@ from sweep.model.shot_records import (
     LineImages,
     PermanentLine,
 )
-from sweep.model.spectrum.search_band import n_alarm_bins
+from sweep.model.shot_settings import LineMotion, RecordSettings, TargetState, WaveformSettings
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import WaveformSegment
 from sweep.model.window import Window
@@ -647,17 +643,25 @@ class Shots:
         is_real = self.detection_settings.noise_bins == "correlated" and not self.complex_record
         return self.fft_size if is_real else 0
 
+    @cached_property
+    def searched_bins(self) -> SearchedBins:
+        """Bins of each segment that are searched for false alarms, and their noise correlation."""
+        return SearchedBins.from_record(
+            self.record,
+            noise_bins=self.detection_settings.noise_bins,
+            bins_counted=self.detection_settings.bins_counted,
+            search_band=self.detection_settings.search_band,
+        )
+
     @property
     def first_searched_bin(self) -> int:
         """Distance of the first bin searched for false alarms from DC and from Nyquist [bins]."""
-        return bin_noise.first_circular_bin(self.window, self.fft_size) if self.real_fft_size else 1
+        return self.searched_bins.first_bin
 
     @property
     def noise_bin_correlation(self) -> float:
         """Correlation coefficient of the noise of adjacent bins, 0..1."""
-        if self.detection_settings.noise_bins == "independent":
-            return 0.0
-        return bin_noise.neighbour_noise_correlation(self.window, self.fft_size)
+        return self.searched_bins.neighbour_correlation
 
     @property
     def detection_rule(self) -> "DetectionRule":
@@ -737,25 +741,7 @@ class Shots:
         ndarray (3, m)
             Number of bins, 0 or more.
         """
-        n_searched: Any = self.fft_size if self.complex_record else self.fft_size // 2
-        if self.real_fft_size:
-            n_searched += 1 - 2 * self.first_searched_bin
-        if self.detection_settings.search_band is not None:
-            fft_size, first_bin = self.fft_size, self.first_searched_bin
-            n_in_band = n_alarm_bins(
-                self.detection_settings.search_band,
-                fft_size,
-                first_bin,
-                is_signed=self.complex_record,
-            )
-            n_searched = n_in_band[:, point_indices]
-        n_bins = np.maximum(n_searched - n_exempt, 0.0)
-        if (
-            self.detection_settings.bins_counted == "all"
-            and self.detection_settings.search_band is None
-        ):
-            n_bins = np.full(np.shape(n_exempt), float(self.fft_size))
-        return np.asarray(n_bins)
+        return self.searched_bins.select_points(point_indices).n_bins_outside_echo(n_exempt)
 
     def alarm_equivalent_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
@@ -775,7 +761,7 @@ class Shots:
         threshold_ratio = np.broadcast_to(self.threshold / self.bin_noise_sigma, self.size)[
             point_indices
         ]
-        return bin_noise.alarm_equivalent_bins(
+        return alarm_equivalent_bins(
             n_searched,
             threshold_ratio=threshold_ratio,
             correlation=self.noise_bin_correlation,
@@ -885,7 +871,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
             adds_powers=architecture != "direct",
             beamlets_error=parameters.get(BEAMLETS_ERROR_PATH, math.nan),
         ),
-        detection_settings=DetectionSettings.from_parameters(parameters, budget.tnr, n_points),
+        detection_settings=DetectionSettings.from_budget(budget, n_points),
         looks=budget.looks,
         tolerances=ErrorTolerances.from_parameters(parameters, budget.looks),
     )

@@ -15,7 +15,7 @@ import numpy as np
 
 from sweep.model import waveform
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.link_budget import PROCESSING_PREFIX
+from sweep.model.link_budget import PROCESSING_PREFIX, LinkBudget
 from sweep.model.spectrum.search_band import search_band_start_and_size
 
 if TYPE_CHECKING:
@@ -102,29 +102,28 @@ class DetectionSettings(NamedTuple):
     """True if the echo's signal far from its lines (leakage) can raise false alarms."""
 
     @classmethod
-    def from_parameters(
-        cls, parameters: Mapping[str, np.ndarray], tnr: np.ndarray, n_points: int
-    ) -> "DetectionSettings":
+    def from_budget(cls, budget: LinkBudget, n_points: int) -> "DetectionSettings":
         """Return the settings of n points that share text parameters and array sizes.
 
         Parameters
         ----------
-        parameters : mapping
-            Parameters by dotted path, as arrays.
-        tnr : ndarray
-            Threshold-to-noise ratio.
+        budget : LinkBudget
+            Link budget of the points.
         n_points : int
             Number of points n.
         """
+        parameters = budget.parameters
         return cls(
-            tnr=tnr,
+            tnr=budget.tnr,
             echo_bins=str(parameters[PROCESSING_PREFIX + "detection"]),
             shot_rule=str(parameters[waveform.SHOT_DETECTION_PATH]),
             reported_peaks=str(parameters[waveform.PEAKS_PATH]),
             two_beat_assumption=str(parameters[waveform.TWO_BEAT_ASSUMPTION_PATH]),
             noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
             bins_counted=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
-            search_band=search_band_start_and_size(parameters, n_points),
+            search_band=search_band_start_and_size(
+                parameters, budget.waveform, budget.record, n_points
+            ),
         )
 
 

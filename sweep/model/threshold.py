@@ -17,23 +17,16 @@ their mean power, with sigma of one record. The probabilities then refer to all 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, reduce
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from sweep.model.detection import bin_noise
+from sweep.model.detection.bin_noise import SearchedBins
 from sweep.model.detection.looks import Looks, solve_threshold_ratio
-from sweep.model.spectrum.search_band import n_alarm_bins, search_band_start_and_size
-from sweep.model.waveform import (
-    SEGMENT_NAMES,
-    SEGMENT_ORDER_PATH,
-    WAVEFORM_DEFAULTS,
-    existing_segments,
-    record_length,
-)
-from sweep.model.window import canonical_window_name, get_window
+from sweep.model.shot_settings import PROCESSING_PREFIX, RecordSettings, WaveformSettings
+from sweep.model.spectrum.search_band import search_band_start_and_size
+from sweep.model.waveform import SEGMENT_NAMES
 
-PROCESSING_PREFIX = "instrument.processing."
 (
     TNR_PATH,
     THRESHOLD_TO_MEAN_PATH,
@@ -97,60 +90,44 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
     log_pfa, looks = np.log(value), Looks.from_parameters(parameters)
     if given_path == DESIGN_PFA_BIN_PATH:
         return looks.threshold_ratio_from_log_pfa(log_pfa) / RAYLEIGH_DEVIATION
-    band_bins, segments = search_band_start_and_size(parameters), ["up"]
+    searched_bins, segments = _searched_bins(parameters), ["up"]
+    differ_by_segment = np.ndim(searched_bins.n_bins) > 0
     if given_path == DESIGN_PFA_SHOT_PATH:  # segments are independent
-        segment_order = existing_segments(
-            str(parameters["instrument.receiver.architecture"]),
-            str(parameters.get(SEGMENT_ORDER_PATH, WAVEFORM_DEFAULTS[SEGMENT_ORDER_PATH])),
-        )
-        if band_bins is None:
-            log_pfa = log_at_least_one_probability(log_pfa, 1 / len(segment_order))
-        else:
+        segment_order = WaveformSettings.from_parameters(parameters).segment_order
+        if differ_by_segment:
             segments = list(segment_order)
-    if band_bins is not None:
-        log_pfa = log_pfa + np.zeros(band_bins.shape[2:])
-    noise_bins = tuple(_noise_bins(parameters, segment) for segment in segments)
-    if band_bins is None and log_pfa.ndim == 0:
-        return _common_threshold_ratio(float(log_pfa), looks, noise_bins) / RAYLEIGH_DEVIATION
-    return solve_threshold_ratio(log_pfa, _log_pfa_function(looks, noise_bins)) / RAYLEIGH_DEVIATION
-
-
-class NoiseBins(NamedTuple):
-    """Number of a segment's bins in which noise may raise false alarms, and their correlation."""
-
-    n_bins: float | np.ndarray
-    """Number of bins. It is (n,) if a search band is set, otherwise one number for all points."""
-    neighbour_correlation: float
-    """Correlation coefficient of the noise of adjacent bins; 0 if bins count as independent."""
-
-    def alarm_equivalent_bins(self, threshold_ratio: np.ndarray, looks: Looks) -> np.ndarray:
-        """Return the number of independent bins with these bins' false-alarm probability."""
-        return bin_noise.alarm_equivalent_bins(
-            self.n_bins,
-            threshold_ratio=threshold_ratio,
-            correlation=self.neighbour_correlation,
-            looks=looks,
-        )
+        else:
+            log_pfa = log_at_least_one_probability(log_pfa, 1 / len(segment_order))
+    if differ_by_segment:
+        log_pfa = log_pfa + np.zeros(np.shape(searched_bins.n_bins)[1:])
+    bins_by_segment = tuple(
+        searched_bins.select_segment(SEGMENT_NAMES.index(segment)) for segment in segments
+    )
+    if not differ_by_segment and log_pfa.ndim == 0:
+        return _common_threshold_ratio(float(log_pfa), looks, bins_by_segment) / RAYLEIGH_DEVIATION
+    log_pfa_function = _log_pfa_function(looks, bins_by_segment)
+    return solve_threshold_ratio(log_pfa, log_pfa_function) / RAYLEIGH_DEVIATION
 
 
 @lru_cache(maxsize=64)
 def _common_threshold_ratio(
-    log_pfa: float, looks: Looks, noise_bins: tuple[NoiseBins, ...]
+    log_pfa: float, looks: Looks, bins_by_segment: tuple[SearchedBins, ...]
 ) -> np.ndarray:
     """Return the threshold over the noise sigma for a given probability of false alarm (cached).
 
     ``log_pfa`` is the natural logarithm of the probability that noise raises an alarm in any
     segment.
     """
-    return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_function(looks, noise_bins))
+    return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_function(looks, bins_by_segment))
 
 
 def _log_pfa_function(
-    looks: Looks, noise_bins: Sequence[NoiseBins]
+    looks: Looks, bins_by_segment: Sequence[SearchedBins]
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that gives the log probability of a false alarm in any segment.
 
-    Its argument is the threshold over the noise sigma. ``noise_bins`` are the bins of the segments.
+    Its argument is the threshold over the noise sigma. ``bins_by_segment`` are the bins of each
+    segment in which noise may raise an alarm.
     """
     from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 
@@ -161,7 +138,7 @@ def _log_pfa_function(
                 looks.log_pfa(threshold_ratio),
                 segment_bins.alarm_equivalent_bins(threshold_ratio, looks),
             )
-            for segment_bins in noise_bins
+            for segment_bins in bins_by_segment
         ),
     )
 
@@ -185,33 +162,18 @@ def segment_alarm_bins(
     sweep.model.preparation.Shots.alarm_equivalent_bins : The number less the bins of a detection.
     """
     looks = Looks.from_parameters(parameters)
-    n_bins = _noise_bins(parameters, segment).alarm_equivalent_bins(threshold_ratio, looks)
+    segment_bins = _searched_bins(parameters).select_segment(SEGMENT_NAMES.index(segment))
+    n_bins = segment_bins.alarm_equivalent_bins(threshold_ratio, looks)
     return n_bins + np.zeros(np.shape(threshold_ratio))
 
 
-def _noise_bins(parameters: Mapping[str, Any], segment: str) -> NoiseBins:
-    """Return the number and noise correlation of a segment's bins that may raise false alarms."""
-    fft_size = int(np.max(parameters[PROCESSING_PREFIX + "fft_size"]))
-    is_complex_record = str(parameters.get("instrument.receiver.record", "real")) == "complex"
-    counts_all_bins = is_complex_record or (
-        str(parameters[PROCESSING_PREFIX + "bins_counted"]) == "all"
+def _searched_bins(parameters: Mapping[str, Any]) -> SearchedBins:
+    """Return the bins in which noise may raise false alarms, for parameters by dotted path."""
+    record = RecordSettings.from_parameters(parameters)
+    waveform = WaveformSettings.from_parameters(parameters)
+    return SearchedBins.from_record(
+        record,
+        noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
+        bins_counted=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
+        search_band=search_band_start_and_size(parameters, waveform, record),
     )
-    band_bins, segment_index = search_band_start_and_size(parameters), SEGMENT_NAMES.index(segment)
-    if str(parameters[PROCESSING_PREFIX + "noise_bins"]) == "independent":
-        if band_bins is None:
-            return NoiseBins(float(fft_size if counts_all_bins else fft_size // 2), 0.0)
-        n_searched = n_alarm_bins(band_bins, fft_size, 1, is_signed=is_complex_record)
-        return NoiseBins(n_searched[segment_index], 0.0)
-    record_window = get_window(
-        canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"])),
-        int(np.max(record_length(parameters))),
-    )
-    first_alarm_bin = (
-        1 if is_complex_record else bin_noise.first_circular_bin(record_window, fft_size)
-    )
-    n_bins = fft_size if counts_all_bins else max(fft_size // 2 + 1 - 2 * first_alarm_bin, 0)
-    if band_bins is not None:
-        n_bins = n_alarm_bins(band_bins, fft_size, first_alarm_bin, is_signed=is_complex_record)[
-            segment_index
-        ]
-    return NoiseBins(n_bins, bin_noise.neighbour_noise_correlation(record_window, fft_size))

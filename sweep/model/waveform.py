@@ -199,17 +199,6 @@ def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
     return 1.0, doppler, down
 
 
-def segment_carriers(parameters: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the frequencies [Hz] of :func:`carrier_frequencies` for parameters by dotted path."""
-    return carrier_frequencies(
-        str(parameters["instrument.receiver.architecture"]),
-        wavelength=parameters["instrument.laser.wavelength"],
-        start_frequency=parameters["instrument.chirp.start_frequency"],
-        bandwidth=parameters["instrument.chirp.bandwidth"],
-        chirp_slopes=chirp_slopes(parameters),
-    )
-
-
 def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
     """Return the names of a shot's segments in the order of time.
 

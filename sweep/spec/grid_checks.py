@@ -39,7 +39,7 @@ from sweep.model.effects.requirements import (
     is_zero,
 )
 from sweep.model.effects.sweep_error_table import fit_sweep_frequency_error
-from sweep.model.link_budget import RECORD_PATH
+from sweep.model.shot_settings import RECORD_PATH
 from sweep.model.waveform import SEARCH_BAND_PATHS, SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
 from sweep.spec.axes import Axis, parameter_location
 from sweep.spec.fields import AUTO, OFF, ON, rules_by_path

@@ -15,6 +15,7 @@ from shot_helpers import (
 from sweep.model import time_domain_truth
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import evaluate
+from sweep.model.link_budget import LinkBudget
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.model.pointcloud.returns import draw_free_bin, draw_returns
@@ -51,9 +52,12 @@ def test_bins_are_those_nearest_to_any_beat(table_4_1, near, deep, slow, spread,
     }  # fmt: skip
     # Twice as close as bins, in range and in velocity; from edge to edge.
     far, fast = np.linspace(near, near + deep, 6000), np.linspace(slow, slow + spread, 2000)
-    beta = 2 * fast / 299792458
+    beta, budget = 2 * fast / 299792458, LinkBudget(scene)
     for band, sign, extra in zip(
-        search_band_start_and_size(scene), (1, 0, -1), (0, 0, 1e9), strict=True
+        search_band_start_and_size(scene, budget.waveform, budget.record),
+        (1, 0, -1),
+        (0, 0, 1e9),
+        strict=True,
     ):
         carrier = 299792458 / 1550e-9 + extra
         beats = [

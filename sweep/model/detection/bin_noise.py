@@ -26,11 +26,14 @@ and for Hann in a record padded to four times its length.
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.detection.looks import SINGLE_LOOK, Looks
+from sweep.model.shot_settings import RecordSettings
+from sweep.model.spectrum.search_band import n_alarm_bins
 from sweep.model.window import Window, centred_transform, window_samples
 
 CIRCULAR_RATIO_MAX = 0.01
@@ -131,6 +134,128 @@ def _equivalent_bins_per_bin(
     return np.where(
         p_cross > 1e-15, np.minimum(equivalent_per_bin, 1.0), p_stay_if_neighbour_crosses
     )
+
+
+class SearchedBins(NamedTuple):
+    """Bins in which noise may raise false alarms, and the correlation of their noise.
+
+    The threshold (:mod:`sweep.model.threshold`) is set on these bins, and the false alarms of
+    prepared shots are those of the same bins.
+    """
+
+    n_bins: float | np.ndarray
+    """Number of bins. It is (segments, n), in the order up, Doppler, down, if a search band is set;
+    (n,) of one of its segments; or one number for all segments and points."""
+    first_bin: int
+    """Distance of the first searched bin from DC and from Nyquist [bins]. It is above 1 in a real
+    record whose noise is correlated: the noise of the bins that are left out is not circular."""
+    neighbour_correlation: float
+    """Correlation coefficient of the noise of adjacent bins, 0..1; 0 if bins count as
+    independent."""
+    includes_echo: bool
+    """True if the bins of a detected echo count as well, as in [T]."""
+
+    @classmethod
+    def from_record(
+        cls,
+        record: RecordSettings,
+        *,
+        noise_bins: str,
+        bins_counted: str,
+        search_band: np.ndarray | None,
+    ) -> "SearchedBins":
+        """Return the searched bins of a record's spectra.
+
+        Parameters
+        ----------
+        record : RecordSettings
+            Window, FFT size and kind of the samples.
+        noise_bins : str
+            ``correlated``, the noise of adjacent bins in a record, or ``independent``.
+        bins_counted : str
+            ``half``, the bins of a real spectrum, or ``all`` N bins of the FFT. A search band has
+            its own bins in either case.
+        search_band : ndarray (3, 2, ...) or None
+            Result of :func:`sweep.model.spectrum.search_band.search_band_start_and_size`.
+
+        Examples
+        --------
+        >>> from sweep.model.window import get_window
+        >>> record = RecordSettings(
+        ...     window=get_window("rectangular", 1024), fft_size=1024, sample_rate=np.array(1e8),
+        ...     acquisition_delay=np.array(0.0), is_complex=False,
+        ... )
+        >>> SearchedBins.from_record(
+        ...     record, noise_bins="correlated", bins_counted="half", search_band=None
+        ... )
+        SearchedBins(n_bins=511.0, first_bin=1, neighbour_correlation=0.0, includes_echo=False)
+        """
+        is_correlated, fft_size = noise_bins == "correlated", record.fft_size
+        has_real_ends = is_correlated and not record.is_complex
+        first_bin = first_circular_bin(record.window, fft_size) if has_real_ends else 1
+        n_bins: float | np.ndarray
+        if search_band is not None:
+            n_bins = n_alarm_bins(search_band, fft_size, first_bin, is_signed=record.is_complex)
+        elif record.is_complex or bins_counted == "all":
+            n_bins = float(fft_size)
+        elif has_real_ends:
+            n_bins = max(fft_size // 2 + 1.0 - 2 * first_bin, 0.0)
+        else:
+            n_bins = float(fft_size // 2)
+        return cls(
+            n_bins=n_bins,
+            first_bin=first_bin,
+            neighbour_correlation=(
+                neighbour_noise_correlation(record.window, fft_size) if is_correlated else 0.0
+            ),
+            includes_echo=bins_counted == "all" and search_band is None,
+        )
+
+    def select_segment(self, segment: int) -> "SearchedBins":
+        """Return the bins of one segment, by its index in the order up, Doppler, down."""
+        if not np.ndim(self.n_bins):
+            return self
+        return self._replace(n_bins=np.asarray(self.n_bins)[segment])
+
+    def select_points(self, point_indices: np.ndarray | slice) -> "SearchedBins":
+        """Return the bins of all segments of some points, (m,) indices or a slice."""
+        if not np.ndim(self.n_bins):
+            return self
+        return self._replace(n_bins=np.asarray(self.n_bins)[:, point_indices])
+
+    def n_bins_outside_echo(self, n_exempt: np.ndarray) -> np.ndarray:
+        """Return the number of bins in which noise may raise false alarms after a detection.
+
+        Parameters
+        ----------
+        n_exempt : ndarray (3, n)
+            Number of bins of the detected echo, by segment.
+
+        Returns
+        -------
+        ndarray (3, n)
+            Number of bins outside the echo, 0 or more; all bins if :attr:`includes_echo`.
+        """
+        if self.includes_echo:
+            return np.full(np.shape(n_exempt), self.n_bins)
+        return np.asarray(np.maximum(self.n_bins - n_exempt, 0.0))
+
+    def alarm_equivalent_bins(self, threshold_ratio: ArrayLike, looks: Looks) -> np.ndarray:
+        """Return the number of independent bins with these bins' false-alarm probability.
+
+        Parameters
+        ----------
+        threshold_ratio : ndarray
+            Threshold over sigma, the noise of a bin per quadrature.
+        looks : Looks
+            Number of looks (records of each segment) and how they are combined.
+        """
+        return alarm_equivalent_bins(
+            self.n_bins,
+            threshold_ratio=threshold_ratio,
+            correlation=self.neighbour_correlation,
+            looks=looks,
+        )
 
 
 NOISE_FILTER_TAPS = 17

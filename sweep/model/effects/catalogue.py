@@ -26,7 +26,7 @@ from sweep.model.effects import (
     speckle,
 )
 from sweep.model.effects.effect import Effect, Parameter
-from sweep.model.link_budget import RECORD_PATH
+from sweep.model.shot_settings import RECORD_PATH
 
 EFFECTS: tuple[Effect, ...] = (
     footprint.FOOTPRINT,

@@ -16,8 +16,9 @@ from sweep.model.effects import image_and_leakage
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import ErrorBound, magnitude_change_from_power
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.link_budget import CHIRP_PREFIX, relative_amplitude
+from sweep.model.link_budget import relative_amplitude
 from sweep.model.preparation import Shots
+from sweep.model.shot_settings import CHIRP_PREFIX
 
 
 def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:

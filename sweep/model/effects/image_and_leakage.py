@@ -43,8 +43,9 @@ from sweep.model.detection.looks import SINGLE_LOOK, Looks
 from sweep.model.effects.effect import Effect, EffectContext
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.link_budget import PROCESSING_PREFIX, RECORD_PATH
+from sweep.model.link_budget import PROCESSING_PREFIX
 from sweep.model.preparation import Shots
+from sweep.model.shot_settings import RECORD_PATH
 from sweep.model.window import get_window
 from sweep.model.window_response import window_response
 

@@ -161,7 +161,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     -----
     Of L samples, the first n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s) lack the echo, limited to
     0..L. tau_0 is the delay of the echo, beta its Doppler ratio, t_0 the start of the record and
-    f_s the sample rate (:meth:`sweep.model.link_budget.RecordSettings.count_samples_before_echo`).
+    f_s the sample rate. It is counted by
+    :meth:`sweep.model.shot_settings.RecordSettings.count_samples_before_echo`.
     """
     n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     for segment_index in np.flatnonzero(shots.has_segment):

@@ -62,7 +62,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import link_budget
+from sweep.model import shot_settings
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import coherent_gain
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
@@ -74,9 +74,9 @@ from sweep.model.effects.error_bounds import (
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.sweep_error_table import SweepFrequencyError, fit_sweep_frequency_error
-from sweep.model.link_budget import CHIRP_PREFIX
 from sweep.model.preparation import Shots
 from sweep.model.shot_records import PhaseError
+from sweep.model.shot_settings import CHIRP_PREFIX
 from sweep.model.window import Window, window_samples
 
 _N_NODES = 256
@@ -409,7 +409,7 @@ def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """
     doppler_ratio_growth = points.stack_segments(
         *(
-            link_budget.doppler_ratio(points.target.acceleration * segment.start_time)
+            shot_settings.doppler_ratio(points.target.acceleration * segment.start_time)
             for segment in points.existing_segments
         )
     )

@@ -28,11 +28,11 @@ from sweep.model.effects.error_bounds import NO_PHASE_ERROR, ErrorBound, PhaseEr
 from sweep.model.ground import FootprintExtent, backscatter
 from sweep.model.link_budget import (
     ADC_NOISE_SOURCE,
-    LineMotion,
     LinkBudget,
     adc_noise_variance,
     relative_amplitude,
 )
+from sweep.model.shot_settings import LineMotion
 from sweep.model.waveform import WaveformSegment
 from sweep.model.window import Window
 from sweep.model.window_response import (

@@ -36,8 +36,8 @@ from sweep.model.effects.doppler import line_shift_bound
 from sweep.model.effects.effect import Effect, EffectContext
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.link_budget import doppler_ratio
 from sweep.model.preparation import Shots
+from sweep.model.shot_settings import doppler_ratio
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 LOOK_DRIFT_MAX_WINDOW_BINS = 0.25

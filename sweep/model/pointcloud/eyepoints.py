@@ -22,8 +22,9 @@ from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.ray_casting import BundleHits, Pose, RayCaster
 from sweep.model.geometry.scanner import PointingJitter, ScanPattern, beamlet_rays
 from sweep.model.ground import BeamletTable, RayTracedGround, backscatter
-from sweep.model.link_budget import APPROACH_SPEED_PATH, BEAM_ELEVATION_PATH
+from sweep.model.link_budget import BEAM_ELEVATION_PATH
 from sweep.model.preparation import Parameters, Shots
+from sweep.model.shot_settings import APPROACH_SPEED_PATH
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 TARGET_HEIGHT_PATH = "atmosphere.target_height"

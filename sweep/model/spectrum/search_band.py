@@ -18,20 +18,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model import waveform
-from sweep.model.waveform import SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
+from sweep.model.shot_settings import RecordSettings, WaveformSettings
+from sweep.model.waveform import (
+    SEARCH_RANGE_PATHS,
+    SEARCH_VELOCITY_PATHS,
+    SEGMENT_NAMES,
+    beat_frequency,
+    fold_frequency,
+)
 
 
 def search_band_start_and_size(
-    parameters: Mapping[str, Any], n_points: int | None = None
+    parameters: Mapping[str, Any],
+    waveform: WaveformSettings,
+    record: RecordSettings,
+    n_points: int | None = None,
 ) -> np.ndarray | None:
     """Return the first bin and the number of bins that are searched, or None if all bins are.
 
     Parameters
     ----------
     parameters
-        Parameters by path. Points share their strings and FFT sizes, and have all or none of the
-        search band's limits.
+        Parameters by path, with all or none of the search band's limits.
+    waveform
+        Waveform of the points' shots.
+    record
+        Record of each segment.
     n_points
         Number of points to which the result is broadcast.
 
@@ -44,28 +56,29 @@ def search_band_start_and_size(
     """
     if SEARCH_RANGE_PATHS[0] not in parameters:
         return None
-    slopes, carriers = waveform.chirp_slopes(parameters), waveform.segment_carriers(parameters)
-    fft_size = int(np.max(parameters["instrument.processing.fft_size"]))
-    bin_width = parameters["instrument.processing.sample_rate"] / fft_size
-    chirp_rate = parameters["instrument.chirp.bandwidth"] / parameters["instrument.chirp.duration"]
-    is_signed = str(parameters.get("instrument.receiver.record", "real")) == "complex"
-    bands = []
-    for slope, carrier in zip(slopes, carriers, strict=True):
-        corners = [
-            waveform.beat_frequency(
-                slope,
-                carrier=carrier,
-                chirp_rate=chirp_rate,
-                range=np.asarray(parameters[range_path], float),
-                radial_velocity=np.asarray(parameters[velocity_path], float),
+    beats = [
+        beat_frequency(
+            slope,
+            carrier=carrier,
+            chirp_rate=waveform.chirp_rate,
+            range=np.asarray(parameters[range_path], float),
+            radial_velocity=np.asarray(parameters[velocity_path], float),
+        )
+        / record.bin_width
+        for slope, carrier in zip(waveform.chirp_slopes, waveform.carriers, strict=True)
+        for range_path in SEARCH_RANGE_PATHS
+        for velocity_path in SEARCH_VELOCITY_PATHS
+    ]
+    beats_by_segment = np.split(np.array(np.broadcast_arrays(*beats)), len(SEGMENT_NAMES))
+    band_bins = np.array(
+        [
+            _nearest_bins(
+                corner_beats.min(axis=0), corner_beats.max(axis=0), record.fft_size,
+                record.is_complex,
             )
-            / bin_width
-            for range_path in SEARCH_RANGE_PATHS
-            for velocity_path in SEARCH_VELOCITY_PATHS
+            for corner_beats in beats_by_segment
         ]
-        beats = np.array(np.broadcast_arrays(*corners))
-        bands.append(_nearest_bins(beats.min(axis=0), beats.max(axis=0), fft_size, is_signed))
-    band_bins = np.array(bands)
+    )  # fmt: skip
     return band_bins if n_points is None else np.broadcast_to(band_bins.T, (n_points, 2, 3)).T
 
 
@@ -84,9 +97,7 @@ def _nearest_bins(
             np.minimum(last_bin - first_bin + 1, fft_size),
         )
         return np.array([first_bin, n_bins], np.int64)
-    folded_ends = waveform.fold_frequency(
-        np.array([beat_min, beat_max]), np.asarray(float(fft_size))
-    )
+    folded_ends = fold_frequency(np.array([beat_min, beat_max]), np.asarray(float(fft_size)))
     bin_min = np.where(
         np.floor(beat_max / fft_size) * fft_size >= beat_min, 0.0, folded_ends.min(axis=0)
     )

@@ -19,14 +19,13 @@ from sweep.model.detection.estimators import ESTIMATOR_PREFIX
 from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
 from sweep.model.evaluation import MISREAD_TOLERANCE_BINS
 from sweep.model.link_budget import (
-    CHIRP_PREFIX,
     LASER_PREFIX,
     PROCESSING_PREFIX,
     RECEIVER_PREFIX,
-    RECORD_PATH,
     LinkBudget,
 )
 from sweep.model.preparation import split_by_category
+from sweep.model.shot_settings import CHIRP_PREFIX, RECORD_PATH
 from sweep.model.window_response import missing_sample_bounds
 from sweep.tasks.studies.flight_study import FlightStudy
 

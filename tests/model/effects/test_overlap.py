@@ -9,9 +9,9 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import overlap
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.effects.phase_errors import chirp_drift_time
-from sweep.model.link_budget import RECORD_PATH
 from sweep.model.sampling import samplers
 from sweep.model.sampling.philox import point_keys
+from sweep.model.shot_settings import RECORD_PATH
 from sweep.model.spectrum import segment_spectra
 from sweep.model.spectrum.line_shape import COSINE_SUM_COEFFICIENTS
 from sweep.model.window import get_window, zero_first_samples
