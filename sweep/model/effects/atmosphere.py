@@ -245,7 +245,8 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
         power_factor=transmission**2,
         amplitude_factor=transmission**2 if is_direct else transmission,
     )
-    return replace(shots, echo_scales=echo_scales._replace(ground_transmission=transmission))
+    ground_transmission = echo_scales.ground_transmission * transmission
+    return replace(shots, echo_scales=echo_scales._replace(ground_transmission=ground_transmission))
 
 
 def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
