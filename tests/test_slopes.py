@@ -8,7 +8,11 @@ import yaml
 
 import sweep
 from sweep.model import time_domain_truth, waveform
-from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION, SegmentCorrelations
+from sweep.model.detection.echo_detection import (
+    RAYLEIGH_DEVIATION,
+    SegmentCorrelations,
+    speckle_mixing_at,
+)
 from sweep.model.detection.estimators import range_velocity_deviation
 from sweep.model.detection.looks import pd_and_miss_any_two_in_speckle
 from sweep.model.evaluation import evaluate_segments, prepare_shots, shot_statistics
@@ -141,7 +145,7 @@ def test_any_two_of_three_that_fade(snr, near):
     number, level, snr = 200_000, 4.0, np.array(snr)
     over = near**4  # of Gaussian footprints
     fading = SegmentCorrelations(*np.array([[near + 0j], [over + 0j], [near + 0j]]))
-    key, mixing = (np.uint64(3), np.uint64(5)), fading.cholesky_factors()[:, 0]
+    key, mixing = (np.uint64(3), np.uint64(5)), speckle_mixing_at(fading.speckle_mixing(), 0)
     factors = np.array(
         [speckle_factors(philox.DrawAddress(*key, draw), 0, mixing) for draw in np.arange(number)]
     ).T

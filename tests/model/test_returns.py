@@ -8,7 +8,7 @@ from scipy import ndimage, stats
 from shot_helpers import DRAWS, is_within_5_sigma, make_point_keys, prepare_single_category
 
 from sweep.model import time_domain_truth, waveform
-from sweep.model.detection.echo_detection import BinThresholds
+from sweep.model.detection.echo_detection import BinThresholds, SpeckleMixing
 from sweep.model.detection.sub_bin_interpolation import interpolator
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import (
@@ -350,7 +350,7 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
         echo_fraction=np.zeros((1, 3, 1)),
         wander_deviation=np.zeros((1, 3, 1)),
         n_independent_bins=np.ones((1, 3, 1)),
-        speckle_cholesky_factors=np.zeros((1, 6)),
+        speckle_mixing=SpeckleMixing(*np.zeros((6, 1))),
         look_covariance_root=np.zeros((1, 3, 1, 0), complex),
     )
     seen = NoiselessSpectra.empty(1)._replace(

@@ -436,6 +436,65 @@ def bin_speckle_at(speckle_table, segment, point):
     )
 
 
+class SpeckleMixing(NamedTuple):
+    """Coefficients that mix independent amplitudes into an echo's amplitudes in three segments.
+
+    With independent circular complex Gaussian z of unit power, the amplitudes are
+
+        A_up      = z_0
+        A_doppler = doppler_from_up z_0 + doppler_own z_1
+        A_down    = down_from_up z_0 + down_from_doppler z_1 + down_own z_2
+
+    The coefficients are the Cholesky factor of the correlation matrix of the amplitudes. Fields are
+    (n,) for n points, or scalars in kernels (:func:`speckle_mixing_at`). They are (0,) or zeros
+    without speckle.
+    """
+
+    doppler_from_up: np.ndarray
+    """Weight of the up segment's amplitude in that of the Doppler segment, 0..1."""
+    doppler_own: np.ndarray
+    """Weight of an independent amplitude in that of the Doppler segment, 0..1."""
+    down_from_up: np.ndarray
+    """Weight of the up segment's amplitude in that of the down segment, 0..1."""
+    down_from_doppler_re: np.ndarray
+    """Real part of the weight of the Doppler segment's independent amplitude in that of the down
+    segment."""
+    down_from_doppler_im: np.ndarray
+    """Imaginary part of the weight of the Doppler segment's independent amplitude in that of the
+    down segment."""
+    down_own: np.ndarray
+    """Weight of an independent amplitude in that of the down segment, 0..1."""
+
+    def broadcast(self, n_points: int) -> "SpeckleMixing":
+        """Return the coefficients of n points as contiguous arrays (n,) that can be written to."""
+        return SpeckleMixing(*(np.array(np.broadcast_to(field, n_points)) for field in self))
+
+    def select(self, indices: np.ndarray) -> "SpeckleMixing":
+        """Return the coefficients of the points with the given indices."""
+        return SpeckleMixing(*(field[indices] for field in self))
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def speckle_mixing_at(mixing, point):
+    """Return the :class:`SpeckleMixing` of one point, of scalars.
+
+    Parameters
+    ----------
+    mixing : SpeckleMixing
+        Coefficients of n points, (n,) each.
+    point : int
+        Index of the point.
+    """
+    return SpeckleMixing(
+        mixing.doppler_from_up[point],
+        mixing.doppler_own[point],
+        mixing.down_from_up[point],
+        mixing.down_from_doppler_re[point],
+        mixing.down_from_doppler_im[point],
+        mixing.down_own[point],
+    )
+
+
 class SegmentCorrelations(NamedTuple):
     """Complex correlations (n,) between segments of an echo's amplitudes in developed speckle."""
 
@@ -446,19 +505,13 @@ class SegmentCorrelations(NamedTuple):
     doppler_down: np.ndarray
     """(n,): complex correlation of the amplitudes in Doppler and down segment, |.| <= 1."""
 
-    def cholesky_factors(self) -> np.ndarray:
-        """Return the Cholesky factors of the segments' correlation matrix, (6, n).
-
-        Returns
-        -------
-        numpy.ndarray
-            Rows m, sqrt(1 - m^2), o, Re c, Im c and d of the equations below.
+    def speckle_mixing(self) -> SpeckleMixing:
+        """Return the coefficients that give independent amplitudes these correlations, (n,) each.
 
         Notes
         -----
-        The amplitudes are A_up = z_0, A_doppler = m z_0 + sqrt(1 - m^2) z_1 and A_down = o z_0 + c
-        z_1 + d z_2, with independent circular complex Gaussian z of unit power. Phases that do not
-        change the joint law of the magnitudes are removed.
+        They are the Cholesky factor of the segments' correlation matrix. Phases that do not change
+        the joint law of the magnitudes are removed.
         """
         up_doppler, up_down, doppler_down = (
             np.minimum(np.abs(correlation), 1.0) for correlation in self
@@ -472,15 +525,13 @@ class SegmentCorrelations(NamedTuple):
                 doppler_own > 1e-7, (rotated_doppler_down - up_doppler * up_down) / doppler_own, 0.0
             )
         down_own = np.sqrt(np.maximum(1 - up_down**2 - np.abs(down_from_doppler) ** 2, 0.0))
-        return np.array(
-            [
-                up_doppler,
-                doppler_own,
-                up_down,
-                down_from_doppler.real,
-                down_from_doppler.imag,
-                down_own,
-            ]
+        return SpeckleMixing(
+            doppler_from_up=up_doppler,
+            doppler_own=doppler_own,
+            down_from_up=up_down,
+            down_from_doppler_re=down_from_doppler.real,
+            down_from_doppler_im=down_from_doppler.imag,
+            down_own=down_own,
         )
 
 
@@ -951,7 +1002,13 @@ def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
 def _zero_bins_given_mode(n_bins):
     """Return a :class:`BinsGivenMode` for ``n_bins`` bins, all of whose fields are zero."""
     rows = np.zeros((5, n_bins))  # one allocation instead of five
-    return BinsGivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    return BinsGivenMode(
+        signal=rows[0],
+        threshold=rows[1],
+        correlation=rows[2],
+        pedestal=rows[3],
+        other_echo_fraction=rows[4],
+    )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1155,7 +1212,13 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
     bin_run = EchoBins(magnitude[begin:end], is_echo[begin:end], echo.first_bin + begin)
     # Not by _zero_bins_given_mode: a call and zeros cost 6 % of the time of an echo.
     rows, pedestal_ratios = np.empty((5, n_bins)), np.empty(n_bins)
-    bins_given_mode = BinsGivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    bins_given_mode = BinsGivenMode(
+        signal=rows[0],
+        threshold=rows[1],
+        correlation=rows[2],
+        pedestal=rows[3],
+        other_echo_fraction=rows[4],
+    )
     previous_fraction, previous_inverse_noise = 0.0, 0.0
     fill_pedestal_ratios(bin_run.magnitude, bin_run.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):

@@ -529,10 +529,10 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
         beam_gradients = _ray_traced_gradients(moments)
         variance_across = moments.covariance[0, 0] - beam_gradients.doppler_ratio**2
         doppler_across = np.sqrt(np.maximum(variance_across, 0.0))
-    bin_width = shots.sample_rate / shots.fft_size
+    bin_width = shots.record.bin_width
     line_shift = np.zeros((3, 2, shots.size))
     for segment_index, segment in enumerate(shots.waveform_segments):
-        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease)
+        delay = segment.delay(shots.range)
         shift_hertz = (
             segment.carrier * beam_gradients.doppler_ratio
             - segment.chirp_rate * delay * beam_gradients.relative_range
@@ -631,7 +631,7 @@ def _line_pair_gradients(
     padding_factor = shots.fft_size / shots.window.length
     distances, line_shifts = [], []
     for segment in (shots.waveform_segments[segment_index] for segment_index in pair):
-        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease)
+        delay = segment.delay(shots.range)
         beat = segment.carrier * segment.doppler_ratio - segment.chirp_rate * delay * (
             1 + segment.doppler_ratio
         )

@@ -60,6 +60,7 @@ from sweep.model.detection.detection_probability import (
 )
 from sweep.model.detection.echo_detection import (
     BinThresholds,
+    SpeckleMixing,
     bin_threshold_at,
     echo_bounds,
     fill_pedestal_ratios,
@@ -67,6 +68,7 @@ from sweep.model.detection.echo_detection import (
     independent_bin_pd_kernel,
     is_real_bin,
     pd_of_independent_bins,
+    speckle_mixing_at,
 )
 from sweep.model.detection.estimators import RangeVelocityDeviation, range_velocity_deviation
 from sweep.model.detection.hoyt import hoyt_tails, pseudo_variance_ratio_at
@@ -582,9 +584,9 @@ class DrawInputs(NamedTuple):
     n_independent_bins: np.ndarray
     """(n, 3, groups): equivalent number of independent bins by which a group in developed speckle
     may be detected."""
-    speckle_cholesky_factors: np.ndarray
-    """(n, 6): elements of the Cholesky factor of the correlation of speckle in the three segments;
-    0 without speckle."""
+    speckle_mixing: SpeckleMixing
+    """(n,) in each field: coefficients of the amplitudes by speckle in the three segments; 0
+    without speckle."""
     look_covariance_root: np.ndarray
     """(n, 3, looks, sets) complex: coefficients by which independent sets of speckle are mixed into
     the partly correlated speckle of looks (records of a segment). In other cases there are no sets.
@@ -595,7 +597,7 @@ class DrawInputs(NamedTuple):
         return DrawInputs(
             *(
                 v.select(indices)
-                if isinstance(v, (SpeckleLineGrid, BinThresholds, DopplerPrediction))
+                if isinstance(v, (SpeckleLineGrid, BinThresholds, DopplerPrediction, SpeckleMixing))
                 else v[indices]
                 for v in self
             )  # type: ignore[arg-type]
@@ -777,19 +779,16 @@ def make_draw_inputs(
         echo_fraction=echo_fraction,
         wander_deviation=wander_deviation,
         n_independent_bins=n_independent_bins,
-        speckle_cholesky_factors=_segment_cholesky_factors(shots),
+        speckle_mixing=_speckle_mixing(shots),
         look_covariance_root=_look_covariance_roots(shots),
     )
 
 
-def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
-    """Return elements (n, 6) of the Cholesky factor of the correlation of the segments' speckle."""
+def _speckle_mixing(shots: Shots) -> SpeckleMixing:
+    """Return the coefficients of the amplitudes by speckle in the segments of n shots."""
     if shots.speckle.segment_correlations is None:
-        return np.zeros((shots.size, 6))
-    cholesky_factors = np.broadcast_to(
-        shots.speckle.segment_correlations.cholesky_factors(), (6, shots.size)
-    )
-    return np.ascontiguousarray(cholesky_factors.T)
+        return SpeckleMixing(*np.zeros((6, shots.size)))
+    return shots.speckle.segment_correlations.speckle_mixing().broadcast(shots.size)
 
 
 def _look_covariance_roots(shots: Shots) -> np.ndarray:
@@ -1352,16 +1351,17 @@ def _measure_by_reading(
     """
     at_returns = partial(_values_of_points, shots, listed_returns.point)
     up_carrier, _, _ = shots.waveform.carriers
-    carrier, bandwidth, duration, sample_rate = (
+    carrier, bandwidth, duration, sample_rate, bin_width = (
         at_returns(values)
         for values in (
             up_carrier,
             shots.waveform.chirp_bandwidth,
             shots.waveform.chirp_duration,
             shots.sample_rate,
+            shots.record.bin_width,
         )
     )
-    bin_width, chirp_rate = sample_rate / shots.fft_size, bandwidth / duration
+    chirp_rate = bandwidth / duration
 
     def convert_peaks(peak_positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Convert the peaks of returns, at ``peak_positions`` (m, 3), to range and velocity."""
@@ -1409,7 +1409,7 @@ def _measure_by_fit(
 ) -> Measurements:
     """Compute range and velocity at the shot's start by a fit of each return's peaks."""
     point = listed_returns.point
-    bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
+    bin_width = np.broadcast_to(shots.record.bin_width, shots.size)
     carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.waveform.carriers]
     chirp_rate = np.broadcast_to(shots.waveform.chirp_rate, shots.size)
     position_error = listed_returns.peaks.position_error.T
@@ -2430,7 +2430,7 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
     random_index = _OTHER_BINS_RANDOM_OFFSET + group * int(DRAWN_INDEPENDENT_BINS_MAX)
     while n_bins_left > 1e-6:
         speckle_amplitude = speckle_amplitudes(
-            address, random_index, inputs.speckle_cholesky_factors[point]
+            address, random_index, speckle_mixing_at(inputs.speckle_mixing, point)
         )[segment]
         re, im = philox.normal_pair(key_0, key_1, draw, philox.STREAM_NOISE[segment], random_index)
         noise_weight, echo_weight = math.sqrt(0.5 * (1.0 - echo_fraction)), math.sqrt(echo_fraction)

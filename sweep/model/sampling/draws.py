@@ -30,8 +30,10 @@ from sweep.model.detection.detection_probability import (
 )
 from sweep.model.detection.echo_detection import (
     BinThresholds,
+    SpeckleMixing,
     bin_threshold_at,
     fill_pedestal_ratios,
+    speckle_mixing_at,
 )
 from sweep.model.detection.hoyt import pseudo_variance_ratio_at
 from sweep.model.detection.marcum import at_least_one_probability
@@ -121,9 +123,8 @@ class DrawCountInputs(NamedTuple):
     :class:`EventProbabilities` is met; unused if noise is drawn."""
     detects_by_any_two_segments: np.ndarray
     """(m,) bool: True if a shot counts as detected by any two of its segments."""
-    speckle_cholesky_factors: np.ndarray
-    """(6, m): Cholesky factor of the correlation of speckle in the three segments
-    (:meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`); (0, m)
+    speckle_mixing: SpeckleMixing
+    """(m,) in each field: coefficients of the amplitudes by speckle in the three segments; (0,)
     without speckle."""
     pseudo_variance_row: np.ndarray
     """(3, m) int64: row of ``DrawCountConfig.pseudo_variance_ratio`` for each segment; 0 for an
@@ -239,7 +240,7 @@ def count_by_probability(
         detects_by_any_two_segments=np.isfinite(
             outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))
         ),
-        speckle_cholesky_factors=np.empty((0, n_rows)),
+        speckle_mixing=SpeckleMixing(*np.empty((6, 0))),
         pseudo_variance_row=np.zeros((3, n_rows), np.int64),
         line_grid=SpeckleLineGrid.empty(),
         line_centre=np.empty((0, 3)),
@@ -273,10 +274,10 @@ def count_in_noise(
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
     threshold_ratio, line_noise_ratio = threshold_and_line_noise_ratios(shots)
-    speckle_cholesky_factors = (
-        np.empty((0, shots.size))
+    speckle_mixing = (
+        None
         if shots.speckle.segment_correlations is None
-        else shots.speckle.segment_correlations.cholesky_factors()
+        else shots.speckle.segment_correlations.speckle_mixing().broadcast(shots.size)
     )
     pfa_bin, speckle_table = np.exp(-0.5 * threshold_ratio**2), shots.speckle_table
     line_grid = speckle_line_grid(shots)
@@ -291,7 +292,11 @@ def count_in_noise(
             pd_if_condition_fails=no_probabilities,
             pd_if_condition_holds=no_probabilities,
             detects_by_any_two_segments=np.full(indices.size, shots.detects_by_any_two_segments),
-            speckle_cholesky_factors=speckle_cholesky_factors[:, indices].copy(),
+            speckle_mixing=(
+                SpeckleMixing(*np.empty((6, 0)))
+                if speckle_mixing is None
+                else speckle_mixing.select(indices)
+            ),
             pseudo_variance_row=speckle_table.pseudo_variance_row[:, indices].copy(),
             line_grid=line_grid.select(indices),
             line_centre=np.ascontiguousarray(
@@ -647,7 +652,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
     is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
     for j in range(draw_ranges.point_index.size):
         threshold_ratio, line_noise_ratio = inputs.threshold_ratio[j], inputs.line_noise_ratio[j]
-        in_speckle = inputs.speckle_cholesky_factors.shape[0] > 0
+        in_speckle = inputs.speckle_mixing.doppler_own.size > 0
         i, batch = draw_ranges.point_index[j], 0
         for first in range(draw_ranges.first_draw[j], draw_ranges.end_draw[j], _DRAWS_PER_STEP):
             n_draws = min(_DRAWS_PER_STEP, draw_ranges.end_draw[j] - first)
@@ -657,7 +662,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                 amplitudes = speckle_amplitudes(
                     DrawAddress(address.key_0, address.key_1, first + d),
                     0,
-                    inputs.speckle_cholesky_factors[:, j],
+                    speckle_mixing_at(inputs.speckle_mixing, j),
                 )
                 for s in range(3):
                     factors_in_phase[s, d] = amplitudes[s].real
@@ -899,9 +904,22 @@ def _mark_leakage_alarms(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_factors(address, group, mixing):
-    """Return the factors by speckle on an echo's magnitudes in up, Doppler and down segment.
+    """Return the factors by speckle on an echo's magnitudes in the three segments.
 
-    Their mean square is 1. The arguments are those of :func:`speckle_amplitudes`.
+    Parameters
+    ----------
+    address : DrawAddress
+        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    group : int
+        Number of the echo (group of adjacent bins).
+    mixing : SpeckleMixing
+        Coefficients of the point, scalars
+        (:class:`sweep.model.detection.echo_detection.SpeckleMixing`).
+
+    Returns
+    -------
+    up, doppler, down : float
+        Factors on |X| in each segment, of mean square 1.
     """
     up, doppler, down = speckle_amplitudes(address, group, mixing)
     return (
@@ -917,12 +935,13 @@ def speckle_amplitudes(address, group, mixing):
 
     Parameters
     ----------
-    address
+    address : DrawAddress
         Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
-    group
+    group : int
         Number of the echo (group of adjacent bins).
-    speckle_cholesky_factors
-        (6,): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`.
+    mixing : SpeckleMixing
+        Coefficients of the point, scalars
+        (:class:`sweep.model.detection.echo_detection.SpeckleMixing`).
 
     Returns
     -------
@@ -934,25 +953,17 @@ def speckle_amplitudes(address, group, mixing):
     re_0, im_0 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group)
     re_1, im_1 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group + 1)
     re_2, im_2 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group + 2)
-    (
-        doppler_from_up,
-        doppler_own,
-        down_from_up,
-        down_from_doppler_re,
-        down_from_doppler_im,
-        down_own,
-    ) = mixing
-    doppler_re = doppler_from_up * re_0 + doppler_own * re_1
-    doppler_im = doppler_from_up * im_0 + doppler_own * im_1
+    doppler_re = mixing.doppler_from_up * re_0 + mixing.doppler_own * re_1
+    doppler_im = mixing.doppler_from_up * im_0 + mixing.doppler_own * im_1
     down_re = (
-        down_from_up * re_0
-        + (down_from_doppler_re * re_1 - down_from_doppler_im * im_1)
-        + down_own * re_2
+        mixing.down_from_up * re_0
+        + (mixing.down_from_doppler_re * re_1 - mixing.down_from_doppler_im * im_1)
+        + mixing.down_own * re_2
     )
     down_im = (
-        down_from_up * im_0
-        + (down_from_doppler_re * im_1 + down_from_doppler_im * re_1)
-        + down_own * im_2
+        mixing.down_from_up * im_0
+        + (mixing.down_from_doppler_re * im_1 + mixing.down_from_doppler_im * re_1)
+        + mixing.down_own * im_2
     )
     return SegmentAmplitudes(
         complex(root_half * re_0, root_half * im_0),

@@ -47,7 +47,6 @@ from scipy import special
 
 from sweep.kernel_cache import njit
 from sweep.model.beamlets import gaussian_quadrature
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.speckle_correlation import (
     TRANSFORM_REACH_BINS,
     TRANSFORM_SAMPLES_PER_BIN,
@@ -258,7 +257,7 @@ def folding_signs(shots: "Shots") -> np.ndarray:
     if shots.complex_record:
         return signs
     for s, segment in enumerate(shots.waveform_segments):
-        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease)
+        delay = segment.delay(shots.range)
         beat = segment.carrier * segment.doppler_ratio - segment.chirp_rate * delay * (
             1 + segment.doppler_ratio
         )
