@@ -405,8 +405,25 @@ def variance_of_grouped_draws(
 ) -> np.ndarray:
     """Return the variance with which a draw of a whole group counts for a mean over groups.
 
-    Parameters are those of :func:`grouped_mean_half_width`; the result is T^2 of the module's
-    description.
+    Parameters
+    ----------
+    variance : array_like
+        Unbiased variance s^2 of a single value.
+    group_variance : array_like
+        Unbiased variance of the mean of a whole group; nan if it is not known.
+    n_groups : array_like
+        Number R of whole groups.
+    group_size : int
+        Number g of values in a whole group.
+    confidence : array_like
+        Confidence, two-sided, 0..1.
+
+    Returns
+    -------
+    ndarray
+        T^2 = t^2 g V / z^2 with the variance V of a group's mean, if that is less than
+        :data:`GROUPED_VARIANCE_RATIO_MAX` times s^2, else s^2. t and z are the two-sided quantiles
+        of Student's distribution with R - 1 degrees of freedom and of the normal distribution.
     """
     groups = np.asarray(n_groups, float)
     z = two_sided_normal_quantile(confidence)

@@ -424,9 +424,14 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
 
 @njit(cache=True, error_model="numpy")
 def bin_speckle_at(speckle_table, segment, point):
-    """Return the :class:`BinSpeckle` of one segment of one point of a :class:`SpeckleTable`.
+    """Return the :class:`BinSpeckle` of one segment of one point.
 
-    ``segment`` and ``point`` are indices.
+    Parameters
+    ----------
+    speckle_table : SpeckleTable
+        Speckle parameters of all segments and points.
+    segment, point : int
+        Indices of the segment (up, Doppler, down) and of the point.
     """
     pseudo_variance_row = speckle_table.pseudo_variance_row[segment, point]
     n_bins = speckle_table.pseudo_variance_ratio.shape[1] if pseudo_variance_row > 0 else 0
@@ -788,9 +793,16 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_real_bin(bin_, real_noise_at_ends, fft_size):
-    """Test if the noise of bin number ``bin_`` is real, as at DC and Nyquist of a real record.
+    """Test if the noise of a bin is real, as at DC and Nyquist of a real record.
 
-    ``real_noise_at_ends`` and ``fft_size`` are fields of :class:`DetectionRule`.
+    Parameters
+    ----------
+    bin_ : int
+        Number of the bin.
+    real_noise_at_ends : bool
+        True if the noise at DC and Nyquist is real (:attr:`DetectionRule.real_noise_at_ends`).
+    fft_size : int
+        FFT size.
     """
     return real_noise_at_ends and (bin_ == 0 or 2 * bin_ == fft_size)
 

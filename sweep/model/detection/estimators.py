@@ -109,17 +109,75 @@ _NEWTON_REACH_BINS = 0.5
 
 
 def peak_bin(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the index of the peak bin; an :data:`Estimator`."""
+    """Return the index of the peak bin; an :data:`Estimator`.
+
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Not used.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+    """
     return peak.astype(float)
 
 
 def parabolic(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the vertex of the parabola through three magnitudes; an :data:`Estimator`."""
+    """Return the vertex of the parabola through three magnitudes; an :data:`Estimator`.
+
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Not used.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+
+    Notes
+    -----
+    With the magnitudes a, b and c of the bins below, at and above the peak, the vertex lies (a - c)
+    / (2 (a - 2 b + c)) bins above it.
+    """
     return peak + _parabola_vertex(np.abs(_three_bins(spectrum, peak)))
 
 
 def parabolic_log(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the vertex of the parabola through three log magnitudes; an :data:`Estimator`."""
+    """Return the vertex of the parabola through three log magnitudes; an :data:`Estimator`.
+
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Not used.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+
+    Notes
+    -----
+    The parabola of :func:`parabolic`, through ln |X|. It is exact for a Gaussian line [Smith and
+    Serra, PARSHL, 1987].
+    """
     with np.errstate(divide="ignore"):
         return peak + _parabola_vertex(np.log(np.abs(_three_bins(spectrum, peak))))
 
@@ -127,16 +185,52 @@ def parabolic_log(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSett
 def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """Estimate by Jacobsen's ratio of three complex bins times a factor; an :data:`Estimator`.
 
-    The factor depends on the window.
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Window and FFT size, on which sign and factor depend.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+
+    Notes
+    -----
+    The module's description has both forms of the ratio [Jacobsen and Kootsookos, IEEE Signal
+    Process. Mag. 24(3), 123, 2007].
     """
     sign, factor = jacobsen_coefficients(settings.window, settings.fft_size)
     return peak + factor * _jacobsen_ratio(_three_bins_about_middle(spectrum, peak, settings), sign)
 
 
 def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Estimate by Jacobsen's ratio of three complex bins; an :data:`Estimator`.
+    """Estimate by Jacobsen's ratio of three complex bins, without its bias; an :data:`Estimator`.
 
-    A table of the ratio for single tones in this window is inverted, so there is no bias.
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Window and FFT size, for which the ratio is tabulated.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+
+    Notes
+    -----
+    A table of the ratio for single tones in this window is inverted. The published factor [Candan,
+    IEEE Signal Process. Lett. 18, 351, 2011] is the slope of that curve at the bin.
     """
     offset, tone_bins = _tone_bins(settings.window, settings.fft_size)
     tone_ratios = np.maximum.accumulate(_jacobsen_ratio(tone_bins, 1))
@@ -148,7 +242,25 @@ def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -
 def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """Return the centroid of the power around the peak; an :data:`Estimator`.
 
-    The mean noise power is subtracted from each bin.
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Window and FFT size, which set the reach, and the mean noise power of a bin.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+
+    Notes
+    -----
+    sum_k k w_k / sum_k w_k over the bins within two resolution cells, with w_k = max(|X_k|^2 - P,
+    0) and the mean noise power P. The peak bin has at least the weight P.
     """
     reach_bins = math.ceil(_CENTROID_REACH_CELLS * settings.fft_size / settings.window.length)
     distance = np.arange(-reach_bins, reach_bins + 1)
@@ -166,7 +278,25 @@ def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
 def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """Return the positions of the maxima of spectra [bins]; an :data:`Estimator`.
 
-    A chirp-z transform samples each spectrum finely around its peak bin.
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Window, FFT size and kind of the record.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+
+    Notes
+    -----
+    A chirp-z transform samples each spectrum at every 1/32 bin around its peak [Rabiner, Schafer
+    and Rader, Bell Syst. Tech. J. 48, 1249, 1969]. A parabola refines the maximum.
     """
     zoom, positions = (
         _zoom_transform(settings.window.length, settings.fft_size),
@@ -190,7 +320,29 @@ def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) 
 def maximum_likelihood(
     spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings
 ) -> np.ndarray:
-    """Return the maximum-likelihood frequency of a tone in white noise; an :data:`Estimator`."""
+    """Return the maximum-likelihood frequency of a tone in white noise; an :data:`Estimator`.
+
+    Parameters
+    ----------
+    spectrum : ndarray (m, bins) complex
+        Spectra without or with noise [V]. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for
+        complex records, with the FFT size N.
+    peak : ndarray (m,) int64
+        Index of the peak's bin in each spectrum.
+    settings : SpectrumSettings
+        Window, FFT size and kind of the record.
+
+    Returns
+    -------
+    ndarray (m,)
+        Frequency of each peak, as a fractional index [bins].
+
+    Notes
+    -----
+    The window is undone, except in samples where it nearly vanishes, and Newton's method finds the
+    maximum of the spectrum near the estimate of :func:`candan`. For a real record this is repeated
+    without the tone's image [Rife and Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974].
+    """
     from sweep.model.detection.sub_bin_interpolation import complex_exponentials
 
     w = settings.taper

@@ -55,8 +55,12 @@ def joint_tail_quadrature(correlation: float) -> JointTailQuadrature:
 def joint_tail_excess(deviate, previous_deviate, quadrature):
     """Return P(S > s, T > t) - P(S > s) P(T > t) of correlated standard normal numbers S and T.
 
-    ``deviate`` is s and ``previous_deviate`` is t. ``quadrature`` is the
-    :class:`JointTailQuadrature` of the correlation of S and T.
+    Parameters
+    ----------
+    deviate, previous_deviate : float
+        Limits s and t.
+    quadrature : JointTailQuadrature
+        Quadrature for the correlation of S and T.
     """
     excess = 0.0
     for k in range(quadrature.sine.size):
@@ -71,9 +75,17 @@ def joint_tail_excess(deviate, previous_deviate, quadrature):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
-    """Compute :func:`joint_tail_excess` for a given ``correlation``, with 4 quadrature nodes.
+    """Return P(S > s, T > t) - P(S > s) P(T > t) with 4 quadrature nodes, for any correlation.
 
-    The result is less precise than the 12 nodes of a :class:`JointTailQuadrature`, and needs none.
+    The result is less precise than that of :func:`joint_tail_excess`, which has 12 nodes, and needs
+    no :class:`JointTailQuadrature`.
+
+    Parameters
+    ----------
+    deviate, previous_deviate : float
+        Limits s and t.
+    correlation : float
+        Correlation coefficient of the standard normal numbers S and T.
     """
     excess, half_angle = 0.0, 0.5 * math.asin(correlation)
     for j in range(_JOINT_TAIL_NODES.size):

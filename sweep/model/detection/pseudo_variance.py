@@ -240,13 +240,15 @@ def multilook_pd_and_miss_near_ends(
 
     Parameters
     ----------
-    signal, threshold_ratio
-        (m,): root mean square |X| and threshold over the noise per quadrature of one look.
-    signal_pseudo_variance, noise_pseudo_variance
-        (m,): pseudo-variance ratio q of the signal, and of the noise.
-    look_covariance
-        (m, k, k) complex: covariance of the echo amplitudes of k looks, of mean power 1, including
-        the rotation of the line's phase from look to look. k looks represent all N.
+    looks : Looks
+        Number of looks (records of each segment) and how they are combined.
+    signal, threshold_ratio : ndarray (m,)
+        Root mean square |X| and threshold over the noise per quadrature of one look.
+    signal_pseudo_variance, noise_pseudo_variance : ndarray (m,)
+        Pseudo-variance ratio q of the signal, and of the noise.
+    look_covariance : ndarray (m, k, k) complex
+        Covariance of the echo amplitudes of k looks, of mean power 1, including the rotation of the
+        line's phase from look to look. k looks represent all N.
 
     Notes
     -----

@@ -190,10 +190,21 @@ def tabulate_crossing_rates(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fill_rate_table(threshold_ratio, crossing_series, arrays):
-    """Compute the rates of :func:`tabulate_crossing_rates` into ``arrays``.
+    """Compute the rates of :func:`tabulate_crossing_rates` into arrays.
 
-    ``arrays`` is :class:`RateTableArrays`, large enough for this threshold. The result is the
-    :class:`RateTableGrid`.
+    Parameters
+    ----------
+    threshold_ratio : float
+        Threshold over sigma, the noise of a bin per quadrature.
+    crossing_series : ndarray
+        :func:`sweep.model.detection.added_crossings.fill_crossing_series` of ``threshold_ratio``.
+    arrays : RateTableArrays
+        Result, large enough for this threshold.
+
+    Returns
+    -------
+    RateTableGrid
+        Grid of the table.
     """
     threshold_ratio = max(threshold_ratio, _TABULATED_THRESHOLD_RATIO_MIN)
     grid = _rate_table_grid(threshold_ratio)
@@ -360,8 +371,15 @@ def add_entry_weights_of_bin(squared_ratio, rate_table, entry_weights):
     bin costs six additions here, and six for each speckle power in
     :func:`add_rates_by_speckle_power`.
 
-    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_speckle_power`.
-    ``entry_weights`` is changed in place; its size is that of :func:`count_entry_weights`.
+    Parameters
+    ----------
+    squared_ratio : float
+        Squared amplitude of the leaked signal over sigma^2, at mean speckle power. sigma is the
+        noise of a bin per quadrature.
+    rate_table : SpeckleCrossingRates
+        Crossing rates by squared amplitude and speckle power.
+    entry_weights : ndarray
+        Weights of the entries, changed in place; its size is that of :func:`count_entry_weights`.
     """
     place = _rate_table_place(squared_ratio, rate_table)
     w = _interpolation_weights(place.fraction, squared_ratio)
@@ -376,10 +394,16 @@ def add_entry_weights_of_bin(squared_ratio, rate_table, entry_weights):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_rates_from_entry_weights(entry_weights, rate_table, rate_sums):
-    """Add the crossing rates of all bins in ``entry_weights`` to sums by speckle power.
+    """Add the crossing rates of all bins, given by the weights of table entries, to sums by power.
 
-    ``entry_weights`` is filled by :func:`add_entry_weights_of_bin`; ``rate_table`` and
-    ``rate_sums`` are as in :func:`add_rates_by_speckle_power`.
+    Parameters
+    ----------
+    entry_weights : ndarray
+        Weights of the entries, filled by :func:`add_entry_weights_of_bin`.
+    rate_table : SpeckleCrossingRates
+        Crossing rates by squared amplitude and speckle power.
+    rate_sums : ndarray (N_SPECKLE_POWERS,)
+        Sums by speckle power, changed in place.
     """
     relative_rates = rate_table.relative_rates
     entries_per_power = np.uint64(rate_table.entries_per_power)

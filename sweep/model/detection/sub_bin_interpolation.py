@@ -401,10 +401,14 @@ def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size:
 
     Parameters
     ----------
-    offset
+    offset : ndarray
         Position of the tone in the middle of the record, relative to the centre bin [bins].
-    drift
+    drift : ndarray
         Linear change of the position over the whole record [bins].
+    window : Window
+        Window of the record.
+    fft_size : int
+        FFT size.
     """
     (error_factor,) = interpolate_tables(
         (_DRIFTS_BINS, _DRIFT_POSITIONS_BINS),
@@ -473,10 +477,19 @@ def late_echo_correction(
 
     Parameters
     ----------
-    offset
+    offset : ndarray
         Result of :func:`estimate_sub_bin_offset` [bins].
-    n_missing
+    n_missing : ndarray
         Number of samples at the record's start without an echo.
+    window : Window
+        Window of the record.
+    fft_size : int
+        FFT size.
+
+    Returns
+    -------
+    LateEchoCorrection
+        Shift of the offset [bins], and factor on its standard error.
     """
     missing_fraction = np.asarray(n_missing) / window.length
     shift_at, factor_at = interpolate_tables(
@@ -556,13 +569,15 @@ def line_spread_error(offset, line_deviation_bins, adds_powers, interpolation):
 
     Parameters
     ----------
-    offset
+    offset : float
         Offset from the centre bin [bins].
-    line_deviation_bins
+    line_deviation_bins : float
         Standard deviation of the lines' positions [bins].
-    adds_powers
+    adds_powers : bool
         True if the lines add as powers. If they add as amplitudes they may cancel, and the error is
         the whole spread.
+    interpolation : Interpolator
+        Interpolator of the window; its ``spread_error_factor`` is a table over the offset.
     """
     if not adds_powers:
         return line_deviation_bins

@@ -16,6 +16,11 @@ Sources of the tables:
   usual season), 1 and 5 (a global storm), after the record of Lemmon et al., Icarus 251, 2015, at
   0.88 um. Extinction by grains of 1.5 um is the same at 1.55 um to some 10 %.
 - Lidar ratios: haze 30 to 70 sr, Martian dust about 40 sr, water drops 18 sr.
+
+References
+----------
+The factor T^2 of transmission T is [T 4.4], which leaves the atmosphere's profile open. Backscatter
+is the single-scattering lidar equation (:func:`backscatter_integral`).
 """
 
 import itertools

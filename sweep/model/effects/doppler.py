@@ -13,6 +13,11 @@ R_b, at P_b = O + R_b d_b. The rotation contributes the closing speed -omega x (
 -omega x (O - X) . d_b, in which R_b cancels. Rotation is thus equivalent to a velocity
 -omega x (O - X) of the instrument, whatever the body's shape. Its component along the beam shifts
 the lines, and its component across the beam spreads them.
+
+References
+----------
+The shift is [T 2.8]. Spread and rotation are derived here; docs/physics.md, *Beats*, has the beat
+with all its terms.
 """
 
 from dataclasses import replace

@@ -128,10 +128,21 @@ class DrawAddresses(NamedTuple):
     (:mod:`sweep.model.sampling.draw_groups`); False for independent draws."""
 
     def uniforms(self, stream: int, count: int, *, are_polar: bool = False) -> np.ndarray:
-        """Return the first uniform numbers of a stream in each draw, (n, count).
+        """Return the first uniform numbers of a stream in each draw.
 
-        ``stream`` is the number of the physical cause. ``are_polar`` is True if the second number
-        of each pair is an angle in cycles.
+        Parameters
+        ----------
+        stream : int
+            Number of the stream, that is of the physical cause.
+        count : int
+            Number of uniform numbers.
+        are_polar : bool
+            True if the second number of each pair is an angle [cycles].
+
+        Returns
+        -------
+        ndarray (n, count)
+            Uniform numbers, 0..1, of the n points.
         """
         from sweep.model.sampling.draw_groups import grouped_uniforms
         from sweep.model.sampling.philox import uniforms

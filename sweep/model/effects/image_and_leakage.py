@@ -31,6 +31,11 @@ bin k. The detecting bin and its neighbours are excluded. By Parseval's theorem 
 have at most ENBW (the window's equivalent noise bandwidth in bins) times the power A^2, and the
 probability rises faster than a^2. So the sum is at most ENBW times that of
 one bin of A, or A^2 / b^2 times that of one at the threshold.
+
+References
+----------
+The sum of line and image is PHYSICS section 5 (:mod:`sweep.model.spectrum.bin_spectrum`). The
+probability of leakage is derived in :mod:`sweep.model.spectrum.leakage`.
 """
 
 import math

@@ -9,6 +9,11 @@ is
 so the image has |1 - g e^(i p)| / |1 + g e^(i p)| of the line's amplitude. The change of the line's
 own gain applies to noise as well and is neglected. The effect acts on the lines: each has a second
 one.
+
+References
+----------
+docs/physics.md, *Complex records*, has the image in figures. The equation follows from I and Q by
+Euler's formula.
 """
 
 from dataclasses import replace

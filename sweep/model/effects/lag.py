@@ -6,6 +6,11 @@ light that one mode collects, the fraction exp(-2 d^2 / (w_T^2 + w_L^2)) remains
 distance of the axes at the target, and w_T and w_L are the radii of the transmitted and the
 received beam at the target (:mod:`sweep.model.beam`). If all light in the aperture mixes, nothing
 is lost.
+
+References
+----------
+The fraction is the overlap of two Gaussian modes at a diffuse target, from the antenna theorem
+[Siegman, Appl. Opt. 5, 1966, 1588]; docs/physics.md, *Lag*.
 """
 
 from dataclasses import replace

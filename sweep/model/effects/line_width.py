@@ -4,6 +4,11 @@ The models of a Gaussian and of a Lorentzian line, with their sources, are in
 :mod:`sweep.model.laser_line`. A Gaussian line averages |X|^2 over frequency shifts. A Lorentzian
 line takes power from the pure line, and adds a pedestal of noise that comes with the echo. An echo
 that arrives within the record has the line and the pedestal of its own samples.
+
+References
+----------
+The Gaussian line is the convolution of [T]. The Lorentzian line's pedestal is that of Richter et
+al., IEEE J. Quantum Electron. 22, 2070, 1986; docs/physics.md, *Line width*.
 """
 
 from dataclasses import replace

@@ -3,6 +3,12 @@
 Each effect adds a noise variance at the ADC. Its error bound is that variance over the variance of
 the receiver's noise. Symbols in the equations: the elementary charge q, the detector's gain M,
 excess noise factor F and responsivity Re, the optical power P, and the electrical bandwidth B_e.
+
+References
+----------
+Shot noise is [T 2.22, 2.23] for any light P, in :mod:`sweep.model.receiver_chain`. That of the
+echo raises false alarms at short range [T 4.2]. Sunlight is Planck's law for the temperature of the
+sun, and rounding is Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9.
 """
 
 from collections.abc import Mapping

@@ -52,6 +52,12 @@ their bins. So
 An even error, as a drift within the record, thus counts in second order. Lines that add as
 amplitudes, or with their own images, change by <|phi|> of the sum of their amplitudes, whatever
 their sum is.
+
+References
+----------
+All phases are the exact beat phase of :mod:`sweep.model.waveform` for this delay, less its terms up
+to t (docs/physics.md, *Range walk and its like*). Simulated records of the exact delay check them
+(:mod:`sweep.model.time_domain_truth`).
 """
 
 import math

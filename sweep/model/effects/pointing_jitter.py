@@ -16,6 +16,11 @@ of every draw fades independently.
 
 The target's radial velocity is the component along the beam; the component across it may be stated
 too. The deflected beam sees v_r cos(t) + (v_a a + v_b b) sin(t)/t.
+
+References
+----------
+The equations are those of a rotation by t about an axis across the beam, derived here. PHYSICS
+section 7 lists the effect; docs/physics.md, *Pointing jitter*, has that of moving instruments.
 """
 
 import math

@@ -399,6 +399,20 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
     """Draw the scintillation of each shot's echo, the same in all its segments.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points, after all effects that are not random.
+    context : EffectContext
+        Parameters and ground of the points.
+    draw_addresses : DrawAddresses
+        Random key (n, 2) and draw number (n,) of each point. Equal addresses give equal shots.
+
+    Returns
+    -------
+    Shots
+        Shots whose echo power, beat amplitude, noise by the echo and pedestal are changed.
+
     Notes
     -----
     The factor multiplies the echo's power, its shot noise and the pedestal of phase noise. Its

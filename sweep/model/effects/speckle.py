@@ -194,16 +194,30 @@ _ZERO_DIVISOR_SUBSTITUTE = 1e-300
 def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
     """Draw the speckle of every beamlet, so that each point has a footprint of its own.
 
-    Notes
-    -----
-    The amplitude of beamlet b is multiplied by g_b = sqrt(kappa) u_b + sqrt(1 - kappa) z_b, with
-    kappa = exp(-(4 pi sigma_h / lambda)^2), as the module's description states.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points, after all effects that are not random.
+    context : EffectContext
+        Parameters and ground of the points.
+    draw_addresses : DrawAddresses
+        Random key (n, 2) and draw number (n,) of each point. Equal addresses give equal shots.
+
+    Returns
+    -------
+    Shots
+        Shots with drawn amplitudes and phases of beamlets, (n, beamlets).
 
     Raises
     ------
     ValueError
         For direct detection, which sums the intensities of all speckles in the aperture: that is
         not a factor on each beamlet's echo.
+
+    Notes
+    -----
+    The amplitude of beamlet b is multiplied by g_b = sqrt(kappa) u_b + sqrt(1 - kappa) z_b, with
+    kappa = exp(-(4 pi sigma_h / lambda)^2), as the module's description states.
     """
     if shots.waveform.architecture == "direct":
         raise ValueError(

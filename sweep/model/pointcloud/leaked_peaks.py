@@ -307,10 +307,25 @@ def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
 def fading_group_of_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> np.ndarray:
-    """Return the index of the group (echo) with whose speckle each bin of leaked signal fades.
+    """Return the group (echo) with whose speckle each bin of leaked signal fades.
 
-    It is the group whose strongest bin is nearest. ``points`` are the indices of the points of
-    ``spectra``. Bins of a complex record are periodic.
+    It is the group whose strongest bin is nearest. Bins of a complex record are periodic.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    groups : BinGroups
+        Groups of adjacent bins above the threshold, without noise: the echoes.
+    points : ndarray (m,) int64
+        Indices of the points of ``spectra``.
+    spectra : NoiselessSpectra
+        Spectra of the points, which list their bins of leaked signal.
+
+    Returns
+    -------
+    ndarray (bins,) int64
+        Index of the group in the segment of each bin.
     """
     bins = _leaked_bins(spectra)
     group_bins = groups.strongest_bin[points[bins.batch_index], bins.segment]
@@ -325,8 +340,23 @@ def bins_without_noise_peaks(
 ) -> LeakageBins:
     """List the bins of leaked signal as bins in which noise alone raises no false peak.
 
-    Their noise is drawn together with the signal instead. The result raises no leaked peaks. Its
-    ``group`` holds the group of each listed bin.
+    Their noise is drawn together with the signal instead.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    groups : BinGroups
+        Groups of adjacent bins above the threshold, without noise: the echoes.
+    points : ndarray (m,) int64
+        Indices of the points of ``spectra``.
+    spectra : NoiselessSpectra
+        Spectra of the points, which list their bins of leaked signal.
+
+    Returns
+    -------
+    LeakageBins
+        Bins that raise no leaked peaks. ``group`` holds the group of each listed bin.
     """
     return LeakageBins.empty(points.size)._replace(
         group=fading_group_of_bins(shots, groups, points, spectra),
@@ -339,7 +369,24 @@ def bins_without_noise_peaks(
 def iter_leakage_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray
 ) -> Iterator[tuple[np.ndarray, LeakageBins]]:
-    """Yield indices of points in batches, with the bins in which leaked signal may raise peaks."""
+    """Yield points in batches, with the bins in which leaked signal may raise peaks.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    groups : BinGroups
+        Groups of adjacent bins above the threshold, without noise: the echoes.
+    points : ndarray (m,) int64
+        Indices of the points that may have such bins (:func:`find_leaking_points`).
+
+    Yields
+    ------
+    batch : ndarray (k,) int64
+        Indices of the batch's points.
+    leakage_bins : LeakageBins
+        Their bins of leaked signal.
+    """
     if shots.permanent_line is None:
         for spans in _iter_leaking_spans(shots, points):
             yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
@@ -1227,10 +1274,25 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def insert_peak(bin_number, ratio, peak_bins, peak_ratios, n_peaks):
-    """Insert a peak into a list sorted by strength, and return the new number of peaks.
+    """Insert a peak into a list sorted by strength, strongest first.
 
-    The peak has |X| / sigma = ``ratio`` in bin ``bin_number``, which is ignored if it is -1. If the
-    list is full, its weakest peak is dropped.
+    If the list is full, its weakest peak is dropped.
+
+    Parameters
+    ----------
+    bin_number : int
+        Bin of the peak; -1 for no peak, which leaves the list as it is.
+    ratio : float
+        |X| of the bin over sigma, the noise of a bin per quadrature.
+    peak_bins, peak_ratios : ndarray (peaks,)
+        List of bins and of |X| / sigma, changed in place.
+    n_peaks : int
+        Number of peaks in the list.
+
+    Returns
+    -------
+    int
+        New number of peaks.
     """
     if bin_number < 0:
         return n_peaks

@@ -475,7 +475,18 @@ class DrawConfig(NamedTuple):
 
     @classmethod
     def from_shots(cls, shots: Shots, first_draw: int, in_noise: bool) -> "DrawConfig":
-        """Return the settings for draws of prepared shots, from draw number ``first_draw`` on."""
+        """Return the settings for draws of prepared shots.
+
+        Parameters
+        ----------
+        shots : Shots
+            Prepared shots.
+        first_draw : int
+            Number of the first draw that is made.
+        in_noise : bool
+            True to add noise to the bins of an echo; False to compare random numbers with
+            probabilities of detection.
+        """
         two_beat_reading = (
             waveform.FAST_READING
             if shots.detection_settings.two_beat_assumption == waveform.FAST_TARGET
@@ -714,9 +725,19 @@ def make_draw_inputs(
 ) -> DrawInputs:
     """Return the quantities of shots on which draws of their peaks depend.
 
-    ``bin_groups`` are the groups of adjacent bins above the threshold. ``motion`` is the known
-    motion of the instrument, as in :func:`draw_returns`. The result has as many groups as the
-    segment with the most.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points.
+    bin_groups : BinGroups
+        Groups of adjacent bins above the threshold in the shots' noiseless spectra.
+    motion : EgoMotion, optional
+        Known motion of the instrument, which corrects range and velocity; None to correct nothing.
+
+    Returns
+    -------
+    DrawInputs
+        Quantities of the n points. They have as many groups as the segment with the most.
     """
     bin_groups = bin_groups.without_unused_groups()
     line_positions, beamlet_amplitude = (
@@ -1615,7 +1636,25 @@ def empty_group_speckle(groups_max):
 
 @njit(cache=True, error_model="numpy")
 def prepare_group_speckle(point, config, inputs, spectra):
-    """Return the bins of a point's echoes for which speckle is drawn, with their mean powers."""
+    """Return the bins of a point's echoes for which speckle is drawn, with their mean powers.
+
+    Parameters
+    ----------
+    point : int
+        Index of the point.
+    config : DrawConfig
+        Settings common to all points.
+    inputs : DrawInputs
+        Quantities of all points.
+    spectra : NoiselessSpectra
+        Magnitudes, over sigma, of the bins around the lines of all points. sigma is the noise of a
+        bin per quadrature.
+
+    Returns
+    -------
+    GroupSpeckle
+        Bins and mean powers of the echoes; its amplitudes are set in each draw.
+    """
     (_, _, groups_max), n_bins_max = inputs.strongest_bin.shape, 0
     first_bin, n_bins = np.zeros((groups_max, 3), np.int64), np.zeros((groups_max, 3), np.int64)
     for g in range(groups_max):
@@ -1729,11 +1768,31 @@ def prepare_group_speckle(point, config, inputs, spectra):
 def fill_pd_amplitude_bin_weights(
     point, segment, group, config, inputs, first_bin, mean_power, factor_rank, factor, weights
 ):
-    """Compute the weights (bins,) of an echo's bins in the amplitude that decides on its detection.
+    """Compute the weights of an echo's bins in the amplitude that decides on its detection.
 
     With ``peak_bin`` only the strongest bin has a weight. If any bin detects, the bins are weighted
     as a lone line in the middle of the echo would fill them. The amplitudes of two segments then
     have the same correlation as in the middle of the echo.
+
+    Parameters
+    ----------
+    point, segment, group : int
+        Indices of the point, of its segment (up, Doppler, down) and of the echo. An echo is a group
+        of adjacent bins.
+    config : DrawConfig
+        Settings common to all points.
+    inputs : DrawInputs
+        Quantities of all points.
+    first_bin : ndarray (groups, 3) int64
+        Number of each echo's first bin, by segment.
+    mean_power : ndarray (groups, 3, bins)
+        Mean power of each bin over speckle, for lines of the total power 1.
+    factor_rank : ndarray (groups,) int64
+        Number of rows of ``factor`` in use; 0 if the speckle is summed over lines.
+    factor : ndarray (groups, rows, 3, bins) complex
+        Factor of the covariance of the bins' speckle.
+    weights : ndarray (bins,)
+        Result: weight of each bin's speckle, such that the amplitude has the mean power 1.
     """
     weights[:] = 0.0
     weights[inputs.strongest_bin[point, segment, group] - first_bin[group, segment]] = 1.0
@@ -1757,8 +1816,18 @@ def fill_pd_amplitude_bin_weights(
 def draw_group_speckle(address, point, inputs, speckle, speckle_factors):
     """Draw the speckle of a point's echoes, and set factors on their magnitudes.
 
-    ``speckle_factors`` (groups, 3), a result, has one row for each echo (group of adjacent bins)
-    and one column for each segment. The complex amplitudes are written into ``speckle``.
+    Parameters
+    ----------
+    address : DrawAddress
+        Keys and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point : int
+        Index of the point.
+    inputs : DrawInputs
+        Quantities of all points.
+    speckle : GroupSpeckle
+        Bins of the point's echoes; the complex ``amplitudes`` are set.
+    speckle_factors : ndarray (groups, 3)
+        Result: factor on the magnitude of each echo (group of adjacent bins) in each segment.
     """
     n_groups, n_looks, _, _ = speckle.amplitudes.shape
     n_independent_sets = len(speckle.independent_amplitudes)
@@ -1811,7 +1880,14 @@ def draw_group_speckle(address, point, inputs, speckle, speckle_factors):
 def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes):
     """Mix independent speckle into the correlated speckle of looks (records of each segment).
 
-    Independent amplitudes are (sets, 3, bins) complex, those of the looks (looks, 3, bins).
+    Parameters
+    ----------
+    covariance_root : ndarray (3, looks, sets) complex
+        Coefficients of each independent set in each look, by segment.
+    independent_amplitudes : ndarray (sets, 3, bins) complex
+        Independent factors by speckle, of mean power 1.
+    look_amplitudes : ndarray (looks, 3, bins) complex
+        Result: factors by speckle in each look.
     """
     look_amplitudes[:] = 0.0
     n_sets, _, n_bins = independent_amplitudes.shape
@@ -2124,12 +2200,35 @@ def list_noisy_leaked_peaks(
     bins,
     ratios,
 ):
-    """List the strongest peaks of bins of leaked signal with their noise; return their number.
+    """List the strongest peaks of bins of leaked signal with their noise.
 
     Adjacent bins that reach the threshold make one peak, in the largest bin. They belong to the
-    echo if they are adjacent to a crossing bin of the echo. ``speckle_factors`` (groups,) are
-    factors on the groups' magnitudes. ``bins`` and ``ratios``, the results, are the bins and |X| /
-    sigma of the peaks.
+    echo, and are not listed, if they are adjacent to a crossing bin of the echo.
+
+    Parameters
+    ----------
+    address : DrawAddress
+        Keys and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment : int
+        Indices of the point and of its segment (up, Doppler, down).
+    spectra : NoiselessSpectra
+        Bins of leaked signal of all points, with |X| / sigma. sigma is the noise of a bin per
+        quadrature.
+    leakage_bins : LeakageBins
+        Bins of leaked signal; ``group`` is the echo with whose speckle each bin fades.
+    speckle_factors : ndarray (groups,)
+        Factors by speckle on the magnitudes of the point's echoes in this segment.
+    threshold_ratio : float
+        Threshold over sigma.
+    interpolation : Interpolator
+        Interpolator of the window; it has the noise correlation of adjacent bins.
+    bins, ratios : ndarray (groups + 1,)
+        Results: bin number, and |X| / sigma, of each peak, the strongest first.
+
+    Returns
+    -------
+    int
+        Number of peaks.
     """
     key_0, key_1, draw = address
     n_peaks, previous_bin, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
@@ -2175,12 +2274,24 @@ def draw_peak_bin(
 
     Parameters
     ----------
-    address
-        Address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
-    point, segment, group
-        Indices of the point, the segment and the echo (group of adjacent bins).
-    config, inputs, spectra, speckle, interpolation, workspace
-        Arguments of :func:`draw_segment_peaks`.
+    address : DrawAddress
+        Keys and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment, group : int
+        Indices of the point, of its segment (up, Doppler, down) and of the echo. An echo is a group
+        of adjacent bins.
+    config : DrawConfig
+        Settings common to all points.
+    inputs : DrawInputs
+        Quantities of all points.
+    spectra : NoiselessSpectra
+        Magnitudes, over sigma, of the bins around the lines of all points. sigma is the noise of a
+        bin per quadrature.
+    speckle : GroupSpeckle
+        Speckle of this draw in the bins of the point's echoes.
+    interpolation : Interpolator
+        Interpolator of the window, for the position between bins.
+    workspace : DrawWorkspace
+        Scratch arrays.
 
     Returns
     -------
@@ -2271,7 +2382,19 @@ def draw_peak_bin(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
-    """Return the complex amplitude of a bin of an echo in a draw: rms magnitude times speckle."""
+    """Return the complex amplitude of a bin of an echo in a draw: rms magnitude times speckle.
+
+    Parameters
+    ----------
+    magnitude : float
+        Root mean square magnitude of the bin over speckle, in any unit.
+    speckle : GroupSpeckle
+        Speckle of the draw.
+    group, segment : int
+        Indices of the echo (group of adjacent bins) and of the segment.
+    bin_index : int
+        Index of the bin, counted from the echo's first bin.
+    """
     if speckle.n_bins[group, segment] == 0:
         return complex(magnitude, 0.0)
     return magnitude * speckle.amplitudes[group, 0, segment, bin_index]
@@ -2281,10 +2404,35 @@ def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
 def detect_in_speckle(
     address, point, segment, group, config, inputs, speckle, interpolation, workspace
 ):
-    """Draw an echo in developed speckle; return True if it is detected, and its :class:`Peak`.
+    """Draw an echo in developed speckle, detected with its probability of detection.
 
-    The arguments and results are those of :func:`draw_peak_bin`.
+    Parameters
+    ----------
+    address : DrawAddress
+        Keys and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment, group : int
+        Indices of the point, of its segment (up, Doppler, down) and of the echo. An echo is a group
+        of adjacent bins.
+    config : DrawConfig
+        Settings common to all points.
+    inputs : DrawInputs
+        Quantities of all points.
+    speckle : GroupSpeckle
+        Speckle of this draw in the bins of the point's echoes.
+    interpolation : Interpolator
+        Interpolator of the window, for the position between bins.
+    workspace : DrawWorkspace
+        Scratch arrays.
 
+    Returns
+    -------
+    is_detected : bool
+        True if the echo is detected.
+    peak : Peak
+        Its peak; UNDETECTED_PEAK if it is not detected.
+
+    Notes
+    -----
     The group's amplitude is a complex Gaussian number: echo plus noise, with ``echo_fraction`` of
     the mean power in the echo. The group is detected if its power exceeds the level that is
     exceeded with the group's probability of detection. So segments are detected together as two
@@ -2419,8 +2567,18 @@ strongest. Each echo has a range of indices."""
 def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_pd):
     """Return True if an echo is detected by an independent bin other than its strongest bin.
 
-    ``single_bin_pd`` is the probability of detection of one bin. The last of the bins is a fraction
-    of one.
+    Parameters
+    ----------
+    address : DrawAddress
+        Keys and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment, group : int
+        Indices of the point, of its segment (up, Doppler, down) and of the echo. An echo is a group
+        of adjacent bins.
+    inputs : DrawInputs
+        Quantities of all points. ``n_independent_bins`` is the number of bins, of which the last is
+        a fraction of one.
+    single_bin_pd : float
+        Probability of detection of one bin, 0..1.
     """
     key_0, key_1, draw = address
     n_bins_left, echo_fraction = (
@@ -2478,7 +2636,15 @@ def draw_adjacent_noise(address, stream, first_index, first_bin, n_bins, config,
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def is_near_end(first_bin, n_bins, config):
-    """Return True if any of the adjacent bins has non-circular noise, near DC or Nyquist."""
+    """Return True if any of adjacent bins has non-circular noise, near DC or Nyquist.
+
+    Parameters
+    ----------
+    first_bin, n_bins : int
+        First bin, and number of bins.
+    config : DrawConfig
+        Settings; ``noise_pseudo_variance_ratio`` has one value for each bin with such noise.
+    """
     n_near_bins = config.noise_pseudo_variance_ratio.size
     return n_near_bins > 0 and (
         first_bin < n_near_bins or first_bin + n_bins - 1 > config.nyquist_bin - n_near_bins
@@ -2489,8 +2655,25 @@ def is_near_end(first_bin, n_bins, config):
 def draw_noise_near_end(address, stream, first_index, first_bin, n_bins, config, noise):
     """Draw the noise of adjacent bins near frequency 0 (DC) or Nyquist.
 
-    The arguments are those of :func:`draw_adjacent_noise`. Bins beyond either end are complex
-    conjugates of their mirror images.
+    Bins beyond either end are complex conjugates of their mirror images.
+
+    Parameters
+    ----------
+    address : DrawAddress
+        Keys and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    stream : int
+        Number of the random stream.
+    first_index : int
+        Index in the stream of the first pair of independent numbers.
+    first_bin : int
+        First bin, which may be negative.
+    n_bins : int
+        Number of bins.
+    config : DrawConfig
+        Settings; ``end_noise_filter`` is the filter for these bins.
+    noise : NoiseScratch
+        Result: noise of each bin in both quadratures, over its standard deviation per quadrature.
+        It has at least as many bins as ``end_noise_filter``.
     """
     last_bin = first_bin + n_bins - 1
     drawn_first, drawn_last = 0, max(last_bin, -first_bin)
@@ -2567,8 +2750,35 @@ def draw_all_bins(
 ):
     """Add noise to all bins of an echo, and detect the echo if any reaches the threshold.
 
-    The arguments and results are those of :func:`draw_peak_bin`. The peak is the largest of these
-    bins.
+    The peak is the largest of these bins.
+
+    Parameters
+    ----------
+    address : DrawAddress
+        Keys and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    point, segment, group : int
+        Indices of the point, of its segment (up, Doppler, down) and of the echo. An echo is a group
+        of adjacent bins.
+    config : DrawConfig
+        Settings common to all points.
+    inputs : DrawInputs
+        Quantities of all points.
+    spectra : NoiselessSpectra
+        Magnitudes, over sigma, of the bins around the lines of all points. sigma is the noise of a
+        bin per quadrature.
+    speckle : GroupSpeckle
+        Speckle of this draw in the bins of the point's echoes.
+    interpolation : Interpolator
+        Interpolator of the window, for the position between bins.
+    workspace : DrawWorkspace
+        Scratch arrays.
+
+    Returns
+    -------
+    is_detected : bool
+        True if the echo is detected.
+    peak : Peak
+        Its peak; UNDETECTED_PEAK if it is not detected.
     """
     noise_sigma, threshold_ratio = inputs.noise_sigma[point], inputs.threshold_ratio[point]
     line_noise_ratio = inputs.line_noise_ratio[point]
@@ -2656,8 +2866,29 @@ def draw_all_bins(
 def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, interpolation):
     """Return a peak, mirrored into 0..N/2 if it is beyond DC or Nyquist.
 
-    N is the FFT size. A peak of a complex record wraps from N/2 to -N/2. The error by the spread of
-    lines (`line_deviation`, [bins]) is added to `noise_error`, that by noise [bins].
+    N is the FFT size. A peak of a complex record wraps from N/2 to -N/2.
+
+    Parameters
+    ----------
+    bin_number : int
+        Number of the peak's largest bin, which may lie beyond DC or Nyquist.
+    position : float
+        Position between bins [bins].
+    noise_error : float
+        Standard error of the position by noise [bins].
+    ratio : float
+        |X| of the largest bin over sigma, the noise of a bin per quadrature.
+    line_deviation : float
+        Standard deviation of the positions of the footprint's lines [bins].
+    config : DrawConfig
+        Settings common to all points.
+    interpolation : Interpolator
+        Interpolator of the window.
+
+    Returns
+    -------
+    Peak
+        Largest bin, position, standard error by noise and by the spread of lines, and ratio.
     """
     fft_size = 2 * config.nyquist_bin
     if config.down_beat_sign:
@@ -2680,7 +2911,21 @@ def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def store_peak(peak, group, segment, index, peak_lists):
-    """Store a peak of a group (or FALSE_PEAK_GROUP) as number ``index`` of a segment's list."""
+    """Store a peak in a segment's list.
+
+    Parameters
+    ----------
+    peak : Peak
+        Peak of a group of adjacent bins, or a false one.
+    group : int
+        Index of the group, or FALSE_PEAK_GROUP.
+    segment : int
+        Index of the segment (up, Doppler, down).
+    index : int
+        Index in the list.
+    peak_lists : PeakLists
+        Lists of the three segments, of which one element is set.
+    """
     peaks = peak_lists.peaks
     peaks.bin[segment, index], peaks.position[segment, index] = peak.bin, peak.position
     peaks.position_error[segment, index] = peak.position_error

@@ -654,7 +654,23 @@ def add_footprint_records(
 ) -> SegmentSignal:
     """Return a segment's signal with the records that draws of its speckle need.
 
-    These are :attr:`SegmentSignal.footprint_records` and :attr:`SegmentSignal.record_scalings`.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    point : int
+        Index of the point.
+    signal : SegmentSignal
+        Signal of one segment without noise.
+    line_grid : SpeckleLineGrid
+        Lines that represent the footprints in developed speckle.
+
+    Returns
+    -------
+    SegmentSignal
+        The signal with :attr:`SegmentSignal.footprint_records` and
+        :attr:`SegmentSignal.record_scalings`. It has no records where none are needed: without
+        developed speckle, for lines that spread too far, and for an echo without samples.
     """
     if shots.speckle.line_gradients is None:
         return signal
@@ -720,12 +736,24 @@ def _draw_speckle_from_records(
 def iter_look_spectra(
     point_spectra: "PointSpectra", segment: int, draws: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Draw and yield complex noisy spectra (m, bins) of a segment [V], look by look.
+    """Draw and yield complex noisy spectra of a segment, look by look.
 
-    A look is one record of the segment.
+    A look is one record of the segment. If looks are added in amplitude, only their mean is
+    yielded.
 
-    If looks are added in amplitude, only their mean is yielded. ``draws`` (m,) int64 are the
-    numbers of the draws.
+    Parameters
+    ----------
+    point_spectra : PointSpectra
+        Signals of a point, with the random key of its draws.
+    segment : int
+        Index of the segment: up, Doppler, down.
+    draws : ndarray (m,) int64
+        Numbers of the draws.
+
+    Yields
+    ------
+    ndarray (m, bins) complex
+        Spectra of one look with noise [V, summed over the record].
     """
     looks, look_sum = point_spectra.shots.looks, np.zeros(1, complex)
     for look, shots in enumerate(point_spectra.look_shots):
@@ -988,10 +1016,21 @@ def flag_detected_bins(
 def estimate_positions(
     spectra: Sequence[np.ndarray], peak_bins: np.ndarray, point_spectra: PointSpectra
 ) -> np.ndarray:
-    """Estimate the positions (m,) of peaks, as fractional indices, averaged over looks (records).
+    """Estimate the positions of peaks, averaged over looks (records of a segment).
 
-    ``spectra`` are the complex spectra (m, bins) of each look [V], and ``peak_bins`` (m,) the
-    indices of the peaks.
+    Parameters
+    ----------
+    spectra : sequence of ndarray (m, bins) complex
+        Spectra of each look [V].
+    peak_bins : ndarray (m,) int64
+        Indices of the peaks' bins.
+    point_spectra : PointSpectra
+        Point to which the spectra belong; it has the estimator and its settings.
+
+    Returns
+    -------
+    ndarray (m,)
+        Positions as fractional indices [bins].
     """
     positions = [
         point_spectra.estimate(spectrum, peak_bins, point_spectra.settings) for spectrum in spectra

@@ -127,9 +127,23 @@ def _philox_round(x0, x1, x2, x3, key0, key1):
 
 @njit(cache=True)
 def four_words(key0, key1, draw, stream, block):
-    """Return the four random words (uint64) of block number ``block`` of a stream.
+    """Return four random words of a stream.
 
-    ``key0`` and ``key1`` are the random key of a point, and ``draw`` is the number of the draw.
+    Parameters
+    ----------
+    key0, key1 : uint64
+        Random key of a point.
+    draw : int
+        Number of the draw.
+    stream : int
+        Number of the stream, that is of the physical cause.
+    block : int
+        Number of the block of four words.
+
+    Returns
+    -------
+    tuple of four uint64
+        Random words.
     """
     k0, k1 = np.uint64(key0), np.uint64(key1)
     x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
@@ -200,19 +214,41 @@ def to_normals(word0, word1):
 
 @njit(cache=True)
 def uniform(key0, key1, draw, stream, index):
-    """Return one uniform random number: number ``index`` of a stream in a draw.
+    """Return one uniform random number of a stream in a draw.
 
     The number is between 2^-53 and 1 - 2^-53. An event of a probability below 2^-53 = 1.1e-16 never
     happens in a comparison with it.
+
+    Parameters
+    ----------
+    key0, key1 : uint64
+        Random key of a point.
+    draw : int
+        Number of the draw.
+    stream : int
+        Number of the stream, that is of the physical cause.
+    index : int
+        Index of the number in the stream.
     """
     return to_uniform(four_words(key0, key1, draw, stream, index >> 2)[index & 3])
 
 
 @njit(cache=True)
 def normal_pair(key0, key1, draw, stream, index):
-    """Return two standard normal random numbers: pair number ``index`` of a stream in a draw.
+    """Return two standard normal random numbers of a stream in a draw.
 
     The two numbers are made from the uniform numbers ``2 index`` and ``2 index + 1``.
+
+    Parameters
+    ----------
+    key0, key1 : uint64
+        Random key of a point.
+    draw : int
+        Number of the draw.
+    stream : int
+        Number of the stream, that is of the physical cause.
+    index : int
+        Index of the pair in the stream.
     """
     words = four_words(key0, key1, draw, stream, index >> 1)
     return to_normals(words[2], words[3]) if index & 1 else to_normals(words[0], words[1])

@@ -328,8 +328,23 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
 def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
     """Add the lines' spectrum to ``field``, only in bins that the line-shape table contains.
 
-    The bins are those of ``n_bins`` from ``first_bin`` on. Each line is spread over cells around
-    its position. The table holds the spectrum of a line in a cell.
+    Each line is spread over cells around its position. The table holds the spectrum of a line in a
+    cell.
+
+    Parameters
+    ----------
+    first_bin : int
+        First bin, counted from the lines' origin.
+    n_bins : int
+        Number of bins.
+    bundle : LineBundle
+        Number and range of the lines in ``field.lines``.
+    shape : LineShape
+        Shape of the lines, with its table (:class:`sweep.model.spectrum.line_shape.LineShape`).
+    layout : SpectrumLayout
+        Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
+    field : FieldWorkspace
+        Lines and scratch arrays. The results are ``re`` and ``im`` [V], to which is added.
     """
     fft_size, cells_per_bin = layout.fft_size, layout.cells_per_bin
     lines, last_line_bin = field.lines, math.floor(bundle.highest_position)
@@ -497,8 +512,16 @@ def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layo
 def far_line_weight(weight_sum, n_sources, layout, sources):
     """Return the total weight [V] of the lines that determines the spectrum in bins far from them.
 
-    ``weight_sum`` is :attr:`LineBundle.weight_sum`, an upper limit of the result. ``sources`` are
-    the :class:`EndStrengths` of ``n_sources`` equivalent lines.
+    Parameters
+    ----------
+    weight_sum : float
+        Sum of the magnitudes of the lines' weights [V], an upper limit of the result.
+    n_sources : int
+        Number of equivalent lines.
+    layout : SpectrumLayout
+        Sizes and type of the spectrum.
+    sources : EndStrengths
+        Equivalent lines, with their amplitudes at both ends of the record.
     """
     start_sum, end_sum = 0.0, 0.0
     for source in range(n_sources):
@@ -512,7 +535,14 @@ def far_line_weight(weight_sum, n_sources, layout, sources):
 def tangent_at(bin_, fft_size, bin_tangents):
     """Return tan(pi k / N) of any bin k, for the FFT size N.
 
-    ``bin_tangents`` holds the values of bins 0 .. N/2.
+    Parameters
+    ----------
+    bin_ : int
+        Bin k, of either sign.
+    fft_size : int
+        FFT size N.
+    bin_tangents : ndarray (N/2 + 1,)
+        tan(pi k / N) of bins k = 0 .. N/2.
     """
     bin_ %= fft_size
     return bin_tangents[bin_] if 2 * bin_ <= fft_size else -bin_tangents[fft_size - bin_]
@@ -520,10 +550,22 @@ def tangent_at(bin_, fft_size, bin_tangents):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def prepare_far_bins(first_bin, n_bins, layout, bin_tangents, far_bins):
-    """Compute tan(pi k / N) and exp(i pi k L / N) of a batch of bins k into ``far_bins``.
+    """Compute tan(pi k / N) and exp(i pi k L / N) of a batch of bins k.
 
-    N is the FFT size, L the number of samples. ``n_bins`` is at most FAR_BINS_PER_BATCH.
-    ``bin_tangents`` holds the bin_tangents of bins 0 .. N/2.
+    N is the FFT size, L the number of samples.
+
+    Parameters
+    ----------
+    first_bin : int
+        First bin k.
+    n_bins : int
+        Number of bins, at most FAR_BINS_PER_BATCH.
+    layout : SpectrumLayout
+        Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
+    bin_tangents : ndarray (N/2 + 1,)
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
+    far_bins : FarBins
+        Results are ``tangent``, ``phasor_re`` and ``phasor_im``.
     """
     fft_size = layout.fft_size
     k = first_bin % fft_size
@@ -747,7 +789,18 @@ def bins_to_nearest_line(first_bin, n_bins, lowest_position, highest_position, f
     """Return the smallest distance [bins] between a range of bins and the lines.
 
     The result is 0 if the range reaches between the lines. Distances are measured around the circle
-    of all ``fft_size`` bins.
+    of all bins.
+
+    Parameters
+    ----------
+    first_bin : int
+        First bin, counted from the lines' origin.
+    n_bins : int
+        Number of bins.
+    lowest_position, highest_position : float
+        Lowest and highest line [bins from the lines' origin].
+    fft_size : int
+        FFT size N, the number of bins on the circle.
     """
     centre_distance = first_bin + 0.5 * (n_bins - 1) - 0.5 * (lowest_position + highest_position)
     centre_distance = abs(centre_distance - fft_size * np.rint(centre_distance / fft_size))
@@ -779,9 +832,27 @@ def compute_magnitudes(
 ):
     """Compute the magnitude of the spectrum in ``n_bins`` bins, into ``workspace.span.magnitude``.
 
-    The first bin is ``first_bin``, counted from DC. Other parameters are those of
-    :func:`compute_field`, with :class:`AveragingShifts` over which the squared magnitude is
-    averaged, and a :class:`SpectrumWorkspace`.
+    Parameters
+    ----------
+    first_bin : int
+        First bin, counted from DC.
+    n_bins : int
+        Number of bins.
+    bundle : LineBundle
+        Number, range and total weight of the lines, which are in ``workspace.field.lines``.
+    negligible_ratio : float
+        Allowed error of |X| over the sum of the lines' amplitudes.
+    shifts : AveragingShifts
+        Frequency shifts over which |X|^2 is averaged; empty for no average.
+    shape : LineShape
+        Shape of the lines (:class:`sweep.model.spectrum.line_shape.LineShape`).
+    layout : SpectrumLayout
+        Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
+    bin_tangents : ndarray (N/2 + 1,)
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
+    workspace : SpectrumWorkspace
+        Lines and scratch arrays. The result is ``span.magnitude``, |X| [V, summed over the record]
+        of each bin without noise.
     """
     field, span = workspace.field, workspace.span
     is_mirror_image = is_mirrored(
@@ -855,11 +926,19 @@ def compute_magnitudes(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def distance_below_level(level, weight_sum, envelope):
-    """Return the distance [bins] from the lines beyond which their spectrum stays below ``level``.
+    """Return the distance [bins] from the lines beyond which their spectrum stays below a level.
 
-    ``weight_sum`` is the lines' total weight [V], ``level`` a magnitude [V]. ``envelope`` is a
-    :class:`sweep.model.spectrum.line_shape.LineEnvelope`. The result is infinite if the lines
-    exceed the level at any distance.
+    The result is infinite if the lines exceed the level at any distance.
+
+    Parameters
+    ----------
+    level : float
+        Magnitude |X| [V].
+    weight_sum : float
+        Sum of the magnitudes of the lines' weights [V].
+    envelope : LineEnvelope
+        Upper envelope of a line's spectrum
+        (:class:`sweep.model.spectrum.line_shape.LineEnvelope`).
     """
     if not weight_sum > 0.0:
         return 1.0
@@ -879,7 +958,16 @@ def distance_below_level(level, weight_sum, envelope):
 def is_mirrored(origin_bin, lowest_position, highest_position, spectrum_type):
     """Return true if a real record shows lines of negative frequency at the opposite frequency.
 
-    The lines' frequencies are given in bins from ``origin_bin``. The middle of their range decides.
+    The middle of the lines' range decides.
+
+    Parameters
+    ----------
+    origin_bin : int
+        Bin from which positions of lines count.
+    lowest_position, highest_position : float
+        Lowest and highest line [bins from ``origin_bin``].
+    spectrum_type : int
+        Type of the spectrum, such as COMPLEX_RECORD, whose lines are never mirrored.
     """
     return (
         origin_bin + 0.5 * (lowest_position + highest_position) < 0.0
@@ -891,7 +979,14 @@ def is_mirrored(origin_bin, lowest_position, highest_position, spectrum_type):
 def folded_line_range(origin_bin, lowest_position, highest_position, layout):
     """Return the :class:`FoldedLineRange` of lines, in bins from DC.
 
-    The given positions are counted from ``origin_bin`` [bins].
+    Parameters
+    ----------
+    origin_bin : int
+        Bin from which positions of lines count.
+    lowest_position, highest_position : float
+        Lowest and highest line [bins from ``origin_bin``].
+    layout : SpectrumLayout
+        Sizes and type of the spectrum.
     """
     if is_mirrored(origin_bin, lowest_position, highest_position, layout.spectrum_type):
         return FoldedLineRange(-origin_bin - highest_position, -origin_bin - lowest_position)
@@ -900,10 +995,18 @@ def folded_line_range(origin_bin, lowest_position, highest_position, layout):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def bins_around_lines(margin_bins, folded_range, layout):
-    """Return the :class:`BinRange` from ``margin_bins`` below the lines to as many bins above.
+    """Return the :class:`BinRange` around lines, with a margin of bins below and above them.
 
-    ``folded_range`` is the :class:`FoldedLineRange`. If the margin extends beyond DC or Nyquist,
-    the part beyond is folded back.
+    If the margin extends beyond DC or Nyquist, the part beyond is folded back.
+
+    Parameters
+    ----------
+    margin_bins : float
+        Number of bins below the lowest line, and above the highest one.
+    folded_range : FoldedLineRange
+        Range of the lines after negative frequencies are folded at DC [bins].
+    layout : SpectrumLayout
+        Sizes and type of the spectrum.
     """
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     margin_bins = min(margin_bins, 2.0 * fft_size)
@@ -925,9 +1028,20 @@ def bins_around_lines(margin_bins, folded_range, layout):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def distance_below_level_with_images(level, weight_sum, folded_range, envelope, layout):
-    """Return the distance [bins] beyond which the spectrum of lines and images is below ``level``.
+    """Return the distance [bins] beyond which the spectrum of lines and images is below a level.
 
-    Parameters are those of :func:`distance_below_level`, with the :class:`FoldedLineRange`.
+    Parameters
+    ----------
+    level : float
+        Magnitude |X| [V].
+    weight_sum : float
+        Sum of the magnitudes of the lines' weights [V].
+    folded_range : FoldedLineRange
+        Range of the lines after negative frequencies are folded at DC [bins].
+    envelope : LineEnvelope
+        Upper envelope of a line's spectrum.
+    layout : SpectrumLayout
+        Sizes and type of the spectrum.
     """
     if layout.spectrum_type == REAL_WITH_IMAGES:
         image_distance = min(

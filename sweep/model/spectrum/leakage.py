@@ -195,26 +195,44 @@ def detect_with_leakage(
     """Compute the bins around a segment's lines, the detection, and the leakage of all bins.
 
     Leakage is the probability of false alarms due to the echo's signal far from its lines.
-    Parameters and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`,
-    with these differences.
 
     Parameters
     ----------
-    limits
-        :class:`LeakageLimits`.
-    speckle_power_max
+    bundle : LineBundle
+        Number, range and total weight of the lines, which are in ``workspace.field.lines``
+        (:class:`sweep.model.spectrum.bin_spectrum.LineBundle`).
+    negligible_magnitude : float
+        Largest |X| of images that may be left out [V, summed over the record].
+    limits : LeakageLimits
+        Noise, threshold and tolerated leakage.
+    speckle_power_max : float
         SPECKLE_POWER_MAX if the echo is in developed speckle, else 1.
-    crossing_series
+    lobe_half_width : int
+        Half-width of the echo's main lobe or pedestal [bins]. Bins within this distance of a strong
+        bin belong to the echo (:func:`sweep.model.detection.echo_detection.mark_exempt_bins`). 0 if
+        only the strongest bin may detect the echo.
+    shape : LineShape
+        Shape of the lines (:class:`sweep.model.spectrum.line_shape.LineShape`).
+    layout : SpectrumLayout
+        Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
+    bin_tangents : ndarray (N/2 + 1,)
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
+    workspace : SpectrumWorkspace
+        Lines, and scratch arrays (:class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`).
+        Results are ``span.magnitude``, |X| [V] of the computed bins without noise, and
+        ``span.is_exempt``, true in bins of the echo.
+    crossing_series : ndarray
         :func:`sweep.model.detection.added_crossings.fill_crossing_series` of the threshold over
-        sigma.
-    speckle_rates
-        :class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates` of the same
-        threshold; used if the echo is in developed speckle.
+        sigma, the noise of a bin per quadrature.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates at the same threshold, used in developed speckle
+        (:class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates`).
 
     Returns
     -------
     DetectedSpan
-        With leakage.
+        First bin, number of bins, strongest bin, number of the echo's bins, and leakage. In
+        developed speckle the leakage is the mean over the speckle.
     """
     span, weight_sum, envelope = workspace.span, bundle.weight_sum, shape.envelope
     # Bounds are those of the brightest speckle.
@@ -340,8 +358,23 @@ def detect_with_leakage(
 def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates):
     """Return the leakage of the computed bins around the lines, or its mean over speckle.
 
-    Leakage is the probability of false alarms due to the echo's signal. The mean is taken over
-    developed speckle if ``speckle_power_max`` is above 1.
+    Leakage is the probability of false alarms due to the echo's signal.
+
+    Parameters
+    ----------
+    n_bins : int
+        Number of computed bins.
+    limits : LeakageLimits
+        Noise and threshold.
+    speckle_power_max : float
+        The mean over developed speckle is taken if it is above 1.
+    span : SpanArrays
+        Magnitudes of the computed bins [V], and which of them belong to the echo.
+    crossing_series : ndarray
+        :func:`sweep.model.detection.added_crossings.fill_crossing_series` of the threshold over
+        sigma, the noise of a bin per quadrature.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates at the same threshold, used in developed speckle.
     """
     if speckle_power_max > 1.0:
         return _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates)
@@ -379,9 +412,19 @@ def false_peak_probability_of_bins_in_speckle(
 ):
     """Return the mean of :func:`false_peak_probability_of_bins` over developed speckle.
 
-    ``speckle_rates`` are the
-    :class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates` of the threshold over
-    the noise sigma.
+    Parameters
+    ----------
+    n_bins : int
+        Number of bins of the span, the computed bins around the lines.
+    limits : LeakageLimits
+        Noise and threshold; the tolerance is not used.
+    negligible_signal_ratio : float
+        |X| over sigma below which a bin counts as noise alone. sigma is the noise of a bin per
+        quadrature.
+    span : SpanArrays
+        Magnitudes of the bins [V], of which negligible ones are set to 0.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates at the threshold over sigma, by speckle power.
     """
     _clear_negligible_bins(n_bins, limits.noise_sigma, negligible_signal_ratio, span)
     return _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates)
@@ -703,12 +746,23 @@ def _envelope_tail(distance_min, envelope):
 def _leakage_bound_of_span(n_bins, limits, span):
     """Return a bound on the leakage of computed bins; inf if a bin is too strong.
 
-    The bound follows from the bins' magnitudes. Leakage is the probability of false alarms due to
-    the echo's signal. With x = a^2/2 and y = b^2/2, of the signal a and the threshold b over the
-    noise sigma, Q_1 is convex in x up to y - 2. Q_1 is the Marcum function. The reason is I_2(z) /
-    I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z = a b. Relative to the strongest bin each bin then adds
-    at most the ratio of their powers. The strongest bin adds at most e^{-(b - a)^2 / 2}. The factor
-    1.2 allows for the probability that noise alone stays below the threshold, at least 1 - e^-2.
+    Parameters
+    ----------
+    n_bins : int
+        Number of computed bins.
+    limits : LeakageLimits
+        Noise and threshold.
+    span : SpanArrays
+        Magnitudes of the computed bins [V], and which of them belong to the echo.
+
+    Notes
+    -----
+    Leakage is the probability of false alarms due to the echo's signal. With x = a^2/2 and y =
+    b^2/2, of the signal a and the threshold b over the noise sigma, Q_1 is convex in x up to y - 2.
+    Q_1 is the Marcum function. The reason is I_2(z) / I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z =
+    a b. Relative to the strongest bin each bin then adds at most the ratio of their powers. The
+    strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2 allows for the probability that
+    noise alone stays below the threshold, at least 1 - e^-2.
     """
     largest, square_sum = 0.0, 0.0
     for i in range(n_bins):
@@ -729,6 +783,19 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
 
     Bins of the echo are left out. Bins above the threshold, which bright speckle may contain, are
     outside the range of the series.
+
+    Parameters
+    ----------
+    n_bins : int
+        Number of computed bins.
+    limits : LeakageLimits
+        Noise and threshold.
+    span : SpanArrays
+        Magnitudes of the computed bins [V], and which of them belong to the echo. The result is
+        ``span.crossing_probability``; ``span.half_square`` is scratch.
+    crossing_series : ndarray
+        :func:`sweep.model.detection.added_crossings.fill_crossing_series` of the threshold over
+        sigma, the noise of a bin per quadrature.
     """
     noise_sigma, threshold = limits.noise_sigma, limits.threshold
     threshold_ratio, scale = threshold / noise_sigma, 0.5 / (noise_sigma * noise_sigma)
@@ -756,11 +823,23 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
 def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope, layout):
     """Return the number of bins to compute one by one beyond the clearance from the lines.
 
-    The leakage integral covers the bins beyond them. The number is a heuristic. It depends on the
-    threshold, on the smoothness of the false-alarm rate, and on 3/4 of ``line_extent``, the extent
-    of the lines [bins]. It is a multiple of 8. :func:`detect_with_leakage` doubles it until
-    :func:`_leakage_of_all_bins` is accurate. ``crossing_distance`` is the distance from the
-    lines [bins] up to which signal alone may cross the threshold.
+    The leakage integral covers the bins beyond them. The number is a heuristic, and a multiple of
+    8. :func:`detect_with_leakage` doubles it until :func:`_leakage_of_all_bins` is accurate.
+
+    Parameters
+    ----------
+    weight_sum : float
+        Sum of the magnitudes of the lines' weights as seen from far bins [V].
+    line_extent : float
+        Distance of the highest from the lowest line [bins]; 3/4 of it are computed.
+    limits : LeakageLimits
+        Noise and threshold, of the brightest speckle.
+    crossing_distance : float
+        Distance from the lines up to which signal alone may cross the threshold [bins].
+    envelope : LineEnvelope
+        Upper envelope of a line's spectrum.
+    layout : SpectrumLayout
+        Sizes of the spectrum; it has the clearance from the lines [bins].
     """
     clearance = layout.clearance_bins
     edge_signal = envelope.magnitude[clearance] * weight_sum / limits.noise_sigma
@@ -790,11 +869,42 @@ def _leakage_of_all_bins(
     crossing_series,
     speckle_rates,
 ):
-    """Compute the :class:`LeakageResult` of the bins around the lines and of all other bins.
+    """Compute the leakage of the bins around the lines and of all other bins.
 
-    Parameters are those of :func:`detect_with_leakage`, with the :class:`DetectedSpan` and the
-    :class:`sweep.model.spectrum.bin_spectrum.FoldedLineRange`. If the echo is in developed
-    speckle, the leakage is the mean over the speckle.
+    Leakage is the probability of false alarms due to the echo's signal far from its lines. In
+    developed speckle it is the mean over the speckle.
+
+    Parameters
+    ----------
+    detected : DetectedSpan
+        Computed bins around the lines, whose magnitudes are in ``workspace.span``.
+    bundle : LineBundle
+        Number, range and total weight of the lines, which are in ``workspace.field.lines``.
+    folded_range : FoldedLineRange
+        Range of the lines after negative frequencies are folded at DC [bins].
+    limits : LeakageLimits
+        Noise, threshold and tolerated leakage.
+    speckle_power_max : float
+        SPECKLE_POWER_MAX if the echo is in developed speckle, else 1.
+    shape : LineShape
+        Shape of the lines (:class:`sweep.model.spectrum.line_shape.LineShape`).
+    layout : SpectrumLayout
+        Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
+    bin_tangents : ndarray (N/2 + 1,)
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
+    workspace : SpectrumWorkspace
+        Lines and magnitudes, and scratch arrays
+        (:class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`).
+    crossing_series : ndarray
+        :func:`sweep.model.detection.added_crossings.fill_crossing_series` of the threshold over
+        sigma, the noise of a bin per quadrature.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates at the same threshold, used in developed speckle.
+
+    Returns
+    -------
+    LeakageResult
+        Leakage, and whether enough bins around the lines are computed for it to be valid.
     """
     span, integral = workspace.span, workspace.leakage_quadrature
     first_bin, n_bins, peak_index = detected.first_bin, detected.n_bins, detected.peak_index
@@ -916,8 +1026,25 @@ def _mean_leakage_of_all_bins(
 ):
     """Return the mean leakage over developed speckle of computed bins and of the integral's bins.
 
-    The integral covers the bins beyond the computed ones, below them, above them, or both. It has
-    ``n_points`` quadrature points.
+    The integral covers the bins beyond the computed ones, below them, above them, or both.
+
+    Parameters
+    ----------
+    n_bins : int
+        Number of computed bins.
+    n_points : int
+        Number of quadrature points of the integral.
+    limits : LeakageLimits
+        Noise and threshold.
+    goes_on_below, goes_on_above : bool
+        True if the integral has bins below or above the computed ones.
+    span : SpanArrays
+        Magnitudes of the computed bins [V], and which of them belong to the echo.
+    integral : LeakageQuadrature
+        Points of the integral: their weights, and |X|^2 over twice the noise variance per
+        quadrature.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates at the threshold over sigma, by speckle power.
     """
     relative_rates_of_far_bins = np.zeros(N_SPECKLE_POWERS)
     scale = 1.0 / (limits.noise_sigma * limits.noise_sigma)
@@ -969,10 +1096,27 @@ def _fill_far_powers(
 ):
     """Compute the squared magnitude of the spectrum at the leakage integral's points.
 
-    The result is written to ``workspace.leakage_quadrature.half_square``. The relative error is
-    exp(-``log_accuracy``). ``workspace.leakage_quadrature.cotangent`` contains tan(pi q / N) of
-    each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there are
-    fewer lines than equivalent lines needed, the lines are summed exactly.
+    If there are fewer lines than equivalent lines needed, the lines are summed exactly.
+
+    Parameters
+    ----------
+    n_points : int
+        Number of points.
+    centre_bin : int
+        Bin in the middle of the lines, 0 .. N/2, from which the distance q [bins] of points counts.
+    bundle : LineBundle
+        Number, range and total weight of the lines, which are in ``workspace.field.lines``.
+    log_accuracy : float
+        -ln of the relative error.
+    shape : LineShape
+        Shape of the lines (:class:`sweep.model.spectrum.line_shape.LineShape`).
+    layout : SpectrumLayout
+        Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
+    bin_tangents : ndarray (N/2 + 1,)
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
+    workspace : SpectrumWorkspace
+        Lines and scratch arrays. ``leakage_quadrature.cotangent`` contains tan(pi q / N) of each
+        point. The result is ``leakage_quadrature.half_square``, |X|^2 [V^2].
     """
     field, integral = workspace.field, workspace.leakage_quadrature
     far_bins = field.far_bins
@@ -1026,7 +1170,19 @@ def _fill_far_powers(
 def _near_end_correction(side, n_bins, span):
     """Compute the :class:`NearEndCorrection` of the leakage integral on one side of the lines.
 
-    ``side`` is -1 for the integral below the computed bins, 1 for that above.
+    Parameters
+    ----------
+    side : int
+        -1 for the integral below the computed bins, 1 for that above.
+    n_bins : int
+        Number of computed bins.
+    span : SpanArrays
+        Crossing probabilities of the computed bins, and which of them belong to the echo.
+
+    Returns
+    -------
+    NearEndCorrection
+        Correction of the sum of false-alarm rates, its error, and the integrand's steepness.
     """
     probabilities, is_exempt = span.crossing_probability, span.is_exempt
     step = 1 if side > 0 else -1

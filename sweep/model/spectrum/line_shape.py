@@ -224,7 +224,17 @@ class PhaseErrorModes(NamedTuple):
 
 
 def zero_phase_error_modes(segments: int, n_shapes: int, n_modes_max: int) -> PhaseErrorModes:
-    """Allocate :class:`PhaseErrorModes` with all values 0."""
+    """Allocate :class:`PhaseErrorModes` with all values 0.
+
+    Parameters
+    ----------
+    segments : int
+        Number of segments.
+    n_shapes : int
+        Number of line shapes of each segment.
+    n_modes_max : int
+        Number of Chebyshev modes for which there is room.
+    """
     shape = segments, n_shapes
     return PhaseErrorModes(
         np.zeros(shape),
@@ -387,10 +397,23 @@ def late_echo_length_classes(window: Window, length_min: np.ndarray) -> np.ndarr
 def late_echo_has_modes(
     window: Window, fft_size: int, tier: int, length_min: np.ndarray, length_max: np.ndarray
 ) -> np.ndarray:
-    """Return true for late echoes whose line shapes may be sums of Chebyshev modes, (n,) bool.
+    """Return true for late echoes whose line shapes may be sums of Chebyshev modes.
 
-    ``length_min`` and ``length_max`` (n,) are the least and the largest number of samples of the
-    echo in any segment. ``tier`` is an index in :data:`LINE_SHAPE_TIERS`.
+    Parameters
+    ----------
+    window : Window
+        Window of the record; only sums of cosines qualify.
+    fft_size : int
+        FFT size.
+    tier : int
+        Index in :data:`LINE_SHAPE_TIERS`.
+    length_min, length_max : ndarray (n,)
+        Least and largest number of samples of each echo in any segment.
+
+    Returns
+    -------
+    ndarray (n,) bool
+        True if the echo is long enough, and of one length class in all segments.
     """
     if window.name not in COSINE_SUM_COEFFICIENTS:
         return np.zeros(length_min.shape, np.bool_)
@@ -407,10 +430,21 @@ def late_echo_has_modes(
 def late_window_samples(
     window: Window, late_position: np.ndarray, n_samples: np.ndarray
 ) -> np.ndarray:
-    """Return the window's values over the last ``n_samples`` samples of the record.
+    """Return the window's values over the last samples of a record.
 
-    ``late_position`` runs from -1 to 1 over these samples. The shape of the result is that of
-    ``n_samples``, followed by that of ``late_position``.
+    Parameters
+    ----------
+    window : Window
+        Window of the record, a sum of cosines.
+    late_position : ndarray (positions)
+        Position in the last samples, from -1 at the first of them to 1 at the record's end.
+    n_samples : ndarray (lengths)
+        Number of last samples.
+
+    Returns
+    -------
+    ndarray (lengths, positions)
+        Values of the window.
     """
     fraction = np.asarray(n_samples)[..., None] / window.length
     record_position = 1.0 - fraction * (1.0 - late_position)
@@ -429,8 +463,18 @@ def late_line_shape_tables(
 ) -> LineShapeTables:
     """Prepare the tables for late echoes of one length class whose shapes are sums of modes.
 
-    Parameters are those of :func:`line_shape_tables`, with the class
-    (:func:`late_echo_length_classes`).
+    Parameters
+    ----------
+    window : Window
+        Window of the record.
+    fft_size : int
+        FFT size N.
+    adds_powers : bool
+        True if the powers of lines add, False if their amplitudes do.
+    tier : int
+        Index in :data:`LINE_SHAPE_TIERS`.
+    length_class : int
+        Class of the echo's number of samples (:func:`late_echo_length_classes`).
     """
     clearance_bins = LINE_SHAPE_TIERS[tier].clearance_bins
     table_half_width = clearance_bins + _LATE_TABLE_MARGIN_BINS
@@ -697,7 +741,15 @@ def _copy_values(source, target):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def copy_line_shape(shapes, from_segment, to_segment):
-    """Copy the line shape of one segment to another segment in ``shapes``."""
+    """Copy the line shape of one segment to another segment.
+
+    Parameters
+    ----------
+    shapes : LineShape
+        Line shapes (segments, ...), changed in place.
+    from_segment, to_segment : int
+        Indices of the segments.
+    """
     source, target = select_segment(shapes, from_segment), select_segment(shapes, to_segment)
     _copy_values(source.table_re, target.table_re)
     _copy_values(source.table_im, target.table_im)
@@ -1072,10 +1124,27 @@ def _zero_end_polynomials(ends):
 def first_segment_of_same_line_shape(
     segment, line_shape_index, modes, echo_lengths, segment_exists
 ):
-    """Return the first segment before ``segment`` with the same line shape; -1 if there is none.
+    """Return the first of the segments before a given one that has the same line shape.
 
-    Two shapes are the same if their modes (:class:`PhaseErrorModes`) and their numbers of samples
-    in ``echo_lengths`` (segments, shapes) are equal.
+    Two shapes are the same if their modes and their numbers of samples are equal.
+
+    Parameters
+    ----------
+    segment : int
+        Index of the given segment.
+    line_shape_index : int
+        Index of the line shape in ``modes``.
+    modes : PhaseErrorModes
+        Chebyshev coefficients of the phase errors of all shapes, by segment.
+    echo_lengths : ndarray (segments, shapes)
+        Number of samples of the echo; empty if echoes fill the record.
+    segment_exists : ndarray (segments,) bool
+        True for existing segments.
+
+    Returns
+    -------
+    int
+        Index of the segment; -1 if there is none.
     """
     n_modes = modes.n_modes[segment, line_shape_index]
     for s in range(segment):

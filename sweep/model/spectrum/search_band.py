@@ -112,10 +112,23 @@ def _nearest_bins(
 def n_alarm_bins(
     band_bins: np.ndarray, fft_size: int, first_alarm_bin: int, *, is_signed: bool
 ) -> np.ndarray:
-    """Return the number of bins of a search band that may raise a false alarm, (3, ...).
+    """Return the number of bins of a search band that may raise a false alarm, by segment.
 
-    ``band_bins`` (3, 2, ...) is the result of :func:`search_band_start_and_size`. In real records
-    (not ``is_signed``) bins closer than ``first_alarm_bin`` to DC or Nyquist raise no alarm.
+    Parameters
+    ----------
+    band_bins : ndarray (3, 2, ...) int64
+        First bin and number of bins of each segment (:func:`search_band_start_and_size`).
+    fft_size : int
+        FFT size.
+    first_alarm_bin : int
+        Distance from DC and from Nyquist from which on bins of a real record raise alarms [bins].
+    is_signed : bool
+        True for complex records, in which all bins may raise alarms.
+
+    Returns
+    -------
+    ndarray (3, ...)
+        Number of bins, 0 or more.
     """
     if is_signed:
         return band_bins[:, 1].astype(float)
@@ -127,7 +140,22 @@ def n_alarm_bins(
 
 
 def is_searched(shots: Any, segment: int, point: int, bins: ArrayLike) -> np.ndarray:
-    """Return whether each of ``bins`` is in the search band of one segment of one point."""
+    """Return whether bins are in the search band of one segment of one point.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    segment, point : int
+        Indices of the segment (up, Doppler, down) and of the point.
+    bins : array_like of int
+        Numbers of the bins.
+
+    Returns
+    -------
+    ndarray of bool
+        True for searched bins; all are without a search band.
+    """
     if shots.detection_settings.search_band is None:
         return np.ones(np.shape(bins), bool)
     first_bin, n_bins = shots.detection_settings.search_band[segment, :, point]

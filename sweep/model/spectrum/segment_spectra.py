@@ -439,8 +439,21 @@ def segment_spectrum(
 ) -> SegmentSpectrum:
     """Return the spectrum of one point's segment around its lines, without noise.
 
-    Bins with a magnitude below ``level_min`` [V, summed over the record] may be left out; 0 returns
-    all bins.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    point : int
+        Index of the point.
+    segment : int
+        Index of the segment: up, Doppler, down.
+    level_min : float
+        |X| [V, summed over the record] below which bins may be left out; 0 returns all bins.
+
+    Returns
+    -------
+    SegmentSpectrum
+        Magnitudes of adjacent bins, and the echo in them.
     """
     shots = replace(shots, permanent_line=None)
     (spans,) = iter_spans(
@@ -457,9 +470,22 @@ def segment_spectrum(
 
 
 def full_segment_spectrum(shots: Shots, point: int, segment: int) -> np.ndarray:
-    """Return the magnitude of all bins of a segment without noise [V], by rising frequency.
+    """Return the magnitude of all bins of a segment without noise, by rising frequency.
 
-    The shape is (bins,). Bins are those of :attr:`sweep.model.preparation.Shots.all_signed_bins`.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    point : int
+        Index of the point.
+    segment : int
+        Index of the segment: up, Doppler, down.
+
+    Returns
+    -------
+    ndarray (bins,)
+        |X| [V, summed over the record] of the bins
+        :attr:`sweep.model.preparation.Shots.all_signed_bins`.
     """
     bins, magnitude = segment_spectrum(shots, point, segment)
     all_magnitudes = np.zeros(shots.n_bins)
@@ -1110,15 +1136,57 @@ def _evaluate_segment(
     speckle_rates,
     spans,
 ):
-    """Compute the spectrum and detection around the lines of segment ``s`` of one point.
+    """Compute the spectrum and detection around the lines of one segment of one point.
 
-    The point is ``spans.point_numbers[i]``. Parameters are those of :func:`_evaluate_points`, with
-    the line shape, the speckle and the crossing rates of the segment. ``next_start`` is the index
-    in ``spans.magnitudes`` of the first bin.
+    Parameters
+    ----------
+    s : int
+        Index of the segment: up, Doppler, down.
+    i : int
+        Index of the point in ``spans.point_numbers``.
+    next_start : int
+        Index in ``spans.magnitudes`` of the segment's first bin.
+    parameters : PointParameters
+        Parameters (n,) of all n points (:class:`sweep.model.spectrum.lines.PointParameters`).
+    parameters_by_segment : SegmentParameters
+        Parameters (segments, n) of all points
+        (:class:`sweep.model.spectrum.lines.SegmentParameters`).
+    lowest_levels : ndarray (n,)
+        |X| [V, summed over the record] below which bins may be left out.
+    beamlets : BeamletArrays
+        Beamlets of all footprints (:class:`sweep.model.spectrum.lines.BeamletArrays`).
+    footprint_row : ndarray (n,) int64
+        Row of each point's footprint in ``beamlets``.
+    line_shape_index : ndarray (m,) int64
+        Index of each evaluated point's line shape in ``modes``.
+    averaging_shifts : AveragingShifts
+        Frequency shifts (m, segments, shifts) over which |X|^2 is averaged [bins]. Shifts of weight
+        0 are the last ones.
+    modes : PhaseErrorModes
+        Chebyshev coefficients of the phase errors
+        (:class:`sweep.model.spectrum.line_shape.PhaseErrorModes`).
+    tables : LineShapeTables
+        Tables of the window (:class:`sweep.model.spectrum.line_shape.LineShapeTables`).
+    settings : EvaluationSettings
+        Settings common to all points.
+    shape : LineShape
+        Line shape of this segment (:class:`sweep.model.spectrum.line_shape.LineShape`).
+    bin_speckle : BinSpeckle
+        Speckle in the bins of this segment
+        (:class:`sweep.model.detection.echo_detection.BinSpeckle`).
+    workspace : SpectrumWorkspace
+        Scratch arrays, overwritten (:class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`).
+    crossing_series : ndarray (SERIES_TERMS_MAX,)
+        :func:`sweep.model.detection.added_crossings.fill_crossing_series` of the point's threshold
+        over sigma, the noise of a bin per quadrature.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates of the point at the same threshold, used in developed speckle.
+    spans : BinSpans
+        Bins around the lines of m points. Its arrays for this point and segment are results.
 
     Returns
     -------
-    next_start
+    next_start : int
         Index of the next span's first bin; SPAN_DOES_NOT_FIT if this span does not fit.
     """
     point, rule, span = spans.point_numbers[i], settings.detection_rule, workspace.span
