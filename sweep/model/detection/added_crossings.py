@@ -194,8 +194,14 @@ def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, 
 def any_crossing_probability(probabilities, first, last):
     """Return the probability of any of several independent crossings, 1 - prod(1 - p).
 
-    The product is over ``probabilities`` of the indices first .. last - 1. Small results keep their
-    precision.
+    Small results keep their precision.
+
+    Parameters
+    ----------
+    probabilities : ndarray
+        Probability p of each crossing, 0..1.
+    first, last : int
+        The product is over the indices first .. last - 1.
     """
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     i = first

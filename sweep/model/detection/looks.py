@@ -805,10 +805,22 @@ class Looks(NamedTuple):
     def negligible_signal_ratio(
         self, *, leakage_probability: np.ndarray, threshold_ratio: np.ndarray, n_bins: int
     ) -> np.ndarray:
-        """Return the signal amplitude below which bins may count as noise alone, (n,).
+        """Return the signal amplitude below which bins may count as noise alone.
 
-        The amplitude is in units of the noise per quadrature of one record. Parameters are those of
-        :func:`sweep.model.detection.echo_detection.negligible_signal_ratio`.
+        Parameters
+        ----------
+        leakage_probability : ndarray (n,)
+            Tolerated error of the probability of a false peak due to leaked signal, summed over all
+            bins that count as noise alone.
+        threshold_ratio : ndarray (n,)
+            Threshold over sigma, the noise of a bin of one record per quadrature.
+        n_bins : int
+            Number of bins of the spectrum.
+
+        Returns
+        -------
+        ndarray (n,)
+            Amplitude over sigma.
         """
         # At small signals the added probability is proportional to the signal's power.
         added_per_signal_power = (

@@ -70,8 +70,21 @@ def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:
 def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
     """Return the relative excess e of the noise variance that explains a bin's false alarms.
 
-    The excess solves exp(-x / (1 + e)) = ``probability``, with x = (4 - pi)/4 ``tnr``^2. The result
-    is nan unless 0 < ``probability`` < 1.
+    Parameters
+    ----------
+    probability : float
+        Probability of a false alarm in a bin.
+    tnr : float
+        Threshold over the standard deviation of |X| in a bin of noise alone.
+
+    Returns
+    -------
+    float
+        Excess e; nan unless 0 < ``probability`` < 1.
+
+    Notes
+    -----
+    e solves exp(-x / (1 + e)) = ``probability``, with x = (4 - pi)/4 ``tnr``^2.
     """
     if not 0.0 < probability < 1.0:
         return math.nan
@@ -81,9 +94,23 @@ def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
 def variance_excess_from_shot_pfa(probability: float, tnr: float, n_bins: float) -> float:
     """Return the relative excess e of the noise variance that explains a shot's false alarms.
 
-    The excess solves (1 - (1 - exp(-x / (1 + e)))^N)^2 = ``probability``, with x = (4 - pi)/4
-    ``tnr``^2 and N = ``n_bins`` in each of two segments. The result is nan unless 0 <
-    ``probability`` < 1.
+    Parameters
+    ----------
+    probability : float
+        Probability of a false alarm in both chirps of a shot.
+    tnr : float
+        Threshold over the standard deviation of |X| in a bin of noise alone.
+    n_bins : float
+        Number N of independent bins in each of the two segments.
+
+    Returns
+    -------
+    float
+        Excess e; nan unless 0 < ``probability`` < 1.
+
+    Notes
+    -----
+    e solves (1 - (1 - exp(-x / (1 + e)))^N)^2 = ``probability``, with x = (4 - pi)/4 ``tnr``^2.
     """
     if not 0.0 < probability < 1.0:
         return math.nan

@@ -196,9 +196,17 @@ def _strongest_mode(
 def power_asymmetry(below, middle, above):
     """Return the relative difference of the powers above and below the strongest bin, -1..1.
 
-    The difference is (P_above - P_below) / (P_above + P_below). Arguments are the |X| of three
-    adjacent bins. The sign shows on which side of the bin the echo's centre lies. The result is 0
-    if both neighbours are faint.
+    The sign shows on which side of the bin the echo's centre lies. The result is 0 if both
+    neighbours are faint.
+
+    Parameters
+    ----------
+    below, middle, above : float
+        |X| of three adjacent bins, in any unit; the strongest is in the middle.
+
+    Notes
+    -----
+    (P_above - P_below) / (P_above + P_below), with P = |X|^2.
     """
     neighbour_power = below * below + above * above
     if not neighbour_power > 1e-6 * middle * middle:

@@ -208,9 +208,16 @@ class GroupMeans:
     def add(
         self, point_indices: np.ndarray, draw_numbers: np.ndarray, values: Mapping[str, np.ndarray]
     ) -> None:
-        """Add the values of m draws, (m,) by name, to those of points.
+        """Add the values of draws to those of their points.
 
-        ``draw_numbers`` (m,) are the numbers of the draws.
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Index of the point of each draw.
+        draw_numbers : ndarray (m,) int64
+            Numbers of the draws.
+        values : mapping of str to ndarray (m,)
+            Values of each draw, by name.
         """
         rows = np.array([values[name] for name in self.names])
         _add_to_group_means(

@@ -169,10 +169,16 @@ class Sampler(ABC):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make the draws ``first_draw`` to ``end_draw`` - 1 of points, and count their events.
+        """Make draws of points, and count their events.
 
-        The counts are added to ``counts`` (names, points, batches) int64, in the order of
-        DRAW_COUNT_OUTPUTS.
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        first_draw, end_draw : int
+            Number of the first draw, and number after the last one.
+        counts : ndarray (names, points, batches) int64
+            Numbers of events, in the order of DRAW_COUNT_OUTPUTS, to which is added.
         """
 
     @abstractmethod

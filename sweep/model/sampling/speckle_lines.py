@@ -758,10 +758,23 @@ class FootprintRecord(NamedTuple):
     def draw_speckled_record(
         self, key: np.ndarray, draw_number: int, echo_number: int
     ) -> np.ndarray:
-        """Draw the complex windowed record (L,) of an echo in speckle.
+        """Draw the complex windowed record of an echo in speckle.
 
-        `key` (2,) uint64 is the random key of the point. The random numbers are those of
-        :func:`draw_bin_amplitudes`.
+        The random numbers are those of :func:`draw_bin_amplitudes`.
+
+        Parameters
+        ----------
+        key : ndarray (2,) uint64
+            Random key of the point.
+        draw_number : int
+            Number of the draw.
+        echo_number : int
+            Number of the echo (group of adjacent bins) in the segment.
+
+        Returns
+        -------
+        ndarray (L,) complex
+            Samples of the record.
         """
         key_0, key_1 = key
         line_amplitudes = np.empty(len(self.series_coefficients), complex)

@@ -1166,8 +1166,20 @@ def first_segment_of_same_line_shape(
 def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
     """Compute the line shape of an echo that arrives after its record has begun.
 
-    The line shape is the spectrum of a line of amplitude 1. The echo has ``tables.echo_lengths``
-    samples L'. Parameters are those of :func:`build_line_shape`.
+    The line shape is the spectrum of a line of amplitude 1.
+
+    Parameters
+    ----------
+    segment : int
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    line_shape_index : int
+        Index of the shape in ``modes``.
+    modes : PhaseErrorModes
+        Chebyshev coefficients of the phase errors.
+    tables : LineShapeTables
+        Tables of the window; ``echo_lengths`` are the numbers L' of samples with the echo.
+    shape : LineShape
+        Result: line shape of the segment.
 
     Notes
     -----

@@ -197,7 +197,22 @@ def _fold_to_bins(shots: Any, cycles_per_sample: np.ndarray) -> np.ndarray:
 
 
 def append_trailing_axes(shots: Any, values: np.ndarray | float, n_trailing: int = 1) -> np.ndarray:
-    """Broadcast ``values`` to all n points and append ``n_trailing`` dimensions of size 1."""
+    """Broadcast values to all points, and append axes of size 1.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points.
+    values : ndarray (n,) or float
+        Values of the points.
+    n_trailing : int
+        Number of axes to append.
+
+    Returns
+    -------
+    ndarray (n, 1, ...)
+        Values that broadcast over beamlets or bins of each point.
+    """
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * n_trailing)
 
 
