@@ -25,8 +25,9 @@ from sweep.model.effects.effect import Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.requirements import ParameterRequirement, condition_equal_to
-from sweep.model.link_budget import RECEIVER_PREFIX, RECORD_PATH
+from sweep.model.link_budget import RECEIVER_PREFIX
 from sweep.model.preparation import Shots
+from sweep.model.shot_settings import RECORD_PATH
 
 GAIN_IMBALANCE_PATH, PHASE_IMBALANCE_PATH = (
     RECEIVER_PREFIX + "iq_gain_imbalance",
