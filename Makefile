@@ -149,7 +149,7 @@ accuracy: $(READY)
 	$(BIN)/python benchmarks/accuracy_page.py
 
 draw-groups: $(READY)
-	$(BIN)/python benchmarks/draw_groups.py
+	$(BIN)/python benchmarks/draw_group_efficiency.py
 
 # Beamlets in a flight over rough terrain, a section of docs/accuracy.md; ten minutes.
 accuracy-terrain: $(READY)

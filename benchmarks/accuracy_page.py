@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-import draw_groups
+import draw_group_efficiency
 from benchmark_helpers import DOCS, EXPERIMENTS, markdown_table
 
 from sweep.analysis import accuracy_results, canvas
@@ -214,7 +214,7 @@ def main() -> None:
     else:
         path = DOCS / "accuracy.md"
         terrain_section = read_page_part(path, "rough_terrain_section")
-        parts = [PAGE_HEAD, *sections, draw_groups.page_section(), terrain_section]
+        parts = [PAGE_HEAD, *sections, draw_group_efficiency.page_section(), terrain_section]
         path.write_text("\n".join(parts) + PAGE_TAIL, encoding="utf-8")
 
 

@@ -286,9 +286,9 @@ def instrument_section(name: str, simulated_by_key: InstrumentFields) -> str:
                      number.get("why", "")])  # fmt: skip
     head = ["number", "published", "simulated", "allowed", "agrees", "difference"]
     lists = [
-        f"{what}:\n\n"
+        f"{label}:\n\n"
         + "\n".join(f"- {statement}" for statement in description[key] or ["nothing"])
-        for what, key in (("Published", "published"), ("Assumed", "assumed"))
+        for label, key in (("Published", "published"), ("Assumed", "assumed"))
     ]
     heading = f"## {name}\n\n{description['title']}. {description['source']}. DOI: {doi}."
     return "\n\n".join([heading, markdown_table(head, rows), *lists])

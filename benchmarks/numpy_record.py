@@ -113,8 +113,8 @@ class PlaneRecords:
         """
         batch_shots = max(1, BATCH_SAMPLES // self.lidar.fft_size)
         counts = np.zeros(3, np.int64)
-        for begin in range(0, n_shots, batch_shots):
-            size = min(batch_shots, n_shots - begin)
+        for first_shot in range(0, n_shots, batch_shots):
+            size = min(batch_shots, n_shots - first_shot)
             n_scatterers = len(self._beats[0])
             amplitudes = (
                 generator.standard_normal((2, size, n_scatterers)) * math.sqrt(0.5)

@@ -353,17 +353,17 @@ def fft_size_rows(extent: Extent) -> list[list[str]]:
     rows = []
     for exponent in extent.fft_exponents:
         lidar = lidar_of_fft_size(2**exponent)
-        ours = measure_in_process(
+        grid_cost = measure_in_process(
             "grid", lidar=lidar, ranges=(150.0, 350.0), points=extent.grid_points,
             is_in_speckle=False, beamlets=1, rounds=extent.growth_rounds,
         )  # fmt: skip
-        theirs = measure_in_process(
+        record_cost = measure_in_process(
             "record", lidar=lidar, scatterers=1, is_in_speckle=False,
             shots=max(4, 2**22 >> exponent), rounds=extent.growth_rounds,
         )  # fmt: skip
         rows.append([
-            f"2^{exponent}", f"{ours.seconds * 1e6:.1f}", f"{ours.megabytes:,.0f}",
-            f"{theirs.seconds * 1e6:,.0f}", f"{theirs.megabytes:,.0f}",
+            f"2^{exponent}", f"{grid_cost.seconds * 1e6:.1f}", f"{grid_cost.megabytes:,.0f}",
+            f"{record_cost.seconds * 1e6:,.0f}", f"{record_cost.megabytes:,.0f}",
         ])  # fmt: skip
     return rows
 
@@ -380,21 +380,26 @@ def beamlet_rows(extent: Extent) -> list[list[str]]:
         points = extent.grid_points // 2
         if beamlets is not None:
             points = max(points // 12, min(points, 200 * points // beamlets))
-        ours = measure_in_process(
+        grid_cost = measure_in_process(
             "grid", lidar=lidar, ranges=(150.0, 350.0), points=points,
             is_in_speckle=True, beamlets=beamlets or "auto", rounds=extent.growth_rounds,
         )  # fmt: skip
-        cells = [f"{ours.seconds * 1e6:,.1f}", f"{ours.megabytes:,.0f}"]
+        cells = [f"{grid_cost.seconds * 1e6:,.1f}", f"{grid_cost.megabytes:,.0f}"]
         if beamlets is None:
             rows.append(["auto", *cells, "-", "-"])
             continue
-        theirs = measure_in_process(
+        record_cost = measure_in_process(
             "record", lidar=lidar, scatterers=beamlets, is_in_speckle=True,
             shots=max(64, 2**18 // beamlets), rounds=extent.growth_rounds,
         )  # fmt: skip
-        rows.append([
-            f"{beamlets:,}", *cells, f"{theirs.seconds * 1e6:,.0f}", f"{theirs.megabytes:,.0f}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{beamlets:,}",
+                *cells,
+                f"{record_cost.seconds * 1e6:,.0f}",
+                f"{record_cost.megabytes:,.0f}",
+            ]
+        )
     return rows
 
 
@@ -524,9 +529,11 @@ def comparison_tables(extent: Extent, folder: Path) -> dict[str, Table]:
     """Return the tables of points a second and of agreement."""
     comparisons = [compare_case(case, extent) for case in CASES]
     return {
-        "rates": Table(RATE_HEAD, [row for each in comparisons for row in each.rate_rows]),
+        "rates": Table(
+            RATE_HEAD, [row for comparison in comparisons for row in comparison.rate_rows]
+        ),
         "agreement": Table(
-            AGREEMENT_HEAD, [row for each in comparisons for row in each.agreement_rows]
+            AGREEMENT_HEAD, [row for comparison in comparisons for row in comparison.agreement_rows]
         ),
     }
 

@@ -150,38 +150,40 @@ class ToleranceRow(NamedTuple):
     """Text that a table shows in place of the tolerance."""
 
 
-def run_trials(bench: StudySample, rungs: Sequence[AccuracySetting], rounds: int) -> list[Trial]:
+def run_trials(bench: StudySample, settings: Sequence[AccuracySetting], rounds: int) -> list[Trial]:
     """Run each setting on all points of a sample; return results and the best times.
 
-    `rungs` are the settings.
+    `settings` are those compared.
     """
     parts = bench.split_into_parts(bench.size)
-    for rung in rungs:  # compiles what there is to compile
-        bench.try_setting(rung, parts[0] if len(parts) > 1 else parts[0][:1], 1)
+    for setting in settings:  # compiles what there is to compile
+        bench.try_setting(setting, parts[0] if len(parts) > 1 else parts[0][:1], 1)
     bench.clear_caches()
     trials_by_part: list[list[Trial]] = []
     for part in parts:
-        best_by_rung: dict[int, Trial] = {}
+        best_by_setting: dict[int, Trial] = {}
         for round_number in range(rounds):  # in turn, so that whatever slows the machine slows all
-            for rung_number, rung in enumerate(rungs):
+            for setting_number, setting in enumerate(settings):
                 if round_number > 0 and (
-                    rung.kind == REFERENCE_KIND
-                    or best_by_rung[rung_number].seconds_per_point * len(part)
+                    setting.kind == REFERENCE_KIND
+                    or best_by_setting[setting_number].seconds_per_point * len(part)
                     > REPEATED_TRIAL_SECONDS_MAX
                 ):
                     continue
                 points_together = (
                     1
-                    if rung.kind == REFERENCE_KIND
+                    if setting.kind == REFERENCE_KIND
                     else min(POINTS_TIMED_TOGETHER, bench.timed_points_max)
                 )
-                trial = bench.try_setting(rung, part, points_together)
-                best_by_rung[rung_number] = min(
-                    best_by_rung.get(rung_number, trial),
+                trial = bench.try_setting(setting, part, points_together)
+                best_by_setting[setting_number] = min(
+                    best_by_setting.get(setting_number, trial),
                     trial,
                     key=lambda trial: trial.seconds_per_point,
                 )
-        trials_by_part.append([best_by_rung[rung_number] for rung_number in sorted(best_by_rung)])
+        trials_by_part.append(
+            [best_by_setting[setting_number] for setting_number in sorted(best_by_setting)]
+        )
         bench.clear_caches()
     return [merge_trials(trials) for trials in zip(*trials_by_part, strict=True)]
 
@@ -204,27 +206,33 @@ def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
         FlightSample(spec, POINTS) if is_flight else GridSample(spec, POINTS, random_points(spec))
     )
     full_ladder = build_setting_ladder(spec)
-    rung_by_tolerance = {
-        tolerance_of_setting(rung): rung
-        for rung in full_ladder.settings
-        if rung.kind == ADAPTIVE_KIND
+    setting_by_tolerance = {
+        tolerance_of_setting(setting): setting
+        for setting in full_ladder.settings
+        if setting.kind == ADAPTIVE_KIND
     }
     full_ladder = add_settings_with_fixed_effects(full_ladder, bench, TRIED_TOLERANCES)
-    fixed_rungs = [
-        rung for rung in full_ladder.settings if rung.kind in (FIXED_EFFECTS_KIND, ALL_EFFECTS_KIND)
+    fixed_settings = [
+        setting
+        for setting in full_ladder.settings
+        if setting.kind in (FIXED_EFFECTS_KIND, ALL_EFFECTS_KIND)
     ]
-    rungs = [*rung_by_tolerance.values(), *fixed_rungs, full_ladder.reference]
-    trials = run_trials(bench, rungs, ROUNDS)
-    trial_by_name = {rung.name: trial for rung, trial in zip(rungs, trials, strict=True)}
-    all_on_rung = next(rung for rung in fixed_rungs if rung.kind == ALL_EFFECTS_KIND)
+    settings = [*setting_by_tolerance.values(), *fixed_settings, full_ladder.reference]
+    trials = run_trials(bench, settings, ROUNDS)
+    trial_by_name = {setting.name: trial for setting, trial in zip(settings, trials, strict=True)}
+    all_effects_setting = next(
+        setting for setting in fixed_settings if setting.kind == ALL_EFFECTS_KIND
+    )
     reference_seen = trial_by_name[full_ladder.reference.name].results
     worst_by_name = {
-        rung.name: worst_error(result_differences(trial_by_name[rung.name].results, reference_seen))
-        for rung in fixed_rungs
+        setting.name: worst_error(
+            result_differences(trial_by_name[setting.name].results, reference_seen)
+        )
+        for setting in fixed_settings
     }
     rows, ray_rows = [], []
-    for tolerance, rung in rung_by_tolerance.items():
-        trial = trial_by_name[rung.name]
+    for tolerance, setting in setting_by_tolerance.items():
+        trial = trial_by_name[setting.name]
         errors = result_differences(trial.results, reference_seen)
         worst_of_row = worst_error(errors)
         fixed_seconds, front_seconds = (
@@ -252,7 +260,7 @@ def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
                 reference_check_row(
                     bench,
                     full_ladder,
-                    trial_by_name[all_on_rung.name],
+                    trial_by_name[all_effects_setting.name],
                     "own, coherent",
                     COHERENT_CHECK_RAYS,
                 )
@@ -260,7 +268,7 @@ def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
         )
     if spec.footprint.beamlets:
         given_number_trial, label = (
-            trial_by_name[all_on_rung.name],
+            trial_by_name[all_effects_setting.name],
             f"{spec.footprint.beamlets:,} by hand",
         )
         ray_rows.append(
@@ -306,7 +314,9 @@ def reference_check_row(
     finer = replace(
         reference, name=f"{more_rays} rays", overrides={**reference.overrides, BEAMLETS: more_rays}
     )
-    reference_trial, finer_trial = (bench.try_setting(rung, part, 1) for rung in (reference, finer))
+    reference_trial, finer_trial = (
+        bench.try_setting(setting, part, 1) for setting in (reference, finer)
+    )
     bench.clear_caches()
     return ToleranceRow(
         np.inf,

@@ -116,7 +116,7 @@ def table_4_1():
 
 
 @pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory):
+def serial_store(tmp_path_factory):
     """The store of the small study, run as a plain loop; not to be changed."""
     from small_studies import run_serially, small_spec
 

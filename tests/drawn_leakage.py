@@ -7,7 +7,7 @@ from sweep.model.spectrum.search_restriction import axis_line_positions
 from sweep.model.spectrum.segment_spectra import segment_spectrum
 
 
-def drawn_leakage(shots, i, *, draws, looks=1, seed=1, fades=True, own=True):
+def drawn_leakage(shots, i, *, draws, looks=1, seed=1, fades=True, per_line=True):
     """Draw whole spectra of a line in noise; the probability of a further group by its signal.
 
     ``own``: looks have independent speckle; else they share it. A further group is a run of bins
@@ -28,7 +28,7 @@ def drawn_leakage(shots, i, *, draws, looks=1, seed=1, fades=True, own=True):
     for _ in range(draws // 500):
         power = np.zeros((2, 500, bins.size))
         amplitude = rng.normal(size=(looks, 2, 500)) / np.sqrt(2)
-        amplitude = amplitude if own else amplitude[:1] + 0 * amplitude
+        amplitude = amplitude if per_line else amplitude[:1] + 0 * amplitude
         for look in range(looks):
             scale = np.sqrt(2 / (window**2).sum())
             noise = np.fft.rfft(window * rng.normal(size=(500, size)))[:, bins] * scale

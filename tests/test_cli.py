@@ -53,7 +53,7 @@ storage: {block_points: 8}
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def working_directory(tmp_path, monkeypatch):
     """A directory of one's own with a spec, small.yaml, in it."""
     (tmp_path / "small.yaml").write_text(STUDY)
     monkeypatch.chdir(tmp_path)
@@ -61,7 +61,7 @@ def here(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def small_store(tmp_path_factory):
     """The small study's store; not to be changed."""
     spec = GridSpec.from_mapping(yaml.safe_load(STUDY))
     store = tmp_path_factory.mktemp("made") / "small.zarr"
@@ -69,10 +69,10 @@ def made(tmp_path_factory):
 
 
 @pytest.fixture
-def ran(here, made):
+def ran(working_directory, small_store):
     """The directory with the store of the small study in it."""
-    shutil.copytree(made, here / "results" / "small.zarr")
-    return here
+    shutil.copytree(small_store, working_directory / "results" / "small.zarr")
+    return working_directory
 
 
 def sweep(*arguments: str):
@@ -80,25 +80,25 @@ def sweep(*arguments: str):
     return CliRunner().invoke(main, [*map(str, arguments)], catch_exceptions=False)
 
 
-def refused(result, *shown: str) -> None:
+def refused(result, *message: str) -> None:
     """A user's mistake: exit code 2, plain words on standard error, nothing on standard output."""
     assert result.exit_code == 2
     assert result.stdout == ""
     assert "Traceback" not in result.stderr
-    for text in shown:
+    for text in message:
         assert text in result.stderr
 
 
-def test_run_makes_a_store_named_after_the_spec_and_prints_a_table(here):
+def test_run_makes_a_store_named_after_the_spec_and_prints_a_table(working_directory):
     result = sweep("run", "small.yaml", "--scheduler", "none")
     assert result.exit_code == 0
-    assert (here / "results" / "small.zarr" / "zarr.json").exists()
+    assert (working_directory / "results" / "small.zarr" / "zarr.json").exists()
     assert "pd_shot > 0.9" in result.stdout and "median pd_doppler" in result.stdout
     assert "range [m]" in result.stdout and "10..393.8" in result.stdout
     assert "results/small.zarr: 80 of 80 points, computed 10 of 10 blocks" in result.stdout
     assert "80 of 80 points" in result.stderr
-    told = sweep("status", "results/small.zarr").stdout  # a study without draws tells of none
-    assert "Half-widths" not in result.stdout + told
+    stdout = sweep("status", "results/small.zarr").stdout  # a study without draws tells of none
+    assert "Half-widths" not in result.stdout + stdout
 
 
 def test_the_summary_counts_what_the_store_holds(ran):
@@ -120,18 +120,18 @@ def test_the_summary_counts_what_the_store_holds(ran):
 def test_the_table_of_a_large_study_is_by_some_of_its_blocks_and_says_so(ran, monkeypatch):
     from sweep.tasks.studies import store_summary
 
-    _, whole, _ = store_summary.detection_summary(ran / "results" / "small.zarr")
+    _, all_rows, _ = store_summary.detection_summary(ran / "results" / "small.zarr")
     monkeypatch.setattr(store_summary, "SAMPLED_BLOCKS_MAX", 4)
     _, rows, share = store_summary.detection_summary(ran / "results" / "small.zarr")
     assert share == 4 / 10
-    assert rows[-1].n_points == 4 * 8 and whole[-1].n_points == 10 * 8
-    kept = {row.label: row for row in whole}
+    assert rows[-1].n_points == 4 * 8 and all_rows[-1].n_points == 10 * 8
+    row_by_label = {row.label: row for row in all_rows}
     assert sum(row.n_points > 0 for row in rows[:-1]) == 4  # a block is a part of this study
-    assert all(row == kept[row.label] for row in rows[:-1] if row.n_points)
+    assert all(row == row_by_label[row.label] for row in rows[:-1] if row.n_points)
     assert "by 40 % of the blocks" in sweep("resume", "results/small.zarr").stdout
 
 
-def test_a_second_run_is_refused_and_says_how_to_go_on_or_begin_anew(ran):
+def test_a_second_run_is_refused_and_says_how_to_go_on_or_begin_again(ran):
     refused(sweep("run", "small.yaml", "--scheduler", "none"), "sweep status", "--overwrite")
     assert sweep("run", "small.yaml", "--scheduler", "none", "--overwrite").exit_code == 0
 
@@ -144,18 +144,18 @@ def test_a_changed_spec_is_refused_with_what_changed(ran):
     assert sweep("resume", store, "--spec", "small.yaml", "--scheduler", "none").exit_code == 0
 
 
-def test_a_link_that_leads_nowhere_is_told_as_such(tmp_path, monkeypatch):
+def test_a_link_that_leads_nowhere_is_reported_as_such(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "turning.yaml").symlink_to("turning.yaml")
     (tmp_path / "lost.yaml").symlink_to("gone.yaml")
     for name, target in (("turning.yaml", "turning.yaml"), ("lost.yaml", "gone.yaml")):
-        done = CliRunner().invoke(main, ["plan", name])
-        assert done.exit_code == 2
-        assert f"'{name}' does not exist: it is a link to '{target}', which" in done.stderr
+        result = CliRunner().invoke(main, ["plan", name])
+        assert result.exit_code == 2
+        assert f"'{name}' does not exist: it is a link to '{target}', which" in result.stderr
 
 
 @pytest.mark.parametrize(
-    ("arguments", "shown"),
+    ("arguments", "message"),
     [
         (["run", "absent.yaml"], "does not exist"),
         (["run", "wrong.yaml"], "telescope"),
@@ -173,17 +173,17 @@ def test_a_link_that_leads_nowhere_is_told_as_such(tmp_path, monkeypatch):
         (["runn", "small.yaml"], "runn"),
     ],
 )
-def test_a_mistake_ends_in_plain_words_and_exit_code_2(here, arguments, shown):
-    (here / "notes").mkdir()
-    (here / "notes" / "text").write_text("mine")
-    (here / "wrong.yaml").write_text(STUDY.replace("25 mm", "25"))
-    refused(sweep(*arguments), shown)
-    assert sorted(path.name for path in here.iterdir() if path.name != "results") == [
+def test_a_mistake_ends_in_plain_words_and_exit_code_2(working_directory, arguments, message):
+    (working_directory / "notes").mkdir()
+    (working_directory / "notes" / "text").write_text("mine")
+    (working_directory / "wrong.yaml").write_text(STUDY.replace("25 mm", "25"))
+    refused(sweep(*arguments), message)
+    assert sorted(path.name for path in working_directory.iterdir() if path.name != "results") == [
         "notes",
         "small.yaml",
         "wrong.yaml",
     ]
-    assert (here / "notes" / "text").read_text() == "mine"
+    assert (working_directory / "notes" / "text").read_text() == "mine"
 
 
 @pytest.mark.parametrize(
@@ -196,35 +196,37 @@ def test_a_mistake_ends_in_plain_words_and_exit_code_2(here, arguments, shown):
         ("spectra", "small.yaml", "--output", "no/spectra.zarr"),
     ],
 )
-def test_a_folder_that_can_not_be_written_is_told_in_a_line(here, monkeypatch, arguments):
+def test_a_folder_that_can_not_be_written_is_reported_in_a_line(
+    working_directory, monkeypatch, arguments
+):
     one = STUDY[: STUDY.index("axes:")].replace("target: {", "target: {range: 2 km, ")
-    (here / "small.yaml").write_text(one)
+    (working_directory / "small.yaml").write_text(one)
     driver.run(GridSpec.from_mapping(yaml.safe_load(one)), store="a.zarr", scheduler="none",
                progress=False)  # fmt: skip
-    (here / "no").write_text("a file in the folder's place")
+    (working_directory / "no").write_text("a file in the folder's place")
     refused(sweep(*arguments), "no", ": mend that, or name another place\n")
-    (here / "no").unlink()
+    (working_directory / "no").unlink()
     make = os.mkdir
 
-    def locked(path, *how, **where):
+    def locked(path, *mode, **directory):
         if "no" in Path(path).parts:
             raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        make(path, *how, **where)
+        make(path, *mode, **directory)
 
     monkeypatch.setattr(os, "mkdir", locked)
     refused(sweep(*arguments), ": Permission denied: mend that, or name another place\n")
 
 
-def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch):
+def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(working_directory, monkeypatch):
     def poisoned(study, block):
         if block == 4:
             raise ValueError("no good")
         return study.evaluate(block)
 
-    whole = driver.run
+    driver_run = driver.run
 
     def run(*arguments, **keywords):
-        return whole(*arguments, **keywords, evaluate=poisoned)
+        return driver_run(*arguments, **keywords, evaluate=poisoned)
 
     monkeypatch.setattr(driver, "run", run)
     result = sweep("run", "small.yaml", "--scheduler", "none")
@@ -232,39 +234,43 @@ def test_a_study_left_incomplete_exits_3_lists_why_and_resumes(here, monkeypatch
     assert "block 4 failed: ValueError: no good" in result.stderr
     assert "1 of 10 blocks left" in result.stderr
     assert "sweep resume results/small.zarr" in result.stderr
-    shown = sweep("status", "results/small.zarr").stdout
-    assert "72 of 80 points, 9 of 10 blocks" in shown
-    assert "block 4 failed on" in shown and "sweep resume" in shown
-    again = "resume", "results/small.zarr", "--scheduler", "none"
-    assert sweep(*again).exit_code == 3  # what failed is left out until it is asked for
-    assert sweep(*again, "--retry-failed").exit_code == 0
+    stdout = sweep("status", "results/small.zarr").stdout
+    assert "72 of 80 points, 9 of 10 blocks" in stdout
+    assert "block 4 failed on" in stdout and "sweep resume" in stdout
+    resume_arguments = "resume", "results/small.zarr", "--scheduler", "none"
+    assert sweep(*resume_arguments).exit_code == 3  # what failed is left out until it is asked for
+    assert sweep(*resume_arguments, "--retry-failed").exit_code == 0
     assert "complete" in sweep("status", "results/small.zarr").stdout
 
 
-def test_a_path_after_an_equals_sign_may_begin_at_home(here, monkeypatch):
-    monkeypatch.setenv("HOME", str(here / "home"))
+def test_a_path_after_an_equals_sign_may_begin_at_home(working_directory, monkeypatch):
+    monkeypatch.setenv("HOME", str(working_directory / "home"))
     store = "--store=~/small.zarr"
     assert sweep("run", "small.yaml", store, "--scheduler", "none").exit_code == 0
-    assert (here / "home" / "small.zarr").is_dir() and not (here / "~").exists()
+    assert (working_directory / "home" / "small.zarr").is_dir() and not (
+        working_directory / "~"
+    ).exists()
     drawn = sweep("shot", "small.yaml", "--output=~/drawn")
-    assert drawn.exit_code == 0 and (here / "home" / "drawn").is_dir()
+    assert drawn.exit_code == 0 and (working_directory / "home" / "drawn").is_dir()
 
 
 def test_status_tells_who_is_at_work(ran):
     log = ran / "results" / "small.zarr" / ".sweep" / "receipts.jsonl"
     log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[:-1]))
     held = StoreLock(ran / "results" / "small.zarr")
-    shown = sweep("status", "results/small.zarr").stdout
+    stdout = sweep("status", "results/small.zarr").stdout
     held.release()
-    assert "72 of 80 points, 9 of 10 blocks" in shown
-    assert f"running: process {os.getpid()} on" in shown
+    assert "72 of 80 points, 9 of 10 blocks" in stdout
+    assert f"running: process {os.getpid()} on" in stdout
 
 
 @pytest.mark.parametrize(
     ("options", "steps", "tasks"),
     [([], False, False), (["-v"], True, False), (["-v", "-v"], True, True)],
 )
-def test_the_log_of_a_command_is_shown_where_it_is_asked_for(here, options, steps, tasks):
+def test_the_log_of_a_command_is_shown_where_it_is_asked_for(
+    working_directory, options, steps, tasks
+):
     result = sweep("run", "small.yaml", "--scheduler", "none", *options)
     assert result.exit_code == 0
     assert bool(re.search(r"sweep\.session: .* blocks computed in ", result.stderr)) == steps
@@ -273,7 +279,7 @@ def test_the_log_of_a_command_is_shown_where_it_is_asked_for(here, options, step
     assert not log.handlers and log.level == logging.NOTSET and log.propagate
 
 
-def test_an_error_that_is_not_the_users_exits_1(here, monkeypatch):
+def test_an_error_that_is_not_the_users_exits_1(working_directory, monkeypatch):
     def broken(*arguments, **keywords):
         raise RuntimeError("a bug")
 
@@ -283,14 +289,14 @@ def test_an_error_that_is_not_the_users_exits_1(here, monkeypatch):
     assert isinstance(result.exception, RuntimeError)
 
 
-def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
+def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(working_directory):
     from sweep.model.effects.catalogue import EFFECT_NAMES
     from sweep.model.outputs import GRID_OUTPUTS
 
     result = sweep("plan", "small.yaml", "--workers", "2")
     assert result.exit_code == 0
-    told, _, table = result.stdout.partition("Effects")
-    lines = dict(line.strip().split("  ", 1) for line in told.splitlines())
+    counts_text, _, table = result.stdout.partition("Effects")
+    lines = dict(line.strip().split("  ", 1) for line in counts_text.splitlines())
     arrays = len(GRID_OUTPUTS) + 2  # what was simulated, and what that leaves out
     assert lines["points"] == "80"
     assert lines["blocks"] == "10 of at most 4 range x 2 power"
@@ -299,7 +305,7 @@ def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
     assert lines["bytes"] == f"{size / 1000:.3g} kB before compression"
     assert lines["time"].partition(",")[0].endswith("on 2 workers")
     assert all(name.replace("_", " ") in " ".join(table.split()) for name in EFFECT_NAMES)
-    assert [path.name for path in here.iterdir()] == ["small.yaml"]
+    assert [path.name for path in working_directory.iterdir()] == ["small.yaml"]
 
 
 HILLS = (
@@ -327,27 +333,27 @@ def words_of(text):
 
 @pytest.mark.parametrize("columns", [40, 60, 80, 120])
 def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_without_one(
-    here, monkeypatch, columns
+    working_directory, monkeypatch, columns
 ):
     from sweep.cli.terminal import print_table
 
     cells = ["12,345 of 678,901", "0.000123", "1.2e+03 us", "123,456,789"]
-    where = "range 10..5000 m, grazing_angle 20..90 deg, laser power 1..3 W"
+    axes_text = "range 10..5000 m, grazing_angle 20..90 deg, laser power 1..3 W"
     monkeypatch.setenv("COLUMNS", str(columns))
 
     def printed():
         with CliRunner().isolation() as (out, _, _):
             headings = ["", "points met", "worst", "costs", "draws needed", "called for"]
-            print_table("Half-widths", headings, [["pd_doppler", *cells, where]], "called for")
+            print_table("Half-widths", headings, [["pd_doppler", *cells, axes_text]], "called for")
             return out.getvalue().decode()
 
     lines = printed().splitlines()
-    assert any(all(cell in line for cell in (*cells, where)) for line in lines)
+    assert any(all(cell in line for cell in (*cells, axes_text)) for line in lines)
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    shown = words_of(printed())
-    assert "…" not in "".join(shown)
-    assert not {*" ".join([*cells, where, "pd_doppler"]).split()} - {*shown}
-    assert all(cell in " ".join(shown) for cell in cells)
+    words = words_of(printed())
+    assert "…" not in "".join(words)
+    assert not {*" ".join([*cells, axes_text, "pd_doppler"]).split()} - {*words}
+    assert all(cell in " ".join(words) for cell in cells)
 
 
 @pytest.mark.parametrize("columns", [40, 60, 80])
@@ -373,8 +379,10 @@ def test_sentences_are_folded_to_a_terminal_and_commands_in_them_stay_whole(monk
         ("bins_counted: all, tnr: 7", "probability 0.589, in both chirps 0.129", "0.589"),
     ],
 )
-def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing, alarms, warned):
-    (here / "small.yaml").write_text(STUDY.replace("tnr: 8", processing))
+def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(
+    working_directory, processing, alarms, warned
+):
+    (working_directory / "small.yaml").write_text(STUDY.replace("tnr: 8", processing))
     for result in (sweep("plan", "small.yaml"), sweep("run", "small.yaml", "--scheduler", "none")):
         assert alarms in result.stdout
         warning = (
@@ -395,42 +403,49 @@ def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing,
 def test_the_remedy_for_many_false_alarms_names_a_field_that_the_study_has(processing, remedy):
     from sweep.spec.noise_alarms import false_alarm_remedy
 
-    drawn = "draws: {method: spectra, number: 2}" if "detector" in processing else ""
-    spec = GridSpec.from_mapping(yaml.safe_load(STUDY.replace("tnr: 8", processing) + drawn))
+    draws_section = "draws: {method: spectra, number: 2}" if "detector" in processing else ""
+    spec = GridSpec.from_mapping(
+        yaml.safe_load(STUDY.replace("tnr: 8", processing) + draws_section)
+    )
     assert false_alarm_remedy(spec) == remedy
 
 
-def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
+def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(working_directory):
     from sweep.spec.noise_alarms import false_alarm_probabilities
 
     text = STUDY.replace("instrument.laser.power: [1 W, 3 W]", "instrument.processing.tnr: [7, 9]")
     text = text.replace("tnr: 8", "tnr: 7")
-    (any_, both), last = false_alarm_probabilities(GridSpec.from_mapping(yaml.safe_load(text)))
+    (any_, pfa_both), last = false_alarm_probabilities(GridSpec.from_mapping(yaml.safe_load(text)))
     p = 2.7183 ** (-(4 - 3.14159) / 4 * 49)
     assert any_ == pytest.approx(1 - (1 - p) ** 2**14, rel=1e-3)
-    assert both == pytest.approx((1 - (1 - p) ** 2**13) ** 2, rel=1e-3) and last < (any_, both)
+    assert pfa_both == pytest.approx((1 - (1 - p) ** 2**13) ** 2, rel=1e-3) and last < (
+        any_,
+        pfa_both,
+    )
     cfar = STUDY.replace("tnr: 8", "tnr: 8, detector: {kind: ca_cfar, pfa: 1e-9}")
-    drawn = yaml.safe_load(cfar + "draws: {method: spectra, number: 2}")
-    ((any_, _),) = false_alarm_probabilities(GridSpec.from_mapping(drawn))
+    mapping = yaml.safe_load(cfar + "draws: {method: spectra, number: 2}")
+    ((any_, _),) = false_alarm_probabilities(GridSpec.from_mapping(mapping))
     assert any_ == pytest.approx(2**14 * 1e-9, rel=1e-4)
 
 
-def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
+def test_a_very_large_study_begins_only_after_a_question(working_directory, monkeypatch):
     """By its points, its bytes, and the time that it takes; a plan says so, too."""
     from sweep.cli import terminal
 
     text = STUDY.replace("number: 40", "number: 100000").replace(
         "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 100000}"
     )
-    (here / "huge.yaml").write_text(text.replace("storage: {block_points: 8}", ""))
-    asked = sweep("run", "huge.yaml")
-    refused(asked, "10,000,000,000 points", "TB", "--yes")
-    assert asked.stderr.count("\n") == 1 and not (here / "results").exists()
-    begun = []
-    monkeypatch.setattr(driver, "run", lambda study, **how: begun.append(study) or sys.exit(0))
-    assert sweep("run", "huge.yaml", "--yes").exit_code == 0 and len(begun) == 1
+    (working_directory / "huge.yaml").write_text(text.replace("storage: {block_points: 8}", ""))
+    result = sweep("run", "huge.yaml")
+    refused(result, "10,000,000,000 points", "TB", "--yes")
+    assert result.stderr.count("\n") == 1 and not (working_directory / "results").exists()
+    requests = []
+    monkeypatch.setattr(
+        driver, "run", lambda study, **execution: requests.append(study) or sys.exit(0)
+    )
+    assert sweep("run", "huge.yaml", "--yes").exit_code == 0 and len(requests) == 1
     monkeypatch.setattr(terminal, "MEASURE_TIME_ABOVE_POINT_DRAWS", 10)
-    assert sweep("run", "small.yaml").exit_code == 0 and len(begun) == 2
+    assert sweep("run", "small.yaml").exit_code == 0 and len(requests) == 2
     with monkeypatch.context() as fewer:
         fewer.setattr(terminal, "ASK_ABOVE_POINTS", 79)
         assert "takes --yes: 80 points" in sweep("plan", "small.yaml").stdout
@@ -439,12 +454,16 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
 
 
 @pytest.mark.parametrize("study", ["small.yaml", "hills.yaml"])
-def test_a_cost_is_told_of_what_is_simulated_and_is_no_more_than_that_of_its_points(here, study):
+def test_a_cost_is_shown_for_what_is_simulated_and_is_no_more_than_that_of_its_points(
+    working_directory, study
+):
     from sweep.tasks.studies.study_loading import make_study
     from sweep.tasks.studies.study_plan import effects_table
 
-    (here / "hills.yaml").write_text(HILLS)
-    rows = effects_table(make_study(load(here / study), here / "none.zarr")).rows
+    (working_directory / "hills.yaml").write_text(HILLS)
+    rows = effects_table(
+        make_study(load(working_directory / study), working_directory / "none.zarr")
+    ).rows
     assert [
         row.name
         for row in rows
@@ -458,15 +477,15 @@ def test_a_cost_is_told_of_what_is_simulated_and_is_no_more_than_that_of_its_poi
 
 
 def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(
-    here, monkeypatch
+    working_directory, monkeypatch
 ):
     from sweep.model.unsupported_shot import UnsupportedShotError
     from sweep.tasks.studies import study_plan
 
-    def beyond(spec, **how):
+    def raise_beyond_model(spec, **message):
         raise UnsupportedShotError("full scale is exceeded: raise it")
 
-    monkeypatch.setattr(study_plan, "effects_table", beyond)
+    monkeypatch.setattr(study_plan, "effects_table", raise_beyond_model)
     refused(sweep("plan", "small.yaml"), "full scale is exceeded: raise it")
 
 
@@ -476,17 +495,20 @@ accuracy: {tolerance: 0.1}
 """
 
 
-def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here):
+def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(working_directory):
     import numpy as np
     import xarray as xr
 
     from sweep.tasks.studies.store_summary import accuracy_rows_of_draws
 
-    (here / "drawn.yaml").write_text(STUDY + DRAWN)
+    (working_directory / "drawn.yaml").write_text(STUDY + DRAWN)
     run = sweep("run", "drawn.yaml", "--scheduler", "none")
-    told = sweep("status", "results/drawn.zarr")
-    store = xr.open_zarr(here / "results" / "drawn.zarr")
-    rows = {row.name: row for row in accuracy_rows_of_draws(here / "results" / "drawn.zarr")}
+    status_result = sweep("status", "results/drawn.zarr")
+    store = xr.open_zarr(working_directory / "results" / "drawn.zarr")
+    rows = {
+        row.name: row
+        for row in accuracy_rows_of_draws(working_directory / "results" / "drawn.zarr")
+    }
     assert list(rows) == ["pd_up", "pd_doppler", "pd_down", "pd_shot"]
     for name, row in rows.items():
         widths = store[f"{name}_half_width"]
@@ -499,7 +521,7 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here
         assert row.worst_point_label.startswith(
             f"range {float(store.range[worst[0]]):.4g} m, power "
         )
-        for result in (run, told):
+        for result in (run, status_result):
             assert (
                 f"{row.n_points_within_tolerance} of 80" in result.stdout
                 and f"{row.draws_needed:,.0f}" in result.stdout
@@ -510,30 +532,34 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here
     assert (promised["tolerance"], promised["confidence"]) == (0.1, 0.95)
 
 
-def test_a_plan_of_very_many_draws_takes_seconds_and_counts_them_all(here):
+def test_a_plan_of_very_many_draws_takes_seconds_and_counts_them_all(working_directory):
     many = STUDY.replace("reflectance: 0.01}", "reflectance: 0.01, roughness: 1 um}")
-    begun = time.monotonic()
-    (here / "many.yaml").write_text(many + "draws: {limit: 1e9}\naccuracy: {tolerance: 1e-6}\n")
+    start_time = time.monotonic()
+    (working_directory / "many.yaml").write_text(
+        many + "draws: {limit: 1e9}\naccuracy: {tolerance: 1e-6}\n"
+    )
     result = sweep("plan", "many.yaml", "--workers", "1")
-    assert time.monotonic() - begun < 60
+    assert time.monotonic() - start_time < 60
     lines = dict(line.strip().split("  ", 1) for line in result.stdout.splitlines()[:7])
     # A draw takes 0.1 us at the least.
     assert float(lines["time a point"].split()[0]) > 1e9 * 0.1
     assert lines["time"].startswith("at most about")
 
 
-def test_plan_of_ten_million_points_takes_seconds(here):
+def test_plan_of_ten_million_points_takes_seconds(working_directory):
     text = STUDY.replace("number: 40", "number: 100000").replace(
         "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 100}"
     )
-    (here / "large.yaml").write_text(text.replace("block_points: 8", "block_points: 1"))
-    begun = time.monotonic()
+    (working_directory / "large.yaml").write_text(
+        text.replace("block_points: 8", "block_points: 1")
+    )
+    start_time = time.monotonic()
     result = sweep("plan", "large.yaml")
     assert "10,000,000 of at most 1 range x 1 power" in result.stdout
-    assert time.monotonic() - begun < 20
+    assert time.monotonic() - start_time < 20
 
 
-def test_shot_prints_its_report_and_draws_the_shot_that_was_asked_for(here):
+def test_shot_prints_its_report_and_draws_the_shot_that_was_asked_for(working_directory):
     result = sweep(
         "shot", "small.yaml", "--at", "range=2km", "--at", "grazing_angle = 45 deg", "--no-noise"
     )
@@ -541,19 +567,19 @@ def test_shot_prints_its_report_and_draws_the_shot_that_was_asked_for(here):
     assert "2000.0000" in result.stdout and "45" in result.stdout
     files = [Path(line) for line in result.stdout.split("\n") if line.startswith("results/")]
     assert {file.suffix for file in files} == {".png", ".txt"}
-    assert all(has_content(here / file) for file in files)
+    assert all(has_content(working_directory / file) for file in files)
     refused(sweep("shot", "small.yaml", "--at", "range"), "is not NAME=VALUE")
     refused(sweep("shot", "small.yaml", "--at", "rnge=2km"), "rnge: is no parameter")
 
 
-def test_figures_go_beside_the_store_or_where_asked(ran):
-    beside = sweep("figures", "results/small.zarr").stdout.split()
-    assert beside and all(name.startswith("results/small-figures/") for name in beside)
-    asked = sweep("figures", "results/small.zarr", "--output", "elsewhere").stdout.split()
-    assert [Path(name).name for name in asked] == [Path(name).name for name in beside]
-    assert all(has_content(ran / name) for name in beside)
-    assert [(ran / name).read_bytes() for name in asked] == [
-        (ran / name).read_bytes() for name in beside
+def test_figures_go_next_to_the_store_or_where_asked(ran):
+    paths = sweep("figures", "results/small.zarr").stdout.split()
+    assert paths and all(name.startswith("results/small-figures/") for name in paths)
+    requested_paths = sweep("figures", "results/small.zarr", "--output", "elsewhere").stdout.split()
+    assert [Path(name).name for name in requested_paths] == [Path(name).name for name in paths]
+    assert all(has_content(ran / name) for name in paths)
+    assert [(ran / name).read_bytes() for name in requested_paths] == [
+        (ran / name).read_bytes() for name in paths
     ]
 
 
@@ -584,7 +610,7 @@ print([m for m in slow if f'scipy.{m}' in sys.modules])
 """
 
 
-def test_what_takes_long_to_import_is_imported_only_where_it_is_needed(here):
+def test_what_takes_long_to_import_is_imported_only_where_it_is_needed(working_directory):
     """Nothing by help, no compiler by what computes nothing, and of scipy what specs need.
 
     scipy.signal brings scipy.stats with it, which takes longer to import than all the rest.
@@ -594,15 +620,15 @@ def test_what_takes_long_to_import_is_imported_only_where_it_is_needed(here):
     Path("wrong.yaml").write_text(study.replace("reflectance", "reflektance"))
     Path("scene.yaml").write_text(study.replace("target: {", "scene: {"))
     assert sweep("run", "small.yaml", "--store", "s.zarr", "--scheduler", "none").exit_code == 0
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True
     )
-    assert done.stdout.splitlines() == [
+    assert process.stdout.splitlines() == [
         "[]", "0 True False", "2 True False", "2 True False", "[]", "[]",
     ]  # fmt: skip
 
 
-def test_the_package_offers_load_run_and_resume(here):
+def test_the_package_offers_load_run_and_resume(working_directory):
     import sweep as package
 
     spec = package.load("small.yaml")
@@ -614,8 +640,8 @@ def test_the_package_offers_load_run_and_resume(here):
         _ = package.nothing
 
 
-def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
-    (here / "long.yaml").write_text(STUDY.replace("number: 40", "number: 4000"))
+def test_the_installed_command_runs_on_workers_and_can_be_interrupted(working_directory):
+    (working_directory / "long.yaml").write_text(STUDY.replace("number: 40", "number: 4000"))
     command = [sys.executable, "-c", "from sweep.cli import main; main()"]
     long = subprocess.Popen(
         [*command, "run", "long.yaml", "--workers", "1"],
@@ -624,7 +650,7 @@ def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
         text=True,
         start_new_session=True,
     )
-    receipts = here / "results" / "long.zarr" / ".sweep" / "receipts.jsonl"
+    receipts = working_directory / "results" / "long.zarr" / ".sweep" / "receipts.jsonl"
     deadline = time.monotonic() + 120
     while not (receipts.exists() and receipts.read_text()) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -654,10 +680,10 @@ def _lines_of_progress(capsys):
     lines.advance(points=30, failed=0)
     lines.advance(points=0, failed=2)
     lines.end()
-    shown = capsys.readouterr().err.splitlines()
-    assert shown[0] == "20 of 100 points"
-    assert shown[1].startswith("50 of 100 points, ")
-    assert shown[-1].endswith("2 blocks failed")
+    stderr_lines = capsys.readouterr().err.splitlines()
+    assert stderr_lines[0] == "20 of 100 points"
+    assert stderr_lines[1].startswith("50 of 100 points, ")
+    assert stderr_lines[-1].endswith("2 blocks failed")
 
 
 @pytest.mark.parametrize(
@@ -675,21 +701,25 @@ def test_durations_are_said_in_words(seconds, text):
     assert progress.duration_text(seconds) == text
 
 
-def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(here):
+def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(working_directory):
     spec = GridSpec.from_mapping(
-        {**yaml.safe_load(STUDY), "execution": {"workers": 3, "scheduler": "none"}}, base=here
+        {**yaml.safe_load(STUDY), "execution": {"workers": 3, "scheduler": "none"}},
+        base=working_directory,
     )
     assert RunOptions().resolve_cluster(SpecWorkload(spec)) is None
     assert RunOptions(workers=2).resolve_cluster(SpecWorkload(spec)).workers == (2, 2)
-    spec = GridSpec.from_mapping({**yaml.safe_load(STUDY), "execution": {"workers": 3}}, base=here)
+    spec = GridSpec.from_mapping(
+        {**yaml.safe_load(STUDY), "execution": {"workers": 3}}, base=working_directory
+    )
     assert RunOptions().resolve_cluster(SpecWorkload(spec)).workers == (3, 3)
 
 
-def test_threads_compute_unless_something_needs_workers(here):
+def test_threads_compute_unless_something_needs_workers(working_directory):
     small, large = yaml.safe_load(STUDY), yaml.safe_load(STUDY)
     large["axes"]["target.range"]["number"] = 10**6
     small, large = (
-        SpecWorkload(GridSpec.from_mapping(mapping, base=here)) for mapping in (small, large)
+        SpecWorkload(GridSpec.from_mapping(mapping, base=working_directory))
+        for mapping in (small, large)
     )
     for workload in (small, large):
         assert RunOptions().resolve_cluster(workload) is None
@@ -716,8 +746,8 @@ def test_threads_and_an_option_of_workers_exclude_each_other(options):
 
 def test_a_study_is_extended_by_the_file_of_a_larger_one(ran):
     (ran / "larger.yaml").write_text(STUDY.replace("[1 W, 3 W]", "[1 W, 3 W, 5 W]"))
-    done = sweep("extend", "results/small.zarr", "larger.yaml", "--scheduler", "none")
-    assert done.exit_code == 0 and "results/small.zarr: 120 of 120 points" in done.stdout
+    result = sweep("extend", "results/small.zarr", "larger.yaml", "--scheduler", "none")
+    assert result.exit_code == 0 and "results/small.zarr: 120 of 120 points" in result.stdout
 
 
 @pytest.mark.parametrize("command", ["status x.zarr", "plan x.yaml", "figures x.zarr"])
@@ -725,18 +755,18 @@ def test_a_folder_that_was_removed_ends_in_a_line(tmp_path, monkeypatch, command
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    told = CliRunner().invoke(main, command.split(), catch_exceptions=False)
-    assert told.exit_code == 2
-    assert told.output == "the current folder was removed: go to another\n"
+    result = CliRunner().invoke(main, command.split(), catch_exceptions=False)
+    assert result.exit_code == 2
+    assert result.output == "the current folder was removed: go to another\n"
 
 
-def test_beamlets_that_are_given_are_said_not_to_be_checked(here):
+def test_beamlets_that_are_given_are_said_not_to_be_checked(working_directory):
     """37 beamlets of a spec that never asked whether they are enough."""
-    told = "whether footprint.beamlets, given as 9, keeps accuracy.tolerance"
-    assert told in " ".join(sweep("plan", "small.yaml").stdout.split())
+    message = "whether footprint.beamlets, given as 9, keeps accuracy.tolerance"
+    assert message in " ".join(sweep("plan", "small.yaml").stdout.split())
     ran = sweep("run", "small.yaml", "--scheduler", "none")
-    assert told in " ".join(ran.stdout.split())
-    assert told in " ".join(sweep("status", "results/small.zarr").stdout.split())
+    assert message in " ".join(ran.stdout.split())
+    assert message in " ".join(sweep("status", "results/small.zarr").stdout.split())
     counted = STUDY.replace("{beamlets: 9, speckle: none}", "{speckle: none}")
-    (here / "counted.yaml").write_text(counted)
+    (working_directory / "counted.yaml").write_text(counted)
     assert "footprint.beamlets" not in sweep("plan", "counted.yaml").stdout

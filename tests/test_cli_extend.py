@@ -30,12 +30,14 @@ def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
     assert file_digests(Path(store)) == file_digests(
         run_serially(four("[1 W, 2 W, 3 W]"), Path("again.zarr")).store
     )
-    again = sweep("extend", store, "--set", f"{POWER}=[1 W, 2 W, 3 W]", "--scheduler", "none")
-    assert again.exit_code == 0 and "nothing to extend" in again.stderr
+    second_result = sweep(
+        "extend", store, "--set", f"{POWER}=[1 W, 2 W, 3 W]", "--scheduler", "none"
+    )
+    assert second_result.exit_code == 0 and "nothing to extend" in second_result.stderr
 
 
 @pytest.mark.parametrize(
-    "arguments, told",
+    "arguments, message",
     [
         ([], "name the larger study, or what is to change in it with --set"),
         (["--set", "draws.limit"], "is not NAME=VALUE, as in draws.limit=1e6"),
@@ -50,8 +52,8 @@ def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
         (["--set", "seed=4"], "seed: 3 -> 4, and must stay as it is"),
     ],
 )
-def test_mistakes_are_told_in_words_and_nothing_changes(store, arguments, told):
+def test_mistakes_are_reported_in_words_and_nothing_changes(store, arguments, message):
     before = file_digests(Path(store))
     result = sweep("extend", store, *arguments)
-    assert result.exit_code == 2 and told in result.stderr and "Traceback" not in result.stderr
+    assert result.exit_code == 2 and message in result.stderr and "Traceback" not in result.stderr
     assert file_digests(Path(store)) == before and [p.name for p in Path().iterdir()] == [store]

@@ -16,7 +16,7 @@ DRAWS = 30
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def working_directory(tmp_path, monkeypatch):
     """A directory of one's own with a study of whole spectra in it."""
     mapping = yaml.safe_load(STUDY)
     mapping["instrument"]["processing"] |= {
@@ -32,44 +32,44 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_spectra_are_those_that_the_study_looks_at(here):
+def test_spectra_are_those_that_the_study_looks_at(working_directory):
     """Detections of the fixed threshold counted by hand, one by one, as the store has them."""
     stores = "a.zarr", "memory://spectra/a.zarr"
     for place in stores:
         assert sweep.run(sweep.load("small.yaml"), store=place, scheduler="none", progress=False)
     store = sweep.open("a.zarr")
     for source in ("small.yaml", *stores):
-        done = command("spectra", source, "--at", "range=3km", "--draws", DRAWS, "-o", "s.zarr",
+        result = command("spectra", source, "--at", "range=3km", "--draws", DRAWS, "-o", "s.zarr",
                        "--overwrite")  # fmt: skip
-        assert done.exit_code == 0, done.output
-        found = xr.open_zarr("s.zarr", consolidated=False).load()
-        flags = np.abs(found.spectrum) >= found.threshold
+        assert result.exit_code == 0, result.output
+        dataset = xr.open_zarr("s.zarr", consolidated=False).load()
+        flags = np.abs(dataset.spectrum) >= dataset.threshold
         for segment in ("up", "down", "doppler"):
-            at = int(np.argmax(np.abs(found.signal.sel(segment=segment).values)))
+            at = int(np.argmax(np.abs(dataset.signal.sel(segment=segment).values)))
             counted = int(flags.sel(segment=segment).isel(frequency=at).sum())
             assert 0 < counted < DRAWS
             assert counted == int(store[f"n_detected_{segment}"].sel(range=3))
-    assert GridSpec.from_stored(found.attrs["spec"]).id == sweep.load("small.yaml").id
+    assert GridSpec.from_stored(dataset.attrs["spec"]).id == sweep.load("small.yaml").id
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
-def test_a_file_says_what_is_true(here, record):
+def test_a_file_says_what_is_true(working_directory, record):
     """Levels against the spectra themselves; lines against range and velocity."""
-    mapping = yaml.safe_load((here / "small.yaml").read_text())
+    mapping = yaml.safe_load((working_directory / "small.yaml").read_text())
     mapping["instrument"]["receiver"]["record"] = record
-    (here / "small.yaml").write_text(yaml.safe_dump(mapping))
-    done = command("spectra", "small.yaml", "--draws", 50, "--first", 7, "-o", "s.npz")
-    assert done.exit_code == 0, done.output
+    (working_directory / "small.yaml").write_text(yaml.safe_dump(mapping))
+    result = command("spectra", "small.yaml", "--draws", 50, "--first", 7, "-o", "s.npz")
+    assert result.exit_code == 0, result.output
     s = np.load("s.npz")
     noise = s["spectrum"] - s["signal"]
     assert s["draw"].tolist() == list(range(7, 57)) and s["segment"].tolist()[1] == "doppler"
     power = np.mean(np.abs(noise[..., 1:-1]) ** 2)
     assert power == pytest.approx(s["noise_power"], rel=5 / np.sqrt(50 * 3 * 511 / 2))
     assert s["true_frequency"][1] == pytest.approx(2 * s["radial_velocity"] / 1550e-9, rel=1e-3)
-    apart = s["line_frequency"][2].mean() - s["line_frequency"][0].mean()
+    spacing = s["line_frequency"][2].mean() - s["line_frequency"][0].mean()
     beat = 2 * s["range"] / 299792458 * 1e9 / 500e-6
-    seen = 2 * beat if record == "complex" else min(2 * beat, 2 * s["true_frequency"][1])
-    assert abs(apart) == pytest.approx(seen, rel=2e-3)
+    folded = 2 * beat if record == "complex" else min(2 * beat, 2 * s["true_frequency"][1])
+    assert abs(spacing) == pytest.approx(folded, rel=2e-3)
     power = np.abs(s["signal"]).argmax(axis=-1)  # of up, Doppler and down
     np.testing.assert_allclose(s["frequency"][power], s["true_frequency"], atol=1e6)
     assert json.loads(str(s["attributes"]))["window_name"] == "hann"
@@ -78,7 +78,7 @@ def test_a_file_says_what_is_true(here, record):
     np.testing.assert_array_equal(np.load("t.npz")["spectrum"][0], s["spectrum"][13])
 
 
-def test_mistakes_are_told(here):
+def test_mistakes_are_reported(working_directory):
     assert command("spectra", "small.yaml", "-o", "s.npz").exit_code == 0
     assert "does not exist" in command("spectra", "absent.yaml", "-o", "t.npz").stderr
     for arguments, words in (
@@ -86,22 +86,22 @@ def test_mistakes_are_told(here):
         (("-o", "s.csv"), ".zarr nor .npz"),
         (("--at", "rnge=1km", "-o", "t.npz"), "did you mean 'target.range'"),
     ):
-        done = command("spectra", "small.yaml", *arguments)
-        assert done.exit_code == 2 and words in done.stderr
+        result = command("spectra", "small.yaml", *arguments)
+        assert result.exit_code == 2 and words in result.stderr
 
 
-def test_code_is_run_with_leave_alone(here, monkeypatch):
+def test_code_is_run_with_leave_alone(working_directory, monkeypatch):
     monkeypatch.setenv("SWEEP_ALLOW_CODE", "")
     text = (
-        (here / "small.yaml")
+        (working_directory / "small.yaml")
         .read_text()
         .replace("    sample_rate:", "    detector: {kind: 'mine_of_cli:detect'}\n    sample_rate:")
     )
-    (here / "own.yaml").write_text(text)
-    (here / "mine_of_cli.py").write_text(
+    (working_directory / "own.yaml").write_text(text)
+    (working_directory / "mine_of_cli.py").write_text(
         "def detect(power, setting):\n    return power > setting.threshold**2\n"
     )
     refused = command("run", "own.yaml", "--scheduler", "none")
     assert refused.exit_code == 2 and "--allow-code mine_of_cli" in refused.stderr
-    done = command("run", "own.yaml", "--scheduler", "none", "--allow-code", "mine_of_cli")
-    assert done.exit_code == 0, done.output
+    result = command("run", "own.yaml", "--scheduler", "none", "--allow-code", "mine_of_cli")
+    assert result.exit_code == 0, result.output

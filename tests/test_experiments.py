@@ -39,16 +39,16 @@ def _shown(paths):
     ]
 
 
-def _written(member, kept):
-    values = np.asarray(member.display_values)[kept].tolist()
+def _written(member, indices):
+    values = np.asarray(member.display_values)[indices].tolist()
     return [f"{value!r} {member.units}".strip() if member.units else value for value in values]
 
 
 def _held(spec, axis):
     """Places of the values of a plain axis at which figures hold it."""
-    written = [figure.where[axis.name] for figure in spec.figures
+    axis_values = [figure.where[axis.name] for figure in spec.figures
                if axis.name in getattr(figure, "where", {})]  # fmt: skip
-    held = [spec.read_coordinate_value(axis.name, value) for several in written
+    held = [spec.read_coordinate_value(axis.name, value) for several in axis_values
             for value in (several if isinstance(several, list | tuple) else [several])]  # fmt: skip
     return np.flatnonzero(matches_any_value(np.asarray(axis.parameters[0].display_values), held))
 
@@ -66,8 +66,8 @@ def _thinned(spec):
     """The same study with a few values left on every axis."""
     mapping, axes = spec.to_yaml_mapping(), {}
     for axis in spec.axes:
-        written = {m.path: _written(m, _kept(spec, axis)) for m in axis.parameters}
-        axes |= {axis.name: {"zip": [written]}} if axis.is_zipped else written
+        thinned_values = {m.path: _written(m, _kept(spec, axis)) for m in axis.parameters}
+        axes |= {axis.name: {"zip": [thinned_values]}} if axis.is_zipped else thinned_values
     if isinstance(spec, GridSpec) and spec.draws.draws_whole_spectra:
         mapping["draws"] |= {"number": 5}
     return GridSpec.from_mapping(mapping | {"axes": axes})
@@ -82,16 +82,16 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
     store = tmp_path / "tiny.zarr"
     assert sweep.run(_thinned(spec), store=store, scheduler="none", progress=False).complete
     dataset = sweep.open(store)
-    drawn = (
+    extra_outputs = (
         {*STANDARD_ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
         if spec.draws.has_draws
         else set()
     )
-    stored = {*GRID_OUTPUTS, *drawn}
+    stored = {*GRID_OUTPUTS, *extra_outputs}
     if spec.draws.draws_whole_spectra:
         stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
     assert set(dataset.data_vars) == {*stored, "effects", "effects_error"}
-    seen = dataset.pd_doppler > 0.2  # else there may be no draw to average over
+    is_detected = dataset.pd_doppler > 0.2  # else there may be no draw to average over
     footprint = spec.footprint
     is_checked = footprint.beamlets == 0 and footprint.phases == "incoherent"
     for name, variable in dataset.data_vars.items():
@@ -99,7 +99,9 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
         if name == "beamlets_error" and not is_checked:
             assert np.isnan(variable).all()
         else:
-            assert np.isfinite(variable.where(seen, 0.0) if resolved else variable).all(), name
+            assert np.isfinite(variable.where(is_detected, 0.0) if resolved else variable).all(), (
+                name
+            )
         if name.startswith(("pd_", "miss_", "pfa_", "p_leakage_")):
             assert ((variable >= 0) & (variable <= 1)).all(), name
     if "miss_shot" in dataset:
@@ -130,9 +132,9 @@ def test_experiment_over_a_scene_runs_to_store_and_figures(path, tmp_path):
     tree = sweep.open_scene(store)
     for scanner in spec.scanners:
         cloud = tree[scanner].ds
-        seen = np.isfinite(cloud.beam_range.values)
-        assert seen.mean() > 0.99
-        assert (np.isfinite(cloud.pd_shot.values) == seen).all()
+        is_seen = np.isfinite(cloud.beam_range.values)
+        assert is_seen.mean() > 0.99
+        assert (np.isfinite(cloud.pd_shot.values) == is_seen).all()
         points = cloud.flags.values > 0
         assert (np.isfinite(cloud.range.values) == points).all()
         assert points.any()

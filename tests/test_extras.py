@@ -17,7 +17,7 @@ OPTIONAL = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["opti
 
 def imported(extra):
     """Modules of an extra's own packages."""
-    names = {re.match(r"[\w-]+", each)[0] for each in OPTIONAL[extra]}
+    names = {re.match(r"[\w-]+", package)[0] for package in OPTIONAL[extra]}
     return {name.replace("-", "_").lower() for name in names}
 
 
@@ -33,9 +33,9 @@ def test_every_optional_module_is_brought_by_its_extra(module):
 def test_a_missing_package_is_one_line_that_tells_what_installs_it(monkeypatch):
     for name in {"obstore", *(name for name in sys.modules if name.startswith("obstore."))}:
         monkeypatch.setitem(sys.modules, name, None)  # those too that another test has imported
-    found = CliRunner().invoke(main, ["status", "s3://bucket/study.zarr"], catch_exceptions=False)
-    assert found.exit_code == 2
-    assert found.output == "obstore is not installed: pip install 'sweep[cloud]'\n"
+    result = CliRunner().invoke(main, ["status", "s3://bucket/study.zarr"], catch_exceptions=False)
+    assert result.exit_code == 2
+    assert result.output == "obstore is not installed: pip install 'sweep[cloud]'\n"
 
 
 def test_other_errors_have_no_remedy():

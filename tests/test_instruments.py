@@ -41,10 +41,10 @@ def refusal(instrument):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_instrument_has_its_published_numbers_and_the_page_has_those_that_are_simulated(name):
     """But for two deviations, which it draws of four times as many shots, and what rounds to 0."""
-    found, numbers = page.simulate_numbers(name, DRAWS), page.instrument_file(name)["numbers"]
-    assert set(found) == set(numbers)
+    simulated, numbers = page.simulate_numbers(name, DRAWS), page.instrument_file(name)["numbers"]
+    assert set(simulated) == set(numbers)
     for key, number in numbers.items():
-        assert page.is_within_allowed(number, found[key]), (key, number, found[key])
+        assert page.is_within_allowed(number, simulated[key]), (key, number, simulated[key])
     text = (ROOT / "docs" / "instruments.md").read_text()
     part = text.split(f"\n## {name}\n")[1].split("\n## ")[0]
     for key, number in numbers.items():
@@ -52,9 +52,9 @@ def test_an_instrument_has_its_published_numbers_and_the_page_has_those_that_are
         cells = [cell.strip() for cell in row.strip("|").split("|")]
         assert cells[4] == "yes"
         if key not in ("sigma_range", "sigma_velocity", "pd_of_snr"):
-            assert cells[2].split()[0] == f"{found[key]:.3g}"
-    for each in page.instrument_file(name)["assumed"]:
-        assert f"- {each}" in part
+            assert cells[2].split()[0] == f"{simulated[key]:.3g}"
+    for assumption in page.instrument_file(name)["assumed"]:
+        assert f"- {assumption}" in part
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -76,9 +76,9 @@ def test_the_tables_of_the_thesis_are_those_of_its_experiments():
         assert spec(f"chester_2017_{table}").id == spec(str(file)).id
 
 
-def test_fields_set_anew_take_the_place_of_the_librarys(tmp_path):
-    anew = {"like": "settembrini_2026", "laser": {"power": "1 mW"}, "processing": {"tnr": 10}}
-    one = spec(anew)
+def test_fields_set_again_take_the_place_of_the_librarys(tmp_path):
+    overrides = {"like": "settembrini_2026", "laser": {"power": "1 mW"}, "processing": {"tnr": 10}}
+    one = spec(overrides)
     assert (one.instrument.laser.power, one.instrument.laser.wavelength) == (1e-3, 1310e-9)
     assert (one.instrument.processing.tnr, one.instrument.processing.threshold_to_mean) == (
         10,
@@ -88,7 +88,7 @@ def test_fields_set_anew_take_the_place_of_the_librarys(tmp_path):
     file.write_text(yaml.safe_dump(one.to_yaml_mapping()))
     assert load(file).id == one.id
     file.write_text(yaml.safe_dump({
-        "title": "A study", "instrument": anew | {"laser": {"power": "1 V"}}, "target": {},
+        "title": "A study", "instrument": overrides | {"laser": {"power": "1 V"}}, "target": {},
     }))  # fmt: skip
     with pytest.raises(SpecError, match=re.escape(f"{file}:3: instrument.laser.power: needs a")):
         load(file)
@@ -102,27 +102,29 @@ def test_a_store_holds_the_instrument_in_whole(tmp_path):
 
 
 def test_a_file_of_the_same_name_is_named_by_its_path(tmp_path):
-    own = read_document(library_instrument_files()["rogers_2021"]).content["instrument"]
-    own["laser"]["power"] = "5 mW"
+    library_instrument = read_document(library_instrument_files()["rogers_2021"]).content[
+        "instrument"
+    ]
+    library_instrument["laser"]["power"] = "5 mW"
     study = {"title": "A study", "target": {"range": "20 m", "grazing_angle": "60 deg",
                                             "reflectance": 0.1}}  # fmt: skip
     for name in ("rogers_2021", "mine"):
-        (tmp_path / name).write_text(yaml.safe_dump(own))
-    for written, power in (("rogers_2021", 4e-3), ("./rogers_2021", 5e-3), ("mine", 5e-3)):
-        found = GridSpec.from_mapping(study | {"instrument": written}, base=tmp_path)
-        assert found.instrument.laser.power == power
+        (tmp_path / name).write_text(yaml.safe_dump(library_instrument))
+    for name_or_path, power in (("rogers_2021", 4e-3), ("./rogers_2021", 5e-3), ("mine", 5e-3)):
+        spec = GridSpec.from_mapping(study | {"instrument": name_or_path}, base=tmp_path)
+        assert spec.instrument.laser.power == power
 
 
-def test_an_unknown_name_is_told_what_there_is():
-    for written, path in (("setembrini_2026", ""), ({"like": "Settembrini_2026"}, ".like")):
-        told = refusal(written)
-        assert told.startswith(f"instrument{path}: is no instrument of the library")
-        assert "did you mean 'settembrini_2026'?" in told
-    told = refusal("no_such_thing_at_all")
-    assert "did you mean" not in told and all(name in told for name in NAMES)
+def test_an_unknown_name_is_refused_with_the_known_names():
+    for reference, path in (("setembrini_2026", ""), ({"like": "Settembrini_2026"}, ".like")):
+        messages = refusal(reference)
+        assert messages.startswith(f"instrument{path}: is no instrument of the library")
+        assert "did you mean 'settembrini_2026'?" in messages
+    messages = refusal("no_such_thing_at_all")
+    assert "did you mean" not in messages and all(name in messages for name in NAMES)
     assert "must be the name of an instrument" in refusal({"like": 3})
-    both = refusal({"like": "rogers_2021", "file": "a.yaml"})
-    assert "instrument.file: names another instrument, besides instrument.like" in both
+    message = refusal({"like": "rogers_2021", "file": "a.yaml"})
+    assert "instrument.file: names another instrument, besides instrument.like" in message
     assert "is no field" in refusal({"like": "rogers_2021", "path": "a.yaml"})
 
 
@@ -130,15 +132,15 @@ def test_the_command_lists_the_library_and_tells_of_each(tmp_path):
     listed = CliRunner().invoke(main, ["instruments"])
     assert [line.split()[0] for line in listed.output.splitlines()] == NAMES
     for name in NAMES:
-        told = CliRunner().invoke(main, ["instruments", name]).output
-        own = page.instrument_file(name)
-        assert own["source"] in told and own["doi"] in told
-        assert yaml.safe_load(told[told.index("\ninstrument:") :])["instrument"].keys() == (
-            own["instrument"].keys()
+        output = CliRunner().invoke(main, ["instruments", name]).output
+        instrument = page.instrument_file(name)
+        assert instrument["source"] in output and instrument["doi"] in output
+        assert yaml.safe_load(output[output.index("\ninstrument:") :])["instrument"].keys() == (
+            instrument["instrument"].keys()
         )
         file = tmp_path / "own.yaml"
-        file.write_text(told)
-        assert read_document(file).content["instrument"] == own["instrument"]
+        file.write_text(output)
+        assert read_document(file).content["instrument"] == instrument["instrument"]
         assert spec({"file": str(file)}).id == spec(name).id
     wrong = CliRunner().invoke(main, ["instruments", "rogers"])
     assert wrong.exit_code == 2 and "did you mean 'rogers_2021'?" in wrong.output
@@ -179,10 +181,10 @@ def test_draws_of_noise_follow_settembrinis_law():
     number = 4000
     axes = {"instrument.laser.power": {"log": ["100 uW", "10 mW"], "number": 5}}
     draws = {"method": "noise", "number": number}
-    seen = page.run_study(
+    outputs = page.run_study(
         page.spec_before_target("settembrini_2026", page.WALL_TARGET, axes=axes, draws=draws)
     )
-    law = np.exp(-4 * np.pi / (1 + seen.snr_up))
+    law = np.exp(-4 * np.pi / (1 + outputs.snr_up))
     error = np.sqrt(law * (1 - law) / number)
-    assert (abs(seen.n_detected_up / number - law) < 5 * error).all()
+    assert (abs(outputs.n_detected_up / number - law) < 5 * error).all()
     assert 0.03 < float(law[0]) < 0.1 and float(law[-1]) > 0.9

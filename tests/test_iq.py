@@ -32,16 +32,16 @@ def test_signs_tell_range_and_velocity_whichever_is_larger(near, fast, equal, do
     rate = 512e6
     f_r = near * rate
     f_d = (fast if equal is None else equal * near) * rate
-    seen = [(f + rate / 2) % rate - rate / 2 for f in (f_d - f_r, f_d, f_d + f_r)]
-    up, middle, down = (np.array(f) for f in seen)
-    found = resolve_range_velocity(
+    beats = [(f + rate / 2) % rate - rate / 2 for f in (f_d - f_r, f_d, f_d + f_r)]
+    up, middle, down = (np.array(f) for f in beats)
+    resolved = resolve_range_velocity(
         up=up, doppler=middle if doppler else None, down=down, sample_rate=np.array(rate),
         bin_width=np.array(1e5), has_signs=True, **CHIRP,
     )  # fmt: skip
     velocity = f_d * 299792458 / 2 / (1.93e14 + 5e8)
-    assert found.radial_velocity == pytest.approx(velocity, abs=1e-6)
+    assert resolved.radial_velocity == pytest.approx(velocity, abs=1e-6)
     delay = (f_r - 5e8 * f_d / (1.93e14 + 5e8)) / 1e14 / (1 + 2 * velocity / 299792458)
-    assert found.range == pytest.approx(299792458 / 2 * delay, abs=1e-6)
+    assert resolved.range == pytest.approx(299792458 / 2 * delay, abs=1e-6)
 
 
 def shots_of(scene, effects=DEFAULT_EFFECTS):
@@ -52,16 +52,16 @@ def shots_of(scene, effects=DEFAULT_EFFECTS):
 @pytest.mark.parametrize("source", ["shot", "amplifier", "intensity"])
 def test_noise_is_that_of_two_receivers_with_half_the_light(source, table_4_1):
     """Simulated: a hybrid gives I and Q half of echo and local oscillator, sampled with noise."""
-    own = 50e-9 if source == "amplifier" else 0.0
+    amplifier_noise = 50e-9 if source == "amplifier" else 0.0
     quiet = table_4_1(fft_size=1024, range=200.0, beamlets=1) | {
         "instrument.receiver.noise_equivalent_power": 0.0,
-        "instrument.receiver.amplifier_noise_current": own,
+        "instrument.receiver.amplifier_noise_current": amplifier_noise,
         "instrument.receiver.local_oscillator_power": 1e-9 if source == "amplifier" else 1e-3,
         "target.reflectance": 1.0 if source == "amplifier" else 1e-4,
         "instrument.laser.relative_intensity_noise": 1e-11 if source == "intensity" else 0.0,
     }  # fmt: skip
     effects = (*DEFAULT_EFFECTS, "relative_intensity_noise")
-    real, both = (
+    real, complex_statistics = (
         shot_statistics(shots_of(quiet | {RECORD: kind}, effects)) for kind in ("real", "complex")
     )
     rng, length, trials = np.random.default_rng(3), 1024, 4000
@@ -75,15 +75,15 @@ def test_noise_is_that_of_two_receivers_with_half_the_light(source, table_4_1):
     deviation = 0.7
     of_real = np.fft.fft(w * (tone.real + deviation * noise[0]))[:, 100]
     of_both = np.fft.fft(w * (tone / 2 + deviation * np.sqrt(light) * (noise[0] + 1j * noise[1])))
-    seen = [
-        abs(w.sum() / 2) ** 2 / np.var(each) for each in (of_real, of_both[:, 100])
+    snrs = [
+        abs(w.sum() / 2) ** 2 / np.var(record) for record in (of_real, of_both[:, 100])
     ]  # the same line over the noise of both quadratures
-    ratio = both["snr_up"][0] / real["snr_up"][0]
-    assert ratio == pytest.approx(seen[1] / seen[0], rel=5 * np.sqrt(2 / trials))
+    ratio = complex_statistics["snr_up"][0] / real["snr_up"][0]
+    assert ratio == pytest.approx(snrs[1] / snrs[0], rel=5 * np.sqrt(2 / trials))
     assert ratio == pytest.approx(
         {"shot": 1.0, "amplifier": 0.5, "intensity": 2.0}[source], rel=2e-3
     )
-    bins = 10 ** (both["log10_pfa_segment"] - real["log10_pfa_segment"])
+    bins = 10 ** (complex_statistics["log10_pfa_segment"] - real["log10_pfa_segment"])
     assert bins[0] == pytest.approx(1024 / 511, rel=2e-2)
 
 
@@ -104,9 +104,9 @@ def test_imbalance_makes_the_image_of_unequal_samples(phases, velocity, table_4_
     for segment in range(3):
         exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
         bins, magnitude = segment_spectra.segment_spectrum(shots, 0, segment)
-        found = np.zeros(4096)
-        found[(bins + 2048) % 4096] = magnitude
-        assert np.abs(found - exact).max() < 1e-9 * exact.max()
+        accumulated_power = np.zeros(4096)
+        accumulated_power[(bins + 2048) % 4096] = magnitude
+        assert np.abs(accumulated_power - exact).max() < 1e-9 * exact.max()
         record = time_domain_truth.analytic_record(shots, 0, segment, 3, with_range_walk=False)
         unequal = record.real + 1j * (g * record / 1j).real  # Q by its own gain and phase
         spectrum = np.abs(np.fft.fft(w * unequal))
@@ -125,11 +125,15 @@ def test_a_grid_of_both_records(tmp_path):
         "axes": {RECORD: ["real", "complex"], "target.radial_velocity": ["-35 m/s", "60 m/s"]},
     })  # fmt: skip
     assert sweep.run(spec, store=tmp_path / "g.zarr", scheduler="none", progress=False).complete
-    found = sweep.open(tmp_path / "g.zarr").load()
-    assert np.abs(found.range_error).max() < 0.3
-    assert np.abs(found.radial_velocity_error).max() < 0.3
-    more = found.log10_pfa_bin.sel(record="complex") - found.log10_pfa_bin.sel(record="real")
-    assert np.abs(more).max() < 1e-5  # the threshold follows the noise, but for the echo's own
+    dataset = sweep.open(tmp_path / "g.zarr").load()
+    assert np.abs(dataset.range_error).max() < 0.3
+    assert np.abs(dataset.radial_velocity_error).max() < 0.3
+    difference = dataset.log10_pfa_bin.sel(record="complex") - dataset.log10_pfa_bin.sel(
+        record="real"
+    )
+    assert (
+        np.abs(difference).max() < 1e-5
+    )  # the threshold follows the noise, but for the echo's own
 
 
 @pytest.mark.parametrize("speed", [pytest.param(15, marks=pytest.mark.slow), 90])
@@ -137,10 +141,10 @@ def test_a_street_in_complex_records(speed, tmp_path):
     """Two segments and signs: every return is read right, whichever of its beats is larger."""
     clouds = {}
     for kind in ("real", "complex"):
-        written = instrument(segments="up down")
-        written["receiver"] |= {"record": kind}
+        mapping = instrument(segments="up down")
+        mapping["receiver"] |= {"record": kind}
         spec = SceneSpec.from_mapping({
-            "title": "A street", "instrument": written,
+            "title": "A street", "instrument": mapping,
             "scene": {"origin": "ground", "objects": STREET},
             "platform": {"path": {
                 "kind": "straight", "from": ["0 m", "0 m", "90 m"], "to": ["0 m", "0 m", "60 m"],
@@ -154,25 +158,25 @@ def test_a_street_in_complex_records(speed, tmp_path):
         store = tmp_path / f"{kind}.zarr"
         assert sweep.run(spec, store=store, scheduler="none", progress=False).complete
         clouds[kind] = sweep.open_scene(store)["frame"].to_dataset().load()
-    real, both = ((cloud["flags"] & TRUE_FLAG > 0).sum().item() for cloud in clouds.values())
+    real, n_complex = ((cloud["flags"] & TRUE_FLAG > 0).sum().item() for cloud in clouds.values())
     wrong = (clouds["complex"]["flags"] & (MISREAD_FLAG | MISPAIRED_FLAG) > 0).sum().item()
     assert (real == 0) == (speed == 90)  # |f_d| > f_r: exchanged
-    assert both > 1000 and both >= 0.99 * real and wrong <= 1e-3 * both
+    assert n_complex > 1000 and n_complex >= 0.99 * real and wrong <= 1e-3 * n_complex
 
 
 @pytest.mark.parametrize(
-    "changed, told",
+    "changes, message",
     [
         ({"receiver": {"record": "complex", "architecture": "direct"}}, "I and Q"),
         ({"receiver": {"record": "both"}}, "real"),
         ({"receiver": {"iq_gain_imbalance": "0.5 dB"}}, "record: complex"),
     ],
 )
-def test_what_makes_no_complex_record_is_told(changed, told):
-    written = instrument()
-    for part, fields in changed.items():
-        written[part] |= fields
+def test_what_makes_no_complex_record_is_refused(changes, message):
+    mapping = instrument()
+    for part, fields in changes.items():
+        mapping[part] |= fields
     target = {"range": "100 m", "reflectance": 0.1, "radial_velocity": "5 m/s",
               "grazing_angle": "90 deg"}  # fmt: skip
-    with pytest.raises(SpecError, match=told):
-        GridSpec.from_mapping({"title": "x", "instrument": written, "target": target})
+    with pytest.raises(SpecError, match=message):
+        GridSpec.from_mapping({"title": "x", "instrument": mapping, "target": target})

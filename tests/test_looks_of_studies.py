@@ -19,14 +19,14 @@ LEVEL = 5 * RAYLEIGH_DEVIATION
 
 def instrument(looks, power="2 mW", **processing):
     """Table 4.1's in chirps of 10 us."""
-    written = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
-    written["chirp"] |= {"duration": "10 us"}
-    written["laser"] |= {"power": power}
-    written["processing"] |= {
+    mapping = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
+    mapping["chirp"] |= {"duration": "10 us"}
+    mapping["laser"] |= {"power": power}
+    mapping["processing"] |= {
         "sample_rate": "512 MHz", "fft_size": 4096, "detection": "peak_bin",
         "noise_bins": "correlated", "tnr": 5,
     } | processing  # fmt: skip
-    return written | {"looks": looks}
+    return mapping | {"looks": looks}
 
 
 TARGET = {"range": "100 m", "reflectance": 0.1, "radial_velocity": "0 m/s",
@@ -75,22 +75,25 @@ def test_looks_reach_grids_and_flights(kind, looks, tmp_path):
         looks, instrument=instrument(looks, power="0.4 mW" if faint else "2 mW"),
         **({"footprint": {"speckle": "none"}} if steady else {}),
     )  # fmt: skip
-    found = results(spec, tmp_path / "study.zarr")
+    dataset = results(spec, tmp_path / "study.zarr")
     law = Looks.from_parameters(spec.parameters())
     assert law.number == looks["number"]
-    signal = np.sqrt(2 * np.ravel(found.snr_up))
-    told, _ = (law.pd_and_miss_steady if steady else law.pd_and_miss_in_speckle)(
+    signal = np.sqrt(2 * np.ravel(dataset.snr_up))
+    expected, _ = (law.pd_and_miss_steady if steady else law.pd_and_miss_in_speckle)(
         signal, np.full(signal.shape, LEVEL)
     )
     # The echo's own shot noise is no part of the noise that the threshold is set on.
-    np.testing.assert_allclose(np.ravel(found.pd_up), told, rtol=2e-3)
-    assert 0.3 < told.min() < 1 - 1e-6
+    np.testing.assert_allclose(np.ravel(dataset.pd_up), expected, rtol=2e-3)
+    assert 0.3 < expected.min() < 1 - 1e-6
     if kind is flight:
-        share = (np.ravel((found["flags"] > 0).any("return_number").mean("draw"))).mean()
-        pd, alarms = found.pd_shot.mean().item(), (found.pfa_up * found.pfa_down).mean().item()
+        share = (np.ravel((dataset["flags"] > 0).any("return_number").mean("draw"))).mean()
+        pd, alarms = (
+            dataset.pd_shot.mean().item(),
+            (dataset.pfa_up * dataset.pfa_down).mean().item(),
+        )
         assert share == pytest.approx(pd + (1 - pd) * alarms, abs=5 * np.sqrt(0.25 / 2000) + 0.02)
-        spread = found.range_interpolated - found.true_range
-        scores = np.ravel(spread / found.range_interpolated_standard_error)
+        spread = dataset.range_interpolated - dataset.true_range
+        scores = np.ravel(spread / dataset.range_interpolated_standard_error)
         scores = scores[np.isfinite(scores)]
         width = np.diff(np.percentile(scores, [15.865, 84.135]))[0] / 2
         assert width == pytest.approx(1.0, abs=0.1)
@@ -98,23 +101,23 @@ def test_looks_reach_grids_and_flights(kind, looks, tmp_path):
 
 def test_a_shot_of_looks_lasts_as_many_times_as_long(tmp_path):
     spec = grid({"number": 1, "combine": "coherent"}, axes={"instrument.looks.number": [1, 4]})
-    found = results(spec, tmp_path / "study.zarr")
-    np.testing.assert_allclose(found.snr_up[1] / found.snr_up[0], 4.0, rtol=1e-6)
-    np.testing.assert_allclose(found.pfa_bin[1], found.pfa_bin[0], rtol=1e-6)
-    rates = found.sweep.false_alarms_per_second()
+    dataset = results(spec, tmp_path / "study.zarr")
+    np.testing.assert_allclose(dataset.snr_up[1] / dataset.snr_up[0], 4.0, rtol=1e-6)
+    np.testing.assert_allclose(dataset.pfa_bin[1], dataset.pfa_bin[0], rtol=1e-6)
+    rates = dataset.sweep.false_alarms_per_second()
     assert float(rates[0] / rates[1]) == pytest.approx(4.0, rel=1e-3)
-    bound = found.sweep.range_error()["bound"]
+    bound = dataset.sweep.range_error()["bound"]
     assert float(bound[0] / bound[1]) == pytest.approx(2.0, rel=1e-3)
     with pytest.raises(ValueError, match=r"instrument\.looks\.number varies"):
-        found.sweep.roc()
+        dataset.sweep.roc()
 
 
 def test_curves_of_looks_go_by_their_own_alarms(tmp_path):
     spec = grid({"number": 4}, footprint={"speckle": "none"})
-    found = results(spec, tmp_path / "study.zarr")
-    law, signal = Looks(4), np.sqrt(2 * found.snr_up.item())
+    dataset = results(spec, tmp_path / "study.zarr")
+    law, signal = Looks(4), np.sqrt(2 * dataset.snr_up.item())
     chances = np.array([1e-8, 1e-3])
-    curve = found.sweep.roc(chances, segment="up")
+    curve = dataset.sweep.roc(chances, segment="up")
     level = law.threshold_ratio_from_log_pfa(np.log(chances))
     np.testing.assert_allclose(np.ravel(curve["curve_tnr"]), level / RAYLEIGH_DEVIATION, rtol=1e-6)
     np.testing.assert_allclose(
@@ -140,14 +143,14 @@ REFUSED = [
 @pytest.mark.parametrize(("looks", "parts", "path"), REFUSED)
 def test_looks_that_are_not_known_are_refused(looks, parts, path):
     """Told once, with the field, and accepted with one look."""
-    given = dict(parts)
-    made = partial(instrument, **given.pop("instrument", {}))
-    with pytest.raises(SpecError) as told:
-        grid(looks, **given, instrument=made(looks))
-    (mistake,) = told.value.mistakes
+    sections = dict(parts)
+    make_instrument = partial(instrument, **sections.pop("instrument", {}))
+    with pytest.raises(SpecError) as error_info:
+        grid(looks, **sections, instrument=make_instrument(looks))
+    (mistake,) = error_info.value.mistakes
     assert mistake.path == path
     assert mistake.suggestion
-    assert grid({"number": 1}, **given, instrument=made({"number": 1})).id
+    assert grid({"number": 1}, **sections, instrument=make_instrument({"number": 1})).id
 
 
 def test_what_flights_of_looks_do_not_draw_is_refused():

@@ -32,7 +32,7 @@ HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\u202egnp\u2066\u200b\x7f"
 OBEYED = set(HOSTILE) - set("]0;owned[2J31mgnp")
 
 
-def told(*arguments, exit_code=0):
+def command_output(*arguments, exit_code=0):
     """Output of a command, none of which a terminal obeys."""
     result = CliRunner().invoke(main, [*map(str, arguments)])
     assert result.exit_code == exit_code, result.output
@@ -43,8 +43,8 @@ def told(*arguments, exit_code=0):
 @pytest.mark.parametrize("character", sorted(OBEYED))
 def test_each_character_that_a_terminal_obeys_is_shown_as_an_escape_sequence(character):
     code = ord(character)
-    shown = f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
-    assert escape_unprintable(f"a{character}b") == f"a{shown}b"
+    escaped = f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
+    assert escape_unprintable(f"a{character}b") == f"a{escaped}b"
 
 
 @pytest.mark.parametrize("text", ["two\nlines\tand a tab", "25 µm, 90°, Zürich, 雷达, 🛰", ""])
@@ -70,25 +70,25 @@ def fails(study, block):
     raise ValueError(HOSTILE)
 
 
-def test_failures_locks_and_titles_of_a_store_are_told_in_printable_text(tmp_path):
+def test_failures_locks_and_titles_of_a_store_are_reported_in_printable_text(tmp_path):
     store = tmp_path / "a.zarr"
     spec = small_spec(title="A\nstudy")
     outcome = run_serially(spec, store, scheduler="none", evaluate=fails)
     assert not outcome.complete and outcome.failures
-    text = told("status", store)
+    text = command_output("status", store)
     assert "block 0 failed on" in text and "\\x1b]0;owned\\x07" in text
     lock = replace(LockHolder.of_this_process(), host=f"{HOSTILE}\ncomplete", token="another")
     (store / ".sweep" / "lock").write_text(json.dumps(asdict(lock)))
-    text = told("status", store)
+    text = command_output("status", store)
     assert "running: process" in text and "complete" not in text.splitlines()
-    text = told("resume", store, "--scheduler", "none", exit_code=2)
+    text = command_output("resume", store, "--scheduler", "none", exit_code=2)
     assert "is being written by process" in text and "complete" not in text.splitlines()
-    with pytest.raises(BusyError) as caught:
+    with pytest.raises(BusyError) as error_info:
         sweep.resume(store, progress=False)
-    assert not OBEYED & set(str(caught.value))
+    assert not OBEYED & set(str(error_info.value))
 
 
-def test_versions_and_ids_in_a_store_are_told_in_printable_text(tmp_path):
+def test_versions_and_ids_in_a_store_are_reported_in_printable_text(tmp_path):
     store = tmp_path / "a.zarr"
     assert run_serially(small_spec(), store).complete
     document = json.loads((store / "zarr.json").read_text())
@@ -97,17 +97,17 @@ def test_versions_and_ids_in_a_store_are_told_in_printable_text(tmp_path):
         "title": HOSTILE, "software": f"{software}, {HOSTILE} {HOSTILE}",
     }  # fmt: skip
     (store / "zarr.json").write_text(json.dumps(document))
-    told("status", store)
-    told("resume", store, exit_code=2)
-    told("verify", store, exit_code=1)
+    command_output("status", store)
+    command_output("resume", store, exit_code=2)
+    command_output("verify", store, exit_code=1)
     document["attributes"]["study_id"] = HOSTILE
     (store / "zarr.json").write_text(json.dumps(document))
     for command in ("status", "resume", "report"):
-        told(command, store, exit_code=2)
-    told("verify", store, exit_code=1)
-    with pytest.raises(StoreError) as caught:
+        command_output(command, store, exit_code=2)
+    command_output("verify", store, exit_code=1)
+    with pytest.raises(StoreError) as error_info:
         sweep.resume(store)
-    assert not OBEYED & set(str(caught.value))
+    assert not OBEYED & set(str(error_info.value))
 
 
 @pytest.mark.parametrize(
@@ -118,31 +118,31 @@ def test_versions_and_ids_in_a_store_are_told_in_printable_text(tmp_path):
         ["extend", "a.zarr", "--set", "HOSTILE"], ["extend", "a.zarr", "--set", "HOSTILE=1"],
     ],
 )  # fmt: skip
-def test_names_on_the_command_line_are_told_in_printable_text(arguments, tmp_path, monkeypatch):
+def test_names_on_the_command_line_are_reported_in_printable_text(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    told(*(word.replace("HOSTILE", HOSTILE) for word in arguments), exit_code=2)
+    command_output(*(word.replace("HOSTILE", HOSTILE) for word in arguments), exit_code=2)
 
 
-def test_a_spec_s_words_are_told_in_printable_text(tmp_path):
+def test_a_spec_s_words_are_reported_in_printable_text(tmp_path):
     words = json.dumps(HOSTILE)  # which YAML reads
     file = tmp_path / "a.yaml"
     file.write_text(f"title: {words}\n{words}: 1\ninstrument: {words}\naxes: {{{words}: [1]}}\n")
-    assert "\\x1b" in told("plan", file, exit_code=2)
-    with pytest.raises(SpecError) as caught:
+    assert "\\x1b" in command_output("plan", file, exit_code=2)
+    with pytest.raises(SpecError) as error_info:
         sweep.load(file)
-    assert not OBEYED & set(str(caught.value))
+    assert not OBEYED & set(str(error_info.value))
 
 
 def test_tables_and_lines_of_a_run_are_printable(capsys, monkeypatch):
     print_table(HOSTILE, ["one", "two"], [[HOSTILE, "a\nb"]])
     progress.ProgressLines().say(HOSTILE)
-    shown = io.StringIO()
+    stream = io.StringIO()
     monkeypatch.setattr(progress, "sys", sys)
     bar = progress.ProgressBar()
-    bar.console = Console(file=shown, force_terminal=True)
+    bar.console = Console(file=stream, force_terminal=True)
     bar.say(HOSTILE)
     out, err = capsys.readouterr()
-    assert not OBEYED & set(out + err + shown.getvalue())
+    assert not OBEYED & set(out + err + stream.getvalue())
 
 
 def test_a_traceback_after_a_command_is_printable(monkeypatch, capsys):
@@ -152,9 +152,9 @@ def test_a_traceback_after_a_command_is_printable(monkeypatch, capsys):
     monkeypatch.setattr("sweep.spec.yaml_document.library_instrument_files", broken)
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))  # put back afterwards
-    with pytest.raises(RuntimeError) as caught:
+    with pytest.raises(RuntimeError) as error_info:
         main(["instruments"])
-    sys.excepthook(caught.type, caught.value, caught.tb)
+    sys.excepthook(error_info.type, error_info.value, error_info.tb)
     err = capsys.readouterr().err
     assert "RuntimeError: \\x1b" in err and not OBEYED & set(err)
 
@@ -195,14 +195,16 @@ def test_errors_of_the_command_suggest_commands_and_errors_in_python_suggest_cal
     with pytest.raises(StoreError, match=r"`sweep\.run\(spec, store=new\)`"):
         sweep.extend("a b.zarr", small_spec(seed=4), progress=False)
     (tmp_path / "study.yaml").write_text(json.dumps(small_mapping()))
-    again = ("run", "study.yaml", "--store", "a b.zarr", "--scheduler", "none")
-    assert "a b.zarr'` tells about it, --overwrite begins anew" in told(*again, exit_code=2)
-    changed = told("extend", "a b.zarr", "--set", "seed=4", exit_code=2)
-    assert "`sweep run SPEC --store NEW`" in changed
+    arguments = ("run", "study.yaml", "--store", "a b.zarr", "--scheduler", "none")
+    assert "a b.zarr'` tells about it, --overwrite begins anew" in command_output(
+        *arguments, exit_code=2
+    )
+    output = command_output("extend", "a b.zarr", "--set", "seed=4", exit_code=2)
+    assert "`sweep run SPEC --store NEW`" in output
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"`sweep\.run\(spec, store=store\)`"):
         sweep.open("file")
-    assert "`sweep run SPEC --store STORE`" in told("status", "file", exit_code=2)
+    assert "`sweep run SPEC --store STORE`" in command_output("status", "file", exit_code=2)
 
 
 def test_what_has_failed_before_is_tried_again_by_a_call_in_python(tmp_path):

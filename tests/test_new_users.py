@@ -106,15 +106,15 @@ SPECS = [
 
 
 @pytest.mark.parametrize(("old", "new", "rule", "remedy"), SPECS)
-def test_a_wrong_spec_is_told_with_line_field_rule_value_and_remedy(
+def test_a_wrong_spec_is_reported_with_line_field_rule_value_and_remedy(
     tmp_path, old, new, rule, remedy
 ):
     assert old in GOOD
     file = tmp_path / "a.yaml"
     file.write_text(GOOD.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         load(file)
-    (mistake,) = (str(m) for m in caught.value.mistakes if rule in str(m))
+    (mistake,) = (str(m) for m in error_info.value.mistakes if rule in str(m))
     assert remedy in mistake.partition("; ")[2]
 
 
@@ -137,7 +137,7 @@ def test_spellings_that_mean_the_same_are_the_same_study(tmp_path, content):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def working_directory(tmp_path, monkeypatch):
     """Directory with a spec, an empty directory, a file of text and a store of another program."""
     monkeypatch.chdir(tmp_path)
     Path("good.yaml").write_text(GOOD)
@@ -189,7 +189,7 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize(("command", "words"), COMMANDS)
-def test_a_wrong_command_ends_in_words_and_changes_nothing(here, command, words):
+def test_a_wrong_command_ends_in_words_and_changes_nothing(working_directory, command, words):
     before = sorted(Path().rglob("*"))
     result = CliRunner().invoke(main, command.split(), catch_exceptions=False)
     assert result.exit_code == 2, result.output
@@ -229,16 +229,16 @@ CALLS = [
 
 
 @pytest.mark.parametrize(("call", "words"), CALLS)
-def test_a_wrong_call_ends_in_words_and_changes_nothing(here, call, words):
+def test_a_wrong_call_ends_in_words_and_changes_nothing(working_directory, call, words):
     before = sorted(Path().rglob("*"))
     with pytest.raises(
         (TypeError, ValueError, SpecError, sweep.tasks.engine.progress.TaskError)
-    ) as told:
+    ) as error_info:
         call()
-    assert words in str(told.value)
+    assert words in str(error_info.value)
     assert sorted(Path().rglob("*")) == before
 
 
-def test_the_good_spec_is_good(here):
+def test_the_good_spec_is_good(working_directory):
     shutil.rmtree("foreign.zarr")
     assert good().axes[0].size == 2

@@ -99,23 +99,27 @@ def test_the_exit_code_is_that_of_the_study_where_nobody_hears_what_is_said(tmp_
     store = tmp_path / "store.zarr"
     command = [*SWEEP, "run", str(spec), "--store", str(store), "--scheduler", "none"]
     if lost == "closed":
-        done = subprocess.run(["sh", "-c", 'exec "$@" >&- 2>&- <&-', "sh", *command], check=False)
+        process = subprocess.run(
+            ["sh", "-c", 'exec "$@" >&- 2>&- <&-', "sh", *command], check=False
+        )
     elif lost == "full":
         with open("/dev/full", "w") as full:
-            done = subprocess.run(command, stdout=full, stderr=full, check=False)
+            process = subprocess.run(command, stdout=full, stderr=full, check=False)
     else:
         reading, writing = os.pipe()
         os.close(reading)
-        done = subprocess.run(command, stdout=writing, stderr=writing, check=False)
+        process = subprocess.run(command, stdout=writing, stderr=writing, check=False)
         os.close(writing)
-    assert done.returncode == 0
+    assert process.returncode == 0
     assert sweep.open(store).blocks_committed == 9
 
 
-def test_lost_output_is_told_where_errors_are_heard(tmp_path, spec):
+def test_lost_output_is_reported_where_errors_are_seen(tmp_path, spec):
     with open("/dev/full", "w") as full:
-        done = subprocess.run([*SWEEP, "schema"], stdout=full, stderr=subprocess.PIPE, text=True)
-    assert done.stderr == "standard output can't be written: [Errno 28] No space left on device\n"
+        process = subprocess.run([*SWEEP, "schema"], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (
+        process.stderr == "standard output can't be written: [Errno 28] No space left on device\n"
+    )
 
 
 RUN = """
@@ -149,13 +153,13 @@ def in_a_terminal(command):
     return started, master
 
 
-@pytest.mark.parametrize("where", ["none", "workers"])
-def test_a_run_whose_terminal_is_closed_stops_and_can_be_resumed(tmp_path, where):
-    store, said = tmp_path / "store.zarr", tmp_path / "said"
+@pytest.mark.parametrize("lost_stream", ["none", "workers"])
+def test_a_run_whose_terminal_is_closed_stops_and_can_be_resumed(tmp_path, lost_stream):
+    store, output_path = tmp_path / "store.zarr", tmp_path / "said"
     script = tmp_path / "script.py"
     script.write_text(RUN)
     tests = str(Path(__file__).parent / "tasks")
-    command = [sys.executable, str(script), str(store), str(said), tests, where]
+    command = [sys.executable, str(script), str(store), str(output_path), tests, lost_stream]
     started, terminal = in_a_terminal(command)
     log = store / JOURNAL_DIR / "receipts.jsonl"
     end = time.monotonic() + 120
@@ -164,27 +168,27 @@ def test_a_run_whose_terminal_is_closed_stops_and_can_be_resumed(tmp_path, where
         time.sleep(0.05)
     os.close(terminal)  # SIGHUP, and EIO for whatever is written
     assert started.wait(120) == 0
-    blocks, _, stopped = said.read_text().partition(" ")
+    blocks, _, stopped = output_path.read_text().partition(" ")
     assert stopped == "interrupted" and 2 <= int(blocks) < 12
     events = [json.loads(line) for line in (store / JOURNAL_DIR / "sessions.jsonl").open()]
     assert events[-1]["event"] == "ended" and events[-1]["stopped"] == "interrupted"
     assert sweep.resume(store, progress=False, scheduler="none").complete
 
 
-@pytest.mark.parametrize("where", ["none", "workers"])
-def test_a_run_whose_terminal_is_stopped_goes_on_to_its_end(tmp_path, where):
+@pytest.mark.parametrize("lost_stream", ["none", "workers"])
+def test_a_run_whose_terminal_is_stopped_goes_on_to_its_end(tmp_path, lost_stream):
     """Run on a terminal that Ctrl-S has stopped from the start."""
-    store, said, script = (tmp_path / name for name in ("store.zarr", "said", "script.py"))
+    store, output_path, script = (tmp_path / name for name in ("store.zarr", "said", "script.py"))
     script.write_text(RUN)
     tests = str(Path(__file__).parent / "tasks")
     master, slave = pty.openpty()
     termios.tcflow(slave, termios.TCOOFF)
     # Warnings are Python's to print, which waits for the terminal.
     options = [sys.executable, "-W", "ignore", str(script)]
-    command = [*options, str(store), str(said), tests, where]
+    command = [*options, str(store), str(output_path), tests, lost_stream]
     started = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave)
     assert started.wait(120) == 0
-    assert said.read_text() == "12 "
+    assert output_path.read_text() == "12 "
     os.close(slave)
     os.close(master)
 
@@ -214,36 +218,36 @@ if __name__ == "__main__":
 
 def test_nothing_that_dask_logs_waits_for_a_terminal_that_is_stopped(tmp_path):
     """Log and print in workers, log in the scheduler's loop and in the main thread."""
-    said, script = tmp_path / "said", tmp_path / "script.py"
+    output_path, script = tmp_path / "said", tmp_path / "script.py"
     script.write_text(LOGGING_CLUSTER)
     master, slave = pty.openpty()
     termios.tcflow(slave, termios.TCOOFF)
-    command = [sys.executable, "-W", "ignore", str(script), str(said)]
+    command = [sys.executable, "-W", "ignore", str(script), str(output_path)]
     started = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave)
     try:
         assert started.wait(120) == 0
     finally:
         started.kill()
-    assert said.read_text() == "11"
+    assert output_path.read_text() == "11"
     os.close(slave)
     os.close(master)
 
 
 def test_a_stream_whose_reader_stops_takes_no_time_and_goes_on_with_it():
     reading, writing = os.pipe()
-    room = fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, 4096)
+    pipe_bytes = fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, 4096)
     with open(writing, "w") as inside, open(reading, "rb") as reader:
         stream = StallTolerantStream(inside)
         print("first", file=stream, flush=True)
         assert os.read(reading, 100) == b"first\n"
-        begun = time.monotonic()
+        start_time = time.monotonic()
         for number in range(200):
-            print(f"{number} " + room // 8 * ".", file=stream, flush=True)
-        assert time.monotonic() - begun < 3.0
-        heard = b""
-        while b"199 " not in heard:
-            heard += reader.read1()
-        assert heard.startswith(b"0 ...")
+            print(f"{number} " + pipe_bytes // 8 * ".", file=stream, flush=True)
+        assert time.monotonic() - start_time < 3.0
+        received = b""
+        while b"199 " not in received:
+            received += reader.read1()
+        assert received.startswith(b"0 ...")
 
 
 def test_a_process_that_ignores_hangups_goes_on_ignoring_them():
@@ -290,7 +294,7 @@ def test_a_bar_whose_terminal_is_gone_goes_on(monkeypatch):
     bar.end()
 
 
-class Deaf(progress.Progress):
+class SilentProgress(progress.Progress):
     """A listener with a mistake in it."""
 
     def __init__(self):
@@ -301,8 +305,8 @@ class Deaf(progress.Progress):
         raise RuntimeError("the window was closed")
 
 
-def test_a_listener_that_fails_is_told_nothing_more(tmp_path, caplog):
-    deaf = Deaf()
+def test_a_listener_that_fails_gets_no_more_calls(tmp_path, caplog):
+    deaf = SilentProgress()
     assert sweep.run(
         small_spec(), store=tmp_path / "s.zarr", scheduler="none", progress=deaf
     ).complete  # fmt: skip
@@ -318,8 +322,8 @@ def test_a_table_that_can_not_be_made_is_no_failure_of_the_study(tmp_path, spec,
         raise OSError(24, "Too many open files")
 
     monkeypatch.setattr(store_summary, "detection_summary", fail)
-    asked = ["run", str(spec), "--store", str(tmp_path / "s.zarr"), "--scheduler", "none"]
-    done = CliRunner().invoke(main, asked)
-    assert done.exit_code == 0, done.output
-    assert "no table of the results: OSError: [Errno 24] Too many open files" in done.output
-    assert "computed 9 of 9 blocks" in done.output
+    arguments = ["run", str(spec), "--store", str(tmp_path / "s.zarr"), "--scheduler", "none"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    assert "no table of the results: OSError: [Errno 24] Too many open files" in result.output
+    assert "computed 9 of 9 blocks" in result.output

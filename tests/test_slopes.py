@@ -77,38 +77,38 @@ def test_all_segments_tell_range_and_velocity_and_their_signs(slopes, signed):
     """Targets near and far, closing and opening; peaks that fold at Nyquist where three tell."""
     far = np.repeat([20.0, 75.0, 240.0], 4)
     speed = np.tile([-60.0, -7.0, 11.0, 90.0], 3)
-    found = fitted(slopes, (1, 1, 1), far, speed, signed=signed)
-    assert found.range == pytest.approx(far, rel=1e-9)
-    assert found.radial_velocity == pytest.approx(speed, rel=1e-7)
+    fit = fitted(slopes, (1, 1, 1), far, speed, signed=signed)
+    assert fit.range == pytest.approx(far, rel=1e-9)
+    assert fit.radial_velocity == pytest.approx(speed, rel=1e-7)
 
 
 @pytest.mark.parametrize("used", PAIRS)
 @pytest.mark.parametrize("slopes", LISTS)
 def test_two_segments_tell_as_much_under_what_is_assumed(slopes, used):
     """Far: closing and opening, but closing beside the light without a chirp. Fast: either."""
-    without = any(slope == 0 and there for slope, there in zip(slopes, used, strict=True))
+    without = any(slope == 0 and is_used for slope, is_used in zip(slopes, used, strict=True))
     far, speed = np.full(2, 300.0), np.array([5.0, 5.0 if without else -5.0])
     cases = [(far, speed, "far"), (np.full(2, 15.0), np.array([80.0, -80.0]), "fast")]
     for metres, closing, assumed in cases:
         for signed in (False, True):
-            found = fitted(slopes, used, metres, closing, signed=signed, assumed=assumed)
-            assert found.range == pytest.approx(metres, rel=1e-9), (assumed, signed)
-            assert found.radial_velocity == pytest.approx(closing, rel=1e-7), (assumed, signed)
+            fit = fitted(slopes, used, metres, closing, signed=signed, assumed=assumed)
+            assert fit.range == pytest.approx(metres, rel=1e-9), (assumed, signed)
+            assert fit.radial_velocity == pytest.approx(closing, rel=1e-7), (assumed, signed)
 
 
 def test_what_is_assumed_decides():
     """An opening target beside the light without a chirp is taken for a closing one."""
     far, speed = np.array([300.0]), np.array([-5.0])
-    found = fitted((1, 0, -1), (1, 1, 0), far, speed, signed=False)
-    assert found.radial_velocity == pytest.approx(-speed)
+    fit = fitted((1, 0, -1), (1, 1, 0), far, speed, signed=False)
+    assert fit.radial_velocity == pytest.approx(-speed)
     shift = 2 * 5.0 * CARRIER / waveform.SPEED_OF_LIGHT
-    assert found.range - far == pytest.approx(shift * waveform.SPEED_OF_LIGHT / RATE, rel=1e-3)
+    assert fit.range - far == pytest.approx(shift * waveform.SPEED_OF_LIGHT / RATE, rel=1e-3)
 
 
 @pytest.mark.parametrize(("slopes", "used"), [((1, 0.5, 1), (1, 0, 1)), ((1, 0, -1), (0, 1, 0))])
 def test_one_slope_tells_nothing(slopes, used):
-    found = fitted(slopes, used, np.array([100.0]), np.array([1.0]), signed=False)
-    assert np.isnan(found.range).all() and np.isnan(found.radial_velocity).all()
+    fit = fitted(slopes, used, np.array([100.0]), np.array([1.0]), signed=False)
+    assert np.isnan(fit.range).all() and np.isnan(fit.radial_velocity).all()
 
 
 @pytest.mark.parametrize("slopes", [(1, 0, -1), (1, 0.4, -0.3), (1, 0, 0.5)])
@@ -120,7 +120,7 @@ def test_standard_errors_are_those_of_drawn_beats(slopes, used):
     far, speed = np.full(number, 300.0), np.full(number, 5.0)
     carriers, rates, beats = beats_of(slopes, far, speed)
     peaks = beats + noise
-    found = waveform.fit_range_velocity(
+    fit = waveform.fit_range_velocity(
         np.abs(peaks),
         carriers=carriers,
         chirp_rates=rates,
@@ -129,13 +129,13 @@ def test_standard_errors_are_those_of_drawn_beats(slopes, used):
         weights=np.array(used)[:, None] / deviations[:, None] ** 2 + 0 * far,
     )
     up, doppler, down = np.where(used, deviations, np.inf)
-    told = range_velocity_deviation(
+    expected = range_velocity_deviation(
         up=up, doppler=doppler, down=down, carriers=tuple(carriers[:, 0]), chirp_rate=RATE,
         range=300.0, radial_velocity=5.0, slopes=slopes,
     )  # fmt: skip
     for name in ("range", "radial_velocity"):
-        spread = getattr(found, name).std(ddof=1)
-        assert spread == pytest.approx(float(getattr(told, name)), rel=5 / np.sqrt(2 * number))
+        spread = getattr(fit, name).std(ddof=1)
+        assert spread == pytest.approx(float(getattr(expected, name)), rel=5 / np.sqrt(2 * number))
 
 
 @pytest.mark.parametrize("snr", [(3.0, 3.0, 3.0), (20.0, 30.0, 25.0), (100.0, 5.0, 100.0)])
@@ -162,14 +162,14 @@ def test_any_two_of_three_that_fade(snr, near):
 
 
 @pytest.mark.parametrize("chance", [1e-300, 0.05, 0.4, 0.9])
-@pytest.mark.parametrize("apart", [1e-6, 1e-9, 1e-12])
-def test_any_two_of_three_of_which_two_are_all_but_one(chance, apart):
+@pytest.mark.parametrize("decorrelation", [1e-6, 1e-9, 1e-12])
+def test_any_two_of_three_of_which_two_are_all_but_one(chance, decorrelation):
     """These two are detected together, and a third adds next to nothing: the series' 0.002."""
     pd = np.full((3, 1), chance)
-    correlations = np.array([[1 - apart], [0.84], [0.8394]])
-    found, missed = pd_and_miss_any_two_in_speckle(pd, 1 - pd, np.array([1e6]), correlations)
-    assert found[0] == pytest.approx(chance, rel=2e-3, abs=2e-3)
-    assert found[0] + missed[0] == pytest.approx(1.0, abs=1e-12)
+    correlations = np.array([[1 - decorrelation], [0.84], [0.8394]])
+    pd_any_two, missed = pd_and_miss_any_two_in_speckle(pd, 1 - pd, np.array([1e6]), correlations)
+    assert pd_any_two[0] == pytest.approx(chance, rel=2e-3, abs=2e-3)
+    assert pd_any_two[0] + missed[0] == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("noisy", [False, True])
@@ -190,15 +190,18 @@ def test_draws_count_the_shots_that_the_closed_form_tells(table_4_1, noisy, spec
         count_in_noise(rows, np.array([0, number]), shots, counts)
     else:
         count_by_probability(rows, np.array([0, number]), outputs, counts)
-    told = np.array([outputs[f"pd_{name}"][0] for name in ("up", "down", "doppler", "shot")])
+    expected = np.array([outputs[f"pd_{name}"][0] for name in ("up", "down", "doppler", "shot")])
     share = counts[:4, 0, 0] / number
-    assert np.all(np.abs(share - told) < 5 * np.sqrt(told * (1 - told) / number)), (share, told)
-    assert told[3] > outputs[PD_BOTH_CHIRPS][0] + 0.02
-    assert outputs["miss_shot"][0] == pytest.approx(1 - told[3], abs=1e-12)
-    both = shot_statistics(
+    assert np.all(np.abs(share - expected) < 5 * np.sqrt(expected * (1 - expected) / number)), (
+        share,
+        expected,
+    )
+    assert expected[3] > outputs[PD_BOTH_CHIRPS][0] + 0.02
+    assert outputs["miss_shot"][0] == pytest.approx(1 - expected[3], abs=1e-12)
+    statistics = shot_statistics(
         prepared(table_4_1() | rule | {SHOT_DETECTION_PATH: "both_chirps"}, effects)
     )
-    assert outputs[PD_BOTH_CHIRPS] == both["pd_shot"]
+    assert outputs[PD_BOTH_CHIRPS] == statistics["pd_shot"]
 
 
 FLAT = {
@@ -208,15 +211,15 @@ FLAT = {
 
 
 def instrument(chirp, processing=None, receiver=None, power="1 W"):
-    written = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
-    written["chirp"] |= {"duration": "10 us"} | chirp
-    written["laser"] |= {"power": power}
-    written["receiver"] |= receiver or {}
-    written["processing"] |= {
+    mapping = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
+    mapping["chirp"] |= {"duration": "10 us"} | chirp
+    mapping["laser"] |= {"power": power}
+    mapping["receiver"] |= receiver or {}
+    mapping["processing"] |= {
         "sample_rate": "512 MHz", "fft_size": 4096, "detection": "any_bin",
         "noise_bins": "correlated",
     } | (processing or {})  # fmt: skip
-    return written
+    return mapping
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
@@ -231,17 +234,17 @@ def test_a_grid_has_segments_of_any_slope(tmp_path, record):
     spec = GridSpec.from_mapping(
         FLAT | {"instrument": instrument(chirp, receiver={"record": record}), "axes": axes}
     )
-    done = sweep.run(spec, store=tmp_path / "grid.zarr", scheduler="none", progress=False)
-    assert done.complete
-    found = sweep.open(tmp_path / "grid.zarr").load()
+    outcome = sweep.run(spec, store=tmp_path / "grid.zarr", scheduler="none", progress=False)
+    assert outcome.complete
+    dataset = sweep.open(tmp_path / "grid.zarr").load()
     bin_width = 512e6 / 4096
     # Peaks by whole bins: half a bin each, over the least difference of two slopes, a half.
     metre = 0.5 * 299792458 / 2 * bin_width / 1e14 * 2 / 0.5
-    assert np.abs(found.range_error).max() < metre
+    assert np.abs(dataset.range_error).max() < metre
     speed = 0.5 * 1550e-9 / 2 * bin_width * (1.5 / 0.5)
-    assert np.abs(found.radial_velocity_error).max() < speed
-    assert (found.pd_shot > 0.99).all()
-    bounds = found.sweep.range_error().bound.sel(segments="up down").to_numpy()
+    assert np.abs(dataset.radial_velocity_error).max() < speed
+    assert (dataset.pd_shot > 0.99).all()
+    bounds = dataset.sweep.range_error().bound.sel(segments="up down").to_numpy()
     if record == "real":  # as 1 over the difference of slopes; beats of errors alike
         assert bounds[0] / bounds[2] == pytest.approx(2 / 0.5, rel=0.1)
 
@@ -262,14 +265,14 @@ def test_drawn_spectra_of_which_one_segment_is_missed(tmp_path):
         store = tmp_path / f"{rule}.zarr"
         assert sweep.run(spec, store=store, scheduler="none", progress=False).complete
         stores[rule] = sweep.open(store).load()
-    both, two = stores.values()
+    both_store, two = stores.values()
     up, doppler, down = (float(two[f"pd_{name}"]) for name in ("up", "doppler", "down"))
     chance = up * down + doppler * (up + down - 2 * up * down)
     assert abs(two.pd_shot - chance) < 5 * np.sqrt(chance * (1 - chance) / 1200)
-    assert two.pd_shot > both.pd_shot + 0.1
+    assert two.pd_shot > both_store.pd_shot + 0.1
     # Beside the light without a chirp a beat tells range with twice the standard error.
     lone = doppler * (up + down - 2 * up * down) / chance
-    mixed = both.range_bound * np.sqrt(1 - lone + 4 * lone)
+    mixed = both_store.range_bound * np.sqrt(1 - lone + 4 * lone)
     assert float(two.range_bound) == pytest.approx(float(mixed), rel=0.05)
     for name in ("range", "radial_velocity"):  # near the threshold estimates stray a little more
         assert 0.95 < two[f"{name}_rmse"] / two[f"{name}_bound"] < 1.2
@@ -294,17 +297,17 @@ def test_lines_of_any_slope_are_those_of_the_record(table_4_1):
     }
     p |= {"instrument.processing.fft_size": 4096, "instrument.chirp.duration": 1e-4}
     shots = prepared(p, ("doppler", "footprint"))
-    found, true = (
+    spectra, true = (
         evaluate_segments(shots),
         time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False),
     )
-    assert found.magnitude == pytest.approx(true.magnitude, rel=1e-9)
-    assert found.frequency == pytest.approx(true.frequency, rel=1e-9)
+    assert spectra.magnitude == pytest.approx(true.magnitude, rel=1e-9)
+    assert spectra.frequency == pytest.approx(true.frequency, rel=1e-9)
 
 
 def test_segments_of_which_two_are_never_detected_are_no_shot():
     pd = np.array([[0.0, 0.0, 0.5], [0.0, 0.3, 0.0], [0.0, 0.0, 0.5]])
-    alike = np.full((3, 3), 0.9)
+    correlations = np.full((3, 3), 0.9)
     for level in (np.full(3, 5.0), np.full(3, 1e100)):
-        found, missed = pd_and_miss_any_two_in_speckle(pd, 1 - pd, level, alike)
-        assert (found[:2] == 0.0).all() and (missed[:2] == 1.0).all() and found[2] > 0.1
+        pd_any_two, missed = pd_and_miss_any_two_in_speckle(pd, 1 - pd, level, correlations)
+        assert (pd_any_two[:2] == 0.0).all() and (missed[:2] == 1.0).all() and pd_any_two[2] > 0.1

@@ -29,14 +29,14 @@ def instrument(**chirp):
 
     Records begin with the chirp: echoes from 90 m lack the first 6 % of them.
     """
-    written = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
-    written["chirp"] |= {"duration": "10 us"} | chirp
-    written["laser"] |= {"power": "1 W"}
-    written["processing"] |= {
+    mapping = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
+    mapping["chirp"] |= {"duration": "10 us"} | chirp
+    mapping["laser"] |= {"power": "1 W"}
+    mapping["processing"] |= {
         "sample_rate": "512 MHz", "fft_size": 4096, "detection": "any_bin",
         "noise_bins": "correlated",
     }  # fmt: skip
-    return written
+    return mapping
 
 
 def test_a_grid_lists_its_segments_and_may_vary_them(tmp_path):
@@ -46,16 +46,16 @@ def test_a_grid_lists_its_segments_and_may_vary_them(tmp_path):
                    "grazing_angle": "90 deg"},
         "axes": {"instrument.chirp.segments": ["up doppler down", "up down", "down up"]},
     })  # fmt: skip
-    done = sweep.run(spec, store=tmp_path / "grid.zarr", scheduler="none", progress=False)
-    assert done.complete
-    found = sweep.open(tmp_path / "grid.zarr").load()
-    assert np.isnan(found.pd_doppler).to_numpy().tolist() == [False, True, True]
-    assert found.pd_shot.to_numpy() == pytest.approx(np.full(3, found.pd_shot[0]), rel=1e-2)
-    assert np.abs(found.range_error).max() < 0.2
-    assert np.abs(found.radial_velocity_error).max() < 0.2
-    bits = found.log10_pfa_shot.to_numpy()  # of two segments for three
+    outcome = sweep.run(spec, store=tmp_path / "grid.zarr", scheduler="none", progress=False)
+    assert outcome.complete
+    dataset = sweep.open(tmp_path / "grid.zarr").load()
+    assert np.isnan(dataset.pd_doppler).to_numpy().tolist() == [False, True, True]
+    assert dataset.pd_shot.to_numpy() == pytest.approx(np.full(3, dataset.pd_shot[0]), rel=1e-2)
+    assert np.abs(dataset.range_error).max() < 0.2
+    assert np.abs(dataset.radial_velocity_error).max() < 0.2
+    bits = dataset.log10_pfa_shot.to_numpy()  # of two segments for three
     assert 10 ** (bits[0] - bits[1]) == pytest.approx(1.5, rel=1e-2)
-    rates = found.sweep.false_alarms_per_second()
+    rates = dataset.sweep.false_alarms_per_second()
     assert float(rates[1] / rates[0]) == pytest.approx(1.5, rel=1e-2)
 
 
@@ -79,8 +79,8 @@ def flown(tmp_path, record="real", **chirp):
 
 
 def receiver(record):
-    written = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
-    return written["receiver"] | {"record": record}
+    mapping = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
+    return mapping["receiver"] | {"record": record}
 
 
 @pytest.fixture(scope="module")
@@ -103,23 +103,26 @@ def test_no_point_of_a_street_is_lost_whatever_the_slopes(tmp_path, three, recor
 
     As many true points as by the lander's three segments, but for what three beats tell apart.
     """
-    found = flown(tmp_path, record, **chirp)
-    kept, before = ((each["flags"] & TRUE_FLAG > 0).sum().item() for each in (found, three))
-    assert kept >= 0.995 * before > 500
+    points = flown(tmp_path, record, **chirp)
+    n_kept, before = ((names["flags"] & TRUE_FLAG > 0).sum().item() for names in (points, three))
+    assert n_kept >= 0.995 * before > 500
     if "doppler" in chirp["segments"]:  # whose beat, with its sign, confirms what belongs together
         assert (
-            found["flags"] & (TRUE_FLAG | UNCONFIRMED_FLAG) == TRUE_FLAG
-        ).sum().item() >= 0.99 * kept
-    nothing = found["flags"] == 0
+            points["flags"] & (TRUE_FLAG | UNCONFIRMED_FLAG) == TRUE_FLAG
+        ).sum().item() >= 0.99 * n_kept
+    nothing = points["flags"] == 0
     assert nothing.any()
     for name in ("range", "radial_velocity"):
-        error = found[f"{name}_interpolated"] - found[f"true_{name}"]
-        scores = (error / found[f"{name}_interpolated_standard_error"]).to_numpy()
+        error = points[f"{name}_interpolated"] - points[f"true_{name}"]
+        scores = (error / points[f"{name}_interpolated_standard_error"]).to_numpy()
         scores = scores[np.isfinite(scores)]
         spread = np.diff(np.percentile(scores, [15.865, 84.135]))[0] / 2
         assert abs(spread - 1) < 0.1, (name, spread, scores.std())
-        whole = found[name] - found[f"true_{name}"]
-        scores = (whole / found[f"{name}_standard_error"]).to_numpy()
+        signed_error = points[name] - points[f"true_{name}"]
+        scores = (signed_error / points[f"{name}_standard_error"]).to_numpy()
         assert 0.8 < np.nanstd(scores) < 1.2, (name, np.nanstd(scores))
-        for told in ("standard_error", "interpolated_standard_error"):  # of no point there is none
-            assert (found[f"{name}_{told}"].isnull() == nothing).all(), (name, told)
+        for error_name in (
+            "standard_error",
+            "interpolated_standard_error",
+        ):  # of no point there is none
+            assert (points[f"{name}_{error_name}"].isnull() == nothing).all(), (name, error_name)

@@ -16,13 +16,13 @@ with mpmath.workdps(40):
     FIFTEEN_DEGREES = float(mpmath.pi / 12)
 
 
-def si(written: object, si_unit: str) -> float:
-    number, unit = read_quantity(written, si_unit=si_unit, example="7 of them")
+def si(text: object, si_unit: str) -> float:
+    number, unit = read_quantity(text, si_unit=si_unit, example="7 of them")
     return unit.to_si(number)
 
 
 @pytest.mark.parametrize(
-    ("written", "si_unit", "value"),
+    ("text", "si_unit", "value"),
     [
         ("2.5 cm", "m", 0.025),
         ("25mm", "m", 0.025),
@@ -64,9 +64,9 @@ def si(written: object, si_unit: str) -> float:
         ("1 V", "V", 1.0),
     ],
 )
-def test_a_written_quantity_gives_exactly_its_si_value(written, si_unit, value):
+def test_a_written_quantity_gives_exactly_its_si_value(text, si_unit, value):
     """Spellings; usual ones, prefixes, angles and decibels are cases of tests/stability."""
-    assert si(written, si_unit) == value
+    assert si(text, si_unit) == value
 
 
 def test_decibels_beyond_a_float_are_refused_and_far_below_it_nothing():
@@ -76,7 +76,7 @@ def test_decibels_beyond_a_float_are_refused_and_far_below_it_nothing():
 
 
 @pytest.mark.parametrize(
-    ("written", "si_unit", "text"),
+    ("spelling", "si_unit", "text"),
     [
         ("1 W*m^-2/nm", "W/m^3", "W/m^2/nm"),
         ("1 pW/rtHz", "W/Hz^0.5", "pW/Hz^0.5"),
@@ -87,8 +87,8 @@ def test_decibels_beyond_a_float_are_refused_and_far_below_it_nothing():
         ("1 dB/Hz", "1/Hz", "dB/Hz"),
     ],
 )
-def test_a_unit_has_one_spelling_which_reads_back_the_same(written, si_unit, text):
-    _, unit = read_quantity(written, si_unit=si_unit, example="7 of them")
+def test_a_unit_has_one_spelling_which_reads_back_the_same(spelling, si_unit, text):
+    _, unit = read_quantity(spelling, si_unit=si_unit, example="7 of them")
     assert unit.symbol == text
     assert read_quantity(f"1 {text}", si_unit=si_unit, example="7 of them") == (1, unit)
 
@@ -106,7 +106,7 @@ def test_all_spellings_of_a_length_are_one_float(micrometres):
 
 
 @pytest.mark.parametrize(
-    ("written", "si_unit", "words"),
+    ("text", "si_unit", "words"),
     [
         ("25", "m", "needs a unit; write e.g. '7 of them'"),
         (25, "m", "needs a unit"),
@@ -152,32 +152,32 @@ def test_all_spellings_of_a_length_are_one_float(micrometres):
         ("1,5 m", "m", "has a comma; numbers are written like 1234.5; write '1.5 m'"),
     ],
 )
-def test_a_quantity_that_cannot_be_read_says_why_and_what_to_write(written, si_unit, words):
-    with pytest.raises(QuantityError) as caught:
-        si(written, si_unit)
-    assert words in str(caught.value)
+def test_a_quantity_that_cannot_be_read_says_why_and_what_to_write(text, si_unit, words):
+    with pytest.raises(QuantityError) as error_info:
+        si(text, si_unit)
+    assert words in str(error_info.value)
 
 
 @pytest.mark.parametrize(
-    ("written", "value"),
+    ("text", "value"),
     [(1, 1), ("2^17", 131072), ("2**17", 131072), ("1e9", 10**9), (1e9, 10**9), ("10 %", 0.1),
      (0.1, Fraction(1, 10)), ("-0.5", -0.5)],
 )  # fmt: skip
-def test_pure_numbers_are_read_exactly(written, value):
-    number, unit = read_number(written)
+def test_pure_numbers_are_read_exactly(text, value):
+    number, unit = read_number(text)
     assert unit.factor * number == (Fraction(1, 10) if value == 0.1 else value)
 
 
 @pytest.mark.parametrize(
-    ("written", "value"), [("2^-1", Fraction(1, 2)), ("10^-3", Fraction(1, 1000)), ("10^+2", 100)]
+    ("text", "value"), [("2^-1", Fraction(1, 2)), ("10^-3", Fraction(1, 1000)), ("10^+2", 100)]
 )
-def test_powers_of_negative_exponents_are_read_exactly(written, value):
-    assert read_number(written)[0] == value
-    assert si(f"{written} m", "m") == float(value)
+def test_powers_of_negative_exponents_are_read_exactly(text, value):
+    assert read_number(text)[0] == value
+    assert si(f"{text} m", "m") == float(value)
 
 
 @pytest.mark.parametrize(
-    ("written", "words"),
+    ("text", "words"),
     [
         ("2^100000000", "has an exponent beyond 999"),
         ("2**-100000000", "has an exponent beyond 999"),
@@ -185,11 +185,11 @@ def test_powers_of_negative_exponents_are_read_exactly(written, value):
         ("0^-1", "divides by zero"),
     ],
 )
-def test_powers_that_are_none_say_why(written, words):
+def test_powers_that_are_none_say_why(text, words):
     with pytest.raises(QuantityError, match=words):
-        read_number(written)
+        read_number(text)
     with pytest.raises(QuantityError, match=words):
-        si(f"{written} m", "m")
+        si(f"{text} m", "m")
 
 
 @given(st.text(max_size=120))
@@ -213,7 +213,7 @@ def test_usual_units_are_exactly_pints(name):
 
 
 @pytest.mark.parametrize(
-    ("written", "si_unit", "value"),
+    ("text", "si_unit", "value"),
     [
         ("30 dBm", "W", 1.0),
         ("0 dBm", "W", 1e-3),
@@ -226,16 +226,16 @@ def test_usual_units_are_exactly_pints(name):
         ("50 percent", "", 0.5),
     ],
 )
-def test_units_of_decibels_mean_what_the_field_means_by_them(written, si_unit, value):
+def test_units_of_decibels_mean_what_the_field_means_by_them(text, si_unit, value):
     if si_unit:
-        number, unit = read_quantity(written, si_unit=si_unit, example="")
+        number, unit = read_quantity(text, si_unit=si_unit, example="")
     else:
-        number, unit = read_number(written)
+        number, unit = read_number(text)
     assert unit.to_si(number) == pytest.approx(value, rel=1e-15)
 
 
 @pytest.mark.parametrize(
-    ("written", "words"),
+    ("text", "words"),
     [
         ("1.234,5 m", "write '1234.5 m'"),
         ("1,234.5 m", "write '1234.5 m'"),
@@ -246,9 +246,9 @@ def test_units_of_decibels_mean_what_the_field_means_by_them(written, si_unit, v
         ("-1,5e3 m", "write '-1.5e3 m'"),
     ],
 )
-def test_a_number_with_a_comma_or_groups_is_told_as_it_is_written_here(written, words):
+def test_a_number_with_a_comma_or_groups_is_refused_with_its_spelling_here(text, words):
     with pytest.raises(QuantityError, match=re.escape(words)):
-        read_quantity(written, si_unit="m", example="")
+        read_quantity(text, si_unit="m", example="")
 
 
 def test_shares_and_numbers_of_nothing_are_none():
@@ -258,8 +258,8 @@ def test_shares_and_numbers_of_nothing_are_none():
 
 
 @pytest.mark.parametrize(
-    ("written", "slope"), [("10 deg", "0.1763"), ("10°", "0.1763"), ("200 mrad", "0.2027")]
+    ("text", "slope"), [("10 deg", "0.1763"), ("10°", "0.1763"), ("200 mrad", "0.2027")]
 )
-def test_an_angle_where_a_slope_is_meant_is_told_as_its_tangent(written, slope):
+def test_an_angle_where_a_slope_is_meant_is_refused_with_its_tangent(text, slope):
     with pytest.raises(QuantityError, match=f"write {slope}, the tangent of that angle"):
-        read_number(written)
+        read_number(text)

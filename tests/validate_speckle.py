@@ -145,12 +145,12 @@ def random_valid_spec(seed: int, spec_number: int) -> RandomSpec:
         mapping = random_mapping(rng)
         signal_over_threshold = np.exp(rng.uniform(np.log(0.8), np.log(5.0)))
         try:
-            found = spec_of_ratio(mapping, signal_over_threshold)
+            random_spec = spec_of_ratio(mapping, signal_over_threshold)
         except (SpecError, UnsupportedShotError):
             continue
-        chirp_pd = [found.stored_pd["pd_up"], found.stored_pd["pd_down"]]
+        chirp_pd = [random_spec.stored_pd["pd_up"], random_spec.stored_pd["pd_down"]]
         if PD_RANGE[0] < min(chirp_pd) and max(chirp_pd) < PD_RANGE[1]:
-            return found
+            return random_spec
 
 
 def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
@@ -376,9 +376,11 @@ def compare_spec(seed: int, spec_number: int, draws: int = DRAWS) -> ComparisonR
         detected_share, stored_pd = float(values.mean()), random_spec.stored_pd[f"pd_{quantity}"]
         pd_bounds = np.clip([detected_share, stored_pd], 1 / draws, 1 - 1 / draws)
         share_deviation = float(np.sqrt(pd_bounds * (1 - pd_bounds) / values.size).max())
-        stated = stated_error(quantity, shots, facet)
+        stated_sigma = stated_error(quantity, shots, facet)
         comparisons.append(
-            Comparison(quantity, stored_pd, detected_share, share_deviation, stated, TOLERANCE)
+            Comparison(
+                quantity, stored_pd, detected_share, share_deviation, stated_sigma, TOLERANCE
+            )
         )
     return ComparisonRow(
         spec_number=spec_number,
@@ -461,13 +463,13 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=DRAWS)
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
-    begun, rows = time.perf_counter(), []
+    start_time, rows = time.perf_counter(), []
     print(TABLE_HEADER)
     for row in iter_rows(options.seed, options.specs, options.draws, options.processes):
         rows.append(row)
         print(format_row(row), flush=True)
     print(error_summary(rows))
-    print(f"{options.draws} draws a spec, {time.perf_counter() - begun:.0f} s")
+    print(f"{options.draws} draws a spec, {time.perf_counter() - start_time:.0f} s")
     return int(any(row.worst.error_over_allowed > 1 for row in rows))
 
 

@@ -164,7 +164,12 @@ class MeasuredSetting:
 
 
 def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
-    """Return the settings in the dataset of a store of `sweep accuracy`, in their order."""
+    """Return the settings in the dataset of a store of `sweep accuracy`, in their order.
+
+    Stores of earlier versions call the dimension of settings `rung`.
+    """
+    if "rung" in dataset.dims:
+        dataset = dataset.rename(rung="setting")
     array_by_name = {name: array.values for name, array in dataset.variables.items()}
     error_quantile = (
         RANDOM_ERROR_QUANTILE if np.isfinite(array_by_name["standard_error"]).any() else 1.0
@@ -184,7 +189,7 @@ def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
             leakage_error=float(np.fmax.reduce(array_by_name["leakage_error"][i])),
             error_quantile=error_quantile,
         )
-        for i, name in enumerate(array_by_name["rung"])
+        for i, name in enumerate(array_by_name["setting"])
     ]
 
 

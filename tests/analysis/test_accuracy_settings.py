@@ -9,7 +9,7 @@ import xarray as xr
 from sweep.analysis import accuracy_results as settings
 from sweep.analysis.datasets import NotAStoreError
 
-MADE_UP = [
+MEASURED_SETTINGS = [
     # name, kind, tolerance, us a point, errors by point
     ("as written", "as written", np.nan, 20.0, [1e-4, 1e-5, 0.0]),
     ("auto at 0.1", "adaptive", 0.1, 10.0, [5e-2, 1e-3, 0.0]),
@@ -28,8 +28,8 @@ MADE_UP = [
 @pytest.fixture
 def dataset():
     """The made-up settings as a store has them: three rounds, the second the quietest."""
-    names, kinds, tolerances, times, errors = zip(*MADE_UP, strict=True)
-    error = ("rung", "point"), np.array(errors)
+    names, kinds, tolerances, times, errors = zip(*MEASURED_SETTINGS, strict=True)
+    error = ("setting", "point"), np.array(errors)
     seconds = 1e-6 * np.outer(times, [1.5, 1.0, 2.0])
     return xr.Dataset(
         {
@@ -37,12 +37,12 @@ def dataset():
             "log10_pfa_error": error,
             "leakage_error": error,
             "magnitude_error": error,
-            "standard_error": (("rung", "point"), np.full((len(names), 3), np.nan)),
-            "seconds": (("rung", "round"), seconds),
-            "planning": (("rung", "round"), seconds / 10),
-            "tolerance": ("rung", np.array(tolerances)),
+            "standard_error": (("setting", "point"), np.full((len(names), 3), np.nan)),
+            "seconds": (("setting", "round"), seconds),
+            "planning": (("setting", "round"), seconds / 10),
+            "tolerance": ("setting", np.array(tolerances)),
         },
-        coords={"rung": np.array(names, object), "kind": ("rung", np.array(kinds, object))},
+        coords={"setting": np.array(names, object), "kind": ("setting", np.array(kinds, object))},
         attrs={
             "title": "Made up", "study_points": 1_000_000, "unit": "points", "points": 3,
             "storing_seconds": 0.5,
@@ -54,17 +54,19 @@ def dataset():
     )  # fmt: skip
 
 
-def test_the_front_is_what_nothing_else_is_both_as_fast_and_as_accurate_as(dataset):
-    found = settings.pareto_front(settings.drop_reference_setting(settings.read_settings(dataset)))
-    names = [s.name for s in found]
+def test_the_front_holds_settings_that_no_other_beats_in_time_and_error(dataset):
+    front = settings.pareto_front(settings.drop_reference_setting(settings.read_settings(dataset)))
+    names = [s.name for s in front]
     assert names == ["auto at 0.1", "19 beamlets", "109 beamlets", "as written", "auto at 1e-06"]
 
 
 def test_errors_below_the_references_own_are_alike(dataset):
     """1e-10 of `all effects on` is no better than the 0 of a setting five times as fast."""
-    found = settings.read_settings(dataset)
+    settings_read = settings.read_settings(dataset)
     assert (
-        settings.fastest_setting_within_error(settings.drop_reference_setting(found), 0.0).name
+        settings.fastest_setting_within_error(
+            settings.drop_reference_setting(settings_read), 0.0
+        ).name
         == "auto at 1e-06"
     )
 
@@ -74,8 +76,8 @@ def test_errors_below_the_references_own_are_alike(dataset):
     [(0.1, "auto at 0.1"), (4e-2, "19 beamlets"), (1e-3, "109 beamlets"), (1e-5, "auto at 1e-06")],
 )
 def test_the_cheapest_setting_meets_the_error_at_every_point(dataset, error, name):
-    found = settings.drop_reference_setting(settings.read_settings(dataset))
-    assert settings.fastest_setting_within_error(found, error).name == name
+    settings_read = settings.drop_reference_setting(settings.read_settings(dataset))
+    assert settings.fastest_setting_within_error(settings_read, error).name == name
     assert settings.fastest_setting_within_error([], error) is None
 
 
@@ -90,26 +92,29 @@ def test_the_best_round_counts_and_ratios_are_taken_round_by_round(dataset):
 
 
 def test_adaptive_settings_meet_the_best_fixed_one_that_is_as_accurate(dataset):
-    duels = settings.compare_adaptive_with_fixed(settings.read_settings(dataset))
-    assert [(d.adaptive.name, d.other.name) for d in duels] == [
+    comparisons = settings.compare_adaptive_with_fixed(settings.read_settings(dataset))
+    assert [(d.adaptive.name, d.other.name) for d in comparisons] == [
         ("auto at 0.1", "19 beamlets"),
         ("auto at 0.001", "109 beamlets"),
         ("auto at 1e-06", "all effects on"),
     ]
-    assert [d.speedup() for d in duels] == pytest.approx([1.2, 0.9, 5.0])
-    (told,) = [
+    assert [d.speedup() for d in comparisons] == pytest.approx([1.2, 0.9, 5.0])
+    (sentence,) = [
         s
         for s in settings.conclusion_sentences(dataset, settings.read_settings(dataset))
         if "single" in s
     ]
-    assert "0.9 to 5 times" in told and "NOT met, by 2 s in all; planning takes 2 s; with" in told
+    assert (
+        "0.9 to 5 times" in sentence
+        and "NOT met, by 2 s in all; planning takes 2 s; with" in sentence
+    )
     dataset.seconds[5] *= 1.02  # 0.918 of its time: within the 10 %
-    (told,) = [
+    (sentence,) = [
         s
         for s in settings.conclusion_sentences(dataset, settings.read_settings(dataset))
         if "single" in s
     ]
-    assert told.endswith(": met.")
+    assert sentence.endswith(": met.")
 
 
 def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(dataset):
@@ -118,12 +123,12 @@ def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(da
     worst = settings.compare_adaptive_with_fixed(settings.read_settings(dataset))[1]
     # Rounds of 30, 20, 40 us against 27, 18, 36, and 3 us a point besides.
     assert worst.speedup(3e-6) == pytest.approx(30 / 33)
-    (told,) = [
+    (sentence,) = [
         s
         for s in settings.conclusion_sentences(dataset, settings.read_settings(dataset))
         if "single" in s
     ]
-    assert "0.9 to 5 times" in told and told.endswith(
+    assert "0.9 to 5 times" in sentence and sentence.endswith(
         "NOT met, by 2e-05 s in all; planning takes 2e-05 s; with the study's store it is 0.91 "
         "times as fast."
     )
@@ -131,14 +136,14 @@ def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(da
 
 def test_a_store_of_an_earlier_version_does_not_say_what_storing_takes(dataset):
     del dataset.attrs["storing_seconds"]
-    told = settings.conclusion_sentences(dataset, settings.read_settings(dataset))
-    assert "take 20 s on one core. No other" in told[0] and "NOT met, by 2 s" in told[1]
+    sentences = settings.conclusion_sentences(dataset, settings.read_settings(dataset))
+    assert "take 20 s on one core. No other" in sentences[0] and "NOT met, by 2 s" in sentences[1]
 
 
 def test_no_fixed_setting_as_accurate_is_no_defeat(dataset):
-    none = dataset.isel(rung=[0, 1, 2, 3, 10])
-    duels = settings.compare_adaptive_with_fixed(settings.read_settings(none))
-    assert all(d.other is None and d.speedup() == np.inf for d in duels)
+    none = dataset.isel(setting=[0, 1, 2, 3, 10])
+    comparisons = settings.compare_adaptive_with_fixed(settings.read_settings(none))
+    assert all(d.other is None and d.speedup() == np.inf for d in comparisons)
     assert any(
         "No fixed setting" in s
         for s in settings.conclusion_sentences(none, settings.read_settings(none))
@@ -146,30 +151,36 @@ def test_no_fixed_setting_as_accurate_is_no_defeat(dataset):
 
 
 def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
-    found = settings.read_settings(dataset)
-    (described,) = settings.compare_adaptive_with_thesis(found)
-    (improved,) = settings.compare_adaptive_with_thesis(found, settings.IMPROVED_THESIS_KIND)
+    settings_read = settings.read_settings(dataset)
+    (described,) = settings.compare_adaptive_with_thesis(settings_read)
+    (improved,) = settings.compare_adaptive_with_thesis(
+        settings_read, settings.IMPROVED_THESIS_KIND
+    )
     assert described.adaptive.name == "auto at 0.1" and improved.adaptive.name == "auto at 0.001"
     assert described.speedup() == pytest.approx(9.0)
     assert improved.speedup() == pytest.approx(6.0)
-    told = " ".join(settings.conclusion_sentences(dataset, settings.read_settings(dataset)))
-    assert "Speed-up: 6 over thesis 2^12. Speed-up over improved versions: 8 over" in told
-    assert "9 over thesis 2^12. Requirement, at least 5: met over thesis 2^12." in told
-    assert "Speed-up of auto at 0.001, error" in told and ": 6 over thesis 2^12, folded" in told
+    text = " ".join(settings.conclusion_sentences(dataset, settings.read_settings(dataset)))
+    assert "Speed-up: 6 over thesis 2^12. Speed-up over improved versions: 8 over" in text
+    assert "9 over thesis 2^12. Requirement, at least 5: met over thesis 2^12." in text
+    assert "Speed-up of auto at 0.001, error" in text and ": 6 over thesis 2^12, folded" in text
 
 
 def test_one_slow_trial_of_two_does_not_count():
     """A median of two would be moved by it."""
-    whole = {
+    shared_columns = {
         "kind": "",
         "tolerance": 0.0,
         "planning_seconds": 0.0,
         "pd_error": np.zeros(1),
         "error_quantile": 1.0,
     }
-    whole |= dict.fromkeys(("log10_pfa_error", "leakage_error", "magnitude_error"), 0.0)
-    one = settings.MeasuredSetting(name="one", seconds_by_round=np.array([1.0, 1.5]), **whole)
-    other = settings.MeasuredSetting(name="other", seconds_by_round=np.array([0.9, 0.9]), **whole)
+    shared_columns |= dict.fromkeys(("log10_pfa_error", "leakage_error", "magnitude_error"), 0.0)
+    one = settings.MeasuredSetting(
+        name="one", seconds_by_round=np.array([1.0, 1.5]), **shared_columns
+    )
+    other = settings.MeasuredSetting(
+        name="other", seconds_by_round=np.array([0.9, 0.9]), **shared_columns
+    )
     assert one.speedup_over(other) == pytest.approx(0.9)
     longer = replace(one, seconds_by_round=np.array([1.0, 1.5, 2.0]))
     steady = replace(other, seconds_by_round=np.array([0.9, 0.9, 0.9]))
@@ -178,9 +189,9 @@ def test_one_slow_trial_of_two_does_not_count():
 
 def test_with_other_beamlets_than_the_thesis_has_nothing_is_asked_for(dataset):
     dataset.attrs["thesis_beamlets"] = 19
-    told = " ".join(settings.conclusion_sentences(dataset, settings.read_settings(dataset)))
-    assert ": 9 over thesis 2^12." in told and "at least 5" not in told
-    assert "This scene has 19 beamlets" in told
+    text = " ".join(settings.conclusion_sentences(dataset, settings.read_settings(dataset)))
+    assert ": 9 over thesis 2^12." in text and "at least 5" not in text
+    assert "This scene has 19 beamlets" in text
 
 
 def test_what_leaves_leakage_out_is_no_fixed_setting_to_be_compared(dataset):
@@ -199,8 +210,8 @@ def test_what_leaves_leakage_out_is_no_fixed_setting_to_be_compared(dataset):
             leakage_error=leaked,
         )
         loose = replace(adaptive[0], pd_error=errors, seconds_by_round=1e-6 * np.array([9.0]))
-        (duel,) = settings.compare_adaptive_with_fixed([loose, setting])
-        assert (duel.other == setting) == beats, leaked
+        (comparison,) = settings.compare_adaptive_with_fixed([loose, setting])
+        assert (comparison.other == setting) == beats, leaked
     assert adaptive[0].covers_leakage_error
 
 
@@ -218,19 +229,19 @@ def test_what_counts_is_the_largest_of_all_that_is_promised(dataset):
 
 def test_where_errors_are_random_most_of_the_points_count(dataset):
     dataset.standard_error[:] = 0.01
-    found = settings.read_settings(dataset)[1]
-    assert found.largest_error == pytest.approx(np.quantile([5e-2, 1e-3, 0.0], 0.95))
+    setting = settings.read_settings(dataset)[1]
+    assert setting.largest_error == pytest.approx(np.quantile([5e-2, 1e-3, 0.0], 0.95))
 
 
 def test_the_page_has_every_setting_and_the_sentences(dataset):
-    found = settings.accuracy_page(dataset, settings.read_settings(dataset)).to_text()
-    assert all(name in found for name, *_ in MADE_UP)
-    assert "All 1,000,000 points take 20 s on one core; storing them takes at least 0.5 s" in found
+    text = settings.accuracy_page(dataset, settings.read_settings(dataset)).to_text()
+    assert all(name in text for name, *_ in MEASURED_SETTINGS)
+    assert "All 1,000,000 points take 20 s on one core; storing them takes at least 0.5 s" in text
     assert (
         "At 2 points, with 109 beamlets in both, it differs from the time domain by <1e-9 in pd"
-        in found
+        in text
     )
-    assert "A note." in found and "Not the whole sample" not in found
+    assert "A note." in text and "Not the whole sample" not in text
 
 
 def test_marks_stand_at_times_and_errors(dataset):
@@ -243,7 +254,7 @@ def test_marks_stand_at_times_and_errors(dataset):
     }
     expected = {
         (us, max(max(e), settings.NEGLIGIBLE_ERROR))
-        for _, kind, _, us, e in MADE_UP
+        for _, kind, _, us, e in MEASURED_SETTINGS
         if kind != "reference"
     }
     assert {(round(t, 9), e) for t, e in marks} == expected

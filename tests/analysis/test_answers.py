@@ -78,17 +78,17 @@ def test_words_are_selected_as_they_are_written(tmp_path):
 
 
 def test_a_probability_in_closed_form_has_an_interval_without_width(surface):
-    found = surface.sweep.detection_probability()
-    assert (found.low == found.pd).all() and (found.high == found.pd).all()
-    assert found.low.attrs["confidence"] == 1.0
+    probability = surface.sweep.detection_probability()
+    assert (probability.low == probability.pd).all() and (probability.high == probability.pd).all()
+    assert probability.low.attrs["confidence"] == 1.0
 
 
 def test_a_drawn_probability_has_its_interval_within_zero_and_one(speckled):
-    found = speckled.sweep.detection_probability("up").compute()
+    probability = speckled.sweep.detection_probability("up").compute()
     reach = speckled.pd_up_half_width.compute()
-    assert (reach > 0).all() and found.low.attrs["confidence"] == 0.95
-    assert found.high.values == pytest.approx(np.minimum(found.pd + reach, 1).values)
-    assert found.low.values == pytest.approx(np.maximum(found.pd - reach, 0).values)
+    assert (reach > 0).all() and probability.low.attrs["confidence"] == 0.95
+    assert probability.high.values == pytest.approx(np.minimum(probability.pd + reach, 1).values)
+    assert probability.low.values == pytest.approx(np.maximum(probability.pd - reach, 0).values)
 
 
 def test_a_roc_curve_is_the_model_at_each_threshold(surface):
@@ -119,12 +119,12 @@ def test_a_study_of_thresholds_has_the_curve_of_its_point_at_each_of_them(tmp_pa
     dataset = sweep.open(store)
     curves = dataset.sweep.roc([1e-9, 1e-6, 1e-3])
     assert curves.pd.dims == ("pfa_bin", "tnr", "range") and curves.tnr.values.tolist() == [8, 10]
-    alone = surface.sweep.sel(range="9 km", grazing_angle="60 deg").sweep.roc([1e-9, 1e-6, 1e-3])
+    selected = surface.sweep.sel(range="9 km", grazing_angle="60 deg").sweep.roc([1e-9, 1e-6, 1e-3])
     for threshold in (8, 10):
         point = dataset.sweep.sel(tnr=threshold, range="9 km").sweep.roc([1e-9, 1e-6, 1e-3])
-        assert point.curve_tnr.values == pytest.approx(alone.curve_tnr.values, rel=1e-6)
-        assert curves.pd.sel(tnr=threshold, range=9).values == pytest.approx(alone.pd, abs=1e-5)
-        assert point.pd.values == pytest.approx(alone.pd, abs=1e-5)
+        assert point.curve_tnr.values == pytest.approx(selected.curve_tnr.values, rel=1e-6)
+        assert curves.pd.sel(tnr=threshold, range=9).values == pytest.approx(selected.pd, abs=1e-5)
+        assert point.pd.values == pytest.approx(selected.pd, abs=1e-5)
     page = CliRunner().invoke(main, ["report", str(store)], catch_exceptions=False)
     assert page.exit_code == 0
 
@@ -176,9 +176,9 @@ def test_false_alarms_with_leakage_are_those_of_either_cause(surface):
     ds = surface.compute()
     up = 1 - (1 - ds.pfa_segment) * (1 - ds.p_leakage_up)
     down = 1 - (1 - ds.pfa_both_chirps / ds.pfa_segment) * (1 - ds.p_leakage_down)
-    found = ds.sweep.false_alarms_per_second(1.0, leakage=True)
-    assert found.values == pytest.approx((up * down).values, rel=1e-6)
-    assert (found > ds.pfa_both_chirps).any()
+    alarm_rate = ds.sweep.false_alarms_per_second(1.0, leakage=True)
+    assert alarm_rate.values == pytest.approx((up * down).values, rel=1e-6)
+    assert (alarm_rate > ds.pfa_both_chirps).any()
 
 
 def test_the_duration_of_a_chirp_may_be_an_axis(tmp_path):
@@ -208,11 +208,11 @@ def test_a_contour_of_a_plane_is_a_straight_line():
 def test_the_summary_is_that_of_the_computed_points(surface):
     holed = surface.copy()
     holed["snr_up"] = surface.snr_up.where(surface.range > 3000)
-    found = holed.sweep.summary()
-    assert all(a.chunks is not None for a in found.data_vars.values())
+    summary = holed.sweep.summary()
+    assert all(a.chunks is not None for a in summary.data_vars.values())
     values = holed.snr_up.values[np.isfinite(holed.snr_up.values)]
     expected = [values.mean(), values.min(), values.max(), values.size]
-    assert found.snr_up.values == pytest.approx(expected)
+    assert summary.snr_up.values == pytest.approx(expected)
     assert 0 < values.size < surface.snr_up.size
 
 
@@ -228,20 +228,20 @@ def test_studies_are_compared_where_they_meet_whatever_their_units_and_order(tmp
         "target.grazing_angle": [f"{float(np.deg2rad(60))!r} rad"],
         "target.range": ["9000 m", "3000 m", "1000 m"],
     }
-    ours, other = (
+    dataset, other = (
         sweep.open(run_into_store(tmp_path, one)),
         sweep.open(run_into_store(tmp_path / "a", two)),
     )
-    found = ours.sweep.compare(other).compute()
-    assert dict(found.sizes) == {"range": 2, "grazing_angle": 1}
-    assert found.range.values.tolist() == [1.0, 9.0]
+    comparison = dataset.sweep.compare(other).compute()
+    assert dict(comparison.sizes) == {"range": 2, "grazing_angle": 1}
+    assert comparison.range.values.tolist() == [1.0, 9.0]
     # the same 1 W; what effects are left out may differ, as each is planned for other neighbours
-    assert np.abs(found.pd_shot).max() < 1e-6
-    assert found.pd_shot_agrees.all()
-    stronger = ours.sweep.compare(other.sweep.sel(power="3 W")).compute()
+    assert np.abs(comparison.pd_shot).max() < 1e-6
+    assert comparison.pd_shot_agrees.all()
+    stronger = dataset.sweep.compare(other.sweep.sel(power="3 W")).compute()
     assert (stronger.snr_up > 0).all() and not stronger.pd_shot_agrees.all()
     expected = float(other.sweep.sel(power="3 W", range="9 km").snr_up.squeeze()) - float(
-        ours.sweep.sel(range="9 km", grazing_angle="60 deg").snr_up
+        dataset.sweep.sel(range="9 km", grazing_angle="60 deg").snr_up
     )
     assert stronger.snr_up.sel(range=9.0).squeeze().item() == pytest.approx(expected)
 
@@ -257,10 +257,10 @@ def test_other_draws_agree_within_their_intervals_and_another_laser_does_not(spe
     sections = {name: spec[name] for name in ("target", "draws", "footprint")}
     axes = {"target.range": ["500 m", "3 km", "6 km"]}
     redrawn = sweep.open(run_into_store(tmp_path, axes, seed=6, **sections))
-    found = speckled.sweep.compare(redrawn).compute()
-    assert (found.pd_up != 0).all() and found.pd_up_agrees.all()
+    comparison = speckled.sweep.compare(redrawn).compute()
+    assert (comparison.pd_up != 0).all() and comparison.pd_up_agrees.all()
     allowed = (speckled.pd_up_half_width + redrawn.pd_up_half_width).values
-    assert (found.pd_up_allowed.values >= allowed).all()
+    assert (comparison.pd_up_allowed.values >= allowed).all()
     (tmp_path / "weak").mkdir()
     instrument = spec["instrument"] | {"laser": spec["instrument"]["laser"] | {"power": "0.2 W"}}
     weak = run_into_store(tmp_path / "weak", axes, seed=6, instrument=instrument, **sections)
@@ -294,7 +294,7 @@ def lone_tone_bound(distance, noise_variance):
     )  # fmt: skip
 
 
-def test_errors_stand_beside_the_bound_that_the_link_budget_gives(tmp_path):
+def test_errors_stand_next_to_the_bound_that_the_link_budget_gives(tmp_path):
     windows = {"instrument.processing.window": ["hann", "hamming"]}
     axes = {"target.range": ["1003 m", "4001 m"], **windows}
     target = spec_over_axes({}).to_yaml_mapping()["target"] | {"grazing_angle": "90 deg"}
@@ -323,9 +323,9 @@ def test_a_study_of_whole_spectra_answers_with_what_it_counted(tmp_path):
     dataset = sweep.open(
         run_into_store(tmp_path, axes, instrument=small, draws={"method": "spectra", "number": 40})
     ).compute()
-    found = dataset.sweep.range_error()
-    assert set(found.data_vars) == {"bias", "rmse", "bound"}
-    assert found.bound.equals(dataset.range_bound)
+    range_error = dataset.sweep.range_error()
+    assert set(range_error.data_vars) == {"bias", "rmse", "bound"}
+    assert range_error.bound.equals(dataset.range_bound)
     rate = dataset.sweep.false_alarms_per_second("20 Hz").values
     assert rate == pytest.approx(20 * dataset.false_alarms.values)
     assert dataset.sweep.compare(dataset).pd_shot_agrees.all()

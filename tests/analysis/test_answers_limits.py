@@ -16,9 +16,9 @@ RANGES = np.array([100.0, 200.0, 400.0, 700.0, 1100.0])
 
 
 def answers(z, x=RANGES, **options):
-    found = dataset_of_deviates(z, range=x).sweep.limit("range", 0.9, **options).compute()
+    limit = dataset_of_deviates(z, range=x).sweep.limit("range", 0.9, **options).compute()
     return {
-        kind: (float(found[kind]), found[f"{kind}_reason"].item())
+        kind: (float(limit[kind]), limit[f"{kind}_reason"].item())
         for kind in ("unbroken", "farthest")
     }
 
@@ -30,9 +30,9 @@ def test_a_fall_that_is_straight_in_the_normal_deviate_is_placed_exactly():
 
 
 def test_a_dip_ends_the_unbroken_range_and_not_the_farthest():
-    found = answers(LEVEL + np.array([3.0, -1.0, 2.0, 1.0, -1.0]))
-    assert found["unbroken"] == (pytest.approx(175.0), 0)
-    assert found["farthest"] == (pytest.approx(900.0), 0)
+    limit = answers(LEVEL + np.array([3.0, -1.0, 2.0, 1.0, -1.0]))
+    assert limit["unbroken"] == (pytest.approx(175.0), 0)
+    assert limit["farthest"] == (pytest.approx(900.0), 0)
 
 
 @pytest.mark.parametrize(
@@ -49,9 +49,9 @@ def test_a_dip_ends_the_unbroken_range_and_not_the_farthest():
     ],
 )  # fmt: skip
 def test_what_is_not_found_says_why(z, unbroken, farthest):
-    found = answers(LEVEL + np.array(z))
-    assert (found["unbroken"][1], found["farthest"][1]) == (unbroken, farthest)
-    for value, reason in found.values():
+    limit = answers(LEVEL + np.array(z))
+    assert (limit["unbroken"][1], limit["farthest"][1]) == (unbroken, farthest)
+    for value, reason in limit.values():
         assert np.isnan(value) == (reason != 0)
 
 
@@ -75,26 +75,26 @@ def walked(z):
 )
 def test_any_profile_is_walked_as_step_by_step(z, from_highest):
     x = np.arange(len(z), dtype=float)
-    found = answers(LEVEL + np.array(z), x, from_highest=from_highest)
+    limit = answers(LEVEL + np.array(z), x, from_highest=from_highest)
     expected = walked(np.array(z[::-1] if from_highest else z))
     for kind, place in zip(("unbroken", "farthest"), expected, strict=True):
         if place is None:
-            assert np.isnan(found[kind][0])
+            assert np.isnan(limit[kind][0])
         else:
             value = len(z) - 1 - place if from_highest else place
-            assert found[kind][0] == pytest.approx(value, abs=1e-9)
+            assert limit[kind][0] == pytest.approx(value, abs=1e-9)
 
 
 def test_intervals_of_pd_make_intervals_of_range():
     z = LEVEL + (640.0 - RANGES) / 1000
-    found = dataset_of_deviates(z, 0.02, range=RANGES).sweep.maximum_range().compute()
+    limit = dataset_of_deviates(z, 0.02, range=RANGES).sweep.maximum_range().compute()
     for end, moved in (("low", -0.02), ("high", 0.02)):
         shifted = np.clip(ndtr(z) + moved, 0, 1)
         i = np.flatnonzero(shifted >= 0.9)[-1]
         a, b = ndtri(shifted[i]) - LEVEL, ndtri(shifted[i + 1]) - LEVEL
         value = RANGES[i] + a / (a - b) * (RANGES[i + 1] - RANGES[i])
-        assert float(found[f"unbroken_{end}"]) == pytest.approx(value)
-    assert found.unbroken_low < found.unbroken < found.unbroken_high
+        assert float(limit[f"unbroken_{end}"]) == pytest.approx(value)
+    assert limit.unbroken_low < limit.unbroken < limit.unbroken_high
 
 
 def test_the_least_angle_is_found_from_the_normal_down_at_every_range():
@@ -103,10 +103,10 @@ def test_the_least_angle_is_found_from_the_normal_down_at_every_range():
     dataset = dataset_of_deviates(
         LEVEL + (angles - least[:, None]) / 10, range=ranges, grazing_angle=angles
     )
-    found = dataset.sweep.minimum_grazing_angle()
-    assert found.unbroken.values == pytest.approx(least)
-    assert found.unbroken.attrs["units"] == "deg"
-    assert found.range.values == pytest.approx(ranges)
+    limit = dataset.sweep.minimum_grazing_angle()
+    assert limit.unbroken.values == pytest.approx(least)
+    assert limit.unbroken.attrs["units"] == "deg"
+    assert limit.range.values == pytest.approx(ranges)
 
 
 @pytest.mark.parametrize("chunks", [{"range": 7}, {"range": 1, "grazing_angle": 3}])
@@ -115,10 +115,10 @@ def test_the_answer_is_lazy_and_the_same_in_any_chunks(chunks):
     x, y = np.linspace(1, 2, 40), np.linspace(10, 80, 8)
     z = LEVEL + rng.normal(0, 2, (40, 8))
     z[rng.random(z.shape) < 0.05] = np.nan
-    whole = dataset_of_deviates(z, range=x, grazing_angle=y)
-    lazy = whole.chunk(chunks).sweep.maximum_range()
+    unsplit = dataset_of_deviates(z, range=x, grazing_angle=y)
+    lazy = unsplit.chunk(chunks).sweep.maximum_range()
     assert all(array.chunks is not None for array in lazy.data_vars.values())
-    assert lazy.compute().identical(whole.sweep.maximum_range())
+    assert lazy.compute().identical(unsplit.sweep.maximum_range())
 
 
 @pytest.mark.parametrize("pd", ["90 %", "0.9", "90%", np.float64(0.9), np.float32(0.9)])
@@ -127,8 +127,8 @@ def test_a_level_of_pd_is_a_share_or_in_percent(pd):
     z = LEVEL + (640.0 - RANGES[:, None]) / 1000 * [1.0, 2.0]
     dataset = dataset_of_deviates(z, range=RANGES, grazing_angle=angles)
     for ask in ("maximum_range", "contour"):
-        expected, found = (getattr(dataset.sweep, ask)(each) for each in (0.9, pd))
-        xr.testing.assert_allclose(found, expected, rtol=1e-6)
+        expected, actual = (getattr(dataset.sweep, ask)(level) for level in (0.9, pd))
+        xr.testing.assert_allclose(actual, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("pd", ["0.9 W", "high", [0.5, 0.9], None, True, "90", 0, 1, "100 %", 1.5])
@@ -164,7 +164,7 @@ def test_the_maximum_range_is_the_root_of_the_model_itself(step, error, tmp_path
     axes = {"target.range": {"step": ["1 km", "9 km", f"{step} m"]}}
     sections = {"instrument": SMOOTH, "footprint": {"beamlets": 1, "speckle": "none"}}
     sections["effects"] = {"overlap": "off"}  # `evaluate` by itself has records filled
-    found = sweep.open(run_into_store(tmp_path, axes, **sections)).sweep.maximum_range().compute()
+    limit = sweep.open(run_into_store(tmp_path, axes, **sections)).sweep.maximum_range().compute()
     parameters = spec_over_axes({}, **sections).parameters()
 
     def excess(distance):
@@ -173,8 +173,8 @@ def test_the_maximum_range_is_the_root_of_the_model_itself(step, error, tmp_path
     root = brentq(excess, 1000, 9000, xtol=1e-3)
     # z falls as 1/R: a straight line through two points is off by h^2 / (4 R) at the most
     assert step**2 / (4 * root) < 1.3 * error
-    assert 1000 * float(found.unbroken) == pytest.approx(root, abs=error)
-    assert found.unbroken.attrs["units"] == "km"
+    assert 1000 * float(limit.unbroken) == pytest.approx(root, abs=error)
+    assert limit.unbroken.attrs["units"] == "km"
 
 
 def test_a_zipped_axis_is_walked_after_a_selection(tmp_path):
@@ -194,7 +194,7 @@ def test_a_zipped_axis_is_walked_after_a_selection(tmp_path):
     with pytest.raises(ValueError, match="select by the other coordinates along 'cut'"):
         dataset.sweep.maximum_range()
     part = dataset.sweep.sel(grazing_angle="15 deg")
-    found = part.sweep.maximum_range(pd=0.5).compute()
+    limit = part.sweep.maximum_range(pd=0.5).compute()
     pd = part.pd_shot.sortby("range").values
     assert pd[0] > pd[1] > 0.5 > pd[2]
-    assert 5 < float(found.unbroken) < 8
+    assert 5 < float(limit.unbroken) < 8

@@ -21,17 +21,17 @@ FIGURES = [
 
 def stores(directory, gigabytes, block_points):
     """Stores with their sizes [B]."""
-    made = {}
+    paths = {}
     for size in gigabytes:
         spec = big_store.spec_of_size(size, block_points=block_points, powers=4, figures=FIGURES)
-        made[directory / f"{size}.zarr"] = big_store.make_store(directory / f"{size}.zarr", spec)
-    return made
+        paths[directory / f"{size}.zarr"] = big_store.make_store(directory / f"{size}.zarr", spec)
+    return paths
 
 
-def peak_of(work, *given):
+def peak_of(work, *arguments):
     """Memory [B] that work takes at most."""
     tracemalloc.start()
-    work(*given)
+    work(*arguments)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak
@@ -42,15 +42,15 @@ def growth(work, sizes, monkeypatch):
     monkeypatch.setattr(datasets, "READ_CHUNK_VALUES_MAX", 2**13)
     work(next(iter(sizes)))  # so that imports and caches are there
     peaks = [peak_of(work, path) for path in sizes]
-    less, more = sizes.values()
-    return (peaks[1] - peaks[0]) / (more - less)
+    smallest, largest = sizes.values()
+    return (peaks[1] - peaks[0]) / (largest - smallest)
 
 
 def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
     def reduce(path):
-        found = big_store.reduce_store(path)
-        assert found["points"] == sweep.open(path).attrs["points"]
-        assert found["error"] < 1e-6  # [m]: pd is straight in its normal deviate
+        reduction = big_store.reduce_store(path)
+        assert reduction["points"] == sweep.open(path).attrs["points"]
+        assert reduction["error"] < 1e-6  # [m]: pd is straight in its normal deviate
 
     # Dask's list of pieces alone: with one chunk a piece it takes twice as much as these stores.
     sizes = stores(tmp_path, (0.001, 0.004), 500)

@@ -43,26 +43,26 @@ def grid(rule, processing, **sections):
 @pytest.mark.parametrize("rule", ["any_bin", "peak_bin"])
 def test_bounds_of_grids_on_slopes_hold_the_wander_that_is_drawn(rule, tmp_path):
     """The strongest frequency of a record errs by speckle; three bins err further by its shape."""
-    whole = {"draws": {"method": "spectra", "number": DRAWS}}
+    sections = {"draws": {"method": "spectra", "number": DRAWS}}
     stores = [
         run_serially(spec, tmp_path / f"{name}.zarr").store
         for name, spec in (
-            ("drawn", grid(rule, {"estimator": {"kind": "chirp_z"}}, **whole)),
+            ("drawn", grid(rule, {"estimator": {"kind": "chirp_z"}}, **sections)),
             ("closed", grid(rule, {})),
         )
     ]
-    drawn, closed = (sweep.open(store).compute() for store in stores)
+    drawn_dataset, closed = (sweep.open(store).compute() for store in stores)
     place, speed = closed.sweep.range_error(), closed.sweep.velocity_error()
-    for bound in (place.bound, drawn.range_bound):
-        ratio = bound / drawn.range_rmse
+    for bound in (place.bound, drawn_dataset.range_bound):
+        ratio = bound / drawn_dataset.range_rmse
         # At 5 degrees the footprint is half a bin, and the largest bin often a neighbour.
         assert ratio[0] == pytest.approx(1.0, abs=0.25)
         # Speckle of the bins beside the strongest one adds up to a tenth to what is drawn. Echoes
         # that must be detected in the strongest bin wander less, by up to a sixth.
         assert (np.abs(ratio[1:] - 1.0) < (0.12 if rule == "any_bin" else 0.2)).all()
-    for bound in (speed.bound, drawn.radial_velocity_bound):
+    for bound in (speed.bound, drawn_dataset.radial_velocity_bound):
         # With the wander by speckle it is an estimate as well: up to a tenth above what is drawn.
-        assert (bound < 1.1 * drawn.radial_velocity_rmse).all()
+        assert (bound < 1.1 * drawn_dataset.radial_velocity_rmse).all()
     steady = grid(rule, {}, effects={"fading": "off"})
-    still = sweep.open(run_serially(steady, tmp_path / "steady.zarr").store).compute()
-    assert (still.sweep.range_error().bound < 0.3 * place.bound).all()
+    steady_dataset = sweep.open(run_serially(steady, tmp_path / "steady.zarr").store).compute()
+    assert (steady_dataset.sweep.range_error().bound < 0.3 * place.bound).all()

@@ -41,21 +41,21 @@ def points_on(x, y, values):
     return points_of(values, grazing_angle=y, range=x)
 
 
-def surface(found, **changes):
+def surface(points, **changes):
     options = {"x": "range", "y": "grazing_angle", "variable": "pd_shot", "label": "pd"}
-    return charts.surface_chart(found, **(options | changes))
+    return charts.surface_chart(points, **(options | changes))
 
 
-def slices(found, by=""):
-    return charts.slice_chart(found, x="range", by=by, variable="pd_shot", label="pd")
+def slices(points, by=""):
+    return charts.slice_chart(points, x="range", by=by, variable="pd_shot", label="pd")
 
 
 def sheet(chart):
     return canvas.draw_chart(chart, "", "")
 
 
-def map_of(found):
-    (panel,) = surface(found).panels
+def map_of(points):
+    (panel,) = surface(points).panels
     return panel.heat_map
 
 
@@ -70,28 +70,28 @@ def painted(chart, value):
 
 def test_a_grid_is_put_together_whatever_the_order_of_its_points():
     order = np.array([2, 0, 1])
-    found = points_on(np.array([1.0, 2.0, 4.0])[order], [20.0, 10.0], [[6, 4, 5], [3, 1, 2]])
-    assert map_of(found).x.tolist() == [1, 2, 4]
-    assert map_of(found).values.tolist() == [[1, 2, 3], [4, 5, 6]]
+    points = points_on(np.array([1.0, 2.0, 4.0])[order], [20.0, 10.0], [[6, 4, 5], [3, 1, 2]])
+    assert map_of(points).x.tolist() == [1, 2, 4]
+    assert map_of(points).values.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
 def test_coordinates_that_vary_together_span_a_plane_with_holes():
     pairs = {"range": [1.0, 2.0, 2.0], "grazing_angle": [10.0, 10.0, 20.0]}
-    found = map_of(points_of([1, 2, 4], pairs=pairs))
-    assert (found.x.tolist(), found.y.tolist()) == ([1, 2], [10, 20])
-    assert np.isnan(found.values[1, 0]) and found.values[0].tolist() == [1, 2]
-    assert found.values[1, 1] == 4
+    panel = map_of(points_of([1, 2, 4], pairs=pairs))
+    assert (panel.x.tolist(), panel.y.tolist()) == ([1, 2], [10, 20])
+    assert np.isnan(panel.values[1, 0]) and panel.values[0].tolist() == [1, 2]
+    assert panel.values[1, 1] == 4
 
 
 @settings(max_examples=40)
 @given(
     shape=st.tuples(st.integers(1, 40), st.integers(1, 90)),
-    most=st.tuples(st.integers(1, 50), st.integers(1, 50)),
+    edges=st.tuples(st.integers(1, 50), st.integers(1, 50)),
     chunks=st.integers(1, 30),
     kind=st.sampled_from(list(BY_HAND)),
     seed=st.integers(0, 99),
 )
-def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, seed):
+def test_cells_hold_their_points_whatever_the_chunks(shape, edges, chunks, kind, seed):
     rng = np.random.default_rng(seed)
     values = np.where(rng.random(shape) < 0.2, np.nan, rng.random(shape))
     array = xr.DataArray(dask.array.from_array(values, chunks=chunks), dims=["y", "x"])
@@ -100,21 +100,25 @@ def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, 
         for d, n in zip("yx", shape, strict=True)
     ]
     points = PointSelection.from_dataset(xr.Dataset({"v": array}))
-    found = points.coarsen("v", list(zip(sides, most, strict=True)), kind).values
-    up, across = (side.points_per_cell(number) for side, number in zip(sides, most, strict=True))
-    assert found.shape == tuple(
-        side.cell_means(m).size for side, m in zip(sides, most, strict=True)
+    coarse_values = points.coarsen("v", list(zip(sides, edges, strict=True)), kind).values
+    up, across = (side.points_per_cell(number) for side, number in zip(sides, edges, strict=True))
+    assert coarse_values.shape == tuple(
+        side.cell_means(m).size for side, m in zip(sides, edges, strict=True)
     )
-    assert all(size <= number for size, number in zip(found.shape, most, strict=True))
-    for (i, j), cell in np.ndenumerate(found):
-        own = values[i * up : (i + 1) * up, j * across : (j + 1) * across]
-        own = own[np.isfinite(own)]
-        assert cell == pytest.approx(BY_HAND[kind](own), rel=1e-14) if own.size else np.isnan(cell)
+    assert all(size <= number for size, number in zip(coarse_values.shape, edges, strict=True))
+    for (i, j), cell in np.ndenumerate(coarse_values):
+        cell_values = values[i * up : (i + 1) * up, j * across : (j + 1) * across]
+        cell_values = cell_values[np.isfinite(cell_values)]
+        assert (
+            cell == pytest.approx(BY_HAND[kind](cell_values), rel=1e-14)
+            if cell_values.size
+            else np.isnan(cell)
+        )
     middle = np.mean(sides[1].values[:across])
-    assert sides[1].cell_means(most[1])[0] == pytest.approx(middle, rel=1e-14)
+    assert sides[1].cell_means(edges[1])[0] == pytest.approx(middle, rel=1e-14)
 
 
-def test_parts_of_zipped_axes_are_told_apart():
+def test_parts_of_zipped_axes_are_distinguished():
     cut = {"zip": [
         {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "15 deg"},
         {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "85 deg"},
@@ -130,13 +134,13 @@ def test_parts_of_zipped_axes_are_told_apart():
         xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates)
     )
 
-    def parts(shown, where):
-        return charts.split_into_parts(select_where(points, spec, where), shown, 6)
+    def parts(panel_variables, selection):
+        return charts.split_into_parts(select_where(points, spec, selection), panel_variables, 6)
 
-    found, left_out = parts(["range", "power"], {})
+    panel_points, left_out = parts(["range", "power"], {})
     assert left_out == 0
-    assert [words for words, _ in found] == ["grazing angle 15°", "grazing angle 85°"]
-    assert found[1][1].sorted_coordinate("range").indices.tolist() == [3, 4, 5]
+    assert [words for words, _ in panel_points] == ["grazing angle 15°", "grazing angle 85°"]
+    assert panel_points[1][1].sorted_coordinate("range").indices.tolist() == [3, 4, 5]
     ((_, held),), _ = parts(["range", "power"], {"grazing_angle": "85 deg"})
     assert held.sorted_coordinate("range").values.tolist() == [1, 2, 3]
     assert parts(["range"], {"grazing_angle": "86 deg"}) == ([], 0)
@@ -150,7 +154,7 @@ def test_one_dip_in_ten_thousand_ranges_is_seen_in_the_picture():
     assert painted(surface(points_on(x, y, values)), 0.0) >= bar_alone + 4
 
 
-def test_the_mean_of_a_cell_is_painted_beside_its_lowest_value():
+def test_the_mean_of_a_cell_is_painted_next_to_its_lowest_value():
     x, y = np.arange(1.0, 10_001.0), np.arange(1.0, 91.0)
     values = np.ones((90, 10_000))
     values[:, ::10] = 0.0
@@ -176,18 +180,18 @@ def test_probabilities_of_detection_span_0_to_1_and_tiny_chances_a_logarithm():
 
 
 def test_words_stand_one_after_the_other_along_an_axis():
-    found = points_of(
+    points = points_of(
         np.linspace(0, 1, 4).reshape(2, 2), grazing_angle=[10.0, 20.0], window=["hann", "hamming"]
     )
-    panel = sheet(surface(found, x="window")).axes[0]
+    panel = sheet(surface(points, x="window")).axes[0]
     assert [label.get_text() for label in panel.get_xticklabels()] == ["hann", "hamming"]
 
 
 def test_parameters_that_vary_together_make_no_panels_and_others_do():
-    found = points_of(np.ones((2, 2)), tnr=[5, 10], pairs={"range": [1.0, 2.0], "power": [1, 3]})
-    assert found.distinguishing_coordinates(["range"]) == ["tnr"]
-    assert found.distinguishing_coordinates(["range", "tnr"]) == []
-    assert found.distinguishing_coordinates(["tnr"]) == ["range"]
+    points = points_of(np.ones((2, 2)), tnr=[5, 10], pairs={"range": [1.0, 2.0], "power": [1, 3]})
+    assert points.distinguishing_coordinates(["range"]) == ["tnr"]
+    assert points.distinguishing_coordinates(["range", "tnr"]) == []
+    assert points.distinguishing_coordinates(["tnr"]) == ["range"]
 
 
 def line_points(values, **by):

@@ -12,15 +12,15 @@ WEAK = INSTRUMENT | {"laser": INSTRUMENT["laser"] | {"power": "0.5 W"}}
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory):
-    made = {}
+    paths = {}
     for name, axes, sections in (
         ("one", AXES, {}),
         ("finer", {"target.range": {"step": ["1 km", "9 km", "1 km"]}}, {}),
         ("weak", AXES, {"instrument": WEAK}),
         ("far", {"target.range": ["20 km", "30 km"]}, {}),
     ):
-        made[name] = str(run_into_store(tmp_path_factory.mktemp(name), axes, **sections))
-    return made
+        paths[name] = str(run_into_store(tmp_path_factory.mktemp(name), axes, **sections))
+    return paths
 
 
 def compared(*arguments):

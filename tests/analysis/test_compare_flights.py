@@ -39,48 +39,54 @@ def arrays(store):
 
 
 def test_shots_meet_at_the_same_time_and_beam_and_differ_as_their_arrays_do(scene_store, slower):
-    found = open_scene(scene_store).sweep.compare(open_scene(slower))
-    assert list(found.children) == ["square"]
-    square = found["square"].to_dataset().compute()
-    ours, other = arrays(scene_store).sel(power=0.3), arrays(slower).sel(power=0.3)
-    when = [
+    comparison = open_scene(scene_store).sweep.compare(open_scene(slower))
+    assert list(comparison.children) == ["square"]
+    square = comparison["square"].to_dataset().compute()
+    first_arrays, other = arrays(scene_store).sel(power=0.3), arrays(slower).sel(power=0.3)
+    times_and_beams = [
         [(round(float(t), 6), int(beam)) for t, beam in zip(*columns, strict=True)]
-        for columns in ((side.time.values, side.beam.values) for side in (ours, other))
+        for columns in ((side.time.values, side.beam.values) for side in (first_arrays, other))
     ]
-    pairs = [(i, when[1].index(shot)) for i, shot in enumerate(when[0]) if shot in when[1]]
+    pairs = [
+        (i, times_and_beams[1].index(shot))
+        for i, shot in enumerate(times_and_beams[0])
+        if shot in times_and_beams[1]
+    ]
     left, right = map(list, zip(*pairs, strict=True))
-    assert 30 < len(pairs) == square.sizes["shot"] < ours.sizes["shot"]
-    assert np.array_equal(square.time, ours.time[left]) and square.power.values == [0.3]
+    assert 30 < len(pairs) == square.sizes["shot"] < first_arrays.sizes["shot"]
+    assert np.array_equal(square.time, first_arrays.time[left]) and square.power.values == [0.3]
     assert square.attrs["shots"] == 316 and square.attrs["other_shots"] == 156
-    share = [((side.flags.values & 1) > 0).any(axis=-1).mean(axis=-1) for side in (ours, other)]
+    share = [
+        ((side.flags.values & 1) > 0).any(axis=-1).mean(axis=-1) for side in (first_arrays, other)
+    ]
     assert square.detected.values[0] == pytest.approx(share[1][right] - share[0][left], abs=1e-15)
     for name in ("pd_up", "pd_shot", "snr_up", "pfa_up"):
-        expected = other[name].values[right] - ours[name].values[left]
+        expected = other[name].values[right] - first_arrays[name].values[left]
         assert np.array_equal(square[name].values[0], expected, equal_nan=True)
     assert square.pd_shot_agrees.all()
 
 
 def test_shares_of_draws_agree_within_both_intervals(scene_store, slower):
-    found = open_scene(scene_store).sweep.compare(open_scene(slower))["square"].compute()
-    assert (found.detected != 0).any() and found.detected_agrees.all()
+    comparison = open_scene(scene_store).sweep.compare(open_scene(slower))["square"].compute()
+    assert (comparison.detected != 0).any() and comparison.detected_agrees.all()
     # 3 of 3 draws hold a share of 0.025^(1/3) and more with 95 %, 20 of 20 one of 0.025^(1/20)
     always = (1 - 0.025 ** (1 / 3)) + (1 - 0.025 ** (1 / 20))
-    beyond = found.detected_allowed.values[0] - always
+    excess = comparison.detected_allowed.values[0] - always
     # effects and beamlets of both studies may each be off by the tolerance of 0.001
-    assert ((beyond >= 0) & (beyond <= 4e-3)).any()
+    assert ((excess >= 0) & (excess <= 4e-3)).any()
 
 
-def test_more_light_is_told_with_the_shot_that_gains_most(slower):
+def test_more_light_is_reported_with_the_shot_that_gains_most(slower):
     tree = open_scene(slower)
     brighter = tree.copy()
     swapped = tree["square"].to_dataset().isel(power=[1, 0]).assign_coords(power=tree.square.power)
     brighter["square"] = xr.DataTree(swapped)
-    found = tree.sweep.compare(brighter)["square"].to_dataset().compute()
+    comparison = tree.sweep.compare(brighter)["square"].to_dataset().compute()
     # what 0.3 mW gained 0.5 mW lost: the same numbers at the other value
-    gain = found.pd_shot.sel(power=0.3).values
+    gain = comparison.pd_shot.sel(power=0.3).values
     assert gain.max() > 0.1
-    assert np.array_equal(gain, -found.pd_shot.sel(power=0.5).values, equal_nan=True)
-    assert not found.pd_shot_agrees.all()
+    assert np.array_equal(gain, -comparison.pd_shot.sel(power=0.5).values, equal_nan=True)
+    assert not comparison.pd_shot_agrees.all()
 
 
 def test_the_command_prints_a_table_for_each_scanner_and_draws(scene_store, slower, tmp_path):
@@ -100,9 +106,11 @@ def test_the_command_prints_a_table_for_each_scanner_and_draws(scene_store, slow
 def test_draws_that_are_not_computed_are_not_taken_for_shots_without_a_point(scene_store, tmp_path):
     tree = open_scene(copy_without_last_cycles(scene_store, tmp_path, with_geometry=False))
     tree.attrs["points_committed"] -= 1  # as receipts tell of a store that is cut off
-    found = tree.sweep.compare(open_scene(scene_store))["square"].to_dataset().compute()
-    assert "detected" not in found and found.sizes["shot"] == 316
-    assert found.pd_shot[:, :256].notnull().all() and found.pd_shot[:, 256:].isnull().all()
+    comparison = tree.sweep.compare(open_scene(scene_store))["square"].to_dataset().compute()
+    assert "detected" not in comparison and comparison.sizes["shot"] == 316
+    assert (
+        comparison.pd_shot[:, :256].notnull().all() and comparison.pd_shot[:, 256:].isnull().all()
+    )
 
 
 def test_flights_that_do_not_meet_and_other_kinds_are_refused(scene_store, slower, tmp_path):

@@ -55,27 +55,35 @@ def cloud(understated=1.0, *, navigated=1.0, shots=SHOTS):
 
 
 def test_normal_errors_of_the_stated_size_are_consistent():
-    found = check_error_consistency(cloud())
-    assert [each.quantity for each in found] == ["range", "radial velocity", "velocity", "altitude"]
-    for each in found:
-        assert each.error_ratio == pytest.approx(1, abs=0.1) and each.is_consistent
+    consistency = check_error_consistency(cloud())
+    assert [check.quantity for check in consistency] == [
+        "range",
+        "radial velocity",
+        "velocity",
+        "altitude",
+    ]
+    for check in consistency:
+        assert check.error_ratio == pytest.approx(1, abs=0.1) and check.is_consistent
 
 
-def test_errors_are_told_by_their_ratio_to_those_that_are_stated():
-    found = {each.quantity: each for each in check_error_consistency(cloud(100.0, navigated=7.0))}
+def test_errors_are_reported_as_ratios_to_stated_errors():
+    ratios = {
+        check.quantity: check for check in check_error_consistency(cloud(100.0, navigated=7.0))
+    }
     for quantity, ratio in (("range", 100), ("radial velocity", 100), ("velocity", 7),
                             ("altitude", 7)):  # fmt: skip
-        assert found[quantity].error_ratio == pytest.approx(ratio, rel=0.1)
-        assert not found[quantity].is_consistent
+        assert ratios[quantity].error_ratio == pytest.approx(ratio, rel=0.1)
+        assert not ratios[quantity].is_consistent
     assert (
-        "residuals are " in found["range"].message and "times the stated" in found["range"].message
+        "residuals are " in ratios["range"].message
+        and "times the stated" in ratios["range"].message
     )
 
 
 def test_few_errors_and_long_flights():
     few = cloud(100.0, shots=3).isel(draw=slice(2), power=slice(1))
-    assert [each.n_errors for each in check_error_consistency(few)] == [6, 6, 2, 2]
-    assert all(each.is_consistent for each in check_error_consistency(few))
+    assert [check.n_errors for check in check_error_consistency(few)] == [6, 6, 2, 2]
+    assert all(check.is_consistent for check in check_error_consistency(few))
     long = check_error_consistency(cloud(3.0, shots=3 << 14))
     assert long[0].n_errors < 3 << 20 and long[0].error_ratio == pytest.approx(3, rel=0.05)
 
@@ -100,8 +108,8 @@ def over_hills(tmp_path_factory):
 
 
 def test_run_report_and_export_say_what_is_inconsistent(over_hills, tmp_path):
-    (told,) = understated_error_messages(over_hills)
-    assert told.startswith("four: altitude is inconsistent: residuals are ")
+    (message,) = understated_error_messages(over_hills)
+    assert message.startswith("four: altitude is inconsistent: residuals are ")
     assert understated_error_messages(over_hills, "none of these") == []
     assert (
         "four: altitude is inconsistent"

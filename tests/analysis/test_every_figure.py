@@ -76,10 +76,13 @@ def pictures(tmp_path_factory):
     directory, sheets = tmp_path_factory.mktemp("every"), {}
     stores = {"grid": run_into_store(directory, SURFACE_AXES, figures=GRID)}
     stores["scene"] = run_flight_into_store(directory, figures=SCENE)
-    for name, axes, more in (("powers", POWER_AND_CUT_AXES, {}), ("drawn", SURFACE_AXES, SPECKLED)):
+    for name, axes, sections in (
+        ("powers", POWER_AND_CUT_AXES, {}),
+        ("drawn", SURFACE_AXES, SPECKLED),
+    ):
         (directory / name).mkdir()
         axes = {"target.range": ["1 km", "4 km", "9 km"]} if name == "drawn" else axes
-        stores[name] = run_into_store(directory / name, axes, **more)
+        stores[name] = run_into_store(directory / name, axes, **sections)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             canvas, "save_sheet", lambda sheet, file, source="": sheets.setdefault(file.stem, sheet)
@@ -96,9 +99,9 @@ def pictures(tmp_path_factory):
         shot_spectra.write_shot_report(spec_over_axes({}), {}, directory, draws_noise=True, seed=3)
     with canvas.uniform_style():
         opened = sweep.open(stores["powers"])
-        less = opened.assign(pd_up=opened.pd_up * 0.999, pd_shot=opened.pd_shot * 0.99)
+        dimmed = opened.assign(pd_up=opened.pd_up * 0.999, pd_shot=opened.pd_shot * 0.99)
         chart = comparison.pd_difference_chart(
-            comparison.compute_tabulated_differences(opened, less)
+            comparison.compute_tabulated_differences(opened, dimmed)
         )
         sheets["comparison"] = draw_chart(chart, "T", "")
     for name, page in (("grid", study_report._grid_report), ("scene", study_report._scene_report)):
@@ -120,7 +123,7 @@ def short(values):
 
 def of_axes(axes):
     """Words, limits and series of axes of a sheet."""
-    found = {
+    description = {
         "title": axes.get_title() or axes.get_title(loc="left"),
         "x": [axes.get_xlabel(), axes.get_xscale(), *(f"{v:.3g}" for v in axes.get_xlim())],
         "y": [axes.get_ylabel(), axes.get_yscale(), *(f"{v:.3g}" for v in axes.get_ylim())],
@@ -134,15 +137,15 @@ def of_axes(axes):
         "images": [list(image.get_array().shape) for image in axes.images],
         "texts": [text.get_text() for text in axes.texts],
     }  # fmt: skip
-    return {name: value for name, value in found.items() if value}
+    return {name: value for name, value in description.items() if value}
 
 
 def of_trace(trace):
     """Kind, choices and values of a trace of a page."""
-    own = {name: getattr(trace, name, None) for name in ("x", "y", "z")}
-    values = {name: short(column) for name, column in own.items() if column is not None}
-    when = ", ".join((trace.meta or {}).get("when", {}).values())
-    return [trace.type, trace.name, when, values]
+    coordinates = {name: getattr(trace, name, None) for name in ("x", "y", "z")}
+    values = {name: short(column) for name, column in coordinates.items() if column is not None}
+    slider_values = ", ".join((trace.meta or {}).get("when", {}).values())
+    return [trace.type, trace.name, slider_values, values]
 
 
 def structure(picture):
@@ -157,7 +160,7 @@ def structure(picture):
         "foot": picture.get_supxlabel(),
         "side": picture.get_supylabel(),
         "texts": [t.get_text() for t in picture.texts],
-        "legends": [[t.get_text() for t in own.get_texts()] for own in picture.legends],
+        "legends": [[t.get_text() for t in legend.get_texts()] for legend in picture.legends],
         "axes": [of_axes(axes) for axes in picture.axes if axes.get_visible()],
     }
 

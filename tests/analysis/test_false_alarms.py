@@ -31,8 +31,8 @@ def power(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def entries(power):
-    found, spec, _ = power
-    return tables.false_alarm_records(found, spec, by="power", printed=PRINTED)
+    records, spec, _ = power
+    return tables.false_alarm_records(records, spec, by="power", printed=PRINTED)
 
 
 def test_rows_are_the_settings_and_columns_the_three_cuts(entries):
@@ -64,10 +64,10 @@ def test_noise_alone_follows_the_setting_of_its_row():
 def test_half_the_bins_give_a_quarter_of_the_alarms():
     processing = INSTRUMENT["processing"] | {"bins_counted": "half"}
     spec = spec_over_axes({}, instrument=INSTRUMENT | {"processing": processing})
-    found, _ = tables.noise_false_alarm_reference(spec, {})
-    assert found["bins"] == 2**16
+    records, _ = tables.noise_false_alarm_reference(spec, {})
+    assert records["bins"] == 2**16
     # the model leaves out the bins of the strongest line and its neighbours: 3 of 65,536
-    assert found["noise_only"] == pytest.approx(found["closed_form"], rel=2 * 3 / 2**16)
+    assert records["noise_only"] == pytest.approx(records["closed_form"], rel=2 * 3 / 2**16)
 
 
 def test_means_leave_out_ranges_up_to_5_m_and_count_no_point_twice(power, entries):
@@ -75,10 +75,10 @@ def test_means_leave_out_ranges_up_to_5_m_and_count_no_point_twice(power, entrie
     at_1_w = dataset.isel(power=0)
     chosen = (at_1_w.grazing_angle == 15) & (at_1_w.range > 5)
     pfa = at_1_w.pfa_both_chirps.values[chosen.values]
-    where = at_1_w.range.values[chosen.values]
+    ranges_at_1_w = at_1_w.range.values[chosen.values]
     # 3500 m at 15 deg lies on two cuts
-    assert where.size == 19 and entries[0]["points"] == 18
-    _, first = np.unique(where, return_index=True)
+    assert ranges_at_1_w.size == 19 and entries[0]["points"] == 18
+    _, first = np.unique(ranges_at_1_w, return_index=True)
     assert entries[0]["study_mean"] == pytest.approx(pfa[first].mean(), rel=1e-14)
 
 
@@ -101,11 +101,11 @@ def leaked(ranges, up, down):
               "pfa_both_chirps": noise * 2e-4}  # fmt: skip
     variables = {name: (["range"], np.asarray(v, float)) for name, v in values.items()}
     dataset = xr.Dataset(variables, {"range": ("range", ranges, {"units": "m"})})
-    (found,) = tables.leakage_records([PointSelection.from_dataset(dataset)])
-    return found
+    (record,) = tables.leakage_records([PointSelection.from_dataset(dataset)])
+    return record
 
 
-def test_leakage_is_told_by_mean_and_median():
+def test_leakage_is_reported_as_mean_and_median():
     result = leaked([5.0, 20.0, 300.0, 4000.0], [0.0, 0.0, 0.06, 0.02], [0.0, 0.0, 0.03, 0.0])
     assert result["p_leakage_up_mean"] == pytest.approx(0.02)
     assert result["p_leakage_up_median"] == pytest.approx(0.01)
@@ -141,12 +141,14 @@ def test_a_grid_is_cut_where_the_thesis_cuts_it_and_left_whole_without_range_and
 
 
 def test_the_page_holds_every_figure_in_text_and_csv(power, tmp_path):
-    found, spec, _ = power
-    page = tables.false_alarm_page(found, spec, by="power", printed=PRINTED, title="Table 4.3")
+    power_records, spec, _ = power
+    page = tables.false_alarm_page(
+        power_records, spec, by="power", printed=PRINTED, title="Table 4.3"
+    )
     text, table = page.save_files(tmp_path, "table_4_3")
-    written = text.read_text()
-    assert written.startswith("Table 4.3\n=========")
-    assert "3.934721e-09" in written and "4.450e-09" in written and "1.131" in written
+    table_text = text.read_text()
+    assert table_text.startswith("Table 4.3\n=========")
+    assert "3.934721e-09" in table_text and "4.450e-09" in table_text and "1.131" in table_text
     with table.open() as file:
         records = list(csv.DictReader(file))
     assert len(records) == 9
@@ -154,19 +156,19 @@ def test_the_page_holds_every_figure_in_text_and_csv(power, tmp_path):
 
 
 def test_the_page_of_a_study_that_nobody_printed_has_no_column_for_it(power):
-    found, spec, _ = power
+    records, spec, _ = power
     assert (
         "printed/closed"
-        not in tables.false_alarm_page(found, spec, by="power", title="T").to_text()
+        not in tables.false_alarm_page(records, spec, by="power", title="T").to_text()
     )
 
 
 def test_thresholds_have_the_chances_of_table_4_2(tmp_path):
     axes = {"instrument.processing.tnr": [1, 5, 10, 15], "target.range": ["1 km", "3 km"]}
-    found = PointSelection.from_dataset(open_store(run_into_store(tmp_path, axes)))
+    points = PointSelection.from_dataset(open_store(run_into_store(tmp_path, axes)))
     printed = (0.8, 0.047, 5.06e-10, 1.17e-21)
     page = tables.threshold_page(
-        found, spec_over_axes(axes), by="tnr", printed=printed, title="Table 4.2"
+        points, spec_over_axes(axes), by="tnr", printed=printed, title="Table 4.2"
     )
     for record, expected in zip(page.records, (0.807, 4.68e-3, 4.79e-10, 1.07e-21), strict=True):
         assert record["closed_form"] == pytest.approx(expected, rel=2e-3)
@@ -181,8 +183,8 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
         "instrument.processing.fft_size": ["2^16", "2^17"],
         "target.range": {"log": ["10 m", "1 km"], "number": 3},
     }
-    found = PointSelection.from_dataset(open_store(run_into_store(tmp_path, axes)))
-    result = tables.false_alarm_records(found, spec_over_axes(axes), by="power")
+    points = PointSelection.from_dataset(open_store(run_into_store(tmp_path, axes)))
+    result = tables.false_alarm_records(points, spec_over_axes(axes), by="power")
     assert [e["setting"] for e in result][:2] == [
         "power 1 W, FFT size 2^16",
         "power 1 W, FFT size 2^17",
@@ -192,10 +194,10 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
 
 def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):
     dataset = open_store(run_into_store(tmp_path, SURFACE_AXES))
-    found = PointSelection.from_dataset(dataset)
-    near = select_beyond_range(found, spec_over_axes(SURFACE_AXES), "10 m")
+    points = PointSelection.from_dataset(dataset)
+    near = select_beyond_range(points, spec_over_axes(SURFACE_AXES), "10 m")
     assert near.size == 23 * 9
     assert (
-        select_beyond_range(found, spec_over_axes(SURFACE_AXES), "10 m", inclusive=True).size
+        select_beyond_range(points, spec_over_axes(SURFACE_AXES), "10 m", inclusive=True).size
         == 24 * 9
     )

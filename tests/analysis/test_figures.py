@@ -16,7 +16,7 @@ from sweep.analysis.study_figures import (
 from sweep.report.html_page import make_interactive_plot
 from sweep.report.study_report import write_report
 
-ASKED = [
+FIGURE_MAPPINGS = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
     {
         "kind": "slices",
@@ -40,25 +40,25 @@ TOGETHER = {"target.range": ["1 km", "3 km"], "instrument.laser.power": ["1 W", 
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory):
-    return run_into_store(tmp_path_factory.mktemp("asked"), SURFACE_AXES, figures=ASKED)
+def figure_store(tmp_path_factory):
+    return run_into_store(tmp_path_factory.mktemp("asked"), SURFACE_AXES, figures=FIGURE_MAPPINGS)
 
 
-def test_every_figure_and_table_of_the_spec_is_made_beside_the_store(asked):
-    files = draw_figures(asked)
-    directory = asked.with_name("study-figures")
+def test_every_figure_and_table_of_the_spec_is_made_next_to_the_store(figure_store):
+    files = draw_figures(figure_store)
+    directory = figure_store.with_name("study-figures")
     names = ["pd_shot_surface.png", "along_range.png", "means.txt", "means.csv"]
     assert files == [directory / name for name in names]
     assert all(map(has_content, files))
 
 
-def test_a_table_averages_over_ranges_from_the_least_on(asked, tmp_path):
+def test_a_table_averages_over_ranges_from_the_least_on(figure_store, tmp_path):
     import csv
 
     import sweep
 
-    draw_figures(asked, tmp_path)
-    dataset = sweep.open(asked)
+    draw_figures(figure_store, tmp_path)
+    dataset = sweep.open(figure_store)
     with (tmp_path / "means.csv").open() as file:
         records = {record["row"]: record for record in csv.DictReader(file)}
     assert set(records) == {f"{angle}°" for angle in range(10, 100, 10)}
@@ -69,7 +69,9 @@ def test_a_table_averages_over_ranges_from_the_least_on(asked, tmp_path):
 
 
 def test_a_store_cut_short_is_drawn_with_what_it_has(tmp_path):
-    path = run_into_store(tmp_path, SURFACE_AXES, figures=ASKED, storage={"block_points": 40})
+    path = run_into_store(
+        tmp_path, SURFACE_AXES, figures=FIGURE_MAPPINGS, storage={"block_points": 40}
+    )
     log = path / ".sweep" / "receipts.jsonl"
     log.write_text(log.read_text().splitlines(keepends=True)[0])
     for chunk in (path / "pd_shot" / "c").rglob("*"):
@@ -79,7 +81,7 @@ def test_a_store_cut_short_is_drawn_with_what_it_has(tmp_path):
 
 
 def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path, monkeypatch):
-    figure = ASKED[1] | {"where": {"grazing_angle": "17 deg"}}
+    figure = FIGURE_MAPPINGS[1] | {"where": {"grazing_angle": "17 deg"}}
     path = run_into_store(tmp_path, {"target.range": ["1 km"], **SURFACE_AXES}, figures=[figure])
     sheets = []
     monkeypatch.setattr(
@@ -131,8 +133,13 @@ def test_a_dollar_in_a_title_is_a_dollar(tmp_path, text):
     sheets = canvas.blank_sheet(4.0, 2.0), canvas.message_sheet(text)
     canvas.set_title(sheets[0], text)
     canvas.set_caption(sheets[0], text)
-    shown = [found for sheet in sheets for found in sheet.findobj(Text) if found.get_text() == text]
-    assert len(shown) == 3 and not any(found.get_parse_math() for found in shown)
+    artists = [
+        text_artist
+        for sheet in sheets
+        for text_artist in sheet.findobj(Text)
+        if text_artist.get_text() == text
+    ]
+    assert len(artists) == 3 and not any(text_artist.get_parse_math() for text_artist in artists)
     for sheet in sheets:
         canvas.save_sheet(sheet, tmp_path / "sheet.png")
 
@@ -163,10 +170,10 @@ def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path)
     for figure, words in zip(figures.figure_specs[2:], ("x", "y"), strict=True):
         (panel,) = figures.make_chart(figure, SHEET_SIZE_LIMITS).panels
         assert getattr(panel, f"{words}_axis").kind == "category"
-        own = (
+        sheet_values = (
             values.transpose("range", "window") if words == "x" else values.transpose("window", ...)
         )
-        np.testing.assert_allclose(panel.heat_map.values, own)
+        np.testing.assert_allclose(panel.heat_map.values, sheet_values)
         assert getattr(panel.heat_map, words).tolist() == ["rectangular", "hann", "blackman"]
         (trace,) = make_interactive_plot(figures.make_chart(figure, SHEET_SIZE_LIMITS)).figure.data
         assert getattr(trace, words).tolist() == ["rectangular", "hann", "blackman"]
@@ -175,7 +182,7 @@ def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path)
 
 def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
     levels = {"levels": [0.5, 0.9]}
-    figures = [ASKED[0] | levels, ASKED[1] | levels | {"variable": "pd_shot"}]
+    figures = [FIGURE_MAPPINGS[0] | levels, FIGURE_MAPPINGS[1] | levels | {"variable": "pd_shot"}]
     path = run_into_store(tmp_path, SURFACE_AXES, figures=figures)
     assert all(map(has_content, draw_figures(path)))
     surface, slices = (
@@ -189,8 +196,8 @@ def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
     assert [line.y[0] for line in levels] == [0.5, 0.9]
     with canvas.uniform_style():
         sheet = canvas.draw_chart(surface, "", "")
-    told = {text.get_text() for axes in sheet.axes for text in axes.texts}
-    assert told == {"0.5", "0.9"}
+    texts = {text.get_text() for axes in sheet.axes for text in axes.texts}
+    assert texts == {"0.5", "0.9"}
     contours = [
         trace for trace in make_interactive_plot(surface).figure.data if trace.type == "contour"
     ]
@@ -201,15 +208,17 @@ def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
 @pytest.mark.parametrize("x", ["range", "window"])
 def test_levels_that_nothing_reaches_or_across_words_leave_the_map(levels, x, tmp_path):
     other = {"range": "window", "window": "range"}[x]
-    asked = {"kind": "surface", "variable": "pd_shot", "x": x, "y": other, "levels": levels}
+    figure = {"kind": "surface", "variable": "pd_shot", "x": x, "y": other, "levels": levels}
     axes = WINDOWS | {"target.range": ["1 km", "4 km", "9 km"]}
-    assert all(map(has_content, draw_figures(run_into_store(tmp_path, axes, figures=[asked]))))
+    assert all(map(has_content, draw_figures(run_into_store(tmp_path, axes, figures=[figure]))))
 
 
-def test_a_picture_says_what_it_was_drawn_from(asked, tmp_path):
-    png, pdf, svg = (draw_figures(asked, tmp_path, form)[0] for form in ("png", "pdf", "svg"))
-    spec = GridResults.from_store(asked).spec
-    told = picture_source_text(spec.id, spec.figures[0])
+def test_a_picture_says_what_it_was_drawn_from(figure_store, tmp_path):
+    png, pdf, svg = (
+        draw_figures(figure_store, tmp_path, form)[0] for form in ("png", "pdf", "svg")
+    )
+    spec = GridResults.from_store(figure_store).spec
+    source_text = picture_source_text(spec.id, spec.figures[0])
     with Image.open(png) as image:
-        assert image.info[canvas.PNG_SOURCE_FIELD] == told
-    assert told in svg.read_text() and told.encode() in pdf.read_bytes()
+        assert image.info[canvas.PNG_SOURCE_FIELD] == source_text
+    assert source_text in svg.read_text() and source_text.encode() in pdf.read_bytes()

@@ -25,8 +25,8 @@ def _draws(n, *, bias=(3.0, -2.0, 0.5), seed=1):
 
 def _of_all(error, variance, available):
     """Tally of all solutions in one cell."""
-    found = tally_errors(error, variance, available, np.zeros(len(error), np.int64), 1)
-    return ErrorTally(*(getattr(found, name)[0] for name in FIELDS))
+    tally = tally_errors(error, variance, available, np.zeros(len(error), np.int64), 1)
+    return ErrorTally(*(getattr(tally, name)[0] for name in FIELDS))
 
 
 def _units(sizes):
@@ -56,10 +56,13 @@ def test_a_tally_says_what_numpy_says_of_all_draws():
 @pytest.mark.parametrize("sizes", [[2000, 3000], [1, 0, 999, 17, 2500, 1483], [500] * 10])
 def test_merged_tallies_equal_one_pass(sizes):
     parts, (error, variance, available) = _units(sizes)
-    whole, merged = _of_all(error, variance, available), merge_tallies(parts)
-    assert merged.n_attempts == whole.n_attempts and merged.n_solutions == whole.n_solutions
+    merged_at_once, merged = _of_all(error, variance, available), merge_tallies(parts)
+    assert (
+        merged.n_attempts == merged_at_once.n_attempts
+        and merged.n_solutions == merged_at_once.n_solutions
+    )
     for name in FIELDS[2:]:
-        np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
+        np.testing.assert_allclose(getattr(merged, name), getattr(merged_at_once, name), rtol=1e-12)
 
 
 def test_tallies_are_merged_in_a_fixed_tree():
@@ -84,11 +87,11 @@ def test_cells_of_altitude_hold_their_own_draws():
     result = tally_errors(error, variance, available, np.digitize(altitude, edges) - 1, 3)
     assert result.n_attempts.shape == (3,) and result.variance.shape == (3, 3)
     for i in range(3):
-        here = (altitude >= edges[i]) & (altitude < edges[i + 1])
-        alone = _of_all(error[here], variance[here], available[here])
+        in_cell = (altitude >= edges[i]) & (altitude < edges[i + 1])
+        tally_in_cell = _of_all(error[in_cell], variance[in_cell], available[in_cell])
         for name in FIELDS:
             np.testing.assert_allclose(
-                getattr(result, name)[i], getattr(alone, name), rtol=1e-12, err_msg=name
+                getattr(result, name)[i], getattr(tally_in_cell, name), rtol=1e-12, err_msg=name
             )
     assert result.n_attempts.sum() == ((altitude >= 100) & (altitude < 500)).sum() < 3000
 
@@ -96,15 +99,15 @@ def test_cells_of_altitude_hold_their_own_draws():
 def test_what_is_not_there_is_nan_and_never_a_warning():
     error, variance, _ = _draws(4)
     error[1:] = np.nan
-    here = np.array([True, False, False, False])
+    is_available = np.array([True, False, False, False])
     with np.errstate(all="raise"):
-        result = tally_errors(error, variance, here, np.array([0, 0, 1, 1]), 3)
+        result = tally_errors(error, variance, is_available, np.array([0, 0, 1, 1]), 3)
         result = result + result
         assert result.availability[:2].tolist() == [0.5, 0.0] and np.isnan(result.availability[2])
         assert np.isfinite(result.bias[0]).all() and np.isnan(result.bias[1:]).all()
         assert np.isfinite(result.rmse[0]).all() and np.isnan(result.rmse[1:]).all()
         assert np.isnan(result.stated_variance[1:]).all()
-        once = _of_all(error, variance, here)
+        once = _of_all(error, variance, is_available)
         assert np.isnan(once.variance).all()  # one draw has no spread
 
 
@@ -113,15 +116,15 @@ def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_variance
     beams, rng = corner_directions(math.radians(22.5)), np.random.default_rng(3)
     measured = beams @ moving + rng.normal(0, 0.01, (n, 4))
     measured[rng.random((n, 4)) >= pd] = np.nan
-    found = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
-    stated = np.diagonal(found.covariance, axis1=-2, axis2=-1)
-    result = _of_all(found.value - moving, stated, found.is_available)
+    solution = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
+    stated_variance = np.diagonal(solution.covariance, axis1=-2, axis2=-1)
+    result = _of_all(solution.value - moving, stated_variance, solution.is_available)
     expected = pd**4 + 4 * pd**3 * (1 - pd)
     assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)
     assert (np.abs(result.bias) <= 5 * np.sqrt(result.stated_variance / result.n_solutions)).all()
     # draws of three and of four beams mix, so the spread of squares is taken from themselves
-    off = found.value[found.is_available] - moving
-    spread = np.std(off**2, axis=0) / np.sqrt(result.n_solutions)
+    errors = solution.value[solution.is_available] - moving
+    spread = np.std(errors**2, axis=0) / np.sqrt(result.n_solutions)
     assert (np.abs(result.variance - result.stated_variance) <= 5 * spread).all()
     assert (5 * spread < 0.07 * result.stated_variance).all()  # a variance 7 % off would show
     np.testing.assert_allclose(

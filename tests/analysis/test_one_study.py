@@ -53,9 +53,9 @@ def by_new_defaults(datasets, dim):
 
 
 def with_variable(one, other, name):
-    changed = one.copy()
-    changed[name] = other[name]
-    return changed
+    modified = one.copy()
+    modified[name] = other[name]
+    return modified
 
 
 NEAR, FAR = {"range": slice(0, 2)}, {"range": slice(2, None)}
@@ -104,16 +104,16 @@ TOGETHER = {
 
 @pytest.mark.parametrize("answer", ["range_error", "roc", "false_alarms_per_second",
                                     "maximum_range", "contour", "summary"])  # fmt: skip
-@pytest.mark.parametrize("how", TOGETHER)
-def test_datasets_of_two_studies_answer_nothing(small, large, how, answer):
+@pytest.mark.parametrize("join_name", TOGETHER)
+def test_datasets_of_two_studies_answer_nothing(small, large, join_name, answer):
     with pytest.raises(ValueError, match=r"stud(y|ies)"):
-        getattr(TOGETHER[how](small.sel(power=1), large).sweep, answer)()
+        getattr(TOGETHER[join_name](small.sel(power=1), large).sweep, answer)()
 
 
 def test_parts_of_one_study_put_together_answer_as_the_whole(small):
     parts = [small.isel(range=[0, 1]), small.isel(range=[2, 3])]
-    whole = xr.concat(parts, "range").sweep.range_error().bound
-    np.testing.assert_array_equal(whole, small.sweep.range_error().bound)
+    bound = xr.concat(parts, "range").sweep.range_error().bound
+    np.testing.assert_array_equal(bound, small.sweep.range_error().bound)
 
 
 @pytest.mark.parametrize("answer", ["range_error", "velocity_error", "roc",
@@ -143,15 +143,17 @@ def test_parts_of_one_study_put_together_answer_as_the_whole(small):
     ],
 )
 def test_an_axis_dropped_or_changed_is_refused_in_words(small, reduce, answer):
-    given = (small,) if answer == "compare" else ()
+    arguments = (small,) if answer == "compare" else ()
     with pytest.raises(ValueError, match=r"study|spec|flags"):
-        getattr(reduce(small).sweep, answer)(*given)
+        getattr(reduce(small).sweep, answer)(*arguments)
 
 
 def test_what_needs_no_parameter_is_answered_without_the_dropped_axis(small):
-    whole = small.sweep.maximum_range(pd=0.5).unbroken
+    unbroken_range = small.sweep.maximum_range(pd=0.5).unbroken
     dropped = small.isel(power=1, drop=True).sweep.maximum_range(pd=0.5).unbroken
-    assert float(dropped) == float(whole.isel(power=1)) != float(whole.isel(power=0))
+    assert (
+        float(dropped) == float(unbroken_range.isel(power=1)) != float(unbroken_range.isel(power=0))
+    )
 
 
 @pytest.mark.parametrize(
@@ -173,16 +175,16 @@ def test_what_needs_no_parameter_is_answered_without_the_dropped_axis(small):
     ],
 )
 def test_a_part_of_a_study_in_other_words_is_still_that_study(small, change):
-    whole, part = (
+    complete, part = (
         {
             (round(float(r) % 999, 6), float(p)): float(bound)
-            for r, p, bound in found.bound.to_dataframe().reset_index()
+            for r, p, bound in range_error.bound.to_dataframe().reset_index()
             .rename(columns={"distance": "range"})[["range", "power", "bound"]]
             .itertuples(index=False)
         }
-        for found in (ds.sweep.range_error() for ds in (small, change(small)))
+        for range_error in (ds.sweep.range_error() for ds in (small, change(small)))
     )  # fmt: skip
-    assert part.items() <= whole.items() and len(part) >= 4
+    assert part.items() <= complete.items() and len(part) >= 4
 
 
 @pytest.mark.parametrize(
@@ -193,19 +195,25 @@ def test_a_part_of_a_study_in_other_words_is_still_that_study(small, change):
 def test_a_join_answers_each_design_by_its_own_spec(stores, small, large, name):
     joined = sweep.open([stores["small"], stores["large"]], dim="design")
     assert joined.design.values.tolist() == ["small", "large"] and joined.sizes["power"] == 2
-    found = getattr(joined.sweep, name)()
-    assert found.study_id.values.tolist() == [small.study_id.item(), large.study_id.item()]
-    for design, alone in (("small", small), ("large", large)):
-        expected = getattr(alone.sweep, name)()
-        own = found.sel(design=design)
+    answer = getattr(joined.sweep, name)()
+    assert answer.study_id.values.tolist() == [small.study_id.item(), large.study_id.item()]
+    for design, dataset in (("small", small), ("large", large)):
+        expected = getattr(dataset.sweep, name)()
+        design_answer = answer.sel(design=design)
         if isinstance(expected, xr.DataArray):
-            own, expected = own.to_dataset(name="value"), expected.to_dataset(name="value")
-        if design == "large" and "power" in own.dims:
-            own = own.sel(power=1)
+            design_answer, expected = (
+                design_answer.to_dataset(name="value"),
+                expected.to_dataset(name="value"),
+            )
+        if design == "large" and "power" in design_answer.dims:
+            design_answer = design_answer.sel(power=1)
         for variable in expected.data_vars:
             dims = expected[variable].dims
             np.testing.assert_allclose(
-                own[variable].transpose(*dims), expected[variable], rtol=1e-12, err_msg=variable
+                design_answer[variable].transpose(*dims),
+                expected[variable],
+                rtol=1e-12,
+                err_msg=variable,
             )
 
 
@@ -216,8 +224,8 @@ def test_one_design_of_a_join_is_that_study(stores, large):
     np.testing.assert_array_equal(
         chosen.sweep.range_error().bound.squeeze(), large.sweep.range_error().bound
     )
-    again = pickle.loads(pickle.dumps(joined)).sweep.maximum_range(pd=0.5)
-    xr.testing.assert_identical(again.compute(), joined.sweep.maximum_range(pd=0.5).compute())
+    limit = pickle.loads(pickle.dumps(joined)).sweep.maximum_range(pd=0.5)
+    xr.testing.assert_identical(limit.compute(), joined.sweep.maximum_range(pd=0.5).compute())
     for refused in (
         lambda: joined.sweep.spec,
         lambda: large.sweep.compare(joined),
@@ -238,8 +246,8 @@ def test_designs_in_other_units_and_on_other_values_are_joined_by_value(tmp_path
     joined = sweep.open([stores["small"], other])
     assert joined.range.values.tolist() == [1, 2, 3, 4, 16] and joined.range.attrs["units"] == "km"
     reach = joined.sweep.maximum_range(pd=0.5)
-    alone = sweep.open(other).sweep.maximum_range(pd=0.5)
-    assert reach.unbroken_reason.sel(design="other", power=1) == alone.unbroken_reason
+    limit = sweep.open(other).sweep.maximum_range(pd=0.5)
+    assert reach.unbroken_reason.sel(design="other", power=1) == limit.unbroken_reason
     np.testing.assert_allclose(
         reach.unbroken.sel(design="small"), small.sweep.maximum_range(pd=0.5).unbroken
     )
@@ -248,7 +256,7 @@ def test_designs_in_other_units_and_on_other_values_are_joined_by_value(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("combine", "message"),
     [
         (lambda s: sweep.open([s["small"], s["small"]]), "twice"),
         (lambda s: sweep.open({"a": s["small"], "b": s["small"]}), "the same study"),
@@ -258,9 +266,9 @@ def test_designs_in_other_units_and_on_other_values_are_joined_by_value(tmp_path
         (lambda s: sweep.open([s["small"], s["large"]], dim="pd_shot"), "'pd_shot' can't name"),
     ],
 )
-def test_joins_that_cannot_be_are_refused_in_words(stores, asked, told):
-    with pytest.raises(ValueError, match=told):
-        asked(stores)
+def test_joins_that_cannot_be_are_refused_in_words(stores, combine, message):
+    with pytest.raises(ValueError, match=message):
+        combine(stores)
 
 
 def test_zipped_axes_join_where_they_are_the_same(tmp_path):
@@ -273,23 +281,23 @@ def test_zipped_axes_join_where_they_are_the_same(tmp_path):
     three = computed(tmp_path, "three", {"cut": other}, telescope__aperture="50 mm")
     bounds = sweep.open([one, two]).sweep.range_error().bound
     for name, store in (("one", one), ("two", two)):
-        alone = sweep.open(store).sweep.range_error().bound
-        np.testing.assert_array_equal(bounds.sel(design=name), alone)
+        range_error = sweep.open(store).sweep.range_error().bound
+        np.testing.assert_array_equal(bounds.sel(design=name), range_error)
     with pytest.raises(ValueError, match="zipped axis 'cut'"):
         sweep.open([one, three])
 
 
-def test_contours_of_designs_are_told_apart(tmp_path):
+def test_contours_of_designs_are_distinguished(tmp_path):
     axes = {
         "target.range": {"step": ["1 km", "8 km", "1 km"]},
         "target.grazing_angle": {"step": ["10 deg", "90 deg", "20 deg"]},
     }
     paths = [computed(tmp_path, "weak", axes, laser__power="1 W"),
              computed(tmp_path, "strong", axes, laser__power="3 W")]  # fmt: skip
-    found = sweep.open(paths).sweep.contour(pd=0.5)
+    contour = sweep.open(paths).sweep.contour(pd=0.5)
     for name, path in zip(("weak", "strong"), paths, strict=True):
-        alone = sweep.open(path).sweep.contour(pd=0.5)
-        np.testing.assert_array_equal(found.range[found.design == name], alone.range)
+        single_contour = sweep.open(path).sweep.contour(pd=0.5)
+        np.testing.assert_array_equal(contour.range[contour.design == name], single_contour.range)
 
 
 def test_studies_whose_intervals_one_lacks_keep_their_own_variables(tmp_path, stores, small):
@@ -299,9 +307,9 @@ def test_studies_whose_intervals_one_lacks_keep_their_own_variables(tmp_path, st
     sweep.run(spec, store=drawn, scheduler="none", progress=False)
     joined = sweep.open([stores["small"], drawn])
     pd = joined.sel(power=1).sweep.detection_probability()
-    alone = sweep.open(drawn).sweep.detection_probability()
+    probability = sweep.open(drawn).sweep.detection_probability()
     for name in ("pd", "low", "high"):
-        np.testing.assert_array_equal(pd[name].sel(design="drawn"), alone[name])
+        np.testing.assert_array_equal(pd[name].sel(design="drawn"), probability[name])
     assert (pd.low == pd.pd).sel(design="small").all()
     assert joined.n_draws.dtype.kind == "i" and (joined.n_draws.sel(design="small") == -1).all()
 
@@ -317,7 +325,7 @@ def test_extremes_of_detection_and_of_misses_are_no_study(small, reduction):
 
 
 @pytest.mark.parametrize(
-    ("answer", "kept", "missing"),
+    ("answer", "selection", "missing"),
     [
         ("range_error", ["pd_shot", "snr_up"], "snr_doppler, snr_down, effects, range_error"),
         ("roc", ["pd_shot"], "snr_up, pd_up"),
@@ -326,6 +334,6 @@ def test_extremes_of_detection_and_of_misses_are_no_study(small, reduction):
         ("false_alarms_per_second", ["pd_shot"], "pfa_both_chirps"),
     ],
 )
-def test_variables_left_out_are_named(small, answer, kept, missing):
+def test_variables_left_out_are_named(small, answer, selection, missing):
     with pytest.raises(ValueError, match=f"the dataset lacks {missing}"):
-        getattr(small[kept].sweep, answer)()
+        getattr(small[selection].sweep, answer)()

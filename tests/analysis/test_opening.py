@@ -158,22 +158,22 @@ def test_a_finished_store_counts_all_shots_of_all_scanners_draws_and_places(scen
     assert attributes["started"] <= attributes["finished"] != ""
 
 
-@pytest.mark.parametrize(("size", "most"), [(1, 7), (20, 14), (1000, 100)])
-def test_stretches_are_whole_chunks_and_cover_all_once(size, most):
+@pytest.mark.parametrize(("size", "size_max"), [(1, 7), (20, 14), (1000, 100)])
+def test_stretches_are_whole_chunks_and_cover_all_once(size, size_max):
     array = xr.DataArray(np.zeros((2, 100)), dims=("power", "shot"))
     array.encoding["preferred_chunks"] = {"power": 1, "shot": 7}
     parts = chunk_aligned_slices(array, "shot", size)
     covered = np.concatenate([np.arange(100)[part] for part in parts])
     assert covered.tolist() == list(range(100))
     assert all(part.start % 7 == 0 for part in parts)
-    assert max(part.stop - part.start for part in parts) == most
+    assert max(part.stop - part.start for part in parts) == size_max
 
 
-def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
+def test_eyepoints_read_back_equal_those_cast_again_bit_for_bit(scene_store, spec):
     world, tree = spec.build_scene(), open_scene(scene_store)
     index = np.array([3, 77, 130, 311])
     for name in spec.scanners:
-        found = read_eyepoints(scene_store, tree[name].to_dataset(), index)
+        eyepoints = read_eyepoints(scene_store, tree[name].to_dataset(), index)
         cast = compute_eyepoints(
             index,
             flight=spec.build_flight(),
@@ -186,9 +186,9 @@ def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
         )
         for field, array in cast._asdict().items():
             equal_nan = array.dtype.kind == "f"
-            assert np.array_equal(getattr(found, field), array, equal_nan=equal_nan), field
+            assert np.array_equal(getattr(eyepoints, field), array, equal_nan=equal_nan), field
 
 
-def test_eyepoints_that_are_gone_are_told_with_a_remedy(tmp_path):
+def test_eyepoints_that_are_gone_are_reported_with_a_remedy(tmp_path):
     with pytest.raises(NotAStoreError, match="running the study again casts them anew"):
         read_eyepoints(tmp_path, xr.Dataset(attrs={"geometry_id": "none"}), np.array([0]))

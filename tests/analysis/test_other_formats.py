@@ -59,11 +59,11 @@ def test_a_grid_goes_through_netcdf_and_answers_the_same(grids, name, engine, tm
     dataset = sweep.open(grids[name])
     assert flat(dataset) and flat(xr.open_zarr(grids[name]))
     dataset.to_netcdf(tmp_path / "grid.nc", engine=engine)
-    again = xr.load_dataset(tmp_path / "grid.nc", engine=engine)
-    xr.testing.assert_equal(again, dataset.compute())
-    assert again.sweep.spec == dataset.sweep.spec
+    restored = xr.load_dataset(tmp_path / "grid.nc", engine=engine)
+    xr.testing.assert_equal(restored, dataset.compute())
+    assert restored.sweep.spec == dataset.sweep.spec
     for variable, bound in dataset.sweep.range_error().items():
-        np.testing.assert_array_equal(again.sweep.range_error()[variable], bound)
+        np.testing.assert_array_equal(restored.sweep.range_error()[variable], bound)
     xr.open_zarr(grids[name]).to_netcdf(tmp_path / "plain.nc", engine=engine)
 
 
@@ -71,8 +71,10 @@ def test_a_grid_goes_through_netcdf_and_answers_the_same(grids, name, engine, tm
 def test_a_join_goes_through_netcdf_and_answers_per_design(grids, engine, tmp_path):
     joined = sweep.open([grids["numbers"], grids["drawn"]])
     joined.to_netcdf(tmp_path / "joined.nc", engine=engine)
-    again = xr.load_dataset(tmp_path / "joined.nc", engine=engine)
-    np.testing.assert_array_equal(again.sweep.range_error().bound, joined.sweep.range_error().bound)
+    restored = xr.load_dataset(tmp_path / "joined.nc", engine=engine)
+    np.testing.assert_array_equal(
+        restored.sweep.range_error().bound, joined.sweep.range_error().bound
+    )
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -82,8 +84,8 @@ def test_what_accuracy_costs_goes_into_netcdf(engine, tmp_path):
     dataset = xr.open_zarr(store)
     assert flat(dataset)
     dataset.to_netcdf(tmp_path / "cost.nc", engine=engine)
-    again = xr.load_dataset(tmp_path / "cost.nc", engine=engine)
-    np.testing.assert_array_equal(again.seconds, dataset.seconds)
+    restored = xr.load_dataset(tmp_path / "cost.nc", engine=engine)
+    np.testing.assert_array_equal(restored.seconds, dataset.seconds)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -98,8 +100,8 @@ def test_a_flight_goes_into_netcdf_whole_or_by_scanner(scene_store, engine, tmp_
     if engine == "scipy":  # its files have no groups
         return
     tree.to_netcdf(tmp_path / "flight.nc", engine=engine)
-    with xr.open_datatree(tmp_path / "flight.nc", engine=engine) as again:
-        difference = again.sweep.compare(tree)["square"]
+    with xr.open_datatree(tmp_path / "flight.nc", engine=engine) as restored:
+        difference = restored.sweep.compare(tree)["square"]
         assert float(abs(difference.pd_shot).max()) == 0
 
 
@@ -112,19 +114,19 @@ def test_a_table_of_a_scanner_s_shots_has_no_cell_of_the_map(scene_store):
 
 
 def test_the_map_of_a_store_of_an_earlier_version_gets_its_group(scene_store, monkeypatch):
-    whole = xr.open_datatree(scene_store, engine="zarr")
+    full_tree = xr.open_datatree(scene_store, engine="zarr")
     names = {"x": "map_x", "y": "map_y", "height": "map_height"}
     old = xr.DataTree.from_dict({
-        "/": xr.merge([whole.to_dataset(), whole["scene_map"].to_dataset().rename(names)]),
-        **{name: whole[name].to_dataset() for name in ("square", "pair")},
+        "/": xr.merge([full_tree.to_dataset(), full_tree["scene_map"].to_dataset().rename(names)]),
+        **{name: full_tree[name].to_dataset() for name in ("square", "pair")},
     })  # fmt: skip
     monkeypatch.setattr(xr, "open_datatree", lambda *_, **__: old)
     tree = sweep.open_scene(scene_store)
-    np.testing.assert_array_equal(tree["scene_map"].height, whole["scene_map"].height)
+    np.testing.assert_array_equal(tree["scene_map"].height, full_tree["scene_map"].height)
     assert "map_x" not in tree["square"].to_dataset().coords
 
 
-def test_software_is_told_alike_by_stores_of_this_version_and_of_earlier_ones():
+def test_software_is_reported_alike_by_stores_of_this_version_and_of_earlier_ones():
     versions = {"numba": "0.60", "numpy": "2.1.0rc1"}
     assert parse_software_versions({"software": versions}) == versions
     assert parse_software_versions({"software": "numba 0.60, numpy 2.1.0rc1"}) == versions

@@ -35,13 +35,13 @@ def few():
 
 
 def test_exact_means_are_those_of_many_draws(few):
-    means, off = tolerance_of_draws.exact_means(few)
+    means, half_widths = tolerance_of_draws.exact_means(few)
     study = GridStudy(few)
-    found = study.evaluate(0)
-    assert study.grid.n_blocks == 1 and off < 1e-12
+    exact = study.evaluate(0)
+    assert study.grid.n_blocks == 1 and half_widths < 1e-12
     for name, mean in zip(PD_OUTPUTS, means, strict=True):
-        error = found[f"{name}_error"].ravel()
-        assert (abs(found[name].ravel() - mean) <= 5 * error + 1e-9).all(), name
+        error = exact[f"{name}_error"].ravel()
+        assert (abs(exact[name].ravel() - mean) <= 5 * error + 1e-9).all(), name
         assert ((error > 1e-4) & (error < 0.01)).sum() >= 4
 
 
@@ -54,8 +54,8 @@ def test_coverage_is_that_of_the_points_where_draws_decide():
     share, sigmas = tolerance_of_draws.coverage(row, 0.95)
     assert share == pytest.approx(2 / 3)
     assert sigmas == pytest.approx((2 / 3 - 0.95) / np.sqrt(0.95 * 0.05 / 75))
-    told = list(tolerance_of_draws.missed_tolerances("it", [row], 0.95))
-    assert len(told) == 5 and "75.0%" in told[0]
+    messages = list(tolerance_of_draws.missed_tolerances("it", [row], 0.95))
+    assert len(messages) == 5 and "75.0%" in messages[0]
     (cells,) = tolerance_of_draws.table_rows([row], 0.95)
     assert cells[2:6] == ["75.00%", "75", "66.67%", "66.7% (-11.3)"]
 
@@ -79,18 +79,18 @@ def test_speckled_points_are_within_their_half_widths_as_often_as_promised(toler
     selected = GridStudy(spec).effect_planner.select_for_block(0)
     effects = {name for _, names in selected.iter_groups_by_effects() for name in names}
     repeated = {name: np.repeat(v, samples) if np.ndim(v) else v for name, v in parameters.items()}
-    found = simulate_draws(
+    results = simulate_draws(
         repeated, effects, keys=make_point_keys(grid.n_points * samples), method="probabilities",
         batch=100, limit=20_000, error_budget=ErrorBudget(tolerance, 0.95),
     )  # fmt: skip
-    assert (found["accuracy_missed"] == 0).all()
-    assert found["n_draws"].max() <= 4000 and found["n_draws"].mean() < 800
+    assert (results["accuracy_missed"] == 0).all()
+    assert results["n_draws"].max() <= 4000 and results["n_draws"].mean() < 800
     assert "speckle" in effects
     sigma = np.sqrt(0.95 * 0.05 / samples / grid.n_points)
     for name, exact in zip(PD_OUTPUTS, means, strict=True):
-        off = found[name].reshape(-1, samples) - exact[:, None]
-        half_width = found[f"{name}_half_width"].reshape(-1, samples)
+        errors = results[name].reshape(-1, samples) - exact[:, None]
+        half_width = results[f"{name}_half_width"].reshape(-1, samples)
         assert (half_width <= tolerance).all()
-        assert (abs(off) <= half_width).mean() >= 0.95 - 5 * sigma, name
-        random_error = 5 * off.std(axis=1) / np.sqrt(samples)
-        assert (abs(off.mean(axis=1)) <= 0.1 * tolerance + random_error).all(), name
+        assert (abs(errors) <= half_width).mean() >= 0.95 - 5 * sigma, name
+        random_error = 5 * errors.std(axis=1) / np.sqrt(samples)
+        assert (abs(errors.mean(axis=1)) <= 0.1 * tolerance + random_error).all(), name

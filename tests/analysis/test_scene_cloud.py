@@ -35,12 +35,12 @@ def arrays(scene_store):
     return xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=1).load()
 
 
-def drawn(found, tree, **options):
-    wanted = {
+def draw_cloud(cloud, tree, **options):
+    arguments = {
         "quantity": "range", "surfaces": ["ground", "block"], "view": "above", "height_map": None,
         "title": "A cloud", "remarks": [],
     }  # fmt: skip
-    sheet = cloud_figures.draw_cloud_sheet(found, **(wanted | options))
+    sheet = cloud_figures.draw_cloud_sheet(cloud, **(arguments | options))
     sheet.canvas.draw()
     return sheet
 
@@ -69,26 +69,28 @@ def small_cloud(points, **changes):
 
 
 def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, arrays):
-    found = gather_point_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
+    cloud_points = gather_point_cloud(
+        weak, ["range"], ranges="quantised", draw=1, with_dropouts=True
+    )
     none = (arrays.flags.values == 0).all(axis=-1)
     assert 20 < none.sum() < none.size - 20
-    assert found.thinned_dropouts.n_total == none.sum()
-    assert found.thinned_points.n_total == (arrays.flags.values > 0).sum()
+    assert cloud_points.thinned_dropouts.n_total == none.sum()
+    assert cloud_points.thinned_points.n_total == (arrays.flags.values > 0).sum()
     aimed = (
         arrays.platform_position.values
         + arrays.beam_range.values[:, None] * arrays.beam_direction.values
     )[none]
     for k, axis in enumerate(WORLD_AXES):
-        assert np.array_equal(found.dropouts[axis], aimed[:, k])
+        assert np.array_equal(cloud_points.dropouts[axis], aimed[:, k])
 
 
 @pytest.mark.parametrize("geometry", [True, False])
 def test_shots_that_are_not_computed_are_no_dropouts(scene_store, spec, tmp_path, arrays, geometry):
     short = open_scene_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=geometry))
     weak = find_axis_position(spec, {"power": "0.3 mW"}).open_recording(short, "pair")
-    found = gather_point_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
+    cloud = gather_point_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
-    assert found.thinned_dropouts.n_total == none[:256].sum() > 0
+    assert cloud.thinned_dropouts.n_total == none[:256].sum() > 0
 
 
 @pytest.mark.parametrize(("power", "draw"), [("0.3 mW", 0), ("1 W", 1)])
@@ -96,7 +98,7 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
     scene_store, tree, spec, power, draw
 ):
     at = find_axis_position(spec, {"power": power})
-    found = gather_point_cloud(
+    cloud = gather_point_cloud(
         at.open_recording(tree, "pair"), ["snr"], ranges="interpolated", draw=draw,
         with_dropouts=True, with_path=True,
     )  # fmt: skip
@@ -104,44 +106,44 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
     true = (arrays.flags.values & TRUE_FLAG) > 0
     position = arrays.position.values
     for k, axis in enumerate(WORLD_AXES):
-        low, high = found.box[axis]
-        for inside in (position[true][:, k], found.dropouts[axis], found.path[axis]):
+        low, high = cloud.box[axis]
+        for inside in (position[true][:, k], cloud.dropouts[axis], cloud.path[axis]):
             assert ((low < inside) & (inside < high)).all()
-    box = np.array([found.box[axis] for axis in WORLD_AXES])
-    others = position[(arrays.flags.values > 0) & ~true]
-    beyond = ((others < box[:, 0]) | (others > box[:, 1])).any(axis=1).sum()
-    assert found.n_outside == beyond > 0
-    assert found.points["x"].size == found.thinned_points.n_total - beyond
-    assert np.array_equal(found.path["z"], arrays.platform_position.values[:, 2])
+    box = np.array([cloud.box[axis] for axis in WORLD_AXES])
+    false_points = position[(arrays.flags.values > 0) & ~true]
+    n_beyond = ((false_points < box[:, 0]) | (false_points > box[:, 1])).any(axis=1).sum()
+    assert cloud.n_outside == n_beyond > 0
+    assert cloud.points["x"].size == cloud.thinned_points.n_total - n_beyond
+    assert np.array_equal(cloud.path["z"], arrays.platform_position.values[:, 2])
 
 
 def test_crops_cut_points_and_dropouts_and_the_picture(weak):
     crops = {"x": (-30.0, 25.0), "time": (1.0, 5.0)}
-    found = gather_point_cloud(weak, ["range"], ranges="quantised", crops=crops, with_dropouts=True)
+    cloud = gather_point_cloud(weak, ["range"], ranges="quantised", crops=crops, with_dropouts=True)
     every = gather_point_cloud(weak, ["range"], ranges="quantised", with_dropouts=True)
     assert (
-        0 < found.thinned_points.n_total < every.thinned_points.n_total
-        and 0 < found.thinned_dropouts.n_total < every.thinned_dropouts.n_total
+        0 < cloud.thinned_points.n_total < every.thinned_points.n_total
+        and 0 < cloud.thinned_dropouts.n_total < every.thinned_dropouts.n_total
     )
-    for table in (found.points, found.dropouts):
+    for table in (cloud.points, cloud.dropouts):
         assert table["x"].min() >= -30 and table["x"].max() <= 25
-    room = max(high - low for low, high in found.box.values()) * recordings.BOX_MARGIN_FRACTION
-    assert found.box["x"][0] >= -30 - room and found.box["x"][1] <= 25 + room
+    margin = max(high - low for low, high in cloud.box.values()) * recordings.BOX_MARGIN_FRACTION
+    assert cloud.box["x"][0] >= -30 - margin and cloud.box["x"][1] <= 25 + margin
     assert (
         gather_point_cloud(weak, ["range"], ranges="quantised", crops={"x": (1e5, np.inf)}) is None
     )
 
 
 def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
-    whole = gather_point_cloud(weak, ["shot"], ranges="quantised")
-    found = gather_point_cloud(weak, ["shot"], ranges="quantised", points_max=50)
-    assert found.thinned_points.step == 2 ** int(
-        np.ceil(np.log2(whole.thinned_points.n_total / 50))
+    dense = gather_point_cloud(weak, ["shot"], ranges="quantised")
+    cloud = gather_point_cloud(weak, ["shot"], ranges="quantised", points_max=50)
+    assert cloud.thinned_points.step == 2 ** int(
+        np.ceil(np.log2(dense.thinned_points.n_total / 50))
     )
-    said = drawn(found, tree, quantity="shot").get_supxlabel()
+    caption = draw_cloud(cloud, tree, quantity="shot").get_supxlabel()
     assert (
-        f"{whole.thinned_points.n_total:,} points, one in {found.thinned_points.step} of them shown"
-        in said
+        f"{dense.thinned_points.n_total:,} points, one in {cloud.thinned_points.step} of them shown"
+        in caption
     )
 
 
@@ -149,33 +151,33 @@ def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
     ("view", "axes"), [("above", ("x", "y")), ("side", ("x", "z")), ("front", ("y", "z"))]
 )
 def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, axes):
-    found = gather_point_cloud(
+    cloud = gather_point_cloud(
         weak, ["range"], ranges="quantised", with_dropouts=True, with_path=True
     )
-    sheet = drawn(found, tree, view=view, height_map=HeightMap.from_tree(tree))
+    sheet = draw_cloud(cloud, tree, view=view, height_map=HeightMap.from_tree(tree))
     picture = sheet.axes[0]
-    true = (found.points["flags"] & TRUE_FLAG) > 0
-    (shown,) = (c.get_offsets() for c in picture.collections if c.zorder == 3)
-    expected = np.column_stack([found.points[axis][true] for axis in axes])
-    assert np.array_equal(np.sort(shown, axis=0), np.sort(expected, axis=0))
+    true = (cloud.points["flags"] & TRUE_FLAG) > 0
+    (offsets,) = (c.get_offsets() for c in picture.collections if c.zorder == 3)
+    expected = np.column_stack([cloud.points[axis][true] for axis in axes])
+    assert np.array_equal(np.sort(offsets, axis=0), np.sort(expected, axis=0))
     pixels = picture.transData.transform([[0, 0], [1, 0], [0, 1]])
     assert pixels[1, 0] - pixels[0, 0] == pytest.approx(pixels[2, 1] - pixels[0, 1], rel=1e-6)
     assert picture.get_xlabel() == f"{axes[0]} (m)" and picture.get_ylabel() == f"{axes[1]} (m)"
 
 
 def test_the_nearest_points_lie_on_top():
-    found = small_cloud([[0, 0, 0], [0, 0, 0], [5.0, 9.0, 1.0]])
+    cloud = small_cloud([[0, 0, 0], [0, 0, 0], [5.0, 9.0, 1.0]])
     scale = point_styles.choose_colours(
-        "range", found.points["range"], is_trusted=np.ones(3, bool), surfaces=[]
+        "range", cloud.points["range"], is_trusted=np.ones(3, bool), surfaces=[]
     )
-    colour = drawn(found, None).axes[0].collections[0].get_facecolors()
+    colour = draw_cloud(cloud, None).axes[0].collections[0].get_facecolors()
     assert np.allclose(colour, scale.to_rgba_colours(np.array([2.0, 0.0, 1.0])))
 
 
 @pytest.mark.parametrize("view", ["oblique", (20.0, 60.0), (-130.0, 5.0)])
 def test_a_view_at_an_angle_has_one_scale_fits_the_sheet_and_fills_it(view):
-    found = small_cloud([[0, 300.0, 150.0], [0, 40.0, 90.0], [0, 10.0, 25.0]])
-    sheet = drawn(found, None, view=view)
+    cloud = small_cloud([[0, 300.0, 150.0], [0, 40.0, 90.0], [0, 10.0, 25.0]])
+    sheet = draw_cloud(cloud, None, view=view)
     axes = sheet.axes[0]
     places = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     x, y, _ = proj3d.proj_transform(*places, axes.get_proj())
@@ -186,7 +188,7 @@ def test_a_view_at_an_angle_has_one_scale_fits_the_sheet_and_fills_it(view):
     frame = units[1:]
     scale = np.sqrt((frame**2).sum() / 2)
     assert frame.T @ frame == pytest.approx(scale**2 * np.eye(2), abs=1e-6 * scale**2)
-    corners = np.array(np.meshgrid(*(found.box[axis] for axis in WORLD_AXES))).reshape(3, -1)
+    corners = np.array(np.meshgrid(*(cloud.box[axis] for axis in WORLD_AXES))).reshape(3, -1)
     x, y, _ = proj3d.proj_transform(*corners, axes.get_proj())
     pixels = axes.transData.transform(np.column_stack([x, y]))
     size = sheet.get_size_inches() * sheet.dpi
@@ -197,21 +199,23 @@ def test_a_view_at_an_angle_has_one_scale_fits_the_sheet_and_fills_it(view):
 
 def test_velocities_of_both_signs_have_a_scale_centred_on_zero_and_of_one_sign_do_not():
     true = np.ones(3, bool)
-    both = point_styles.choose_colours(
+    two_sided = point_styles.choose_colours(
         "radial_velocity", np.array([-1, 0, 4.0]), is_trusted=true, surfaces=[]
     )
     one = point_styles.choose_colours(
         "radial_velocity", np.array([1, 2, 4.0]), is_trusted=true, surfaces=[]
     )
-    assert (both.norm.vmin, both.norm.vmax) == (-4, 4)
-    assert both.cmap is point_styles.DIVERGING_COLOUR_MAP
+    assert (two_sided.norm.vmin, two_sided.norm.vmax) == (-4, 4)
+    assert two_sided.cmap is point_styles.DIVERGING_COLOUR_MAP
     assert (one.norm.vmin, one.norm.vmax) == (1, 4)
-    assert both.label == "radial velocity (m/s)"
-    middle = both.to_rgba_colours(np.array([0.0]))[0, :3]
-    assert all(middle.sum() < both.to_rgba_colours(np.array([v]))[0, :3].sum() for v in (-4.0, 4.0))
+    assert two_sided.label == "radial velocity (m/s)"
+    middle = two_sided.to_rgba_colours(np.array([0.0]))[0, :3]
+    assert all(
+        middle.sum() < two_sided.to_rgba_colours(np.array([v]))[0, :3].sum() for v in (-4.0, 4.0)
+    )
 
 
-def test_false_and_lonely_values_do_not_stretch_a_scale_but_are_told():
+def test_false_and_lonely_values_do_not_stretch_a_scale_but_are_counted():
     values = np.concatenate([np.linspace(100, 200, 1000), [5000.0, -7.0]])
     trusted = np.arange(values.size) < 1000
     scale = point_styles.choose_colours("range", values, is_trusted=trusted, surfaces=[])
@@ -242,7 +246,7 @@ def test_surfaces_and_kinds_of_points_have_names_and_colours_of_their_own():
 
 def test_far_off_coordinates_are_read_against_a_round_number():
     points = np.array([[4_000_000.0, 4_000_300.0], [10.0, 90.0], [0, 10.0]])
-    sheet = drawn(small_cloud(points), None)
+    sheet = draw_cloud(small_cloud(points), None)
     picture = sheet.axes[0]
     assert picture.get_xlabel() == "x - 4000000 (m)" and picture.get_ylabel() == "y (m)"
     words = [tick.get_text() for tick in picture.get_xticklabels()]
@@ -274,9 +278,9 @@ def test_slopes_towards_the_light_are_brighter_and_walls_are_left_open():
     towards = HeightMap(
         x, y, 0.3 * (x - y[:, None])
     ).hillshade()  # rises to the south-east, faces the sun
-    away = HeightMap(x, y, 0.3 * (y[:, None] - x)).hillshade()
+    facing_away = HeightMap(x, y, 0.3 * (y[:, None] - x)).hillshade()
     level = HeightMap(x, y, np.zeros((21, 21))).hillshade()
-    assert (towards > level).all() and (level > away).all()
+    assert (towards > level).all() and (level > facing_away).all()
     step = np.where(x > 5, 10.0, 0.0) + 0 * y[:, None]
-    kept = np.isfinite(HeightMap(x, y, step).mask_steep_ground().height)
-    assert not kept[:, 10].any() and kept[:, :9].all() and kept[:, 13:].all()
+    is_kept = np.isfinite(HeightMap(x, y, step).mask_steep_ground().height)
+    assert not is_kept[:, 10].any() and is_kept[:, :9].all() and is_kept[:, 13:].all()

@@ -36,15 +36,15 @@ def test_a_store_cut_short_is_drawn_as_far_as_it_is_and_says_how_far(
     assert [file.name for file in draw_figures(short)] == ["velocity_all_navigation.png"]
 
 
-def test_spectra_need_the_eyepoints_beside_the_store(tmp_path):
+def test_spectra_need_the_eyepoints_next_to_the_store(tmp_path):
     directory = tmp_path / "own"
     directory.mkdir()
     store = run_flight_into_store(
         directory, figures=[{"kind": "shot_spectra", "shot": 0}], draws={"number": 1}
     )
-    alone = store.rename(tmp_path / "moved.zarr")
+    moved_store = store.rename(tmp_path / "moved.zarr")
     with pytest.raises(NotAStoreError, match="eyepoints of the study are not at"):
-        draw_figures(alone)
+        draw_figures(moved_store)
 
 
 def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every_point(
@@ -58,35 +58,35 @@ def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every
     shots = weak.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values)
     points = weak.read_thinned_rows(["time", "radial_velocity", "beam"], 10**6, **options)
-    there = arrays.flags.values > 0
+    is_point = arrays.flags.values > 0
     assert np.array_equal(
-        points.to_columns()["radial_velocity"], arrays.radial_velocity.values[there]
+        points.to_columns()["radial_velocity"], arrays.radial_velocity.values[is_point]
     )
     short = open_scene_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=False))
-    less = find_axis_position(spec, {"power": "0.3 mW"}).open_recording(short, "pair")
-    shots = less.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
+    incomplete = find_axis_position(spec, {"power": "0.3 mW"}).open_recording(short, "pair")
+    shots = incomplete.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values[:256])
     interval = 2.0, 3.0
     limited = options | {"time_limits": interval}
-    some = weak.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **limited)
+    rows = weak.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **limited)
     inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
-    assert np.array_equal(some.to_columns()["pd_shot"], arrays.pd_shot.values[inside])
+    assert np.array_equal(rows.to_columns()["pd_shot"], arrays.pd_shot.values[inside])
 
 
 def test_a_scatter_shows_the_values_with_units_and_counts_false_points_beyond(scene_store, spec):
     strong = find_axis_position(spec, {"power": "1 W"}).open_recording(
         open_scene_tree(scene_store), "pair"
     )
-    found = strong.read_thinned_rows(["time", "range", "snr"], 10**6, ranges="interpolated")
+    rows = strong.read_thinned_rows(["time", "range", "snr"], 10**6, ranges="interpolated")
     sheet = cloud_figures.draw_scatter_sheet(
-        found, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
+        rows, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
     )
-    table, axes = found.to_columns(), sheet.axes[0]
+    table, axes = rows.to_columns(), sheet.axes[0]
     true = (table["flags"] & TRUE_FLAG) > 0
     expected = np.column_stack([table["time"], table["range"]])
     assert np.array_equal(axes.collections[0].get_offsets(), expected[true])
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "range (m)")
     low, high = axes.get_ylim()
-    beyond = int((~true & ((expected[:, 1] < low) | (expected[:, 1] > high))).sum())
-    assert beyond > 0 and f"{beyond} false points outside" in sheet.get_supxlabel()
+    n_beyond = int((~true & ((expected[:, 1] < low) | (expected[:, 1] > high))).sum())
+    assert n_beyond > 0 and f"{n_beyond} false points outside" in sheet.get_supxlabel()
     assert sheet.axes[1].get_ylabel() == "signal-to-noise ratio (dB)"

@@ -42,55 +42,60 @@ def test_statistics_are_plain_averages_over_the_solutions_of_a_bin(
     assert curve.altitude_edges[0] == altitude.min() and curve.altitude_edges[-1] >= altitude.max()
     error = arrays[quantity].values - arrays[f"true_{quantity}"].values[:, None]
     error = error.reshape(*error.shape[:2], -1)
-    stated = arrays["velocity_covariance" if quantity == "velocity" else "altitude_variance"]
+    stated_variance = arrays[
+        "velocity_covariance" if quantity == "velocity" else "altitude_variance"
+    ]
     size = error.shape[-1]
-    variance = stated.values.reshape(*error.shape[:2], size, size).diagonal(axis1=2, axis2=3)
-    seen = 0
+    variance = stated_variance.values.reshape(*error.shape[:2], size, size).diagonal(
+        axis1=2, axis2=3
+    )
+    n_solutions = 0
     for i, (low, high) in enumerate(
         zip(curve.altitude_edges[:-1], curve.altitude_edges[1:], strict=True)
     ):
         inside = (altitude >= low) & (altitude < high)
-        own = error[inside].reshape(-1, size)
-        solved = np.isfinite(own).all(axis=1)
-        assert curve.tally.n_attempts[i] == own.shape[0]
+        errors = error[inside].reshape(-1, size)
+        solved = np.isfinite(errors).all(axis=1)
+        assert curve.tally.n_attempts[i] == errors.shape[0]
         assert curve.tally.availability[i] == pytest.approx(solved.mean())
-        seen += own.shape[0]
+        n_solutions += errors.shape[0]
         if not solved.any():
             assert np.isnan(curve.tally.bias[i]).all()
             continue
-        own = own[solved]
-        spread = own.std(axis=0, ddof=1) / np.sqrt(len(own))
+        errors = errors[solved]
+        spread = errors.std(axis=0, ddof=1) / np.sqrt(len(errors))
         predicted = variance[inside].reshape(-1, size)[solved].mean(axis=0)
-        assert curve.tally.bias[i] == pytest.approx(own.mean(axis=0), rel=1e-9, abs=1e-13)
+        assert curve.tally.bias[i] == pytest.approx(errors.mean(axis=0), rel=1e-9, abs=1e-13)
         assert curve.bias_standard_error[i] == pytest.approx(spread, rel=1e-9)
-        rmse = np.sqrt((own**2).mean(axis=0))
+        rmse = np.sqrt((errors**2).mean(axis=0))
         assert curve.rmse[i, :size] == pytest.approx(rmse, rel=1e-9)
         assert curve.stated_deviation[i, :size] == pytest.approx(np.sqrt(predicted), rel=1e-9)
         if size == 3:
-            length = np.sqrt((np.linalg.norm(own, axis=1) ** 2).mean())
+            length = np.sqrt((np.linalg.norm(errors, axis=1) ** 2).mean())
             assert curve.rmse[i, 3] == pytest.approx(length, rel=1e-9)
             assert curve.stated_deviation[i, 3] == pytest.approx(np.sqrt(predicted.sum()), rel=1e-9)
-    assert seen == arrays.sizes["cycle"] * 3
+    assert n_solutions == arrays.sizes["cycle"] * 3
 
 
 def test_results_are_the_same_bits_every_time_and_the_same_numbers_in_other_chunks(
     scene_store, spec, tmp_path, monkeypatch
 ):
-    own = recordings(scene_store, spec, "0.3 mW")
-    (first,), (again,) = (
-        navigation_error_curves(own, quantity="velocity", n_bins=5) for _ in range(2)
+    recordings_of_store = recordings(scene_store, spec, "0.3 mW")
+    (first,), (second,) = (
+        navigation_error_curves(recordings_of_store, quantity="velocity", n_bins=5)
+        for _ in range(2)
     )
-    assert np.array_equal(first.rmse, again.rmse, equal_nan=True)
+    assert np.array_equal(first.rmse, second.rmse, equal_nan=True)
     monkeypatch.setattr(navigation_errors, "SOLUTIONS_PER_READ", 1)  # a tally for each chunk
     square = {"square": SCENE_MAPPING["scanners"]["square"]}
     other = run_flight_into_store(
         tmp_path, scanners=square, storage={"block_shots": 160, "block_draws": 1}
     )
-    (apart,) = navigation_error_curves(
+    (other_curve,) = navigation_error_curves(
         recordings(other, spec, "0.3 mW"), quantity="velocity", n_bins=5
     )
-    assert np.array_equal(first.tally.n_solutions, apart.tally.n_solutions)
-    np.testing.assert_allclose(apart.rmse, first.rmse, rtol=1e-12)
+    assert np.array_equal(first.tally.n_solutions, other_curve.tally.n_solutions)
+    np.testing.assert_allclose(other_curve.rmse, first.rmse, rtol=1e-12)
 
 
 @pytest.mark.parametrize("geometry", [True, False])
@@ -124,10 +129,10 @@ def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_s
     )
     sheet = draw_chart(navigation_error_chart([curve, curve], "all"), "T", "note")
     panels = {axes.get_title(loc="left"): axes for axes in sheet.axes if axes.get_visible()}
-    error, stated = panels["RMS error of the velocity, z"].lines[:2]
+    error, stated_line = panels["RMS error of the velocity, z"].lines[:2]
     assert np.array_equal(error.get_ydata(), curve.rmse[:, 2])
-    assert np.array_equal(stated.get_ydata(), curve.stated_deviation[:, 2])
-    assert error.get_linestyle() == "-" and stated.get_linestyle() == "--"
+    assert np.array_equal(stated_line.get_ydata(), curve.stated_deviation[:, 2])
+    assert error.get_linestyle() == "-" and stated_line.get_linestyle() == "--"
     assert panels["RMS error of the velocity, z"].get_ylabel() == "error (m/s)"
     available = panels["velocity available"].lines[0]
     assert np.array_equal(available.get_ydata(), 100 * curve.tally.availability)
@@ -146,7 +151,7 @@ def test_the_table_holds_the_same_numbers_in_text_and_csv(scene_store, spec, tmp
     assert [float(row["bias"]) for row in rows] == curve.tally.bias[:, 0].tolist()
     assert [float(row["from"]) for row in rows] == curve.altitude_edges[:-1].tolist()
     assert sum(int(row["cycles"]) for row in rows) == curve.tally.n_attempts.sum()
-    said = text.read_text()
-    assert "square: altitude" in said and "in m;" in said and "a note" in said
+    table_text = text.read_text()
+    assert "square: altitude" in table_text and "in m;" in table_text and "a note" in table_text
     only = navigation_error_page([curve], show="bias", title="", remarks=[])
     assert "rmse" not in only.records[0] and "bias" in only.records[0]

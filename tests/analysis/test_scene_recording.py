@@ -53,24 +53,26 @@ def test_every_quantity_of_specs_can_be_shown():
 def test_points_are_those_with_flags_in_the_order_of_shots_and_returns(weak, arrays, draw, ranges):
     names = ["x", "y", "z", "range", "radial_velocity", "snr", "flags", "shot", "beam",
              "return_number", "returns", "pd_shot"]  # fmt: skip
-    found = all_points(weak, names, draw=draw, ranges=ranges)
+    points = all_points(weak, names, draw=draw, ranges=ranges)
     suffix = "_interpolated" if ranges == "interpolated" else ""
     row = 0
     for shot in range(arrays.sizes["shot"]):
-        here = arrays.isel(shot=shot)
-        flags = here.flags.values[draw]
+        shot_arrays = arrays.isel(shot=shot)
+        flags = shot_arrays.flags.values[draw]
         for k in np.flatnonzero(flags):
-            along = here.beam_direction.values * float(here[f"range{suffix}"][draw, k])
-            expected = here.platform_position.values + along
-            assert [found[axis][row] for axis in "xyz"] == pytest.approx(expected, abs=1e-9)
+            along = shot_arrays.beam_direction.values * float(
+                shot_arrays[f"range{suffix}"][draw, k]
+            )
+            expected = shot_arrays.platform_position.values + along
+            assert [points[axis][row] for axis in "xyz"] == pytest.approx(expected, abs=1e-9)
             for name in ("range", "radial_velocity"):
-                assert found[name][row] == here[f"{name}{suffix}"].values[draw, k]
-            assert found["snr"][row] == here.snr.values[draw, k]
-            assert (found["shot"][row], found["beam"][row]) == (shot, int(here.beam))
-            assert (found["return_number"][row], found["returns"][row]) == (k, (flags > 0).sum())
-            assert found["pd_shot"][row] == float(here.pd_shot)
+                assert points[name][row] == shot_arrays[f"{name}{suffix}"].values[draw, k]
+            assert points["snr"][row] == shot_arrays.snr.values[draw, k]
+            assert (points["shot"][row], points["beam"][row]) == (shot, int(shot_arrays.beam))
+            assert (points["return_number"][row], points["returns"][row]) == (k, (flags > 0).sum())
+            assert points["pd_shot"][row] == float(shot_arrays.pd_shot)
             row += 1
-    assert row == len(found["x"]) > 20
+    assert row == len(points["x"]) > 20
 
 
 def test_altitude_is_the_height_over_the_slope_at_the_start_of_the_cycle(weak, arrays):
@@ -78,10 +80,12 @@ def test_altitude_is_the_height_over_the_slope_at_the_start_of_the_cycle(weak, a
     position = arrays.platform_position.values
     start = np.arange(weak.n_shots) // 4 * 4
     below = GROUND_SLOPE * position[:, 0]
-    beside = np.abs(position[start, 0] - 20) > 20.5  # not over the block
-    found = weak.shot_values("altitude", part)
-    assert beside.sum() > 100
-    assert found[beside] == pytest.approx((position[:, 2] - below)[start][beside], abs=1e-6)
+    is_off_ridge = np.abs(position[start, 0] - 20) > 20.5  # not over the block
+    altitude = weak.shot_values("altitude", part)
+    assert is_off_ridge.sum() > 100
+    assert altitude[is_off_ridge] == pytest.approx(
+        (position[:, 2] - below)[start][is_off_ridge], abs=1e-6
+    )
 
 
 def test_beams_aim_at_the_slope_or_at_the_block(weak):
@@ -93,15 +97,15 @@ def test_beams_aim_at_the_slope_or_at_the_block(weak):
 
 def test_what_is_not_computed_has_no_points_and_no_stretch(scene_store, spec, tmp_path):
     at = find_axis_position(spec, {"power": "1 W"})
-    whole = at.open_recording(open_scene_tree(scene_store), "square")
+    recording = at.open_recording(open_scene_tree(scene_store), "square")
     short = at.open_recording(
         open_scene_tree(copy_without_last_cycles(scene_store, tmp_path)), "square"
     )
-    found = all_points(whole, ["time", "x", "shot"])
-    less = all_points(short, ["time", "x", "shot"])
-    kept = found["shot"] < 256
-    assert not kept.all()
-    assert np.array_equal(less["x"], found["x"][kept])
+    points = all_points(recording, ["time", "x", "shot"])
+    incomplete_points = all_points(short, ["time", "x", "shot"])
+    is_computed = points["shot"] < 256
+    assert not is_computed.all()
+    assert np.array_equal(incomplete_points["x"], points["x"][is_computed])
 
 
 def test_stretches_outside_of_an_interval_of_time_are_not_read(weak, monkeypatch):
@@ -111,8 +115,8 @@ def test_stretches_outside_of_an_interval_of_time_are_not_read(weak, monkeypatch
     monkeypatch.setattr(module, "chunk_aligned_slices", lambda array, dim: every(array, dim, 64))
     assert [part.start for part in weak.iter_shot_slices()] == [0, 128, 256]
     time = weak.read_array("time", slice(0, weak.n_shots))
-    asked = float(time[130]), float(time[200])
-    assert [part.start for part in weak.iter_shot_slices(asked)] == [128]
+    interval = float(time[130]), float(time[200])
+    assert [part.start for part in weak.iter_shot_slices(interval)] == [128]
 
 
 def test_rows_within_limits_are_kept_and_those_without_a_value_are_not():
@@ -169,9 +173,9 @@ def test_a_place_is_the_first_that_fits_and_says_what_it_left_open(spec):
 
 
 def test_places_that_are_none_are_refused_with_what_there_is(spec):
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         find_axis_position(spec, {"powr": "1 W", "power": "2 W"})
-    text = str(caught.value)
+    text = str(error_info.value)
     assert "did you mean 'power'?" in text
     assert "where.power: is no value of this study (you wrote 2 W); it has 0.3 mW, 1000 mW" in text
     with pytest.raises(SpecError, match=r"where\.power"):
@@ -182,11 +186,14 @@ def test_shots_are_computed_draw_by_draw_as_their_chunks_are_there(scene_store, 
     copy = shutil.copytree(scene_store, tmp_path / "holes.zarr")
     (copy / ".sweep" / "receipts.jsonl").unlink()  # what is committed has to be there
     (copy / "square" / "flags" / "c" / "0" / "1" / "1" / "0").unlink()  # shots 128 to 255, draw 2
-    whole, tree = slice(0, 316), open_scene_tree(copy)
+    all_shots, tree = slice(0, 316), open_scene_tree(copy)
     weak, strong = (
         find_axis_position(spec, {"power": power}).open_recording(tree, "square")
         for power in ("0.3 mW", "1 W")
     )
-    assert np.flatnonzero(~weak.computed_shot_mask(whole, 2)).tolist() == list(range(128, 256))
-    assert weak.computed_shot_mask(whole, 1).all() and strong.computed_shot_mask(whole, 2).all()
+    assert np.flatnonzero(~weak.computed_shot_mask(all_shots, 2)).tolist() == list(range(128, 256))
+    assert (
+        weak.computed_shot_mask(all_shots, 1).all()
+        and strong.computed_shot_mask(all_shots, 2).all()
+    )
     assert not weak.computed_shot_mask(slice(150, 160), 2).any()

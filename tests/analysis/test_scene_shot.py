@@ -65,11 +65,11 @@ def test_without_true_points_of_two_surfaces_several_groups_will_do(scene_store,
         open_scene_tree(scene_store), "square"
     )
     values = square.dataset.load()
-    alike = square.dataset.assign(surface=xr.zeros_like(values.surface))
-    seen = type(square)("square", alike)
+    without_surfaces = square.dataset.assign(surface=xr.zeros_like(values.surface))
+    shot_view = type(square)("square", without_surfaces)
     expected = int(np.flatnonzero(values.surfaces_seen.values >= 2)[0])
-    assert find_multi_surface_shot(seen) == expected
-    none = alike.assign(surfaces_seen=xr.zeros_like(values.surfaces_seen))
+    assert find_multi_surface_shot(shot_view) == expected
+    none = without_surfaces.assign(surfaces_seen=xr.zeros_like(values.surfaces_seen))
     assert find_multi_surface_shot(type(square)("square", none)) is None
 
 
@@ -95,15 +95,15 @@ def test_two_surfaces_have_a_peak_each_where_their_own_range_beats(scene_store, 
     peaks = [up.frequency[group.peak_index] for group in up.bin_groups]
     hit = eyepoints.surface[0] >= 0
     for surface, name in enumerate(("ground", "block")):
-        own = hit & (eyepoints.surface[0] == surface)
+        on_surface = hit & (eyepoints.surface[0] == surface)
         # the up-chirp's beat: 2 v / lambda less 2 R S / c, to the millionth of the range's part
         beat = (
             2 * (eyepoints.radial_velocity[0] + eyepoints.velocity_offset[0]) / 1550e-9
             - 2 * (eyepoints.range[0] + eyepoints.offset[0]) * (1e9 / 500e-6) / SPEED_OF_LIGHT
-        )[own]
-        drawn = 1e6 * np.sort(marks[name].get_xdata())
-        assert drawn == pytest.approx(np.sort(np.abs(beat)), abs=0.01 * bin_)
-        assert min(abs(peak - f) for peak in peaks for f in drawn) < 1.5 * bin_
+        )[on_surface]
+        peak_frequencies = 1e6 * np.sort(marks[name].get_xdata())
+        assert peak_frequencies == pytest.approx(np.sort(np.abs(beat)), abs=0.01 * bin_)
+        assert min(abs(peak - f) for peak in peaks for f in peak_frequencies) < 1.5 * bin_
     low, high = close.get_xlim()
     assert all(low < 1e-6 * peak < high for peak in peaks)
     assert "told" in sheet.get_supxlabel().lower()

@@ -47,12 +47,12 @@ def test_axes_take_their_first_values_unless_set_by_name_or_path():
     assert p["target.grazing_angle"] == pytest.approx(np.pi / 4)
 
 
-def test_mistakes_in_what_is_set_are_told_together_with_near_misses():
-    with pytest.raises(SpecError) as caught:
+def test_mistakes_in_what_is_set_are_reported_together_with_near_misses():
+    with pytest.raises(SpecError) as error_info:
         shot_spectra.select_shot_parameters(
             spec_over_axes(SURFACE_AXES), {"rnage": "3 km", "grazing_angle": "45"}
         )
-    text = str(caught.value)
+    text = str(error_info.value)
     assert "did you mean 'target.range'?" in text and "needs a unit" in text
 
 
@@ -90,11 +90,11 @@ def test_bins_of_complex_records_have_the_signs_and_the_places_of_their_frequenc
     doppler, far = 2 * velocity / 1550e-9, 2e12 * 2 * 6000.0 / 299792458.0
     for segment, beat in zip(shot.segments, (doppler - far, doppler, doppler + far), strict=True):
         expected = (beat / width + half) % 2**14 - half
-        own = segment.bins[segment.peak_index]
-        assert own == pytest.approx(expected, abs=3)
-        assert segment.frequency[segment.peak_index] == own * width
+        peak_bins = segment.bins[segment.peak_index]
+        assert peak_bins == pytest.approx(expected, abs=3)
+        assert segment.frequency[segment.peak_index] == peak_bins * width
         assert segment.bins[0] == -half and segment.bins[-1] == half - 1
-        assert segment.bins[[g.peak_index for g in segment.bin_groups]].tolist() == [own]
+        assert segment.bins[[g.peak_index for g in segment.bin_groups]].tolist() == [peak_bins]
     rows = shot_spectra._segment_table(shot).rows
     assert [row[3] for row in rows] == [s.bins[s.peak_index] for s in shot.segments]
     assert [float(row[2]) for row in rows] == pytest.approx(
@@ -128,8 +128,8 @@ def test_noise_is_the_seeds_alone():
 
 def test_groups_are_runs_of_bins_above_threshold_with_their_highest():
     magnitude = np.array([5.0, 1.0, 6.0, 7.0, 6.5, 1.0, 1.0, 5.0])
-    found = shot_spectra.find_bin_groups(magnitude, 5.0)
-    assert [(g.first_index, g.last_index, g.peak_index) for g in found] == [
+    groups = shot_spectra.find_bin_groups(magnitude, 5.0)
+    assert [(g.first_index, g.last_index, g.peak_index) for g in groups] == [
         (0, 0, 0),
         (2, 4, 3),
         (7, 7, 7),
@@ -150,12 +150,12 @@ def test_the_upper_axis_reads_true_range_and_velocity_at_the_beats_folded_or_not
     shot = shot_spectra.simulate_shot(parameters)
     for segment in shot.segments:
         at_peak = segment.frequency[segment.peak_index]
-        found = float(shot_spectra.range_or_velocity_at(shot, segment, np.array(at_peak)))
+        axis_value = float(shot_spectra.range_or_velocity_at(shot, segment, np.array(at_peak)))
         # a bin is 0.343 m of range and 3.55 mm/s of velocity; the peak is within one
         if segment.slope:
-            assert found == pytest.approx(distance, abs=0.35)
+            assert axis_value == pytest.approx(distance, abs=0.35)
         else:
-            assert found == pytest.approx(velocity, abs=0.0036)
+            assert axis_value == pytest.approx(velocity, abs=0.0036)
 
 
 def test_what_the_shot_reports_is_what_the_model_reports_without_noise(one):

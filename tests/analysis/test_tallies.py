@@ -13,27 +13,32 @@ from sweep.analysis import selection
 from sweep.analysis.selection import PointSelection, Statistics, compute_statistics
 
 floats = st.floats(-1e300, 1e300, allow_nan=False)
-some = st.lists(
+float_lists = st.lists(
     st.one_of(floats, st.sampled_from([0.0, -0.0, 1.0, 1e-300])), min_size=1, max_size=99
 )
 
 
-@given(values=some, cut=st.integers(1, 9))
+@given(values=float_lists, cut=st.integers(1, 9))
 def test_a_mean_is_the_exact_one_but_for_rounding(values, cut):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(selection, "SUMMED_VALUES_MAX", cut)
-        found = Statistics.from_values(np.array(values))
+        statistics = Statistics.from_values(np.array(values))
     exact, size = sum(map(Fraction, values)), sum(abs(Fraction(v)) for v in values)
-    assert abs(Fraction(found.mean) * len(values) - exact) <= size * len(values) * Fraction(
+    assert abs(Fraction(statistics.mean) * len(values) - exact) <= size * len(values) * Fraction(
         1, 2**51
     )
-    assert (found.minimum, found.maximum) == (min(values), max(values))
+    assert (statistics.minimum, statistics.maximum) == (min(values), max(values))
 
 
 def test_values_that_are_not_finite_count_for_nothing():
     values = xr.Dataset({"v": ("x", [np.nan, 2.0, np.inf, -np.inf])})
-    (found,) = compute_statistics([PointSelection.from_dataset(values)], "v")
-    assert (found.n_finite, found.mean, found.minimum, found.maximum) == (1, 2.0, 2.0, 2.0)
+    (statistics,) = compute_statistics([PointSelection.from_dataset(values)], "v")
+    assert (statistics.n_finite, statistics.mean, statistics.minimum, statistics.maximum) == (
+        1,
+        2.0,
+        2.0,
+        2.0,
+    )
     assert math.isnan(Statistics.from_values(np.array([np.nan])).mean)
 
 
@@ -48,14 +53,14 @@ def test_groups_hold_their_own_points_whatever_the_pieces(chunks, seed):
     groups = [
         part for _, part in PointSelection.from_dataset(cut).sel("x", [1, 2, 5, 8]).group_by("kind")
     ]
-    for (kind, part), found in zip(
+    for (kind, part), statistics in zip(
         PointSelection.from_dataset(dataset).group_by("kind"),
         compute_statistics(groups, "v"),
         strict=True,
     ):
-        own = values[along == kind][:, [1, 2, 5, 8]]
-        assert found.n_finite == np.isfinite(own).sum()
-        rounding = 1e-14 * np.nanmean(np.abs(own))  # a mean may be near 0
-        assert found.mean == pytest.approx(np.nanmean(own), rel=0, abs=rounding)
-        assert found.median == np.nanmedian(own)
+        kind_values = values[along == kind][:, [1, 2, 5, 8]]
+        assert statistics.n_finite == np.isfinite(kind_values).sum()
+        rounding = 1e-14 * np.nanmean(np.abs(kind_values))  # a mean may be near 0
+        assert statistics.mean == pytest.approx(np.nanmean(kind_values), rel=0, abs=rounding)
+        assert statistics.median == np.nanmedian(kind_values)
         assert part.size == 9 * (along == kind).sum()

@@ -55,9 +55,9 @@ def test_table_4_2_is_what_its_study_computes(thinned):
 def test_tables_of_shots_are_what_their_studies_compute(number, name, thinned):
     """All but the last column, leakage, which is a mean over the whole study's points."""
     thinned(name)
-    found = rows(f"Table {number}", validation_page.shot_alarm_table(name, number))
-    assert len(found) == 9
-    assert [row[:-1] for row in found] == [row[:-1] for row in rows(f"Table {number}")]
+    table_rows = rows(f"Table {number}", validation_page.shot_alarm_table(name, number))
+    assert len(table_rows) == 9
+    assert [row[:-1] for row in table_rows] == [row[:-1] for row in rows(f"Table {number}")]
 
 
 def test_every_experiment_on_the_page_is_there():
@@ -68,13 +68,13 @@ def test_every_experiment_on_the_page_is_there():
 
 def test_what_explains_a_printed_number_follows_from_it():
     closed = bin_pfa(5.0)
-    told = {
+    sentences = {
         float(f"{closed:.2g}"): "the same in 2 digits",
         float(f"{closed:.1g}"): "the same in 1 digit,",
         10 * closed * 1.01: r"a slip of the thesis: 0\.00472\d* is meant, \+1\.0 % from ours",
         1.1 * closed: r"its noise is 1\.81 % above",
     }
-    for printed, words in told.items():
+    for printed, words in sentences.items():
         assert re.match(words, validation_page.explain_printed_alarm(5.0, printed, closed))
     # TNR is a ratio of magnitudes, whose squares grow with the noise's variance
     assert bin_pfa(5.0 / 1.0181**0.5) == pytest.approx(1.1 * closed, rel=5e-3)

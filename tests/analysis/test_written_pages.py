@@ -32,7 +32,7 @@ def blocks(language, page):
     return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
 
 
-def shown(page):
+def spec_on_page(page):
     """The one spec of a page."""
     (text,) = blocks("yaml", page)
     return yaml.load(text, Loader=yaml.BaseLoader)
@@ -52,7 +52,7 @@ def named(page):
 
 def test_the_spec_of_draws_promises_the_defaults():
     spec = GridSpec.from_mapping(
-        spec_over_axes({}).to_yaml_mapping() | shown(DRAWS_PAGE), base=Path(".")
+        spec_over_axes({}).to_yaml_mapping() | spec_on_page(DRAWS_PAGE), base=Path(".")
     )
     assert spec.draws.is_adaptive and spec.accuracy == spec_over_axes({}).accuracy
 
@@ -72,9 +72,9 @@ def test_every_field_and_every_array_of_draws_is_listed():
 
 
 def test_the_spec_of_detectors_is_one():
-    written, mapping = shown(DETECTORS), spec_over_axes({}).to_yaml_mapping()
-    mapping["instrument"]["processing"] |= written["instrument"]["processing"]
-    mapping |= {"draws": written["draws"], "axes": written["axes"], "figures": []}
+    spec_mapping, mapping = spec_on_page(DETECTORS), spec_over_axes({}).to_yaml_mapping()
+    mapping["instrument"]["processing"] |= spec_mapping["instrument"]["processing"]
+    mapping |= {"draws": spec_mapping["draws"], "axes": spec_mapping["axes"], "figures": []}
     assert GridSpec.from_mapping(mapping, base=Path(".")).axes[0].name == "detector"
 
 
@@ -95,15 +95,15 @@ def test_every_effect_is_listed_in_the_order_in_which_it_acts():
 
 
 def test_every_field_that_an_effect_brings_is_listed_with_it():
-    for (_, _, _, told), effect in zip(rows(EFFECTS_PAGE), EFFECTS, strict=True):
-        names = {name.rsplit(".", 1)[-1] for name in re.findall(r"`([^`]*)`", told)}
+    for (_, _, _, fields), effect in zip(rows(EFFECTS_PAGE), EFFECTS, strict=True):
+        names = {name.rsplit(".", 1)[-1] for name in re.findall(r"`([^`]*)`", fields)}
         brought = {parameter.path.rsplit(".", 1)[-1] for parameter in effect.parameters}
         assert brought <= names, effect.name
 
 
 def test_the_spec_of_effects_is_one_that_can_be_written():
     spec = GridSpec.from_mapping(
-        spec_over_axes({}).to_yaml_mapping() | shown(EFFECTS_PAGE), base=Path(".")
+        spec_over_axes({}).to_yaml_mapping() | spec_on_page(EFFECTS_PAGE), base=Path(".")
     )
     assert (
         spec.effect_modes()["leakage"] == "on" and spec.effect_modes()["footprint_phase"] == "off"
@@ -119,9 +119,9 @@ def test_the_code_that_reads_flags_runs(tmp_path, monkeypatch, capsys):
               progress=False)  # fmt: skip
     (code,) = [block for block in blocks("python", EFFECTS_PAGE) if "flag_masks" in block]
     exec(code, {})
-    told = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"range walk at \d+ % of the points", told[0])
-    assert float(told[1].rsplit(" ", 1)[-1]) <= 1e-3
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"range walk at \d+ % of the points", lines[0])
+    assert float(lines[1].rsplit(" ", 1)[-1]) <= 1e-3
 
 
 @pytest.mark.parametrize(

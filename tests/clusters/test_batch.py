@@ -46,12 +46,12 @@ def script_of(cluster) -> list[str]:
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def working_directory(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_slurm_is_told_what_the_file_says(here):
+def test_slurm_gets_the_options_of_the_file(working_directory):
     lines = script_of(described("slurm"))
     for line in (
         "#SBATCH -p normal", "#SBATCH -A lidar", "#SBATCH -n 1", "#SBATCH --cpus-per-task=16",
@@ -62,7 +62,7 @@ def test_slurm_is_told_what_the_file_says(here):
         assert line in lines, line
 
 
-def test_pbs_is_told_what_the_file_says(here):
+def test_pbs_gets_the_options_of_the_file(working_directory):
     lines = script_of(described("pbs"))
     for line in (
         "#PBS -q normal", "#PBS -A lidar", "#PBS -l select=1:ncpus=16:mem=30GB",
@@ -72,7 +72,7 @@ def test_pbs_is_told_what_the_file_says(here):
 
 
 @pytest.mark.parametrize("kind", ["slurm", "pbs"])
-def test_a_jobs_workers_are_those_of_the_file(here, kind):
+def test_a_jobs_workers_are_those_of_the_file(working_directory, kind):
     words = shlex.split(script_of(described(kind))[-1])
     assert words[0] == "/opt/sweep/bin/python"
     assert "tls://10.0.0.5:8786" in words
@@ -127,21 +127,21 @@ exit 0
 
 
 @pytest.fixture
-def played_pbs(here, monkeypatch):
+def played_pbs(working_directory, monkeypatch):
     """A PBS of two scripts, its jobs processes of this machine, none left at the end."""
-    programs = here / "bin"
+    programs = working_directory / "bin"
     programs.mkdir()
     for name, text in (("qsub", QSUB), ("qdel", QDEL)):
-        (programs / name).write_text(text.format(directory=here))
+        (programs / name).write_text(text.format(directory=working_directory))
         (programs / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
     monkeypatch.setattr(jobqueue, "RESUBMIT_PAUSE_SECONDS", 0.2)
-    yield here
-    for pid in here.glob("job-*.pid"):
+    yield working_directory
+    for pid in working_directory.glob("job-*.pid"):
         subprocess.run([programs / "qdel", pid.stem.removeprefix("job-")], check=True)
 
 
-def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
+def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, serial_store):
     from dask import config
 
     def evaluate(study, block):
@@ -168,7 +168,7 @@ def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
         )
     killer.join()
     assert outcome.complete
-    assert file_digests(outcome.store) == file_digests(undisturbed)
+    assert file_digests(outcome.store) == file_digests(serial_store)
     assert int((played_pbs / "count").read_text()) >= 3  # the first, the refused, another
     assert (played_pbs / "deleted").read_text().split()[-1] == "3"  # none is left in the queue
 
@@ -177,8 +177,10 @@ def test_ctrl_c_stays_what_it_is_where_batch_systems_are_used():
     code = (
         "import signal, sweep.tasks.engine.deploy.jobqueue; print(signal.getsignal(signal.SIGINT))"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == str(signal.default_int_handler)
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == str(signal.default_int_handler)
 
 
 def test_a_batch_system_is_used_from_any_thread(tmp_path):
@@ -200,9 +202,9 @@ with ThreadPoolExecutor(1) as pool:
     except ClusterError as error:
         print(error)
 """
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path,
         env=os.environ | {"PATH": "/nowhere"},
     )  # fmt: skip
-    assert "no workers could be started" in told.stdout and "sbatch" in told.stdout
-    assert "signal" not in told.stdout
+    assert "no workers could be started" in process.stdout and "sbatch" in process.stdout
+    assert "signal" not in process.stdout

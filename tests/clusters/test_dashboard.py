@@ -23,9 +23,11 @@ PAGES = ("status", "info/main/workers.html", "json/counts.json", "metrics", "sta
 
 def reached(**section):
     """Cluster of one worker in this process, with a section `scheduler`, and what is said."""
-    told = RecordingProgress()
+    progress = RecordingProgress()
     described = cluster_config_from_mapping({"kind": "local", "workers": 1, "scheduler": section})
-    return clusters.connect_cluster(described, max_workers=1, processes=False, say=told.say), told
+    return clusters.connect_cluster(
+        described, max_workers=1, processes=False, say=progress.say
+    ), progress
 
 
 def pages_by_port():
@@ -51,52 +53,52 @@ def status(address, page):
 
 
 def test_no_page_is_shown_unless_a_dashboard_is_asked_for():
-    connected, told = reached()
+    connected, progress = reached()
     before = set(pages_by_port())
     with connected:
         opened = {a: s for a, s in pages_by_port().items() if a not in before}
-    assert opened and not any("dashboard" in line for line in told)
+    assert opened and not any("dashboard" in line for line in progress)
     assert not any(code == 200 for codes in opened.values() for code in codes)
 
 
-@pytest.mark.parametrize("written", [0, "0", "127.0.0.1:0", "localhost:0"])
-def test_a_dashboard_that_is_asked_for_listens_to_this_machine_alone(written):
-    connected, told = reached(dashboard=written)
+@pytest.mark.parametrize("setting", [0, "0", "127.0.0.1:0", "localhost:0"])
+def test_a_dashboard_that_is_asked_for_listens_to_this_machine_alone(setting):
+    connected, progress = reached(dashboard=setting)
     before = set(pages_by_port())
     with connected:
         opened = {a: s for a, s in pages_by_port().items() if a not in before}
-    assert any("dashboard http://127.0.0.1:" in line for line in told)
-    shown = {address for address, codes in opened.items() if 200 in codes}
-    assert shown and {address.ip for address in shown} == {"127.0.0.1"}
+    assert any("dashboard http://127.0.0.1:" in line for line in progress)
+    reachable = {address for address, codes in opened.items() if 200 in codes}
+    assert reachable and {address.ip for address in reachable} == {"127.0.0.1"}
 
 
 @pytest.mark.parametrize(
-    "written", [":8787", "0.0.0.0:8787", "10.0.0.5:8787", "[::]:8787", "node1:8787", "yes", True]
+    "address", [":8787", "0.0.0.0:8787", "10.0.0.5:8787", "[::]:8787", "node1:8787", "yes", True]
 )
-def test_a_dashboard_for_other_machines_is_refused(written):
+def test_a_dashboard_for_other_machines_is_refused(address):
     with pytest.raises(SpecError, match=r"scheduler\.dashboard: .*write a port, such as 8787"):
-        cluster_config_from_mapping({"kind": "local", "scheduler": {"dashboard": written}})
+        cluster_config_from_mapping({"kind": "local", "scheduler": {"dashboard": address}})
 
 
 def test_a_dashboard_has_the_port_asked_for_or_any_where_that_is_taken():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        asked = cluster_config_from_mapping(
+    with socket.socket() as occupied:
+        occupied.bind(("127.0.0.1", 0))
+        port = occupied.getsockname()[1]
+        scheduler_config = cluster_config_from_mapping(
             {"kind": "local", "scheduler": {"dashboard": port}}
         ).scheduler
-        assert local_ssh.dashboard_address(asked) == "127.0.0.1:0"
-    assert local_ssh.dashboard_address(asked) == f"127.0.0.1:{port}"
+        assert local_ssh.dashboard_address(scheduler_config) == "127.0.0.1:0"
+    assert local_ssh.dashboard_address(scheduler_config) == f"127.0.0.1:{port}"
 
 
 def test_schedulers_of_jobs_and_of_ssh_have_none_either():
     section = {"host": "10.0.0.5"}
-    asked = {"kind": "slurm", "workers": 2, "worker": {"memory": "4 GB"},
+    mapping = {"kind": "slurm", "workers": 2, "worker": {"memory": "4 GB"},
              "job": {"walltime": "1 h"}, "scheduler": section}  # fmt: skip
-    options = local_ssh.scheduler_options(cluster_config_from_mapping(asked).scheduler)
+    options = local_ssh.scheduler_options(cluster_config_from_mapping(mapping).scheduler)
     assert options["dashboard"] is False and options["dashboard_address"] == "127.0.0.1:0"
-    asked["scheduler"] = section | {"dashboard": 0}
-    options = local_ssh.scheduler_options(cluster_config_from_mapping(asked).scheduler)
+    mapping["scheduler"] = section | {"dashboard": 0}
+    options = local_ssh.scheduler_options(cluster_config_from_mapping(mapping).scheduler)
     assert options["dashboard"] is True and options["dashboard_address"] == "127.0.0.1:0"
 
 
@@ -108,12 +110,14 @@ def test_a_run_asks_for_a_dashboard_by_an_option(tmp_path):
         RunOptions(workers=1).resolve_cluster(SpecWorkload(small_spec())).scheduler.dashboard
         == "none"
     )
-    given = {"kind": "local", "workers": 2, "scheduler": {"dashboard": "9000"}}
-    kept = RunOptions(cluster=given, dashboard=True).resolve_cluster(SpecWorkload(small_spec()))
-    assert kept.scheduler.dashboard == "9000" and kept.workers == WorkerBounds(2, 2)
-    for elsewhere in ("none", "tcp://10.0.0.5:8786"):
+    cluster = {"kind": "local", "workers": 2, "scheduler": {"dashboard": "9000"}}
+    resolved = RunOptions(cluster=cluster, dashboard=True).resolve_cluster(
+        SpecWorkload(small_spec())
+    )
+    assert resolved.scheduler.dashboard == "9000" and resolved.workers == WorkerBounds(2, 2)
+    for scheduler in ("none", "tcp://10.0.0.5:8786"):
         with pytest.raises(ClusterError, match="leave out dashboard=True"):
-            run(small_spec(), store=tmp_path / "a.zarr", scheduler=elsewhere, dashboard=True)
+            run(small_spec(), store=tmp_path / "a.zarr", scheduler=scheduler, dashboard=True)
 
 
 def test_the_example_of_a_local_cluster_has_no_dashboard():

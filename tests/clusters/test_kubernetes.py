@@ -26,7 +26,7 @@ CLUSTERS = "/apis/kubernetes.dask.org/v1/namespaces/lidar/daskclusters"
 AUTOSCALERS = "/apis/kubernetes.dask.org/v1/namespaces/lidar/daskautoscalers"
 
 
-def asked(**changes):
+def kubernetes_objects(**changes):
     mapping = yaml.safe_load((DEPLOY / "kubernetes.yaml").read_text()) | changes
     cluster = cluster_config_from_mapping(mapping)
     return kubernetes.cluster_resource(cluster, cluster.workers)["spec"]
@@ -38,7 +38,7 @@ def container(part):
 
 
 def test_the_file_becomes_a_resource_of_the_operator():
-    spec = asked(environment={"AWS_REGION": "eu-west-1"})
+    spec = kubernetes_objects(environment={"AWS_REGION": "eu-west-1"})
     worker, scheduler = container(spec["worker"]), container(spec["scheduler"])
     assert spec["worker"]["replicas"] == 4
     assert worker["resources"]["limits"] == {"cpu": "1", "memory": "4000000000"}
@@ -70,7 +70,7 @@ def api_server(certificate_directory: Path):
         command = [re.sub("^/etc/sweep-tls", str(certificate_directory), w) for w in spec["args"]]
         command = [w.replace("$(DASK_WORKER_NAME)", "pod-1") for w in command]
         assert command[:1] == ["dask"]
-        variables = {each["name"]: each["value"] for each in spec["env"]}
+        variables = {variable["name"]: variable["value"] for variable in spec["env"]}
         children.append(
             subprocess.Popen(
                 [sys.executable, "-m", f"distributed.cli.dask_{command[1]}", *command[2:]],
@@ -160,7 +160,7 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, undisturbed, monkeypatch):
+def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, serial_store, monkeypatch):
     files = local_ssh.make_certificates(tmp_path / "tls")
     monkeypatch.setattr(kubernetes, "SCHEDULER_PORT", free_port())
     monkeypatch.setattr(kubernetes, "scheduler_host", lambda _: "127.0.0.1")
@@ -173,15 +173,15 @@ def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, undisturbed, m
         monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, port)))
         outcome = run_serially(small_spec(), tmp_path / "pods.zarr", cluster=mapping)
         assert outcome.complete
-        assert file_digests(outcome.store) == file_digests(undisturbed)
-        changes = [each for each in requests if each[0] != "GET"]
+        assert file_digests(outcome.store) == file_digests(serial_store)
+        changes = [request for request in requests if request[0] != "GET"]
     assert changes == [
         ("POST", CLUSTERS), ("POST", AUTOSCALERS),
         ("DELETE", f"{AUTOSCALERS}/sweep"), ("DELETE", f"{CLUSTERS}/sweep"),
     ]  # fmt: skip
 
 
-def test_no_kubernetes_is_told_in_words(tmp_path, monkeypatch):
+def test_no_kubernetes_is_reported_in_words(tmp_path, monkeypatch):
     monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, free_port())))
     cluster = DEPLOY / "kubernetes.yaml"
     with pytest.raises(ClusterError, match="Kubernetes starts no workers"):

@@ -33,7 +33,7 @@ print(outcome.complete)
 
 @pytest.mark.slow
 def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_is_run(
-    undisturbed, tmp_path
+    serial_store, tmp_path
 ):
     folder = tmp_path / "downloads"
     folder.mkdir()
@@ -48,13 +48,13 @@ def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_
         env={**os.environ, "PYTHONPATH": str(path)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert ended.stdout == "True\n" and ended.returncode == 0, ended.stderr
-    assert file_digests(tmp_path / "s.zarr") == file_digests(undisturbed)
+    assert file_digests(tmp_path / "s.zarr") == file_digests(serial_store)
     assert not (tmp_path / "imported").exists()
 
 
 @pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
-    undisturbed, tmp_path, monkeypatch, workers
+    serial_store, tmp_path, monkeypatch, workers
 ):
     monkeypatch.setattr(local_ssh, "WORKER_TTL", "1 s")  # ten heartbeats at least
     monkeypatch.setattr(dispatcher, "WORKER_SILENCE_SECONDS", 1.0)
@@ -69,12 +69,12 @@ def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     outcome = run(
         small_spec(), store=tmp_path / "s.zarr", workers=workers, evaluate=evaluate, progress=False
     )
-    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(serial_store)
     assert sorted(receipt_blocks(outcome.store)) == list(range(12))
     assert not psutil.pid_exists(int(pid.read_text()))
 
 
-class Ending(Progress):
+class EndingProgress(Progress):
     """Progress that has all workers end as the first points arrive, and gives up in the end."""
 
     def __init__(self, workers) -> None:
@@ -92,13 +92,13 @@ class Ending(Progress):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, monkeypatch):
+def test_workers_are_started_again_where_none_is_left(serial_store, tmp_path, monkeypatch):
     monkeypatch.setattr(session, "NO_WORKER_WARNING_SECONDS", 1.0)
     monkeypatch.setattr(dispatcher, "WORKER_THREADS_REFRESH_SECONDS", 0.1)
     clusters, start = [], local_ssh.start_local_cluster
 
-    def started(*given, **options):
-        clusters.append(start(*given, **options))
+    def started(*keywords, **options):
+        clusters.append(start(*keywords, **options))
         return clusters[-1]
 
     def evaluate(study, block):
@@ -106,11 +106,11 @@ def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, mon
         return study.evaluate(block)
 
     monkeypatch.setattr(local_ssh, "start_local_cluster", started)
-    told = Ending(clusters)
+    progress = EndingProgress(clusters)
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}):
         outcome = run(
-            small_spec(), store=tmp_path / "s.zarr", workers=2, processes=False, progress=told,
+            small_spec(), store=tmp_path / "s.zarr", workers=2, processes=False, progress=progress,
             evaluate=evaluate,
         )  # fmt: skip
-    assert any(line.startswith("no worker is left (") for line in told.lines)
-    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
+    assert any(line.startswith("no worker is left (") for line in progress.lines)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(serial_store)

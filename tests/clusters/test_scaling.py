@@ -13,7 +13,7 @@ LOCAL = {"kind": "local", "scheduler": {"dashboard": "127.0.0.1:0"}}
 
 
 @pytest.mark.slow
-def test_a_cluster_between_bounds_grows_with_the_work(undisturbed, tmp_path):
+def test_a_cluster_between_bounds_grows_with_the_work(serial_store, tmp_path):
     log = tmp_path / "pids"
 
     def evaluate(study, block):
@@ -32,7 +32,7 @@ def test_a_cluster_between_bounds_grows_with_the_work(undisturbed, tmp_path):
         small_spec(), tmp_path / "grown.zarr", cluster=described, evaluate=evaluate
     )
     assert outcome.complete
-    assert file_digests(outcome.store) == file_digests(undisturbed)
+    assert file_digests(outcome.store) == file_digests(serial_store)
     assert len(set(log.read_text().split())) >= 2
 
 
@@ -70,8 +70,8 @@ def test_the_command_tells_what_is_wrong_with_a_clusters_file(tmp_path, monkeypa
     assert "bad.yaml:2: workers: must be a number" in result.output
     assert not (tmp_path / "results").exists()
     (tmp_path / "local.yaml").write_text("kind: local\n")
-    both = ["run", str(spec), "--cluster", "local.yaml", "--scheduler", "none"]
-    result = CliRunner().invoke(main, both)
+    arguments = ["run", str(spec), "--cluster", "local.yaml", "--scheduler", "none"]
+    result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
     assert "both named" in result.output
     assert not (tmp_path / "results").exists()

@@ -37,7 +37,7 @@ def environment():
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def working_directory(tmp_path, monkeypatch):
     """A directory with a study and a cluster of two jobs."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "slow.yaml").write_text(yaml.safe_dump(SLOW))
@@ -83,23 +83,23 @@ def workers(store) -> set[bytes]:
     return read_receipt_totals(store, BLOCKS, since=0.0).recent_workers
 
 
-def test_a_study_in_a_job_ends_as_in_a_plain_loop(here, environment, undisturbed):
-    (here / "small.yaml").write_text(yaml.safe_dump(small_mapping(), sort_keys=False))
-    cluster = yaml.safe_load((here / "slurm.yaml").read_text())
-    (here / "slurm.yaml").write_text(yaml.safe_dump(cluster | {"workers": 1}))
-    asked = ("--store", "small.zarr", "--cluster", "slurm.yaml")
-    with sweep(environment, "run", "small.yaml", *asked) as child:
+def test_a_study_in_a_job_ends_as_in_a_plain_loop(working_directory, environment, serial_store):
+    (working_directory / "small.yaml").write_text(yaml.safe_dump(small_mapping(), sort_keys=False))
+    cluster = yaml.safe_load((working_directory / "slurm.yaml").read_text())
+    (working_directory / "slurm.yaml").write_text(yaml.safe_dump(cluster | {"workers": 1}))
+    options = ("--store", "small.zarr", "--cluster", "slurm.yaml")
+    with sweep(environment, "run", "small.yaml", *options) as child:
         output, _ = child.communicate(timeout=WAIT)
     assert child.returncode == 0, output
-    assert file_digests(here / "small.zarr") == file_digests(undisturbed)
+    assert file_digests(working_directory / "small.zarr") == file_digests(serial_store)
     assert running_job_ids(environment) == []
 
 
 @pytest.mark.slow
-def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environment):
-    store = here / "slow.zarr"
-    asked = ("--store", "slow.zarr", "--cluster", "slurm.yaml")
-    with sweep(environment, "run", "slow.yaml", *asked) as child:
+def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(working_directory, environment):
+    store = working_directory / "slow.zarr"
+    options = ("--store", "slow.zarr", "--cluster", "slurm.yaml")
+    with sweep(environment, "run", "slow.yaml", *options) as child:
         # Both jobs work, so that the one that is killed takes a worker that the cluster knows.
         wait_for(lambda: len(workers(store)) == 2 and len(receipt_blocks(store)) >= 5, child)
         before = running_job_ids(environment)
@@ -119,18 +119,18 @@ def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environm
 
     outcome = run(load("slow.yaml"), store="plain.zarr", scheduler="none", progress=False)
     assert outcome.complete
-    assert file_digests(store) == file_digests(here / "plain.zarr")
+    assert file_digests(store) == file_digests(working_directory / "plain.zarr")
 
 
 @pytest.mark.slow
-def test_jobs_that_the_batch_system_refuses_are_told_at_once(here, environment):
-    cluster = yaml.safe_load((here / "slurm.yaml").read_text())
+def test_jobs_that_the_batch_system_refuses_are_reported_at_once(working_directory, environment):
+    cluster = yaml.safe_load((working_directory / "slurm.yaml").read_text())
     cluster["job"]["queue"] = "absent"
-    (here / "slurm.yaml").write_text(yaml.safe_dump(cluster))
+    (working_directory / "slurm.yaml").write_text(yaml.safe_dump(cluster))
     with sweep(environment, "run", "slow.yaml", "--cluster", "slurm.yaml") as child:
         output, _ = child.communicate(timeout=WAIT)
     assert child.returncode == 2
     assert "no workers could be started" in output
     assert "invalid partition" in output
     assert "Traceback" not in output
-    assert not (here / "results" / "slow.zarr").exists()
+    assert not (working_directory / "results" / "slow.zarr").exists()

@@ -30,8 +30,8 @@ def test_workers_are_dealt_out_evenly():
     hosts = ["a", "b", "c", "d"]
     cluster = cluster_config_from_mapping({**SSH, "hosts": hosts, "workers": 10})
     shares = {
-        host: each["options"]["kwargs"]["n_workers"]
-        for host, each in local_ssh.ssh_worker_specs(cluster, 10).items()
+        host: options["options"]["kwargs"]["n_workers"]
+        for host, options in local_ssh.ssh_worker_specs(cluster, 10).items()
     }
     assert shares == {"a": 3, "b": 3, "c": 2, "d": 2}
     assert list(local_ssh.ssh_worker_specs(cluster, 2)) == ["a", "b"]
@@ -94,7 +94,7 @@ def server(directory: Path):
         loop.close()
 
 
-def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
+def test_a_study_over_ssh_with_tls(tmp_path, serial_store):
     files = local_ssh.make_certificates(tmp_path / "tls")
     with server(tmp_path) as (port, commands):
         cluster = {
@@ -105,7 +105,7 @@ def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
         }  # fmt: skip
         outcome = run_serially(small_spec(), tmp_path / "ssh.zarr", cluster=cluster)
         assert outcome.complete
-        assert file_digests(outcome.store) == file_digests(undisturbed)
+        assert file_digests(outcome.store) == file_digests(serial_store)
         (started,) = [words for words in map(shlex.split, commands) if len(words) > 1]
         assert sys.executable in started
         assert any(word.startswith("tls://127.0.0.1:") for word in started)

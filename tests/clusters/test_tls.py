@@ -42,9 +42,12 @@ def test_certificates_are_their_owners_alone_and_good_for_a_year(files):
 
 def shake_hands(files) -> None:
     """A handshake in memory, either side checking the other's certificate in the strictest way."""
-    here, there = ssl.MemoryBIO(), ssl.MemoryBIO()
+    client_side, server_side = ssl.MemoryBIO(), ssl.MemoryBIO()
     sides = []
-    for server, incoming, outgoing in ((False, here, there), (True, there, here)):
+    for server, incoming, outgoing in (
+        (False, client_side, server_side),
+        (True, server_side, client_side),
+    ):
         purpose = ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT
         context = ssl.SSLContext(purpose)
         context.check_hostname = False
@@ -53,29 +56,29 @@ def shake_hands(files) -> None:
         context.load_verify_locations(files.ca)
         context.load_cert_chain(files.certificate, files.key)
         sides.append(context.wrap_bio(incoming, outgoing, server_side=server))
-    done = [False, False]
+    is_done = [False, False]
     for _ in range(10):
         for i, side in enumerate(sides):
             with suppress(ssl.SSLWantReadError):
                 side.do_handshake()
-                done[i] = True
-    assert all(done)
+                is_done[i] = True
+    assert all(is_done)
 
 
 def test_the_command_prints_a_section_and_never_overwrites(tmp_path):
-    made = CliRunner().invoke(main, ["certificates", str(tmp_path / "tls")])
-    assert made.exit_code == 0
+    result = CliRunner().invoke(main, ["certificates", str(tmp_path / "tls")])
+    assert result.exit_code == 0
     import yaml
 
-    assert local(**yaml.safe_load(made.output)).certificate_paths() is not None
-    again = CliRunner().invoke(main, ["certificates", str(tmp_path / "tls")])
-    assert again.exit_code == 2
-    assert "is there already" in again.output
+    assert local(**yaml.safe_load(result.output)).certificate_paths() is not None
+    second_result = CliRunner().invoke(main, ["certificates", str(tmp_path / "tls")])
+    assert second_result.exit_code == 2
+    assert "is there already" in second_result.output
 
 
 @pytest.mark.slow
 def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
-    security, undisturbed, tmp_path, monkeypatch
+    security, serial_store, tmp_path, monkeypatch
 ):
     from distributed import Security
 
@@ -94,13 +97,13 @@ def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
             small_spec(), tmp_path / "tls.zarr", cluster=address_of(address, security)
         )
         assert outcome.complete
-        assert file_digests(outcome.store) == file_digests(undisturbed)
+        assert file_digests(outcome.store) == file_digests(serial_store)
 
-        plain = address.replace("tls://", "tcp://")
+        plain_address = address.replace("tls://", "tcp://")
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
-            run_serially(small_spec(), tmp_path / "plain.zarr", scheduler=plain)
-        others = local_ssh.make_certificates(tmp_path / "others")
-        stranger = address_of(address, {k: str(v) for k, v in others._asdict().items()})
+            run_serially(small_spec(), tmp_path / "plain.zarr", scheduler=plain_address)
+        other_certificates = local_ssh.make_certificates(tmp_path / "others")
+        stranger = address_of(address, {k: str(v) for k, v in other_certificates._asdict().items()})
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
             run_serially(small_spec(), tmp_path / "stranger.zarr", cluster=stranger)
         refuses(address, Security(require_encryption=True))
@@ -140,22 +143,24 @@ def test_without_certificates_of_ones_own_nobody_else_gets_in(processes):
     import psutil
     from distributed import Security
 
-    own = psutil.Process()
-    before = listening([own, *own.children(recursive=True)])
+    process = psutil.Process()
+    before = listening([process, *process.children(recursive=True)])
     described = local(scheduler={"dashboard": "127.0.0.1:0"})
     with cluster_connection.connect_cluster(
         described, max_workers=9, processes=processes, say=lambda _: None
     ) as reached:
         reached.client.wait_for_workers(1)
-        found = listening([own, *own.children(recursive=True)]) - before
+        new_ports = listening([process, *process.children(recursive=True)]) - before
         address = reached.client.scheduler.address
         if processes:
             assert address.startswith("tls://127.0.0.1:")
             for security in (None, Security.temporary()):
                 refuses(address, security)
             refuses(address.replace("tls", "tcp"), None)
-    assert len(found) >= 3 if processes else len(found) == 2  # pages, of scheduler and worker
-    assert {host for host, _ in found} == {"127.0.0.1"}
+    assert (
+        len(new_ports) >= 3 if processes else len(new_ports) == 2
+    )  # pages, of scheduler and worker
+    assert {host for host, _ in new_ports} == {"127.0.0.1"}
 
 
 def listening(processes) -> set[tuple[str, int]]:

@@ -11,6 +11,28 @@ REPOSITORY = Path(__file__).parents[2]
 
 GLOSSARY = REPOSITORY / "docs" / "glossary.md"
 
+ORDINARY_WORDS = {
+    *("act", "acts", "alike", "anew", "barred", "each", "fades", "flying", "looked", "much"),
+    *("partly", "room", "stray"),
+}
+"""Words that names may not use and that are plain English in a sentence."""
+
+UNCHECKED_PAGES = {"architecture.md"}
+"""Pages that are being rewritten."""
+
+PAGES = [
+    *(p for p in sorted((REPOSITORY / "docs").glob("*.md")) if p.name not in UNCHECKED_PAGES),
+    REPOSITORY / "README.md",
+    REPOSITORY / "CONTRIBUTING.md",
+]
+"""Pages without retired words; the glossary names them in its table alone."""
+
+RETIRED_NAMES_OF_TESTS = {
+    *("asked", "caught", "found", "given", "got", "here", "made", "mine", "most", "own", "said"),
+    *("seen", "theirs", "there", "told", "undisturbed", "whole"),
+}
+"""Names that say nothing of a value's kind: results, messages, stores have their nouns."""
+
 
 def words_of_code(text):
     """Words of code in the glossary's table: (word, meaning, retired words)."""
@@ -81,6 +103,51 @@ def test_no_name_uses_a_word_that_the_glossary_retires(table):
         if lines[retired]
     }
     assert not uses, "\n".join(f"{word}: {places}" for word, places in uses.items())
+
+
+def unambiguous_retired_words(table):
+    """Words that the glossary retires and that no sentence needs: retired word -> word."""
+    return {
+        retired: word
+        for word, _, retired_words in table
+        for retired in retired_words
+        if retired not in ORDINARY_WORDS
+    }
+
+
+def page_words(path):
+    """Words of a page with their lines, without rows of the glossary's table."""
+    for number, line in enumerate(path.read_text().split("\n"), 1):
+        if path != GLOSSARY or not line.startswith("| `"):
+            for word in re.findall(r"[a-z]+", line.lower()):
+                yield word, number
+
+
+def test_no_page_uses_a_word_that_the_glossary_retires(table):
+    retired = unambiguous_retired_words(table)
+    assert {"knob", "rung", "doubt", "told", "smears"} <= set(retired)
+    retired |= {f"{word}s": instead for word, instead in retired.items()}
+    uses = [
+        f"{path.relative_to(REPOSITORY)}:{line} {word} (say {retired[word]})"
+        for path in PAGES
+        for word, line in page_words(path)
+        if word in retired
+    ]
+    assert not uses, "\n".join(uses)
+
+
+@pytest.mark.parametrize("folder", ["tests", "benchmarks"])
+def test_no_name_of_tests_and_benchmarks_is_a_retired_word(table, folder):
+    retired = unambiguous_retired_words(table)
+    paths = sorted((REPOSITORY / folder).rglob("*.py"))
+    assert paths
+    uses = [
+        f"{path.relative_to(REPOSITORY)}:{line} {name}"
+        for path in paths
+        for name, line in identifiers(path.read_text())
+        if name in RETIRED_NAMES_OF_TESTS or set(identifier_parts(name)) & set(retired)
+    ]
+    assert not uses, "\n".join(uses)
 
 
 @pytest.mark.parametrize(

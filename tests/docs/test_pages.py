@@ -43,7 +43,7 @@ class Words(yaml.SafeLoader):
     yaml_implicit_resolvers = {"<": yaml.SafeLoader.yaml_implicit_resolvers["<"]}  # noqa: RUF012
 
 
-WHOLE = {
+COMPLETE_SPEC = {
     "title": "What a fragment of a spec is laid over",
     "instrument": "chester_2017_table_4_1",
     "target": {"range": "20 m", "grazing_angle": "60 deg", "radial_velocity": "1 m/s",
@@ -62,8 +62,8 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.S | re.M)
 
 def blocks(page):
     """Language and text of every block of a page, in order, but for those that run elsewhere."""
-    found = BLOCK.findall(page.read_text(encoding="utf-8"))
-    return [(language, text) for language, text in found if not ELSEWHERE.search(text)]
+    matches = BLOCK.findall(page.read_text(encoding="utf-8"))
+    return [(language, text) for language, text in matches if not ELSEWHERE.search(text)]
 
 
 def name(page):
@@ -77,11 +77,11 @@ def lines(text):
     return [line.rstrip() for line in text.strip("\n").splitlines()]
 
 
-def save(text, over=WHOLE):
+def save(text, over=COMPLETE_SPEC):
     """A spec under the name that its first line gives; one without is laid over a whole spec."""
-    found = re.match(r"# (\S+\.yaml)\n", text)
-    path = Path(found.group(1) if found else LAID_OVER)
-    laid = text if found else yaml.dump(over | yaml.load(text, Words))
+    match = re.match(r"# (\S+\.yaml)\n", text)
+    path = Path(match.group(1) if match else LAID_OVER)
+    laid = text if match else yaml.dump(over | yaml.load(text, Words))
     path.write_text(laid, encoding="utf-8")
     return path
 
@@ -92,7 +92,7 @@ def is_quoted(code):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def working_directory(tmp_path, monkeypatch):
     """A directory of one's own with the experiments in it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "experiments").symlink_to(REPOSITORY / "experiments")
@@ -102,11 +102,11 @@ def here(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=name)
-def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
-    found = blocks(page)
-    assert {language for language, _ in found} <= {"yaml", "sh", "python", "text"}
-    over = WHOLE
-    for (before, _), (language, text) in zip([("", ""), *found], found, strict=False):
+def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, working_directory):
+    page_blocks = blocks(page)
+    assert {language for language, _ in page_blocks} <= {"yaml", "sh", "python", "text"}
+    over = COMPLETE_SPEC
+    for (before, _), (language, text) in zip([("", ""), *page_blocks], page_blocks, strict=False):
         if language == "python" and text.startswith(MAKES_A_FILE):
             exec(compile(text, page.name, "exec"), {})
         elif language == "python" and is_quoted(text):
@@ -127,7 +127,7 @@ def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
         if {"sh", "python"} & {language for language, _ in blocks(p)}
     ],
 )
-def test_what_a_page_tells_to_run_runs_and_shows_what_comes(page, here):
+def test_what_a_page_tells_to_run_runs_and_shows_what_comes(page, working_directory):
     if page.stem in NEEDED:
         pytest.importorskip(NEEDED[page.stem])
     names, printed = {}, []
@@ -148,8 +148,8 @@ def test_what_a_page_tells_to_run_runs_and_shows_what_comes(page, here):
                 exec(compile(text, page.name, "exec"), names)
             printed = lines(out.getvalue())
         elif language == "text":  # what a command prints tells more, such as how far it is
-            told = lines(text)
-            assert [line for line in printed if line in told] == told, printed
+            expected_lines = lines(text)
+            assert [line for line in printed if line in expected_lines] == expected_lines, printed
 
 
 def commands(page):
@@ -164,11 +164,11 @@ def commands(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_commands_and_their_options_are_there(page):
-    for program, word, *others in commands(page):
+    for program, word, *arguments in commands(page):
         if program == "sweep" and word in main.commands:
             known = {option for p in main.commands[word].params for option in p.opts}
-            given = {other.partition("=")[0] for other in others if other.startswith("-")}
-            assert given <= known | {"--help", "-h"}, (word, given)
+            options = {other.partition("=")[0] for other in arguments if other.startswith("-")}
+            assert options <= known | {"--help", "-h"}, (word, options)
         elif program == "sweep":
             assert word in {"--help", "COMMAND"}, word
 
@@ -181,12 +181,12 @@ TARGETS = sorted(
 @pytest.mark.parametrize("target", TARGETS)
 def test_a_target_of_make_starts_programs_that_are_there(target, monkeypatch):
     monkeypatch.delenv("TIMES", raising=False)  # a file that even a dry run of parts would add to
-    told = subprocess.run(
+    process = subprocess.run(
         ["make", "--dry-run", "--old-file", ".venv/.core", "--old-file", ".venv/.ready", target],
         cwd=REPOSITORY, capture_output=True, text=True,
     )  # fmt: skip
-    assert told.returncode == 0 and told.stdout, told.stderr
-    for path in {REPOSITORY / found for found in re.findall(r"\S+\.py\b", told.stdout)}:
+    assert process.returncode == 0 and process.stdout, process.stderr
+    for path in {REPOSITORY / script for script in re.findall(r"\S+\.py\b", process.stdout)}:
         monkeypatch.syspath_prepend(str(path.parent))
         runpy.run_path(str(path), run_name="imported")
 
@@ -224,8 +224,8 @@ def test_every_question_on_the_first_page_leads_to_one_page():
 
 def test_every_page_is_two_clicks_or_fewer_from_the_first():
     def links(name):
-        found = re.findall(r"\]\(([^)#\s:]+\.md)", (DOCS / name).read_text(encoding="utf-8"))
-        return {os.path.normpath(Path(name).parent / link) for link in found}
+        page_links = re.findall(r"\]\(([^)#\s:]+\.md)", (DOCS / name).read_text(encoding="utf-8"))
+        return {os.path.normpath(Path(name).parent / link) for link in page_links}
 
     first = links("index.md")
     second = first.union(*(links(name) for name in first if (DOCS / name).exists()))

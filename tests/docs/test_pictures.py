@@ -21,8 +21,8 @@ def test_a_picture_is_of_the_present_model_and_study(picture):
 
 
 def test_every_picture_of_readme_is_one_that_the_command_draws():
-    shown = re.findall(r"!\[[^]]*\]\(docs/([^)]+)\)", (ROOT / "README.md").read_text())
-    assert shown and set(shown) <= {picture.file for picture in pictures.PICTURES}
+    shown_pictures = re.findall(r"!\[[^]]*\]\(docs/([^)]+)\)", (ROOT / "README.md").read_text())
+    assert shown_pictures and set(shown_pictures) <= {picture.file for picture in pictures.PICTURES}
 
 
 @pytest.mark.parametrize("change", ["model", "study", "figure", "none", "gone"])
@@ -48,7 +48,9 @@ def test_a_picture_of_anything_else_is_out_of_date(change, tmp_path, monkeypatch
     elif change == "study":
         (tmp_path / "quickstart.yaml").write_text(spec.replace("[0.1 W,", "[0.2 W,"))
     elif change == "figure":
-        changed = spec.replace("levels: [0.5, 0.9], title: Where", "levels: [0.9], title: Where")
-        assert changed != spec
-        (tmp_path / "quickstart.yaml").write_text(changed)
+        changed_spec = spec.replace(
+            "levels: [0.5, 0.9], title: Where", "levels: [0.9], title: Where"
+        )
+        assert changed_spec != spec
+        (tmp_path / "quickstart.yaml").write_text(changed_spec)
     assert not pictures.is_current(picture)

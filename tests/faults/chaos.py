@@ -474,11 +474,13 @@ def replacing_study():
     return small_spec(footprint={"beamlets": 7, "speckle": "none"})
 
 
-def set_up_store(arena: ChaosStudy, command: str, undisturbed: Path, rng: random.Random) -> None:
+def set_up_store(
+    arena: ChaosStudy, command: str, reference_store: Path, rng: random.Random
+) -> None:
     """Put what a command needs in its place: a complete store, for repair a damaged one."""
     if command == "run":
         return
-    copy_store(undisturbed, arena.store.parent).rename(arena.store)
+    copy_store(reference_store, arena.store.parent).rename(arena.store)
     if command == "repair":
         manifest = ".sweep/template.jsonl"
         names = rng.sample(["pd_up/zarr.json", "range/c/0", "grazing_angle/zarr.json", manifest], 3)
@@ -514,12 +516,16 @@ def plan_kills(
 
 
 def kill_and_resume(
-    scenario: KillScenario, rng: random.Random, kills_max: int, directory: Path, undisturbed: Path
+    scenario: KillScenario,
+    rng: random.Random,
+    kills_max: int,
+    directory: Path,
+    reference_store: Path,
 ) -> tuple[ChaosStudy, KillOutcomes]:
     """One study, killed and resumed until it is done or was killed as often as it may be."""
     disk = LoopDisk(directory) if scenario.causes == BY_POWER_CUT else None
     study, outcomes = ChaosStudy(directory, disk), KillOutcomes(studies=1)
-    set_up_store(study, scenario.command, undisturbed, rng)
+    set_up_store(study, scenario.command, reference_store, rng)
     with (
         run_cluster(study, 2)
         if scenario.cluster == "lasting"
@@ -562,7 +568,7 @@ def _run_leg(
 
 
 def check_store(
-    arena: ChaosStudy, scenario: KillScenario, outcomes: KillOutcomes, undisturbed: Path
+    arena: ChaosStudy, scenario: KillScenario, outcomes: KillOutcomes, reference_store: Path
 ) -> None:
     """Hold a study that was tormented against the undisturbed one."""
     committed: set[str] = set()
@@ -578,7 +584,7 @@ def check_store(
         else:
             outcomes.lost += block in committed and not (recomputes_all or may_compute_twice)
     receipts_by_block = Counter(receipt_blocks(resulting_store))
-    outcomes.lost += len(receipt_blocks(undisturbed)) - len(receipts_by_block)
+    outcomes.lost += len(receipt_blocks(reference_store)) - len(receipts_by_block)
     outcomes.twice += sum(n_receipts > 1 for n_receipts in receipts_by_block.values())
     reports = [
         report for path in {arena.store, resulting_store} for report in verify(path, progress=False)
@@ -586,7 +592,7 @@ def check_store(
     has_no_leftovers = set(arena.store.parent.iterdir()) == {arena.store, resulting_store}
     is_intact = all(report.is_undamaged and report.complete for report in reports)
     outcomes.different += not (
-        file_digests(resulting_store) == file_digests(undisturbed)
+        file_digests(resulting_store) == file_digests(reference_store)
         and has_no_leftovers
         and is_intact
     )
@@ -607,7 +613,7 @@ def prepare_parent_process() -> None:
     })  # fmt: skip
 
 
-def make_undisturbed_stores(directory: Path) -> dict[str, Path]:
+def make_reference_stores(directory: Path) -> dict[str, Path]:
     """Stores that commands make undisturbed."""
 
     def make_stores() -> None:
@@ -646,7 +652,7 @@ def run_campaign(
     directory = Path(tempfile.mkdtemp(prefix="chaos-"))
     total_weight = sum(scenario.weight for scenario in scenarios)
     try:
-        expected = make_undisturbed_stores(directory / "undisturbed")
+        expected = make_reference_stores(directory / "undisturbed")
         if not can_cut_power(directory):
             scenarios = tuple(scenario for scenario in scenarios if scenario.causes != BY_POWER_CUT)
             print("this machine allows no power cuts", file=sys.stderr)
@@ -718,7 +724,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="Parts of the names of kinds of kills, a|b.")
     arguments = parser.parse_args()
-    begun = time.monotonic()
+    start_time = time.monotonic()
     name_parts = arguments.only.split("|")
     scenarios = tuple(
         scenario
@@ -734,7 +740,7 @@ def main() -> None:
         result.lost + result.twice + result.different + result.hanging
         for result in outcomes_by_scenario.values()
     )
-    print(f"{kills} kills, seed {arguments.seed}, {time.monotonic() - begun:.0f} s: ", end="")
+    print(f"{kills} kills, seed {arguments.seed}, {time.monotonic() - start_time:.0f} s: ", end="")
     print(
         "nothing lost, nothing twice, every store identical" if not n_faults else "NOT ALL IS WELL"
     )

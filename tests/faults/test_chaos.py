@@ -18,6 +18,6 @@ def test_killed_studies_end_as_if_nobody_had_disturbed_them(kills, kinds):
     script = Path(__file__).with_name("chaos.py")  # forks, which a process with threads should not
     command = [sys.executable, str(script), "--kills", kills, "--seed", "20", "--only", kinds]
     environment = {**os.environ, "COLUMNS": "200"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "nothing lost, nothing twice, every store identical" in done.stdout
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "nothing lost, nothing twice, every store identical" in process.stdout

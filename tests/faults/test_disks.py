@@ -40,7 +40,9 @@ def committed_is_whole(store) -> None:
 @pytest.mark.parametrize(
     "size, place", [("640k", {"scheduler": "none"}), ("1M", {"workers": 2, "processes": False})]
 )
-def test_a_full_disk_stops_a_study_that_goes_on_when_there_is_room(disk, undisturbed, size, place):
+def test_a_full_disk_stops_a_study_that_goes_on_when_there_is_room(
+    disk, serial_digests, size, place
+):
     store = disk / "small.zarr"
     assert mount("-o", f"remount,size={size}", str(disk))
     outcome = run(small_spec(), store=store, progress=False, **place)
@@ -49,14 +51,14 @@ def test_a_full_disk_stops_a_study_that_goes_on_when_there_is_room(disk, undistu
     committed_is_whole(store)
     before = receipt_blocks(store)
     assert len(before) == outcome.blocks_done
-    again = resume(store, progress=False, **place)
-    assert not again.complete and "make room" in again.stop_reason
+    second_outcome = resume(store, progress=False, **place)
+    assert not second_outcome.complete and "make room" in second_outcome.stop_reason
     assert mount("-o", "remount,size=16M", str(disk))
     assert resume(store, progress=False, scheduler="none").complete
     assert receipt_blocks(store)[: len(before)] == before and sorted(receipt_blocks(store)) == list(
         range(12)
     )
-    assert file_digests(store) == undisturbed
+    assert file_digests(store) == serial_digests
 
 
 def test_a_disk_that_is_full_from_the_start_is_left_as_it_was(disk):
@@ -65,7 +67,7 @@ def test_a_disk_that_is_full_from_the_start_is_left_as_it_was(disk):
     assert list(disk.iterdir()) == []
 
 
-def test_a_disk_without_inodes_is_not_told_as_a_full_one(disk):
+def test_a_disk_without_inodes_is_not_reported_as_full(disk):
     store = disk / "small.zarr"
     assert mount("-o", "remount,size=16M,nr_inodes=300", str(disk))
     outcome = run(small_spec(), store=store, progress=False, scheduler="none")
@@ -93,7 +95,7 @@ def at_block(number, happening):
     return evaluate
 
 
-def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, undisturbed):
+def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, serial_digests):
     store = disk / "small.zarr"
     assert mount("-o", "remount,size=16M", str(disk))
     evaluate = at_block(5, lambda: mount("-o", "remount,ro", str(disk)) or pytest.fail("busy"))
@@ -106,25 +108,27 @@ def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, un
         resume(store, progress=False, scheduler="none")
     assert mount("-o", "remount,rw", str(disk))
     assert resume(store, progress=False, scheduler="none").complete
-    assert sorted(receipt_blocks(store)) == list(range(12)) and file_digests(store) == undisturbed
+    assert (
+        sorted(receipt_blocks(store)) == list(range(12)) and file_digests(store) == serial_digests
+    )
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
 def test_a_folder_that_vanishes_stops_a_study_that_goes_on_when_it_is_back(
-    tmp_path, undisturbed, place
+    tmp_path, serial_digests, place
 ):
-    store, elsewhere = tmp_path / "small.zarr", tmp_path / "elsewhere.zarr"
-    evaluate = at_block(5, lambda: shutil.move(store, elsewhere))
+    store, other_path = tmp_path / "small.zarr", tmp_path / "elsewhere.zarr"
+    evaluate = at_block(5, lambda: shutil.move(store, other_path))
     outcome = run(small_spec(), store=store, progress=False, evaluate=evaluate, **place)
     assert "small.zarr is no longer there" in outcome.stop_reason and not outcome.complete
     with pytest.raises(StoreError, match=r"there is no store|not a Zarr store"):
         resume(store, progress=False, scheduler="none")
     shutil.rmtree(store, ignore_errors=True)  # what another worker was at meanwhile
-    before = receipt_blocks(elsewhere)
+    before = receipt_blocks(other_path)
     assert before
-    shutil.move(elsewhere, store)
+    shutil.move(other_path, store)
     assert resume(store, progress=False, scheduler="none").complete
     assert receipt_blocks(store)[: len(before)] == before and sorted(receipt_blocks(store)) == list(
         range(12)
     )
-    assert file_digests(store) == undisturbed
+    assert file_digests(store) == serial_digests

@@ -87,7 +87,7 @@ def wait_for(condition, timeout: float = 120.0) -> None:
         time.sleep(0.02)
 
 
-def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
+def finish(tmp_path: Path, serial_digests: dict[str, str]) -> None:
     """Resume, and see that the store is the undisturbed one and committed work was not repeated."""
     store = tmp_path / "small.zarr"
     committed = receipt_blocks(store)
@@ -100,7 +100,7 @@ def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     assert sorted(receipt_blocks(store)) == list(range(BLOCKS))
     before = Counter(logged_blocks(tmp_path / "log"))
     assert all(before[block] == 1 for block in committed)
-    assert file_digests(store) == undisturbed
+    assert file_digests(store) == serial_digests
 
 
 #: Repairs a store, and dies as the first, second, ... object is about to get its place.
@@ -124,7 +124,9 @@ print(deaths)
 """
 
 
-def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp_path, undisturbed):
+def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(
+    tmp_path, serial_digests
+):
     store = tmp_path / "small.zarr"
     run(small_spec(), store=store, scheduler="none", progress=False)
     for name in ("beamlets", "effects", "noise_variance", "pd_up", "snr_up", ""):
@@ -134,11 +136,11 @@ def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp
     (report,) = verify(store, repair=True, progress=False)
     assert report.is_undamaged
     assert resume(store, progress=False, scheduler="none").complete
-    assert file_digests(store) == undisturbed
+    assert file_digests(store) == serial_digests
 
 
 @pytest.mark.slow
-def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, undisturbed):
+def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, serial_digests):
     store = tmp_path / "small.zarr"
     with client_process(tmp_path) as client:
         wait_for(lambda: len(receipt_blocks(store)) >= 2)
@@ -147,4 +149,4 @@ def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, undi
         assert output.strip().splitlines()[-1] == "interrupted"
         assert "/sweep/" not in output  # no traceback of ours
     assert set(logged_blocks(tmp_path / "log")) == set(receipt_blocks(store))
-    finish(tmp_path, undisturbed)
+    finish(tmp_path, serial_digests)

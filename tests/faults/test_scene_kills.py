@@ -29,7 +29,7 @@ run(small_scene_spec(), store=sys.argv[1], scheduler="none", evaluate=slowly, pr
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory):
+def serial_digests(tmp_path_factory):
     """Files of the study and of its eyepoints, run as a plain loop."""
     store = tmp_path_factory.mktemp("plain") / "scene.zarr"
     with pytest.MonkeyPatch.context() as patch:
@@ -40,7 +40,7 @@ def plain(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["casting", "looking"])
-def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage):
+def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, serial_digests, stage):
     store = tmp_path / "killed" / "scene.zarr"
     store.parent.mkdir()
     eyepoints = eyepoint_store_location(store, small_scene_spec().geometry_id("three"))
@@ -59,4 +59,4 @@ def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage)
     for path, committed in before.items():
         after = receipt_blocks(path)
         assert after[: len(committed)] == committed and len(set(after)) == len(after)
-    assert file_digests(store.parent) == plain
+    assert file_digests(store.parent) == serial_digests

@@ -281,7 +281,7 @@ def _with_characters_cut(draw: st.DrawFn, mapping: dict[str, Any]) -> CorruptedS
 
 
 @st.composite
-def _with_stray_character(draw: st.DrawFn, mapping: dict[str, Any]) -> CorruptedSpec:
+def _with_inserted_character(draw: st.DrawFn, mapping: dict[str, Any]) -> CorruptedSpec:
     text = to_yaml(mapping)
     position = draw(st.integers(0, len(text)))
     character = draw(st.sampled_from([*"\t:{}[]'\"&*!|>%@`#,-?é\u2029\x00\x85", "\r", "- ", ": "]))
@@ -301,7 +301,7 @@ CORRUPTIONS = (
     _with_deep_nesting,
     _replaced_by_garbage,
     _with_characters_cut,
-    _with_stray_character,
+    _with_inserted_character,
 )
 
 

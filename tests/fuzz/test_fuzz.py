@@ -23,7 +23,7 @@ from sweep.units import QuantityError
 
 MANY = int(os.environ.get("FUZZ", 0))
 """Specs of each kind that `make fuzz` asks for, by the seed of the command line."""
-MOST_MEMORY = 8 << 30
+MEMORY_MAX_BYTES = 8 << 30
 """Address space of `make fuzz` [bytes]: what asks for more has failed."""
 FEW = settings(
     derandomize=not MANY, deadline=None, database=None, suppress_health_check=list(HealthCheck),
@@ -34,7 +34,7 @@ FEW = settings(
 @pytest.fixture(autouse=True)
 def quick():
     if MANY:
-        resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
     with fast_planning():
         yield
 
@@ -45,17 +45,17 @@ def file(folder):
 
 
 @settings(FEW, max_examples=MANY * 2 // 3 or 24)
-@given(written=studies())
-def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, written):
-    file.write_text(to_yaml(written), encoding="utf-8")
+@given(mapping=studies())
+def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, mapping):
+    file.write_text(to_yaml(mapping), encoding="utf-8")
     check_study(file)
 
 
 def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder):
     @settings(FEW, max_examples=MANY // 3 or 5)
     @given(written=flights(folder))
-    def holds(written):
-        (folder / "now.yaml").write_text(to_yaml(written), encoding="utf-8")
+    def holds(mapping):
+        (folder / "now.yaml").write_text(to_yaml(mapping), encoding="utf-8")
         check_flight(folder / "now.yaml")
 
     holds()
@@ -96,9 +96,9 @@ def test_every_number_has_a_smallest_and_a_largest_value(model, name, rule):
 
 @pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)
 def test_every_field_refuses_odd_values_in_words_or_takes_them(model, name, rule):
-    for written in ODD_VALUES:
+    for text in ODD_VALUES:
         try:
-            rule.read(written)
+            rule.read(text)
         except QuantityError as error:
             assert error.rule and "<" not in error.rule
 
@@ -113,8 +113,8 @@ def test_every_rule_has_a_strategy_all_of_whose_values_it_takes(model, name, rul
 
     @settings(FEW, max_examples=6)
     @given(value_strategy(rule, 300.0))
-    def holds(written):
-        rule.read(written)
+    def holds(mapping):
+        rule.read(mapping)
 
     holds()
 

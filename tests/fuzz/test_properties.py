@@ -23,7 +23,7 @@ from sweep.spec import GridSpec, SceneSpec, SpecError, from_stored
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
 
-SOME = settings(
+FEW_EXAMPLES = settings(
     derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
     phases=[Phase.generate], max_examples=8,
 )  # fmt: skip
@@ -51,28 +51,28 @@ PEAKS = "instrument.processing.peaks"
 """The strongest peak alone may be one of leaked signal, which grows with the light."""
 
 
-def steady(written, *paths):
+def steady(mapping, *paths):
     """The study of one point, without draws, with all effects that it has, and without paths."""
     for section in ("axes", "draws", "effects", "accuracy"):
-        written.pop(section, None)
-    written["accuracy"] = {"tolerance": 0}
-    written["storage"] = {"block_points": 1000}
+        mapping.pop(section, None)
+    mapping["accuracy"] = {"tolerance": 0}
+    mapping["storage"] = {"block_points": 1000}
     for path in (*RANDOM, MASKING, PEAKS, *paths):
-        remove_field(written, path)
-    return without_rejected_parts(written)
+        remove_field(mapping, path)
+    return without_rejected_parts(mapping)
 
 
-def spec_of(written):
+def spec_of(mapping):
     """The study; those that are refused are passed over."""
     try:
-        return GridSpec.from_mapping(written)
+        return GridSpec.from_mapping(mapping)
     except SpecError:
         assume(False)
 
 
-def results_of(written):
+def results_of(mapping):
     """Results of a study of one block."""
-    results = GridStudy(spec_of(written)).evaluate(0)
+    results = GridStudy(spec_of(mapping)).evaluate(0)
     assume(not np.isnan(results["pd_shot"]).any())  # what is beyond the model
     return results
 
@@ -98,9 +98,9 @@ def rounded(name, values):
         ("target.reflectance", (0.01, 0.4, 0.41, 1)),
     ],
 )
-@settings(SOME)
-@given(written=studies())
-def test_more_light_is_never_worse(path, factors, written):
+@settings(FEW_EXAMPLES)
+@given(mapping=studies())
+def test_more_light_is_never_worse(path, factors, mapping):
     """SNR and pd of a segment rise with the echo E: SNR goes as E / (a + b E), as E^2 / (a + b E)
     of direct detection, where light that is noise (echo, sun, air) grows with the aperture or the
     power at the most as the echo does; and the threshold over the noise does not rise. Clipping
@@ -109,44 +109,44 @@ def test_more_light_is_never_worse(path, factors, written):
     diffraction adds to some apertures' echo, and the table of truncated beams errs by up to 1e-4
     (4e-7 about 1 where 3.7 waists fit in: SNR falls by as much as the aperture grows by a fifth).
     """
-    written = steady(written, *CLIPPING)
-    written["instrument"]["laser"].pop("focus", None)
+    mapping = steady(mapping, *CLIPPING)
+    mapping["instrument"]["laser"].pop("focus", None)
     if "aperture" in path:
-        remove_field(written, "instrument.laser.beam_waist")
-    base = spec_of(written).parameters()[path] if path != "target.reflectance" else 1
+        remove_field(mapping, "instrument.laser.beam_waist")
+    base = spec_of(mapping).parameters()[path] if path != "target.reflectance" else 1
     unit = {"power": " W", "aperture": " m"}.get(path.rsplit(".", 1)[-1], "")
-    results = results_of(written | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
+    results = results_of(mapping | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
     for name in SIGNAL:
         assert not falls(*rounded(name, results[name])), (name, results[name])
 
 
-@settings(SOME)
-@given(written=studies())
-def test_a_higher_threshold_detects_less_and_alarms_less(written):
-    written = steady(written)
+@settings(FEW_EXAMPLES)
+@given(mapping=studies())
+def test_a_higher_threshold_detects_less_and_alarms_less(mapping):
+    mapping = steady(mapping)
     for way in THRESHOLD_PATHS:  # that of the axis alone is left
-        remove_field(written, way)
+        remove_field(mapping, way)
     axes = {TNR_PATH: [0.01, 1, 5, 5.1, 30]}
-    results = results_of(written | {"axes": axes})
+    results = results_of(mapping | {"axes": axes})
     for name in ("pd_up", "pd_down", "pd_doppler", "pd_shot", "pfa_bin", "log10_pfa_bin"):
         values = results[name][::-1]
         values = values - values.min() if name.startswith("log10") else values
         assert not falls(*rounded(name, values)), name
 
 
-@settings(SOME)
-@given(written=studies())
-def test_without_movement_up_and_down_chirp_are_alike(written):
+@settings(FEW_EXAMPLES)
+@given(mapping=studies())
+def test_without_movement_up_and_down_chirp_are_alike(mapping):
     """Their beats then are range beats of either sign. Phases differ by the carriers, so that it
     holds where these play no part: beamlets that add as powers, which those of direct detection
     do not, and no images. At DC there is no echo without its image: a bin off it at the least."""
-    written = steady(written, *MOVING)
-    written["effects"] = {"image": "off"}
-    written["footprint"]["phases"] = "incoherent"
-    assume(written["instrument"]["receiver"].get("architecture") != "direct")
-    given = spec_of(written).parameters()
-    assume(given["target.range"] * given["instrument.chirp.bandwidth"] >= 299792458 / 2)
-    results = results_of(written)
+    mapping = steady(mapping, *MOVING)
+    mapping["effects"] = {"image": "off"}
+    mapping["footprint"]["phases"] = "incoherent"
+    assume(mapping["instrument"]["receiver"].get("architecture") != "direct")
+    parameters = spec_of(mapping).parameters()
+    assume(parameters["target.range"] * parameters["instrument.chirp.bandwidth"] >= 299792458 / 2)
+    results = results_of(mapping)
     for name in ("snr", "pd", "miss", "p_leakage"):
         up, down = results[f"{name}_up"], results[f"{name}_down"]
         # Bins at the threshold, or half way to another, may count in one and not in the other.
@@ -156,31 +156,38 @@ def test_without_movement_up_and_down_chirp_are_alike(written):
     assert np.isnan(error) or abs(error) < 1e-9  # rounding, where three beats are fitted
 
 
-@settings(SOME)
-@given(written=studies())
-def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
-    written = without_rejected_parts(written)
+@settings(FEW_EXAMPLES)
+@given(mapping=studies())
+def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(mapping):
+    mapping = without_rejected_parts(mapping)
     try:
-        spec = GridSpec.from_mapping(written)
+        spec = GridSpec.from_mapping(mapping)
     except SpecError:  # mended as far as that is known
         reject()
-    again = from_stored(spec.to_json())
-    assert again.id == spec.id
-    ours, theirs = GridStudy(spec).evaluate(0), GridStudy(again).evaluate(0)
-    for name, values in ours.items():
-        assert np.array_equal(values, theirs[name], equal_nan=values.dtype.kind == "f"), name
+    restored = from_stored(spec.to_json())
+    assert restored.id == spec.id
+    results, restored_results = GridStudy(spec).evaluate(0), GridStudy(restored).evaluate(0)
+    for name, values in results.items():
+        assert np.array_equal(values, restored_results[name], equal_nan=values.dtype.kind == "f"), (
+            name
+        )
 
 
-@settings(SOME)
-@given(written=studies(), seed=st.integers(0, 2**63), blocks=st.integers(1, 7))
-def test_neither_seed_nor_blocks_change_what_is_not_random(written, seed, blocks):
-    written = without_rejected_parts(written)
-    written.pop("draws", None)
-    other = written | {"seed": seed, "storage": {"block_points": blocks}}
-    ours, theirs = results_of(written | {"storage": {}}), GridStudy(GridSpec.from_mapping(other))
-    where = theirs.grid.block_slices(theirs.n_blocks - 1)
-    for name, values in theirs.evaluate(theirs.n_blocks - 1).items():
-        assert np.array_equal(values, ours[name][where], equal_nan=values.dtype.kind == "f"), name
+@settings(FEW_EXAMPLES)
+@given(mapping=studies(), seed=st.integers(0, 2**63), blocks=st.integers(1, 7))
+def test_neither_seed_nor_blocks_change_what_is_not_random(mapping, seed, blocks):
+    mapping = without_rejected_parts(mapping)
+    mapping.pop("draws", None)
+    other = mapping | {"seed": seed, "storage": {"block_points": blocks}}
+    results, other_study = (
+        results_of(mapping | {"storage": {}}),
+        GridStudy(GridSpec.from_mapping(other)),
+    )
+    block = other_study.grid.block_slices(other_study.n_blocks - 1)
+    for name, values in other_study.evaluate(other_study.n_blocks - 1).items():
+        assert np.array_equal(values, results[name][block], equal_nan=values.dtype.kind == "f"), (
+            name
+        )
 
 
 def turned(x, y, z, *, turn, shift):
@@ -230,17 +237,17 @@ def seen_in(instrument, turn=0.0, shift=(0.0, 0.0, 0.0)):
     study = FlightStudy(spec, Path("nowhere.zarr"))
     (eyepoints,) = study.eyepoint_studies()
     numbers = np.arange(eyepoints.n_points)
-    seen = eyepoints.cast_cycles(numbers)
+    cast_eyepoints = eyepoints.cast_cycles(numbers)
     shots, part = (
-        eyepoints_from_arrays(seen, eyepoints.beamlet_weights),
+        eyepoints_from_arrays(cast_eyepoints, eyepoints.beamlet_weights),
         study.scanner_grids["cone"].flight_block(0),
     )
-    return seen, study.simulate_shots(
-        part, seen, shots, study.select_effects(part, shots, numbers), numbers
+    return cast_eyepoints, study.simulate_shots(
+        part, cast_eyepoints, shots, study.select_effects(part, shots, numbers), numbers
     )
 
 
-@settings(SOME, max_examples=6)
+@settings(FEW_EXAMPLES, max_examples=6)
 @given(
     turn=st.floats(-4, 4).map(lambda x: round(x, 3)),
     shift=st.tuples(*[st.integers(-100_000, 100_000)] * 3),
@@ -250,13 +257,13 @@ def test_a_flight_is_the_same_in_any_frame(turn, shift):
     the edge of a facet, makes less than ten times that of it; as much of 1e3 m is 1e-13 rad, and
     of 80 m/s 1e-11 m/s. A range bin is 0.3 m: 1e-10 of a bin is 1e-9 of a bin's magnitude.
     """
-    seen, found = seen_in(INSTRUMENT)
+    expected, actual = seen_in(INSTRUMENT)
     other, same = seen_in(INSTRUMENT, turn, shift)
-    assert np.isfinite(seen["beam_range"]).all()
-    assert len(set(seen["beam_surface"].tolist())) > 1, "nothing but the slope is seen"
-    assert np.array_equal(seen["beam_surface"], other["beam_surface"])
-    assert np.allclose(seen["beam_range"], other["beam_range"], rtol=0, atol=1e-9)
+    assert np.isfinite(expected["beam_range"]).all()
+    assert len(set(expected["beam_surface"].tolist())) > 1, "nothing but the slope is seen"
+    assert np.array_equal(expected["beam_surface"], other["beam_surface"])
+    assert np.allclose(expected["beam_range"], other["beam_range"], rtol=0, atol=1e-9)
     speed = "beam_radial_velocity"
-    assert np.allclose(seen[speed], other[speed], rtol=0, atol=1e-9)
+    assert np.allclose(expected[speed], other[speed], rtol=0, atol=1e-9)
     for name in ("snr_up", "pd_up", "pd_down", "pd_shot", "pfa_up"):
-        assert np.allclose(found[name], same[name], rtol=1e-6, atol=1e-12), name
+        assert np.allclose(actual[name], same[name], rtol=1e-6, atol=1e-12), name

@@ -54,10 +54,10 @@ def test_a_segment_alarms_as_often_as_drawn_noise_does(table_4_1, name, length):
     crossed = [
         (m[:, low : high - low + 3] >= level).any(axis=1) for m in noise(name, length, n, 20_000, 7)
     ]
-    drawn = np.mean(crossed)
-    spread = 5 * np.sqrt(drawn / np.size(crossed))
-    limit = 0.03 * drawn + spread if name == "flattop" or length < n else 0.02 * drawn + spread
-    assert results["pfa_segment"][0] == pytest.approx(drawn, abs=limit)
+    share = np.mean(crossed)
+    spread = 5 * np.sqrt(share / np.size(crossed))
+    limit = 0.03 * share + spread if name == "flattop" or length < n else 0.02 * share + spread
+    assert results["pfa_segment"][0] == pytest.approx(share, abs=limit)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.625, 0.976])
@@ -77,13 +77,15 @@ def test_the_tail_keeps_its_digits_beyond_float64():
     """At TNR 60 (p = 1e-336) a further bin counts for what 1 - p11 / p leaves."""
     level, rho = 60 * RAYLEIGH_DEVIATION, 0.999
     scale = np.sqrt(1 - rho**2)
-    both, _ = integrate.quad(
+    joint_probability, _ = integrate.quad(
         lambda u: np.exp(-u) * marcum_q1(rho * np.sqrt(level**2 + 2 * u) / scale, level / scale).q,
         0, 40, epsabs=1e-14,
     )  # fmt: skip
-    found = log_segment_pfa(1000, level=level, correlation=rho)
-    assert found < np.log(1e-308) and 0.1 < both < 0.9
-    assert found == pytest.approx(np.log(1 + 999 * (1 - both)) - level**2 / 2, rel=1e-13)
+    log_pfa = log_segment_pfa(1000, level=level, correlation=rho)
+    assert log_pfa < np.log(1e-308) and 0.1 < joint_probability < 0.9
+    assert log_pfa == pytest.approx(
+        np.log(1 + 999 * (1 - joint_probability)) - level**2 / 2, rel=1e-13
+    )
 
 
 def test_correlations_of_neighbours_are_those_of_the_windows_squares():
@@ -102,9 +104,9 @@ def test_correlations_of_neighbours_are_those_of_the_windows_squares():
 def test_noise_at_dc_and_nyquist_is_that_of_a_real_bin(level):
     """|a + n|, n of variance 2: both tails by the normal distribution."""
     for a in (0.0, 0.5, 6.4, 8.0, 39.0):
-        found, missed = bin_crossing_tails(a, level, True)
+        pd, missed = bin_crossing_tails(a, level, True)
         normal = stats.norm(scale=np.sqrt(2))
-        assert found == pytest.approx(normal.sf(level - a) + normal.cdf(-level - a), rel=1e-12)
+        assert pd == pytest.approx(normal.sf(level - a) + normal.cdf(-level - a), rel=1e-12)
         assert missed == pytest.approx(normal.cdf(level - a) - normal.cdf(-level - a), abs=1e-15)
 
 

@@ -45,10 +45,12 @@ def scene_of(table_4_1, beat, **changes):
 @pytest.mark.parametrize("order", [3, 6, 12])
 def test_the_filter_is_a_butterworth_of_its_order(order):
     frequency = np.array([-450e6, -200e6, 0.0, 1e6, 150e6, 200e6, 260e6, 900e6])
-    found = receiver_chain.antialias_power_transmission(
+    transmission = receiver_chain.antialias_power_transmission(
         frequency, antialias_bandwidth=np.array(200e6), antialias_order=np.array(order)
     )
-    assert found == pytest.approx(np.abs(butterworth(frequency, 200e6, order)) ** 2, rel=1e-9)
+    assert transmission == pytest.approx(
+        np.abs(butterworth(frequency, 200e6, order)) ** 2, rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(("bandwidth", "order"), [(60e6, 12), (250e6, 6), (600e6, 3)])
@@ -56,30 +58,30 @@ def test_the_noises_density_is_the_sum_of_aliases_that_pass(bandwidth, order):
     frequency = np.linspace(-1.2e9, 1.2e9, 97)
     aliases = frequency[:, None] + RATE * np.arange(-300, 301)
     passed = np.abs(poles(aliases) * butterworth(aliases, bandwidth, order)) ** 2
-    found = receiver_chain.relative_noise_density(
+    density = receiver_chain.relative_noise_density(
         frequency, detector_bandwidth=400e6, amplifier_bandwidth=400e6, sample_rate=RATE,
         antialias_bandwidth=bandwidth, antialias_order=order,
     )  # fmt: skip
-    wanted = passed.sum(axis=1) * RATE / (2 * min(bandwidth, 400e6))
-    assert found == pytest.approx(wanted, rel=2e-8)
+    expected = passed.sum(axis=1) * RATE / (2 * min(bandwidth, 400e6))
+    assert density == pytest.approx(expected, rel=2e-8)
 
 
 def test_without_a_filter_every_answer_is_the_same_bit_for_bit(table_4_1):
     scene = table_4_1(**NATURE | {"range": np.linspace(100.0, 9000, 40), "beamlets": 7}) | ADC
-    plain, none = (evaluation.evaluate(p, EVERY) for p in (scene, scene | filtered(0.0, 3)))
-    for name, values in plain.items():
+    unfiltered, none = (evaluation.evaluate(p, EVERY) for p in (scene, scene | filtered(0.0, 3)))
+    for name, values in unfiltered.items():
         assert np.array_equal(values, none[name], equal_nan=True), name
 
 
 def test_a_filter_far_beyond_the_poles_changes_nothing():
     """Aliases beyond the 32nd have 2 (400/600)^4 / (3 32.5^3) = 3.8e-6, of a sum of 2/3 or more."""
-    given = {"detector_bandwidth": 400e6, "amplifier_bandwidth": 400e6, "sample_rate": RATE}
+    parameters = {"detector_bandwidth": 400e6, "amplifier_bandwidth": 400e6, "sample_rate": RATE}
     frequency = np.linspace(0, 3e8, 31)
     wide = receiver_chain.relative_noise_density(
-        frequency, **given, antialias_bandwidth=1e12, antialias_order=6
+        frequency, **parameters, antialias_bandwidth=1e12, antialias_order=6
     )
     assert wide == pytest.approx(
-        receiver_chain.relative_noise_density(frequency, **given), rel=6e-6
+        receiver_chain.relative_noise_density(frequency, **parameters), rel=6e-6
     )
 
 
@@ -104,21 +106,23 @@ def drawn_spectra(scene, beat, bandwidth, order, draws, seed):
     Noise is drawn at 16 times the rate, with the density that the receiver has without a filter;
     every 16th sample is kept, and the ADC's noise added.
     """
-    rng, plain = np.random.default_rng(seed), prepared(scene)
+    rng, unfiltered = np.random.default_rng(seed), prepared(scene)
     taper = signal.windows.hann(BINS, sym=False)
-    own = sum(v for name, v in plain.noise.variances.items() if name != "quantisation")
-    whole = OVER * 2 * BINS
-    high = np.fft.rfftfreq(whole, 1 / (OVER * RATE))
+    noise_variance = sum(
+        v for name, v in unfiltered.noise.variances.items() if name != "quantisation"
+    )
+    n_samples = OVER * 2 * BINS
+    high = np.fft.rfftfreq(n_samples, 1 / (OVER * RATE))
     gain = poles(high) * butterworth(high, bandwidth, order)
-    deviation = np.sqrt(own * (OVER * RATE / 2) / 400e6)
+    deviation = np.sqrt(noise_variance * (OVER * RATE / 2) / 400e6)
     spectra = []
     for _ in range(draws // 2000):
-        white = rng.normal(size=(2000, whole)) * deviation
-        record = np.fft.irfft(gain * np.fft.rfft(white), whole)[:, : OVER * BINS : OVER]
-        rounding = np.sqrt(plain.noise.variances.get("quantisation", 0.0))
+        white = rng.normal(size=(2000, n_samples)) * deviation
+        record = np.fft.irfft(gain * np.fft.rfft(white), n_samples)[:, : OVER * BINS : OVER]
+        rounding = np.sqrt(unfiltered.noise.variances.get("quantisation", 0.0))
         record = record + rounding * rng.normal(size=record.shape)
         spectra.append(np.fft.rfft(taper * record))
-    line = time_domain_truth.analytic_record(plain, 0, 1, 0) / plain.whitening_gain[1, 0]
+    line = time_domain_truth.analytic_record(unfiltered, 0, 1, 0) / unfiltered.whitening_gain[1, 0]
     line = line * butterworth([beat], bandwidth, order)[0]
     return np.concatenate(spectra), np.fft.rfft(taper * line.real)
 
@@ -137,22 +141,22 @@ def test_lines_and_noise_are_those_of_drawn_records(table_4_1, beat, bandwidth, 
     scene = scene | {"instrument.laser.power": ratio}
     faint = evaluation.evaluate(scene | filtered(bandwidth, order), EVERY)
     level = 5.0 * np.sqrt(2 - np.pi / 2) * np.sqrt(power / 2)
-    found = np.mean(np.abs(line[k] * np.sqrt(ratio) + noise[:, k]) >= level)
+    share = np.mean(np.abs(line[k] * np.sqrt(ratio) + noise[:, k]) >= level)
     # The drawn level is off by 1 / (2 root n) of itself, which moves pd by less than its own error.
-    assert 0.3 < found < 0.7
-    assert faint["pd_doppler"][0] == pytest.approx(found, abs=5 * 0.5 / draws**0.5 * np.sqrt(2))
+    assert 0.3 < share < 0.7
+    assert faint["pd_doppler"][0] == pytest.approx(share, abs=5 * 0.5 / draws**0.5 * np.sqrt(2))
 
 
 def test_the_ratio_of_noise_to_line_is_the_aliases(table_4_1):
     """At 100 MHz a filter at 250 MHz keeps out all aliases: SNR as without folding."""
     scene = scene_of(table_4_1, 100e6)
-    plain, clean = (
+    unfiltered, clean = (
         evaluation.evaluate(p, EVERY)["snr_doppler"][0]
         for p in (scene, scene | filtered(250e6, 12))
     )
     aliases = 100e6 + RATE * np.arange(-4000, 4001)
     every = (np.abs(poles(aliases)) ** 2).sum() / np.abs(poles(100e6)) ** 2
-    assert clean / plain == pytest.approx(every, rel=1e-4)
+    assert clean / unfiltered == pytest.approx(every, rel=1e-4)
     assert 10 * np.log10(every) == pytest.approx(1.05, abs=0.01)
 
 
@@ -172,11 +176,11 @@ def test_skirts_at_an_echo_are_whitened_as_the_echo_is(table_4_1, monkeypatch):
     """Their share of it is that of a spectrum that is not whitened; a bin's density is 1 % off."""
     shares, raised = [], permanent_line.echo_magnitude_with_line
 
-    def seen(magnitudes, skirts, **given):
+    def spectrum(magnitudes, skirts, **parameters):
         shares.append(skirts[magnitudes.argmax()] / magnitudes.max())
-        return raised(magnitudes, skirts, **given)
+        return raised(magnitudes, skirts, **parameters)
 
-    monkeypatch.setattr(permanent_line, "echo_magnitude_with_line", seen)
+    monkeypatch.setattr(permanent_line, "echo_magnitude_with_line", spectrum)
     leak = {"instrument.telescope.leak_path": 3.0, "instrument.telescope.isolation": 1e6}
     for shape in ("receiver", "white"):
         scene = scene_of(table_4_1, 280e6) | leak | {"instrument.receiver.noise_shape": shape}
@@ -187,7 +191,7 @@ def test_skirts_at_an_echo_are_whitened_as_the_echo_is(table_4_1, monkeypatch):
 
 
 @pytest.mark.parametrize("at", [None, 200e6])
-def test_a_leaked_line_is_beside_the_noise_where_it_is_seen(table_4_1, at):
+def test_a_leaked_line_stands_by_its_alias_in_noise(table_4_1, at):
     """At its own beat near DC, or where its skirts meet an echo; never at the echo's 280 MHz."""
     scene = scene_of(table_4_1, 280e6)
     scene |= {"instrument.telescope.leak_path": 3.0, "instrument.telescope.isolation": 1e6}
@@ -204,10 +208,10 @@ def test_the_adc_sees_what_the_filter_leaves(table_4_1):
     """In the segment that passes best: the up-chirp, at the Doppler shift less the range's beat."""
     scene = scene_of(table_4_1, 50e6) | {"target.range": 2000.0}
     beat = 50e6 - 1e9 / 500e-6 * 2 * 2000.0 / SPEED_OF_LIGHT
-    plain, narrow = (
+    unfiltered, narrow = (
         total_beat_amplitude(prepared(p))[0] for p in (scene, scene | filtered(10e6, 3))
     )
-    assert narrow / plain == pytest.approx(abs(butterworth([beat], 10e6, 3)[0]), rel=1e-5)
+    assert narrow / unfiltered == pytest.approx(abs(butterworth([beat], 10e6, 3)[0]), rel=1e-5)
 
 
 def test_the_adc_sees_no_segment_that_the_waveform_lacks(table_4_1):

@@ -60,11 +60,11 @@ class Instrument(NamedTuple):
             "amplifier_bandwidth": shots.receiver_filter.amplifier_bandwidth,
         }
         # enough samples that what a transform's circle brings back is far from the record
-        whole = OVER * (length + 64)
-        high = np.fft.rfftfreq(whole, 1 / (OVER * rate))
+        n_samples = OVER * (length + 64)
+        high = np.fft.rfftfreq(n_samples, 1 / (OVER * rate))
         gain = receiver_chain.receiver_transfer(high, **poles)
         within = receiver_chain.electrical_bandwidth(poles) / (OVER * rate / 2)
-        white = rng.normal(size=(draws, whole)) * np.sqrt(shots.noise_variance[0] / within)
+        white = rng.normal(size=(draws, n_samples)) * np.sqrt(shots.noise_variance[0] / within)
         return np.fft.irfft(gain * np.fft.rfft(white, axis=1), axis=1)[:, : OVER * length : OVER]
 
     def spectra(self, records):
@@ -94,7 +94,7 @@ class Instrument(NamedTuple):
         speckle = np.ones((DRAWS, lines), complex)
         if shots.speckle.segment_correlations is not None:
             speckle, of_down_alone = rng.normal(size=(2, DRAWS, lines, 2)) @ [1, 1j] / np.sqrt(2)
-        found, alarms = [], []
+        spectra, alarms = [], []
         for segment in (0, 2):
             if segment == 2 and lines == 1 and shots.speckle.segment_correlations is not None:
                 shared = abs(shots.speckle.segment_correlations.up_down[0])
@@ -112,14 +112,14 @@ class Instrument(NamedTuple):
             searched[:edge] = searched[signal.size - edge :] = False
             above = []
             for first in range(0, DRAWS, 2000):
-                some = speckle[first : first + 2000]
-                records = (some @ beats).real + self.noise(len(some), rng)
+                speckle_part = speckle[first : first + 2000]
+                records = (speckle_part @ beats).real + self.noise(len(speckle_part), rng)
                 above.append(self.spectra(records) >= level)
             above = np.concatenate(above)
-            found.append(above[:, echo].any(axis=1))
+            spectra.append(above[:, echo].any(axis=1))
             alarms.append(above[:, searched].any(axis=1))
-        found.append(found[0] & found[1])
-        return np.mean(found, axis=1), np.mean(alarms, axis=1)
+        spectra.append(spectra[0] & spectra[1])
+        return np.mean(spectra, axis=1), np.mean(alarms, axis=1)
 
 
 def spread(p):
@@ -147,9 +147,9 @@ def random_scene(table_4_1, seed):
     effects = {*evaluation.DEFAULT_EFFECTS, "segment_motion", *(["fading"] if fades else [])}
     faint = evaluation.evaluate(scene | {"instrument.laser.power": 1e-6}, effects)
     snr = 1e6 * faint["snr_up"][0]
-    wanted = (scene["instrument.processing.tnr"] * 0.655 + rng.uniform(-1, 1)) ** 2 / 2
-    wanted *= rng.uniform(1, 4) if fades else 1
-    return scene | {"instrument.laser.power": wanted / snr}, effects
+    mean_power = (scene["instrument.processing.tnr"] * 0.655 + rng.uniform(-1, 1)) ** 2 / 2
+    mean_power *= rng.uniform(1, 4) if fades else 1
+    return scene | {"instrument.laser.power": mean_power / snr}, effects
 
 
 @pytest.mark.parametrize(
@@ -176,8 +176,10 @@ def test_drawn_records_detect_and_alarm_as_often_as_the_closed_forms(table_4_1, 
         assert expected == pytest.approx(drawn, abs=0.04 * drawn + spread(drawn)), name
 
 
-@pytest.mark.parametrize(("tnr", "snr", "most"), [(2.5, 4.0, 0.03), (4.5, 8.0, 0.02)])
-def test_both_chirps_in_common_speckle_are_overrated_at_low_thresholds(table_4_1, tnr, snr, most):
+@pytest.mark.parametrize(("tnr", "snr", "excess_max"), [(2.5, 4.0, 0.03), (4.5, 8.0, 0.02)])
+def test_both_chirps_in_common_speckle_are_overrated_at_low_thresholds(
+    table_4_1, tnr, snr, excess_max
+):
     """By no more than docs/physics.md says: noise in an echo's other bins counts as its fading."""
     scene = table_4_1(
         **NATURE, window="hamming", fft_size=256, beamlets=1, phases="incoherent", tnr=tnr,
@@ -191,7 +193,7 @@ def test_both_chirps_in_common_speckle_are_overrated_at_low_thresholds(table_4_1
     outputs = evaluation.evaluate(scene, effects)
     for name, drawn in zip(("up", "down"), pd, strict=False):
         assert outputs[f"pd_{name}"][0] == pytest.approx(drawn, abs=0.005 + spread(drawn)), name
-    assert -spread(pd[2]) < outputs["pd_shot"][0] - pd[2] < most + spread(pd[2])
+    assert -spread(pd[2]) < outputs["pd_shot"][0] - pd[2] < excess_max + spread(pd[2])
 
 
 @pytest.mark.parametrize(
@@ -208,11 +210,11 @@ def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
     spectrum = np.fft.fft(w * line)[70:131]
     spectrum *= np.sqrt(2 * snr) / abs(spectrum).max()  # over the noise per quadrature
     magnitude, echo = abs(spectrum), np.zeros(61, bool)
-    beside = math.ceil(main_lobe_half_width(shape))
-    mark_exempt_bins(magnitude, 61, level, echo, beside)
+    half_width = math.ceil(main_lobe_half_width(shape))
+    mark_exempt_bins(magnitude, 61, level, echo, half_width)
     rule = DetectionRule(
         True,
-        beside,
+        half_width,
         False,
         size,
         True,
@@ -226,14 +228,14 @@ def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
     pd, _ = pd_and_miss(
         EchoBins(magnitude, echo, 70), int(magnitude.argmax()), rule, levels, speckle
     )
-    rng, found = np.random.default_rng(int(10 * place) + snr), 0
+    rng, n_alarms = np.random.default_rng(int(10 * place) + snr), 0
     for _ in range(draws // 2000):
         noise = rng.normal(size=(2000, size, 2)) @ np.array([1, 1j])
         noise = np.fft.fft(noise * w, axis=1)[:, 70:131] / np.sqrt((w**2).sum())
         speckle = (rng.normal(size=(2000, 2)) @ np.array([1, 1j])) / np.sqrt(2)
         crosses = abs(noise + speckle[:, None] * spectrum) >= level
-        found += crosses[:, echo].any(axis=1).sum()
-    drawn = found / draws
+        n_alarms += crosses[:, echo].any(axis=1).sum()
+    drawn = n_alarms / draws
     assert pd == pytest.approx(drawn, abs=0.004 + 5 * np.sqrt(drawn * (1 - drawn) / draws))
 
 

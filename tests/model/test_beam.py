@@ -46,21 +46,21 @@ CASES = {
 
 def overlap(sent, received, range, offset=0.0):
     """Integral of I_T I_L over a plane across two beams whose axes are apart [1/m^2]."""
-    both = sent.radius(range) ** 2 + received.radius(range) ** 2
-    return 2 / (math.pi * both) * np.exp(-2 * offset**2 / both)
+    squared_radius = sent.radius(range) ** 2 + received.radius(range) ** 2
+    return 2 / (math.pi * squared_radius) * np.exp(-2 * offset**2 / squared_radius)
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_the_overlap_is_that_of_two_propagated_fields(case):
-    sent, received, range, focus, apart = case
+    sent, received, range, focus, separation = case
     one = propagated(sent, range, focus=focus)
-    other = propagated(received, range, focus=focus, centre=apart)
-    seen = (np.abs(one * other) ** 2).sum() * (SIDE / NUMBER) ** 2
+    other = propagated(received, range, focus=focus, centre=separation)
+    overlap_area = (np.abs(one * other) ** 2).sum() * (SIDE / NUMBER) ** 2
     beams = [
         GaussianBeam.from_waist(waist=w, wavelength=WAVELENGTH, focus=focus)
         for w in (sent, received)
     ]
-    assert overlap(*beams, range, apart) == pytest.approx(seen, rel=1e-6)
+    assert overlap(*beams, range, separation) == pytest.approx(overlap_area, rel=1e-6)
 
 
 def test_light_moves_as_the_moving_product_of_both_fields_says():
@@ -108,28 +108,30 @@ def test_beamlets_on_a_plane_come_to_the_integral_over_it(focus, angle):
     across, along = np.linspace(-0.04, 0.04, 401), np.linspace(-0.04, 0.04, 401) / np.sin(grazing)
     x, s = np.meshgrid(across, along)
     depth, height = 40.0 + s * np.cos(grazing), s * np.sin(grazing)
-    seen = 1.0
+    antenna_pattern = 1.0
     for waist in (6e-3, 9e-3):
         width = GaussianBeam.from_waist(waist=waist, wavelength=WAVELENGTH, focus=focus).radius(
             depth
         )
-        seen = seen * 2 / (np.pi * width**2) * np.exp(-2 * (x**2 + height**2) / width**2)
+        antenna_pattern = (
+            antenna_pattern * 2 / (np.pi * width**2) * np.exp(-2 * (x**2 + height**2) / width**2)
+        )
     # A patch of the plane catches its sine of the light, and Lambert's law sends sine / pi back.
     cell = (across[1] - across[0]) * (along[1] - along[0]) * np.sin(grazing)
-    whole = WAVELENGTH**2 * seen.sum() * cell * np.sin(grazing) / np.pi
+    received_share = WAVELENGTH**2 * antenna_pattern.sum() * cell * np.sin(grazing) / np.pi
     area = beam.effective_collecting_area(p)
     _, offset, _, echo = FlatGround(p, 1).beamlets
-    assert area / 40.0**2 * echo.sum() == pytest.approx(whole, rel=2e-5)
+    assert area / 40.0**2 * echo.sum() == pytest.approx(received_share, rel=2e-5)
     if angle < 90:
-        spread = np.sqrt((seen * (depth - 40) ** 2).sum() / seen.sum()) / 40
+        spread = np.sqrt((antenna_pattern * (depth - 40) ** 2).sum() / antenna_pattern.sum()) / 40
         assert np.sqrt((echo * offset**2).sum() / echo.sum()) == pytest.approx(spread, rel=2e-4)
 
 
 def test_both_laws_are_the_same_where_the_aperture_is_two_waists_wide():
     one = GaussianBeam.from_waist(waist=12.5e-3, wavelength=WAVELENGTH)
-    seen = WAVELENGTH**2 * 1e14 * overlap(one, one, 1e7)
+    effective_area = WAVELENGTH**2 * 1e14 * overlap(one, one, 1e7)
     near = 1 + (np.pi * 12.5e-3**2 / WAVELENGTH / 1e7) ** 2  # 1 + 1e-9 of Rayleigh's range
-    assert seen * near == pytest.approx(np.pi * 12.5e-3**2, rel=1e-14)
+    assert effective_area * near == pytest.approx(np.pi * 12.5e-3**2, rel=1e-14)
 
 
 def test_beyond_the_limit_of_diffraction_a_decade_of_divergence_costs_20_db(table_4_1):
@@ -143,9 +145,9 @@ def test_beyond_the_limit_of_diffraction_a_decade_of_divergence_costs_20_db(tabl
     lost = np.diff([snr(angle) for angle in angles]) / np.diff(np.log10(angles))
     assert lost == pytest.approx(-20.0, abs=0.02)
     # -8.1 dB at 200 urad for 25 mm, and -22.1 dB at 1 mrad, against all light in the aperture
-    whole = 10 * np.log10(evaluation.evaluate(table_4_1(range=3000.0, beamlets=1))["snr_up"][0])
-    assert snr(2e-4) - whole == pytest.approx(-8.1, abs=0.1)
-    assert snr(1e-3) - whole == pytest.approx(-22.06, abs=0.01)
+    snr_db = 10 * np.log10(evaluation.evaluate(table_4_1(range=3000.0, beamlets=1))["snr_up"][0])
+    assert snr(2e-4) - snr_db == pytest.approx(-8.1, abs=0.1)
+    assert snr(1e-3) - snr_db == pytest.approx(-22.06, abs=0.01)
 
 
 def test_a_focused_beam_of_settembrini_and_others():
@@ -180,9 +182,9 @@ def test_no_beam_that_its_aperture_cuts_off_does_better_than_0_40():
     assert fills[best.argmax()] == pytest.approx(0.8, abs=0.02)
     for fill, defocus in ((0.4, 0.0), (0.8, 0.0), (0.8, 2.5), (1.0, 0.7), (0.6, 9.0)):
         near = np.hypot(1, fill**2 * defocus)  # w(R) over its far-field law
-        whole = fill**2 / near**2
-        found = whole * beam.truncation_efficiency(fill, defocus)
-        assert found == pytest.approx(cut_off(fill, defocus), rel=3e-3)
+        efficiency_limit = fill**2 / near**2
+        efficiency = efficiency_limit * beam.truncation_efficiency(fill, defocus)
+        assert efficiency == pytest.approx(cut_off(fill, defocus), rel=3e-3)
 
 
 def test_what_an_aperture_cuts_off_is_tabulated_to_1e_4():
@@ -221,12 +223,12 @@ def test_a_flight_sees_a_plane_as_a_grid_does(table_4_1):
         n_beamlets=37,
         footprint_full_angles=partial(beam.footprint_full_angles, one),
     )
-    seen = evaluation.shot_statistics(
+    statistics = evaluation.shot_statistics(
         prepare_eyepoint_shots(eyepoints, one, [SurfaceMaterial("ground", 1.0, "lambert")])
     )
     grid = evaluation.evaluate(one)
     for name in ("snr_up", "snr_doppler", "snr_down"):
-        assert seen[name] == pytest.approx(grid[name], rel=2e-4)
+        assert statistics[name] == pytest.approx(grid[name], rel=2e-4)
     assert grid["snr_up"] != pytest.approx(
         evaluation.evaluate(one | {beam.FOCUS_PATH: 0.0})["snr_up"], rel=0.1
     )
@@ -273,7 +275,7 @@ LAGS = {
 
 @pytest.mark.parametrize("case", LAGS.values(), ids=LAGS)
 def test_axes_apart_cost_what_the_overlap_loses(case, table_4_1):
-    changes, apart = case
+    changes, separation = case
     scene = PARAMETER_DEFAULTS | table_4_1(
         coupling="single_mode", beam_divergence=1e-4, range=3000.0
     )
@@ -281,10 +283,12 @@ def test_axes_apart_cost_what_the_overlap_loses(case, table_4_1):
     radius = np.hypot(waist, WAVELENGTH * 3000.0 / (np.pi * waist))
     effects = (*DEFAULT_EFFECTS, "lag")
     quiet, parted = (evaluation.evaluate(p, effects)["snr_up"][0] for p in (scene, scene | changes))
-    assert parted / quiet == pytest.approx(np.exp(-(apart**2) / radius**2), rel=2e-3)
+    assert parted / quiet == pytest.approx(np.exp(-(separation**2) / radius**2), rel=2e-3)
     for law in ({beam.COUPLING_PATH: "aperture"}, {"instrument.receiver.architecture": "direct"}):
-        kept, whole = (evaluation.evaluate(p | law, effects) for p in (scene | changes, scene))
-        np.testing.assert_equal(kept, whole)
+        with_loss, without_loss = (
+            evaluation.evaluate(p | law, effects) for p in (scene | changes, scene)
+        )
+        np.testing.assert_equal(with_loss, without_loss)
 
 
 def test_light_from_elsewhere_passes_one_mode(table_4_1):

@@ -49,7 +49,7 @@ def _edge(places, *, lift=0.0, velocity=(0.0, 0.0, -20.0)):
         level_plate(x=(-1e3, 30.0)),
         level_plate(x=(0.0, 30.0), surface=1, height=TABLE_HEIGHT),
     ]
-    seen = [
+    eyepoint_list = [
         observe_shots(
             straight_flight(position=(x, 0.0, HEIGHT), velocity=velocity),
             bodies=bodies,
@@ -60,14 +60,16 @@ def _edge(places, *, lift=0.0, velocity=(0.0, 0.0, -20.0)):
         )
         for x in places
     ]
-    fields = [np.concatenate(values) for values in zip(*(s[:-1] for s in seen), strict=True)]
-    return Eyepoints._make([*fields, seen[0].weight])
+    fields = [
+        np.concatenate(values) for values in zip(*(s[:-1] for s in eyepoint_list), strict=True)
+    ]
+    return Eyepoints._make([*fields, eyepoint_list[0].weight])
 
 
-def _cloud(seen, parameters, **keywords):
-    keys = keywords.pop("keys", _keys(np.arange(len(seen.time))))
+def _cloud(shot_eyepoints, parameters, **keywords):
+    keys = keywords.pop("keys", _keys(np.arange(len(shot_eyepoints.time))))
     return simulate_cloud(
-        seen, parameters=parameters, surfaces=[GROUND, TABLE], keys=keys, **keywords
+        shot_eyepoints, parameters=parameters, surfaces=[GROUND, TABLE], keys=keys, **keywords
     )
 
 
@@ -88,51 +90,57 @@ ON_GROUND, ON_TABLE, BOTH, BLIND = -1.0, 1.0, 1e-4, 60.0
 
 
 def test_arrays_are_those_of_the_table(table_4_1):
-    got = _cloud(_edge([ON_GROUND, BLIND]), _strong(table_4_1), draws=3, returns_max=2)
+    cloud = _cloud(_edge([ON_GROUND, BLIND]), _strong(table_4_1), draws=3, returns_max=2)
     sizes = {"shot": 2, "draw": 3, "return_number": 2, "xyz": 3}
-    assert got.keys() == SHOT_STATISTIC_VARIABLES.keys() | POINT_VARIABLES.keys()
+    assert cloud.keys() == SHOT_STATISTIC_VARIABLES.keys() | POINT_VARIABLES.keys()
     for name, output in (SHOT_STATISTIC_VARIABLES | POINT_VARIABLES).items():
-        assert got[name].dtype == output.dtype, name
-        assert got[name].shape == tuple(sizes[d] for d in output.dims), name
+        assert cloud[name].dtype == output.dtype, name
+        assert cloud[name].shape == tuple(sizes[d] for d in output.dims), name
 
 
 @METHODS
 def test_each_surface_in_a_footprint_gives_its_point(table_4_1, method):
     """The table rises by 5 m/s: a range and a velocity of its own, half a bin off at the most."""
-    seen = _edge([ON_GROUND, BOTH, ON_TABLE], lift=5.0)
-    got = _cloud(seen, _strong(table_4_1), draws=20, method=method)
-    np.testing.assert_array_equal(got["surfaces_seen"], [1, 2, 1])
+    shot_eyepoints = _edge([ON_GROUND, BOTH, ON_TABLE], lift=5.0)
+    cloud = _cloud(shot_eyepoints, _strong(table_4_1), draws=20, method=method)
+    np.testing.assert_array_equal(cloud["surfaces_seen"], [1, 2, 1])
     truth = {0: (HEIGHT, 20.0), 1: (HEIGHT - TABLE_HEIGHT, 25.0)}
     for shot, expected in ((0, {0}), (1, {0, 1}), (2, {1})):
-        there = got["flags"][shot] > 0
-        assert (there.sum(axis=1) == len(expected)).all()
-        assert (got["flags"][shot][there] == TRUE_FLAG).all()
-        surface = got["surface"][shot]
+        is_point = cloud["flags"][shot] > 0
+        assert (is_point.sum(axis=1) == len(expected)).all()
+        assert (cloud["flags"][shot][is_point] == TRUE_FLAG).all()
+        surface = cloud["surface"][shot]
         assert all(set(row[row >= 0]) == expected for row in surface)
         for number in expected:
-            own, (far, closing) = surface == number, truth[number]
+            on_surface, (far, closing) = surface == number, truth[number]
             names = "true_range", "range_interpolated", "range"
             for name, bins in zip(names, (1e-6, 0.2, 1.2), strict=True):
-                np.testing.assert_allclose(got[name][shot][own], far, atol=bins * RANGE_BIN)
+                np.testing.assert_allclose(
+                    cloud[name][shot][on_surface], far, atol=bins * RANGE_BIN
+                )
             names = "true_radial_velocity", "radial_velocity_interpolated", "radial_velocity"
             for name, bins in zip(names, (0.1, 0.3, 1.2), strict=True):
-                np.testing.assert_allclose(got[name][shot][own], closing, atol=bins * VELOCITY_BIN)
+                np.testing.assert_allclose(
+                    cloud[name][shot][on_surface], closing, atol=bins * VELOCITY_BIN
+                )
 
 
 @METHODS
 def test_without_the_platforms_motion_a_target_at_rest_stands_still(table_4_1, method):
     """An oblique flight: what is left is the table's own 5 m/s, and 0 for the ground."""
-    seen = _edge([ON_GROUND, ON_TABLE], lift=5.0, velocity=(70.0, -30.0, -20.0))
-    got = _cloud(seen, _strong(table_4_1, power=1e-2), draws=DRAWS, method=method, returns_max=1)
-    left, stated = (
-        got[f"radial_velocity_{name}"][..., 0]
+    shot_eyepoints = _edge([ON_GROUND, ON_TABLE], lift=5.0, velocity=(70.0, -30.0, -20.0))
+    cloud = _cloud(
+        shot_eyepoints, _strong(table_4_1, power=1e-2), draws=DRAWS, method=method, returns_max=1
+    )
+    left, stated_error = (
+        cloud[f"radial_velocity_{name}"][..., 0]
         for name in ("compensated", "interpolated_standard_error")
     )
     assert np.isfinite(left).all()
     error = left - [[0.0], [5.0]]
     assert np.abs(error.mean(axis=1)).max() < 0.02 * VELOCITY_BIN
     # What is stated counts the spread of the footprint's lines, which all draws share, as well.
-    spread = error.std(axis=1) / stated.mean(axis=1)
+    spread = error.std(axis=1) / stated_error.mean(axis=1)
     assert (spread > 0.9).all() and (spread < 1 + 5 / np.sqrt(2 * DRAWS)).all()
 
 
@@ -144,58 +152,64 @@ def test_shots_that_are_computed_together_are_as_alone_whatever_effects_each_has
         "several_returns", "doppler_spread", "signal_shot_noise", "solar_background",
     }  # fmt: skip
     every = pack_effect_flags(np.array([[name in DEFAULT_EFFECTS] for name in EFFECT_NAMES]))[0]
-    off = [sum(1 << free[i] for i in range(4) if n >> i & 1) for n in range(16)]
-    flags = np.array([int(every) & ~bits for bits in off], np.uint32)
-    seen = _edge([BOTH] * 16, lift=5.0, velocity=(3.0, 0.0, -20.0))
+    effect_masks = [sum(1 << free[i] for i in range(4) if n >> i & 1) for n in range(16)]
+    flags = np.array([int(every) & ~bits for bits in effect_masks], np.uint32)
+    shot_eyepoints = _edge([BOTH] * 16, lift=5.0, velocity=(3.0, 0.0, -20.0))
     parameters = _strong(table_4_1, power=1e-2, phases=phases)
     parameters["target.solar_irradiance"] = 1e9
-    got = _cloud(seen, parameters, effects=DEFAULT_EFFECTS, effect_flags=flags, draws=3)
+    cloud = _cloud(shot_eyepoints, parameters, effects=DEFAULT_EFFECTS, effect_flags=flags, draws=3)
     for shot in range(16):
-        own = unpack_effect_flags(int(flags[shot]))
+        shot_effects = unpack_effect_flags(int(flags[shot]))
         key, one = _keys([shot]), np.array([shot])
-        alone = _cloud(seen.select(one), parameters, effects=own, draws=3, keys=key)
-        for name, values in alone.items():
-            np.testing.assert_array_equal(got[name][shot], values[0], err_msg=f"{name} {own}")
+        single = _cloud(
+            shot_eyepoints.select(one), parameters, effects=shot_effects, draws=3, keys=key
+        )
+        for name, values in single.items():
+            np.testing.assert_array_equal(
+                cloud[name][shot], values[0], err_msg=f"{name} {shot_effects}"
+            )
     for i in range(4):  # each of them makes a difference
         other = 1 << i
         differs = [
-            name for name in SHOT_STATISTIC_VARIABLES if (got[name][0] != got[name][other]).any()
+            name
+            for name in SHOT_STATISTIC_VARIABLES
+            if (cloud[name][0] != cloud[name][other]).any()
         ]
         assert differs, EFFECT_NAMES[free[i]]
 
 
 def test_points_lie_along_the_beam_as_commanded(table_4_1):
-    seen = observe_shots(
+    shot_eyepoints = observe_shots(
         straight_flight(),
         beams=cone_directions(4, half_angle=0.4),
         index=np.arange(8),
         jitter=PointingJitter(1e-3, 1),
     )
-    got = _cloud(seen, _strong(table_4_1))
-    apart = got["position"][:, 0, 0] - seen.position
+    cloud = _cloud(shot_eyepoints, _strong(table_4_1))
+    offset = cloud["position"][:, 0, 0] - shot_eyepoints.position
     np.testing.assert_allclose(
-        apart, got["range_interpolated"][:, 0, :1] * seen.direction, rtol=1e-12
+        offset, cloud["range_interpolated"][:, 0, :1] * shot_eyepoints.direction, rtol=1e-12
     )
-    assert np.isnan(got["position"][:, 0, 1:]).all()
-    assert np.abs(got["position"][:, 0, 0, 2]).max() > 0.1
+    assert np.isnan(cloud["position"][:, 0, 1:]).all()
+    assert np.abs(cloud["position"][:, 0, 0, 2]).max() > 0.1
 
 
 def test_two_laws_in_one_footprint_scatter_each_their_own(table_4_1):
     """Equal parts of a tilted beam on two plates at one height: the powers' ratio is cos(i)."""
     bodies = [level_plate(y=(-1e4, 0.0)), level_plate(y=(0.0, 1e4), surface=1)]
     beams = cone_directions(1, half_angle=np.radians(60.0))
-    seen = observe_shots(straight_flight(), bodies=bodies, beams=beams)
+    shot_eyepoints = observe_shots(straight_flight(), bodies=bodies, beams=beams)
     shots = prepare_eyepoint_shots(
-        seen,
+        shot_eyepoints,
         _strong(table_4_1),
         [SurfaceMaterial("a", 0.1, "lommel_seeliger"), SurfaceMaterial("b", 0.1)],
     )
     power = (
         shots.footprint.relative_amplitude[0] ** 2
-        / seen.weight
+        / shot_eyepoints.weight
         * (1 + shots.footprint.relative_range_offset[0]) ** 2
     )
-    first, second = (power[seen.surface[0] == s] for s in (0, 1))
+    first, second = (power[shot_eyepoints.surface[0] == s] for s in (0, 1))
     assert min(first.size, second.size) > 5
     np.testing.assert_allclose(first, 0.1 / np.pi, rtol=1e-12)
     np.testing.assert_allclose(second, 0.05 / np.pi, rtol=1e-3)
@@ -208,24 +222,24 @@ def test_two_laws_in_one_footprint_scatter_each_their_own(table_4_1):
 def test_a_shot_that_sees_nothing_has_the_false_alarms_of_noise_alone(table_4_1, method):
     """A point wants a false peak in the up and in the down-chirp, of N/2 bins each."""
     eyepoints = _edge([BLIND] * 4)
-    got = _cloud(eyepoints, _strong(table_4_1, tnr=7.4), draws=DRAWS, method=method)
+    cloud = _cloud(eyepoints, _strong(table_4_1, tnr=7.4), draws=DRAWS, method=method)
     one = np.exp(-(4 - np.pi) / 4 * 7.4**2)
     chance = 1 - (1 - one) ** 2**15
     assert 0.1 < chance < 0.5
     known = {"surfaces_seen": 0, "beamlets": eyepoints.weight.size}
     for name in SHOT_STATISTIC_VARIABLES:
         if name.startswith("pfa"):
-            np.testing.assert_allclose(got[name], chance, rtol=1e-9)
+            np.testing.assert_allclose(cloud[name], chance, rtol=1e-9)
         else:
-            np.testing.assert_array_equal(got[name], known.get(name, np.nan))
-    assert (got["flags"][:, :, 1:] == 0).all()
-    there = got["flags"][:, :, 0] > 0
-    assert (got["flags"][:, :, 0][there] & KIND == FALSE_ALARM_FLAG).all()
-    assert is_within_5_sigma(there.sum(axis=1), chance**2).all()
-    assert (got["surface"] == -1).all()
+            np.testing.assert_array_equal(cloud[name], known.get(name, np.nan))
+    assert (cloud["flags"][:, :, 1:] == 0).all()
+    is_point = cloud["flags"][:, :, 0] > 0
+    assert (cloud["flags"][:, :, 0][is_point] & KIND == FALSE_ALARM_FLAG).all()
+    assert is_within_5_sigma(is_point.sum(axis=1), chance**2).all()
+    assert (cloud["surface"] == -1).all()
     for name in ("true_range", "true_radial_velocity", "pd"):
-        assert np.isnan(got[name]).all(), name
-    assert np.isfinite(got["position"][:, :, 0][there]).all()
+        assert np.isnan(cloud[name]).all(), name
+    assert np.isfinite(cloud["position"][:, :, 0][is_point]).all()
 
 
 @METHODS
@@ -234,22 +248,22 @@ def test_dropouts_of_two_surfaces_have_their_probabilities(table_4_1, method):
 
     Without that, pairs go by strength; those draws are few and stand as slack.
     """
-    seen, parameters = _edge([BOTH, -BOTH]), _weak(table_4_1, 10.0, power=2.3e-3)
-    got = _cloud(seen, parameters, draws=DRAWS, method=method)
-    found = list_bin_groups(prepare_eyepoint_shots(seen, parameters, [GROUND, TABLE]))
-    slack = DRAWS * (1 - got["pd_doppler"] + 1e-4)
+    shot_eyepoints, parameters = _edge([BOTH, -BOTH]), _weak(table_4_1, 10.0, power=2.3e-3)
+    cloud = _cloud(shot_eyepoints, parameters, draws=DRAWS, method=method)
+    groups = list_bin_groups(prepare_eyepoint_shots(shot_eyepoints, parameters, [GROUND, TABLE]))
+    slack = DRAWS * (1 - cloud["pd_doppler"] + 1e-4)
     assert (slack < 0.002 * DRAWS).all()
-    np.testing.assert_array_equal(got["surfaces_seen"], 2)
-    both = found.pd[:, 0, :2] * found.pd[:, 2, :2]
-    assert ((both > 0.05) & (both < 0.999)).all()
-    np.testing.assert_array_equal(both[:, 0], got["pd_shot"])
-    right = (got["flags"] & (TRUE_FLAG | MISREAD_FLAG)) > 0
-    counts = np.array([(right & (got["surface"] == s)).any(axis=2).sum(axis=1) for s in (0, 1)])
+    np.testing.assert_array_equal(cloud["surfaces_seen"], 2)
+    joint_pd = groups.pd[:, 0, :2] * groups.pd[:, 2, :2]
+    assert ((joint_pd > 0.05) & (joint_pd < 0.999)).all()
+    np.testing.assert_array_equal(joint_pd[:, 0], cloud["pd_shot"])
+    right = (cloud["flags"] & (TRUE_FLAG | MISREAD_FLAG)) > 0
+    counts = np.array([(right & (cloud["surface"] == s)).any(axis=2).sum(axis=1) for s in (0, 1)])
     # which is the stronger differs between the shots: the ground in one, the table in the other
     stronger = counts.argmax(axis=0)
     assert set(stronger) == {0, 1}
     for place, surface in ((0, stronger), (1, 1 - stronger)):
-        assert is_within_5_sigma(counts[surface, [0, 1]], both[:, place], slack).all()
+        assert is_within_5_sigma(counts[surface, [0, 1]], joint_pd[:, place], slack).all()
 
 
 @METHODS
@@ -261,18 +275,18 @@ def test_points_are_as_many_as_peaks_and_false_alarms_make_them(table_4_1, metho
     lists are sums of such chances, whatever pairs with what.
     """
     power = {ON_GROUND: 6e-4, BOTH: 1.6e-3}[place]
-    seen, parameters = _edge([place]), _weak(table_4_1, 7.6, power=power)
-    got = _cloud(seen, parameters, draws=DRAWS, method=method)
-    found = list_bin_groups(prepare_eyepoint_shots(seen, parameters, [GROUND, TABLE]))
-    pfa = got["pfa_up"][0], got["pfa_down"][0]
+    shot_eyepoints, parameters = _edge([place]), _weak(table_4_1, 7.6, power=power)
+    cloud = _cloud(shot_eyepoints, parameters, draws=DRAWS, method=method)
+    groups = list_bin_groups(prepare_eyepoint_shots(shot_eyepoints, parameters, [GROUND, TABLE]))
+    pfa = cloud["pfa_up"][0], cloud["pfa_down"][0]
     assert all(0.03 < chance < 0.5 for chance in pfa)
     tails = []
     for segment, alarm in zip((0, 2), pfa, strict=True):
         number = np.ones(1)
-        for chance in (*found.pd[0, segment][found.strongest_bin[0, segment] >= 0], alarm):
+        for chance in (*groups.pd[0, segment][groups.strongest_bin[0, segment] >= 0], alarm):
             number = np.convolve(number, [1 - chance, chance])
         tails.append(np.cumsum(number[::-1])[::-1])
-    points = (got["flags"][0] > 0).sum(axis=1)
+    points = (cloud["flags"][0] > 0).sum(axis=1)
     expected = tails[0] * tails[1]
     for k in range(1, min(4, len(expected)) + 1):
         assert is_within_5_sigma((points >= k).sum(), expected[k] if k < len(expected) else 0.0)
@@ -281,9 +295,9 @@ def test_points_are_as_many_as_peaks_and_false_alarms_make_them(table_4_1, metho
         # what is neither the true pair nor missing holds a false peak; a false peak takes a true
         # one from its partner by chance, once in some 300
         mean = expected[1:].sum()
-        false = (got["flags"][0] & FALSE_ALARM_FLAG > 0).sum()
+        false = (cloud["flags"][0] & FALSE_ALARM_FLAG > 0).sum()
         slack = DRAWS * pfa[0] / 300
-        assert abs(false - DRAWS * (mean - got["pd_shot"][0])) < 5 * np.sqrt(DRAWS * mean) + slack
+        assert abs(false - DRAWS * (mean - cloud["pd_shot"][0])) < 5 * np.sqrt(DRAWS * mean) + slack
 
 
 @METHODS
@@ -292,55 +306,55 @@ def test_leaked_signal_raises_the_false_alarms_stated(table_4_1, method):
     parameters = _strong(
         table_4_1, window="rectangular", power=3.0, fft_size=2**12, leakage_floor=2.0
     )
-    seen, spectra = _edge([ON_GROUND, ON_TABLE]), 3000
-    got = _cloud(seen, parameters, draws=DRAWS, method=method)
-    np.testing.assert_allclose(got["pd_shot"], 1.0, rtol=1e-12)
-    chance = got["pfa_up"] * got["pfa_down"]
+    shot_eyepoints, spectra = _edge([ON_GROUND, ON_TABLE]), 3000
+    drawn_cloud = _cloud(shot_eyepoints, parameters, draws=DRAWS, method=method)
+    np.testing.assert_allclose(drawn_cloud["pd_shot"], 1.0, rtol=1e-12)
+    chance = drawn_cloud["pfa_up"] * drawn_cloud["pfa_down"]
     assert ((chance > 0.01) & (chance < 0.1)).all()
-    whole = _cloud(seen, parameters, draws=spectra, method="spectra")
-    for points, draws in ((got, DRAWS), (whole, spectra)):
+    cloud = _cloud(shot_eyepoints, parameters, draws=spectra, method="spectra")
+    for points, draws in ((drawn_cloud, DRAWS), (cloud, spectra)):
         second = (points["flags"][:, :, 1] & FALSE_ALARM_FLAG) > 0
         deviation = np.sqrt(chance * (1 - chance) / draws)
-        drawn = second.mean(axis=1)
-        assert (abs(drawn - chance) < 5 * deviation).all(), (drawn, chance)
+        leaked_share = second.mean(axis=1)
+        assert (abs(leaked_share - chance) < 5 * deviation).all(), (leaked_share, chance)
     target = table_4_1(range=HEIGHT, radial_velocity=20.0, reflectance_law="lambert")
     plane = evaluate(target | parameters)
     expected = 1 - (1 - plane["pfa_segment"]) * (1 - plane["p_leakage_up"])
-    np.testing.assert_allclose(got["pfa_up"][0], expected, rtol=1e-3)
+    np.testing.assert_allclose(drawn_cloud["pfa_up"][0], expected, rtol=1e-3)
 
 
 @METHODS
 def test_flags_tell_what_a_point_is(table_4_1, method):
-    seen = _edge([ON_GROUND, BOTH, -BOTH, BLIND], velocity=(0.0, 0.0, -60.0))
+    shot_eyepoints = _edge([ON_GROUND, BOTH, -BOTH, BLIND], velocity=(0.0, 0.0, -60.0))
     # by little light the Doppler peak is often lost, and with it the reading of a fast mover
     parts = [
-        _cloud(seen, _weak(table_4_1, 7.6, power=power), draws=5000, method=method)
+        _cloud(shot_eyepoints, _weak(table_4_1, 7.6, power=power), draws=5000, method=method)
         for power in (5e-4, 1.35e-3)
     ]
-    got = {name: np.concatenate([part[name] for part in parts]) for name in POINT_VARIABLES}
-    kinds, there = got["flags"] & KIND, got["flags"] > 0
+    cloud = {name: np.concatenate([part[name] for part in parts]) for name in POINT_VARIABLES}
+    kinds, is_point = cloud["flags"] & KIND, cloud["flags"] > 0
     known = [TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG, SIDELOBE_FLAG]
-    assert np.isin(kinds[there], known).all()
+    assert np.isin(kinds[is_point], known).all()
     assert all(
         (kinds == kind).sum() > 20
         for kind in (TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG)
     )
     truthful = np.isin(kinds, [TRUE_FLAG, MISREAD_FLAG])
-    np.testing.assert_array_equal(got["surface"] >= 0, truthful)
+    np.testing.assert_array_equal(cloud["surface"] >= 0, truthful)
     for name in ("true_range", "true_radial_velocity"):
-        np.testing.assert_array_equal(np.isfinite(got[name]), truthful)
-    np.testing.assert_array_equal(np.isfinite(got["range"]), there)
-    np.testing.assert_array_equal(np.isfinite(got["pd"]), there & (kinds != FALSE_ALARM_FLAG))
+        np.testing.assert_array_equal(np.isfinite(cloud[name]), truthful)
+    np.testing.assert_array_equal(np.isfinite(cloud["range"]), is_point)
+    np.testing.assert_array_equal(np.isfinite(cloud["pd"]), is_point & (kinds != FALSE_ALARM_FLAG))
     true = kinds == TRUE_FLAG
-    assert np.abs(got["range"] - got["true_range"])[true].max() < 4 * RANGE_BIN
-    assert np.abs(got["radial_velocity"] - got["true_radial_velocity"])[true].max() < (
+    assert np.abs(cloud["range"] - cloud["true_range"])[true].max() < 4 * RANGE_BIN
+    assert np.abs(cloud["radial_velocity"] - cloud["true_radial_velocity"])[true].max() < (
         4 * VELOCITY_BIN
     )
-    above = got["true_range"] < HEIGHT - TABLE_HEIGHT / 2
-    np.testing.assert_array_equal(got["surface"][truthful] == 1, above[truthful])
+    above = cloud["true_range"] < HEIGHT - TABLE_HEIGHT / 2
+    np.testing.assert_array_equal(cloud["surface"][truthful] == 1, above[truthful])
     misread = kinds == MISREAD_FLAG
-    assert np.abs(got["range"] - got["true_range"])[misread].min() > 4 * RANGE_BIN
-    assert (got["flags"][misread] & UNCONFIRMED_FLAG > 0).mean() > 0.9
+    assert np.abs(cloud["range"] - cloud["true_range"])[misread].min() > 4 * RANGE_BIN
+    assert (cloud["flags"][misread] & UNCONFIRMED_FLAG > 0).mean() > 0.9
 
 
 # Invariance
@@ -348,32 +362,40 @@ def test_flags_tell_what_a_point_is(table_4_1, method):
 
 @METHODS
 def test_any_split_of_shots_and_of_draws_gives_the_same_bytes(table_4_1, method, monkeypatch):
-    seen = _edge([ON_GROUND, BOTH, BLIND, -BOTH, ON_TABLE, BLIND, 30.0 - 1e-5], lift=5.0)
-    assert 0 < (seen.surface[-1] < 0).sum() < seen.weight.size  # in part past the edge
+    shot_eyepoints = _edge([ON_GROUND, BOTH, BLIND, -BOTH, ON_TABLE, BLIND, 30.0 - 1e-5], lift=5.0)
+    assert (
+        0 < (shot_eyepoints.surface[-1] < 0).sum() < shot_eyepoints.weight.size
+    )  # in part past the edge
     parameters = _weak(table_4_1, 7.6) | {"target.solar_irradiance": 1e9}
     keys = _keys(np.arange(7))
-    whole = _cloud(seen, parameters, keys=keys, draws=40, method=method)
-    assert len(np.unique(whole["flags"])) > 3
+    cloud = _cloud(shot_eyepoints, parameters, keys=keys, draws=40, method=method)
+    assert len(np.unique(cloud["flags"])) > 3
     for shots in (np.arange(7)[::-1], [2], [0], [1, 6], [5, 2, 3]):
-        some = _cloud(seen.select(shots), parameters, keys=keys[shots], draws=40, method=method)
-        for name, values in some.items():
-            assert values.tobytes() == whole[name][shots].tobytes(), (name, shots)
+        cloud_part = _cloud(
+            shot_eyepoints.select(shots), parameters, keys=keys[shots], draws=40, method=method
+        )
+        for name, values in cloud_part.items():
+            assert values.tobytes() == cloud[name][shots].tobytes(), (name, shots)
     for first, number in ((0, 1), (1, 25), (26, 14)):
-        some = _cloud(seen, parameters, keys=keys, first_draw=first, draws=number, method=method)
+        cloud_part = _cloud(
+            shot_eyepoints, parameters, keys=keys, first_draw=first, draws=number, method=method
+        )
         for name in POINT_VARIABLES:
-            part = whole[name][:, first : first + number]
-            assert some[name].tobytes() == part.tobytes(), (name, first)
+            part = cloud[name][:, first : first + number]
+            assert cloud_part[name].tobytes() == part.tobytes(), (name, first)
         for name in SHOT_STATISTIC_VARIABLES:
-            assert some[name].tobytes() == whole[name].tobytes(), name
+            assert cloud_part[name].tobytes() == cloud[name].tobytes(), name
     monkeypatch.setattr(point_cloud, "VALUES_PER_BATCH", 1)
-    for name, values in _cloud(seen, parameters, keys=keys, draws=40, method=method).items():
-        assert values.tobytes() == whole[name].tobytes(), name
+    for name, values in _cloud(
+        shot_eyepoints, parameters, keys=keys, draws=40, method=method
+    ).items():
+        assert values.tobytes() == cloud[name].tobytes(), name
 
 
 def test_no_shots_give_no_points(table_4_1):
-    seen = _edge([ON_GROUND]).select(slice(0, 0))
-    got = _cloud(seen, _strong(table_4_1), draws=2)
-    assert all(len(values) == 0 for values in got.values())
+    shot_eyepoints = _edge([ON_GROUND]).select(slice(0, 0))
+    cloud = _cloud(shot_eyepoints, _strong(table_4_1), draws=2)
+    assert all(len(values) == 0 for values in cloud.values())
 
 
 @pytest.mark.parametrize("law", ["log_normal", "gamma_gamma"])
@@ -383,42 +405,51 @@ def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
     air = {"atmosphere.turbulence": "uniform", "atmosphere.structure_constant": 3e-14,
            "atmosphere.scintillation_law": law, "atmosphere.path": "level"}  # fmt: skip
     p = scene_parameters(table_4_1, fft_size=2**12) | air
-    seen = observe_shots(straight_flight(position=(0.0, 0.0, 300.0)), number=1).select(
+    shot_eyepoints = observe_shots(straight_flight(position=(0.0, 0.0, 300.0)), number=1).select(
         np.zeros(number, int)
     )
     effects = set(DEFAULT_EFFECTS) - {"signal_shot_noise"}
-    still = _cloud(seen.select([0]), p, effects=effects)["snr_up"][0]
-    found = _cloud(seen, p, effects=effects | {"scintillation"}, draws=2)
-    factor = found["snr_up"] / still
-    given = prepare_eyepoint_shots(seen.select([0]), p, [GROUND, TABLE])
+    without_turbulence = _cloud(shot_eyepoints.select([0]), p, effects=effects)["snr_up"][0]
+    cloud = _cloud(shot_eyepoints, p, effects=effects | {"scintillation"}, draws=2)
+    factor = cloud["snr_up"] / without_turbulence
+    shots = prepare_eyepoint_shots(shot_eyepoints.select([0]), p, [GROUND, TABLE])
     legs = two_way_log_variances(
         turbulence_profile(PARAMETER_DEFAULTS | p),
         PARAMETER_DEFAULTS | p,
-        np.array([given.range[0]]),
+        np.array([shots.range[0]]),
     )
     variance = np.exp(sum(v[0] for leg in legs for v in leg)) - 1
     assert 0.02 < variance < 1
     assert abs(factor.mean() - 1) < 5 * np.sqrt(variance / number)
     spread = np.var((factor - 1) ** 2)
     assert abs(factor.var() - variance) < 5 * np.sqrt(spread / number)
-    alone = _cloud(seen.select([7]), p, effects=effects | {"scintillation"}, keys=_keys([7]))
-    assert alone["snr_up"][0] == found["snr_up"][7]
+    single = _cloud(
+        shot_eyepoints.select([7]), p, effects=effects | {"scintillation"}, keys=_keys([7])
+    )
+    assert single["snr_up"][0] == cloud["snr_up"][7]
 
 
-def test_a_turning_beam_is_received_beside_where_it_was_sent(table_4_1):
+def test_a_turning_beam_is_received_next_to_where_it_was_sent(table_4_1):
     """Of the echo exp(-2 d^2 / (w_T^2 + w_L^2)) is left, d what the axis moves by meanwhile."""
     p = PARAMETER_DEFAULTS | scene_parameters(table_4_1, fft_size=2**12, coupling="single_mode")
     p["instrument.laser.beam_waist"] = 5e-3
     scanner = LineScan(0.4, 40.0, 1e4)
-    seen = observe_shots(
+    shot_eyepoints = observe_shots(
         straight_flight(position=(0.0, 0.0, HEIGHT)), scanner=scanner, index=[300], number=1
     )
-    rate, far = seen.turn_rate[0], seen.range[0]
-    found, straight = (
-        _cloud(seen, p, effects=(*set(DEFAULT_EFFECTS) - {"signal_shot_noise"}, *more))["snr_up"][0]
-        for more in (["lag"], [])
+    rate, far = shot_eyepoints.turn_rate[0], shot_eyepoints.range[0]
+    turning, straight = (
+        _cloud(
+            shot_eyepoints,
+            p,
+            effects=(*set(DEFAULT_EFFECTS) - {"signal_shot_noise"}, *further_effects),
+        )["snr_up"][0]
+        for further_effects in (["lag"], [])
     )
-    (waist, _), apart = beam.transmitted_and_oscillator_beams(p), 2 * rate * far**2 / 299792458.0
-    expected = np.exp(-2 * apart**2 / (2 * waist.radius(far) ** 2))
+    (waist, _), separation = (
+        beam.transmitted_and_oscillator_beams(p),
+        2 * rate * far**2 / 299792458.0,
+    )
+    expected = np.exp(-2 * separation**2 / (2 * waist.radius(far) ** 2))
     assert 0.1 < expected < 0.95
-    assert found / straight == pytest.approx(expected, rel=1e-6)
+    assert turning / straight == pytest.approx(expected, rel=1e-6)

@@ -39,8 +39,8 @@ def test_the_ratio_before_the_fft_follows_from_that_after_it():
     tone = 0.3 * np.cos(2 * np.pi * 100 * np.arange(1024) / 1024)
     signal = abs(np.fft.rfft(tone * window_samples("hamming", 1024))[100]) ** 2
     snr = signal / (w.energy * 0.5**2)
-    found = estimators.carrier_to_noise_ratio(snr=snr, window=w)
-    assert found == pytest.approx((tone**2).mean() / 0.5**2, rel=1e-9)
+    cnr = estimators.carrier_to_noise_ratio(snr=snr, window=w)
+    assert cnr == pytest.approx((tone**2).mean() / 0.5**2, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hamming", "hann"])
@@ -68,11 +68,11 @@ def test_the_largest_value_of_a_windowed_spectrum_is_as_far_off_as_it_says(name)
 def test_the_bound_of_range_and_velocity_is_that_of_beats_differentiated(doppler):
     """Least squares weighted by the beats' errors, their slopes by differences of the beats."""
     carriers = (193e12, 193e12, 193e12 + 1e9)
-    where, spread = {"range": 2000.0, "radial_velocity": 150.0}, np.array([1e3, doppler, 1.5e3])
+    target, spread = {"range": 2000.0, "radial_velocity": 150.0}, np.array([1e3, doppler, 1.5e3])
 
     def beats(**at):
         return np.array([
-            waveform.beat_frequency(sign, carrier=carrier, chirp_rate=2e12, **(where | at))
+            waveform.beat_frequency(sign, carrier=carrier, chirp_rate=2e12, **(target | at))
             for sign, carrier in zip(waveform.DEFAULT_CHIRP_SLOPES, carriers, strict=True)
         ])  # fmt: skip
 
@@ -81,22 +81,27 @@ def test_the_bound_of_range_and_velocity_is_that_of_beats_differentiated(doppler
         (beats(radial_velocity=151.0) - beats(radial_velocity=149.0)) / 2,
     ], axis=1)  # fmt: skip
     expected = np.sqrt(np.diag(np.linalg.inv(slopes.T @ np.diag(spread**-2.0) @ slopes)))
-    found = estimators.range_velocity_deviation(
-        up=spread[0], doppler=spread[1], down=spread[2], carriers=carriers, chirp_rate=2e12, **where
+    deviation = estimators.range_velocity_deviation(
+        up=spread[0],
+        doppler=spread[1],
+        down=spread[2],
+        carriers=carriers,
+        chirp_rate=2e12,
+        **target,
     )
-    assert found == pytest.approx(tuple(expected), rel=1e-6)
+    assert deviation == pytest.approx(tuple(expected), rel=1e-6)
 
 
 def test_range_and_velocity_take_two_beats():
     """Up and down beats alone: half sum and half difference. One beat alone knows neither."""
-    given = {
+    arguments = {
         "carriers": (2e14,) * 3, "chirp_rate": 2e12, "range": 0.0, "radial_velocity": 0.0,
         "doppler": np.inf,
     }  # fmt: skip
-    found = estimators.range_velocity_deviation(up=3e3, down=4e3, **given)
-    assert found.range == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e12))
-    assert found.radial_velocity == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e14))
-    blind = estimators.range_velocity_deviation(up=3e3, down=np.inf, **given)
+    deviation = estimators.range_velocity_deviation(up=3e3, down=4e3, **arguments)
+    assert deviation.range == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e12))
+    assert deviation.radial_velocity == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e14))
+    blind = estimators.range_velocity_deviation(up=3e3, down=np.inf, **arguments)
     assert np.isinf(blind.range) and np.isinf(blind.radial_velocity)
 
 
@@ -106,10 +111,10 @@ def test_a_walking_phase_errs_as_the_straight_line_through_it_does(ratio):
     duration, width = 2e-6, 1e5
     time = (np.arange(4000) + 0.5) / 4000 * duration
     slope = (time - time.mean()) / ((time - time.mean()) ** 2).sum()
-    apart = np.abs(time[:, None] - time)
-    covariance = 2 * np.pi * width * np.maximum(ratio * duration - apart, 0.0)
+    lags = np.abs(time[:, None] - time)
+    covariance = 2 * np.pi * width * np.maximum(ratio * duration - lags, 0.0)
     expected = np.sqrt(slope @ covariance @ slope) / (2 * np.pi)
-    found = estimators.phase_noise_deviation(
+    deviation = estimators.phase_noise_deviation(
         line_width=width, delay=ratio * duration, duration=duration
     )
-    assert found == pytest.approx(expected, rel=0.02 if ratio < 0.01 else 1e-4)
+    assert deviation == pytest.approx(expected, rel=0.02 if ratio < 0.01 else 1e-4)

@@ -38,49 +38,49 @@ SIXTEEN = square_patterns(np.radians([15.0, 7.5]))[0].reshape(-1, 3)
 PATTERNS = pytest.mark.parametrize("beams", [THREE, FOUR, SIXTEEN], ids=len)
 
 
-def _shots(seen):
+def _shots(shot_eyepoints):
     return {
-        "platform_position": seen.position,
-        "platform_velocity": seen.velocity,
-        "beam_direction": seen.direction,
-        "beam_turning": seen.direction_rate,
-        "platform_acceleration": seen.platform_acceleration,
+        "platform_position": shot_eyepoints.position,
+        "platform_velocity": shot_eyepoints.velocity,
+        "beam_direction": shot_eyepoints.direction,
+        "beam_turning": shot_eyepoints.direction_rate,
+        "platform_acceleration": shot_eyepoints.platform_acceleration,
     }
 
 
-def _points(seen, *, draws=1, returns=3, range_error=0.02, velocity_error=3e-4):
+def _points(shot_eyepoints, *, draws=1, returns=3, range_error=0.02, velocity_error=3e-4):
     """Points that state the truth exactly, one for each shot and draw, with standard errors."""
-    shape = len(seen.time), draws, returns
+    shape = len(shot_eyepoints.time), draws, returns
     points = {"flags": np.zeros(shape, np.uint8)}
     points["flags"][..., 0] = TRUE_FLAG
     for name, value, error in (
-        ("range", seen.range, range_error),
-        ("radial_velocity", seen.radial_velocity, velocity_error),
+        ("range", shot_eyepoints.range, range_error),
+        ("radial_velocity", shot_eyepoints.radial_velocity, velocity_error),
     ):
         points[f"{name}_per_slip"] = np.zeros(shape)
-        for suffix, given in (
+        for suffix, column in (
             ("_interpolated", value[:, None]),
             ("_interpolated_standard_error", error),
             ("_standard_error", np.hypot(error, 0.1)),
         ):
             points[name + suffix] = np.full(shape, np.nan)
-            points[name + suffix][..., 0] = given
+            points[name + suffix][..., 0] = column
     return points
 
 
 def _seen(beams, *, number=6, path=None, rate=2.0, interval=None, **keywords):
     """Shots of some cycles over level ground."""
-    each = len(beams)
-    scanner = BeamCycle(beams, [list(range(each))], rate, interval)
+    shots_per_cycle = len(beams)
+    scanner = BeamCycle(beams, [list(range(shots_per_cycle))], rate, interval)
     path = straight_flight(position=(0.0, 0.0, 900.0), velocity=MOVING) if path is None else path
     return observe_shots(
-        path, scanner=scanner, index=np.arange(number * each), number=1, **keywords
+        path, scanner=scanner, index=np.arange(number * shots_per_cycle), number=1, **keywords
     )
 
 
-def _solved(seen, points, beams, ground_slope=0.0, **keywords):
-    given = {"shots_per_cycle": len(beams), "ground_slope": ground_slope}
-    return solve_navigation(_shots(seen), points, **given, **keywords)
+def _solved(shot_eyepoints, points, beams, ground_slope=0.0, **keywords):
+    arguments = {"shots_per_cycle": len(beams), "ground_slope": ground_slope}
+    return solve_navigation(_shots(shot_eyepoints), points, **arguments, **keywords)
 
 
 # Without chance
@@ -96,28 +96,31 @@ def test_true_points_give_the_mean_velocity_and_the_altitude_at_the_start(beams)
         Rotation.from_euler("xyz", [0.1, -0.2, 0.7]).as_quat(scalar_first=True)
     )
     path = straight_flight((3.0, 4.0, 900.0), MOVING, attitude, acceleration=(3.0, -6.0, 9.0))
-    seen = _seen(beams, path=path)
-    got = _solved(seen, _points(seen, draws=2), beams, test_level=0.001)
-    each = seen.velocity.reshape(6, -1, 3)
-    assert np.ptp(each, axis=1).max() > 1.0
-    expected = np.broadcast_to(each.mean(axis=1)[:, None], (6, 2, 3))
-    np.testing.assert_allclose(got["velocity"], expected, atol=1e-11)
-    height = seen.position[:: len(beams), 2]
-    np.testing.assert_allclose(got["altitude"], np.stack([height, height], 1), rtol=1e-12)
-    assert got.keys() == NAVIGATION_VARIABLES.keys()
-    room = {"cycle": 6, "draw": 2, "xyz": 3, "xyz_again": 3}
+    shot_eyepoints = _seen(beams, path=path)
+    solution = _solved(shot_eyepoints, _points(shot_eyepoints, draws=2), beams, test_level=0.001)
+    beam_velocities = shot_eyepoints.velocity.reshape(6, -1, 3)
+    assert np.ptp(beam_velocities, axis=1).max() > 1.0
+    expected = np.broadcast_to(beam_velocities.mean(axis=1)[:, None], (6, 2, 3))
+    np.testing.assert_allclose(solution["velocity"], expected, atol=1e-11)
+    height = shot_eyepoints.position[:: len(beams), 2]
+    np.testing.assert_allclose(solution["altitude"], np.stack([height, height], 1), rtol=1e-12)
+    assert solution.keys() == NAVIGATION_VARIABLES.keys()
+    sizes = {"cycle": 6, "draw": 2, "xyz": 3, "xyz_again": 3}
     for name, output in NAVIGATION_VARIABLES.items():
-        assert got[name].dtype == output.dtype, name
-        assert got[name].shape == tuple(room[d] for d in output.dims), name
+        assert solution[name].dtype == output.dtype, name
+        assert solution[name].shape == tuple(sizes[d] for d in output.dims), name
     for name in ("velocity", "altitude"):
-        assert (got[f"{name}_status"] == STATUS_SOLVED).all()
-        assert (got[f"{name}_beams"] == len(beams)).all()
+        assert (solution[f"{name}_status"] == STATUS_SOLVED).all()
+        assert (solution[f"{name}_beams"] == len(beams)).all()
 
 
 def test_the_first_confirmed_point_of_a_shot_is_taken_whatever_it_is_in_truth():
     """Wrong values stand where the instrument must not look; a false alarm it can not know."""
-    seen = _seen(FOUR)
-    points, plain = _points(seen), _solved(seen, _points(seen), FOUR)
+    shot_eyepoints = _seen(FOUR)
+    points, solution_of_first = (
+        _points(shot_eyepoints),
+        _solved(shot_eyepoints, _points(shot_eyepoints), FOUR),
+    )
     for name in points:
         points[name][..., 1] = points[name][..., 0]  # the truth moves to the second place
     points["flags"][..., 0] = FALSE_ALARM_FLAG | UNCONFIRMED_FLAG
@@ -127,25 +130,25 @@ def test_the_first_confirmed_point_of_a_shot_is_taken_whatever_it_is_in_truth():
             points[f"{name}_interpolated"][..., place] = 33.0
             points[f"{name}_interpolated_standard_error"][..., place] = 1e-9
             points[f"{name}_standard_error"][..., place] = 1e-3
-    got = _solved(seen, points, FOUR)
+    solution = _solved(shot_eyepoints, points, FOUR)
     for name in NAVIGATION_VARIABLES:
-        np.testing.assert_array_equal(got[name], plain[name], err_msg=name)
+        np.testing.assert_array_equal(solution[name], solution_of_first[name], err_msg=name)
     points["flags"][..., 0] = FALSE_ALARM_FLAG
-    fooled = _solved(seen, points, FOUR)
-    assert (np.abs(fooled["altitude"] - plain["altitude"]) > 100.0).all()
+    fooled = _solved(shot_eyepoints, points, FOUR)
+    assert (np.abs(fooled["altitude"] - solution_of_first["altitude"]) > 100.0).all()
     assert (fooled["velocity_status"] == STATUS_SOLVED).all()
 
 
 def test_shots_without_a_confirmed_point_are_left_out():
-    seen = _seen(FOUR)
-    points = _points(seen)
+    shot_eyepoints = _seen(FOUR)
+    points = _points(shot_eyepoints)
     points["flags"][0] = 0  # nothing
     points["flags"][4 + 1] = TRUE_FLAG | UNCONFIRMED_FLAG  # nothing to trust
     points["flags"][8:10] = 0  # two of four
     points["flags"][12:16] = 0  # all
-    got = _solved(seen, points, FOUR)
-    assert got["velocity_beams"][:, 0].tolist() == [3, 3, 0, 0, 4, 4]
-    assert got["altitude_beams"][:, 0].tolist() == [3, 3, 2, 0, 4, 4]
+    solution = _solved(shot_eyepoints, points, FOUR)
+    assert solution["velocity_beams"][:, 0].tolist() == [3, 3, 0, 0, 4, 4]
+    assert solution["altitude_beams"][:, 0].tolist() == [3, 3, 2, 0, 4, 4]
     status = [
         STATUS_SOLVED,
         STATUS_SOLVED,
@@ -154,16 +157,16 @@ def test_shots_without_a_confirmed_point_are_left_out():
         STATUS_SOLVED,
         STATUS_SOLVED,
     ]
-    assert got["velocity_status"][:, 0].tolist() == status
-    assert np.isnan(got["velocity"][2:4]).all() and np.isnan(got["altitude"][3]).all()
-    assert np.isnan(got["velocity_covariance"][2:4]).all()
+    assert solution["velocity_status"][:, 0].tolist() == status
+    assert np.isnan(solution["velocity"][2:4]).all() and np.isnan(solution["altitude"][3]).all()
+    assert np.isnan(solution["velocity_covariance"][2:4]).all()
     solved = [0, 1, 4, 5]
-    np.testing.assert_allclose(got["velocity"][solved], np.tile(MOVING, (4, 1, 1)), atol=1e-11)
+    np.testing.assert_allclose(solution["velocity"][solved], np.tile(MOVING, (4, 1, 1)), atol=1e-11)
 
 
 def test_standard_errors_of_nothing_count_as_a_millionth_of_a_bin_and_others_not_at_all():
-    seen = _seen(FOUR)
-    points = _points(seen)
+    shot_eyepoints = _seen(FOUR)
+    points = _points(shot_eyepoints)
     for name in ("range", "radial_velocity"):
         points[f"{name}_interpolated_standard_error"][4:8, :, 0] = 0.0
         points[f"{name}_standard_error"][4:8, :, 0] = 0.2
@@ -171,21 +174,21 @@ def test_standard_errors_of_nothing_count_as_a_millionth_of_a_bin_and_others_not
         points[f"{name}_interpolated_standard_error"][12, :, 0] = np.inf
         points[f"{name}_interpolated_standard_error"][16, :, 0] = 0.0
         points[f"{name}_standard_error"][16, :, 0] = 0.0
-    got = _solved(seen, points, FOUR, pointing_jitter=1e-9)
-    assert got["velocity_beams"][:, 0].tolist() == [4, 4, 3, 3, 3, 4]
-    ratio = got["velocity_covariance"][1, 0] / got["velocity_covariance"][0, 0]
+    solution = _solved(shot_eyepoints, points, FOUR, pointing_jitter=1e-9)
+    assert solution["velocity_beams"][:, 0].tolist() == [4, 4, 3, 3, 3, 4]
+    ratio = solution["velocity_covariance"][1, 0] / solution["velocity_covariance"][0, 0]
     expected = ((0.2e-6) ** 2 + (1e-9 * 90) ** 2) / (3e-4) ** 2
     assert 0.4 * expected < np.diag(ratio).min() <= np.diag(ratio).max() < 2 * expected
 
 
 def test_a_false_beam_is_found_among_sixteen_and_noticed_among_four():
     for beams, status in ((SIXTEEN, STATUS_EXCLUDED), (FOUR, STATUS_WITHHELD)):
-        seen = _seen(beams)
-        points = _points(seen)
+        shot_eyepoints = _seen(beams)
+        points = _points(shot_eyepoints)
         points["radial_velocity_interpolated"][1, :, 0] += 5.0
-        got = _solved(seen, points, beams, test_level=0.001)
-        assert got["velocity_status"][:, 0].tolist() == [status, *[STATUS_SOLVED] * 5]
-        without = _solved(seen, points, beams, test_level=0.0)
+        solution = _solved(shot_eyepoints, points, beams, test_level=0.001)
+        assert solution["velocity_status"][:, 0].tolist() == [status, *[STATUS_SOLVED] * 5]
+        without = _solved(shot_eyepoints, points, beams, test_level=0.0)
         assert (without["velocity_status"] == STATUS_SOLVED).all()
         assert np.abs(without["velocity"][0, 0] - MOVING).max() > 0.1
 
@@ -197,10 +200,10 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     rest = straight_flight(
         (0.0, 0.0, 0.0), attitude=FixedAttitude(tilted.as_quat(scalar_first=True))
     )
-    seen = _seen(FOUR, path=path, bodies=[level_plate()], body_motion=[rest])
-    points = _points(seen)
+    shot_eyepoints = _seen(FOUR, path=path, bodies=[level_plate()], body_motion=[rest])
+    points = _points(shot_eyepoints)
     free, usual, held, contradicted = (
-        _solved(seen, points, FOUR, ground_slope=slope, relief=relief)
+        _solved(shot_eyepoints, points, FOUR, ground_slope=slope, relief=relief)
         for slope, relief in (
             (1e7, 0.0), (Navigation().ground_slope, 0.0), (0.0, 0.0), (0.0, 7.0)
         )
@@ -209,8 +212,8 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     rough = _solved(level, _points(level), FOUR, ground_slope=0.0, relief=7.0)
     np.testing.assert_allclose(free["altitude"], 900.0, rtol=1e-12)
     # As a study has it if it says nothing: off by far less than it states.
-    off = np.abs(usual["altitude"] - 900.0) / np.sqrt(usual["altitude_variance"])
-    assert off.max() < 1e-3 and (usual["altitude_variance"] < 1e-2).all()
+    scores = np.abs(usual["altitude"] - 900.0) / np.sqrt(usual["altitude_variance"])
+    assert scores.max() < 1e-3 and (usual["altitude_variance"] < 1e-2).all()
     assert (np.abs(held["altitude"] - 900.0) > 1.0).all()
     # Of the mean of four points, and of the ground straight below.
     np.testing.assert_allclose(rough["altitude_variance"], 7.0**2 / 4 + 7.0**2, rtol=1e-3)
@@ -220,25 +223,25 @@ def test_the_grounds_slope_and_relief_are_passed_on():
 
 @PATTERNS
 def test_any_split_of_cycles_gives_the_same_bytes(beams, monkeypatch):
-    each = len(beams)
-    seen = _seen(beams, number=40, rate=4.0)
+    shots_per_cycle = len(beams)
+    shot_eyepoints = _seen(beams, number=40, rate=4.0)
     generator = np.random.default_rng(1)
-    points = _points(seen)
+    points = _points(shot_eyepoints)
     points["flags"][generator.random(points["flags"].shape) < 0.2] = 0
     for name in ("range", "radial_velocity"):
         points[f"{name}_interpolated"] += generator.normal(0, 1e-3, points["flags"].shape)
     options = {"test_level": 0.05, "pointing_jitter": 1e-5, "ground_slope": 0.1}
-    whole = _solved(seen, points, beams, **options)
-    assert len(np.unique(whole["velocity_status"])) > 1
+    solution = _solved(shot_eyepoints, points, beams, **options)
+    assert len(np.unique(solution["velocity_status"])) > 1
     for first, last in ((0, 1), (1, 4), (5, 6)):
-        some = slice(each * first, each * last)
-        part = {name: values[some] for name, values in points.items()}
-        got = _solved(seen.select(some), part, beams, **options)
+        shots = slice(shots_per_cycle * first, shots_per_cycle * last)
+        part = {name: values[shots] for name, values in points.items()}
+        solution_part = _solved(shot_eyepoints.select(shots), part, beams, **options)
         for name in NAVIGATION_VARIABLES:
-            assert got[name].tobytes() == whole[name][first:last].tobytes(), name
+            assert solution_part[name].tobytes() == solution[name][first:last].tobytes(), name
     monkeypatch.setattr(navigation, "BEAMS_PER_BATCH", 1)
-    for name, values in _solved(seen, points, beams, **options).items():
-        assert values.tobytes() == whole[name].tobytes(), name
+    for name, values in _solved(shot_eyepoints, points, beams, **options).items():
+        assert values.tobytes() == solution[name].tobytes(), name
 
 
 # Through the whole flow
@@ -246,11 +249,11 @@ def test_any_split_of_cycles_gives_the_same_bytes(beams, monkeypatch):
 
 def _flown(table_4_1, beams, *, draws=DRAWS, method="probabilities", **changes):
     """Eyepoints and cloud of one cycle, and the velocity of its platform."""
-    seen = _seen(beams, number=1, interval=0.0)
+    shot_eyepoints = _seen(beams, number=1, interval=0.0)
     keys = philox.point_keys(np.arange(float(len(beams)))[:, None], domain="cycles", seed=8)
     parameters = scene_parameters(table_4_1, **({"fft_size": 2**16, "window": "hann"} | changes))
     points = simulate_cloud(
-        seen,
+        shot_eyepoints,
         parameters=parameters,
         surfaces=[SurfaceMaterial("ground", 0.1)],
         keys=keys,
@@ -258,7 +261,7 @@ def _flown(table_4_1, beams, *, draws=DRAWS, method="probabilities", **changes):
         method=method,
         returns_max=2,
     )
-    return seen, points
+    return shot_eyepoints, points
 
 
 def _propagated(beams, velocity_error, range_error):
@@ -280,30 +283,30 @@ def test_mean_and_covariance_are_those_propagated_from_the_points(table_4_1, bea
 
     The interpolation is good to 1e-3 bins of bias there, under the 5 sigma of the mean.
     """
-    seen, points = _flown(table_4_1, beams, method=method, power=30.0)
+    shot_eyepoints, points = _flown(table_4_1, beams, method=method, power=30.0)
     assert (points["flags"][:, :, 0] == TRUE_FLAG).all()
-    got = _solved(seen, points, beams)
-    assert (got["velocity_status"] == STATUS_SOLVED).all()
-    off = {
+    solution = _solved(shot_eyepoints, points, beams)
+    assert (solution["velocity_status"] == STATUS_SOLVED).all()
+    errors = {
         name: points[f"{name}_interpolated"][:, :, 0] - points[f"true_{name}"][:, :, 0]
         for name in ("range", "radial_velocity")
     }
     covariance, variance = _propagated(
-        beams, off["radial_velocity"].std(axis=1), off["range"].std(axis=1)
+        beams, errors["radial_velocity"].std(axis=1), errors["range"].std(axis=1)
     )
-    error = got["velocity"][0] - MOVING
+    error = solution["velocity"][0] - MOVING
     spread = np.sqrt(np.diag(covariance))
     assert (np.abs(error.mean(axis=0)) <= 5 * spread / np.sqrt(DRAWS)).all()
     # of a sample covariance of normal numbers: (C_ii C_jj + C_ij^2) / n
     allowed = 5 * np.sqrt((np.outer(spread, spread) ** 2 + covariance**2) / DRAWS)
     assert (np.abs(np.cov(error.T) - covariance) <= allowed).all()
-    stated = got["velocity_covariance"][0].mean(axis=0)
-    assert (np.abs(np.cov(error.T) - stated) <= allowed).all()
-    height = got["altitude"][0] - seen.position[0, 2]
+    stated_covariance = solution["velocity_covariance"][0].mean(axis=0)
+    assert (np.abs(np.cov(error.T) - stated_covariance) <= allowed).all()
+    height = solution["altitude"][0] - shot_eyepoints.position[0, 2]
     assert abs(height.mean()) <= 5 * np.sqrt(variance / DRAWS)
     assert height.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / DRAWS))
     assert height.var() == pytest.approx(
-        got["altitude_variance"][0].mean(), rel=5 * np.sqrt(2 / DRAWS)
+        solution["altitude_variance"][0].mean(), rel=5 * np.sqrt(2 / DRAWS)
     )
 
 
@@ -315,17 +318,19 @@ def test_velocity_is_there_as_often_as_three_beams_are_confirmed(table_4_1, meth
     the draws.
     """
     for beams in (THREE, FOUR):
-        seen, points = _flown(table_4_1, beams, method=method, power=0.008, tnr=9.5)
-        each = points["pd_shot"] * points["pd_doppler"]
-        assert ((each > 0.1) & (each < 0.95)).all()
-        chance = np.prod(each)
+        shot_eyepoints, points = _flown(table_4_1, beams, method=method, power=0.008, tnr=9.5)
+        beam_pd = points["pd_shot"] * points["pd_doppler"]
+        assert ((beam_pd > 0.1) & (beam_pd < 0.95)).all()
+        chance = np.prod(beam_pd)
         if len(beams) == 4:
-            chance += sum(np.prod(np.where(np.arange(4) == b, 1 - each, each)) for b in range(4))
-        got = _solved(seen, points, beams)
-        there = (got["velocity_status"] == STATUS_SOLVED).sum()
+            chance += sum(
+                np.prod(np.where(np.arange(4) == b, 1 - beam_pd, beam_pd)) for b in range(4)
+            )
+        solution = _solved(shot_eyepoints, points, beams)
+        n_solved = (solution["velocity_status"] == STATUS_SOLVED).sum()
         allowed = 5 * np.sqrt(DRAWS * chance * (1 - chance)) + 1e-4 * DRAWS
-        assert abs(there - DRAWS * chance) <= allowed
-        assert np.isfinite(got["velocity"][0]).all(axis=1).sum() == there
+        assert abs(n_solved - DRAWS * chance) <= allowed
+        assert np.isfinite(solution["velocity"][0]).all(axis=1).sum() == n_solved
 
 
 def test_jitter_spreads_velocity_and_altitude_as_stated():
@@ -335,29 +340,29 @@ def test_jitter_spreads_velocity_and_altitude_as_stated():
     """
     sigma, number = 2e-4, 5000
     path = straight_flight(velocity=(60.0, -20.0, 0.0))
-    seen = _seen(
+    shot_eyepoints = _seen(
         FOUR, number=number, path=path, rate=number / 9.9, interval=0.0,
         jitter=PointingJitter(sigma, 4),
     )  # fmt: skip
-    points = _points(seen, range_error=1e-9, velocity_error=1e-9)
-    got = _solved(seen, points, FOUR, pointing_jitter=sigma)
+    points = _points(shot_eyepoints, range_error=1e-9, velocity_error=1e-9)
+    solution = _solved(shot_eyepoints, points, FOUR, pointing_jitter=sigma)
     across = np.linalg.norm(np.cross(FOUR, [60.0, -20.0, 0.0]), axis=1)
     tangent = np.hypot(FOUR[:, 0], FOUR[:, 1]) / -FOUR[:, 2]
     ranges = 1000.0 / -FOUR[:, 2]
     covariance, variance = _propagated(FOUR, sigma * across, sigma * ranges * tangent)
-    stated = got["velocity_covariance"][:, 0]
+    stated_covariance = solution["velocity_covariance"][:, 0]
     # Covariances follow residuals that contradict them, by chance in one cycle of ten thousand.
-    as_stated = (np.abs(stated - covariance) <= 0.01 * covariance.max()).all(axis=(1, 2))
+    as_stated = (np.abs(stated_covariance - covariance) <= 0.01 * covariance.max()).all(axis=(1, 2))
     assert as_stated.mean() > 0.996
-    close = np.isclose(got["altitude_variance"], variance, rtol=0.01)
+    close = np.isclose(solution["altitude_variance"], variance, rtol=0.01)
     assert close.mean() > 0.996
-    error = got["velocity"][:, 0] - [60.0, -20.0, 0.0]
+    error = solution["velocity"][:, 0] - [60.0, -20.0, 0.0]
     spread = np.sqrt(np.diag(covariance))
     assert (np.abs(error.mean(axis=0)) <= 5 * spread / np.sqrt(number)).all()
     allowed = 5 * np.sqrt((np.outer(spread, spread) ** 2 + covariance**2) / number)
     assert (np.abs(np.cov(error.T) - covariance) <= allowed).all()
-    height = got["altitude"][:, 0] - 1000.0
+    height = solution["altitude"][:, 0] - 1000.0
     assert height.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / number))
-    screened = _solved(seen, points, FOUR, pointing_jitter=sigma, test_level=0.01)
+    screened = _solved(shot_eyepoints, points, FOUR, pointing_jitter=sigma, test_level=0.01)
     withheld = (screened["velocity_status"] == STATUS_WITHHELD).sum()
     assert abs(withheld - 0.01 * number) <= 5 * np.sqrt(0.01 * number)

@@ -89,7 +89,7 @@ def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
         j for i in range(len(magnitude)) if above[i] or i == peak for j in (i - 1, i, i + 1)
     } & set(range(len(magnitude)))
     with mpmath.workdps(130):  # of chances of 1e-90, thirty
-        beta, further = mpmath.mpf(level) / sigma, mpmath.mpf(0)
+        beta, probability = mpmath.mpf(level) / sigma, mpmath.mpf(0)
         # No further group yet: after a quiet bin, in an echo's group, in one that may join one.
         quiet, of_echo, waits = mpmath.mpf(1), mpmath.mpf(0), mpmath.mpf(0)
         for i, m in enumerate(magnitude):
@@ -98,7 +98,7 @@ def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
                     joins = i in exempt and edge_crossing_probability(
                         m / sigma, magnitude[i - 1] / sigma, level / sigma, correlation
                     )
-                    quiet, further = quiet + joins * waits, further + (1 - joins) * waits
+                    quiet, probability = quiet + joins * waits, probability + (1 - joins) * waits
                 quiet, of_echo, waits = quiet + of_echo, mpmath.mpf(0), mpmath.mpf(0)
                 continue
             crosses = 1 - (1 - q1(mpmath.mpf(m) / sigma, beta)) / (1 - q1(0, beta))
@@ -107,13 +107,13 @@ def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
                 joins = edge_crossing_probability(
                     magnitude[i - 1] / sigma, m / sigma, level / sigma, correlation
                 )
-            further += (1 - crosses) * waits
+            probability += (1 - crosses) * waits
             waits, quiet, of_echo = (
                 crosses * (waits + quiet * (1 - joins)),
                 (1 - crosses) * (quiet + of_echo),
                 crosses * (of_echo + quiet * joins),
             )
-        return peak, exempt, float(further + waits)
+        return peak, exempt, float(probability + waits)
 
 
 def q1(a, b):
@@ -191,10 +191,10 @@ def test_bins_below_the_floor_leak_no_more_together_than_is_allowed(tnr, chance)
     floor = negligible_signal_ratio(
         leakage_probability=np.array(chance), threshold_ratio=np.array(level), n_bins=bins
     )
-    each = marcum_q1_excess(float(floor), level) / -math.expm1(-0.5 * level * level)
-    assert bins * each <= chance * (1 + 1e-9)
+    excess = marcum_q1_excess(float(floor), level) / -math.expm1(-0.5 * level * level)
+    assert bins * excess <= chance * (1 + 1e-9)
     # and are no fewer than that asks for, but for those near the threshold
-    assert bins * each >= 0.8 * chance or floor == pytest.approx(1 / level)
+    assert bins * excess >= 0.8 * chance or floor == pytest.approx(1 / level)
 
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-5])
@@ -206,9 +206,9 @@ def test_bins_taken_one_by_one_leak_to_within_the_tolerance(table_4_1, tolerance
     every = evaluation.evaluate(
         scene | {"accuracy.leakage_floor": 0.0}, segment_evaluator=one_by_one
     )
-    found = evaluation.evaluate(scene, segment_evaluator=one_by_one)
+    statistics = evaluation.evaluate(scene, segment_evaluator=one_by_one)
     for name in ("p_leakage_up", "p_leakage_down"):
-        assert found[name] == pytest.approx(every[name], abs=tolerance / 2), name
+        assert statistics[name] == pytest.approx(every[name], abs=tolerance / 2), name
     fixed = evaluation.evaluate(
         scene | {"accuracy.leakage_floor": 0.1}, segment_evaluator=one_by_one
     )

@@ -23,12 +23,12 @@ TRAINING, RANK = 24, 18
 
 
 def setting(**changes):
-    given = {
+    settings = {
         "fft_size": 512, "sample_rate": 1.0, "window": get_window("rectangular", 512),
         "noise_power": 1.0, "threshold": 2.0, "training": TRAINING, "guard": 2, "rank": RANK,
         "pfa": 1e-2,
     }  # fmt: skip
-    return SpectrumSettings(**given | changes)
+    return SpectrumSettings(**settings | changes)
 
 
 def by_integral(kind, factor):
@@ -52,8 +52,8 @@ def by_integral(kind, factor):
 def test_factors_give_the_design_probability_by_an_integral_over_the_level(kind, pfa):
     factor = cfar_factor(kind, training=TRAINING, rank=RANK, pfa=pfa)
     assert by_integral(kind, factor) == pytest.approx(pfa, rel=1e-6)
-    found = cfar_crossing_probability(kind, factor, training=TRAINING, rank=RANK)
-    assert found == pytest.approx(pfa, rel=1e-9)
+    probability = cfar_crossing_probability(kind, factor, training=TRAINING, rank=RANK)
+    assert probability == pytest.approx(pfa, rel=1e-9)
 
 
 def test_a_factor_in_print():
@@ -68,8 +68,8 @@ def test_flags_are_those_of_each_bin_by_itself(kind):
     factor, inner = cfar_factor(kind, training=TRAINING, rank=RANK, pfa=s.pfa), power[:, 1:-1]
     expected = np.zeros(power.shape, bool)
     for k in range(inner.shape[1]):
-        apart = np.arange(s.guard + 1, s.guard + TRAINING // 2 + 1)
-        below, above = (inner.take(k + sign * apart, axis=1, mode="wrap") for sign in (-1, 1))
+        distances = np.arange(s.guard + 1, s.guard + TRAINING // 2 + 1)
+        below, above = (inner.take(k + sign * distances, axis=1, mode="wrap") for sign in (-1, 1))
         cells = np.concatenate([below, above], axis=1)
         level = {
             CA_CFAR: cells.mean(axis=1),
@@ -87,16 +87,16 @@ def rate(kind, name, fft_size, rows, pfa=1e-2):
     noise = np.random.default_rng(7).standard_normal((rows, 512)) * cached_window_samples(w)
     power = np.abs(np.fft.rfft(noise, fft_size)) ** 2
     flags = DETECTORS[kind](power, setting(fft_size=fft_size, window=w, pfa=pfa))[:, 1:-1]
-    each = flags.mean(axis=1)
-    return each.mean(), each.std() / np.sqrt(rows)
+    shares = flags.mean(axis=1)
+    return shares.mean(), shares.std() / np.sqrt(rows)
 
 
 @pytest.mark.parametrize("kind", [CA_CFAR, OS_CFAR, GOCA_CFAR])
 def test_false_alarms_of_independent_bins_come_at_the_design_rate(kind):
     """Untapered records of white noise; 5 standard errors of 8000 spectra are some 4 %."""
-    found, error = rate(kind, "rectangular", 512, 8000)
+    alarm_rate, error = rate(kind, "rectangular", 512, 8000)
     assert 5 * error < 0.05 * 1e-2
-    assert abs(found - 1e-2) < 5 * error
+    assert abs(alarm_rate - 1e-2) < 5 * error
 
 
 @pytest.mark.parametrize("kind", [CA_CFAR, OS_CFAR, GOCA_CFAR])
@@ -105,11 +105,11 @@ def test_a_fluctuating_signal_is_detected_as_often_as_it_should(kind):
     rows, snr, s = 40_000, 30.0, setting(fft_size=64, pfa=1e-3)
     power = np.random.default_rng(3).exponential(size=(rows, 33))
     power[:, 16] *= 1 + snr
-    found = DETECTORS[kind](power, s)[:, 16].mean()
+    pd = DETECTORS[kind](power, s)[:, 16].mean()
     factor = cfar_factor(kind, training=TRAINING, rank=RANK, pfa=s.pfa)
     expected = cfar_crossing_probability(kind, factor / (1 + snr), training=TRAINING, rank=RANK)
     assert 0.5 < expected < 0.9
-    assert abs(found - expected) < 5 * np.sqrt(expected * (1 - expected) / rows)
+    assert abs(pd - expected) < 5 * np.sqrt(expected * (1 - expected) / rows)
 
 
 def loss(kind, training, rank, pfa=1e-6, pd=0.5):
@@ -117,8 +117,10 @@ def loss(kind, training, rank, pfa=1e-6, pd=0.5):
     factor = cfar_factor(kind, training=training, rank=rank, pfa=pfa)
 
     def short(snr):
-        found = cfar_crossing_probability(kind, factor / (1 + snr), training=training, rank=rank)
-        return found - pd
+        detection_probability = cfar_crossing_probability(
+            kind, factor / (1 + snr), training=training, rank=rank
+        )
+        return detection_probability - pd
 
     return 10 * np.log10(brentq(short, 1, 1e6) / (np.log(pfa) / np.log(pd) - 1))
 

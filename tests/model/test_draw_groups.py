@@ -64,12 +64,12 @@ def test_each_pair_of_a_group_visits_every_cell_of_every_shape_once(are_polar):
 
 
 def test_a_number_depends_on_nothing_but_its_address():
-    whole = numbers(4, 200, 6)
+    all_numbers = numbers(4, 200, 6)
     point, draw = np.array([3, 0, 2, 2, 1]), np.array([199, 64, 63, 5, 128])
-    some = grouped_uniforms(keys(4)[point], draw, STREAM, 2)
-    np.testing.assert_array_equal(some, whole[point, draw, :2])
+    numbers_of_draw = grouped_uniforms(keys(4)[point], draw, STREAM, 2)
+    np.testing.assert_array_equal(numbers_of_draw, all_numbers[point, draw, :2])
     other = grouped_uniforms(keys(4)[point], draw, STREAM + 1, 2)
-    assert (other != some).all()
+    assert (other != numbers_of_draw).all()
 
 
 @pytest.mark.parametrize("are_polar", [False, True])
@@ -81,8 +81,8 @@ def test_a_draw_alone_is_uniform_and_its_numbers_independent(draw, are_polar):
     ).T
     for values in (first, second, third, fourth):
         assert stats.kstest(values, "uniform").pvalue > 1e-4
-    for values, others in ((first, second), (first, third), (second, fourth)):
-        table = np.histogram2d(values, others, bins=16, range=[[0, 1], [0, 1]])[0]
+    for values, other_numbers in ((first, second), (first, third), (second, fourth)):
+        table = np.histogram2d(values, other_numbers, bins=16, range=[[0, 1], [0, 1]])[0]
         assert stats.chisquare(table.ravel()).pvalue > 1e-4
 
 
@@ -103,8 +103,8 @@ def test_means_of_groups_are_numpys_however_draws_are_divided():
     n_points, draws = 3, 5 * GROUP_SIZE + 17
     values = random.random((2, n_points, draws))
     values[1, 2] = np.nan
-    whole, parts = GroupMeans(n_points, ("a", "b")), GroupMeans(n_points, ("a", "b"))
-    for means, edges in ((whole, [0, draws]), (parts, [0, 1, 30, 64, 200, 201, draws])):
+    all_means, parts = GroupMeans(n_points, ("a", "b")), GroupMeans(n_points, ("a", "b"))
+    for means, edges in ((all_means, [0, draws]), (parts, [0, 1, 30, 64, 200, 201, draws])):
         for start, end in pairwise(edges):
             point = np.repeat(np.arange(n_points), end - start)
             number = np.tile(np.arange(start, end), n_points)
@@ -115,10 +115,10 @@ def test_means_of_groups_are_numpys_however_draws_are_divided():
             means = restored  # goes on from what is stored
         group_means = values[:, :, : 5 * GROUP_SIZE].reshape(2, n_points, 5, GROUP_SIZE).mean(-1)
         n_values = np.isfinite(values).sum(axis=-1)
-        found = means.statistics(np.arange(n_points), n_values)
-        np.testing.assert_array_equal(found.n_groups, np.where(n_values, 5, 0))
+        statistics = means.statistics(np.arange(n_points), n_values)
+        np.testing.assert_array_equal(statistics.n_groups, np.where(n_values, 5, 0))
         expected = np.where(n_values, group_means.var(axis=-1, ddof=1), np.nan)
-        np.testing.assert_allclose(found.group_variance, expected, rtol=1e-12)
+        np.testing.assert_allclose(statistics.group_variance, expected, rtol=1e-12)
 
 
 def half_widths(values):
@@ -187,11 +187,11 @@ def test_the_mean_of_a_group_varies_no_more_than_that_of_independent_draws(funct
 
 def test_half_widths_of_equal_values_are_what_so_many_draws_can_miss():
     z = two_sided_normal_quantile(CONFIDENCE)
-    found = grouped_mean_half_width(
+    half_width = grouped_mean_half_width(
         variance=0.0, n_values=640, group_variance=0.0, n_groups=10, group_size=64,
         confidence=CONFIDENCE,
     )  # fmt: skip
-    assert found == pytest.approx(z**2 / 640, rel=1e-12)
+    assert half_width == pytest.approx(z**2 / 640, rel=1e-12)
 
 
 def test_half_widths_fall_to_students_and_those_of_independent_draws_bound_them():
@@ -202,11 +202,11 @@ def test_half_widths_fall_to_students_and_those_of_independent_draws_bound_them(
         "confidence": CONFIDENCE,
     }  # fmt: skip
     spread = 1e-5
-    found = grouped_mean_half_width(group_variance=spread, **arguments)
+    half_width = grouped_mean_half_width(group_variance=spread, **arguments)
     student = stats.t.ppf(0.975, n_groups - 1) * np.sqrt(spread / n_groups)
     unseen = stats.norm.ppf(0.975) ** 2 / n
     # The root of d^2 = student^2 + unseen d.
-    assert found == pytest.approx(unseen / 2 + np.hypot(student, unseen / 2), rel=1e-9)
+    assert half_width == pytest.approx(unseen / 2 + np.hypot(student, unseen / 2), rel=1e-9)
     wide = grouped_mean_half_width(group_variance=1.0, **arguments)
     interval = bounded_mean_interval(mean=0.0, variance=variance, n_values=n, confidence=CONFIDENCE)
     assert wide == pytest.approx(float(interval.high), rel=1e-9)

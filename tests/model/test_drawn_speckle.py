@@ -42,13 +42,13 @@ ESTIMATOR = {PROCESSING + "estimator.kind": "maximum_likelihood"}
 
 def slope(table_4_1, angle, *, ratio, **changes):
     """Parameters of a shot on a slope whose up-chirp has so many times the threshold."""
-    own = {
+    parameters = {
         "target.range": 300.0, "target.grazing_angle": np.radians(angle),
         "target.radial_velocity": 6.0, "target.reflectance_law": "thesis",
         PROCESSING + "window": "hann", PROCESSING + "tnr": 10.0,
     }  # fmt: skip
     return with_signal_over_threshold(
-        PARAMETER_DEFAULTS | table_4_1() | LANDER_PARAMETERS | own | changes, ratio
+        PARAMETER_DEFAULTS | table_4_1() | LANDER_PARAMETERS | parameters | changes, ratio
     )
 
 
@@ -58,7 +58,7 @@ def flown(p, method, draws):
     along = np.array([np.cos(angle), 0.0, -np.sin(angle)])
     nearer = np.array([-np.sin(angle), 0.0, -np.cos(angle)])  # towards the facet's near side
     velocity = p["target.radial_velocity"] * along + p["target.transverse_velocity"] * nearer
-    seen = observe_shots(
+    shot_eyepoints = observe_shots(
         straight_flight(position=tuple(-distance * along), velocity=tuple(velocity)),
         beams=along[None],
         footprint_full_angles=lambda far: beam.footprint_full_angles(
@@ -68,7 +68,7 @@ def flown(p, method, draws):
     instrument = {path: value for path, value in p.items() if not path.startswith("target.")}
     sun = "target.solar_irradiance"
     return simulate_cloud(
-        seen,
+        shot_eyepoints,
         parameters=PARAMETER_DEFAULTS
         | instrument
         | {sun: p[sun], "footprint.speckle": "developed"},
@@ -136,17 +136,17 @@ def test_drawn_bins_have_the_mean_power_and_the_correlation_of_the_closed_form(s
     number, distance = 20_000, (0.3, -0.2)
     a, b = spread
     fan = fan_of([(a, 0.0), (0.0, 0.0), (b, 0.0)], [(0.0, 0.0), (0.0, 0.0), (turn, 0.0)], shape)
-    drawn = []
-    for segment, off in ((0, distance[0]), (2, distance[1])):
+    powers = []
+    for segment, expected_beat in ((0, distance[0]), (2, distance[1])):
         middle = np.full(3, np.nan)
-        middle[segment] = -off
-        drawn.append(
+        middle[segment] = -expected_beat
+        powers.append(
             speckle_lines.draw_segment_bin_amplitudes(
                 fan, 0, middle, 0, 1, key=make_point_keys(1)[0], draws=np.arange(number)
             )[:, 0]
         )
-    one, other = drawn
-    for amplitude in drawn:
+    one, other = powers
+    for amplitude in powers:
         assert np.mean(np.abs(amplitude) ** 2) == pytest.approx(1.0, abs=5 / np.sqrt(number))
     lines = LinePairGradients(
         tuple(np.array([d]) for d in distance), tuple(np.array([s]) for s in spread),
@@ -180,8 +180,8 @@ def test_correlations_of_bins_are_the_sums_of_a_fine_grid_of_scatterers(shape):
     strength = (power * first**2).sum(axis=1) * (power * second**2).sum(axis=1)
     together = peak_bin_correlation(w, lines)
     np.testing.assert_allclose(together, shared / np.sqrt(strength), rtol=0, atol=2e-4)
-    alone = [peak_bin_correlation(w, lines.select(np.array([i])))[0] for i in range(n)]
-    np.testing.assert_array_equal(together, alone)
+    single = [peak_bin_correlation(w, lines.select(np.array([i])))[0] for i in range(n)]
+    np.testing.assert_array_equal(together, single)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4, 1.5])
@@ -202,22 +202,24 @@ def test_places_of_two_segments_wander_together_as_their_closed_form_says(turn, 
     moment = np.sqrt(share) * (amplitude @ (phases * lines).T)
     total = echo + np.sqrt(1 - share) * normal(number, 2)
     power = np.abs(total) ** 2
-    there = (power > level).all(axis=1)
-    wander = (b * (moment / total).real)[there]
+    both_detected = (power > level).all(axis=1)
+    wander = (b * (moment / total).real)[both_detected]
     footprints = speckle_lines.LineGradients(
-        np.tile([[b[0], 0.0], [0.0, 0.0], [b[1], 0.0]], (there.sum(), 1, 1)),
-        np.tile([[0.0, 0.0], [0.0, 0.0], [turn, 0.0]], (there.sum(), 1, 1)),
+        np.tile([[b[0], 0.0], [0.0, 0.0], [b[1], 0.0]], (both_detected.sum(), 1, 1)),
+        np.tile([[0.0, 0.0], [0.0, 0.0], [turn, 0.0]], (both_detected.sum(), 1, 1)),
     )
-    shares = np.full((2, there.sum()), share)
-    stated = speckle_lines.wander_covariance(footprints, (0, 2), power[there].T, shares)
+    shares = np.full((2, both_detected.sum()), share)
+    stated_covariance = speckle_lines.wander_covariance(
+        footprints, (0, 2), power[both_detected].T, shares
+    )
     product = wander[:, 0] * wander[:, 1]
     error = product.std() / np.sqrt(product.size)
-    assert abs(product.mean() - stated.mean()) < 5 * error
+    assert abs(product.mean() - stated_covariance.mean()) < 5 * error
     for k in range(2):  # of one segment alone, whatever the other's amplitude
-        own = power[:, k] > level
-        seen = b[k] * (moment[own, k] / total[own, k]).real
-        stated_alone = b[k] ** 2 * share / (2 * power[own, k])
-        assert (seen**2).mean() == pytest.approx(stated_alone.mean(), rel=0.02)
+        is_detected = power[:, k] > level
+        offsets = b[k] * (moment[is_detected, k] / total[is_detected, k]).real
+        stated_alone = b[k] ** 2 * share / (2 * power[is_detected, k])
+        assert (offsets**2).mean() == pytest.approx(stated_alone.mean(), rel=0.02)
 
 
 # Points
@@ -239,10 +241,10 @@ def test_places_wander_as_those_of_scatterers(case, rule, table_4_1):
     draws = 5000
     _, *truth = scatterers_reported(p, draws, seed=angle)
     for method in ("probabilities", "noise"):
-        got = flown(p, method, draws)
-        true = got["flags"][0, :, 0] == 1
+        cloud = flown(p, method, draws)
+        true = cloud["flags"][0, :, 0] == 1
         for name, drawn in zip(("range", "radial_velocity"), truth, strict=True):
-            points = got[f"{name}_interpolated"][0, true, 0]
+            points = cloud[f"{name}_interpolated"][0, true, 0]
             # Of middle halves, which few large excursions do not move.
             one, other = (np.subtract(*np.quantile(x, [0.84, 0.16])) for x in (points, drawn))
             assert one / other == pytest.approx(1.0, abs=0.12), (method, name)
@@ -261,13 +263,13 @@ def test_points_on_slopes_are_as_good_as_they_say(angle, rule, method, table_4_1
     Errors of velocity are stated some 17 % too large for any bin at 5 degrees.
     """
     p = slope(table_4_1, angle, ratio=10.0, **{PROCESSING + "detection": rule})
-    got = flown(p, method, 3000)
-    true = got["flags"][0, :, 0] == 1
+    points = flown(p, method, 3000)
+    true = points["flags"][0, :, 0] == 1
     most_of_velocity = 0.2 if (angle, rule) == (5, "any_bin") else 0.13
-    for name, most in (("range", 0.1), ("radial_velocity", most_of_velocity)):
-        error = (got[f"{name}_interpolated"] - got[f"true_{name}"])[0, true, 0]
-        scores = error / got[f"{name}_interpolated_standard_error"][0, true, 0]
-        assert scores.std() == pytest.approx(1.0, abs=most), name
+    for name, deviation_max in (("range", 0.1), ("radial_velocity", most_of_velocity)):
+        error = (points[f"{name}_interpolated"] - points[f"true_{name}"])[0, true, 0]
+        scores = error / points[f"{name}_interpolated_standard_error"][0, true, 0]
+        assert scores.std() == pytest.approx(1.0, abs=deviation_max), name
 
 
 def test_errors_of_whole_spectra_on_slopes_are_those_of_the_other_methods(table_4_1):
@@ -276,11 +278,11 @@ def test_errors_of_whole_spectra_on_slopes_are_those_of_the_other_methods(table_
     It takes the window's effect on the record back, and so sees the speckle in all bins.
     """
     p = slope(table_4_1, 10, ratio=10.0, **ESTIMATOR, **{PROCESSING + "detection": "any_bin"})
-    got = flown(p, "spectra", 500)
-    true = got["flags"][0, :, 0] == 1
+    points = flown(p, "spectra", 500)
+    true = points["flags"][0, :, 0] == 1
     for name in ("range", "radial_velocity"):
-        error = (got[f"{name}_interpolated"] - got[f"true_{name}"])[0, true, 0]
-        scores = error / got[f"{name}_interpolated_standard_error"][0, true, 0]
+        error = (points[f"{name}_interpolated"] - points[f"true_{name}"])[0, true, 0]
+        scores = error / points[f"{name}_interpolated_standard_error"][0, true, 0]
         assert scores.std() == pytest.approx(1.0, abs=0.1 + 5 / np.sqrt(2 * true.sum())), name
         assert abs(scores.mean()) < 0.25, name
 
@@ -293,16 +295,16 @@ def test_three_segments_of_a_shot_are_detected_together(table_4_1):
     error = np.sqrt(detected.mean() * (1 - detected.mean()) / draws)
     assert shots.detection_settings.echo_bins == "peak_bin"
     for method in ("probabilities", "noise"):
-        got = flown(p, method, draws)
-        flags = got["flags"][0, :, 0]
+        points = flown(p, method, draws)
+        flags = points["flags"][0, :, 0]
         confirmed = (flags > 0) & (flags & UNCONFIRMED_FLAG == 0)
         assert abs(confirmed.mean() - detected.mean()) < 4 * np.sqrt(2) * error
         unconfirmed = (flags > 0) & (flags & UNCONFIRMED_FLAG > 0)
-        pair = float(got["pd_shot"][0])
+        pair = float(points["pd_shot"][0])
         assert abs((confirmed | unconfirmed).mean() - pair) < 4 * np.sqrt(pair * (1 - pair) / draws)
-        assert unconfirmed.mean() < 0.3 * (pair * (1 - float(got["pd_doppler"][0])))
+        assert unconfirmed.mean() < 0.3 * (pair * (1 - float(points["pd_doppler"][0])))
         # Read as a far target, and not as a fast one.
-        assert np.nanmax(np.abs(got["range_interpolated"][0, :, 0] - 300.0)) < 1.0
+        assert np.nanmax(np.abs(points["range_interpolated"][0, :, 0] - 300.0)) < 1.0
 
 
 def shot_at_random(table_4_1, number):
@@ -333,17 +335,17 @@ def test_methods_agree_on_how_often_what_is_detected(number, table_4_1):
     for method in methods:
         if (several and method == "noise") or (method == "spectra" and number % 3):
             continue
-        got = flown(p, method, draws if method != "spectra" else 400)
-        flags = got["flags"][0, :, 0]
-        there = flags > 0
-        confirmed = there & (flags & UNCONFIRMED_FLAG == 0)
-        shares[method] = np.array([there.mean(), confirmed.mean(), (flags == 1).mean()])
-        pair, count = float(got["pd_shot"][0]), there.size
+        points = flown(p, method, draws if method != "spectra" else 400)
+        flags = points["flags"][0, :, 0]
+        is_point = flags > 0
+        confirmed = is_point & (flags & UNCONFIRMED_FLAG == 0)
+        shares[method] = np.array([is_point.mean(), confirmed.mean(), (flags == 1).mean()])
+        pair, count = float(points["pd_shot"][0]), is_point.size
         # any_bin has no closed form of both chirps; spectra find a neighbour of the peak as well.
         slack = 0.012 if p[PROCESSING + "detection"] == "any_bin" else 0.0
         slack = max(slack, 0.03) if method == "spectra" else slack
-        alarms = float(got["pfa_up"][0] + got["pfa_down"][0])
-        assert abs(there.mean() - pair) < 5 * np.sqrt(pair * (1 - pair) / count) + slack + alarms
+        alarms = float(points["pfa_up"][0] + points["pfa_down"][0])
+        assert abs(is_point.mean() - pair) < 5 * np.sqrt(pair * (1 - pair) / count) + slack + alarms
     one = shares["probabilities"]
     for method, other in shares.items():
         count = draws if method != "spectra" else 400

@@ -53,7 +53,7 @@ def test_an_up_beat_at_dc_is_a_real_number_in_flights(table_4_1):
     """The Doppler frequency takes the range beat away: pairs are detected as grids say."""
     p = hover(table_4_1, RANGE_BEAT / BIN_WIDTH + 0.3)
     for method in ("probabilities", "noise"):
-        got = flown(p, method, DRAWS)
-        pair = float(got["pd_shot"][0])
-        there = (got["flags"][0, :, 0] > 0).mean()
-        assert abs(there - pair) < 0.01 + 4 * np.sqrt(pair * (1 - pair) / DRAWS), method
+        points = flown(p, method, DRAWS)
+        pair = float(points["pd_shot"][0])
+        detected_share = (points["flags"][0, :, 0] > 0).mean()
+        assert abs(detected_share - pair) < 0.01 + 4 * np.sqrt(pair * (1 - pair) / DRAWS), method

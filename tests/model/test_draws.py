@@ -40,8 +40,8 @@ def test_detections_and_false_alarms_have_their_probabilities(table_4_1, method)
         parameters, DEFAULT_EFFECTS, keys=make_point_keys(6), batch_sizes=[DRAWS], method=method
     )
     for segment in ("up", "down", "doppler", "shot"):
-        found = counts[f"n_detected_{segment}"][:, 0]
-        assert _within_5_sigma(found, outputs[f"pd_{segment}"]).all(), segment
+        share = counts[f"n_detected_{segment}"][:, 0]
+        assert _within_5_sigma(share, outputs[f"pd_{segment}"]).all(), segment
     alarm = 1 - (1 - outputs["pfa_segment"]) * (1 - outputs["p_leakage_up"])
     assert ((alarm > 0.02) & (alarm < 0.98)).all()
     assert _within_5_sigma(counts["n_false_alarm_up"][:, 0], alarm).all()
@@ -88,7 +88,7 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
         "footprint.beamlets": 7,
     }
     chosen, draws = (*DEFAULT_EFFECTS, *effects), 1500
-    found = simulate_draws(
+    results = simulate_draws(
         parameters, chosen, keys=make_point_keys(6), batch_sizes=[1000, 500], method=method
     )
     names = ("pd_up", "pd_doppler", "pd_down", "pd_shot", "alarm")
@@ -105,10 +105,10 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
     for name, count in (counted | {"alarm": "n_false_alarm_up"}).items():
         p = table[name]
         sigma = np.sqrt((p * (1 - p)).sum(axis=1))
-        assert (abs(found[count].sum(axis=1) - p.sum(axis=1)) <= 5 * sigma + 3).all(), name
+        assert (abs(results[count].sum(axis=1) - p.sum(axis=1)) <= 5 * sigma + 3).all(), name
         assert ((p.mean(axis=1) > 0.02) & (p.mean(axis=1) < 0.98)).sum() >= 2, name
         if name in GRID_OUTPUTS:
-            np.testing.assert_allclose(found[name], p.mean(axis=1), rtol=1e-10)
+            np.testing.assert_allclose(results[name], p.mean(axis=1), rtol=1e-10)
 
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
@@ -119,11 +119,11 @@ def test_batches_split_the_same_draws(method, random, table_4_1):
     parameters |= {"footprint.beamlets": 7, "target.grazing_angle": np.linspace(0.3, 1.5, 6)}
     arguments = {"keys": make_point_keys(6), "method": method}
     effects = (*DEFAULT_EFFECTS, *random)
-    whole = simulate_draws(parameters, effects, batch_sizes=[300], **arguments)
+    results = simulate_draws(parameters, effects, batch_sizes=[300], **arguments)
     parts = simulate_draws(parameters, effects, batch_sizes=[100, 150, 50], **arguments)
     later = simulate_draws(parameters, effects, first_draw=100, batch_sizes=[150], **arguments)
     for name in DRAW_COUNT_OUTPUTS:
-        np.testing.assert_array_equal(parts[name].sum(axis=1), whole[name][:, 0])
+        np.testing.assert_array_equal(parts[name].sum(axis=1), results[name][:, 0])
         np.testing.assert_array_equal(parts[name][:, 1], later[name][:, 0])
     for name in (*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS):
-        np.testing.assert_array_equal(parts[name], whole[name])
+        np.testing.assert_array_equal(parts[name], results[name])

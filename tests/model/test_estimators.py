@@ -47,9 +47,9 @@ rectangular window stands at 1 / (2 pi 120) of it, and 1e-5 where that is taken 
 def test_a_tone_without_noise_is_placed_within_the_estimators_bias(name, shape, length):
     delta = np.linspace(-0.49, 0.49, 41)
     spectrum, peak, setting = spectra(shape, length, delta)
-    found = ESTIMATORS[name](spectrum, peak, setting)
-    assert found.shape == peak.shape and found.dtype == float
-    assert np.abs(found - BIN - delta).max() <= BIASES[name]
+    offset_estimate = ESTIMATORS[name](spectrum, peak, setting)
+    assert offset_estimate.shape == peak.shape and offset_estimate.dtype == float
+    assert np.abs(offset_estimate - BIN - delta).max() <= BIASES[name]
 
 
 @pytest.mark.parametrize("shift", [0, 1, 511])  # a peak in the last bin, the first, the middle
@@ -64,11 +64,11 @@ def test_a_complex_spectrum_has_no_ends(name, shift):
     noise = 0.1 * (rng.normal(size=size) + 1j * rng.normal(size=size))
     record = np.exp(2j * np.pi * (size - 1 + 0.3) * np.arange(size) / size) + noise
     spectrum = np.fft.fft(cached_window_samples(setting.window) * record)[None]
-    (whole,) = ESTIMATORS[name](np.roll(spectrum, 512, 1), np.array([511]), setting)
-    (found,) = ESTIMATORS[name](
+    (expected,) = ESTIMATORS[name](np.roll(spectrum, 512, 1), np.array([511]), setting)
+    (estimate,) = ESTIMATORS[name](
         np.roll(spectrum, shift, 1), np.array([(shift - 1) % size]), setting
     )
-    assert (found - shift) % size == pytest.approx((whole - 512) % size, abs=1e-6)
+    assert (estimate - shift) % size == pytest.approx((expected - 512) % size, abs=1e-6)
 
 
 def test_every_estimator_is_looked_at():
@@ -129,7 +129,7 @@ def test_the_standard_error_of_a_position_is_the_spread_of_estimates_in_noise(na
         fft_size=fft_size, sample_rate=1.0, window=window, noise_power=1.0, threshold=1.0,
         training=4, guard=1, rank=3, pfa=1e-6, complex_record=True,
     )  # fmt: skip
-    stated = position_error_at_sigma(name, window, fft_size)
+    stated_error = position_error_at_sigma(name, window, fft_size)
     peak, samples = fft_size // 5, np.arange(length)
     for delta in (0.0, 0.2, 0.45):
         phase = 2 * np.pi * ((peak + delta) * samples / fft_size + rng.random((number, 1)))
@@ -138,7 +138,7 @@ def test_the_standard_error_of_a_position_is_the_spread_of_estimates_in_noise(na
         spectrum = np.fft.fftshift(np.fft.fft(settings.taper * record, fft_size), axes=1)
         ratio = np.abs(spectrum[:, peak + middle]).mean() / (noise * np.sqrt(window.energy / 2))
         position = ESTIMATORS[name](spectrum, np.full(number, peak + middle), settings) - middle
-        error = np.interp(delta, np.linspace(0, 1, stated.size), stated) / ratio
+        error = np.interp(delta, np.linspace(0, 1, stated_error.size), stated_error) / ratio
         assert position.std() == pytest.approx(error, rel=0.09)
         assert abs(position.mean() - peak - delta) < 5 * error / np.sqrt(number) + 1e-5
 

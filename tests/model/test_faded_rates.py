@@ -50,12 +50,12 @@ def test_tabulated_rates_are_those_of_a_bin_at_each_speckle_power(level):
     for amplitude in np.exp(np.linspace(np.log(1e-4), np.log(level + 20), 300)):
         sums = np.zeros(N_SPECKLE_POWERS)
         add_rates_by_speckle_power(amplitude**2, 1.0, table, sums)
-        told = sums * TABULATED_SPECKLE_POWERS
+        rates_per_power = sums * TABULATED_SPECKLE_POWERS
         faded = amplitude * np.sqrt(TABULATED_SPECKLE_POWERS)
         expected = direct_rates(faded, level)
         sound = expected < CERTAIN
-        np.testing.assert_allclose(told[sound], expected[sound], rtol=2e-5, atol=1e-14)
-        assert (told[~sound] > 0.9 * CERTAIN).all()
+        np.testing.assert_allclose(rates_per_power[sound], expected[sound], rtol=2e-5, atol=1e-14)
+        assert (rates_per_power[~sound] > 0.9 * CERTAIN).all()
 
 
 @pytest.mark.parametrize("level", [1.5, 6.55, 35.0])
@@ -95,12 +95,12 @@ def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
     magnitude, exempt = run_at_random(seed, level)
     span = SpanArrays(magnitude.copy(), exempt, *np.zeros((2, magnitude.size + 8)))
     limits = leakage.LeakageLimits(1.0, level, 0.0, correlation)
-    told = leakage.false_peak_probability_of_bins_in_speckle(
+    mean_by_table = leakage.false_peak_probability_of_bins_in_speckle(
         np.int64(magnitude.size), limits, 0.0, span, table_of(level)
     )
 
     def log_rates(per_octave):
-        found = []
+        mean_leakage = []
         for k in range(per_octave * N_SPECKLE_OCTAVES + 1):
             root = np.sqrt(SPECKLE_POWER_MAX * 2.0 ** (-k / per_octave))
             chances = np.where(exempt, 0.0, -np.expm1(-direct_rates(root * magnitude, level)))
@@ -109,15 +109,15 @@ def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
                 chances, 0, chances.size, magnitude, exempt, 1.0 / root, level / root, correlation
             )
             rate = -np.log1p(-min(any_crossing_probability(chances, 0, chances.size), 1 - 1e-15))
-            found.append((np.log(max(rate, leakage.RATE_MIN)), brightest))
-        return np.array([f[0] for f in found]), found[0][1]
+            mean_leakage.append((np.log(max(rate, leakage.RATE_MIN)), brightest))
+        return np.array([f[0] for f in mean_leakage]), mean_leakage[0][1]
 
     of_octaves, brightest = log_rates(1)
     per_octave = 1
     if brightest > leakage.OCTAVE_STEP_LEAKAGE_MAX:
         per_octave, (of_octaves, _) = POWERS_PER_OCTAVE_MAX, log_rates(POWERS_PER_OCTAVE_MAX)
     expected = leakage.mean_leakage_in_speckle(of_octaves, per_octave)
-    assert told == pytest.approx(expected, rel=5e-5, abs=1e-13)
+    assert mean_by_table == pytest.approx(expected, rel=5e-5, abs=1e-13)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -132,7 +132,7 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     steady[2, 1:] = rng.uniform(-0.6, 0.6, bins - 1)
     bins_given_mode = echo_detection.BinsGivenMode(*steady, np.zeros(bins))
     run = echo_detection.EchoBins(steady[0], echo, 100)
-    told = echo_detection._mean_over_mode_power(bins_given_mode, run, False, 1024)
+    expected = echo_detection._mean_over_mode_power(bins_given_mode, run, False, 1024)
 
     ratio = steady[1] / steady[0]
     first = np.min(np.maximum(steady[1] - echo_detection._IMPOSSIBLE_BELOW_SIGMA, 0.0) / steady[0])
@@ -149,11 +149,11 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
         echo_detection._pd_and_miss_given_mode(bins_given_mode, one, run, False, 1024, np.inf, 0.0)
         for one in z
     ]
-    found, missed = (weight * np.array(of_nodes).T).sum(axis=1)
-    found += np.exp(-last * last)
-    whole = found + missed
+    pd, missed = (weight * np.array(of_nodes).T).sum(axis=1)
+    pd += np.exp(-last * last)
+    total = pd + missed
     # 7 nodes leave out up to 8 bins each: 56, if each were as large as may be neglected.
     relative = 30 * echo_detection._NEGLIGIBLE_FRACTION
-    assert told[0] == pytest.approx(found / whole, rel=relative, abs=0)
-    assert told[1] == pytest.approx(missed / whole, rel=relative, abs=0)
-    assert told[0] == pytest.approx(found / whole, abs=30 * echo_detection._NEGLIGIBLE_PROBABILITY)
+    assert expected[0] == pytest.approx(pd / total, rel=relative, abs=0)
+    assert expected[1] == pytest.approx(missed / total, rel=relative, abs=0)
+    assert expected[0] == pytest.approx(pd / total, abs=30 * echo_detection._NEGLIGIBLE_PROBABILITY)

@@ -63,7 +63,7 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
     if every_bin:  # a padded FFT has each bin looked at
         p["instrument.processing.fft_size"] = 2**19
         p["target.range"] = np.array([150.3])
-    told = evaluate(p, effects)["p_leakage_up"]
+    grid_leakage = evaluate(p, effects)["p_leakage_up"]
     ((_, shots),) = prepare_shots(p, effects)
     for i in range(shots.size):
         bins, magnitude = segment_spectrum(shots, i, 0)
@@ -87,7 +87,7 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
             raised.append(any_crossing_probability(chances, 0, chances.size))
         expected = np.trapezoid(np.array(raised) * np.exp(-powers), powers)
         if expected > 1e-7:
-            assert told[i] == pytest.approx(expected, rel=0.05)
+            assert grid_leakage[i] == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize("fades", [False, True])
@@ -104,8 +104,8 @@ def test_leakage_is_that_of_further_groups_in_drawn_spectra(table_4_1, window, p
         "instrument.receiver.noise_shape": "white",
     }  # fmt: skip
     effects = (*DEFAULT_EFFECTS, "fading") if fades else DEFAULT_EFFECTS
-    told = evaluate(p, effects)["p_leakage_up"]
+    expected = evaluate(p, effects)["p_leakage_up"]
     ((_, shots),) = prepare_shots(p, effects)
     for i in range(shots.size):
         drawn, deviation = drawn_leakage(shots, i, draws=4000, fades=fades)
-        assert told[i] == pytest.approx(drawn, abs=4 * deviation + 0.1 * drawn)
+        assert expected[i] == pytest.approx(drawn, abs=4 * deviation + 0.1 * drawn)

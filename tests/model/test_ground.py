@@ -16,14 +16,14 @@ def test_velocities_of_beamlets_by_vectors():
     """The instrument moves with v_r along the axis and v_t across it, towards the near side."""
     (across, along), _ = place_beamlets(37)
     divergence, radial, transverse = 0.2, 40.0, -70.0
-    *_, (found,) = plane_footprint(
+    *_, (velocities,) = plane_footprint(
         radial_velocity=[radial], transverse_velocity=[transverse], grazing_angle=np.ones(1),
         beam_divergence=np.array([divergence]), n_beamlets=37,
     )  # fmt: skip
     rays = np.stack([across * divergence / 4, along * divergence / 4, np.ones(37)])
     rays /= np.linalg.norm(rays, axis=0)
     velocity = np.array([0.0, transverse, radial])
-    assert found == pytest.approx(velocity @ rays - radial, abs=1e-11)
+    assert velocities == pytest.approx(velocity @ rays - radial, abs=1e-11)
 
 
 @pytest.mark.parametrize("grazing", [0.2, 1.2])
@@ -50,8 +50,8 @@ def test_all_sunlight_together_is_the_solar_constant():
                     points=[5e-7, 2e-6, 1e-5])[0]  # fmt: skip
 
     assert total(**one) == pytest.approx(1361.0, rel=1e-3)
-    away = {"distance": 2 * one["distance"], "elevation": np.pi / 6}
-    assert total(**away) == pytest.approx(1361.0 / 8, rel=1e-3)
+    at_two_au = {"distance": 2 * one["distance"], "elevation": np.pi / 6}
+    assert total(**at_two_au) == pytest.approx(1361.0 / 8, rel=1e-3)
     assert solar_irradiance(wavelength=1.55e-6, distance=0.0, elevation=1.0) == 0.0
     # the sun shines through its least opaque wavelengths there, a fifth brighter than a black body
     assert 0.2 < solar_irradiance(wavelength=1.55e-6, **one) * 1e-9 < 0.27

@@ -62,8 +62,10 @@ def drawn_alarms(shots, seed):
     factor = vectors * np.sqrt(np.maximum(values, 0))
     rng, level = np.random.default_rng(seed), float(shots.threshold[0] / shots.bin_noise_sigma[0])
     numbers = rng.normal(size=(DRAWS, places.size, 2)) @ [1, 1j] @ factor.T
-    alone, crosses = ((abs(numbers + s) >= level).any(axis=1).mean() for s in (0 * signal, signal))
-    return (crosses - alone) / (1 - alone)
+    without_signal, crosses = (
+        (abs(numbers + s) >= level).any(axis=1).mean() for s in (0 * signal, signal)
+    )
+    return (crosses - without_signal) / (1 - without_signal)
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.8, 0.95, 1.02, 1.2])

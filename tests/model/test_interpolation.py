@@ -103,8 +103,8 @@ def test_errors_under_noise_are_those_reported_and_no_less_than_the_bound(name, 
         noise = generator.standard_normal((DRAWS, 2 * LENGTH)).view(complex)
         tone = np.exp(2j * np.pi * (32 + delta) * np.arange(LENGTH) / LENGTH)
         clean = np.abs(tone @ basis)
-        found = np.abs((tone + sigma / np.sqrt(w.energy) * noise) @ basis)
-        placed = np.array([estimate_sub_bin_offset(*m, tables) for m in found])
+        magnitudes = np.abs((tone + sigma / np.sqrt(w.energy) * noise) @ basis)
+        placed = np.array([estimate_sub_bin_offset(*m, tables) for m in magnitudes])
         expected = sub_bin_standard_error(delta, clean[1] / sigma, tables)
         spread = np.sqrt(np.mean((placed - delta) ** 2))
         assert spread == pytest.approx(expected, rel=0.025 + 1 / ratio)
@@ -204,11 +204,13 @@ def test_places_of_late_echoes_are_those_of_their_lines(name, length, size, shar
         assert read + late.shift == pytest.approx(place, abs=2e-3)
         sigma = abs(bins[1]) / ratio / np.sqrt((taper**2).sum())
         noisy = np.abs(bins + sigma * (noise[0] + 1j * noise[1]) @ turns)
-        found = np.array([estimate_sub_bin_offset(*row, tables) for row in noisy])
-        found = found + late_echo_correction(found, np.full(draws, missing), shape, size).shift
-        stated = sub_bin_standard_error(read, ratio, tables) * late.error_factor
-        assert found.std() == pytest.approx(float(stated), rel=0.15)
-        assert found.mean() == pytest.approx(place, abs=0.2 * float(stated) + 2e-3)
+        estimates = np.array([estimate_sub_bin_offset(*row, tables) for row in noisy])
+        estimates = (
+            estimates + late_echo_correction(estimates, np.full(draws, missing), shape, size).shift
+        )
+        stated_error = sub_bin_standard_error(read, ratio, tables) * late.error_factor
+        assert estimates.std() == pytest.approx(float(stated_error), rel=0.15)
+        assert estimates.mean() == pytest.approx(place, abs=0.2 * float(stated_error) + 2e-3)
 
 
 @pytest.mark.parametrize("share", [0.31, 0.5, 0.7])
@@ -226,10 +228,12 @@ def test_half_a_record_and_less_tells_a_place_with_a_rectangular_window(share, p
     read = np.array([estimate_sub_bin_offset(*row, tables) for row in noisy])
     late = late_echo_correction(read, np.full(draws, missing), shape, size)
     error = np.sqrt(np.square(np.abs(read + late.shift) - place).mean())
-    stated = np.median(sub_bin_standard_error(np.median(read), ratio, tables) * late.error_factor)
-    assert stated < 0.03
+    stated_error = np.median(
+        sub_bin_standard_error(np.median(read), ratio, tables) * late.error_factor
+    )
+    assert stated_error < 0.03
     floor = 0.06 if share > 0.6 else 0.01  # next to a bin, where reads hardly rise with the place
-    assert 0.85 * stated < error < 1.15 * stated + (floor if place < 0.1 else 0.0)
+    assert 0.85 * stated_error < error < 1.15 * stated_error + (floor if place < 0.1 else 0.0)
 
 
 def test_whole_echoes_stay_as_they_are():

@@ -42,8 +42,8 @@ def test_no_success_and_nothing_but_success_in_very_many_trials():
     n = np.array([1.0, 1e6, 1e12])
     unseen = -np.expm1(np.log(0.025) / n)
     for k, ends in ((0 * n, (0, unseen)), (n, (1 - unseen, 1))):
-        found = clopper_pearson_interval(successes=k, trials=n, confidence=CONFIDENCE)
-        for end, expected in zip(found, ends, strict=True):
+        bounds = clopper_pearson_interval(successes=k, trials=n, confidence=CONFIDENCE)
+        for end, expected in zip(bounds, ends, strict=True):
             np.testing.assert_allclose(end, expected + 0 * n, rtol=1e-12)
 
 
@@ -52,8 +52,8 @@ def test_wilsons_ends_are_as_likely_as_their_own_variance_says(n):
     k = np.unique([0, 1, n // 3, n - 1, n])
     low, high = wilson_interval(successes=k, trials=n, confidence=CONFIDENCE)
     for end in (low, high):
-        apart = (k / n - end) ** 2 - Z**2 * end * (1 - end) / n
-        np.testing.assert_allclose(apart, 0, atol=1e-14)
+        residual = (k / n - end) ** 2 - Z**2 * end * (1 - end) / n
+        np.testing.assert_allclose(residual, 0, atol=1e-14)
     assert (low < high).all() and low[0] == 0 and high[-1] == 1
     assert high[0] == pytest.approx(Z**2 / (n + Z**2), rel=1e-12)
 
@@ -72,8 +72,8 @@ def test_counts_are_as_sure_as_promised(name, n):
     k = np.arange(n + 1)
     interval = COUNT_INTERVALS[name](successes=k, trials=n, confidence=CONFIDENCE)
     for p in CHANCES:
-        found, step = coverage(k / n, interval, stats.binom.pmf(k, n, p), p)
-        assert found >= CONFIDENCE - (step if name == "wilson" else 1e-12), p
+        coverage_share, step = coverage(k / n, interval, stats.binom.pmf(k, n, p), p)
+        assert coverage_share >= CONFIDENCE - (step if name == "wilson" else 1e-12), p
 
 
 def test_on_the_average_wilsons_own_interval_is_right_and_clopper_and_pearsons_wider():
@@ -99,8 +99,8 @@ def test_means_of_two_values_are_as_sure_as_promised(pair, n):
         mean=mean, variance=variance, n_values=n, confidence=CONFIDENCE
     )
     for p in CHANCES:
-        found, step = coverage(mean, interval, stats.binom.pmf(k, n, p), u + (v - u) * p)
-        assert found >= CONFIDENCE - step, p
+        coverage_share, step = coverage(mean, interval, stats.binom.pmf(k, n, p), u + (v - u) * p)
+        assert coverage_share >= CONFIDENCE - step, p
 
 
 AMPLITUDE = np.linspace(0, 20, 20_001)
@@ -129,19 +129,19 @@ def test_means_of_skewed_values_are_as_sure_as_promised(values, n):
         interval = bounded_mean_interval(
             mean=mean, variance=drawn.var(axis=1, ddof=1), n_values=n, confidence=CONFIDENCE
         )
-        found = (abs(mean - pd) <= interval_half_width(mean, interval)).mean()
+        coverage_share = (abs(mean - pd) <= interval_half_width(mean, interval)).mean()
         sigma = np.sqrt(CONFIDENCE * (1 - CONFIDENCE) / trials)
-        assert found >= CONFIDENCE - 5 * sigma, pd
+        assert coverage_share >= CONFIDENCE - 5 * sigma, pd
 
 
 def test_draws_all_alike_promise_no_more_than_so_many_draws_can():
     n = np.array([1, 100, 10_000])
-    for mean, room in ((0.0, 1.0), (1.0, 1.0), (0.3, 0.7)):
+    for mean, half_width_max in ((0.0, 1.0), (1.0, 1.0), (0.3, 0.7)):
         interval = bounded_mean_interval(mean=mean, variance=0.0, n_values=n, confidence=CONFIDENCE)
         width = interval_half_width(mean, interval)
-        np.testing.assert_allclose(width, np.minimum(Z**2 / n, 1) * room, rtol=1e-12)
+        np.testing.assert_allclose(width, np.minimum(Z**2 / n, 1) * half_width_max, rtol=1e-12)
         # What 19 of 20 samples of so many miss has a probability of 3 / n, and adds as much.
-        assert (width >= room * -np.expm1(np.log(0.05) / n)).all()
+        assert (width >= half_width_max * -np.expm1(np.log(0.05) / n)).all()
 
 
 def test_with_many_draws_only_their_variance_counts():

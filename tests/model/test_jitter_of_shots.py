@@ -42,20 +42,20 @@ def _alike(values, deviation):
 
 def test_a_slanting_beam_is_off_by_a_normal_angle_in_its_plane():
     """cos(angle from nadir) = height / range; each of four beams shows another component."""
-    seen = _seen(cone_directions(4, half_angle=np.pi / 4, azimuth=0.4))
-    off = (np.arccos(1000.0 / seen.range) - np.pi / 4).reshape(-1, 4)
-    assert _alike(off.ravel(), SIGMA)
-    correlation = np.corrcoef(off.T)[np.triu_indices(4, 1)]
-    assert (np.abs(correlation) < 5 / np.sqrt(len(off))).all()
+    shot_eyepoints = _seen(cone_directions(4, half_angle=np.pi / 4, azimuth=0.4))
+    errors = (np.arccos(1000.0 / shot_eyepoints.range) - np.pi / 4).reshape(-1, 4)
+    assert _alike(errors.ravel(), SIGMA)
+    correlation = np.corrcoef(errors.T)[np.triu_indices(4, 1)]
+    assert (np.abs(correlation) < 5 / np.sqrt(len(errors))).all()
 
 
 def test_the_instrument_knows_nothing_of_it():
-    plain, jittered = (
+    steady_eyepoints, jittered = (
         _seen(cone_directions(3, half_angle=0.4), jitter) for jitter in (None, JITTER)
     )
     for name in ("time", "beam", "cycle", "position", "velocity", "direction"):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(jittered, name))
-    assert (plain.range != jittered.range).mean() > 0.99
+        np.testing.assert_array_equal(getattr(steady_eyepoints, name), getattr(jittered, name))
+    assert (steady_eyepoints.range != jittered.range).mean() > 0.99
 
 
 def test_the_turn_has_three_independent_normal_angles_about_the_bodys_axes():
@@ -89,13 +89,13 @@ def test_the_seed_decides_on_the_angles():
     assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(2000)
 
 
-@pytest.mark.parametrize("some", [[33, 7, 20], [5]])
-def test_any_stretch_of_a_flight_is_the_same_bit_for_bit(some):
+@pytest.mark.parametrize("shot_index", [[33, 7, 20], [5]])
+def test_any_stretch_of_a_flight_is_the_same_bit_for_bit(shot_index):
     path = straight_flight(velocity=(1.0, 2.0, -50.0), attitude=NadirAttitude(0.3))
     scanner = BeamCycle(corner_directions(np.radians(22.5)), [[0, 1, 2, 3]], 4.0)
-    whole, part = (
+    all_eyepoints, part = (
         observe_shots(path, scanner=scanner, index=index, jitter=JITTER)
-        for index in (np.arange(36), np.array(some))
+        for index in (np.arange(36), np.array(shot_index))
     )
-    for all_shots, alone in zip(whole[:-1], part[:-1], strict=True):
-        np.testing.assert_array_equal(all_shots[some], alone)
+    for all_shots, expected in zip(all_eyepoints[:-1], part[:-1], strict=True):
+        np.testing.assert_array_equal(all_shots[shot_index], expected)

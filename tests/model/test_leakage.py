@@ -49,8 +49,8 @@ def compare(shots):
     listed, every = (
         list_bin_groups(shots, groups_max=1, every_bin=k).leakage[:, 1] for k in (False, True)
     )
-    apart = np.nanmax(np.abs(listed - every) / np.maximum(every, 1e-20), initial=0.0)
-    error["leakage"] = max(error["leakage"], apart)
+    difference = np.nanmax(np.abs(listed - every) / np.maximum(every, 1e-20), initial=0.0)
+    error["leakage"] = max(error["leakage"], difference)
     return SegmentResults(**error), slow
 
 
@@ -90,10 +90,10 @@ def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(nam
             bundle, clearance, FAR_LINE_LOG_ACCURACY, layout, field
         )
         bound = far_line_weight(total, n_sources, layout, field.far_equivalent_lines)
-        away = np.geomspace(layout.clearance_bins + 1, 2000, 24) + generator.uniform(0, 1)
-        y = half + away[:, None] - places
+        distances = np.geomspace(layout.clearance_bins + 1, 2000, 24) + generator.uniform(0, 1)
+        y = half + distances[:, None] - places
         kernel = direct_transform(shape, y.ravel()).reshape(y.shape) * np.exp(1j * np.pi * y)
-        index = np.searchsorted(tabulated.distance, away - 1.5, "right") - 1
+        index = np.searchsorted(tabulated.distance, distances - 1.5, "right") - 1
         envelope = tabulated.magnitude[index]
         assert (abs(kernel @ s) <= bound * envelope * (1 + 1e-9) + 1e-12 * total).all()
         assert bound <= total
@@ -119,17 +119,17 @@ def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     parameters["target.radial_velocity"] = generator.uniform(-470.0, 470.0, 300)
     ((_, shots),) = prepare_shots(parameters)
     assert shots.images.are_summed
-    whole = evaluate_segments(shots)
-    some = evaluate_segments(
+    spectra = evaluate_segments(shots)
+    in_part = evaluate_segments(
         replace(
             shots, tolerances=shots.tolerances._replace(leakage_probability=np.asarray(allowed))
         )
     )
-    missed = whole.leakage - some.leakage
-    assert (missed <= allowed).all() and (missed >= -1e-6 * whole.leakage).all()
+    missed = spectra.leakage - in_part.leakage
+    assert (missed <= allowed).all() and (missed >= -1e-6 * spectra.leakage).all()
     for name in ("pd", "miss", "magnitude", "frequency", "n_exempt"):
         np.testing.assert_allclose(
-            getattr(some, name), getattr(whole, name), rtol=1e-9, atol=1e-300
+            getattr(in_part, name), getattr(spectra, name), rtol=1e-9, atol=1e-300
         )
     assert (missed > 0).any()
 
@@ -178,7 +178,7 @@ RANGE_BIN, DOPPLER_BIN = 149_896_229 * 600e6 / 2e12, 1550e-9 * 600e6 / 299_792_4
 """Offset [m] and change of 2 v_r / c that move a line by one bin, times the FFT's size."""
 
 
-def drawn_bundles(table_4_1, seed, fft_size, apart):
+def drawn_bundles(table_4_1, seed, fft_size, spread):
     """Forty shots of two to three clusters of lines, ``apart`` bins from the beam's centre."""
     rng = np.random.default_rng((61, seed))
     shots, beamlets = 40, int(rng.choice([1, 2, 5, 19]))
@@ -191,9 +191,9 @@ def drawn_bundles(table_4_1, seed, fft_size, apart):
         leakage_floor=1e-12,
     )
     ranges = 10 ** rng.uniform(0.0, 3.8, shots)
-    clusters = rng.uniform(-apart, apart, (2, shots, 3))
-    which = rng.integers(3, size=(shots, beamlets))
-    bins, doppler = (np.take_along_axis(c, which, axis=1) for c in clusters)
+    clusters = rng.uniform(-spread, spread, (2, shots, 3))
+    cluster_index = rng.integers(3, size=(shots, beamlets))
+    bins, doppler = (np.take_along_axis(c, cluster_index, axis=1) for c in clusters)
     bins += rng.normal(size=bins.shape) * rng.choice([1e-6, 0.1, 2.0])
     parameters |= {
         "target.range": ranges,
@@ -214,8 +214,8 @@ def drawn_bundles(table_4_1, seed, fft_size, apart):
 )
 def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_size, image):
     """As wide as the band, or all past DC or Nyquist, where only images make spectra even."""
-    for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
-        shots = drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
+    for seed, spread in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
+        shots = drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, spread)
         held(replace(shots, images=shots.images._replace(are_summed=image)))
 
 
@@ -224,11 +224,11 @@ def test_lines_further_apart_than_there_are_bins_fold_into_the_spectrum(table_4_
     for seed in range(6):
         shots = drawn_bundles(table_4_1, 1000 + seed, fft_size, 2.0 * fft_size)
         for segment in np.flatnonzero(shots.has_segment):
-            _, found = segment_spectrum(shots, seed, int(segment))
+            _, spectrum = segment_spectrum(shots, seed, int(segment))
             exact = time_domain_truth.time_domain_spectrum(
                 shots, seed, int(segment), with_range_walk=False
             )
-            assert np.abs(found - exact).max() < 1e-8 * exact.max()
+            assert np.abs(spectrum - exact).max() < 1e-8 * exact.max()
 
 
 @pytest.mark.parametrize("place", [0.0, 300e6])
@@ -260,19 +260,21 @@ def test_bins_of_the_run_are_those_of_the_record(table_4_1, window, phases):
             | {"target.range": r, "target.grazing_angle": grazing, "target.radial_velocity": v}
         )
         for segment in range(3):
-            low, found = detected_window(shots, segment)
+            low, magnitudes = detected_window(shots, segment)
             exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
-            assert 5 < found.size < 4097
-            error = magnitude_error(shots, found, exact[low : low + found.size], exact.max())
+            assert 5 < magnitudes.size < 4097
+            error = magnitude_error(
+                shots, magnitudes, exact[low : low + magnitudes.size], exact.max()
+            )
             assert error < (1e-9 if shots.footprint.adds_powers else 1e-10)
 
 
-@pytest.mark.parametrize("apart", [0.5, 50.0])
-def test_groups_are_those_of_every_bin(table_4_1, apart):
+@pytest.mark.parametrize("spread", [0.5, 50.0])
+def test_groups_are_those_of_every_bin(table_4_1, spread):
     """Of the wide run that looks at each bin, the fast one leaves out no group and no neighbour."""
-    found = 0
+    n_groups = 0
     for seed in range(5):
-        shots = drawn_bundles(table_4_1, 900 + seed, 16384, apart)
+        shots = drawn_bundles(table_4_1, 900 + seed, 16384, spread)
         fast, slow = (
             list_bin_groups(shots, groups_max=6),
             list_bin_groups(shots, groups_max=6, every_bin=True),
@@ -280,8 +282,8 @@ def test_groups_are_those_of_every_bin(table_4_1, apart):
         for name in ("strongest_bin", "first_bin", "last_bin", "n_exempt"):
             np.testing.assert_array_equal(getattr(fast, name), getattr(slow, name))
         np.testing.assert_allclose(fast.neighbour_magnitudes, slow.neighbour_magnitudes, rtol=1e-7)
-        found += (slow.strongest_bin >= 0).sum(axis=-1).max()
-    assert found >= 5 * (2 if apart > 1 else 1)
+        n_groups += (slow.strongest_bin >= 0).sum(axis=-1).max()
+    assert n_groups >= 5 * (2 if spread > 1 else 1)
 
 
 @pytest.mark.parametrize("beta", [0.3, 2.0, 4.5, 6.55, 10.0, 25.0, 29.9])
@@ -291,11 +293,11 @@ def test_added_crossings_have_their_digits(beta):
     x = y * np.array([1e-30, 1e-12, 1e-6, 1e-3, 0.03, 0.1, 0.2, 0.35, 0.45])
     series, out = np.zeros(SERIES_TERMS_MAX), np.empty(32)
     fill_crossing_series(beta, series)
-    room = np.zeros(32)
-    room[: x.size] = x
-    fill_added_crossings(room, x.size, beta, series, out)
+    scratch = np.zeros(32)
+    scratch[: x.size] = x
+    fill_added_crossings(scratch, x.size, beta, series, out)
     with mpmath.workdps(40):
-        for value, got in zip(x, out, strict=False):
+        for value, actual in zip(x, out, strict=False):
             xm, ym = mpmath.mpf(value), mpmath.mpf(y)
             term, below, total, n = mpmath.e ** (-xm), mpmath.e ** (-ym), mpmath.mpf(0), 0
             power = below
@@ -309,7 +311,9 @@ def test_added_crossings_have_their_digits(beta):
                 if n > 20 and term < total * mpmath.mpf(10) ** -38:
                     break
             exact = total / (1 - below)
-            assert abs(got / float(exact) - 1) < 2e-14 + 3e-16 * y  # e^-y itself is good to y eps
+            assert (
+                abs(actual / float(exact) - 1) < 2e-14 + 3e-16 * y
+            )  # e^-y itself is good to y eps
 
 
 def test_many_small_chances_keep_their_digits():

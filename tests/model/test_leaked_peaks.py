@@ -73,7 +73,7 @@ def _allowed(n, m):
 
 def _flown(table_4_1, method, scene, *, draws=0, first=0):
     """Points of a shot on the edge of a dim roof over bright ground, or on the ground alone."""
-    changes, further = SCENES[scene]
+    changes, further_options = SCENES[scene]
     changes = dict(changes)
     height, effects = changes.pop("height", HEIGHT), changes.pop("effects", DEFAULT_EFFECTS)
     roof = level_plate(x=(0.0, 30.0), surface=1, height=ROOF)
@@ -83,9 +83,9 @@ def _flown(table_4_1, method, scene, *, draws=0, first=0):
     table = scene_parameters(table_4_1, **law, **changes)
     speckle = "developed" if "fading" in effects else "none"
     starts = {"probabilities": 0, "noise": 10**6, "spectra": 2 * 10**6}
-    got = simulate_cloud(
+    cloud = simulate_cloud(
         observe_shots(path, bodies=bodies, number=7),
-        parameters=PARAMETER_DEFAULTS | table | further | {"footprint.speckle": speckle},
+        parameters=PARAMETER_DEFAULTS | table | further_options | {"footprint.speckle": speckle},
         surfaces=[SurfaceMaterial("ground", 0.5), SurfaceMaterial("roof", 0.005)],
         keys=make_point_keys(1),
         effects=effects,
@@ -93,11 +93,11 @@ def _flown(table_4_1, method, scene, *, draws=0, first=0):
         draws=draws or NUMBER[method],
         first_draw=starts[method] + first,
     )
-    return got, height
+    return cloud, height
 
 
 @pytest.fixture(scope="module")
-def drawn(table_4_1):
+def drawn_distances(table_4_1):
     """Distances and false points of the draws of a scene by a method, drawn once."""
     return lru_cache(partial(_distances, table_4_1))
 
@@ -108,11 +108,11 @@ def _distances(table_4_1, method, scene):
     0 where all points are the echo's own, whole half bins elsewhere, as the ranges of up and down
     peaks are. Draws are independent of each other.
     """
-    got, height = _flown(table_4_1, method, scene)
-    found, there = got["range"][0], got["flags"][0] > 0
-    apart = np.minimum(np.abs(found - height), np.abs(found - height + ROOF)) / RANGE_BIN
-    apart = np.where(there & (apart > NEAR), np.rint(2 * apart) / 2, 0.0)
-    return apart.max(axis=1), (got["flags"][0] & FALSE_ALARM_FLAG > 0).any(axis=1)
+    cloud, height = _flown(table_4_1, method, scene)
+    distances, is_point = cloud["range"][0], cloud["flags"][0] > 0
+    distance = np.minimum(np.abs(distances - height), np.abs(distances - height + ROOF)) / RANGE_BIN
+    distance = np.where(is_point & (distance > NEAR), np.rint(2 * distance) / 2, 0.0)
+    return distance.max(axis=1), (cloud["flags"][0] & FALSE_ALARM_FLAG > 0).any(axis=1)
 
 
 def _difference(one, other):
@@ -123,8 +123,11 @@ def _difference(one, other):
 
 @pytest.mark.parametrize("scene", list(SCENES))
 @pytest.mark.parametrize("method", ["noise", "spectra"])
-def test_points_are_as_far_from_the_echoes_as_in_drawn_noise(scene, method, drawn):
-    (by_chance, false), (in_noise, noisy) = drawn("probabilities", scene), drawn(method, scene)
+def test_points_are_as_far_from_the_echoes_as_in_drawn_noise(scene, method, drawn_distances):
+    (by_chance, false), (in_noise, noisy) = (
+        drawn_distances("probabilities", scene),
+        drawn_distances(method, scene),
+    )
     assert false.mean() > FALSE_SHARE
     allowed = _allowed(by_chance.size, in_noise.size)
     assert _difference(by_chance, in_noise) < allowed
@@ -133,12 +136,12 @@ def test_points_are_as_far_from_the_echoes_as_in_drawn_noise(scene, method, draw
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
 def test_any_split_of_draws_has_the_same_false_peaks(method, table_4_1):
-    whole, _ = _flown(table_4_1, method, "the same in speckle", draws=60)
-    assert (whole["flags"] & FALSE_ALARM_FLAG > 0).any()
+    at_once, _ = _flown(table_4_1, method, "the same in speckle", draws=60)
+    assert (at_once["flags"] & FALSE_ALARM_FLAG > 0).any()
     for first, number in ((0, 7), (7, 53)):
         part, _ = _flown(table_4_1, method, "the same in speckle", draws=number, first=first)
         for name in outputs.POINT_VARIABLES:
-            assert part[name].tobytes() == whole[name][:, first : first + number].tobytes(), name
+            assert part[name].tobytes() == at_once[name][:, first : first + number].tobytes(), name
 
 
 # One segment
@@ -160,8 +163,8 @@ def _leakage_by_quadrature(amplitudes, level):
     log_power = edges[:-1, None] + half * (node + 1)
     mean = 0.0
     for t, w in zip(log_power.ravel(), (half * weight).ravel(), strict=True):
-        whole = sum(n * _rate(a * math.exp(0.5 * t), level) for a, n in amplitudes.items())
-        mean -= w * math.exp(t - math.exp(t)) * math.expm1(-whole)
+        total_rate = sum(n * _rate(a * math.exp(0.5 * t), level) for a, n in amplitudes.items())
+        mean -= w * math.exp(t - math.exp(t)) * math.expm1(-total_rate)
     return mean
 
 
@@ -205,17 +208,17 @@ def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
     assert means[1, 2] == pytest.approx(_leakage_by_quadrature(signal, level), **within)
     assert np.count_nonzero(means) == 1
     # Echoes fade each for itself.
-    apart = leaks._replace(group=np.arange(bins.size) % 2).mean_leakage()[1, 2]
+    separate = leaks._replace(group=np.arange(bins.size) % 2).mean_leakage()[1, 2]
     halves = [dict(zip(*np.unique(half, return_counts=True), strict=True))
               for half in (bins[::2], bins[1::2])]  # fmt: skip
     stays = [1 - _leakage_by_quadrature(half, level) for half in halves]
-    assert apart == pytest.approx(1 - stays[0] * stays[1], **within)
+    assert separate == pytest.approx(1 - stays[0] * stays[1], **within)
 
 
-def _raised(leaks, level, draws, *, fading=None, room=3):
+def _raised(leaks, level, draws, *, fading=None, size=3):
     """Bins and sizes of the peaks raised in the up-chirp, a list for each draw."""
-    found = []
-    bins, ratios = np.empty(room, np.int64), np.empty(room)
+    peak_bins = []
+    bins, ratios = np.empty(size, np.int64), np.empty(size)
     (key,), tables = make_point_keys(1), interpolator(get_window("hamming", SIZE), SIZE)
     for d in range(draws):
         ratios[:] = 0.0
@@ -223,8 +226,8 @@ def _raised(leaks, level, draws, *, fading=None, room=3):
         number = leaked.draw_leaked_peaks(
             DrawAddress(*key, d), 0, 0, leaks, factors, level, 1, tables, bins, ratios
         )
-        found.append((bins[:number].copy(), ratios[:number].copy()))
-    return found
+        peak_bins.append((bins[:number].copy(), ratios[:number].copy()))
+    return peak_bins
 
 
 def _largest(bins, magnitudes, level):
@@ -234,9 +237,13 @@ def _largest(bins, magnitudes, level):
     return np.where(size >= level, bins[best], -1), np.where(size >= level, size, 0.0)
 
 
-def _one_shot(table_4_1, effects=DEFAULT_EFFECTS, further=(), **changes):
+def _one_shot(table_4_1, effects=DEFAULT_EFFECTS, further_parameters=(), **changes):
     law = {"fft_size": SIZE, "beamlets": 1, "radial_velocity": 20.0, "window": "hamming"}
-    parameters = PARAMETER_DEFAULTS | table_4_1(**law | {"range": 400.0} | changes) | dict(further)
+    parameters = (
+        PARAMETER_DEFAULTS
+        | table_4_1(**law | {"range": 400.0} | changes)
+        | dict(further_parameters)
+    )
     return prepare_single_category(parameters, effects)
 
 
@@ -247,8 +254,8 @@ def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1
     effects = (*DEFAULT_EFFECTS, "fading") if fades else DEFAULT_EFFECTS
     speckle = {"footprint.speckle": "developed" if fades else "none"}
     shots = _one_shot(table_4_1, effects, speckle, phases="incoherent", power=420.0)
-    found = list_bin_groups(shots)
-    ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
+    groups = list_bin_groups(shots)
+    ((_, leaks),) = leaked.iter_leakage_bins(shots, groups, np.zeros(1, np.int64))
     level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
     stretch = slice(leaks.bins_begin[0, 0], leaks.bins_end[0, 0])
     bins, signal = leaks.bins[stretch], np.exp(leaks.log_amplitude[stretch])
@@ -259,27 +266,31 @@ def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1
     places, sizes = _largest(bins, np.abs(np.sqrt(power)[:, None] * signal + noise), level)
     factors = np.sqrt(np.random.default_rng(9).exponential(size=draws)) if fades else None
     peaks = _raised(leaks, level, draws, fading=factors)
-    own = np.array([b[0] if b.size else -1 for b, _ in peaks])
+    first_bins = np.array([b[0] if b.size else -1 for b, _ in peaks])
     own_size = np.array([r[0] if r.size else 0.0 for _, r in peaks])
     share = (places >= 0).mean()
     assert 0.1 < share < 0.9
-    assert _difference(places, own) < _allowed(draws, draws)
+    assert _difference(places, first_bins) < _allowed(draws, draws)
     assert _difference(sizes, own_size) < _allowed(draws, draws)
     # The mean over speckle, or the closed form of a steady echo, is their share.
-    told = leaks.mean_leakage()[0, 0] if fades else found.leakage[0, 0]
-    assert share == pytest.approx(told, abs=5 * math.sqrt(0.25 / draws))
+    expected = leaks.mean_leakage()[0, 0] if fades else groups.leakage[0, 0]
+    assert share == pytest.approx(expected, abs=5 * math.sqrt(0.25 / draws))
 
 
 def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypatch):
     """Records of the line at a uniform phase, in noise; the echo itself leaks nothing."""
     monkeypatch.setattr(permanent_line, "MASK_THRESHOLD_FRACTION", 0.8)  # for many alarms
     draws, random = 4000, np.random.default_rng(4)
-    further = {LEAK_LENGTH_PATH: 40.0, ISOLATION_PATH: 1e5}
+    further_parameters = {LEAK_LENGTH_PATH: 40.0, ISOLATION_PATH: 1e5}
     shots = _one_shot(
-        table_4_1, (*DEFAULT_EFFECTS, "circulator_leak"), further, range=1500.0, power=1.0
+        table_4_1,
+        (*DEFAULT_EFFECTS, "circulator_leak"),
+        further_parameters,
+        range=1500.0,
+        power=1.0,
     )
-    found = list_bin_groups(shots)
-    ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
+    groups = list_bin_groups(shots)
+    ((_, leaks),) = leaked.iter_leakage_bins(shots, groups, np.zeros(1, np.int64))
     level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
     scale, line = permanent_line.line_of_point(shots, 0, 0)
     bins = leaks.permanent_line_bins[
@@ -290,9 +301,9 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     noise = random.standard_normal((draws, 2 * bins.size)).view(complex)
     places, _ = _largest(bins, np.abs(one * turn + other * turn.conj() + noise), level)
     peaks = _raised(leaks, level, draws)
-    own = np.array([b[0] if b.size else -1 for b, _ in peaks])
+    first_bins = np.array([b[0] if b.size else -1 for b, _ in peaks])
     assert (places >= 0).mean() > 0.1
-    assert _difference(places, own) < _allowed(draws, draws)
+    assert _difference(places, first_bins) < _allowed(draws, draws)
     # Noise alone raises nothing where the line is masked.
     hidden = leaks.no_noise_peak_bins[
         leaks.no_noise_peak_begin[0, 0] : leaks.no_noise_peak_end[0, 0]
@@ -307,30 +318,34 @@ def _faint_shots(table_4_1, power, record="real"):
         fft_size=SIZE, beamlets=1, radial_velocity=20.0, window="hamming", power=power,
         phases="incoherent", range=np.linspace(300.0, 500.0, 7),
     )  # fmt: skip
-    further = {"footprint.speckle": "developed", RECORD: record}
-    return prepare_single_category(PARAMETER_DEFAULTS | law | further, (*DEFAULT_EFFECTS, "fading"))
+    further_parameters = {"footprint.speckle": "developed", RECORD: record}
+    return prepare_single_category(
+        PARAMETER_DEFAULTS | law | further_parameters, (*DEFAULT_EFFECTS, "fading")
+    )
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, table_4_1):
     shots = _faint_shots(table_4_1, 200.0, record)
-    found, listed = leaked.find_groups_and_leakage_bins(shots, 4)
-    apart = list_bin_groups(shots, with_leakage=False)
-    for name, values in found._asdict().items():
+    groups, listed = leaked.find_groups_and_leakage_bins(shots, 4)
+    groups_without = list_bin_groups(shots, with_leakage=False)
+    for name, values in groups._asdict().items():
         if name != "leakage":
-            np.testing.assert_allclose(values, getattr(apart, name), rtol=1e-12, err_msg=name)
+            np.testing.assert_allclose(
+                values, getattr(groups_without, name), rtol=1e-12, err_msg=name
+            )
     number = 0
-    for (part, leaks), (same, others) in zip(
-        listed, leaked.iter_leakage_bins(shots, apart, np.arange(shots.size)), strict=True
+    for (part, leaks), (same, other_leaks) in zip(
+        listed, leaked.iter_leakage_bins(shots, groups_without, np.arange(shots.size)), strict=True
     ):
         assert (part == same).all()
         for name in ("bins_begin", "bins_end", "bins"):
-            assert (getattr(leaks, name) == getattr(others, name)).all()
-        assert (leaks.group == others.group).all() and (
-            leaks.side_of_adjacent_echo_bin == others.side_of_adjacent_echo_bin
+            assert (getattr(leaks, name) == getattr(other_leaks, name)).all()
+        assert (leaks.group == other_leaks.group).all() and (
+            leaks.side_of_adjacent_echo_bin == other_leaks.side_of_adjacent_echo_bin
         ).all()
-        np.testing.assert_allclose(leaks.log_amplitude, others.log_amplitude, rtol=1e-9)
-        np.testing.assert_allclose(found.leakage[part], others.mean_leakage(), rtol=1e-9)
+        np.testing.assert_allclose(leaks.log_amplitude, other_leaks.log_amplitude, rtol=1e-9)
+        np.testing.assert_allclose(groups.leakage[part], other_leaks.mean_leakage(), rtol=1e-9)
         number += leaks.bins.size
     assert number > 50
 
@@ -361,5 +376,5 @@ def test_rates_stay_below_their_bounds_at_every_octave_of_speckle(table_4_1):
                 leaks.first_log_amplitude[law],
                 leaks.log_amplitude_step[law],
             )
-            whole = sum(leaked._crossing_rate(a, table) for a in amplitudes)
-            assert whole <= leaks.crossing_rate_sum_bounds[j, s, octave] <= 1.3 * whole
+            total_rate = sum(leaked._crossing_rate(a, table) for a in amplitudes)
+            assert total_rate <= leaks.crossing_rate_sum_bounds[j, s, octave] <= 1.3 * total_rate

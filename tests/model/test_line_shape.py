@@ -37,7 +37,7 @@ def transform(name, sizes, phase, y):
     return np.exp(-1j * np.pi * length / fft_size * np.outer(y, x)) @ record
 
 
-def seen(sizes, power, places, weights, first, count, shape):
+def model_spectrum(sizes, power, places, weights, first, count, shape):
     """F of some bins as the model has it, (count,)."""
     n, places = places.size, places + shape.shift
     field = allocate_workspace(count + 16).field
@@ -63,18 +63,20 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
         places = rng.uniform(-3, 3, 2)
         weights = rng.normal(size=2) + 1j * rng.normal(size=2)
         weights = abs(weights) + 0j if power else weights
-        whole = abs(transform(name, sizes, np.zeros_like, np.zeros(1))[0]) ** (1 + power)
+        peak_power = abs(transform(name, sizes, np.zeros_like, np.zeros(1))[0]) ** (1 + power)
         lines = transform(name, sizes, phase, np.ravel(bins[:, None] - places))
         lines = lines.reshape(bins.size, 2)
         exact = (abs(lines) ** 2 if power else lines) @ weights
         first = -(fft_size // 2)
-        found = seen(sizes, power, places, weights, first, fft_size, shape)[bins - first]
-        assert abs(found - exact).max() < ACCURACY * whole * abs(weights).sum(), drift
-        away = (bins[:, None] - places - shape.shift + fft_size / 2) % fft_size - fft_size / 2
+        spectrum = model_spectrum(sizes, power, places, weights, first, fft_size, shape)[
+            bins - first
+        ]
+        assert abs(spectrum - exact).max() < ACCURACY * peak_power * abs(weights).sum(), drift
+        offsets = (bins[:, None] - places - shape.shift + fft_size / 2) % fft_size - fft_size / 2
         tabulated = shape.shape.envelope
-        index = np.searchsorted(tabulated.distance, abs(away), "right").clip(1) - 1
+        index = np.searchsorted(tabulated.distance, abs(offsets), "right").clip(1) - 1
         envelope = tabulated.magnitude[index]
-        assert (abs(lines) <= envelope * (1 + 1e-9) + 1e-12 * whole ** (1 / (1 + power))).all()
+        assert (abs(lines) <= envelope * (1 + 1e-9) + 1e-12 * peak_power ** (1 / (1 + power))).all()
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hann", "flattop", "kaiser(8)"])

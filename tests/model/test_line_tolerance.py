@@ -29,28 +29,28 @@ def some_shots(table_4_1, phases, effects, seed):
     "effects", [DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "range_walk")], ids=["plain", "range walk"]
 )
 def test_bins_are_within_what_is_allowed_and_pd_within_half_of_it(table_4_1, phases, effects):
-    changed = 0
+    n_changed = 0
     for seed in range(3):
         shots = some_shots(table_4_1, phases, effects, seed)
         exact = evaluate_segments(shots)
         for tolerance in (1e-1, 1e-3, 1e-6):
-            found = evaluate_segments(
+            spectra = evaluate_segments(
                 replace(
                     shots, tolerances=shots.tolerances._replace(line_error=np.asarray(tolerance))
                 )
             )
-            apart = abs(found.magnitude - exact.magnitude) / shots.bin_noise_sigma
+            errors = abs(spectra.magnitude - exact.magnitude) / shots.bin_noise_sigma
             rounding = 1e-11 * exact.magnitude / shots.bin_noise_sigma
-            assert (apart <= tolerance + rounding).all()
-            assert abs(found.pd - exact.pd).max() <= 0.5 * tolerance + 1e-9
-            changed += (apart > 10 * rounding).sum()
-    assert changed > 100
+            assert (errors <= tolerance + rounding).all()
+            assert abs(spectra.pd - exact.pd).max() <= 0.5 * tolerance + 1e-9
+            n_changed += (errors > 10 * rounding).sum()
+    assert n_changed > 100
 
 
 def test_parts_of_the_tolerance_can_be_set_by_hand(table_4_1):
     parameters = PARAMETER_DEFAULTS | table_4_1(phases="coherent", fft_size=2**12)
-    given = {"accuracy.line_error": 1e-4, "accuracy.leakage_error": 2e-5}
-    ((_, by_hand),) = prepare_shots(parameters | given | {"accuracy.tolerance": 0.1})
+    errors_by_path = {"accuracy.line_error": 1e-4, "accuracy.leakage_error": 2e-5}
+    ((_, by_hand),) = prepare_shots(parameters | errors_by_path | {"accuracy.tolerance": 0.1})
     assert (by_hand.tolerances.line_error, by_hand.tolerances.leakage_probability) == (1e-4, 2e-5)
     ((_, auto),) = prepare_shots(parameters | {"accuracy.tolerance": 0.1})
     assert auto.tolerances.line_error == pytest.approx(0.1)

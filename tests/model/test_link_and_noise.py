@@ -177,7 +177,7 @@ def test_the_noise_of_table_4_1_by_hand(table_4_1):
 
 
 def test_gain_raises_light_and_detector_noise_as_its_square_and_leaves_the_amplifiers(table_4_1):
-    plain = prepare_single_category(
+    noise_variances = prepare_single_category(
         table_4_1(fft_size=1024, solar_irradiance=2.6e8)
     ).noise.variances
     gained = prepare_single_category(
@@ -188,7 +188,7 @@ def test_gain_raises_light_and_detector_noise_as_its_square_and_leaves_the_ampli
         "detector": 100.0, "amplifier": 1.0,
     }  # fmt: skip
     for source, factor in factors.items():
-        assert gained[source] == pytest.approx(factor * plain[source], rel=1e-13), source
+        assert gained[source] == pytest.approx(factor * noise_variances[source], rel=1e-13), source
 
 
 def test_the_narrower_stage_sets_the_bandwidth_of_the_noise(table_4_1):
@@ -260,10 +260,10 @@ def test_the_noises_density_is_the_sum_of_its_aliases(other):
     aliases = frequency[:, None] + 600e6 * np.arange(-4000, 4001)
     poles = (1 + (aliases / 400e6) ** 2) * (1 + (aliases / other) ** 2)
     summed = (1 / poles).sum(axis=1) * 600e6 / (2 * min(400e6, other))
-    found = receiver_chain.relative_noise_density(
+    density = receiver_chain.relative_noise_density(
         frequency, detector_bandwidth=400e6, amplifier_bandwidth=other, sample_rate=600e6
     )
-    assert found == pytest.approx(summed, rel=2e-8)
+    assert density == pytest.approx(summed, rel=2e-8)
 
 
 def test_drawn_noise_that_passes_the_receiver_has_its_density(table_4_1):
@@ -283,16 +283,16 @@ def test_drawn_noise_that_passes_the_receiver_has_its_density(table_4_1):
         power += (np.abs(np.fft.rfft(record, axis=1)) ** 2).mean(axis=0) / (40 * n)
     # of a density of one sample's variance over the half of the high rate, within 400 MHz
     expected = power / (400e6 / (over * 300e6))
-    found = receiver_chain.relative_noise_density(
+    density = receiver_chain.relative_noise_density(
         np.fft.rfftfreq(n, 1 / 600e6), detector_bandwidth=400e6, amplifier_bandwidth=400e6,
         sample_rate=600e6,
     )  # fmt: skip
-    assert found[1:-1] == pytest.approx(expected[1:-1], rel=0.025)
-    assert 10 * np.log10(found[[0, 21]]) == pytest.approx([-0.4, -1.4], abs=0.05)
+    assert density[1:-1] == pytest.approx(expected[1:-1], rel=0.025)
+    assert 10 * np.log10(density[[0, 21]]) == pytest.approx([-0.4, -1.4], abs=0.05)
 
 
 @pytest.mark.parametrize(
-    ("ours", "name"),
+    ("constant", "name"),
     [
         (constants.SPEED_OF_LIGHT, "speed of light in vacuum"),
         (constants.ELEMENTARY_CHARGE, "elementary charge"),
@@ -300,5 +300,5 @@ def test_drawn_noise_that_passes_the_receiver_has_its_density(table_4_1):
         (constants.BOLTZMANN, "Boltzmann constant"),
     ],
 )
-def test_constants_are_those_of_the_si(ours, name):
-    assert ours == scipy.constants.value(name)
+def test_constants_are_those_of_the_si(constant, name):
+    assert constant == scipy.constants.value(name)

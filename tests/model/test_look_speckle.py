@@ -107,20 +107,24 @@ def test_looks_detect_as_often_as_in_drawn_records(case, table_4_1):
     ) | {LOOKS_NUMBER_PATH: p[LOOKS_NUMBER_PATH]}
     shots = prepare_single_category(p)
     outputs = shot_statistics(shots)
-    found = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
-    shot = found["up"] & found["down"]
+    detections = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
+    shot = detections["up"] & detections["down"]
     if shots.detects_by_any_two_segments:
-        shot = sum(found[segment].astype(int) for segment in found) >= 2
-    shares = {"pd_up": found["up"].mean(), "pd_down": found["down"].mean(), "pd_shot": shot.mean()}
+        shot = sum(detections[segment].astype(int) for segment in detections) >= 2
+    shares = {
+        "pd_up": detections["up"].mean(),
+        "pd_down": detections["down"].mean(),
+        "pd_shot": shot.mean(),
+    }
     for name, share in shares.items():
         pd = float(outputs[name][0])
         error = np.sqrt(pd * (1 - pd) / DRAWS)
         assert abs(pd - share) < 4 * error + TOLERANCE, name
 
 
-def drawn_amplitudes(number, turn, apart, snr, draws, rng):
+def drawn_amplitudes(number, turn, gap, snr, draws, rng):
     """Powers (draws, 3, looks) of segments whose speckle turns by these phases, noise included."""
-    times = np.concatenate([np.arange(number) * turn + segment * apart for segment in range(3)])
+    times = np.concatenate([np.arange(number) * turn + segment * gap for segment in range(3)])
     values, vectors = np.linalg.eigh(np.exp(-0.5 * (times[:, None] - times) ** 2))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     echo, noise = (
@@ -132,14 +136,14 @@ def drawn_amplitudes(number, turn, apart, snr, draws, rng):
     return power.reshape(draws, 3, number)
 
 
-def speckle_of(number, turn, apart):
+def speckle_of(number, turn, gap):
     lag = np.arange(number)
     by_lag = np.broadcast_to(np.exp(-0.5 * (turn * lag) ** 2).astype(complex), (3, 1, number))
     lags = np.arange(1 - number, number)
     weight = number - np.abs(lags)
-    alone = (weight * np.exp(-((turn * lags) ** 2))).sum()
+    total = (weight * np.exp(-((turn * lags) ** 2))).sum()
     between = [
-        np.sqrt((weight * np.exp(-((distance * apart + turn * lags) ** 2))).sum() / alone)
+        np.sqrt((weight * np.exp(-((distance * gap + turn * lags) ** 2))).sum() / total)
         for distance in (1, 2, 1)
     ]
     return LookSpeckle.from_correlations(
@@ -159,33 +163,35 @@ def test_looks_detect_as_often_as_drawn_amplitudes(number, combine, votes, turn)
         speckle_of(number, turn, turn / 3),
     )
     power = drawn_amplitudes(number, turn, turn / 3, snr, draws, rng)
-    shown = power.mean(axis=2) if combine == "power" else np.sort(power, axis=2)[:, :, -votes]
-    least = np.quantile(shown[:, 0], 0.5)
-    detected = shown >= least
+    tested_power = (
+        power.mean(axis=2) if combine == "power" else np.sort(power, axis=2)[:, :, -votes]
+    )
+    least = np.quantile(tested_power[:, 0], 0.5)
+    detected = tested_power >= least
     signals, level = np.sqrt(2 * np.array(snr, float))[:, None], np.sqrt(2 * np.array([least]))
     pd, miss = looks.pd_and_miss_in_speckle(signals, level, speckle)
     np.testing.assert_allclose(pd + miss, 1.0, atol=1e-12)
-    both = looks.joint_pd_in_speckle(
+    joint_pd = looks.joint_pd_in_speckle(
         signals[0], signals[2], level, speckle.segment_correlation[1], speckle
     )
     two = looks.pd_and_miss_any_two(signals, level, speckle.segment_correlation, pd, speckle)[0]
-    told = [*pd[:, 0], both[0], two[0]]
+    expected = [*pd[:, 0], joint_pd[0], two[0]]
     drawn = [
         *detected.mean(axis=0), (detected[:, 0] & detected[:, 2]).mean(),
         (detected.sum(axis=1) >= 2).mean(),
     ]  # fmt: skip
-    np.testing.assert_allclose(told, drawn, atol=TOLERANCE + 3 * 0.5 / np.sqrt(draws))
+    np.testing.assert_allclose(expected, drawn, atol=TOLERANCE + 3 * 0.5 / np.sqrt(draws))
 
 
 def test_looks_of_one_speckle_and_of_independent_ones_are_swerlings_cases():
     signal = np.array([[0.5, 2.0, 6.0, 20.0]] * 3)
     level = np.full(4, 2.5)
     for turn, law in ((1e-9, Looks(8)), (50.0, Looks(8, has_independent_speckle=True))):
-        found, missed = Looks(8, has_moving_speckle=True).pd_and_miss_in_speckle(
+        pd, missed = Looks(8, has_moving_speckle=True).pd_and_miss_in_speckle(
             signal, level, speckle_of(8, turn, 0.0)
         )
         expected, lost = law.pd_and_miss_in_speckle(signal, level)
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
+        np.testing.assert_allclose(pd, expected, rtol=1e-6)
         np.testing.assert_allclose(missed, lost, rtol=1e-6)
 
 
@@ -195,16 +201,18 @@ def test_tails_keep_their_digits():
     speckle = speckle_of(4, 0.8, 0.0)
     for signal, level in ((1.0, 6.0), (30.0, 2.0)):
         a, b = np.full((3, 1), signal), np.full((3, 1), level)
-        found, missed = Looks(4, has_moving_speckle=True).pd_and_miss_in_speckle(a, b, speckle)
+        pd, missed = Looks(4, has_moving_speckle=True).pd_and_miss_in_speckle(a, b, speckle)
         with mpmath.workdps(60):
             mean = [1 + mpmath.mpf(float(c)) * signal**2 / 2 for c in speckle.eigenvalue[0, 0]]
             exact = sum(
-                mpmath.exp(-2 * mpmath.mpf(level) ** 2 / own)
-                * mpmath.fprod(own / (own - other) for other in mean if other != own)
-                for own in mean
+                mpmath.exp(-2 * mpmath.mpf(level) ** 2 / mean_power)
+                * mpmath.fprod(
+                    mean_power / (mean_power - other) for other in mean if other != mean_power
+                )
+                for mean_power in mean
             )
         if exact < 0.5:
-            assert float(found[0, 0]) == pytest.approx(float(exact), rel=1e-6)
+            assert float(pd[0, 0]) == pytest.approx(float(exact), rel=1e-6)
         else:
             assert float(missed[0, 0]) == pytest.approx(float(1 - exact), rel=1e-6)
 

@@ -42,23 +42,25 @@ def amplitudes(rng, *size):
     return (rng.normal(size=size) + 1j * rng.normal(size=size)) / np.sqrt(2)
 
 
-def drawn(looks, speckle, signals, level, alike=1.0):
+def drawn_detections(looks, speckle, signals, level, correlation=1.0):
     """Share of draws in which each of two segments is detected, and both are."""
-    rng, found = np.random.default_rng([looks.number, len(looks.combine), len(speckle)]), []
-    apart = looks.number if looks.has_independent_speckle else 1
+    rng, magnitudes = np.random.default_rng([looks.number, len(looks.combine), len(speckle)]), []
+    n_speckles = looks.number if looks.has_independent_speckle else 1
     for _ in range(DRAWS // PIECE):
-        first = amplitudes(rng, PIECE, apart)
-        second = alike * first + np.sqrt(1 - alike**2) * amplitudes(rng, PIECE, apart)
+        first = amplitudes(rng, PIECE, n_speckles)
+        second = correlation * first + np.sqrt(1 - correlation**2) * amplitudes(
+            rng, PIECE, n_speckles
+        )
         pair = (1.0, 1.0) if speckle == "steady" else (first, second)
         power = [
             np.abs(a * z + np.sqrt(2) * amplitudes(rng, PIECE, looks.number)) ** 2
             for a, z in zip(signals, pair, strict=True)
         ]
         if looks.combine == "binary":
-            found.append([(p >= level**2).sum(axis=1) >= looks.votes for p in power])
+            magnitudes.append([(p >= level**2).sum(axis=1) >= looks.votes for p in power])
         else:
-            found.append([p.mean(axis=1) >= level**2 for p in power])
-    up, down = np.concatenate(found, axis=1)
+            magnitudes.append([p.mean(axis=1) >= level**2 for p in power])
+    up, down = np.concatenate(magnitudes, axis=1)
     return up.mean(), down.mean(), (up & down).mean()
 
 
@@ -74,27 +76,33 @@ def test_closed_forms_are_the_mean_over_draws(number, combine, votes, speckle):
     one, other = signals = (1.6, 1.3)
     level = np.array(2.0)
     law = looks.pd_and_miss_steady if speckle == "steady" else looks.pd_and_miss_in_speckle
-    told = [float(law(np.array(a), level)[0]) for a in signals]
-    together = told[0] * told[1]
+    expected = [float(law(np.array(a), level)[0]) for a in signals]
+    together = expected[0] * expected[1]
     if speckle != "steady":
         together = float(looks.joint_pd_in_speckle(one, other, level, np.array(1.0)))
-    for share, chance in zip(drawn(looks, speckle, signals, level), [*told, together], strict=True):
+    for share, chance in zip(
+        drawn_detections(looks, speckle, signals, level), [*expected, together], strict=True
+    ):
         assert abs(share - chance) < 5 * np.sqrt(chance * (1 - chance) / DRAWS)
     for a in signals:
-        found, missed = law(np.array(a), level)
-        assert found + missed == pytest.approx(1.0, abs=1e-12)
+        pd, missed = law(np.array(a), level)
+        assert pd + missed == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("apart", [True, False])
-def test_segments_that_share_part_of_their_speckle(apart):
+@pytest.mark.parametrize("is_independent", [True, False])
+def test_segments_that_share_part_of_their_speckle(is_independent):
     """Exact where looks fade apart; else within 0.01, between what is shared wholly and not."""
-    looks, level, signals = Looks(8, has_independent_speckle=apart), np.array(2.6), (2.0, 1.6)
-    told = float(looks.joint_pd_in_speckle(*signals, level, np.array(0.8)))
-    share = drawn(looks, "part", signals, level, alike=0.8)[2]
-    assert abs(share - told) < 5 * np.sqrt(told / DRAWS) + (0.0 if apart else 0.01)
+    looks, level, signals = (
+        Looks(8, has_independent_speckle=is_independent),
+        np.array(2.6),
+        (2.0, 1.6),
+    )
+    expected = float(looks.joint_pd_in_speckle(*signals, level, np.array(0.8)))
+    share = drawn_detections(looks, "part", signals, level, correlation=0.8)[2]
+    assert abs(share - expected) < 5 * np.sqrt(expected / DRAWS) + (0.0 if is_independent else 0.01)
     up, down = (looks.pd_and_miss_in_speckle(np.array(a), level)[0] for a in signals)
-    alone = looks.joint_pd_in_speckle(*signals, level, np.array(0.0))
-    assert float(alone) == pytest.approx(float(up * down), rel=1e-6)
+    product = looks.joint_pd_in_speckle(*signals, level, np.array(0.0))
+    assert float(product) == pytest.approx(float(up * down), rel=1e-6)
 
 
 def test_one_look_is_marcums_q_and_swerlings_first_case():
@@ -122,9 +130,9 @@ def test_deep_tails_keep_their_digits(number, signal, level):
             * mpmath.gammainc(number + j, y, mpmath.inf, regularized=True)
             for j in range(900)
         )  # fmt: skip
-    found, missed = Looks(number).pd_and_miss_steady(np.array(signal), np.array(level))
+    pd, missed = Looks(number).pd_and_miss_steady(np.array(signal), np.array(level))
     if exact < 0.5:
-        assert float(found) == pytest.approx(float(exact), rel=1e-10)
+        assert float(pd) == pytest.approx(float(exact), rel=1e-10)
     else:
         assert float(missed) == pytest.approx(float(1 - exact), rel=1e-10)
 
@@ -161,22 +169,22 @@ def test_alarms_of_correlated_bins_are_those_of_drawn_records(looks):
     )
     taper = window.window_samples("hamming", length)
     sigma = np.sqrt((taper**2).sum() / 2)
-    found, number = 0, 4000
+    n_alarms, number = 0, 4000
     for _ in range(number):
         records = rng.normal(size=(looks.number, length)) * taper
         power = np.abs(np.fft.rfft(records, 1024)[:, 16:496]) ** 2
         if looks.combine == "binary":
-            found += ((power >= (level * sigma) ** 2).sum(axis=0) >= looks.votes).any()
+            n_alarms += ((power >= (level * sigma) ** 2).sum(axis=0) >= looks.votes).any()
         else:
-            found += (power.mean(axis=0) >= (level * sigma) ** 2).any()
+            n_alarms += (power.mean(axis=0) >= (level * sigma) ** 2).any()
     correlation = bin_noise.neighbour_noise_correlation(window.get_window("hamming", length), 1024)
     bins = bin_noise.alarm_equivalent_bins(
         480, threshold_ratio=level, correlation=correlation, looks=looks
     )
-    told = float(at_least_one_probability(2e-3, bins))
+    expected = float(at_least_one_probability(2e-3, bins))
     assert bins < 400
-    error = 5 * np.sqrt(told * (1 - told) / number)
-    assert found / number == pytest.approx(told, abs=error + 0.03 * told)
+    error = 5 * np.sqrt(expected * (1 - expected) / number)
+    assert n_alarms / number == pytest.approx(expected, abs=error + 0.03 * expected)
 
 
 def instrument(**changes):
@@ -201,8 +209,8 @@ def dimmed(parameters, effects, pd):
     """The same with as little light as gives about a probability of detection."""
     powers = np.geomspace(1e-7, 1e2, 300)
     tried = parameters | {"instrument.laser.power": powers, "target.range": ON_A_BIN}
-    found = evaluate(tried, effects)["pd_up"]
-    return parameters | {"instrument.laser.power": float(np.interp(pd, found, powers))}
+    dimmed_pd = evaluate(tried, effects)["pd_up"]
+    return parameters | {"instrument.laser.power": float(np.interp(pd, dimmed_pd, powers))}
 
 
 LOOKS = {
@@ -234,18 +242,22 @@ LOOKS = {
 @pytest.mark.parametrize("name", parametrize_product(3, LOOKS))
 def test_whole_spectra_are_detected_as_often_as_the_closed_form_says(scene, name):
     changes, effects = LOOKS[name]
-    given = dimmed(scene(**changes), ("image", *effects), 0.6)
-    told, number = evaluate(given, ("image", *effects)), 600
-    found = simulate_draws(
-        given, ("image", *effects), keys=make_point_keys(1), batch_sizes=[number], method="spectra"
+    parameters = dimmed(scene(**changes), ("image", *effects), 0.6)
+    expected, number = evaluate(parameters, ("image", *effects)), 600
+    results = simulate_draws(
+        parameters,
+        ("image", *effects),
+        keys=make_point_keys(1),
+        batch_sizes=[number],
+        method="spectra",
     )
-    for which in ("pd_up", "pd_down", "pd_shot"):
-        p = told[which][0]
+    for output_name in ("pd_up", "pd_down", "pd_shot"):
+        p = expected[output_name][0]
         assert 0.2 < p < 0.9
-        assert found[which][0] == pytest.approx(p, abs=5 * np.sqrt(p * (1 - p) / number))
+        assert results[output_name][0] == pytest.approx(p, abs=5 * np.sqrt(p * (1 - p) / number))
     searched = 2 * 509 * number  # bins of both segments
-    assert found["pfa_bin"][0] == pytest.approx(1e-5, abs=5 * np.sqrt(1e-5 / searched))
-    np.testing.assert_allclose(told["pfa_bin"], 1e-5, rtol=1e-9)
+    assert results["pfa_bin"][0] == pytest.approx(1e-5, abs=5 * np.sqrt(1e-5 / searched))
+    np.testing.assert_allclose(expected["pfa_bin"], 1e-5, rtol=1e-9)
 
 
 def test_the_threshold_of_a_segment_holds_its_alarms(scene):
@@ -254,40 +266,40 @@ def test_the_threshold_of_a_segment_holds_its_alarms(scene):
         {LOOKS_NUMBER_PATH: 8},
         {LOOKS_NUMBER_PATH: 8, LOOKS_COMBINE_PATH: "binary", LOOKS_VOTES_PATH: 4},
     ):
-        given = (
+        parameters = (
             base
             | changes
             | {DESIGN_PFA_SEGMENT_PATH: 0.2, "instrument.processing.window": "hamming"}
         )
-        given |= {"target.reflectance": 1e-12}
-        found = simulate_draws(
-            given, (), keys=make_point_keys(1), batch_sizes=[600], method="spectra"
+        parameters |= {"target.reflectance": 1e-12}
+        results = simulate_draws(
+            parameters, (), keys=make_point_keys(1), batch_sizes=[600], method="spectra"
         )
-        share = found["n_false_alarm_up"].sum() / 600
+        share = results["n_false_alarm_up"].sum() / 600
         assert share == pytest.approx(0.2, abs=5 * np.sqrt(0.16 / 600) + 0.03 * 0.2)
 
 
 def test_estimates_err_by_the_root_of_the_number_of_looks_less(scene):
     quiet = scene(**{ESTIMATOR_PREFIX + "kind": "chirp_z", "instrument.laser.power": 1e-3})
-    found = {}
+    deviations = {}
     for number in (1, 16):
-        given = quiet | {LOOKS_NUMBER_PATH: number}
-        found[number] = simulate_draws(
-            given, ("image",), keys=make_point_keys(1), batch_sizes=[250], method="spectra"
+        parameters = quiet | {LOOKS_NUMBER_PATH: number}
+        deviations[number] = simulate_draws(
+            parameters, ("image",), keys=make_point_keys(1), batch_sizes=[250], method="spectra"
         )
-    one, many = (found[number] for number in (1, 16))
+    one, many = (deviations[number] for number in (1, 16))
     assert one["range_bound"] == pytest.approx(4 * many["range_bound"], rel=1e-12)
-    for each in (one, many):
-        ratio = each["range_rmse"] / each["range_bound"]
+    for deviation in (one, many):
+        ratio = deviation["range_rmse"] / deviation["range_bound"]
         assert ratio == pytest.approx(1.0, abs=5 / np.sqrt(2 * 250) + 0.02)
 
 
 def test_acceleration_costs_coherent_looks_what_exact_records_lose(scene):
     """Records by the exact delay, look by look, their phases' best straight line taken off."""
-    given = scene(
+    parameters = scene(
         **{LOOKS_NUMBER_PATH: 8, LOOKS_COMBINE_PATH: "coherent", "target.acceleration": 80.0}
     )
-    ((_, shots),) = prepare_shots(given, ("segment_motion", "image"))
+    ((_, shots),) = prepare_shots(parameters, ("segment_motion", "image"))
     bins = np.exp(-2j * np.pi * 100 * np.arange(1024) / 1024)
     record = partial(
         time_domain_truth.analytic_record, point=0, segment=0, beamlet=0, with_acceleration=True
@@ -297,14 +309,14 @@ def test_acceleration_costs_coherent_looks_what_exact_records_lose(scene):
     phase = np.unwrap(np.angle(sums))
     turned = sums * np.exp(-1j * np.polyfit(place, phase, 1)[0] * place)
     lost = np.abs(turned.mean()) / np.abs(sums).mean()
-    told = coherent_gain(
+    expected = coherent_gain(
         Looks(8, "coherent"), acceleration=np.array(80.0),
         carrier=np.asarray(shots.waveform.carriers[0]), look_period=np.array(20e-6),
     )  # fmt: skip
-    assert 0.5 < told < 0.9
-    assert float(told) == pytest.approx(lost, rel=2e-3)
+    assert 0.5 < expected < 0.9
+    assert float(expected) == pytest.approx(lost, rel=2e-3)
     magnitude = {
-        effects: evaluate_segments(next(prepare_shots(given, effects))[1]).magnitude[0, 0]
+        effects: evaluate_segments(next(prepare_shots(parameters, effects))[1]).magnitude[0, 0]
         for effects in (("image",), ("image", "acceleration"))
     }
     ratio = magnitude["image", "acceleration"] / magnitude[("image",)]
@@ -315,31 +327,31 @@ def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
     """exp(-2 pi dnu tau) of the power adds up; what walks is noise, and new in each record."""
     laser = {"instrument.laser.line_width": 1e5, "instrument.laser.line_shape": "lorentzian"}
     effects = ("image", "line_width")
-    given = scene(**{LOOKS_NUMBER_PATH: 4, LOOKS_COMBINE_PATH: "coherent"}, **laser)
-    ((_, pure),) = prepare_shots(given, ("image",))
-    ((_, shots),) = prepare_shots(given, effects)
+    parameters = scene(**{LOOKS_NUMBER_PATH: 4, LOOKS_COMBINE_PATH: "coherent"}, **laser)
+    ((_, pure),) = prepare_shots(parameters, ("image",))
+    ((_, shots),) = prepare_shots(parameters, effects)
     delay = 2 * ON_A_BIN / SPEED_OF_LIGHT
     share = np.exp(-2 * np.pi * 1e5 * delay)
     left = (evaluate_segments(shots).magnitude[0, 0] / evaluate_segments(pure).magnitude[0, 0]) ** 2
     assert left == pytest.approx(share, rel=1e-9)
-    given = dimmed(given, effects, 0.6)
-    told, number = evaluate(given, effects)["pd_up"][0], 800
-    found = simulate_draws(
-        given, effects, keys=make_point_keys(1), batch_sizes=[number], method="spectra"
+    parameters = dimmed(parameters, effects, 0.6)
+    expected, number = evaluate(parameters, effects)["pd_up"][0], 800
+    results = simulate_draws(
+        parameters, effects, keys=make_point_keys(1), batch_sizes=[number], method="spectra"
     )
-    error = 5 * np.sqrt(told * (1 - told) / number)
-    assert found["pd_up"][0] == pytest.approx(told, abs=error + 0.02)
-    without = evaluate(given, ("image",))["pd_up"][0]
-    assert without > told + 0.1
+    error = 5 * np.sqrt(expected * (1 - expected) / number)
+    assert results["pd_up"][0] == pytest.approx(expected, abs=error + 0.02)
+    without = evaluate(parameters, ("image",))["pd_up"][0]
+    assert without > expected + 0.1
     timing = {"line_width": np.array([1e5]), "delay": np.array([delay])}
-    own = {"duration": np.array([2e-6]), "window": shots.window}
-    assert apparent_line_and_pedestal(**timing, **own)[0] > pure_line_power_fraction(
-        **timing, duration=own["duration"]
+    line = {"duration": np.array([2e-6]), "window": shots.window}
+    assert apparent_line_and_pedestal(**timing, **line)[0] > pure_line_power_fraction(
+        **timing, duration=line["duration"]
     )
 
 
 @pytest.mark.parametrize("combine", ["power", "binary"])
-def test_a_target_that_moves_smears_the_mean_power_of_its_looks(scene, combine):
+def test_a_moving_target_spreads_the_mean_power_of_its_looks(scene, combine):
     """0.9 bins from first to last: the mean of each look's own spectrum, by any route."""
     moving = scene(
         **{LOOKS_NUMBER_PATH: 32, LOOKS_COMBINE_PATH: combine, "target.radial_velocity": 1000.0}
@@ -351,74 +363,82 @@ def test_a_target_that_moves_smears_the_mean_power_of_its_looks(scene, combine):
         return
     ((_, shots),) = prepare_shots(moving, effects)
     bins, magnitude = segment_spectrum(shots, 0, 0)
-    each = [dict(zip(*segment_spectrum(look, 0, 0), strict=True)) for look in shots.split_by_look()]
+    spectra = [
+        dict(zip(*segment_spectrum(look, 0, 0), strict=True)) for look in shots.split_by_look()
+    ]
     for k in range(95, 105):
-        expected = np.sqrt(np.mean([look[k] ** 2 for look in each]))
+        expected = np.sqrt(np.mean([look[k] ** 2 for look in spectra]))
         # The receiver's poles are those of the middle look's line.
         assert magnitude[list(bins).index(k)] == pytest.approx(expected, rel=1e-4)
     in_time = time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False)
     np.testing.assert_allclose(
         evaluate_segments(shots).magnitude[::2], in_time.magnitude[::2], rtol=1e-4
     )
-    seen = [look[100] for look in each]
-    assert max(seen) > 1.2 * min(seen)
+    look_magnitudes = [look[100] for look in spectra]
+    assert max(look_magnitudes) > 1.2 * min(look_magnitudes)
 
 
 def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
-    given = scene(**{LOOKS_NUMBER_PATH: 4, "accuracy.leakage_floor": -1.0})
-    given |= {"target.range": np.array([ON_A_BIN + 0.3]), "instrument.laser.power": 4e-3}
-    told = evaluate(given, ("image", "leakage"))
-    ((_, shots),) = prepare_shots(given, ("image",))
+    parameters = scene(**{LOOKS_NUMBER_PATH: 4, "accuracy.leakage_floor": -1.0})
+    parameters |= {"target.range": np.array([ON_A_BIN + 0.3]), "instrument.laser.power": 4e-3}
+    outputs = evaluate(parameters, ("image", "leakage"))
+    ((_, shots),) = prepare_shots(parameters, ("image",))
     bins, magnitude = segment_spectrum(shots, 0, 0)
     sigma, level = float(shots.bin_noise_sigma[0]), float(shots.threshold[0])
-    own = magnitude >= level
-    own |= np.convolve(own, np.ones(3), "same") > 0
-    counts = ~own & (bins > 0) & (bins < 512)
+    is_echo = magnitude >= level
+    is_echo |= np.convolve(is_echo, np.ones(3), "same") > 0
+    counts = ~is_echo & (bins > 0) & (bins < 512)
     crosses = stats.ncx2.sf(4 * (level / sigma) ** 2, 8, 4 * (magnitude / sigma) ** 2)
     quiet = special.gammaincc(4, 2 * (level / sigma) ** 2)
     chances = np.where(counts, (crosses - quiet) / (1 - quiet), 0.0)
     # By one record that detects as often: groups that join the echo are no further ones.
     scaled = sigma * np.sqrt((level / sigma) ** 2 - 2 * 3 / 4)
     near = shots.detection_rule.sidelobe_bin_noise_correlation
-    alone = 1 - np.prod(1 - chances)
-    exclude_bins_joining_echo(chances, 0, chances.size, magnitude, own, sigma / 2, scaled, near)
+    product = 1 - np.prod(1 - chances)
+    exclude_bins_joining_echo(chances, 0, chances.size, magnitude, is_echo, sigma / 2, scaled, near)
     expected = 1 - np.prod(1 - chances)
-    assert 1e-3 < expected < alone < 0.9
-    assert told["p_leakage_up"][0] == pytest.approx(expected, rel=1e-2)
+    assert 1e-3 < expected < product < 0.9
+    assert outputs["p_leakage_up"][0] == pytest.approx(expected, rel=1e-2)
 
 
 @pytest.mark.parametrize("speckle", ["common", "independent"])
 def test_leakage_of_fading_looks_is_that_of_drawn_spectra(scene, speckle):
     """The mean over the fade of further groups in averaged spectra."""
-    given = scene(
+    parameters = scene(
         **{LOOKS_NUMBER_PATH: 4, LOOKS_SPECKLE_PATH: speckle, "accuracy.leakage_floor": -1.0}
     )
-    given |= {
+    parameters |= {
         "target.range": np.array([ON_A_BIN + 0.5]), "instrument.laser.power": 16e-3,
         "footprint.speckle": "developed", "footprint.phases": "incoherent",
     }  # fmt: skip
-    told = evaluate(given, ("image", "leakage", "fading"))["p_leakage_up"][0]
-    ((_, shots),) = prepare_shots(given, ("image", "fading"))
-    drawn, deviation = drawn_leakage(shots, 0, draws=12000, looks=4, own=speckle == "independent")
-    steady = evaluate(given, ("image", "leakage"))["p_leakage_up"][0]
-    assert told > 1.3 * steady
-    assert told == pytest.approx(drawn, abs=4 * deviation)
+    expected = evaluate(parameters, ("image", "leakage", "fading"))["p_leakage_up"][0]
+    ((_, shots),) = prepare_shots(parameters, ("image", "fading"))
+    drawn, deviation = drawn_leakage(
+        shots, 0, draws=12000, looks=4, per_line=speckle == "independent"
+    )
+    steady = evaluate(parameters, ("image", "leakage"))["p_leakage_up"][0]
+    assert expected > 1.3 * steady
+    assert expected == pytest.approx(drawn, abs=4 * deviation)
 
 
 def test_votes_of_one_and_of_all_are_any_and_every_record():
     level, signal = np.array(2.0), np.array(1.5)
-    each = marcum_q1(signal, level)
-    assert Looks(6, "binary", 1).pd_and_miss_steady(signal, level)[1] == pytest.approx(each.p**6)
-    assert Looks(6, "binary", 6).pd_and_miss_steady(signal, level)[0] == pytest.approx(each.q**6)
+    pd_of_look = marcum_q1(signal, level)
+    assert Looks(6, "binary", 1).pd_and_miss_steady(signal, level)[1] == pytest.approx(
+        pd_of_look.p**6
+    )
+    assert Looks(6, "binary", 6).pd_and_miss_steady(signal, level)[0] == pytest.approx(
+        pd_of_look.q**6
+    )
 
 
 def test_a_threshold_over_the_noise_is_that_of_one_record(scene):
-    given = {path: v for path, v in scene().items() if path != DESIGN_PFA_BIN_PATH}
-    given |= {LOOKS_NUMBER_PATH: 4, "instrument.processing.tnr": 6.0}
+    parameters = {path: v for path, v in scene().items() if path != DESIGN_PFA_BIN_PATH}
+    parameters |= {LOOKS_NUMBER_PATH: 4, "instrument.processing.tnr": 6.0}
     level = 6.0 * RAYLEIGH_DEVIATION
-    assert float(tnr_from_parameters(given)) == 6.0
-    found = evaluate(given, ())["log10_pfa_bin"][0]
-    assert found == pytest.approx(np.log10(special.gammaincc(4, 2 * level**2)), rel=1e-9)
+    assert float(tnr_from_parameters(parameters)) == 6.0
+    log_pfa = evaluate(parameters, ())["log10_pfa_bin"][0]
+    assert log_pfa == pytest.approx(np.log10(special.gammaincc(4, 2 * level**2)), rel=1e-9)
 
 
 def test_drawn_rough_surfaces_fade_in_looks_as_the_closed_form_says(scene):
@@ -426,21 +446,21 @@ def test_drawn_rough_surfaces_fade_in_looks_as_the_closed_form_says(scene):
     rough = scene(**{LOOKS_NUMBER_PATH: 8, "footprint.beamlets": 19, "target.roughness": 1e-3})
     smooth = {path: v for path, v in rough.items() if path != "target.roughness"}
     light = dimmed(smooth, ("image", "fading"), 0.6)["instrument.laser.power"]
-    told = evaluate(smooth | {"instrument.laser.power": light}, ("image", "fading"))
-    found = simulate_draws(
+    expected = evaluate(smooth | {"instrument.laser.power": light}, ("image", "fading"))
+    results = simulate_draws(
         rough | {"instrument.laser.power": light}, ("image", "speckle"), keys=make_point_keys(1),
         batch_sizes=[6000], method="probabilities",
     )  # fmt: skip
-    for which in ("pd_up", "pd_shot"):
-        error = found[f"{which}_error"][0]
-        assert found[which][0] == pytest.approx(told[which][0], abs=5 * error)
-        assert 0.4 < told[which][0] < 0.8
+    for name in ("pd_up", "pd_shot"):
+        error = results[f"{name}_error"][0]
+        assert results[name][0] == pytest.approx(expected[name][0], abs=5 * error)
+        assert 0.4 < expected[name][0] < 0.8
 
 
 @pytest.mark.parametrize("combine", ["power", "binary", "coherent"])
 def test_pictures_show_what_is_held_against_the_threshold(scene, combine):
     """Noise: mean power within 5 sigma, a spread less by the root of 16; or any bin's votes."""
-    given = scene(
+    parameters = scene(
         **{
             LOOKS_NUMBER_PATH: 16,
             LOOKS_COMBINE_PATH: combine,
@@ -448,14 +468,14 @@ def test_pictures_show_what_is_held_against_the_threshold(scene, combine):
             "target.reflectance": 1e-12,
         }
     )
-    shot = simulate_shot(given, ("image",), seed=3)
+    shot = simulate_shot(parameters, ("image",), seed=3)
     power = (shot.segments[0].magnitude[8:-8] / shot.noise_sigma) ** 2 / 2
     looks = shot.prepared_shot.looks
     if combine == "binary":  # the fourth largest of 16
         levels = np.array([0.8, 1.4, 2.0])
-        told = looks.pd_and_miss_steady(np.zeros(3), np.sqrt(2 * levels))[0]
+        alarm_probability = looks.pd_and_miss_steady(np.zeros(3), np.sqrt(2 * levels))[0]
         shares = (power[:, None] >= levels).mean(axis=0)
-        assert np.abs(shares - told).max() < 5 * 0.5 / np.sqrt(power.size)
+        assert np.abs(shares - alarm_probability).max() < 5 * 0.5 / np.sqrt(power.size)
         return
     spread = 1 / np.sqrt(looks.n_power_averaged)
     assert power.mean() == pytest.approx(1.0, abs=5 * spread / np.sqrt(power.size))

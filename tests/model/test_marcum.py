@@ -89,12 +89,12 @@ def test_two_infinite_arguments_give_nan():
 
 def test_arrays_broadcast_and_equal_the_scalar_forms():
     a, b = np.linspace(0.0, 12.0, 7)[:, None], np.linspace(0.1, 9.0, 5)
-    found = marcum_q1(a, b)
-    assert found.q.shape == (7, 5)
+    values = marcum_q1(a, b)
+    assert values.q.shape == (7, 5)
     assert marcum_q1(1.0, 2.0).p.shape == ()
     for i in range(7):
         for j in range(5):
-            assert tuple(v[i, j] for v in found) == marcum_q1_tails(a[i, 0], b[j])
+            assert tuple(v[i, j] for v in values) == marcum_q1_tails(a[i, 0], b[j])
 
 
 # At least one among many
@@ -107,8 +107,8 @@ def test_certainty_impossibility_and_no_tries():
         0.0,
         0.0,
     ]
-    found = log_at_least_one_probability([-math.inf, 0.0, 0.0, -1.0], [5, 3, 0, 0])
-    assert found.tolist() == [-math.inf, 0.0, -math.inf, -math.inf]
+    log_probability = log_at_least_one_probability([-math.inf, 0.0, 0.0, -1.0], [5, 3, 0, 0])
+    assert log_probability.tolist() == [-math.inf, 0.0, -math.inf, -math.inf]
 
 
 def test_arrays_broadcast():

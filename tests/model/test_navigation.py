@@ -32,9 +32,9 @@ FREE = 1e7
 """Slope known so vaguely beforehand that the plane is free."""
 
 
-def altitude(**given):
+def altitude(**keywords):
     """Altitudes over ground of any slope unless said otherwise."""
-    return navigation.solve_altitude(**({"slope": FREE} | given))
+    return navigation.solve_altitude(**({"slope": FREE} | keywords))
 
 
 def _ranges(beams, height, *, normal=(0.0, 0.0, 1.0), offset=0.0):
@@ -51,87 +51,89 @@ def _ranges(beams, height, *, normal=(0.0, 0.0, 1.0), offset=0.0):
 @pytest.mark.parametrize("number", [3, 4, 7])
 def test_standard_errors_go_as_1_over_sine_across_and_1_over_cosine_along(number, half_angle):
     beams = cone_directions(number, half_angle=half_angle, azimuth=0.3)
-    found = solve_velocity(direction=beams, radial_velocity=np.zeros(number), standard_error=0.02)
+    solution = solve_velocity(
+        direction=beams, radial_velocity=np.zeros(number), standard_error=0.02
+    )
     across = 0.02**2 * 2 / (number * np.sin(half_angle) ** 2)
     along = 0.02**2 / (number * np.cos(half_angle) ** 2)
     expected = np.diag([across, across, along])
-    np.testing.assert_allclose(found.covariance, expected, rtol=1e-11, atol=1e-11 * across)
+    np.testing.assert_allclose(solution.covariance, expected, rtol=1e-11, atol=1e-11 * across)
 
 
 @PATTERNS
 def test_mean_and_covariance_of_drawn_velocities_are_those_propagated(beams):
     error = 0.01 * (1 + np.arange(len(beams)) % 3)  # unequal: the weights matter
     noise = np.random.default_rng(1).standard_normal((DRAWS, len(beams))) * error
-    found = solve_velocity(
+    solution = solve_velocity(
         direction=beams, radial_velocity=beams @ MOVING + noise, standard_error=error
     )
-    off, stated = found.value - MOVING, found.covariance[0]
-    variance = np.diag(stated)
-    assert (np.abs(off.mean(axis=0)) <= 5 * np.sqrt(variance / DRAWS)).all()
+    errors, stated_covariance = solution.value - MOVING, solution.covariance[0]
+    variance = np.diag(stated_covariance)
+    assert (np.abs(errors.mean(axis=0)) <= 5 * np.sqrt(variance / DRAWS)).all()
     # of a sample covariance of normal numbers: (C_ii C_jj + C_ij^2) / (n - 1)
-    spread = np.sqrt((np.outer(variance, variance) + stated**2) / (DRAWS - 1))
-    assert (np.abs(np.cov(off.T) - stated) <= 5 * spread).all()
+    spread = np.sqrt((np.outer(variance, variance) + stated_covariance**2) / (DRAWS - 1))
+    assert (np.abs(np.cov(errors.T) - stated_covariance) <= 5 * spread).all()
     degrees = len(beams) - 3
-    assert abs(found.chi_square.mean() - degrees) <= 5 * np.sqrt(2 * degrees / DRAWS) + 1e-9
+    assert abs(solution.chi_square.mean() - degrees) <= 5 * np.sqrt(2 * degrees / DRAWS) + 1e-9
 
 
 def test_a_turned_frame_turns_the_solution():
     noise = np.random.default_rng(2).standard_normal(16) * 0.05
     error = np.linspace(0.01, 0.1, 16)
     measured = SIXTEEN @ MOVING + noise
-    plain = solve_velocity(direction=SIXTEEN, radial_velocity=measured, standard_error=error)
+    unturned = solve_velocity(direction=SIXTEEN, radial_velocity=measured, standard_error=error)
     for turn in Rotation.random(5, random_state=3).as_matrix():
         turned = solve_velocity(
             direction=SIXTEEN @ turn.T, radial_velocity=measured, standard_error=error
         )
-        np.testing.assert_allclose(turned.value, turn @ plain.value, atol=1e-11)
+        np.testing.assert_allclose(turned.value, turn @ unturned.value, atol=1e-11)
         np.testing.assert_allclose(
-            turned.covariance, turn @ plain.covariance @ turn.T, atol=1e-13 * 0.1
+            turned.covariance, turn @ unturned.covariance @ turn.T, atol=1e-13 * 0.1
         )
-        assert turned.chi_square == pytest.approx(plain.chi_square, rel=1e-9)
+        assert turned.chi_square == pytest.approx(unturned.chi_square, rel=1e-9)
 
 
 def test_four_beams_can_spare_any_one_and_three_can_not():
     for beams, status in ((FOUR, STATUS_SOLVED), (THREE, STATUS_UNDETERMINED)):
         valid = ~np.eye(len(beams), dtype=bool)
         measured = np.where(valid, beams @ MOVING, np.nan)
-        found = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
-        assert (found.status == status).all()
-        assert (found.is_used == valid).all() and (found.degrees_of_freedom == 0).all()
+        solution = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
+        assert (solution.status == status).all()
+        assert (solution.is_used == valid).all() and (solution.degrees_of_freedom == 0).all()
         if status == STATUS_SOLVED:
-            np.testing.assert_allclose(found.value, np.tile(MOVING, (4, 1)), atol=1e-12)
+            np.testing.assert_allclose(solution.value, np.tile(MOVING, (4, 1)), atol=1e-12)
             full = solve_velocity(
                 direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01
             )
-            lost = np.linalg.eigvalsh(found.covariance - full.covariance)
+            lost = np.linalg.eigvalsh(solution.covariance - full.covariance)
             assert (lost > -1e-15).all()  # a beam less never makes anything better known
         else:
-            assert np.isnan(found.value).all() and np.isnan(found.covariance).all()
+            assert np.isnan(solution.value).all() and np.isnan(solution.covariance).all()
 
 
 def test_no_cycles_make_no_solutions():
     nothing = np.empty((0, 5, 4))
-    found = solve_velocity(
+    solution = solve_velocity(
         direction=FOUR, radial_velocity=nothing, standard_error=0.01, test_level=0.01
     )
-    assert found.value.shape == (0, 5, 3) and found.is_available.shape == (0, 5)
+    assert solution.value.shape == (0, 5, 3) and solution.is_available.shape == (0, 5)
 
 
 @pytest.mark.parametrize("half_angle", [1e-1, 1e-3, 1e-5, 1e-7])
 def test_a_cone_so_narrow_that_rounding_spoils_it_is_refused(half_angle):
     """Singular values sqrt(3/2) sin and sqrt(3) cos: a condition number of 1e6 at 1.4e-6 rad."""
     beams = cone_directions(3, half_angle=half_angle)
-    found = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
-    assert found.is_available == (np.sqrt(2) / np.tan(half_angle) < 1e6)
-    assert np.isfinite(found.value).all() == found.is_available
+    solution = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
+    assert solution.is_available == (np.sqrt(2) / np.tan(half_angle) < 1e6)
+    assert np.isfinite(solution.value).all() == solution.is_available
 
 
 def test_beams_in_a_plane_leave_the_velocity_across_undetermined():
     angle = np.radians([-20.0, -5.0, 5.0, 30.0])
     beams = np.column_stack([np.sin(angle), 0 * angle, -np.cos(angle)])
     beams = beams @ Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix().T
-    found = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
-    assert found.status == STATUS_UNDETERMINED and np.isnan(found.value).all()
+    solution = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
+    assert solution.status == STATUS_UNDETERMINED and np.isnan(solution.value).all()
 
 
 # ---- one false beam ----
@@ -149,26 +151,30 @@ def _drawn_with_alarm(beams, *, alarm, beam, seed):
 
 @PATTERNS
 def test_true_beams_are_suspect_at_the_stated_level(beams):
-    found = _drawn_with_alarm(beams, alarm=0.0, beam=0, seed=6)
-    suspect = (found.status != STATUS_SOLVED).sum()
+    solution = _drawn_with_alarm(beams, alarm=0.0, beam=0, seed=6)
+    suspect = (solution.status != STATUS_SOLVED).sum()
     assert suspect == 0 if len(beams) == 3 else is_within_5_sigma(suspect, LEVEL)
 
 
 @pytest.mark.parametrize("beam", [0, 13])
 def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     """Far out, it is found whenever the fit without it passes: in 1 - level of the draws."""
-    found = _drawn_with_alarm(SIXTEEN, alarm=50.0, beam=beam, seed=7)
-    right = (found.status == STATUS_EXCLUDED) & ~found.is_used[:, beam]
+    solution = _drawn_with_alarm(SIXTEEN, alarm=50.0, beam=beam, seed=7)
+    right = (solution.status == STATUS_EXCLUDED) & ~solution.is_used[:, beam]
     assert is_within_5_sigma(right.sum(), 1 - LEVEL)
-    assert (found.status[~right] == STATUS_WITHHELD).all() and np.isnan(found.value[~right]).all()
-    assert (found.is_used[right].sum(axis=1) == 15).all() and (
-        found.degrees_of_freedom[right] == 12
+    assert (solution.status[~right] == STATUS_WITHHELD).all() and np.isnan(
+        solution.value[~right]
+    ).all()
+    assert (solution.is_used[right].sum(axis=1) == 15).all() and (
+        solution.degrees_of_freedom[right] == 12
     ).all()
     left = np.delete(SIXTEEN, beam, axis=0)
-    stated = 0.01**2 * np.linalg.inv(left.T @ left)
-    np.testing.assert_allclose(found.covariance[right][0], stated, rtol=1e-9, atol=1e-16)
-    off = found.value[right] - MOVING
-    assert (np.abs(off.mean(axis=0)) <= 5 * np.sqrt(np.diag(stated) / DRAWS)).all()
+    stated_covariance = 0.01**2 * np.linalg.inv(left.T @ left)
+    np.testing.assert_allclose(
+        solution.covariance[right][0], stated_covariance, rtol=1e-9, atol=1e-16
+    )
+    errors = solution.value[right] - MOVING
+    assert (np.abs(errors.mean(axis=0)) <= 5 * np.sqrt(np.diag(stated_covariance) / DRAWS)).all()
 
 
 def test_the_power_of_the_test_is_that_of_the_noncentral_chi_square():
@@ -176,21 +182,21 @@ def test_the_power_of_the_test_is_that_of_the_noncentral_chi_square():
     leverage = SIXTEEN[beam] @ np.linalg.solve(SIXTEEN.T @ SIXTEEN, SIXTEEN[beam])
     power = ncx2.sf(chi2.isf(LEVEL, 13), 13, (alarm / 0.01) ** 2 * (1 - leverage))
     assert 0.3 < power < 0.95
-    found = _drawn_with_alarm(SIXTEEN, alarm=alarm, beam=beam, seed=8)
-    assert is_within_5_sigma((found.status != STATUS_SOLVED).sum(), power)
-    excluded = found.status == STATUS_EXCLUDED
+    solution = _drawn_with_alarm(SIXTEEN, alarm=alarm, beam=beam, seed=8)
+    assert is_within_5_sigma((solution.status != STATUS_SOLVED).sum(), power)
+    excluded = solution.status == STATUS_EXCLUDED
     assert (
-        ~found.is_used[excluded, beam]
+        ~solution.is_used[excluded, beam]
     ).mean() > 0.8  # a beam told from 15 others: 1/16 by chance
 
 
 def test_two_false_alarms_are_withheld():
     measured = SIXTEEN @ MOVING
     measured[[2, 9]] += [40.0, -25.0]
-    found = solve_velocity(
+    solution = solve_velocity(
         direction=SIXTEEN, radial_velocity=measured, standard_error=0.01, test_level=LEVEL
     )
-    assert found.status == STATUS_WITHHELD
+    assert solution.status == STATUS_WITHHELD
 
 
 def test_level_ground_tells_which_of_four_ranges_is_false():
@@ -198,9 +204,9 @@ def test_level_ground_tells_which_of_four_ranges_is_false():
     ranges = _ranges(FOUR, 400.0) + rng.normal(0, 0.1, (DRAWS, 4))
     ranges[np.arange(DRAWS), np.arange(DRAWS) % 4] = rng.uniform(0, 300, DRAWS)
     known = {"direction": FOUR, "range": ranges, "standard_error": 0.1, "test_level": LEVEL}
-    found = altitude(**known, slope=0.0)
-    right = (found.status == STATUS_EXCLUDED) & (
-        found.is_used.argmin(axis=1) == np.arange(DRAWS) % 4
+    solution = altitude(**known, slope=0.0)
+    right = (solution.status == STATUS_EXCLUDED) & (
+        solution.is_used.argmin(axis=1) == np.arange(DRAWS) % 4
     )
     assert is_within_5_sigma(right.sum(), 1 - LEVEL)
     assert (
@@ -214,8 +220,8 @@ def test_level_ground_tells_which_of_four_ranges_is_false():
 def test_a_platform_that_moves_between_beams_is_put_right_by_their_offsets():
     offset = np.linspace(-1.5, 1.5, 4)[:, None] * MOVING / 80
     ranges = _ranges(FOUR, 90.0, normal=NORMAL, offset=offset)
-    found = altitude(direction=FOUR, range=ranges, standard_error=0.1, offset=offset)
-    assert found.value == pytest.approx(90.0, rel=1e-13)
+    solution = altitude(direction=FOUR, range=ranges, standard_error=0.1, offset=offset)
+    assert solution.value == pytest.approx(90.0, rel=1e-13)
 
 
 @PATTERNS
@@ -224,7 +230,7 @@ def test_the_altitudes_variance_is_its_response_to_each_range(beams, slope):
     """Variance = sum of (dh/dR_i)^2 sigma_i^2, by central differences, plus what slopes add."""
     error = np.linspace(0.05, 0.2, len(beams))
     ranges = _ranges(beams, 200.0)
-    found = altitude(direction=beams, range=ranges, standard_error=error, slope=slope)
+    solution = altitude(direction=beams, range=ranges, standard_error=error, slope=slope)
     step = 1e-3 * np.eye(len(beams))
     high, low = (
         altitude(direction=beams, range=ranges + s, standard_error=error, slope=slope).value
@@ -245,7 +251,7 @@ def test_the_altitudes_variance_is_its_response_to_each_range(beams, slope):
             from_slopes += slope**2 * ((tilted.value - 200.0) / 1e-5) ** 2
     expected = np.sum((response * error) ** 2) + from_slopes
     # steps of 1e-5 relative leave that much, squared or not, of curvature
-    assert found.covariance == pytest.approx(expected, rel=2e-5)
+    assert solution.covariance == pytest.approx(expected, rel=2e-5)
 
 
 @PATTERNS
@@ -255,14 +261,14 @@ def test_mean_and_variance_of_drawn_altitudes_are_those_propagated(beams):
     down = -(beams @ NORMAL) / NORMAL[2]
     heights = rng.normal(0, 0.3, (DRAWS, len(beams)))  # relief lifts a point, the range shrinks
     ranges = (500.0 - heights) / down + rng.normal(0, 1, heights.shape) * error
-    found = altitude(direction=beams, range=ranges, standard_error=error, relief=0.3)
-    off, variance = found.value - 500.0, found.covariance.mean()
+    solution = altitude(direction=beams, range=ranges, standard_error=error, relief=0.3)
+    errors, variance = solution.value - 500.0, solution.covariance.mean()
     # the curvature of the problem is of order variance / altitude, far below 5 sigma / sqrt(n)
     assert variance / 500 < 0.2 * np.sqrt(variance / DRAWS)
-    assert abs(off.mean()) <= 5 * np.sqrt(variance / DRAWS)
-    assert abs(off.var(ddof=1) / variance - 1) <= 5 * np.sqrt(2 / DRAWS)
+    assert abs(errors.mean()) <= 5 * np.sqrt(variance / DRAWS)
+    assert abs(errors.var(ddof=1) / variance - 1) <= 5 * np.sqrt(2 / DRAWS)
     degrees = len(beams) - 3
-    assert abs(found.chi_square.mean() - degrees) <= 5 * np.sqrt(2 * degrees / DRAWS) + 1e-6
+    assert abs(solution.chi_square.mean() - degrees) <= 5 * np.sqrt(2 * degrees / DRAWS) + 1e-6
 
 
 def test_on_a_steep_slope_errors_count_by_how_the_beams_meet_it():
@@ -270,32 +276,38 @@ def test_on_a_steep_slope_errors_count_by_how_the_beams_meet_it():
     normal = np.array([np.sin(radians(30.0)), 0.0, np.cos(radians(30.0))])
     noise = np.random.default_rng(16).normal(0, 0.1, (DRAWS, 4))
     ranges = _ranges(FOUR, 500.0, normal=normal) + noise
-    found = altitude(direction=FOUR, range=ranges, standard_error=0.1)
-    assert abs(found.value.var(ddof=1) / found.covariance.mean() - 1) <= 5 * np.sqrt(2 / DRAWS)
-    assert abs(found.chi_square.mean() - 1) <= 5 * np.sqrt(2 / DRAWS)
+    solution = altitude(direction=FOUR, range=ranges, standard_error=0.1)
+    assert abs(solution.value.var(ddof=1) / solution.covariance.mean() - 1) <= 5 * np.sqrt(
+        2 / DRAWS
+    )
+    assert abs(solution.chi_square.mean() - 1) <= 5 * np.sqrt(2 / DRAWS)
 
 
 def test_a_slope_known_beforehand_counts_in_the_variance_of_one_beam():
-    found = altitude(direction=FOUR[:1], range=[100.0], standard_error=0.1, slope=0.05, relief=0.2)
+    solution = altitude(
+        direction=FOUR[:1], range=[100.0], standard_error=0.1, slope=0.05, relief=0.2
+    )
     cosine = -FOUR[0, 2]
-    assert found.value == pytest.approx(100 * cosine)
+    assert solution.value == pytest.approx(100 * cosine)
     expected = (0.1 * cosine) ** 2 + 0.2**2 + 0.05**2 * 100**2 * (1 - cosine**2)
-    assert found.covariance == pytest.approx(expected, rel=1e-12)
+    assert solution.covariance == pytest.approx(expected, rel=1e-12)
 
 
 def test_two_beams_see_the_slope_along_their_line():
     """Nadir lies between them, so that the slope across it does not matter."""
     beams, height = FOUR[[0, 2]], 300.0
-    found = altitude(
+    solution = altitude(
         direction=beams, range=_ranges(beams, height, normal=NORMAL), standard_error=0.1
     )
-    assert found.value == pytest.approx(height, rel=1e-12) and found.degrees_of_freedom == 1
+    assert solution.value == pytest.approx(height, rel=1e-12) and solution.degrees_of_freedom == 1
 
 
 def test_no_beam_gives_no_altitude():
-    found = altitude(direction=FOUR, range=np.full(4, np.nan), standard_error=0.1, test_level=0.01)
-    assert found.status == STATUS_UNDETERMINED and not found.is_available
-    assert np.isnan(found.value) and np.isnan(found.covariance)
+    solution = altitude(
+        direction=FOUR, range=np.full(4, np.nan), standard_error=0.1, test_level=0.01
+    )
+    assert solution.status == STATUS_UNDETERMINED and not solution.is_available
+    assert np.isnan(solution.value) and np.isnan(solution.covariance)
 
 
 def test_a_tiny_slope_is_level_ground():
@@ -314,18 +326,20 @@ def test_ground_of_random_slope_is_off_by_the_stated_variance():
     tilt = rng.normal(0, 0.03, (DRAWS, 2))
     beams = FOUR[:2]
     ranges = 200.0 / (tilt @ beams[:, :2].T - beams[:, 2]) + rng.normal(0, 0.1, (DRAWS, 2))
-    found = altitude(direction=beams, range=ranges, standard_error=0.1, slope=0.03)
-    ratio = np.mean((found.value - 200.0) ** 2) / found.covariance.mean()
+    solution = altitude(direction=beams, range=ranges, standard_error=0.1, slope=0.03)
+    ratio = np.mean((solution.value - 200.0) ** 2) / solution.covariance.mean()
     assert abs(ratio - 1) <= 5 * np.sqrt(2 / DRAWS) + 0.01
-    assert found.covariance.mean() > 100 * 0.1**2  # by far the slope's doing
-    assert (found.degrees_of_freedom == 1).all()  # two heights and two slopes known, three sought
-    assert abs(found.chi_square.mean() - 1) <= 5 * np.sqrt(2 / DRAWS) + 0.01
+    assert solution.covariance.mean() > 100 * 0.1**2  # by far the slope's doing
+    assert (
+        solution.degrees_of_freedom == 1
+    ).all()  # two heights and two slopes known, three sought
+    assert abs(solution.chi_square.mean() - 1) <= 5 * np.sqrt(2 / DRAWS) + 0.01
 
 
 def test_a_beam_that_grazes_the_fitted_plane_does_not_run_off_with_the_weight():
     """A false range tilts the plane until another beam runs along it or past it."""
     ranges = _ranges(SIXTEEN, 100.0)
     ranges[0] = 9000.0
-    found = altitude(direction=SIXTEEN, range=ranges, standard_error=0.1, test_level=1e-3)
-    assert found.status == STATUS_EXCLUDED and not found.is_used[0]
-    assert found.value == pytest.approx(100.0, rel=1e-12)
+    solution = altitude(direction=SIXTEEN, range=ranges, standard_error=0.1, test_level=1e-3)
+    assert solution.status == STATUS_EXCLUDED and not solution.is_used[0]
+    assert solution.value == pytest.approx(100.0, rel=1e-12)

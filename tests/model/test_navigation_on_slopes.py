@@ -46,16 +46,20 @@ def slanting(slope):
     return clean_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
 
 
-def solved(parameters, descent, slope, beams, *, interval=0.0, floor=None, stated=None, **ground):
+def solved(
+    parameters, descent, slope, beams, *, interval=0.0, floor=None, stated_floor=None, **ground
+):
     """Mean NEES / 3 of velocity, rms of altitude's z, and mean errors of each cycle's altitude."""
-    seen = observe_shots(
+    shot_eyepoints = observe_shots(
         straight_flight(**({"position": (0.0, 0.0, 800.0)} | descent)), bodies=[slanting(slope)],
         scanner=fixed_beams(beams, rate=2.0, interval=interval), index=range(CYCLES * len(beams)),
         beam_divergence=1e-7,
     )  # fmt: skip
-    keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="o", seed=1)
+    keys = philox.point_keys(
+        np.arange(len(shot_eyepoints.time), dtype=float)[:, None], domain="o", seed=1
+    )
     points = simulate_cloud(
-        seen,
+        shot_eyepoints,
         parameters=parameters,
         surfaces=[SurfaceMaterial("ground", 0.2)],
         keys=keys,
@@ -63,21 +67,27 @@ def solved(parameters, descent, slope, beams, *, interval=0.0, floor=None, state
         effects=MOVING,
     )
     if floor is not None:
-        points = apply_error_floor(points, seen, floor, keys=keys, seed=1)
-    stated = {} if floor is None and stated is None else {"error_floor": stated or floor}
-    shots = eyepoints_to_arrays(seen)
-    found = solve_navigation(
-        shots, points, shots_per_cycle=len(beams), **({"ground_slope": 10.0} | ground), **stated
+        points = apply_error_floor(points, shot_eyepoints, floor, keys=keys, seed=1)
+    stated_floor = (
+        {} if floor is None and stated_floor is None else {"error_floor": stated_floor or floor}
+    )
+    shots = eyepoints_to_arrays(shot_eyepoints)
+    solution = solve_navigation(
+        shots,
+        points,
+        shots_per_cycle=len(beams),
+        **({"ground_slope": 10.0} | ground),
+        **stated_floor,
     )
     position, velocity = (
         shots[f"platform_{name}"].reshape(CYCLES, -1, 3) for name in ("position", "velocity")
     )
-    error = found["velocity"] - velocity.mean(axis=1)[:, None]
-    inverse = np.linalg.inv(found["velocity_covariance"])
+    error = solution["velocity"] - velocity.mean(axis=1)[:, None]
+    inverse = np.linalg.inv(solution["velocity_covariance"])
     nees = np.einsum("cdi,cdij,cdj->cd", error, inverse, error) / 3
     x, y, z = position[:, 0].T
-    height = found["altitude"] - (z - slope * x - slope / 2 * y)[:, None]
-    scores = height / np.sqrt(found["altitude_variance"])
+    height = solution["altitude"] - (z - slope * x - slope / 2 * y)[:, None]
+    scores = height / np.sqrt(solution["altitude_variance"])
     return nees.mean(), np.sqrt((scores**2).mean()), height.mean(axis=1)
 
 

@@ -48,8 +48,8 @@ def test_the_implied_excess_is_the_one_that_made_the_figure(excess, tnr):
         excess, abs=1e-14
     )
     if of_shot < 0.5:
-        found = noise_false_alarms.variance_excess_from_shot_pfa(of_shot, tnr, 131072)
-        assert found == pytest.approx(excess, abs=1e-14)
+        implied_excess = noise_false_alarms.variance_excess_from_shot_pfa(of_shot, tnr, 131072)
+        assert implied_excess == pytest.approx(excess, abs=1e-14)
 
 
 @pytest.mark.parametrize("figure", [0.0, 1.0, float("nan")])

@@ -104,8 +104,8 @@ def test_an_instrument_in_the_plane_of_a_wall_sees_what_is_beyond_it(table_4_1, 
     eyes = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL, far], beams=FORWARD)
     np.testing.assert_allclose(eyes.range, 200.0, rtol=1e-4)
     prepare_eyepoint_shots(eyes, scene_parameters(table_4_1), [SurfaceMaterial("wall", 0.1)])
-    alone = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
-    assert not alone.has_target.any()
+    eyepoints = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
+    assert not eyepoints.has_target.any()
 
 
 def test_a_surface_farther_than_the_least_range_is_hit():

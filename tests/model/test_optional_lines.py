@@ -37,9 +37,9 @@ DRIFTS = {
 }
 
 
-def prepared(parameters, *further, without=()):
-    effects = [name for name in (*DEFAULT_EFFECTS, *further) if name not in without]
-    ((_, shots),) = prepare_shots(parameters | (DRIFTS if further else {}), effects)
+def prepared(parameters, *further_effects, without=()):
+    effects = [name for name in (*DEFAULT_EFFECTS, *further_effects) if name not in without]
+    ((_, shots),) = prepare_shots(parameters | (DRIFTS if further_effects else {}), effects)
     return shots
 
 
@@ -87,8 +87,10 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
                 AGREEMENT if shots.footprint.adds_powers else 1e-11
             )
         if distance < 1:  # beats next to DC: images are there, and were left out
-            both = evaluate_segments(replace(shots, images=shots.images._replace(are_summed=True)))
-            assert abs(both.magnitude[1] / evaluate_segments(shots).magnitude[1] - 1) > 1e-3
+            summed = evaluate_segments(
+                replace(shots, images=shots.images._replace(are_summed=True))
+            )
+            assert abs(summed.magnitude[1] / evaluate_segments(shots).magnitude[1] - 1) > 1e-3
 
 
 # Leakage
@@ -96,21 +98,21 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
 
 def same_detections(shots):
     """Largest relative change of a magnitude, and change of a pd, by leaving leakage out."""
-    whole = evaluate_segments(shots)
+    with_all_bins = evaluate_segments(shots)
     worst = np.zeros(2)
     for every_bin in (False, True):
-        found = evaluate_segments(
+        spectra = evaluate_segments(
             replace(
                 shots, detection_settings=shots.detection_settings._replace(includes_leakage=False)
             ),
             bin_by_bin=every_bin,
         )
-        assert not np.nan_to_num(found.leakage).any()
-        np.testing.assert_array_equal(found.frequency, whole.frequency)
-        np.testing.assert_array_equal(found.n_exempt, whole.n_exempt)
+        assert not np.nan_to_num(spectra.leakage).any()
+        np.testing.assert_array_equal(spectra.frequency, with_all_bins.frequency)
+        np.testing.assert_array_equal(spectra.n_exempt, with_all_bins.n_exempt)
         with np.errstate(invalid="ignore"):
-            change = abs(found.magnitude - whole.magnitude) / whole.magnitude
-        moved = [abs(found.pd - whole.pd), abs(found.miss - whole.miss)]
+            change = abs(spectra.magnitude - with_all_bins.magnitude) / with_all_bins.magnitude
+        moved = [abs(spectra.pd - with_all_bins.pd), abs(spectra.miss - with_all_bins.miss)]
         worst = np.maximum(worst, [np.nanmax(change, initial=0.0), np.nanmax(moved)])
     return worst
 
@@ -119,8 +121,8 @@ def same_detections(shots):
 @pytest.mark.parametrize("fft_size", [64, 255, 512, 1023, 4099, 8192])
 def test_without_leakage_detections_stay_what_they_are(table_4_1, fft_size, image):
     """Bundles wide and narrow, weak and strong, on DC and Nyquist and beyond."""
-    for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
-        shots = bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
+    for seed, spread in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
+        shots = bundles(table_4_1, 10 * fft_size + seed, fft_size, spread)
         magnitude, pd = same_detections(
             replace(shots, images=shots.images._replace(are_summed=image))
         )
@@ -161,8 +163,8 @@ def test_without_leakage_only_noise_raises_false_peaks(table_4_1):
         counts = simulate_draws(parameters, effects, keys=keys, batch_sizes=[4000], method="noise")
         shares[name] = counts["n_false_alarm_up"][0, 0] / 4000, outputs["pfa_segment"][0]
     assert shares["with"][0] > 0.5
-    found, expected = shares["without"]
-    assert abs(found - expected) < 5 * np.sqrt(expected * (1 - expected) / 4000)
+    without_leakage, expected = shares["without"]
+    assert abs(without_leakage - expected) < 5 * np.sqrt(expected * (1 - expected) / 4000)
 
 
 # Phase errors and widths
@@ -237,11 +239,11 @@ def smeared():
 @pytest.mark.parametrize("effects, case, window, phases", list(smeared()))
 def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, phases, table_4_1):
     parameters = scene(table_4_1, window=window, phases=phases, **CASES[case])
-    shots, plain = prepared(parameters, *effects), prepared(parameters)
+    shots, unperturbed = prepared(parameters, *effects), prepared(parameters)
     for segment in range(3):
         bins, fast = segment_spectra.segment_spectrum(shots, 0, segment)
         slow = exact(shots, 0, segment, width_by_hermite(shots, 0))
-        peak = segment_spectra.segment_spectrum(plain, 0, segment)[1].max()
+        peak = segment_spectra.segment_spectrum(unperturbed, 0, segment)[1].max()
         assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
         assert magnitude_error(shots, fast, slow, peak) < AGREEMENT
 
@@ -261,17 +263,17 @@ def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, 
         "accuracy.leakage_floor": 1e-12,
     }
     shots = prepared(parameters, *effects, without=() if leakage else ("leakage",))
-    found, listed = evaluate_segments(shots), list_bin_groups(shots)
+    spectra, listed = evaluate_segments(shots), list_bin_groups(shots)
     slow = evaluate_segments(shots, bin_by_bin=True)
-    np.testing.assert_allclose(found.leakage, slow.leakage, rtol=1e-6, atol=1e-20)
+    np.testing.assert_allclose(spectra.leakage, slow.leakage, rtol=1e-6, atol=1e-20)
     above = 0
     for i in range(40):
         for segment in range(3):
             bins, magnitude = segment_spectra.segment_spectrum(shots, i, segment)
             level = shots.threshold[i]
             best = magnitude.argmax()
-            assert found.magnitude[segment, i] == pytest.approx(magnitude[best], rel=1e-9)
-            assert found.frequency[segment, i] == best * shots.sample_rate[i] / 4096
+            assert spectra.magnitude[segment, i] == pytest.approx(magnitude[best], rel=1e-9)
+            assert spectra.frequency[segment, i] == best * shots.sample_rate[i] / 4096
             assert listed.strongest_bin[i, segment, 0] == best
             neighbours = magnitude[np.clip([best - 1, best, best + 1], 0, bins[-1])]
             inside = 0 < best < bins[-1]
@@ -282,7 +284,7 @@ def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, 
             crossing = magnitude >= level
             crossing[best] = True
             wide = np.convolve(crossing, np.ones(3), "same") > 0
-            assert found.n_exempt[segment, i] == wide.sum()
+            assert spectra.n_exempt[segment, i] == wide.sum()
             above += crossing.sum() > 1
     assert above > 20
 
@@ -308,9 +310,11 @@ def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
         drawn = returns.draw_returns(
             shots, list_bin_groups(shots), keys=keys, draws=4000, method=method
         ).group[..., 0]  # fmt: skip
-        seen = (drawn == 0).any(axis=-1).mean(axis=1)
+        missed_share = (drawn == 0).any(axis=-1).mean(axis=1)
         # An up peak makes a return where there is a down peak, or a false one, to go with it.
-        assert (seen < pd + 5 * sigma * np.sqrt(number / 4000)).all() and (seen > 0).all()
+        assert (missed_share < pd + 5 * sigma * np.sqrt(number / 4000)).all() and (
+            missed_share > 0
+        ).all()
 
 
 # What is not there, and company
@@ -333,13 +337,13 @@ def test_the_company_of_points_changes_no_bit(phases, left_out, table_4_1):
     }
     chosen = [n for n in (*DEFAULT_EFFECTS, *DRIFTING, "line_width") if n not in left_out]
 
-    def found(index):
+    def spectra_of(index):
         part = {k: v[index] if np.ndim(v) else v for k, v in parameters.items()}
         ((_, shots),) = prepare_shots(part, chosen)
         return evaluate_segments(shots)
 
-    whole = found(np.arange(number))
-    some = rng.permutation(number)[: number // 2]
-    for index in (some, some[:1], np.array([number - 1])):
-        there = np.ascontiguousarray(np.array(whole)[..., index])
-        assert there.tobytes() == np.array(found(index)).tobytes()
+    all_points = spectra_of(np.arange(number))
+    point_index = rng.permutation(number)[: number // 2]
+    for index in (point_index, point_index[:1], np.array([number - 1])):
+        expected = np.ascontiguousarray(np.array(all_points)[..., index])
+        assert expected.tobytes() == np.array(spectra_of(index)).tobytes()

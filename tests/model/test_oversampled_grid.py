@@ -27,7 +27,7 @@ with the tenth power.
 """
 
 
-def drawn(table_4_1, number=12, **changes):
+def drawn_scene(table_4_1, number=12, **changes):
     rng = np.random.default_rng(5)
     scene = table_4_1(
         range=rng.uniform(10.0, 1e4, number),
@@ -77,10 +77,10 @@ def error(shots, degree):
         )
         for segment in range(3):
             _, exact = segment_spectra.segment_spectrum(shots, i, segment)
-            bins, found = spectrum(shots, i, segment, degree=degree)
+            bins, spectrum_values = spectrum(shots, i, segment, degree=degree)
             inner = slice(bins.size // 4, -bins.size // 4)
-            apart = np.abs(found**order - exact[bins] ** order) / peak**order
-            worst = max(worst, apart[inner].max())
+            errors = np.abs(spectrum_values**order - exact[bins] ** order) / peak**order
+            worst = max(worst, errors[inner].max())
     return worst
 
 
@@ -88,7 +88,7 @@ def error(shots, degree):
 @pytest.mark.parametrize("window", DEPOSIT)
 def test_lines_in_cells_are_as_near_as_cells_can_be(window, phases, table_4_1):
     number = 2 if "kaiser" in window else 12  # whose whole spectrum takes its time
-    shots = drawn(table_4_1, number, window=window, phases=phases)
+    shots = drawn_scene(table_4_1, number, window=window, phases=phases)
     shots = replace(shots, images=shots.images._replace(are_summed=False))
     nearest, shared = DEPOSIT[window]
     assert 1e-3 < error(shots, 0) < nearest
@@ -111,9 +111,9 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
         ((_, shots),) = prepare_shots(scene, WITHOUT_LEAKAGE)
         for i in range(2):
             _, exact = segment_spectra.segment_spectrum(shots, i, 1)
-            bins, found = spectrum(shots, i, 1, degree=9)
+            bins, spectrum_values = spectrum(shots, i, 1, degree=9)
             edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
-            assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
+            assert np.abs(spectrum_values - exact[bins])[edge].max() < 1e-8 * exact.max()
             without = segment_spectra.segment_spectrum(
                 replace(shots, images=shots.images._replace(are_summed=False)), i, 1
             )[1]
@@ -122,15 +122,17 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
 
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
 def test_the_way_back_to_the_bins_alone_is_the_whole_way_back(phases, table_4_1):
-    shots = drawn(table_4_1, 12, phases=phases)
+    shots = drawn_scene(table_4_1, 12, phases=phases)
     for i, segment in itertools.product(range(shots.size), range(3)):
-        _, whole = spectrum(shots, i, segment)
+        _, magnitudes = spectrum(shots, i, segment)
         _, real = spectrum(shots, i, segment, real=True)
         _, folded = spectrum(shots, i, segment, folded=True)
-        _, both = spectrum(shots, i, segment, real=True, folded=True)
+        _, real_and_folded = spectrum(shots, i, segment, real=True, folded=True)
         order = 2 if shots.footprint.adds_powers else 1  # a root of rounding is much
-        for other in (real, folded, both):
-            assert np.abs(whole**order - other**order).max() < 1e-14 * whole.max() ** order
+        for other in (real, folded, real_and_folded):
+            assert (
+                np.abs(magnitudes**order - other**order).max() < 1e-14 * magnitudes.max() ** order
+            )
 
 
 def test_the_same_detections_come_of_it(table_4_1):
@@ -139,15 +141,17 @@ def test_the_same_detections_come_of_it(table_4_1):
         range=rng.uniform(200.0, 9000.0, 40), grazing_angle=np.radians(rng.uniform(5.0, 90.0, 40))
     )
     exact = evaluate(scene, WITHOUT_LEAKAGE, segment_evaluator=evaluate_segments)
-    found = evaluate(
+    outputs = evaluate(
         scene,
         WITHOUT_LEAKAGE,
         segment_evaluator=lambda s: oversampled_grid.find_peaks_on_grid(s, degree=9),
     )
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_up", "range_error", "noise_variance"):
         # Images beyond the grid are left out: 1e-4 of a line at the very most.
-        assert found[name] == pytest.approx(exact[name], rel=2e-3, abs=1e-3), name
-    assert found["log10_pfa_both_chirps"] == pytest.approx(exact["log10_pfa_both_chirps"], abs=1e-4)
+        assert outputs[name] == pytest.approx(exact[name], rel=2e-3, abs=1e-3), name
+    assert outputs["log10_pfa_both_chirps"] == pytest.approx(
+        exact["log10_pfa_both_chirps"], abs=1e-4
+    )
 
 
 def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
@@ -157,9 +161,9 @@ def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
     ((_, shots),) = wide
     assert list(oversampled_grid.cells_per_point(shots)) == [2**13, 2**12]
     assert list(oversampled_grid.cells_per_point(shots, 2**11)) == [2**13, 2**11]
-    bins, found = spectrum(shots, 0, 0, degree=9)
+    bins, spectrum_values = spectrum(shots, 0, 0, degree=9)
     _, exact = segment_spectra.segment_spectrum(shots, 0, 0)
-    assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
+    assert np.abs(spectrum_values - exact[bins]).max() < 1e-3 * exact.max()
 
 
 def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
@@ -167,12 +171,12 @@ def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
         range=np.array([700.0, 3000.0]), fft_size=4096, beamlets=19, radial_velocity=0.0
     )
     exact = evaluate(scene, WITHOUT_LEAKAGE)
-    found = evaluate(
+    outputs = evaluate(
         scene, WITHOUT_LEAKAGE, segment_evaluator=time_domain_truth.evaluate_segments_in_time_domain
     )
     for name in ("pd_up", "pd_doppler", "pd_shot", "miss_shot", "snr_up", "range_error"):
-        assert found[name] == pytest.approx(exact[name], rel=1e-6, abs=1e-9), name
-    assert np.array_equal(found["pfa_both_chirps"], exact["pfa_both_chirps"])
+        assert outputs[name] == pytest.approx(exact[name], rel=1e-6, abs=1e-9), name
+    assert np.array_equal(outputs["pfa_both_chirps"], exact["pfa_both_chirps"])
 
 
 def test_direct_detection_has_no_doppler_segment(table_4_1):
@@ -181,7 +185,7 @@ def test_direct_detection_has_no_doppler_segment(table_4_1):
         oversampled_grid.find_peaks_on_grid,
         time_domain_truth.evaluate_segments_in_time_domain,
     ):
-        found = evaluate(
+        outputs = evaluate(
             scene | {"instrument.processing.fft_size": 4096}, ("image",), segment_evaluator=look
         )
-        assert np.isnan(found["pd_doppler"]).all() and (found["pd_up"] > 0).all()
+        assert np.isnan(outputs["pd_doppler"]).all() and (outputs["pd_up"] > 0).all()

@@ -42,20 +42,27 @@ def tilted(slope, across=None):
     return clean_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
 
 
-def errors_of_points(seen, parameters, effects=MOVING, **how):
+def errors_of_points(eyepoints, parameters, effects=MOVING, **keywords):
     """Errors of range and velocity over their standard errors, of true points, and the errors."""
-    keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="o", seed=1)
-    got = simulate_cloud(
-        seen, parameters=parameters, surfaces=[SurfaceMaterial("ground", 0.2)], keys=keys, draws=30,
-        effects=effects, **how,
-    )  # fmt: skip
-    true = got["flags"] & TRUE_FLAG > 0
+    keys = philox.point_keys(
+        np.arange(len(eyepoints.time), dtype=float)[:, None], domain="o", seed=1
+    )
+    cloud = simulate_cloud(
+        eyepoints,
+        parameters=parameters,
+        surfaces=[SurfaceMaterial("ground", 0.2)],
+        keys=keys,
+        draws=30,
+        effects=effects,
+        **keywords,
+    )
+    true = cloud["flags"] & TRUE_FLAG > 0
     assert true.any(axis=(1, 2)).all()
-    found = {}
+    errors = {}
     for name in ("range", "radial_velocity"):
-        error = got[f"{name}_interpolated"][true] - got[f"true_{name}"][true]
-        found[name] = error, error / got[f"{name}_interpolated_standard_error"][true]
-    return found
+        error = cloud[f"{name}_interpolated"][true] - cloud[f"true_{name}"][true]
+        errors[name] = error, error / cloud[f"{name}_interpolated_standard_error"][true]
+    return errors
 
 
 def shots(motion, slope=0.0, across=None, **keywords):
@@ -68,10 +75,10 @@ def shots(motion, slope=0.0, across=None, **keywords):
     )
 
 
-def is_near_one(scores, most=1.5):
+def is_near_one(scores, ratio_max=1.5):
     """Scores of 68 % of the points, and their mean, are those of true standard errors."""
     inner = np.quantile(np.abs(scores), 0.683)
-    assert 0.3 < inner < most
+    assert 0.3 < inner < ratio_max
     assert np.abs(scores).max() < 6
 
 
@@ -81,10 +88,10 @@ def is_near_one(scores, most=1.5):
 def test_points_of_a_moving_instrument_are_as_good_as_they_say(table_4_1, name, slope, method):
     parameters = scene_parameters(table_4_1, beamlets=109)
     priors = MotionPriors() if slope else LEVEL_GROUND
-    found = errors_of_points(
+    errors = errors_of_points(
         shots(MOTIONS[name], slope), parameters, method=method, motion_priors=priors
     )
-    for _, scores in found.values():
+    for _, scores in errors.values():
         is_near_one(scores)
 
 
@@ -94,9 +101,9 @@ def test_standard_errors_are_right_over_ground_of_the_stated_slopes_and_do_not_k
     Two slopes of each plane make its errors: 80 numbers, whose mean square is known to 16 %.
     """
     parameters, slopes = scene_parameters(table_4_1, beamlets=19), MotionPriors().terrain_slope
-    random, squares, stated = np.random.default_rng(5), [], []
+    random, squares, stated_errors = np.random.default_rng(5), [], []
     for along, across in slopes * random.standard_normal((40, 2)):
-        seen = observe_shots(
+        shot_eyepoints = observe_shots(
             straight_flight(**(FALL | MOTIONS["turning"])),
             bodies=[tilted(along, across)],
             number=19,
@@ -104,20 +111,22 @@ def test_standard_errors_are_right_over_ground_of_the_stated_slopes_and_do_not_k
             index=range(4),
             beam_divergence=1e-7,
         )
-        error, scores = errors_of_points(seen, parameters)["range"]
+        error, scores = errors_of_points(shot_eyepoints, parameters)["range"]
         squares.append((scores**2).mean())
-        stated.append(np.median(error / scores / seen.range.mean()))
+        stated_errors.append(np.median(error / scores / shot_eyepoints.range.mean()))
     assert np.mean(squares) == pytest.approx(1, abs=0.35)
     # The error grows with the range alone, not with the slope: some 20 % of it is noise.
-    assert np.ptp(stated) < 0.2 * np.mean(stated)
+    assert np.ptp(stated_errors) < 0.2 * np.mean(stated_errors)
 
 
 def test_a_wobble_of_20_deg_a_second_moves_level_ground_by_no_more_than_millimetres(table_4_1):
     """Uncorrected it is metres: 2.2 m of 3,127.5 m, stated as 6.4 mm."""
-    seen = shots(MOTIONS["wobbling"])
-    assert np.abs(seen.acceleration).max() > 25
+    shot_eyepoints = shots(MOTIONS["wobbling"])
+    assert np.abs(shot_eyepoints.acceleration).max() > 25
     parameters = scene_parameters(table_4_1, beamlets=109)
-    (error, _), (speed, _) = errors_of_points(seen, parameters, motion_priors=LEVEL_GROUND).values()
+    (error, _), (speed, _) = errors_of_points(
+        shot_eyepoints, parameters, motion_priors=LEVEL_GROUND
+    ).values()
     assert np.abs(error).max() < 0.08 and np.median(np.abs(error)) < 0.02
     assert np.abs(speed).max() < 2e-3
 
@@ -136,8 +145,8 @@ def test_segments_of_any_slopes_are_corrected_alike(table_4_1, down_slope, recor
 @pytest.mark.parametrize("left_out", [{"acceleration"}, {"range_walk"}, {"segment_motion"}])
 def test_only_what_is_simulated_is_corrected(table_4_1, left_out):
     parameters = scene_parameters(table_4_1, beamlets=109)
-    seen = shots(MOTIONS["turning"], 0.1)
-    for _, scores in errors_of_points(seen, parameters, MOVING - left_out).values():
+    shot_eyepoints = shots(MOTIONS["turning"], 0.1)
+    for _, scores in errors_of_points(shot_eyepoints, parameters, MOVING - left_out).values():
         is_near_one(scores)
 
 
@@ -148,7 +157,7 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
     come from what the scene does.
     """
     lift = straight_flight(position=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 30.0))
-    seen = observe_shots(
+    shot_eyepoints = observe_shots(
         straight_flight(**FALL),
         bodies=[level_plate()],
         body_motion=[lift],
@@ -156,11 +165,13 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
         index=range(4),
         number=109,
     )
-    np.testing.assert_allclose(ego_motion_of_eyepoints(seen).acceleration, 0, atol=1e-9)
+    np.testing.assert_allclose(ego_motion_of_eyepoints(shot_eyepoints).acceleration, 0, atol=1e-9)
     parameters = scene_parameters(table_4_1, beamlets=109)
     for acceleration, low, high in ((0.0, 50, 1000), (30.0, 0.9, 1.1), (300.0, 0.09, 0.11)):
         priors = MotionPriors(terrain_slope=0.0, target_acceleration=acceleration)
-        (error, scores), _ = errors_of_points(seen, parameters, motion_priors=priors).values()
+        (error, scores), _ = errors_of_points(
+            shot_eyepoints, parameters, motion_priors=priors
+        ).values()
         assert np.abs(error).min() > 0.5
         assert low < np.median(np.abs(scores)) < high
 
@@ -168,7 +179,7 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
 def test_a_targets_speed_stated_beforehand_is_in_the_standard_errors(table_4_1):
     """A plate that slides by 100 m/s along a beam's azimuth, seen at 15 deg from its normal."""
     slide = straight_flight(position=(0.0, 0.0, 0.0), velocity=(100.0, 0.0, 0.0))
-    seen = observe_shots(
+    shot_eyepoints = observe_shots(
         straight_flight(**FALL),
         bodies=[level_plate()],
         body_motion=[slide],
@@ -181,21 +192,29 @@ def test_a_targets_speed_stated_beforehand_is_in_the_standard_errors(table_4_1):
     scores = {}
     for speed in (0.0, 100.0):
         priors = MotionPriors(terrain_slope=0.0, target_speed=speed)
-        (_, scores[speed]), _ = errors_of_points(seen, parameters, motion_priors=priors).values()
+        (_, scores[speed]), _ = errors_of_points(
+            shot_eyepoints, parameters, motion_priors=priors
+        ).values()
     assert np.median(np.abs(scores[0.0])) > 3
     assert np.median(np.abs(scores[100.0])) == pytest.approx(1, abs=0.2)
 
 
 def test_known_motion_is_the_true_one_over_level_ground():
     for motion in MOTIONS.values():
-        seen = shots(motion)
-        known = ego_motion_of_eyepoints(seen)
-        np.testing.assert_allclose(known.acceleration, seen.acceleration, rtol=1e-9, atol=1e-9)
-        slip = known.slip_at(seen.range)
-        np.testing.assert_allclose(slip, seen.radial_velocity - seen.approach_speed, atol=1e-6)
+        shot_eyepoints = shots(motion)
+        known = ego_motion_of_eyepoints(shot_eyepoints)
+        np.testing.assert_allclose(
+            known.acceleration, shot_eyepoints.acceleration, rtol=1e-9, atol=1e-9
+        )
+        slip = known.slip_at(shot_eyepoints.range)
+        np.testing.assert_allclose(
+            slip, shot_eyepoints.radial_velocity - shot_eyepoints.approach_speed, atol=1e-6
+        )
 
 
 def test_a_beam_that_looks_ahead_is_taken_to_meet_a_wall_that_faces_it():
-    seen = observe_shots(straight_flight(attitude=WOBBLE), beams=np.array([[1.0, 0.0, -0.01]]))
-    known = ego_motion_of_eyepoints(seen)
+    shot_eyepoints = observe_shots(
+        straight_flight(attitude=WOBBLE), beams=np.array([[1.0, 0.0, -0.01]])
+    )
+    known = ego_motion_of_eyepoints(shot_eyepoints)
     assert known.slip_at(np.array([1e3])).tolist() == [0.0]

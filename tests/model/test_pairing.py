@@ -44,8 +44,8 @@ def _beats(target_range, radial_velocity):
 def _pair(up, doppler, down, tolerance=CONFIRMATION_TOLERANCE_BINS, assumed=waveform.FAR_READING):
     """(confirmed, [(up, doppler, down, code)])."""
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
-    room = max(lists[0].size, lists[2].size, 1)
-    pairs = PeakPairs.allocate(room)
+    size = max(lists[0].size, lists[2].size, 1)
+    pairs = PeakPairs.allocate(size)
     confirmed, number = pair_peaks(*lists, AT_START, float(N), 0.0, assumed, tolerance, pairs)
     return confirmed, [tuple(map(int, p)) for p in zip(*pairs, strict=True)][:number]
 
@@ -114,9 +114,9 @@ def test_a_peak_confirms_others_by_chance_as_rarely_as_stated():
     generator = np.random.default_rng(2)
     triples = generator.uniform(0, N / 2, (40_000, 3))
     hits = sum(_confirmed(*t, CONFIRMATION_TOLERANCE_BINS)[0] >= 0 for t in triples)
-    stated = 16 * 2 * CONFIRMATION_TOLERANCE_BINS / (N / 2)
-    assert stated == pytest.approx(1.5e-3, rel=0.03)
-    assert 0.1 * stated < hits / 40_000 <= stated + 5 * np.sqrt(stated / 40_000)
+    chance = 16 * 2 * CONFIRMATION_TOLERANCE_BINS / (N / 2)
+    assert chance == pytest.approx(1.5e-3, rel=0.03)
+    assert 0.1 * chance < hits / 40_000 <= chance + 5 * np.sqrt(chance / 40_000)
 
 
 # Scenes

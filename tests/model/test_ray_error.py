@@ -72,10 +72,16 @@ def _parameters(table_4_1, power=0.006):
     return scene_parameters(table_4_1, power=power, fft_size=2**16)
 
 
-def _cloud(seen, parameters, **keywords):
-    keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="rays", seed=1)
+def _cloud(shot_eyepoints, parameters, **keywords):
+    keys = philox.point_keys(
+        np.arange(len(shot_eyepoints.time), dtype=float)[:, None], domain="rays", seed=1
+    )
     return simulate_cloud(
-        seen, parameters=parameters, surfaces=SURFACES, keys=keys, **{"returns_max": 1} | keywords
+        shot_eyepoints,
+        parameters=parameters,
+        surfaces=SURFACES,
+        keys=keys,
+        **{"returns_max": 1} | keywords,
     )
 
 
@@ -91,20 +97,24 @@ def test_the_fewest_follow_from_the_tolerance_alone():
 
 
 @pytest.mark.parametrize("rays", RAYS)
-def test_shots_get_more_rays_as_theirs_tell(rays):
+def test_ray_counts_grow_with_the_estimated_error(rays):
     """About as many as the error, which falls with their number, asks for; and no more at a time
     than an error from so few can be trusted with."""
     tolerance, over = 1e-3, np.array([0.0, 0.5, 1.0, 1.01, 3.0, 8.0, 1e3, np.nan])
-    more = next_ray_counts(rays, tolerance * over, ErrorBudget(tolerance))
-    assert (more[[0, 1, 2, -1]] == 0).all()
+    counts = next_ray_counts(rays, tolerance * over, ErrorBudget(tolerance))
+    assert (counts[[0, 1, 2, -1]] == 0).all()
     if rays == RAYS[-1]:
-        assert (more == 0).all(), "there are no more to be had"
+        assert (counts == 0).all(), "there are no more to be had"
         return
-    asked = more[3:-1]
-    assert (asked > 2 * rays).all() or (asked == RAYS[-1]).all()
-    assert set(asked) <= set(RAYS) and (np.diff(asked) >= 0).all()
-    enough = (asked >= rays * np.minimum(over[3:-1], 10)) | (asked == RAYS[-1]) | (rays <= 19)
-    assert enough.all() and asked[-1] <= 50 * rays
+    middle_counts = counts[3:-1]
+    assert (middle_counts > 2 * rays).all() or (middle_counts == RAYS[-1]).all()
+    assert set(middle_counts) <= set(RAYS) and (np.diff(middle_counts) >= 0).all()
+    enough = (
+        (middle_counts >= rays * np.minimum(over[3:-1], 10))
+        | (middle_counts == RAYS[-1])
+        | (rays <= 19)
+    )
+    assert enough.all() and middle_counts[-1] <= 50 * rays
 
 
 @pytest.mark.parametrize(
@@ -140,62 +150,77 @@ def test_numbers_are_whole_shells(number):
 
 
 @pytest.mark.parametrize(("scene", "number"), parametrize_product(4, SCENES, [19, 109, 439]))
-def test_it_tells_what_far_more_rays_would_change(table_4_1, scene, number):
+def test_ray_error_is_the_change_by_far_more_rays(table_4_1, scene, number):
     """Of 99 in 100 shots at least half of it, of four in ten no more than ten times as much.
 
     But of those in which no ray has hit what others would.
     """
-    parameters, seen = _parameters(table_4_1), _seen(scene, number)
+    parameters, shot_eyepoints = _parameters(table_4_1), _seen(scene, number)
     many = _cloud(_seen(scene, MANY), parameters)
-    few = _cloud(seen, parameters, estimates_ray_error=True)
+    few = _cloud(shot_eyepoints, parameters, estimates_ray_error=True)
     detected = sum(abs(few[name] - many[name]) for name in DETECTED)
-    one, other = (np.sqrt(2 * each["snr_up"]) for each in (few, many))
+    one, other = (np.sqrt(2 * stated_error["snr_up"]) for stated_error in (few, many))
     real = np.maximum(detected, abs(one - other) / np.maximum(np.maximum(one, other), 1))
-    off = (real > 1e-6) & (np.ptp(seen.surface, axis=1) == (scene != "rough ground"))
-    ratio = few["beamlets_error"][off] / real[off]
-    assert off.sum() > SHOTS / 4 and real[off].max() > 0.03
+    is_changed = (real > 1e-6) & (
+        np.ptp(shot_eyepoints.surface, axis=1) == (scene != "rough ground")
+    )
+    ratio = few["beamlets_error"][is_changed] / real[is_changed]
+    assert is_changed.sum() > SHOTS / 4 and real[is_changed].max() > 0.03
     assert (ratio >= 0.5).mean() >= 0.99
     assert (ratio <= 10).mean() >= 0.4
     assert few["beamlets_error"].max() <= 1
 
 
-def test_of_even_ground_there_is_next_to_nothing_to_tell(table_4_1):
+def test_ray_error_of_even_ground_is_negligible(table_4_1):
     parameters = _parameters(table_4_1)
-    found = [
+    clouds = [
         _cloud(_seen("the edge of a table", number), parameters, estimates_ray_error=True)
         for number in (19, 109)
     ]
     far = np.arange(SHOTS) < 5  # 49 mm and more, 3.9 deviations, from the edge
-    assert [each["beamlets_error"][far].max() < 1e-8 for each in found] == [True, True]
+    assert [cloud_result["beamlets_error"][far].max() < 1e-8 for cloud_result in clouds] == [
+        True,
+        True,
+    ]
 
 
-def test_it_is_told_only_where_it_is_asked_for(table_4_1):
+def test_ray_error_is_estimated_only_on_request(table_4_1):
     """All else is the same bit for bit; shots that see nothing have none."""
-    seen = _seen("the edge of a table", 19)
-    seen.surface[3] = -1
-    seen.range[3], seen.radial_velocity[3] = np.inf, np.nan
-    for values in (seen.offset, seen.velocity_offset, seen.cos_incidence):
+    shot_eyepoints = _seen("the edge of a table", 19)
+    shot_eyepoints.surface[3] = -1
+    shot_eyepoints.range[3], shot_eyepoints.radial_velocity[3] = np.inf, np.nan
+    for values in (
+        shot_eyepoints.offset,
+        shot_eyepoints.velocity_offset,
+        shot_eyepoints.cos_incidence,
+    ):
         values[3] = np.nan
     parameters = _parameters(table_4_1)
-    asked, not_asked = (
-        _cloud(seen, parameters, estimates_ray_error=each) for each in (True, False)
+    with_estimate, not_asked = (
+        _cloud(shot_eyepoints, parameters, estimates_ray_error=estimates_ray_error)
+        for estimates_ray_error in (True, False)
     )
-    for name in asked.keys() - {"beamlets_error"}:
-        np.testing.assert_array_equal(asked[name], not_asked[name])
-    assert np.isnan([each["beamlets_error"][3] for each in (asked, not_asked)]).all()
-    others = np.arange(SHOTS) != 3
-    assert np.isnan(not_asked["beamlets_error"][others]).all()
-    assert (asked["beamlets_error"][others] > 0).any()
+    for name in with_estimate.keys() - {"beamlets_error"}:
+        np.testing.assert_array_equal(with_estimate[name], not_asked[name])
+    assert np.isnan(
+        [
+            estimates_ray_error["beamlets_error"][3]
+            for estimates_ray_error in (with_estimate, not_asked)
+        ]
+    ).all()
+    is_other = np.arange(SHOTS) != 3
+    assert np.isnan(not_asked["beamlets_error"][is_other]).all()
+    assert (with_estimate["beamlets_error"][is_other] > 0).any()
     part = np.arange(100, 130)
-    alone = simulate_cloud(
-        seen.select(part),
+    single = simulate_cloud(
+        shot_eyepoints.select(part),
         parameters=parameters,
         surfaces=SURFACES,
         returns_max=1,
         estimates_ray_error=True,
         keys=np.zeros((part.size, 2), np.uint64),
     )
-    np.testing.assert_array_equal(alone["beamlets_error"], asked["beamlets_error"][part])
+    np.testing.assert_array_equal(single["beamlets_error"], with_estimate["beamlets_error"][part])
 
 
 def _ridge_errors(number, width):
@@ -207,21 +232,21 @@ def _ridge_errors(number, width):
     offsets, weight = place_beamlets(number)
     angle, place = np.meshgrid(np.linspace(0, np.pi, 13), [0.0, 0.3, 1.0])
     direction = np.stack([np.cos(angle.ravel()), np.sin(angle.ravel())], axis=1)
-    away = direction @ offsets - place.ravel()[:, None]
-    power = weight * np.exp(-0.5 * (away / width) ** 2)
+    distances = direction @ offsets - place.ravel()[:, None]
+    power = weight * np.exp(-0.5 * (distances / width) ** 2)
     squared = 1 + width**2
     true = width / np.sqrt(squared) * np.exp(-0.5 * place.ravel() ** 2 / squared)
-    told = np.empty(len(power))
-    _fill_power_errors(power, pair_opposite_beamlets(number), told)
-    return abs(power.sum(axis=1) / true - 1), told
+    estimated_errors = np.empty(len(power))
+    _fill_power_errors(power, pair_opposite_beamlets(number), estimated_errors)
+    return abs(power.sum(axis=1) / true - 1), estimated_errors
 
 
 @pytest.mark.parametrize("width", [5.0, 2.0, 1.0, 0.5])
 @pytest.mark.parametrize("number", RAYS[:5])
-def test_what_the_end_of_the_lattice_leaves_out_is_told(number, width):
+def test_ray_error_includes_what_the_end_of_the_lattice_omits(number, width):
     """Lines that fill many bins make a bin's power a ridge over the beam."""
-    error, told = _ridge_errors(number, width)
-    assert (told >= error).all()
+    error, estimated_error = _ridge_errors(number, width)
+    assert (estimated_error >= error).all()
 
 
 @pytest.mark.parametrize("width", [2.0, 1.0, 0.5])
@@ -239,13 +264,13 @@ def test_speckled_change_is_that_of_the_fading_law(relative):
     """The law is integrated here over the power of the speckle, and Marcum's Q."""
     power, step = np.linspace(0.0, 60.0, 200_001, retstep=True)
     for a, b in [(0.5, 4.0), (4.0, 4.0), (9.0, 4.0), (60.0, 4.0), (9.0, 6.5)]:
-        changed = [
+        pd_by_factor = [
             (np.exp(-power) * marcum_q1(a * np.sqrt(power * factor), np.array(b)).q).sum() * step
             for factor in (max(1 - relative, 0.0), 1.0, 1 + relative)
         ]
-        expected = np.abs(np.diff(changed)).max()
-        told = float(_speckled_pd_change(np.array(a), np.array(b), relative))
-        assert told == pytest.approx(expected, rel=2e-3, abs=2e-6)
+        expected = np.abs(np.diff(pd_by_factor)).max()
+        estimated_change = float(_speckled_pd_change(np.array(a), np.array(b), relative))
+        assert estimated_change == pytest.approx(expected, rel=2e-3, abs=2e-6)
 
 
 @pytest.mark.parametrize("n_looks", [2, 3, 8, 50])
@@ -273,9 +298,11 @@ def test_in_speckle_it_tells_what_far_more_rays_would_change(table_4_1, scene, d
     few = _cloud(_seen(scene, 37), parameters, effects=effects, estimates_ray_error=True)
     steady = _cloud(_seen(scene, 37), _parameters(table_4_1, power=0.05), estimates_ray_error=True)
     real = sum(abs(few[name] - many[name]) for name in DETECTED)
-    off = (real > 1e-6) & (np.ptp(_seen(scene, 37).surface, axis=1) == (scene != "rough ground"))
-    ratio = few["beamlets_error"][off] / real[off]
-    assert off.sum() > SHOTS / 10
+    is_changed = (real > 1e-6) & (
+        np.ptp(_seen(scene, 37).surface, axis=1) == (scene != "rough ground")
+    )
+    ratio = few["beamlets_error"][is_changed] / real[is_changed]
+    assert is_changed.sum() > SHOTS / 10
     assert (ratio >= 0.5).mean() >= 0.97
     assert np.median(ratio) < 20
     assert np.nanmedian(few["beamlets_error"]) < 0.7 * np.nanmedian(steady["beamlets_error"])

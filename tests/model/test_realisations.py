@@ -28,7 +28,7 @@ ALL = (*DEFAULT_EFFECTS, *RANDOM)
 
 def index(legs):
     """Variance of the whole factor of unit mean, exp(sum of log variances) - 1, for either law."""
-    return np.expm1(sum(each.large_eddies + each.small_eddies for each in legs))
+    return np.expm1(sum(leg.large_eddies + leg.small_eddies for leg in legs))
 
 
 def scene(table_4_1, **changes):
@@ -57,19 +57,19 @@ def per_draw(parameters, effects, n, draws, first_draw=0, seeded=None):
 
 
 def test_any_stretch_of_points_or_draws_has_the_same_bits(table_4_1, monkeypatch):
-    whole = per_draw(scene(table_4_1), ALL, 4, 60)
+    at_once = per_draw(scene(table_4_1), ALL, 4, 60)
     means = mean_statistics(scene(table_4_1), ALL, keys=make_point_keys(4), draws=60)
-    assert np.unique(whole["snr_up"]).size == 240
+    assert np.unique(at_once["snr_up"]).size == 240
     late = per_draw(scene(table_4_1), ALL, 4, 20, first_draw=30)
-    alone = scene(table_4_1, range=np.array([5000.0]), fft_size=4096)
-    single = per_draw(alone, ALL, 1, 60, seeded=make_point_keys(4)[3:])
+    single_point = scene(table_4_1, range=np.array([5000.0]), fft_size=4096)
+    single = per_draw(single_point, ALL, 1, 60, seeded=make_point_keys(4)[3:])
     monkeypatch.setattr(realisations, "DRAWS_PER_BATCH", 7)
     pieces = per_draw(scene(table_4_1), ALL, 4, 60)
     summed = mean_statistics(scene(table_4_1), ALL, keys=make_point_keys(4), draws=60)
     for name in GRID_OUTPUTS:
-        np.testing.assert_array_equal(whole[name][:, 30:50], late[name], err_msg=name)
-        np.testing.assert_array_equal(whole[name][3:], single[name], err_msg=name)
-        np.testing.assert_array_equal(whole[name], pieces[name], err_msg=name)
+        np.testing.assert_array_equal(at_once[name][:, 30:50], late[name], err_msg=name)
+        np.testing.assert_array_equal(at_once[name][3:], single[name], err_msg=name)
+        np.testing.assert_array_equal(at_once[name], pieces[name], err_msg=name)
     for name, values in means.items():
         np.testing.assert_array_equal(values, summed[name], err_msg=name)
 
@@ -108,12 +108,12 @@ def test_random_effects_come_and_go_without_moving_each_others_numbers(table_4_1
     shaken, every = (drawn_shots(parameters, e) for e in (["pointing_jitter"], RANDOM))
     np.testing.assert_array_equal(every.range, shaken.range)
     # Beamlets are elsewhere, and the factors on them are what they were.
-    plain = drawn_shots(parameters, [])
+    unperturbed = drawn_shots(parameters, [])
     np.testing.assert_allclose(
         every.footprint.relative_amplitude
         / shaken.footprint.relative_amplitude[shaken.footprint.row_of_point],
         speckled.footprint.relative_amplitude
-        / plain.footprint.relative_amplitude[plain.footprint.row_of_point],
+        / unperturbed.footprint.relative_amplitude[unperturbed.footprint.row_of_point],
         rtol=1e-12,
     )
     np.testing.assert_array_equal(every.footprint.phase_cycles, speckled.footprint.phase_cycles)
@@ -125,15 +125,19 @@ def test_a_random_effect_that_does_nothing_leaves_every_count_as_it_is(method, t
     parameters = scene(table_4_1) | {"atmosphere.structure_constant": 0.0}
     parameters["instrument.processing.tnr"] = 5.0
     chosen = {"keys": make_point_keys(4), "batch_sizes": [40, 70], "method": method}
-    still = simulate_draws(parameters, DEFAULT_EFFECTS, **chosen)
-    drawn = simulate_draws(parameters, [*DEFAULT_EFFECTS, "scintillation"], **chosen)
+    without_effect = simulate_draws(parameters, DEFAULT_EFFECTS, **chosen)
+    with_effect = simulate_draws(parameters, [*DEFAULT_EFFECTS, "scintillation"], **chosen)
     for name in DRAW_COUNT_OUTPUTS:
-        np.testing.assert_array_equal(still[name], drawn[name], err_msg=name)
+        np.testing.assert_array_equal(without_effect[name], with_effect[name], err_msg=name)
     for name in GRID_OUTPUTS:
-        np.testing.assert_allclose(still[name], drawn[name], rtol=1e-12, err_msg=name)
-    assert still["n_detected_up"].sum() > 0 and still["n_false_alarm_up"].sum() > 0
+        np.testing.assert_allclose(
+            without_effect[name], with_effect[name], rtol=1e-12, err_msg=name
+        )
+    assert (
+        without_effect["n_detected_up"].sum() > 0 and without_effect["n_false_alarm_up"].sum() > 0
+    )
     for name in STANDARD_ERROR_OUTPUTS:
-        assert (still[name] == 0).all()
+        assert (without_effect[name] == 0).all()
 
 
 def test_means_are_means_of_the_draws_with_their_standard_errors(table_4_1):
@@ -147,8 +151,8 @@ def test_means_are_means_of_the_draws_with_their_standard_errors(table_4_1):
     for name in ("pd_up", "pd_down", "pd_doppler", "pd_shot"):
         error = drawn[name].std(axis=1, ddof=1) / np.sqrt(300)
         np.testing.assert_allclose(means[name + "_error"], error, rtol=1e-9)
-        alone = mean_statistics(parameters, ALL, keys=make_point_keys(4), draws=1)
-        assert np.isnan(alone[name + "_error"]).all()
+        first_draw = mean_statistics(parameters, ALL, keys=make_point_keys(4), draws=1)
+        assert np.isnan(first_draw[name + "_error"]).all()
     np.testing.assert_allclose(drawn["pd_up"] * drawn["pd_down"], drawn["pd_shot"], rtol=1e-15)
 
 
@@ -182,8 +186,12 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
     }
     effects = (*DEFAULT_EFFECTS, "scintillation")
     stretches = list(iter_realisations(parameters, effects, keys=make_point_keys(4), draws=DRAWS))
-    (plain,) = iter_realisations(parameters, DEFAULT_EFFECTS, keys=make_point_keys(4), draws=1)
-    power = np.concatenate([s.shots.echo_power for s in stretches]) / plain.shots.echo_power[0]
+    (realisation,) = iter_realisations(
+        parameters, DEFAULT_EFFECTS, keys=make_point_keys(4), draws=1
+    )
+    power = (
+        np.concatenate([s.shots.echo_power for s in stretches]) / realisation.shots.echo_power[0]
+    )
     even = scintillation.TurbulenceProfile(uniform=1e-14)
     legs = scintillation.two_way_log_variances(
         even, PARAMETER_DEFAULTS | parameters, np.array(3000.0)
@@ -194,14 +202,16 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
     assert square.mean() == pytest.approx(index(legs), abs=5 * square.std() / root)
     for stretch in stretches[:2]:
         shots, outputs = stretch.shots, shot_statistics(stretch.shots)
-        share = shots.echo_power / plain.shots.echo_power[0]
-        quiet = plain.shots.noise.variances["signal_shot"][0]
+        share = shots.echo_power / realisation.shots.echo_power[0]
+        quiet = realisation.shots.noise.variances["signal_shot"][0]
         np.testing.assert_allclose(shots.noise.variances["signal_shot"], share * quiet, rtol=1e-12)
         by_light = 2 if architecture == "direct" else 1
         signal = outputs["snr_up"] * shots.noise_variance
-        alone = evaluate_without(parameters, DEFAULT_EFFECTS)
+        unperturbed = evaluate_without(parameters, DEFAULT_EFFECTS)
         np.testing.assert_allclose(
-            signal, share**by_light * alone["snr_up"][0] * alone["noise_variance"][0], rtol=1e-9
+            signal,
+            share**by_light * unperturbed["snr_up"][0] * unperturbed["noise_variance"][0],
+            rtol=1e-9,
         )
 
 
@@ -217,9 +227,9 @@ def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
     variance = np.log1p(index(legs))
     x, weight = np.polynomial.hermite_e.hermegauss(100)
     root = np.exp(0.5 * (np.sqrt(variance) * x - variance / 2))
-    plain = evaluate_without(parameters)
+    outputs = evaluate_without(parameters)
     beta = 8.0 * np.sqrt(2 - np.pi / 2)
-    pd = {s: marcum_q1(np.sqrt(2 * plain[f"snr_{s}"]) * root, beta).q for s in ("up", "down")}
+    pd = {s: marcum_q1(np.sqrt(2 * outputs[f"snr_{s}"]) * root, beta).q for s in ("up", "down")}
     for name, values in {"up": pd["up"], "shot": pd["up"] * pd["down"]}.items():
         exact = (weight * values).sum() / np.sqrt(2 * np.pi)
         assert 0.05 < exact < 0.95
@@ -246,9 +256,9 @@ def test_the_mean_over_jitter_is_a_quadrature_over_both_angles(changes, sigma, t
     parameters = table_4_1(**{"range": 5000.0, "tnr": 8.0, "power": 0.15} | changes)
     a, b = (v.ravel() for v in np.mgrid[-6:6.05:0.1, -6:6.05:0.1])
     share = np.exp(-(a**2 + b**2) / 2) * 0.1**2 / (2 * np.pi)
-    off = sigma * np.stack([a, b], axis=1)
+    angles = sigma * np.stack([a, b], axis=1)
     steepness = parameters["target.grazing_angle"]
-    far, grazing, direction = intersect_level_plane(5000.0, steepness, off)
+    far, grazing, direction = intersect_level_plane(5000.0, steepness, angles)
     along = direction @ [np.cos(steepness), 0.0, -np.sin(steepness)]
     outputs = evaluate_without(
         parameters
@@ -275,9 +285,9 @@ def test_a_moving_instrument_sees_what_its_jitter_turns_into_the_beam(table_4_1)
         parameters, (*DEFAULT_EFFECTS, "pointing_jitter"), keys=make_point_keys(1), draws=2000
     )
     upwards = np.arcsin(2000.0 * np.sin(0.5) / stretch.shots.range) - 0.5  # -a
-    found = stretch.shots.target.radial_velocity - 50.0
-    np.testing.assert_allclose(found, 80.0 * upwards, atol=3 * 130.0 * 1e-4**2 * 10)
-    assert found.std() == pytest.approx(80.0 * 1e-4, rel=5 / np.sqrt(4000))
+    velocity_shift = stretch.shots.target.radial_velocity - 50.0
+    np.testing.assert_allclose(velocity_shift, 80.0 * upwards, atol=3 * 130.0 * 1e-4**2 * 10)
+    assert velocity_shift.std() == pytest.approx(80.0 * 1e-4, rel=5 / np.sqrt(4000))
 
 
 def test_a_beam_over_the_horizon_is_a_draw_without_an_echo(table_4_1):
@@ -303,9 +313,9 @@ def test_a_steady_beam_is_the_shot_as_it_is(table_4_1):
         np.array([0.0, 1.0]),
     )
     assert (angles[0] == 0).all() and (angles[1] != 0).all()
-    still = mean_statistics(
+    unperturbed = mean_statistics(
         parameters, (*DEFAULT_EFFECTS, "pointing_jitter"), keys=make_point_keys(2), draws=3
     )
-    plain = evaluate_without(parameters)
+    outputs = evaluate_without(parameters)
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_down"):
-        np.testing.assert_allclose(still[name], plain[name], rtol=1e-6)
+        np.testing.assert_allclose(unperturbed[name], outputs[name], rtol=1e-6)

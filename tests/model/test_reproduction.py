@@ -55,11 +55,11 @@ def test_pfa_of_a_shot_is_that_both_chirps_alarm_in_any_of_all_bins(exponent, pr
 
 
 def test_a_real_record_has_half_of_those_bins_and_a_detection_takes_three_more(table_4_1):
-    both = {
+    pfa_by_rule = {
         counted: dark(table_4_1, bins_counted=counted)["pfa_segment"][0]
         for counted in ("half", "all")
     }
-    assert both["half"] / both["all"] == pytest.approx((2**16 - 3) / 2**17, rel=1e-4)
+    assert pfa_by_rule["half"] / pfa_by_rule["all"] == pytest.approx((2**16 - 3) / 2**17, rel=1e-4)
 
 
 PRINTED = {
@@ -74,9 +74,9 @@ PRINTED = {
 """Tables 4.3 to 4.5 as PHYSICS section 9 gives them: slices at 15 deg, 85 deg, 3500 m."""
 
 
-@pytest.mark.parametrize("changed, printed", PRINTED.items())
+@pytest.mark.parametrize("change, printed", PRINTED.items())
 def test_the_printed_false_alarm_rates_lie_8_to_36_percent_above_noise_alone(
-    changed, printed, table_4_1
+    change, printed, table_4_1
 ):
     """Averages over a coarse slice of each: noise-only rates with the echo's own shot noise."""
     ranges = np.linspace(6, 1e4, 200)
@@ -85,8 +85,8 @@ def test_the_printed_false_alarm_rates_lie_8_to_36_percent_above_noise_alone(
         {"range": ranges, "grazing_angle": np.radians(85)},
         {"range": 3500.0, "grazing_angle": np.radians(np.arange(1.0, 91.0))},
     )
-    for where, figure in zip(slices, printed, strict=True):
-        scene = table_4_1(**where, bins_counted="all", beamlets=7, **dict([changed]))
+    for slice_parameters, figure in zip(slices, printed, strict=True):
+        scene = table_4_1(**slice_parameters, bins_counted="all", beamlets=7, **dict([change]))
         ratio = figure / evaluation.evaluate(scene)["pfa_both_chirps"].mean()
         assert 1.07 < ratio < 1.37
 

@@ -52,16 +52,16 @@ def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, ca
     parameters = scenes(table_4_1, 1, window=window, reflectance_law=law)
     exact = evaluation.evaluate(parameters | FINE)
     for tolerance in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
-        found = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
+        outputs = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
         for name in PDS:
             assert (
-                abs(found[name] - exact[name]).max() <= ErrorBudget.beamlets_fraction * tolerance
+                abs(outputs[name] - exact[name]).max() <= ErrorBudget.beamlets_fraction * tolerance
             ), name
         for name in SNRS:
-            bins, true = np.sqrt(2 * found[name]), np.sqrt(2 * exact[name])  # over sigma
+            bins, true = np.sqrt(2 * outputs[name]), np.sqrt(2 * exact[name])  # over sigma
             assert (abs(bins - true) / np.maximum(true, 1)).max() <= tolerance, name
-        assert (found["beamlets_error"] <= ErrorBudget.beamlets_fraction * tolerance).all()
-        assert found["beamlets"].min() == 2 and np.median(found["beamlets"]) <= 9
+        assert (outputs["beamlets_error"] <= ErrorBudget.beamlets_fraction * tolerance).all()
+        assert outputs["beamlets"].min() == 2 and np.median(outputs["beamlets"]) <= 9
 
 
 def test_wide_beams_at_normal_incidence_take_several_lines(table_4_1):
@@ -74,11 +74,11 @@ def test_wide_beams_at_normal_incidence_take_several_lines(table_4_1):
     exact = evaluation.evaluate(
         parameters | {"footprint.beamlets": side * side, "footprint.pattern": "square"}
     )
-    found = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": 1e-3})
+    outputs = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": 1e-3})
     far = parameters["target.range"] > 1000
-    assert (found["beamlets_error"][far] > 0).all() and found["beamlets"][far].min() > 20
+    assert (outputs["beamlets_error"][far] > 0).all() and outputs["beamlets"][far].min() > 20
     for name in PDS:
-        assert abs(found[name] - exact[name]).max() <= 1e-3
+        assert abs(outputs[name] - exact[name]).max() <= 1e-3
 
 
 def steep(table_4_1, **changes):
@@ -101,11 +101,11 @@ def test_a_tighter_tolerance_never_gives_a_worse_answer(table_4_1, changes):
     line = {"footprint.beamlets": 4001, "footprint.pattern": "line"}
     exact = evaluation.evaluate(parameters | line)
     for tolerance in (1e-1, 1e-2, 1e-3, 1e-5, 1e-7, 0.0):
-        found = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
-        assert found["snr_up"] == pytest.approx(exact["snr_up"], rel=max(tolerance, 1e-6))
-        assert abs(found["pd_up"] - exact["pd_up"]).max() <= max(tolerance, 1e-6)
+        outputs = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
+        assert outputs["snr_up"] == pytest.approx(exact["snr_up"], rel=max(tolerance, 1e-6))
+        assert abs(outputs["pd_up"] - exact["pd_up"]).max() <= max(tolerance, 1e-6)
         assert (
-            found["beamlets_error"] <= max(ErrorBudget.beamlets_fraction * tolerance, 1e-6)
+            outputs["beamlets_error"] <= max(ErrorBudget.beamlets_fraction * tolerance, 1e-6)
         ).all()
 
 
@@ -125,10 +125,10 @@ def test_tighter_tolerances_of_random_scenes_come_nearer(table_4_1):
         fine["instrument.laser.power"] = power  # so that its pd is neither 0 nor 1
         exact, errors = evaluation.evaluate(parameters | many | fine), []
         for tolerance in (1e-1, 1e-3, 1e-5, 1e-7):
-            wanted = AUTO | fine | {"accuracy.tolerance": tolerance}
-            found = evaluation.evaluate(parameters | wanted)
-            errors.append(max(abs(found[name][0] - exact[name][0]) for name in PDS))
-            assert errors[-1] <= found["beamlets_error"][0] + 2e-9
+            parameters_used = AUTO | fine | {"accuracy.tolerance": tolerance}
+            outputs = evaluation.evaluate(parameters | parameters_used)
+            errors.append(max(abs(outputs[name][0] - exact[name][0]) for name in PDS))
+            assert errors[-1] <= outputs["beamlets_error"][0] + 2e-9
             assert errors[-1] <= max(ErrorBudget.beamlets_fraction * tolerance, 1e-6)
         worst = max(worst, errors[0])
     assert worst > 1e-5
@@ -141,12 +141,12 @@ def test_a_velocity_along_a_wide_beam_spreads_its_lines_alone(table_4_1, transve
     moving = scene | {"target.transverse_velocity": transverse}
     square = {"footprint.beamlets": 61 * 61, "footprint.pattern": "square"}
     exact = evaluation.evaluate(scene | square | {"target.transverse_velocity": 1e-9})
-    for some in (square, AUTO | {"accuracy.tolerance": 1e-5}):
-        found = evaluation.evaluate(moving | some)
+    for scene_parameters_used in (square, AUTO | {"accuracy.tolerance": 1e-5}):
+        outputs = evaluation.evaluate(moving | scene_parameters_used)
         for name in SNRS:
-            assert found[name] == pytest.approx(exact[name], rel=2e-4)
-    still = evaluation.evaluate(scene | square | {"target.radial_velocity": 0.0})
-    assert found["snr_doppler"] < 0.6 * still["snr_doppler"]
+            assert outputs[name] == pytest.approx(exact[name], rel=2e-4)
+    at_rest = evaluation.evaluate(scene | square | {"target.radial_velocity": 0.0})
+    assert outputs["snr_doppler"] < 0.6 * at_rest["snr_doppler"]
     ((_, shots),) = prepare_shots(moving | square)
     (x, y), _ = place_beamlets(61 * 61, "square")
     cosine = 1 / np.sqrt(1 + (x**2 + y**2) * 0.005**2)
@@ -159,23 +159,23 @@ def test_a_velocity_along_a_wide_beam_spreads_its_lines_alone(table_4_1, transve
 def test_a_lattice_of_many_beamlets_agrees_with_the_line(table_4_1):
     """An arrangement of its own: two-dimensional, of 20,000 beamlets, for narrow spreads."""
     parameters = scenes(table_4_1, 3, beam_divergence=5e-5)
-    some = {path: v[:40] if np.ndim(v) else v for path, v in parameters.items()}
+    first_points = {path: v[:40] if np.ndim(v) else v for path, v in parameters.items()}
     lattice = evaluation.evaluate(
-        some | {"footprint.beamlets": 20_000, "footprint.pattern": "hexagonal"}
+        first_points | {"footprint.beamlets": 20_000, "footprint.pattern": "hexagonal"}
     )
-    found = evaluation.evaluate(some | AUTO | {"accuracy.tolerance": 1e-6})
+    outputs = evaluation.evaluate(first_points | AUTO | {"accuracy.tolerance": 1e-6})
     for name in PDS:
         # the lattice ends at three deviations of the beam: its fourth moment is 5 % short
-        assert abs(found[name] - lattice[name]).max() <= 2e-3
+        assert abs(outputs[name] - lattice[name]).max() <= 2e-3
 
 
-def test_points_stay_what_they_are_whatever_points_are_beside_them(table_4_1):
+def test_points_stay_what_they_are_whatever_points_are_next_to_them(table_4_1):
     parameters = scenes(table_4_1, 4) | AUTO | {"accuracy.tolerance": 1e-3}
-    whole = evaluation.evaluate(parameters)
+    at_once = evaluation.evaluate(parameters)
     for chosen in (slice(0, 7), slice(7, None)):
         part = {path: v[chosen] if np.ndim(v) else v for path, v in parameters.items()}
         for name, values in evaluation.evaluate(part).items():
-            assert np.array_equal(values, whole[name][chosen], equal_nan=True), name
+            assert np.array_equal(values, at_once[name][chosen], equal_nan=True), name
 
 
 @pytest.mark.parametrize(
@@ -210,8 +210,8 @@ def test_where_no_provided_number_is_enough_the_error_says_so(table_4_1):
         phases="incoherent", range=1e4, grazing_angle=np.radians([0.5, 80.0]), fft_size=2**12,
         beam_divergence=np.array([0.05, 1e-4]), bandwidth=1e9,
     ) | AUTO  # fmt: skip
-    found = evaluation.evaluate(parameters | {"accuracy.tolerance": 1e-3})
-    assert found["beamlets_error"][0] > 1e-3 >= found["beamlets_error"][1]
+    outputs = evaluation.evaluate(parameters | {"accuracy.tolerance": 1e-3})
+    assert outputs["beamlets_error"][0] > 1e-3 >= outputs["beamlets_error"][1]
     by_hand = evaluation.evaluate(
         parameters | {"footprint.beamlets": 7, "accuracy.tolerance": 1e-3}
     )

@@ -63,27 +63,28 @@ def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamle
     shots = prepare_single_category(
         table_4_1(range=ranges[0], radial_velocity=velocities[0], beamlets=beamlets, **changes)
     )
-    which = np.arange(beamlets) % len(ranges)
+    surface_index = np.arange(beamlets) % len(ranges)
     member = np.arange(beamlets) // len(ranges)
-    offset = ranges[which] / ranges[0] - 1 + spread / ranges[0] * (member / beamlets)
+    offset = ranges[surface_index] / ranges[0] - 1 + spread / ranges[0] * (member / beamlets)
     share = np.ones(len(ranges)) if shares is None else np.array(shares)
     return dataclasses.replace(
         shots,
         footprint=shots.footprint._replace(
             relative_range_offset=offset[None],
-            doppler_ratio_offset=(2 / LIGHT * (velocities[which] - velocities[0]))[None],
-            relative_amplitude=shots.footprint.relative_amplitude[:1] * np.sqrt(share[which])[None],
+            doppler_ratio_offset=(2 / LIGHT * (velocities[surface_index] - velocities[0]))[None],
+            relative_amplitude=shots.footprint.relative_amplitude[:1]
+            * np.sqrt(share[surface_index])[None],
         ),
     )
 
 
-def _certain(found, sure=1.0):
-    return found._replace(pd=np.where(np.isnan(found.pd), np.nan, sure))
+def _certain(groups, sure=1.0):
+    return groups._replace(pd=np.where(np.isnan(groups.pd), np.nan, sure))
 
 
-def _drawn(shots, found=None, **keywords):
-    found = list_bin_groups(shots) if found is None else found
-    return draw_returns(shots, found, keys=make_point_keys(shots.range.size), **keywords)
+def _drawn(shots, groups=None, **keywords):
+    groups = list_bin_groups(shots) if groups is None else groups
+    return draw_returns(shots, groups, keys=make_point_keys(shots.range.size), **keywords)
 
 
 # Groups
@@ -95,36 +96,36 @@ def test_groups_are_runs_of_bins_above_the_threshold_in_the_true_spectrum(table_
         table_4_1, [300.0, 420.0, 330.0], [20.0, 20.0, 21.0], shares=[1.0, 0.3, 0.1],
         fft_size=4096, beamlets=6, tnr=4.0,
     )  # fmt: skip
-    found = list_bin_groups(shots, groups_max=8)
+    groups = list_bin_groups(shots, groups_max=8)
     for segment in range(3):
         spectrum = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
         label, number = ndimage.label(spectrum >= shots.threshold[0])
         assert number >= (1 if segment == 1 else 2)
         order = np.argsort(-ndimage.maximum(spectrum, label, range(1, number + 1)), kind="stable")
         slices = ndimage.find_objects(label)
-        listed = found.strongest_bin[0, segment] >= 0
+        listed = groups.strongest_bin[0, segment] >= 0
         assert listed.sum() == min(number, 8)
-        for g, which in enumerate(order[:8]):
-            run = slices[which][0]
-            assert found.first_bin[0, segment, g] == run.start
-            assert found.last_bin[0, segment, g] == run.stop - 1
+        for g, group_index in enumerate(order[:8]):
+            run = slices[group_index][0]
+            assert groups.first_bin[0, segment, g] == run.start
+            assert groups.last_bin[0, segment, g] == run.stop - 1
             peak = run.start + spectrum[run].argmax()
-            assert found.strongest_bin[0, segment, g] == peak
+            assert groups.strongest_bin[0, segment, g] == peak
             np.testing.assert_allclose(
-                found.neighbour_magnitudes[0, segment, g], spectrum[peak - 1 : peak + 2], rtol=1e-5
+                groups.neighbour_magnitudes[0, segment, g], spectrum[peak - 1 : peak + 2], rtol=1e-5
             )
 
 
 def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
     shots = prepare_single_category(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
-    found, expected = list_bin_groups(shots), evaluate_segments(shots)
-    np.testing.assert_array_equal(found.pd[:, :, 0].T, expected.pd)
-    np.testing.assert_array_equal(found.magnitude[:, :, 0].T, expected.magnitude)
+    groups, expected = list_bin_groups(shots), evaluate_segments(shots)
+    np.testing.assert_array_equal(groups.pd[:, :, 0].T, expected.pd)
+    np.testing.assert_array_equal(groups.magnitude[:, :, 0].T, expected.magnitude)
     np.testing.assert_array_equal(
-        found.strongest_bin[:, :, 0].T, np.rint(expected.frequency * 2**17 / 600e6)
+        groups.strongest_bin[:, :, 0].T, np.rint(expected.frequency * 2**17 / 600e6)
     )
-    np.testing.assert_array_equal(found.n_exempt.T, expected.n_exempt)
-    np.testing.assert_array_equal(found.leakage.T[[0, 2]], expected.leakage[[0, 2]])
+    np.testing.assert_array_equal(groups.n_exempt.T, expected.n_exempt)
+    np.testing.assert_array_equal(groups.leakage.T[[0, 2]], expected.leakage[[0, 2]])
     assert not expected.leakage[1].any()  # of the Doppler segment only draws need to know
 
 
@@ -137,13 +138,13 @@ def test_fewer_groups_listed_are_the_strongest_of_all(table_4_1):
 
 
 def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
-    found = list_bin_groups(
+    groups = list_bin_groups(
         prepare_single_category(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3))
     )
-    assert (found.strongest_bin[0, :, 0] >= 0).all()
-    assert (found.strongest_bin[0, :, 1:] == -1).all()
-    assert (found.pd[0, :, 0] < 0.1).all()
-    np.testing.assert_array_equal(found.first_bin[..., 0], found.last_bin[..., 0])
+    assert (groups.strongest_bin[0, :, 0] >= 0).all()
+    assert (groups.strongest_bin[0, :, 1:] == -1).all()
+    assert (groups.pd[0, :, 0] < 0.1).all()
+    np.testing.assert_array_equal(groups.first_bin[..., 0], groups.last_bin[..., 0])
 
 
 # Without chance
@@ -151,21 +152,24 @@ def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
 
 def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
     shots = prepare_single_category(table_4_1(range=np.linspace(300.0, 3000.0, 50), beamlets=19))
-    found = _certain(list_bin_groups(shots))
-    got, expected = _drawn(shots, found), measure_range_velocity(shots, evaluate_segments(shots))
-    np.testing.assert_array_equal(got.range[:, 0, 0], expected.range)
-    np.testing.assert_array_equal(got.radial_velocity[:, 0, 0], expected.radial_velocity)
-    assert (got.flags[:, 0, 0] == TRUE_FLAG).all()
+    groups = _certain(list_bin_groups(shots))
+    returns, expected = (
+        _drawn(shots, groups),
+        measure_range_velocity(shots, evaluate_segments(shots)),
+    )
+    np.testing.assert_array_equal(returns.range[:, 0, 0], expected.range)
+    np.testing.assert_array_equal(returns.radial_velocity[:, 0, 0], expected.radial_velocity)
+    assert (returns.flags[:, 0, 0] == TRUE_FLAG).all()
 
 
 def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
     shots = prepare_single_category(
         table_4_1(architecture="direct", range=200.0, power=200.0, radial_velocity=3.0)
     )
-    got = _drawn(shots)
-    assert got.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
-    assert got.range_interpolated[0, 0, 0] == pytest.approx(200.0, abs=0.5 * RANGE_BIN)
-    assert got.group[0, 0, 0].tolist() == [0, -1, 0]
+    returns = _drawn(shots)
+    assert returns.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
+    assert returns.range_interpolated[0, 0, 0] == pytest.approx(200.0, abs=0.5 * RANGE_BIN)
+    assert returns.group[0, 0, 0].tolist() == [0, -1, 0]
 
 
 @pytest.mark.parametrize("order", ["up down", "down up"])
@@ -176,10 +180,10 @@ def test_a_triangle_loses_no_return_for_want_of_a_third_segment(order, table_4_1
         shots,
         waveform=dataclasses.replace(shots.waveform, segment_order=tuple(order.split())),
     )
-    got = _drawn(shots)
-    assert got.flags[0, 0].tolist() == [TRUE_FLAG, TRUE_FLAG, 0, 0]
-    np.testing.assert_allclose(got.range[0, 0, :2], [300.0, 320.0], atol=2 * RANGE_BIN)
-    np.testing.assert_allclose(got.radial_velocity[0, 0, :2], 1.0, atol=2 * VELOCITY_BIN)
+    returns = _drawn(shots)
+    assert returns.flags[0, 0].tolist() == [TRUE_FLAG, TRUE_FLAG, 0, 0]
+    np.testing.assert_allclose(returns.range[0, 0, :2], [300.0, 320.0], atol=2 * RANGE_BIN)
+    np.testing.assert_allclose(returns.radial_velocity[0, 0, :2], 1.0, atol=2 * VELOCITY_BIN)
 
 
 # Chance
@@ -209,12 +213,12 @@ def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1,
         batch_sizes=[2000],
         method=method,
     )
-    got = _drawn(shots, first_draw=3, draws=2000, method=method)
-    both = (got.group[..., 0] == 0) & (got.group[..., 2] == 0)
-    np.testing.assert_array_equal(both.any(2).sum(1), counts["n_detected_shot"][:, 0])
+    returns = _drawn(shots, first_draw=3, draws=2000, method=method)
+    both_detected = (returns.group[..., 0] == 0) & (returns.group[..., 2] == 0)
+    np.testing.assert_array_equal(both_detected.any(2).sum(1), counts["n_detected_shot"][:, 0])
     out = evaluate(parameters)
-    expected = np.broadcast_to((out["pd_up"] * out["pd_down"])[:, None, None], both.shape)
-    np.testing.assert_allclose(got.pd[both], expected[both])
+    expected = np.broadcast_to((out["pd_up"] * out["pd_down"])[:, None, None], both_detected.shape)
+    np.testing.assert_allclose(returns.pd[both_detected], expected[both_detected])
     assert (np.abs(out["pd_up"] - out["pd_down"]) > 1e-3).any()
     middling = counts["n_detected_shot"]
     assert ((middling > 200) & (middling < 1800)).sum() >= 2
@@ -231,7 +235,7 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
     parameters = _weak(table_4_1, **law)
     shots = prepare_single_category(parameters)
     out = evaluate(parameters)
-    got = _drawn(shots, draws=DRAWS, method=method)
+    returns = _drawn(shots, draws=DRAWS, method=method)
     alarm = [
         1 - (1 - out["pfa_segment"]) * (1 - out["p_leakage_up"]),
         1 - (1 - 10 ** (out["log10_pfa_both_chirps"] - out["log10_pfa_segment"]))
@@ -242,19 +246,19 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
     for pd, a in zip((out["pd_up"], out["pd_down"]), alarm, strict=True):
         none.append((1 - pd) * (1 - a))
         two.append(pd * a)
-    number = (got.flags > 0).sum(2)
+    number = (returns.flags > 0).sum(2)
     assert is_within_5_sigma((number >= 1).sum(1), (1 - none[0]) * (1 - none[1])).all()
     assert is_within_5_sigma((number == 2).sum(1), two[0] * two[1]).all()
     # readings by chance (1e-3 of the false peaks) take a true peak from its partner
-    both = ((got.group[..., 0] == 0) & (got.group[..., 2] == 0)).any(2)
+    both_detected = ((returns.group[..., 0] == 0) & (returns.group[..., 2] == 0)).any(2)
     slack = 3e-3 * DRAWS * alarm[0]
     expected = DRAWS * out["pd_up"] * out["pd_down"]
     spread = np.sqrt(expected * (1 - expected / DRAWS))
-    assert (np.abs(both.sum(1) - expected) < 5 * spread + slack).all()
-    confirmed = (got.flags == TRUE_FLAG).any(2).sum(1)
+    assert (np.abs(both_detected.sum(1) - expected) < 5 * spread + slack).all()
+    confirmed = (returns.flags == TRUE_FLAG).any(2).sum(1)
     expected = expected * out["pd_doppler"]
     assert (np.abs(confirmed - expected) < 5 * np.sqrt(expected) + slack).all()
-    false = (got.flags & FALSE_ALARM_FLAG > 0).any(2).sum(1)
+    false = (returns.flags & FALSE_ALARM_FLAG > 0).any(2).sum(1)
     expected = DRAWS * ((1 - none[0]) * (1 - none[1]) - out["pd_up"] * out["pd_down"])
     expected = expected + DRAWS * two[0] * two[1]
     assert (np.abs(false - expected) < 5 * np.sqrt(expected) + slack).all()
@@ -270,8 +274,8 @@ def test_false_peaks_fall_on_every_free_bin_alike():
         bins = np.full((3, 4), -1)
         for g, (first, last) in enumerate(spans):
             bins[:, g] = first, first, last
-        taken = {k for first, last in spans for k in range(first - 1, last + 2)}
-        free = sorted(set(range(1, half + 1)) - taken - set(BARRED.tolist()))
+        occupied_bins = {k for first, last in spans for k in range(first - 1, last + 2)}
+        free = sorted(set(range(1, half + 1)) - occupied_bins - set(BARRED.tolist()))
         chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
         places, counts = np.unique(
             [draw_free_bin(u, *bins, BARRED, 1, half, 2 * half, False) for u in chances],
@@ -298,13 +302,13 @@ NO_LINES = SpeckleLineGrid(
 """Lines of points whose echoes do not fade."""
 
 
-def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
+def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, n_noise_bins=0.0, alarm=0.0):
     """Draws of the up-chirp segment of one point: from number to strongest peak, or None.
 
     `magnitude` is |X| of the bin below the strongest, of the strongest, and of that above.
     """
     rule = NoiseFilter(np.empty((0, 17)), np.empty(0, np.int64), 0)
-    how = DrawConfig(
+    config = DrawConfig(
         0,
         True,
         True,
@@ -353,20 +357,20 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
         speckle_mixing=SpeckleMixing(*np.zeros((6, 1))),
         look_covariance_root=np.zeros((1, 3, 1, 0), complex),
     )
-    seen = NoiselessSpectra.empty(1)._replace(
-        first_bin=np.full((1, 3), low), n_noise_bins=np.full((1, 3), others)
+    spectra = NoiselessSpectra.empty(1)._replace(
+        first_bin=np.full((1, 3), low), n_noise_bins=np.full((1, 3), n_noise_bins)
     )
     lists = PeakLists.allocate(2)
     (key,) = make_point_keys(1)
 
-    def drawn(number):
+    def draw_peak(number):
         draw_segment_peaks(
             DrawAddress(*key, number),
             0,
             0,
-            how,
+            config,
             known,
-            seen,
+            spectra,
             LeakageBins.empty(1),
             np.ones((1, 3)),
             empty_group_speckle(1),
@@ -377,7 +381,7 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
         )
         return Peak(*(values[0, 0] for values in lists.peaks)) if lists.n_peaks[0] else None
 
-    return drawn
+    return draw_peak
 
 
 def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
@@ -393,7 +397,7 @@ def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
         (1.0, beta, 1.0),
         interpolator(get_window("hann", 4000), 4000),
         half,
-        others=n,
+        n_noise_bins=n,
         alarm=-np.expm1(n * np.log1p(-one)),
     )
     drawn = [peak for peak in map(noise, range(4000)) if peak is not None]
@@ -442,23 +446,23 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
             radial_velocity=9.0, beamlets=1, power=0.5, phases="incoherent",
         )
     )  # fmt: skip
-    got = _drawn(shots, draws=1000, method=method)
-    assert (got.flags[..., 0] == TRUE_FLAG).all()
-    assert 2 * got.snr[..., 0].mean() == pytest.approx(64**2, rel=0.4)
+    returns = _drawn(shots, draws=1000, method=method)
+    assert (returns.flags[..., 0] == TRUE_FLAG).all()
+    assert 2 * returns.snr[..., 0].mean() == pytest.approx(64**2, rel=0.4)
     for quantity, expected in (
         ("range", shots.range),
         ("radial_velocity", shots.target.radial_velocity),
     ):
-        found = getattr(got, f"{quantity}_interpolated")[..., 0]
-        reported = getattr(got, f"{quantity}_interpolated_standard_error")[..., 0]
-        deviation = (found - expected[:, None]) / reported
+        interpolated = getattr(returns, f"{quantity}_interpolated")[..., 0]
+        reported = getattr(returns, f"{quantity}_interpolated_standard_error")[..., 0]
+        deviation = (interpolated - expected[:, None]) / reported
         assert np.sqrt(np.mean(deviation**2)) == pytest.approx(1.0, abs=0.041)
-        whole = getattr(got, quantity)[..., 0]
-        coarse = getattr(got, f"{quantity}_standard_error")[..., 0]
+        whole_bins = getattr(returns, quantity)[..., 0]
+        coarse = getattr(returns, f"{quantity}_standard_error")[..., 0]
         width = RANGE_BIN if quantity == "range" else VELOCITY_BIN
         assert (coarse > reported).all()
         assert coarse.min() >= 0.999 * width / np.sqrt(24)
-        assert (np.abs(whole - expected[:, None]) < 1.1 * width).all()
+        assert (np.abs(whole_bins - expected[:, None]) < 1.1 * width).all()
 
 
 @pytest.mark.parametrize(("velocity", "delay"), [(55.0, 0.0), (-55.0, 0.0), (30.0, 1e-4)])
@@ -471,16 +475,16 @@ def test_interpolated_ranges_of_moving_ground_are_those_at_the_beginning(
         radial_velocity=velocity, beamlets=1, power=5.0, phases="incoherent",
         acquisition_delay=delay,
     )  # fmt: skip
-    walking, still = (*DEFAULT_EFFECTS, "range_walk"), DEFAULT_EFFECTS
-    for effects in (walking, still):
+    walking, steady_effects = (*DEFAULT_EFFECTS, "range_walk"), DEFAULT_EFFECTS
+    for effects in (walking, steady_effects):
         ((_, shots),) = prepare_shots(parameters, effects)
-        got = _drawn(shots, draws=200, method="noise")
-        assert (got.flags[..., 0] == TRUE_FLAG).all()
-        off = got.range_interpolated[..., 0] - shots.range[:, None]
-        stated = got.range_interpolated_standard_error[..., 0]
-        assert abs(off.mean()) < 5 * stated.mean() / np.sqrt(off.size) + 5e-5
+        returns = _drawn(shots, draws=200, method="noise")
+        assert (returns.flags[..., 0] == TRUE_FLAG).all()
+        errors = returns.range_interpolated[..., 0] - shots.range[:, None]
+        stated_error = returns.range_interpolated_standard_error[..., 0]
+        assert abs(errors.mean()) < 5 * stated_error.mean() / np.sqrt(errors.size) + 5e-5
     uncorrected = abs(velocity) * (2 * delay + 2**17 / 600e6)
-    assert uncorrected > 0.01 > 20 * stated.mean() / np.sqrt(off.size)
+    assert uncorrected > 0.01 > 20 * stated_error.mean() / np.sqrt(errors.size)
 
 
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
@@ -498,15 +502,15 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
             phases=phases,
         )
     )  # fmt: skip
-    got = _drawn(shots, draws=1)
-    good = got.flags[..., 0] == TRUE_FLAG
-    error = (got.range_interpolated[..., 0] - shots.range[:, None])[good]
-    stated = got.range_interpolated_standard_error[..., 0][good]
+    returns = _drawn(shots, draws=1)
+    good = returns.flags[..., 0] == TRUE_FLAG
+    error = (returns.range_interpolated[..., 0] - shots.range[:, None])[good]
+    stated_error = returns.range_interpolated_standard_error[..., 0][good]
     assert good.mean() > 0.9
     high = 1.5 if phases == "incoherent" else 2.5
-    assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < high
-    noise_alone = RANGE_BIN / np.sqrt(2 * np.median(got.snr[..., 0][good]))
-    assert np.median(stated) > 2 * noise_alone / np.sqrt(2)
+    assert 0.5 < np.sqrt(np.mean((error / stated_error) ** 2)) < high
+    noise_alone = RANGE_BIN / np.sqrt(2 * np.median(returns.snr[..., 0][good]))
+    assert np.median(stated_error) > 2 * noise_alone / np.sqrt(2)
 
 
 def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
@@ -544,8 +548,8 @@ def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
     lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
     assert compare_return_with_truth(all_three, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
     assert compare_return_with_truth(all_three, centres, *bins, lines, dim) == (TRUE_FLAG, 0)
-    apart = np.array([0, 0, 1], np.int8)
-    assert compare_return_with_truth(apart, centres, *bins, lines, lit) == (MISPAIRED_FLAG, -1)
+    separate = np.array([0, 0, 1], np.int8)
+    assert compare_return_with_truth(separate, centres, *bins, lines, lit) == (MISPAIRED_FLAG, -1)
     assert compare_return_with_truth(all_three, centres, *nowhere, lines, lit) == (
         SIDELOBE_FLAG,
         -1,
@@ -555,21 +559,21 @@ def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
     assert compare_return_with_truth(noise, centres, *bins, lines, lit) == (FALSE_ALARM_FLAG, -1)
 
 
-def _only(found, present):
+def _only(groups, present):
     """Groups detected or not by hand: {(segment, group): pd}."""
-    pd = found.pd.copy()
+    pd = groups.pd.copy()
     for (segment, g), chance in present.items():
         pd[:, segment, g] = chance
-    return found._replace(pd=pd)
+    return groups._replace(pd=pd)
 
 
 def test_peaks_of_two_surfaces_make_a_mispaired_return(table_4_1):
     shots = _surfaces(table_4_1, [400.0, 412.0], [12.0, 12.0], shares=[1.0, 0.6])
-    found = _only(_certain(list_bin_groups(shots)), {(0, 1): 0.0, (2, 0): 0.0})
-    got = _drawn(shots, found)
-    assert got.flags[0, 0].tolist() == [MISPAIRED_FLAG | UNCONFIRMED_FLAG, 0, 0, 0]
-    assert got.group[0, 0, 0].tolist() == [0, -1, 1]
-    assert got.beamlet[0, 0, 0] == -1
+    groups = _only(_certain(list_bin_groups(shots)), {(0, 1): 0.0, (2, 0): 0.0})
+    returns = _drawn(shots, groups)
+    assert returns.flags[0, 0].tolist() == [MISPAIRED_FLAG | UNCONFIRMED_FLAG, 0, 0, 0]
+    assert returns.group[0, 0, 0].tolist() == [0, -1, 1]
+    assert returns.beamlet[0, 0, 0] == -1
 
 
 @pytest.mark.parametrize("two_beats", [waveform.FAR_TARGET, waveform.FAST_TARGET])
@@ -582,10 +586,10 @@ def test_a_pair_without_its_doppler_peak_is_read_as_two_beats_are(table_4_1, two
             detection_settings=shots.detection_settings._replace(two_beat_assumption=two_beats),
         )
         kind = TRUE_FLAG if kind == two_beats else MISREAD_FLAG
-        found = _only(_certain(list_bin_groups(shots)), {(1, g): 0.0 for g in range(4)})
-        got = _drawn(shots, found)
-        assert got.flags[0, 0, 0] == kind | UNCONFIRMED_FLAG
-        assert got.beamlet[0, 0, 0] >= 0
+        groups = _only(_certain(list_bin_groups(shots)), {(1, g): 0.0 for g in range(4)})
+        returns = _drawn(shots, groups)
+        assert returns.flags[0, 0, 0] == kind | UNCONFIRMED_FLAG
+        assert returns.beamlet[0, 0, 0] >= 0
 
 
 def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
@@ -601,13 +605,13 @@ def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
     shots = dataclasses.replace(  # false peaks may pair with the true ones
         shots, detection_settings=shots.detection_settings._replace(includes_leakage=False)
     )
-    got = _drawn(shots, _certain(list_bin_groups(shots)))
-    assert got.flags[0, 0, 0] == TRUE_FLAG
-    assert (got.flags[0, 0, 1:] & SIDELOBE_FLAG > 0).all()
+    returns = _drawn(shots, _certain(list_bin_groups(shots)))
+    assert returns.flags[0, 0, 0] == TRUE_FLAG
+    assert (returns.flags[0, 0, 1:] & SIDELOBE_FLAG > 0).all()
 
 
 def test_surfaces_merged_in_one_group_are_one_true_return(table_4_1):
     shots = _surfaces(table_4_1, [400.0, 400.3], [12.0, 12.0])
-    got = _drawn(shots)
-    assert got.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
-    assert 399.8 < got.range[0, 0, 0] < 400.5
+    returns = _drawn(shots)
+    assert returns.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
+    assert 399.8 < returns.range[0, 0, 0] < 400.5

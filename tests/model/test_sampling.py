@@ -37,7 +37,7 @@ def scene(table_4_1, *, ranges=(100.0, 900.0, 1200.0, 4000.0), **changes):
     return table_4_1(**varied | changes) | {"target.roughness": 1e-5}
 
 
-def some(parameters, index):
+def select_points(parameters, index):
     return {path: v[index] if np.ndim(v) else v for path, v in parameters.items()}
 
 
@@ -59,27 +59,27 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
     """Each point against a fixed number of draws, the one at which it stopped, to the last bit."""
     parameters, accuracy = scene(table_4_1), ErrorBudget(0.06, 0.9)
     chosen = {"keys": keys(4), "method": method, "error_budget": accuracy}
-    found = simulate_draws(parameters, effects, batch=20, limit=400, **chosen)
+    results = simulate_draws(parameters, effects, batch=20, limit=400, **chosen)
     drawn = {*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
-    assert set(found) == (drawn | {RUNNING_SUMS} if effects is SPECKLED else drawn)
-    numbers = found["n_draws"]
+    assert set(results) == (drawn | {RUNNING_SUMS} if effects is SPECKLED else drawn)
+    numbers = results["n_draws"]
     group_size = GROUP_SIZE if effects is SPECKLED else 1
     assert np.isin(numbers, list(stopping_checks(20, 400, group_size))).all()
     assert np.unique(numbers).size > 1 or (method, effects) == ("probabilities", DEFAULT_EFFECTS)
     for point, number in enumerate(numbers.tolist()):
         fixed = simulate_draws(parameters, effects, batch_sizes=[number], **chosen)
-        for name, values in found.items():
+        for name, values in results.items():
             np.testing.assert_array_equal(values[point], np.ravel(fixed[name][point]), err_msg=name)
 
 
 def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_1):
     parameters, accuracy = scene(table_4_1), ErrorBudget(0.06, 0.9)
     chosen = {"keys": keys(4), "method": "probabilities", "error_budget": accuracy}
-    found = simulate_draws(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
-    assert (found["accuracy_missed"] == 0).all()
+    results = simulate_draws(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
+    assert (results["accuracy_missed"] == 0).all()
     for name in PD_OUTPUTS:
-        assert (found[f"{name}_half_width"] <= 0.06).all()
-    for point, number in enumerate(found["n_draws"].tolist()):
+        assert (results[f"{name}_half_width"] <= 0.06).all()
+    for point, number in enumerate(results["n_draws"].tolist()):
         for before in [n for n in stopping_checks(20, 10_000, GROUP_SIZE) if n < number]:
             fixed = simulate_draws(parameters, SPECKLED, batch_sizes=[before], **chosen)
             widths = [fixed[f"{name}_half_width"][point] for name in PD_OUTPUTS]
@@ -97,22 +97,24 @@ def test_neighbours_and_the_cutting_of_work_change_no_bit(effects, method, table
     monkeypatch.setattr(realisations, "DRAWS_PER_BATCH", 7)
     for point in range(4):
         index = slice(point, point + 1)
-        alone = simulate_draws(some(parameters, index), effects, keys=keys(4)[index], **chosen)
-        for name, values in alone.items():
+        single = simulate_draws(
+            select_points(parameters, index), effects, keys=keys(4)[index], **chosen
+        )
+        for name, values in single.items():
             np.testing.assert_array_equal(values[0], together[name][point], err_msg=name)
 
 
-def test_where_the_limit_comes_first_the_excess_is_told(table_4_1):
+def test_where_the_limit_comes_first_the_excess_is_reported(table_4_1):
     tolerance = np.array([0.5, 0.01, 0.2, 0.01])
-    found = simulate_draws(
+    results = simulate_draws(
         scene(table_4_1), SPECKLED, keys=keys(4), batch=30, limit=100, method="probabilities",
         error_budget=ErrorBudget(tolerance, 0.95),
     )  # fmt: skip
-    widths = np.max([found[f"{name}_half_width"] for name in PD_OUTPUTS], axis=0)
-    np.testing.assert_array_equal(found["accuracy_missed"], np.maximum(widths - tolerance, 0))
-    missed = found["accuracy_missed"] > 0
+    widths = np.max([results[f"{name}_half_width"] for name in PD_OUTPUTS], axis=0)
+    np.testing.assert_array_equal(results["accuracy_missed"], np.maximum(widths - tolerance, 0))
+    missed = results["accuracy_missed"] > 0
     assert missed.tolist() == [False, True, False, True]
-    assert (found["n_draws"][missed] == 100).all() and (found["n_draws"][~missed] < 100).all()
+    assert (results["n_draws"][missed] == 100).all() and (results["n_draws"][~missed] < 100).all()
 
 
 @pytest.mark.parametrize("interval", COUNT_INTERVALS)
@@ -122,20 +124,20 @@ def test_the_share_of_draws_in_noise_has_the_interval_asked_for(interval, table_
         "method": "noise",
         "error_budget": ErrorBudget(0.01, 0.9, interval=interval),
     }
-    found = simulate_draws(scene(table_4_1), DEFAULT_EFFECTS, batch_sizes=[150, 50], **chosen)
+    results = simulate_draws(scene(table_4_1), DEFAULT_EFFECTS, batch_sizes=[150, 50], **chosen)
     for name, count in COUNTS.items():
-        k = found[count].sum(axis=1)
+        k = results[count].sum(axis=1)
         expected = COUNT_INTERVALS[interval](successes=k, trials=200, confidence=0.9)
         np.testing.assert_array_equal(
-            found[f"{name}_half_width"], interval_half_width(k / 200, expected)
+            results[f"{name}_half_width"], interval_half_width(k / 200, expected)
         )
-    assert 20 < found["n_detected_up"][1].sum() < 180
+    assert 20 < results["n_detected_up"][1].sum() < 180
     until = simulate_draws(scene(table_4_1), DEFAULT_EFFECTS, batch=50, limit=1000, **chosen)
     assert (until["n_draws"] > 150).all()
 
 
 def test_probabilities_that_are_known_need_no_draws(table_4_1):
-    found = simulate_draws(
+    results = simulate_draws(
         scene(table_4_1),
         DEFAULT_EFFECTS,
         keys=keys(4),
@@ -144,9 +146,9 @@ def test_probabilities_that_are_known_need_no_draws(table_4_1):
         method="probabilities",
         error_budget=ErrorBudget(0.0),
     )
-    assert (found["n_draws"] == 50).all() and (found["accuracy_missed"] == 0).all()
+    assert (results["n_draws"] == 50).all() and (results["accuracy_missed"] == 0).all()
     for name in PD_OUTPUTS:
-        assert (found[f"{name}_half_width"] == 0).all()
+        assert (results[f"{name}_half_width"] == 0).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -154,12 +156,12 @@ def test_probabilities_that_are_known_need_no_draws(table_4_1):
 def test_a_segment_that_is_not_there_keeps_no_point_open(effects, method, table_4_1):
     parameters = table_4_1(range=np.array([20.0]), architecture="direct")
     parameters |= {"target.pointing_jitter": 1e-6}
-    found = simulate_draws(
+    results = simulate_draws(
         parameters, effects, keys=keys(1), batch=40, limit=10_000, method=method,
         error_budget=ErrorBudget(0.05),
     )  # fmt: skip
-    assert np.isnan(found["pd_doppler_half_width"]) and found["accuracy_missed"] == 0
-    assert found["n_draws"] < 10_000
+    assert np.isnan(results["pd_doppler_half_width"]) and results["accuracy_missed"] == 0
+    assert results["n_draws"] < 10_000
 
 
 def test_a_speckled_targets_pd_is_within_the_tolerance_as_often_as_promised(table_4_1):
@@ -168,17 +170,17 @@ def test_a_speckled_targets_pd_is_within_the_tolerance_as_often_as_promised(tabl
     single = evaluate(scene(table_4_1, ranges=[500.0]))
     beta = 8.0 * np.sqrt(2 - np.pi / 2)
     exact = {s: np.exp(-(beta**2) / (2 + 2 * single[f"snr_{s}"])) for s in ("up", "down")}
-    found = simulate_draws(
+    results = simulate_draws(
         scene(table_4_1, ranges=np.full(number, 500.0)), SPECKLED, keys=keys(number), batch=4,
         limit=10_000, method="probabilities", error_budget=ErrorBudget(tolerance, 0.9),
     )  # fmt: skip
-    assert np.unique(found["n_draws"]).size > 3 and (found["accuracy_missed"] == 0).all()
+    assert np.unique(results["n_draws"]).size > 3 and (results["accuracy_missed"] == 0).all()
     sigma = np.sqrt(0.9 * 0.1 / number)
     for name, pd in exact.items():
         assert 0.2 < pd < 0.9
-        apart = abs(found[f"pd_{name}"] - pd)
-        assert (apart <= found[f"pd_{name}_half_width"]).mean() >= 0.9 - 5 * sigma
-        assert found[f"pd_{name}"].mean() == pytest.approx(pd[0], abs=0.1 * tolerance)
+        errors = abs(results[f"pd_{name}"] - pd)
+        assert (errors <= results[f"pd_{name}_half_width"]).mean() >= 0.9 - 5 * sigma
+        assert results[f"pd_{name}"].mean() == pytest.approx(pd[0], abs=0.1 * tolerance)
 
 
 class Coins:
@@ -218,11 +220,13 @@ def test_stopping_costs_little_coverage_and_bias(method, tolerance):
     for pd in (0.0, 1e-4, 0.3 * tolerance, tolerance, 1.3 * tolerance, 0.2, 0.5, 0.8, 0.9999, 1.0):
         coins, points = Coins(pd, trials, method), np.arange(trials)
         draw_until_accurate(coins, points, stopping_checks(10, 10**6), ErrorBudget(tolerance))
-        found = coins.hits / coins.n_draws
-        within = (abs(found - pd) <= coins.widths(points) + 1e-15).mean()
-        most = coins.n_draws.max()
-        step = stats.binom.pmf(round(most * pd), most, pd) if method == "wilson" else 0
+        estimate = coins.hits / coins.n_draws
+        within = (abs(estimate - pd) <= coins.widths(points) + 1e-15).mean()
+        n_draws_max = coins.n_draws.max()
+        step = (
+            stats.binom.pmf(round(n_draws_max * pd), n_draws_max, pd) if method == "wilson" else 0
+        )
         sigma = np.sqrt(0.95 * 0.05 / trials)
         assert within >= 0.95 - 5 * sigma - step, pd
-        spread = found.std() / np.sqrt(trials)
-        assert abs(found.mean() - pd) <= 0.1 * tolerance + 5 * spread, pd
+        spread = estimate.std() / np.sqrt(trials)
+        assert abs(estimate.mean() - pd) <= 0.1 * tolerance + 5 * spread, pd

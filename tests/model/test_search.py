@@ -69,11 +69,11 @@ def test_bins_are_those_nearest_to_any_beat(table_4_1, near, deep, slow, spread,
         turns = np.array(place) / SIZE
         turns = turns - np.rint(turns)
         expected = np.unique(np.floor((turns if record == "complex" else abs(turns)) * SIZE + 0.5))
-        found = band[0] + np.arange(band[1])
+        bins = band[0] + np.arange(band[1])
         if record == "complex":
-            found, expected = found % SIZE, expected % SIZE
-        assert np.array_equal(np.unique(found), np.unique(expected))
-        assert np.unique(found).size == band[1]
+            bins, expected = bins % SIZE, expected % SIZE
+        assert np.array_equal(np.unique(bins), np.unique(expected))
+        assert np.unique(bins).size == band[1]
 
 
 def noisy_spectra(shots, segment, rng):
@@ -83,8 +83,8 @@ def noisy_spectra(shots, segment, rng):
     signal = time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=False)
     if shots.complex_record:
         noise = rng.normal(size=shape) + 1j * rng.normal(size=shape)
-        whole = np.fft.fft(taper * (signal / 2 + sigma * np.sqrt(0.5) * noise), SIZE)
-        return np.abs(whole)
+        spectrum = np.fft.fft(taper * (signal / 2 + sigma * np.sqrt(0.5) * noise), SIZE)
+        return np.abs(spectrum)
     return np.abs(np.fft.rfft(taper * (signal.real + sigma * rng.normal(size=shape)), SIZE))
 
 
@@ -93,14 +93,14 @@ def noisy_spectra(shots, segment, rng):
 )
 def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table_4_1):
     """The strongest bin of the up beat lies some bins within the band's far end, or beyond it."""
-    whole = prepare_single_category(scene_of(table_4_1, record=record))
-    place = time_domain_truth.evaluate_segments_in_time_domain(whole).frequency[0, 0] / (
+    all_bins = prepare_single_category(scene_of(table_4_1, record=record))
+    place = time_domain_truth.evaluate_segments_in_time_domain(all_bins).frequency[0, 0] / (
         600e6 / SIZE
     )  # of the echo [bins]
     metre = 299792458 * 600e6 / SIZE / (2 * 50e12)
     end = 220.0 + offset * metre
     scene = scene_of(table_4_1, (end - 60 * metre, end, 3.0, 3.0), record)
-    shots, found = prepare_single_category(scene), evaluate(scene)
+    shots, outputs = prepare_single_category(scene), evaluate(scene)
     first, number = shots.detection_settings.search_band[0, :, 0]
     inside = np.isin(place % SIZE, (first + np.arange(number)) % SIZE)
     assert inside == (offset >= 0) and abs(number - 61) <= 1
@@ -111,16 +111,18 @@ def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table
     near &= bool(inside)
     hits, alarms = crosses[:, near].any(axis=1).sum(), crosses[:, ~near].any(axis=1).sum()
     assert 0.2 < evaluate(scene_of(table_4_1, record=record))["pd_up"][0] < 0.98
-    assert is_within_5_sigma(hits, found["pd_up"][0], 0.005 * DRAWS)
-    assert found["pd_up"][0] + found["miss_up"][0] == pytest.approx(1)
+    assert is_within_5_sigma(hits, outputs["pd_up"][0], 0.005 * DRAWS)
+    assert outputs["pd_up"][0] + outputs["miss_up"][0] == pytest.approx(1)
     if not inside:
-        assert found["pd_up"][0] == found["pd_shot"][0] == 0 and np.isnan(found["range_error"][0])
-    chance = found["pfa_segment"][0]
+        assert outputs["pd_up"][0] == outputs["pd_shot"][0] == 0 and np.isnan(
+            outputs["range_error"][0]
+        )
+    chance = outputs["pfa_segment"][0]
     if inside:
         assert is_within_5_sigma(alarms, chance, 0.03 * chance * DRAWS)
         assert chance < evaluate(scene_of(table_4_1, record=record))["pfa_segment"][0] / 3
     else:
-        leaking = found["p_leakage_up"][0]  # of the main lobe's half that is in the band
+        leaking = outputs["p_leakage_up"][0]  # of the main lobe's half that is in the band
         assert (leaking > 0.02) == (offset == -1)
         either = 1 - (1 - chance) * (1 - leaking)
         assert is_within_5_sigma(alarms, either, 0.03 * either * DRAWS)
@@ -129,11 +131,11 @@ def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table
 def test_a_band_of_all_bins_is_the_whole_record(table_4_1):
     ranges = np.array([20.0, 75.0, 300.0])
     for record in ("real", "complex"):
-        plain, wide = (
+        unlimited, wide = (
             evaluate(scene_of(table_4_1, band, record, range=ranges), ("leakage",))
             for band in (None, (0.0, 1e5, -1000.0, 1000.0))
         )
-        for name, values in plain.items():
+        for name, values in unlimited.items():
             if "leakage" not in name:
                 assert np.array_equal(values, wide[name], equal_nan=True), (record, name)
 
@@ -142,12 +144,12 @@ def test_a_band_of_all_bins_is_the_whole_record(table_4_1):
 @pytest.mark.parametrize("noise", ["correlated", "independent"])
 def test_thresholds_keep_the_rate_of_alarms_in_the_band(noise, record, table_4_1):
     band = (np.array([10.0, 40.0]), 150.0, -2.0, 5.0)
-    where = {"range": 500.0, "radial_velocity": -60.0}  # where no bins are taken away
-    dark = scene_of(table_4_1, band, record, reflectance=0.0, noise_bins=noise, **where)
+    target = {"range": 500.0, "radial_velocity": -60.0}  # where no bins are taken away
+    dark = scene_of(table_4_1, band, record, reflectance=0.0, noise_bins=noise, **target)
     dark = {path: value for path, value in dark.items() if path != TNR_PATH}
-    found = evaluate(dark | {DESIGN_PFA_SEGMENT_PATH: 1e-5})
-    assert found["pfa_segment"] == pytest.approx([1e-5, 1e-5], rel=1e-9)
-    assert found["pfa_bin"][1] > found["pfa_bin"][0]  # in fewer bins
+    outputs = evaluate(dark | {DESIGN_PFA_SEGMENT_PATH: 1e-5})
+    assert outputs["pfa_segment"] == pytest.approx([1e-5, 1e-5], rel=1e-9)
+    assert outputs["pfa_bin"][1] > outputs["pfa_bin"][0]  # in fewer bins
     assert evaluate(dark | {DESIGN_PFA_SHOT_PATH: 1e-5})["pfa_shot"] == pytest.approx(
         [1e-5, 1e-5], rel=1e-9
     )
@@ -159,7 +161,7 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
     """Two bands: the echo is in one. False peaks of noise lie in the bands, and evenly."""
     band = (np.array([150.0, 60.0]), np.array([260.0, 140.0]), 0.0, 5.0)
     scene = scene_of(table_4_1, band, record, range=np.full(2, 220.0), tnr=4.5)
-    found, draws = evaluate(scene), 1000
+    outputs, draws = evaluate(scene), 1000
     counts = simulate_draws(
         scene,
         DEFAULT_EFFECTS,
@@ -169,10 +171,10 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
         first_draw=0,
     )
     spread = 5 * np.sqrt(draws * 0.25)
-    assert counts["n_detected_up"][:, 0] == pytest.approx(draws * found["pd_up"], abs=spread)
+    assert counts["n_detected_up"][:, 0] == pytest.approx(draws * outputs["pd_up"], abs=spread)
     assert counts["n_detected_up"][1, 0] == 0
     assert counts["n_false_alarm_up"][:, 0] == pytest.approx(
-        draws * (1 - (1 - found["pfa_segment"]) * (1 - found["p_leakage_up"])), abs=spread
+        draws * (1 - (1 - outputs["pfa_segment"]) * (1 - outputs["p_leakage_up"])), abs=spread
     )
     shots = prepare_single_category(scene)
     listed = list_bin_groups(shots)
@@ -181,10 +183,10 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
     ] == 0
     points = draw_returns(shots, listed, keys=make_point_keys(2), draws=draws, method=method)
     assert (points.group[1][..., [0, 2]] < 0).all()
-    own = np.isfinite(points.range) & (points.flags & UNCONFIRMED_FLAG == 0)
+    is_confirmed = np.isfinite(points.range) & (points.flags & UNCONFIRMED_FLAG == 0)
     # In one band the echo, in the other noise: of signed beats Doppler's seldom confirms that.
     for i in range(1 if record == "complex" else 2):
-        far = points.range[i][own[i]]
+        far = points.range[i][is_confirmed[i]]
         assert far.size > 10
         assert band[0][i] - 10 < far.min() and far.max() < band[1][i] + 10
 
@@ -201,8 +203,8 @@ def test_false_peaks_fall_on_every_free_bin_of_the_band_alike(signed):
     chances = (np.arange(100 * len(expected)) + 0.5) / (100 * len(expected))
     if signed:
         bins[:, 0] += 2 * 512  # runs of complex records count from further on
-    found = [
+    drawn_bins = [
         draw_free_bin(u, strongest, lowest, highest, NONE, first, last, 512, signed)
         for u in chances
     ]
-    assert found == np.repeat(expected, 100).tolist()
+    assert drawn_bins == np.repeat(expected, 100).tolist()

@@ -41,11 +41,11 @@ def test_a_target_at_150_metres_a_second_is_7_5_centimetres_nearer_after_500_mic
 ):
     """S 2/c 7.5 cm is 1.0007 kHz a segment: less by S 2/c times both the range and beta."""
     shots = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1))
-    assert [float(each.range_decrease) for each in shots.waveform_segments] == pytest.approx(
+    assert [float(segment.range_decrease) for segment in shots.waveform_segments] == pytest.approx(
         [0, 0.075, 0.15]
     )
-    still = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1), DEFAULT_EFFECTS)
-    bins = beamlet_line_positions(shots)[0, :, 0] - beamlet_line_positions(still)[0, :, 0]
+    at_rest = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1), DEFAULT_EFFECTS)
+    bins = beamlet_line_positions(shots)[0, :, 0] - beamlet_line_positions(at_rest)[0, :, 0]
     moved = 2e12 * 2 * 0.15 / speed_of_light * (1 + 300 / speed_of_light) / (600e6 / 2**17)
     np.testing.assert_allclose(bins, [0, 0, -moved], atol=1e-9)
 
@@ -85,7 +85,7 @@ def test_segments_follow_those_that_there_are(architecture, order, gap, starts, 
 def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, order, table_4_1):
     """In 40 digits: R - v T - a T^2 / 2 from the shot's start, and each segment's own chirp."""
     place = SEGMENT_ORDERS[order].split().index(SEGMENT_NAMES[segment])
-    range_0, v, begun = 1400.0, -130.0, place * 500e-6
+    range_0, v, start = 1400.0, -130.0, place * 500e-6
     shots = prepared(
         table_4_1(
             range=range_0, radial_velocity=v, beamlets=1, fft_size=512, sample_rate=1.2e6,
@@ -99,17 +99,17 @@ def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, orde
     with mpmath.workdps(40):
         for n in range(0, 512, 73):
             t = 20e-6 + mpmath.mpf(n) / mpmath.mpf(1.2e6)
-            since = begun + t
+            since = start + t
             delay = 2 * (range_0 - v * since - mpmath.mpf(a) * since**2 / 2) / 299792458
             emitted = [carrier * at + sign * mpmath.mpf(2e12) * at**2 / 2 for at in (t - delay, t)]
             cycles = emitted[0] - emitted[1]
             expected.append(complex(mpmath.expjpi(2 * (cycles - mpmath.nint(cycles)))))
-    found = record[::73] / abs(record[::73])
+    rotation = record[::73] / abs(record[::73])
     # a range of 1400 m is rounded to 2e-13 m of 775 nm a turn, cycles of 1e5 to 1e-11
-    assert np.abs(found - expected).max() < 1e-5
+    assert np.abs(rotation - expected).max() < 1e-5
 
 
-def drawn(number):
+def draw_scene(number):
     rng = np.random.default_rng((23, number))
     scene = {
         "architecture": ("homodyne", "heterodyne", "direct")[number % 3],
@@ -120,21 +120,21 @@ def drawn(number):
         "beam_divergence": 10 ** rng.uniform(-5, -2.5), "radial_velocity": rng.uniform(-300, 300),
         "acquisition_delay": float(rng.choice([0.0, 70e-6])),
     }  # fmt: skip
-    further = {
+    further_parameters = {
         "target.acceleration": rng.choice([-1, 1]) * 10 ** rng.uniform(0, 5),
         "target.transverse_velocity": rng.uniform(-200, 200),
         SEGMENT_ORDER_PATH: SEGMENT_ORDERS[number % len(SEGMENT_ORDERS)],
         SEGMENT_GAP_PATH: float(rng.choice([0.0, 130e-6])),
     }
-    return scene, further
+    return scene, further_parameters
 
 
-def disagreement(shots, **kept):
+def disagreement(shots, **keeps_walk):
     return max(
         magnitude_error(
             shots,
             segment_spectra.segment_spectrum(shots, 0, int(segment))[1],
-            time_domain_truth.time_domain_spectrum(shots, 0, int(segment), **kept),
+            time_domain_truth.time_domain_spectrum(shots, 0, int(segment), **keeps_walk),
         )
         for segment in np.flatnonzero(shots.has_segment)
     )
@@ -142,16 +142,16 @@ def disagreement(shots, **kept):
 
 @pytest.mark.parametrize("number", range(24))
 def test_the_fast_path_is_the_truth_as_the_target_moves_on(number, table_4_1):
-    scene, further = drawn(number)
-    parameters = table_4_1(**scene) | further
+    scene, further_parameters = draw_scene(number)
+    parameters = table_4_1(**scene) | further_parameters
     assert disagreement(prepared(parameters), with_range_walk=False) < 1e-9, scene
 
 
 @pytest.mark.parametrize("number", range(0, 24, 5))
 def test_the_drift_within_a_record_is_that_of_its_own_segment(number, table_4_1):
     """One beamlet: range walk, acceleration and a beam that slides, from where its segment is."""
-    scene, further = drawn(number)
-    parameters = table_4_1(**scene | {"beamlets": 1}) | further
+    scene, further_parameters = draw_scene(number)
+    parameters = table_4_1(**scene | {"beamlets": 1}) | further_parameters
     shots = prepared(parameters, (*MOVING, "range_walk", "acceleration"))
     assert disagreement(shots, with_acceleration=True) < 1e-8, scene
 
@@ -171,7 +171,7 @@ def test_beamlets_keep_their_own_velocities_from_segment_to_segment(table_4_1):
     rng = np.random.default_rng(3)
     scene = table_4_1(fft_size=4096, phases="coherent", radial_velocity=20.0, range=900.0)
     shots = prepared(scene | {"footprint.beamlets": 19})
-    own = replace(
+    perturbed_shots = replace(
         shots,
         footprint=shots.footprint._replace(
             doppler_ratio_offset=rng.uniform(
@@ -179,7 +179,7 @@ def test_beamlets_keep_their_own_velocities_from_segment_to_segment(table_4_1):
             )
         ),
     )
-    assert disagreement(own, with_range_walk=False) < 1e-9
+    assert disagreement(perturbed_shots, with_range_walk=False) < 1e-9
 
 
 @pytest.mark.parametrize("velocity", [150.0, -90.0])
@@ -197,13 +197,13 @@ def test_what_is_reported_is_put_right_by_the_velocity_that_is_measured(
     moving = {"target.transverse_velocity": across, SEGMENT_ORDER_PATH: SEGMENT_ORDERS[order]}
     shots = prepared(scene | moving, (*MOVING, "range_walk"))
     keys = np.ones((1, 2), np.uint64)
-    found = draw_returns(shots, list_bin_groups(shots), keys=keys, draws=400)
+    returns = draw_returns(shots, list_bin_groups(shots), keys=keys, draws=400)
     slid = across / np.tan(1.1)
     within = (up + down) / 2 * 500e-6 + 2**17 / 600e6 / 2
-    off = np.median(found.range_interpolated[0, :, 0]) - 812.34
-    assert off == pytest.approx(-slid * within, abs=1e-4)
+    error = np.median(returns.range_interpolated[0, :, 0]) - 812.34
+    assert error == pytest.approx(-slid * within, abs=1e-4)
     mixed = slid * 2e12 * (down - up) / 2 * 500e-6 / (speed_of_light / 1550e-9)
-    speed = np.median(found.radial_velocity_interpolated[0, :, 0])
+    speed = np.median(returns.radial_velocity_interpolated[0, :, 0])
     assert speed == pytest.approx(velocity - mixed, abs=3e-6)
 
 
@@ -214,7 +214,7 @@ SLOWS = (100.0**2 - 30.0**2) / (2 * 400.0)
 
 def of_flight(table_4_1, effects):
     """The first shots of three beams, falling straight at level ground from 500 m."""
-    seen = observe_shots(
+    shot_eyepoints = observe_shots(
         straight_flight(
             (0.0, 0.0, 500.0), (0.0, 0.0, -100.0), acceleration=(0.0, 0.0, SLOWS), duration=6.0
         ),
@@ -224,7 +224,10 @@ def of_flight(table_4_1, effects):
     )
     ground = [SurfaceMaterial("ground", 0.1, "lambert")]
     return prepare_eyepoint_shots(
-        seen, PARAMETER_DEFAULTS | scene_parameters(table_4_1, beamlets=1), ground, effects
+        shot_eyepoints,
+        PARAMETER_DEFAULTS | scene_parameters(table_4_1, beamlets=1),
+        ground,
+        effects,
     )
 
 
@@ -239,11 +242,11 @@ def of_grid(table_4_1, effects):
     return prepared(scene | along | across, effects)
 
 
-@pytest.mark.parametrize("made", [of_flight, of_grid])
-def test_morpheus_magnitudes_are_those_of_the_truth_that_decelerates(made, table_4_1):
+@pytest.mark.parametrize("make_shots", [of_flight, of_grid])
+def test_morpheus_magnitudes_are_those_of_the_truth_that_decelerates(make_shots, table_4_1):
     """Without the acceleration they are off by a tenth, 14 kHz of drift over bins of 4.6 kHz."""
     within = (*MOVING, "range_walk")
-    slowing, steady = (made(table_4_1, (*within, *also)) for also in (["acceleration"], []))
+    slowing, steady = (make_shots(table_4_1, (*within, *also)) for also in (["acceleration"], []))
     assert float(np.ravel(slowing.target.acceleration)[0]) == pytest.approx(-10.509, abs=1e-3)
     assert float(np.ravel(slowing.target.approach_speed)[0]) == pytest.approx(100.0 / np.cos(TILT))
     assert disagreement(slowing, with_acceleration=True) < 1e-8
@@ -256,13 +259,17 @@ def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
     ground = [SurfaceMaterial("ground", 0.1, "lambert")]
     called = []
     for slows in (SLOWS, 0.0):
-        seen = observe_shots(
+        eyepoints = observe_shots(
             straight_flight(velocity=(0.0, 0.0, -slows), acceleration=(0.0, 0.0, slows)), number=7
         )
         planned = plan_shot_effects(
-            seen, np.zeros(1, np.int64), scene_parameters(table_4_1, beamlets=7), ground, modes={},
+            eyepoints,
+            np.zeros(1, np.int64),
+            scene_parameters(table_4_1, beamlets=7),
+            ground,
+            modes={},
             has_rotating_bodies=False,
-        )  # fmt: skip
+        )
         flags = planned.selected_effects(1).effect_flags
         called.append({"acceleration", "segment_motion"} & set(unpack_effect_flags(int(flags[0]))))
     assert called == [{"acceleration", "segment_motion"}, set()]
@@ -283,7 +290,7 @@ def test_speckles_turn_once_between_segments(table_4_1):
     )
     for segment in range(3):
         first, second = (
-            segment_spectra.segment_spectrum(each.shots, 0, segment)[1] for each in (one, other)
+            segment_spectra.segment_spectrum(pair.shots, 0, segment)[1] for pair in (one, other)
         )
         np.testing.assert_allclose(first, second, atol=1e-5 * first.max())
     starts = [

@@ -78,19 +78,23 @@ def spec_at_random(number):
         if number % 5 == 0 and "doppler" in instrument["chirp"]["segments"]:
             continue
         try:
-            found = spec_of_ratio(mapping, ratio)
+            random_spec = spec_of_ratio(mapping, ratio)
         except (SpecError, UnsupportedShotError):
             continue
-        chirps = [found.stored_pd["pd_up"], found.stored_pd["pd_down"]]
+        chirps = [random_spec.stored_pd["pd_up"], random_spec.stored_pd["pd_down"]]
         if min(chirps) > 0.1 and max(chirps) < 0.97:
-            return found
+            return random_spec
 
 
 def shares_of_grid(p, method, draws, seed):
     """Shares of a grid's draws by segment, and of the shot."""
-    given = dict(p) | {"target.range": np.ravel(p["target.range"])[:1]}
+    parameters = dict(p) | {"target.range": np.ravel(p["target.range"])[:1]}
     counts = simulate_draws(
-        given, COMPARED_EFFECTS, keys=make_point_keys(1, seed), batch_sizes=[draws], method=method
+        parameters,
+        COMPARED_EFFECTS,
+        keys=make_point_keys(1, seed),
+        batch_sizes=[draws],
+        method=method,
     )
     names = ("up", "doppler", "down", "shot")
     return {name: counts[f"n_detected_{name}"][0, 0] / draws for name in names}
@@ -107,8 +111,8 @@ def shares_of_flight(p, method, draws):
 
 def compared(number):
     """Shares that differ from those of scatterers, or among flights, by more than is allowed."""
-    found = spec_at_random(number)
-    shots, p, differing = found.shots, found.parameters, []
+    random_spec = spec_at_random(number)
+    shots, p, differing = random_spec.shots, random_spec.parameters, []
     detected = segment_detections(draw_shots(p, shots, draws=SCATTERER_DRAWS, seed=number), shots)
     chirps = detected["up"] & detected["down"]
     events = detected | {"shot": shot_detections(detected, shots), "chirps": chirps}
@@ -123,12 +127,12 @@ def compared(number):
                 continue
             likely = np.clip(truth[name], 1e-3, 1 - 1e-3)
             sigma = math.sqrt(likely * (1 - likely) * (1 / draws + 1 / SCATTERER_DRAWS))
-            more, apart = SIGMAS * sigma + slack[name != "doppler"], share - truth[name]
-            if abs(apart) > more:
+            allowed, difference = SIGMAS * sigma + slack[name != "doppler"], share - truth[name]
+            if abs(difference) > allowed:
                 differing.append(f"{source} {name}: {share:.4f} for {truth[name]:.4f}")
 
     law = [stated_error(name, shots, facet) + validate_speckle.TOLERANCE for name in ("up", "shot")]
-    stored = {name[3:]: share for name, share in found.stored_pd.items()}
+    stored = {name[3:]: share for name, share in random_spec.stored_pd.items()}
     compare("closed form", {k: v for k, v in stored.items() if k != "shot"}, 1e9, law[:1] * 2)
     compare("closed form", {"shot": stored["shot"]}, 1e9, law)
     several, flights = shots.looks.is_noncoherent, {}

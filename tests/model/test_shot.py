@@ -57,21 +57,21 @@ def test_points_together_are_the_same_bits_as_point_by_point(table_4_1):
         evaluation.evaluate(table_4_1(**{name: v[i].item() for name, v in points.items()}))
         for i in range(60)
     ]
-    apart = {name: np.concatenate([s[name] for s in single]) for name in GRID_OUTPUTS}
-    assert same_bits(together, apart) == set()
+    joined = {name: np.concatenate([s[name] for s in single]) for name in GRID_OUTPUTS}
+    assert same_bits(together, joined) == set()
 
 
 @pytest.mark.parametrize("number", [2, 33])
-def test_it_does_not_matter_which_parameters_come_as_arrays(number, table_4_1):
+def test_parameters_may_be_arrays_or_scalars(number, table_4_1):
     scenes = mixed_points(24, seed=1)
     for i in range(24):
         scene = table_4_1(**{name: v[i].item() for name, v in scenes.items()})
-        alone = evaluation.evaluate(scene)
+        outputs = evaluation.evaluate(scene)
         chosen = np.random.default_rng((32, i)).choice(list(scene), 12, replace=False)
         arrays = scene | {path: np.array([scene[path]] * number) for path in chosen}
         repeated = evaluation.evaluate(arrays)
         for k in range(number):
-            assert same_bits({n: v[k : k + 1] for n, v in repeated.items()}, alone) == set()
+            assert same_bits({n: v[k : k + 1] for n, v in repeated.items()}, outputs) == set()
 
 
 def test_reported_range_and_velocity_err_by_the_rounding_to_bins_and_by_no_bias(table_4_1):

@@ -35,11 +35,11 @@ EFFECTS = (*DEFAULT_EFFECTS, "fading", "chirp_nonlinearity", "line_width")
 
 
 def _parameters(table_4_1, changes, speckle, power):
-    given = table_4_1(
+    parameters = table_4_1(
         fft_size=2**14, detection="peak_bin", beamlets=19, phases="incoherent", range=1000.0,
         radial_velocity=20.0, tnr=5.0, power=power,
     )  # fmt: skip
-    return PARAMETER_DEFAULTS | given | {"footprint.speckle": speckle} | changes
+    return PARAMETER_DEFAULTS | parameters | {"footprint.speckle": speckle} | changes
 
 
 @given(

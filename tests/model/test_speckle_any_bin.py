@@ -48,8 +48,8 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
     noise = 2 * (basis @ basis.conj().T).real / (w**2).sum()
     magnitude, echo = np.sqrt(np.diag(signal)), np.zeros(bins.size, bool)
     shape = get_window(name, LENGTH)
-    beside = math.ceil(main_lobe_half_width(shape) * padding)
-    mark_exempt_bins(magnitude, bins.size, LEVEL, echo, beside)
+    half_width = math.ceil(main_lobe_half_width(shape) * padding)
+    mark_exempt_bins(magnitude, bins.size, LEVEL, echo, half_width)
     values, vectors = np.linalg.eigh((signal + noise)[np.ix_(echo, echo)])
     factor = vectors * np.sqrt(np.maximum(values, 0) / 2)
     detected = np.zeros(DRAWS, bool)
@@ -58,7 +58,7 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
         detected[first : first + 5000] = (abs(numbers @ factor.T) >= LEVEL).any(axis=1)
     rule = DetectionRule(
         True,
-        beside,
+        half_width,
         False,
         size,
         True,

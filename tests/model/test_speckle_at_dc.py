@@ -52,7 +52,7 @@ def with_circular_pd(parameters, pd):
 
 
 @pytest.mark.parametrize(
-    ("bins", "circular", "drawn", "error"),
+    ("bins", "circular", "expected_share", "error"),
     [
         (0.0, 0.8195, 0.6570, 0.0024),
         (0.11, 0.8075, 0.6496, 0.0024),
@@ -60,12 +60,12 @@ def with_circular_pd(parameters, pd):
         (0.63, 0.5984, 0.4746, 0.0025),
     ],
 )
-def test_a_hovering_lidar_detects_a_real_number(bins, circular, drawn, error, table_4_1):
+def test_a_hovering_lidar_detects_a_real_number(bins, circular, expected_share, error, table_4_1):
     """Shares drawn by another simulation, with the probabilities of circular numbers there."""
     p = at_doppler(PARAMETER_DEFAULTS | table_4_1() | HOVER, bins * BIN_WIDTH)
     p = with_circular_pd(p, circular)
     outputs = shot_statistics(prepare_single_category(p))
-    assert abs(outputs["pd_doppler"][0] - drawn) < 3 * error
+    assert abs(outputs["pd_doppler"][0] - expected_share) < 3 * error
     assert outputs["pd_doppler"][0] + outputs["miss_doppler"][0] == pytest.approx(1, abs=1e-12)
 
 
@@ -103,11 +103,11 @@ def test_an_up_beat_at_dc_is_a_real_number(rule, tolerance, table_4_1):
         draw_segment_detections(p, shots, draws=DRAWS, seed=3),
         shot_statistics(shots),
     )
-    both = (detections["up"] & detections["down"]).mean()
+    joint_share = (detections["up"] & detections["down"]).mean()
     error = np.sqrt(0.25 / DRAWS)
     assert abs(detections["up"].mean() - outputs["pd_up"][0]) < 4 * error
     # The poles take 1 % of the power at the down beat that the simulation leaves.
-    assert abs(both - outputs["pd_shot"][0]) < 4 * error + tolerance
+    assert abs(joint_share - outputs["pd_shot"][0]) < 4 * error + tolerance
 
 
 def test_any_two_segments_detect_a_hovering_lidar_as_drawn(table_4_1):
@@ -183,10 +183,10 @@ def test_looks_near_dc_are_detected_alike_in_the_time_domain(speckle, waveform, 
 @pytest.mark.parametrize("level", [1e-3, 0.7, 2.0, 9.0])
 def test_the_hoyt_law_is_the_mean_of_exponentials(share, level):
     """Of |X|^2 = P (1 + q cos t) times an exponential variable, t uniform."""
-    found, missed = hoyt_tails(1.7, share, level)
+    pd, missed = hoyt_tails(1.7, share, level)
     t = np.pi * (np.arange(20_000) + 0.5) / 20_000
     exponent = level**2 / (1.7 * (1 + share * np.cos(t)))
-    assert found == pytest.approx(np.exp(-exponent).mean(), rel=1e-9, abs=1e-300)
+    assert pd == pytest.approx(np.exp(-exponent).mean(), rel=1e-9, abs=1e-300)
     assert missed == pytest.approx(-np.expm1(-exponent).mean(), rel=1e-5)
 
 

@@ -83,10 +83,10 @@ def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, toler
     shots = prepare_single_category(p)
     outputs = shot_statistics(shots)
     detections = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
-    both = (detections["up"] & detections["down"]).mean()
+    joint_share = (detections["up"] & detections["down"]).mean()
     expected = float(outputs["pd_shot"][0])
     error = np.sqrt(expected * (1 - expected) / DRAWS)
-    assert abs(both - expected) < 4 * error + tolerance
+    assert abs(joint_share - expected) < 4 * error + tolerance
 
 
 def test_carriers_that_differ_share_less_speckle_than_equal_ones(table_4_1):

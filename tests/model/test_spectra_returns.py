@@ -39,19 +39,19 @@ def _given(table_4_1, tnr=10.0, power=1.6e-3, **methods):
     return parameters | methods
 
 
-def _flown(parameters, *, first=1000, draws=NUMBER, bodies=None, x=0.0, **given):
-    given = {"effects": EFFECTS} | given
+def _flown(parameters, *, first=1000, draws=NUMBER, bodies=None, x=0.0, **arguments):
+    arguments = {"effects": EFFECTS} | arguments
     path = straight_flight(position=(x, 0.0, HEIGHT), velocity=(0.0, 0.0, -CLOSING))
-    seen = observe_shots(path, bodies=bodies, number=7)
+    shot_eyepoints = observe_shots(path, bodies=bodies, number=7)
     return simulate_cloud(
-        seen,
+        shot_eyepoints,
         parameters=parameters,
         surfaces=[SurfaceMaterial("ground", 0.1), SurfaceMaterial("table", 0.1)],
         keys=make_point_keys(1),
         first_draw=first,
         draws=draws,
         method="spectra",
-        **given,
+        **arguments,
     )
 
 
@@ -79,15 +79,15 @@ def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, way):
     kind, record = way
     changes = {ESTIMATOR_PREFIX + "kind": kind, RECORD: record}
     parameters = _given(table_4_1, power=1.0, **changes)
-    got, grid = _flown(parameters), _grid(parameters)
-    assert got["snr_up"][0] == pytest.approx(grid["snr_up"][0], rel=1e-9)
+    cloud, grid = _flown(parameters), _grid(parameters)
+    assert cloud["snr_up"][0] == pytest.approx(grid["snr_up"][0], rel=1e-9)
     for name in ("range", "radial_velocity"):
-        error = (got[f"{name}_interpolated"] - got[f"true_{name}"])[0, :, 0]
-        assert np.isfinite(error).all() and (got["flags"][0, :, 0] == TRUE_FLAG).all()
+        error = (cloud[f"{name}_interpolated"] - cloud[f"true_{name}"])[0, :, 0]
+        assert np.isfinite(error).all() and (cloud["flags"][0, :, 0] == TRUE_FLAG).all()
         bias, rmse = grid[f"{name}_bias"][0], grid[f"{name}_rmse"][0]
         scatter = np.sqrt(max(rmse**2 - bias**2, 0.0))
-        apart = 5 * scatter * np.sqrt(2 / NUMBER)
-        assert error.mean() == pytest.approx(bias, abs=apart + 1e-6)
+        allowed = 5 * scatter * np.sqrt(2 / NUMBER)
+        assert error.mean() == pytest.approx(bias, abs=allowed + 1e-6)
         assert error.std() == pytest.approx(scatter, rel=5 / np.sqrt(NUMBER), abs=1e-6)
 
 
@@ -102,15 +102,17 @@ def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
     kind, record = way
     chosen = {DETECTOR_PREFIX + "kind": kind, DETECTOR_PREFIX + "pfa": 1e-4, RECORD: record}
     parameters = _given(table_4_1, tnr=6.0, power=1e-2, **chosen)
-    got, grid = _flown(parameters), _grid(parameters)
-    found = np.isin(got["flags"], (TRUE_FLAG, TRUE_FLAG | UNCONFIRMED_FLAG)).any(axis=2).mean()
+    cloud, grid = _flown(parameters), _grid(parameters)
+    detected_share = (
+        np.isin(cloud["flags"], (TRUE_FLAG, TRUE_FLAG | UNCONFIRMED_FLAG)).any(axis=2).mean()
+    )
     pd = grid["pd_shot"][0]
     assert 0.1 < pd < 0.95
-    assert found == pytest.approx(pd, abs=5 * np.sqrt(2 * pd * (1 - pd) / NUMBER))
+    assert detected_share == pytest.approx(pd, abs=5 * np.sqrt(2 * pd * (1 - pd) / NUMBER))
     # Closed forms know the fixed threshold alone.
-    assert np.isfinite(got["pd_shot"]).all() == (kind == "fixed")
+    assert np.isfinite(cloud["pd_shot"]).all() == (kind == "fixed")
     if kind == "fixed":
-        assert got["pd_shot"][0] == pytest.approx(pd, abs=5 * np.sqrt(pd * (1 - pd) / NUMBER))
+        assert cloud["pd_shot"][0] == pytest.approx(pd, abs=5 * np.sqrt(pd * (1 - pd) / NUMBER))
 
 
 @pytest.mark.parametrize("record", [pytest.param("real", marks=pytest.mark.slow), "complex"])
@@ -118,35 +120,41 @@ def test_the_strongest_peak_is_as_often_wrong_as_the_closed_form_of_a_grid_says(
     """A return of both right peaks may be misread for want of a Doppler peak."""
     changes = {PEAKS_PATH: STRONGEST_PEAK, RECORD: record}
     parameters = _given(table_4_1, tnr=3.0, power=1e-2, **changes)
-    got = _flown(parameters, draws=2000)
+    cloud = _flown(parameters, draws=2000)
     grid = evaluate(parameters | TARGET, EFFECTS)
-    flags = got["flags"][0]
+    flags = cloud["flags"][0]
     assert not flags[:, 1:].any()  # a shot has one return
     right = ((flags[:, 0] & (TRUE_FLAG | MISREAD_FLAG)) > 0).mean()
     pd, wrong = grid["pd_shot"][0], grid["p_wrong_range_shot"][0]
     assert 0.2 < pd < 0.8 and wrong > 0.05
-    for found, told in ((right, pd), ((flags[:, 0] > 0).mean() - right, wrong)):
-        assert found == pytest.approx(told, abs=0.006 + 5 * np.sqrt(told * (1 - told) / 2000))
-    assert np.isnan(got["pd_shot"]).all()
+    for share, expected in ((right, pd), ((flags[:, 0] > 0).mean() - right, wrong)):
+        assert share == pytest.approx(
+            expected, abs=0.006 + 5 * np.sqrt(expected * (1 - expected) / 2000)
+        )
+    assert np.isnan(cloud["pd_shot"]).all()
 
 
 def test_functions_of_ones_own_see_every_draw_alone(table_4_1):
     """A detector that flags one bin off the echo, and an estimator that says so."""
 
-    def here(power, setting):
+    def first_module_method(power, setting):
         return np.arange(power.shape[1])[None] == 300
 
-    def there(spectrum, peak, setting):
+    def second_module_method(spectrum, peak, setting):
         assert spectrum.shape == (1, setting.fft_size // 2 + 1) and (peak == 300).all()
         return peak + 0.25
 
-    own = SpectrumMethods({"mine:here": here}, {"mine:there": there})
+    methods = SpectrumMethods(
+        {"mine:here": first_module_method}, {"mine:there": second_module_method}
+    )
     chosen = {DETECTOR_PREFIX + "kind": "mine:here", ESTIMATOR_PREFIX + "kind": "mine:there"}
-    got = _flown(_given(table_4_1, **chosen), draws=3, methods=own)
-    assert (got["flags"][0, :, 0] & FALSE_ALARM_FLAG).all() and not got["flags"][0, :, 1:].any()
+    cloud = _flown(_given(table_4_1, **chosen), draws=3, methods=methods)
+    assert (cloud["flags"][0, :, 0] & FALSE_ALARM_FLAG).all() and not cloud["flags"][0, :, 1:].any()
     # Up and down beat alike: no range, and a velocity of 300.25 bins; or the reverse.
     bins = 299792458.0 * 600e6 / (4 * 2**11 * 2e12), 1550e-9 * 600e6 / 2**12
-    far, closing = (np.abs(got[f"{n}_interpolated"][0, :, 0]) for n in ("range", "radial_velocity"))
+    far, closing = (
+        np.abs(cloud[f"{n}_interpolated"][0, :, 0]) for n in ("range", "radial_velocity")
+    )
     read = far / bins[0] + closing / bins[1]
     np.testing.assert_allclose(read, 300.25, rtol=1e-3)
 
@@ -157,24 +165,29 @@ def test_both_surfaces_of_a_footprint_are_seen_and_fade_each_for_itself(table_4_
     changes = {ESTIMATOR_PREFIX + "kind": "candan", "footprint.speckle": "developed"}
     parameters = _given(table_4_1, power=0.3, **changes)
     effects = (*EFFECTS, "several_returns", "fading")
-    got = _flown(parameters, bodies=bodies, x=1e-4, effects=effects, draws=2000)
-    seen = [(got["surface"] == number).any(axis=2)[0] for number in (0, 1)]
-    one, other = (each.mean() for each in seen)
-    apart = 5 * np.sqrt(one * other * (1 - one * other) / 2000)
-    assert (seen[0] & seen[1]).mean() == pytest.approx(one * other, abs=apart)
-    both = seen[0] & seen[1]
-    snr = [np.where(got["surface"][0] == k, got["snr"][0], 0.0).max(axis=1)[both] for k in (0, 1)]
+    cloud = _flown(parameters, bodies=bodies, x=1e-4, effects=effects, draws=2000)
+    is_surface_seen = [(cloud["surface"] == number).any(axis=2)[0] for number in (0, 1)]
+    one, other = (is_seen.mean() for is_seen in is_surface_seen)
+    allowed = 5 * np.sqrt(one * other * (1 - one * other) / 2000)
+    assert (is_surface_seen[0] & is_surface_seen[1]).mean() == pytest.approx(
+        one * other, abs=allowed
+    )
+    both_seen = is_surface_seen[0] & is_surface_seen[1]
+    snr = [
+        np.where(cloud["surface"][0] == k, cloud["snr"][0], 0.0).max(axis=1)[both_seen]
+        for k in (0, 1)
+    ]
     # One fading of both would have them rise and fall as one.
-    assert abs(np.corrcoef(*snr)[0, 1]) < 5 / np.sqrt(both.sum()) < 0.2
-    true = got["flags"] == TRUE_FLAG
-    off = np.abs(got["range_interpolated"] - got["true_range"])[true]
-    assert np.median(off) < 0.5 * 299792458.0 * 600e6 / (4 * 2**11 * 2e12)
+    assert abs(np.corrcoef(*snr)[0, 1]) < 5 / np.sqrt(both_seen.sum()) < 0.2
+    true = cloud["flags"] == TRUE_FLAG
+    errors = np.abs(cloud["range_interpolated"] - cloud["true_range"])[true]
+    assert np.median(errors) < 0.5 * 299792458.0 * 600e6 / (4 * 2**11 * 2e12)
 
 
 def test_any_split_of_draws_gives_the_same_bytes(table_4_1):
     parameters = _given(table_4_1, **{ESTIMATOR_PREFIX + "kind": "chirp_z"})
-    whole = _flown(parameters, draws=6)
+    at_once = _flown(parameters, draws=6)
     part = _flown(parameters, first=1002, draws=3)
     for name, values in part.items():
-        expected = whole[name][:, 2:5] if values.ndim > 1 else whole[name]
+        expected = at_once[name][:, 2:5] if values.ndim > 1 else at_once[name]
         np.testing.assert_array_equal(values, expected, err_msg=name)

@@ -26,29 +26,34 @@ from sweep.model.sampling.samplers import PriorDraws, simulate_draws
 from sweep.model.time_domain_truth import time_domain_spectrum
 
 EFFECTS = ("doppler",)
-WHOLE = {"method": "spectra"}
+WHOLE_SPECTRA = {"method": "spectra"}
 RECORD = "instrument.receiver.record"
 COMPLEX = {RECORD: "complex"}
-BOTH = pytest.mark.parametrize("record", ["real", "complex"])
+BOTH_RECORDS = pytest.mark.parametrize("record", ["real", "complex"])
 
 
 def _points(table_4_1, **changes):
-    given = {
+    parameters = {
         "instrument.processing.fft_size": 2048,
         "instrument.processing.tnr": 6.0,
         "target.range": np.array([1000.0, 2000.0, 3500.0]),
     }
-    return table_4_1() | given | changes
+    return table_4_1() | parameters | changes
 
 
 def _drawn(parameters, number=400, effects=EFFECTS, **place):
     size = np.size(parameters["target.range"])
     return simulate_draws(
-        parameters, effects, keys=make_point_keys(size), batch_sizes=[number], **place, **WHOLE
+        parameters,
+        effects,
+        keys=make_point_keys(size),
+        batch_sizes=[number],
+        **place,
+        **WHOLE_SPECTRA,
     )
 
 
-@BOTH
+@BOTH_RECORDS
 @pytest.mark.parametrize(("window", "duration"), [("rectangular", 5e-4), ("hamming", 2.5e-6)])
 def test_noise_has_the_power_and_the_correlation_of_window_and_padding(
     table_4_1, window, duration, record
@@ -70,7 +75,7 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(
     assert near == pytest.approx(expected, abs=5 / np.sqrt(independent))
 
 
-@BOTH
+@BOTH_RECORDS
 def test_the_signal_is_that_of_the_time_domain(table_4_1, record):
     """A lone line: magnitudes of the record's own FFT; its place, but for its image."""
     parameters = _points(table_4_1) | {"target.range": 1000.0, "footprint.beamlets": 1}
@@ -86,7 +91,7 @@ def test_the_signal_is_that_of_the_time_domain(table_4_1, record):
     assert (up + down) / 2 == pytest.approx(beat, abs=5e-3)
 
 
-@BOTH
+@BOTH_RECORDS
 def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1, record):
     """Tones on bins of an untapered record: nothing beside them, where one more look is taken.
 
@@ -115,17 +120,19 @@ def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1, record):
     assert (drawn["pfa_bin_error"] < 0.07 * drawn["pfa_bin"]).all()  # at 5 sigma under sqrt 2
 
 
-@BOTH
+@BOTH_RECORDS
 def test_the_most_likely_range_and_velocity_reach_the_bound(table_4_1, record):
     """Within 15 %, of a lone line; 5 standard errors of 600 draws are 14 %."""
     parameters = _points(table_4_1, **{"footprint.beamlets": 1, "target.range": np.array([600.0])})
     parameters |= {ESTIMATOR_PREFIX + "kind": "maximum_likelihood", RECORD: record}
-    found = _drawn(parameters, 600)
+    drawn_outputs = _drawn(parameters, 600)
     for name in ("range", "radial_velocity"):
-        assert found[f"{name}_rmse"] == pytest.approx(found[f"{name}_bound"], rel=0.15)
-        assert np.abs(found[f"{name}_bias"]) < 5 * found[f"{name}_bias_error"]
+        assert drawn_outputs[f"{name}_rmse"] == pytest.approx(
+            drawn_outputs[f"{name}_bound"], rel=0.15
+        )
+        assert np.abs(drawn_outputs[f"{name}_bias"]) < 5 * drawn_outputs[f"{name}_bias_error"]
     coarse = _drawn(parameters | {ESTIMATOR_PREFIX + "kind": "peak_bin"}, 100)
-    assert coarse["range_rmse"] > 2 * found["range_bound"]
+    assert coarse["range_rmse"] > 2 * drawn_outputs["range_bound"]
 
 
 def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
@@ -139,9 +146,9 @@ def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
             "target.radial_velocity": 300.0, ESTIMATOR_PREFIX + "kind": "maximum_likelihood",
         },
     )  # fmt: skip
-    found = _drawn(parameters, 300, (*EFFECTS, "range_walk"))
-    assert abs(found["range_bias"]) < 5 * found["range_bias_error"] + 1e-3
-    assert found["range_bias_error"] < 2e-3
+    drawn_outputs = _drawn(parameters, 300, (*EFFECTS, "range_walk"))
+    assert abs(drawn_outputs["range_bias"]) < 5 * drawn_outputs["range_bias_error"] + 1e-3
+    assert drawn_outputs["range_bias_error"] < 2e-3
 
 
 @pytest.mark.parametrize(
@@ -151,45 +158,47 @@ def test_batches_points_and_their_order_change_no_bit(table_4_1, effects, record
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
     parameters |= {RECORD: record}
     parameters |= {DETECTOR_PREFIX + "kind": "os_cfar", ESTIMATOR_PREFIX + "kind": "candan"}
-    given = make_point_keys(3)
-    whole = simulate_draws(parameters, effects, keys=given, batch_sizes=[40, 30], **WHOLE)
+    keys = make_point_keys(3)
+    at_once = simulate_draws(parameters, effects, keys=keys, batch_sizes=[40, 30], **WHOLE_SPECTRA)
     other = parameters | {"target.range": parameters["target.range"][::-1].copy()}
-    parts = simulate_draws(other, effects, keys=given[::-1], batch_sizes=[13, 7, 50], **WHOLE)
-    for name, values in whole.items():
+    parts = simulate_draws(
+        other, effects, keys=keys[::-1], batch_sizes=[13, 7, 50], **WHOLE_SPECTRA
+    )
+    for name, values in at_once.items():
         if values.ndim == 2:
             np.testing.assert_array_equal(values.sum(axis=1), parts[name][::-1].sum(axis=1))
         else:
             np.testing.assert_array_equal(values, parts[name][::-1], err_msg=name)
-    alone = {path: v[1:2] if np.ndim(v) else v for path, v in parameters.items()}
-    one = simulate_draws(alone, effects, keys=given[1:2], batch_sizes=[70], **WHOLE)
+    single_point = {path: v[1:2] if np.ndim(v) else v for path, v in parameters.items()}
+    one = simulate_draws(single_point, effects, keys=keys[1:2], batch_sizes=[70], **WHOLE_SPECTRA)
     for name in SPECTRA_OUTPUTS:
-        np.testing.assert_array_equal(one[name], whole[name][1:2], err_msg=name)
+        np.testing.assert_array_equal(one[name], at_once[name][1:2], err_msg=name)
 
 
 def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
     parameters, accuracy = _points(table_4_1), ErrorBudget(0.1, 0.95, interval="wilson")
-    given = {"keys": make_point_keys(3), "error_budget": accuracy} | WHOLE
-    found = simulate_draws(parameters, EFFECTS, batch=20, limit=500, **given)
-    assert (found["accuracy_missed"] == 0).all() and found["n_draws"].min() < 100
-    again = simulate_draws(
-        parameters, EFFECTS, batch_sizes=[int(found["n_draws"][0])], **given
+    arguments = {"keys": make_point_keys(3), "error_budget": accuracy} | WHOLE_SPECTRA
+    results = simulate_draws(parameters, EFFECTS, batch=20, limit=500, **arguments)
+    assert (results["accuracy_missed"] == 0).all() and results["n_draws"].min() < 100
+    repeated = simulate_draws(
+        parameters, EFFECTS, batch_sizes=[int(results["n_draws"][0])], **arguments
     )  # fmt: skip
-    assert again["pd_shot"][0] == found["pd_shot"][0]
-    assert again["n_detected_shot"][0, 0] == found["n_detected_shot"][0]
+    assert repeated["pd_shot"][0] == results["pd_shot"][0]
+    assert repeated["n_detected_shot"][0, 0] == results["n_detected_shot"][0]
 
 
-def _in_pieces(**given):
+def _in_pieces(**arguments):
     """Results of draws that are stopped as soon as can be and gone on with, and how often."""
     before, number, pieces = None, -1, 0
     while True:
-        found = simulate_draws(prior_draws=before, should_stop=lambda: True, **given)
-        if found["n_draws"].sum() == number:
-            return found, pieces
-        number, pieces = found["n_draws"].sum(), pieces + 1
+        results = simulate_draws(prior_draws=before, should_stop=lambda: True, **arguments)
+        if results["n_draws"].sum() == number:
+            return results, pieces
+        number, pieces = results["n_draws"].sum(), pieces + 1
         counts = np.stack(
-            [found[name].reshape(len(found["n_draws"]), -1) for name in DRAW_COUNT_OUTPUTS]
+            [results[name].reshape(len(results["n_draws"]), -1) for name in DRAW_COUNT_OUTPUTS]
         )
-        before = PriorDraws(found["n_draws"], counts, found)
+        before = PriorDraws(results["n_draws"], counts, results)
 
 
 @pytest.mark.parametrize("kind", ["ca_cfar", "os_cfar", "goca_cfar"])
@@ -230,9 +239,11 @@ def test_an_iq_echo_on_the_seam_or_at_zero_is_found_as_any_other(table_4_1, edge
     pd = _drawn(parameters | as_loud, 300)["pd_doppler"]
     assert 0.2 < pd[2] < 0.8
     assert np.abs(pd - pd[2]).max() < 5 * np.sqrt(2 * pd[2] * (1 - pd[2]) / 300)
-    found = _drawn(parameters | {"instrument.laser.power": 10.0}, 300)
-    assert (found["pd_shot"] == 1).all()
-    np.testing.assert_allclose(found["range_rmse"], found["range_bound"], rtol=5 / np.sqrt(600))
+    drawn_outputs = _drawn(parameters | {"instrument.laser.power": 10.0}, 300)
+    assert (drawn_outputs["pd_shot"] == 1).all()
+    np.testing.assert_allclose(
+        drawn_outputs["range_rmse"], drawn_outputs["range_bound"], rtol=5 / np.sqrt(600)
+    )
 
 
 @pytest.mark.parametrize("much", [{"batch_sizes": [40, 30]}, {"batch": 16, "limit": 70}])
@@ -247,23 +258,23 @@ def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
 
     sizes = {"instrument.processing.fft_size": np.array([2048, 1024, 2048])}
     parameters = _points(table_4_1, **sizes) | {DETECTOR_PREFIX + "kind": "m:f"}
-    given = {
+    arguments = {
         "parameters": parameters,
         "effects": EFFECTS,
         "keys": make_point_keys(3),
         **much,
-        **WHOLE,
+        **WHOLE_SPECTRA,
     }
-    given |= {
+    arguments |= {
         "error_budget": ErrorBudget(0.1),
         "methods": SpectrumMethods({"m:f": over_the_median}),
     }
-    whole, (found, pieces) = simulate_draws(**given), _in_pieces(**given)
+    in_one_call, (at_once, pieces) = simulate_draws(**arguments), _in_pieces(**arguments)
     assert pieces > 3
-    for name, values in whole.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    for name, values in in_one_call.items():
+        np.testing.assert_array_equal(at_once[name], values, err_msg=name)
     monkeypatch.setattr(samplers, "SPECTRUM_SAMPLES_PER_STEP", 3 * 2048)
-    assert (simulate_draws(**given)["pfa_bin"] != whole["pfa_bin"]).all()
+    assert (simulate_draws(**arguments)["pfa_bin"] != in_one_call["pfa_bin"]).all()
 
 
 def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
@@ -284,9 +295,9 @@ def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
     )
     effects = (*EFFECTS, "speckle")
     pd = averaged(parameters, effects, keys=make_point_keys(1), draws=600)["pd_down"]
-    found = _drawn(parameters, 600, effects)["pd_down"]
+    drawn_pd = _drawn(parameters, 600, effects)["pd_down"]
     assert 0.1 < pd[0] < 0.95
-    assert found == pytest.approx(pd, abs=5 * 0.5 / np.sqrt(600))
+    assert drawn_pd == pytest.approx(pd, abs=5 * 0.5 / np.sqrt(600))
 
 
 def test_methods_may_be_ones_own(table_4_1):
@@ -302,9 +313,9 @@ def test_methods_may_be_ones_own(table_4_1):
         DETECTOR_PREFIX + "kind": "m:f",
         ESTIMATOR_PREFIX + "kind": "m:g",
     }
-    found = _drawn(parameters, 5, methods=methods)
-    assert (found["pd_shot"] == 1).all()
-    assert (found["false_alarms"] == 0).all()  # one group, and the signal within it
+    drawn_outputs = _drawn(parameters, 5, methods=methods)
+    assert (drawn_outputs["pd_shot"] == 1).all()
+    assert (drawn_outputs["false_alarms"] == 0).all()  # one group, and the signal within it
 
 
 CHIRP_2_US = {
@@ -319,12 +330,12 @@ def test_ranges_err_by_the_walk_of_the_lasers_phase(table_4_1):
     """100 kHz, 500 MHz in 2 us: known errors of 4.3 to 30.7 mm, and bounds to 38.8 mm."""
     place = {"target.range": np.array([10.0, 75.0, 100.0])}
     parameters = _points(table_4_1, **CHIRP_2_US) | WANDERING | place
-    found = _drawn(parameters, number=600, effects=("doppler", "line_width", "image"))
+    drawn_outputs = _drawn(parameters, number=600, effects=("doppler", "line_width", "image"))
     known = np.array([4.3e-3, 30.7e-3])
     spread = 5 / np.sqrt(2 * 600)
-    np.testing.assert_allclose(found["range_rmse"][:2], known, rtol=0.05 + spread)
+    np.testing.assert_allclose(drawn_outputs["range_rmse"][:2], known, rtol=0.05 + spread)
     bounds = [4.3e-3, 29.8e-3, 38.8e-3]
-    np.testing.assert_allclose(found["range_bound"], bounds, rtol=0.1)
+    np.testing.assert_allclose(drawn_outputs["range_bound"], bounds, rtol=0.1)
 
 
 def test_the_laser_turns_the_record_sample_by_sample(table_4_1):
@@ -335,8 +346,8 @@ def test_the_laser_turns_the_record_sample_by_sample(table_4_1):
     ((_, shots),) = prepare_shots(parameters, ("doppler", "image", "line_width"))
     key, draws, rate = make_point_keys(1)[0], np.arange(3), 500e6
     delay = 100.0 / SPEED_OF_LIGHT * rate
-    found = draw_signal_spectra(shots, 0, 2, noiseless_signal(shots, 0, 2), key=key, draws=draws)
-    for draw, drawn in zip(draws, found, strict=True):
+    spectra = draw_signal_spectra(shots, 0, 2, noiseless_signal(shots, 0, 2), key=key, draws=draws)
+    for draw, drawn in zip(draws, spectra, strict=True):
         steps = n_phase_walk_steps(delay=delay, length=shots.window.length)
         numbers = philox.uniforms(key[None], np.array([draw]), philox.STREAM_LASER_PHASE[2], steps)
         phase = phase_walk(

@@ -53,9 +53,9 @@ def record_of(sizes, origin, delta, weights):
     """
     fft_size, length = sizes
     n = np.arange(length)
-    whole = (n * origin) % fft_size / fft_size - (length * origin) % (2 * fft_size) / fft_size / 2
+    cycles = (n * origin) % fft_size / fft_size - (length * origin) % (2 * fft_size) / fft_size / 2
     part = np.outer(delta, n - length / 2) / fft_size
-    return 2 * np.asarray(weights)[:, None] * np.exp(2j * np.pi * (whole + part))
+    return 2 * np.asarray(weights)[:, None] * np.exp(2j * np.pi * (cycles + part))
 
 
 def bundle(rng, number, spread):
@@ -103,9 +103,9 @@ def few_for(delta, weights, tolerance, limits):
     workspace = allocate_workspace(n + 16)
     lines, nodes = workspace.field.lines, workspace.nodes
     lines.position[:n], lines.re[:n], lines.im[:n] = delta, np.real(weights), np.imag(weights)
-    wanted = count_nodes(np.pi * half, tolerance, limits)
+    n_nodes = count_nodes(np.pi * half, tolerance, limits)
     number = replace_lines_by_nodes(
-        lines, n, wanted, middle, half, workspace.field.line_scratch, nodes
+        lines, n, n_nodes, middle, half, workspace.field.line_scratch, nodes
     )
     return nodes.position[:number].copy(), nodes.re[:number] + 1j * nodes.im[:number]
 
@@ -154,10 +154,10 @@ def test_few_lines_are_as_good_in_every_bin_as_the_window_lets_them(name, tolera
         few, strength = few_for(delta, np.ones(108), tolerance, limits)
         assert few.size < 108
         many = record @ np.exp(1j * np.pi * np.outer(t, delta)).sum(axis=1)
-        found = record @ (np.exp(1j * np.pi * np.outer(t, few)) @ strength)
+        spectrum = record @ (np.exp(1j * np.pi * np.outer(t, few)) @ strength)
         # What nodes alias onto the terms that are there is as much again.
-        whole = 108 * np.abs(window_samples(name, 256)).sum()
-        assert np.abs(many - found).max() <= 2 * tolerance * whole + 1e-12 * whole
+        scale = 108 * np.abs(window_samples(name, 256)).sum()
+        assert np.abs(many - spectrum).max() <= 2 * tolerance * scale + 1e-12 * scale
 
 
 # What is left out
@@ -185,12 +185,12 @@ def test_bins_that_a_level_leaves_out_hold_less_and_the_others_are_unchanged(
         )  # fmt: skip
         ((_, shots),) = prepare_shots(scene)
         for segment in range(3):
-            _, whole = segment_spectrum(shots, 0, segment)
+            _, spectrum = segment_spectrum(shots, 0, segment)
             for fraction in (0.3, 1e-2, 1e-3, 1e-5):
-                level = fraction * whole.max()
+                level = fraction * spectrum.max()
                 bins, part = segment_spectrum(shots, 0, segment, level_min=level)
-                assert part == pytest.approx(whole[bins], rel=1e-9, abs=1e-13 * whole.max())
-                left_out = np.delete(whole, bins)
+                assert part == pytest.approx(spectrum[bins], rel=1e-9, abs=1e-13 * spectrum.max())
+                left_out = np.delete(spectrum, bins)
                 # Line and image are each below the level.
-                both = np.sqrt(2) if phases == "incoherent" else 2.0
-                assert left_out.size == 0 or left_out.max() < both * level
+                factor = np.sqrt(2) if phases == "incoherent" else 2.0
+                assert left_out.size == 0 or left_out.max() < factor * level

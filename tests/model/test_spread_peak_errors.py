@@ -92,7 +92,7 @@ def scores(shape, rule, angle, draws=4000, places=20):
             bins, spectrum, mean = drawn_segment(
                 window, sign * spread, phase, middle, amplitudes, lines, rng
             )
-            index, three, offset, found = detected_peak(spectrum, mean, rule, tables)
+            index, three, offset, estimate = detected_peak(spectrum, mean, rule, tables)
             mean_power = mean.max() + 2
             noise_error = [
                 sub_bin_standard_error(o, m, tables)
@@ -102,7 +102,7 @@ def scores(shape, rule, angle, draws=4000, places=20):
                 (bins[index] + offset - middle, offset, three.max(axis=1) ** 2 / mean_power,
                  np.full(number, mean.max() / mean_power), np.array(noise_error))
             )  # fmt: skip
-            detected &= found
+            detected &= estimate
         columns.append(np.array(by_segment)[:, :, detected])
     (up, down) = np.concatenate(columns, axis=2)
     count = up.shape[1]

@@ -27,7 +27,7 @@ SMALL = {
     "noise_bins": "correlated",
 }  # fmt: skip
 FADING = (*DEFAULT_EFFECTS, "fading")
-ALONE = tuple(effect for effect in FADING if effect != "leakage")
+WITHOUT_LEAKAGE = tuple(effect for effect in FADING if effect != "leakage")
 
 
 def scene_of(table_4_1, speckle="none", record="real", peaks=STRONGEST_PEAK, **changes):
@@ -67,12 +67,14 @@ def reported(shots, segment, echo, rng):
         first, number = shots.detection_settings.search_band[segment, :, 0]
         searched &= (bins - first) % SIZE < number
     if shots.detection_settings.echo_bins == "peak_bin":
-        own = magnitude[:, int(np.rint(place)) % SIZE]
+        echo_magnitude = magnitude[:, int(np.rint(place)) % SIZE]
     else:
-        own = magnitude[:, near & searched].max(axis=1)
+        echo_magnitude = magnitude[:, near & searched].max(axis=1)
     other = magnitude[:, ~near & searched].max(axis=1)
     level = shots.threshold[0]
-    return (own >= level) & (own > other), (other >= level) & (other >= own)
+    return (echo_magnitude >= level) & (echo_magnitude > other), (other >= level) & (
+        other >= echo_magnitude
+    )
 
 
 def speckle_of(kind, rng):
@@ -82,53 +84,55 @@ def speckle_of(kind, rng):
     return np.sqrt(0.5) * (rng.normal(size=DRAWS) + 1j * rng.normal(size=DRAWS))
 
 
-def shares(shots, alike):
+def shares(shots, correlation):
     """Shots whose segments share so much of their speckle."""
-    fading = SegmentCorrelations(*(alike * one for one in shots.speckle.segment_correlations))
+    fading = SegmentCorrelations(*(correlation * one for one in shots.speckle.segment_correlations))
     return replace(shots, speckle=shots.speckle._replace(segment_correlations=fading))
 
 
 @pytest.mark.parametrize(
-    ("tnr", "detection", "alike", "record"),
+    ("tnr", "detection", "correlation", "record"),
     parametrize_product(
         5, [2.5, 4.5], ["any_bin", "peak_bin"], [None, 1.0, 0.7], ["real", "complex"]
     ),
 )
-def test_drawn_records_whose_largest_bin_is_reported(tnr, detection, alike, record, table_4_1):
+def test_drawn_records_whose_largest_bin_is_reported(
+    tnr, detection, correlation, record, table_4_1
+):
     """At TNR 2.5 noise nearly always alarms, at 4.5 hardly ever. Segments share their speckle."""
-    speckle = "none" if alike is None else "developed"
+    speckle = "none" if correlation is None else "developed"
     changes = {"tnr": tnr, "detection": detection}
     shots = prepare_single_category(scene_of(table_4_1, speckle, record, **changes), FADING)
-    shots = shots if alike is None else shares(shots, alike)
-    found, rng, each = shot_statistics(shots), np.random.default_rng(71), []
+    shots = shots if correlation is None else shares(shots, correlation)
+    statistics, rng, pair_shares = shot_statistics(shots), np.random.default_rng(71), []
     first, second = (speckle_of(speckle, rng) for _ in range(2))
-    share = 1.0 if alike is None else alike
-    for segment, name, own in ((0, "up", 0.0), (2, "down", np.sqrt(1 - share**2))):
-        echo = (share if own else 1.0) * first + own * second
+    share = 1.0 if correlation is None else correlation
+    for segment, name, decorrelation in ((0, "up", 0.0), (2, "down", np.sqrt(1 - share**2))):
+        echo = (share if decorrelation else 1.0) * first + decorrelation * second
         right, wrong = reported(shots, segment, echo, rng)
-        each.append((right, wrong))
-        assert 0.1 < found[f"pd_{name}"][0] < 0.97
-        assert is_within_5_sigma(right.sum(), found[f"pd_{name}"][0], 0.005 * DRAWS)
-        assert is_within_5_sigma(wrong.sum(), found[f"p_wrong_range_{name}"][0], 0.003 * DRAWS)
-    (up, up_wrong), (down, down_wrong) = each
-    assert is_within_5_sigma((up & down).sum(), found["pd_shot"][0], 0.007 * DRAWS)
+        pair_shares.append((right, wrong))
+        assert 0.1 < statistics[f"pd_{name}"][0] < 0.97
+        assert is_within_5_sigma(right.sum(), statistics[f"pd_{name}"][0], 0.005 * DRAWS)
+        assert is_within_5_sigma(wrong.sum(), statistics[f"p_wrong_range_{name}"][0], 0.003 * DRAWS)
+    (up, up_wrong), (down, down_wrong) = pair_shares
+    assert is_within_5_sigma((up & down).sum(), statistics["pd_shot"][0], 0.007 * DRAWS)
     spoilt = (up | up_wrong) & (down | down_wrong) & ~(up & down)
-    assert is_within_5_sigma(spoilt.sum(), found["p_wrong_range_shot"][0], 0.006 * DRAWS)
+    assert is_within_5_sigma(spoilt.sum(), statistics["p_wrong_range_shot"][0], 0.006 * DRAWS)
     if tnr == 2.5:
-        assert found["p_wrong_range_up"][0] > 0.02
+        assert statistics["p_wrong_range_up"][0] > 0.02
 
 
 @pytest.mark.parametrize("speckle", ["none", "developed"])
 def test_drawn_records_that_are_searched_in_a_band(speckle, table_4_1):
     band = dict(zip(SEARCH_BAND_PATHS, (160.0, 240.0, 2.0, 4.0), strict=True))
     scene = scene_of(table_4_1, speckle, tnr=2.5) | band
-    shots, found = prepare_single_category(scene, FADING), evaluate(scene, FADING)
+    shots, outputs = prepare_single_category(scene, FADING), evaluate(scene, FADING)
     rng = np.random.default_rng(72)
     right, wrong = reported(shots, 0, speckle_of(speckle, rng), rng)
-    assert is_within_5_sigma(right.sum(), found["pd_up"][0], 0.005 * DRAWS)
-    assert is_within_5_sigma(wrong.sum(), found["p_wrong_range_up"][0], 0.005 * DRAWS)
-    whole = evaluate(scene_of(table_4_1, speckle, tnr=2.5), FADING)
-    assert found["p_wrong_range_up"][0] < 0.7 * whole["p_wrong_range_up"][0]
+    assert is_within_5_sigma(right.sum(), outputs["pd_up"][0], 0.005 * DRAWS)
+    assert is_within_5_sigma(wrong.sum(), outputs["p_wrong_range_up"][0], 0.005 * DRAWS)
+    in_all_bins = evaluate(scene_of(table_4_1, speckle, tnr=2.5), FADING)
+    assert outputs["p_wrong_range_up"][0] < 0.7 * in_all_bins["p_wrong_range_up"][0]
 
 
 def of_one_bin(law, bins, level, reach):
@@ -144,8 +148,11 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
         table_4_1, speckle, tnr=tnr, power=10**decades, detection="peak_bin",
         noise_bins="independent",
     )  # fmt: skip
-    shots, found = prepare_single_category(scene, ALONE), evaluate(scene, ALONE)
-    crosses = evaluate(scene | {PEAKS_PATH: "all"}, ALONE)
+    shots, outputs = (
+        prepare_single_category(scene, WITHOUT_LEAKAGE),
+        evaluate(scene, WITHOUT_LEAKAGE),
+    )
+    crosses = evaluate(scene | {PEAKS_PATH: "all"}, WITHOUT_LEAKAGE)
     sigma = shots.bin_noise_sigma[0]
     level, signal = shots.threshold[0] / sigma, np.sqrt(2 * crosses["snr_up"][0])
     law, reach = stats.rice(signal), signal + 20
@@ -158,9 +165,9 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
     bins = SIZE // 2 - evaluate_segments(shots).n_exempt[0, 0]  # but those that the echo occupies
     lost = of_one_bin(law, bins, level, min(reach, 40))
     wrong = alarm * missed + lost
-    assert found["pd_up"][0] == pytest.approx(1 - missed - lost, abs=1e-6)
-    assert found["p_wrong_range_up"][0] == pytest.approx(wrong, rel=1e-5, abs=1e-7)
-    assert found["p_wrong_range_up"][0] == pytest.approx(wrong, rel=0.03, abs=1e-20)
+    assert outputs["pd_up"][0] == pytest.approx(1 - missed - lost, abs=1e-6)
+    assert outputs["p_wrong_range_up"][0] == pytest.approx(wrong, rel=1e-5, abs=1e-7)
+    assert outputs["p_wrong_range_up"][0] == pytest.approx(wrong, rel=0.03, abs=1e-20)
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
@@ -168,33 +175,35 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
 @pytest.mark.parametrize("detection", ["any_bin", "peak_bin"])
 def test_right_wrong_and_nothing_add_to_one(detection, speckle, record, table_4_1):
     changes = {"tnr": np.linspace(0.1, 9, 40), "detection": detection}
-    found = evaluate(scene_of(table_4_1, speckle, record, **changes), ALONE)
-    crosses = evaluate(scene_of(table_4_1, speckle, record, "all", **changes), ALONE)
+    outputs = evaluate(scene_of(table_4_1, speckle, record, **changes), WITHOUT_LEAKAGE)
+    crosses = evaluate(scene_of(table_4_1, speckle, record, "all", **changes), WITHOUT_LEAKAGE)
     nothing = (1 - crosses["pfa_segment"]) * crosses["miss_up"]
-    assert found["pd_up"] + found["p_wrong_range_up"] + nothing == pytest.approx(np.ones(40))
+    assert outputs["pd_up"] + outputs["p_wrong_range_up"] + nothing == pytest.approx(np.ones(40))
     for name in ("up", "doppler", "down", "shot"):
-        pd, wrong = found[f"pd_{name}"], found[f"p_wrong_range_{name}"]
-        assert pd + found[f"miss_{name}"] == pytest.approx(np.ones(40))
+        pd, wrong = outputs[f"pd_{name}"], outputs[f"p_wrong_range_{name}"]
+        assert pd + outputs[f"miss_{name}"] == pytest.approx(np.ones(40))
         assert (wrong >= 0).all() and (pd + wrong <= 1 + 1e-12).all()
         assert (pd <= crosses[f"pd_{name}"]).all()
         # Where noise hardly alarms what crosses is right.
         rare = crosses["pfa_shot"]
         assert (crosses[f"pd_{name}"] - pd <= rare + 1e-12).all() and rare.min() < 1e-3
-    both = found["pd_shot"] + found["p_wrong_range_shot"]
-    assert both[0] == pytest.approx(1, abs=1e-3)  # both chirps report something
-    assert {name for name in found if name not in crosses} == set(STRONGEST_PEAK_OUTPUTS)
+    total = outputs["pd_shot"] + outputs["p_wrong_range_shot"]
+    assert total[0] == pytest.approx(1, abs=1e-3)  # both chirps report something
+    assert {name for name in outputs if name not in crosses} == set(STRONGEST_PEAK_OUTPUTS)
 
 
 def test_of_strong_echoes_no_peak_is_wrong(table_4_1):
-    found = evaluate(scene_of(table_4_1, tnr=1.0, power=10.0), DEFAULT_EFFECTS)
-    assert found["pd_shot"] == pytest.approx([1]) and found["p_wrong_range_shot"] < 1e-6
+    outputs = evaluate(scene_of(table_4_1, tnr=1.0, power=10.0), DEFAULT_EFFECTS)
+    assert outputs["pd_shot"] == pytest.approx([1]) and outputs["p_wrong_range_shot"] < 1e-6
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_segments_of_their_own_speckle_are_independent(record, table_4_1):
     scene = scene_of(table_4_1, "developed", record, tnr=np.array([2.5, 4.0, 6.0]))
-    found = shot_statistics(shares(prepare_single_category(scene, FADING), 0.0))
-    assert found["pd_shot"] == pytest.approx(found["pd_up"] * found["pd_down"], rel=1e-9)
+    statistics = shot_statistics(shares(prepare_single_category(scene, FADING), 0.0))
+    assert statistics["pd_shot"] == pytest.approx(
+        statistics["pd_up"] * statistics["pd_down"], rel=1e-9
+    )
     near, far = (
         shot_statistics(shares(prepare_single_category(scene, FADING), 1e-4 * k)) for k in (0, 1)
     )
@@ -205,6 +214,6 @@ def test_segments_of_their_own_speckle_are_independent(record, table_4_1):
 def test_an_echo_outside_the_band_is_never_right(table_4_1):
     """All alarms there are of noise, and of the echo's share in the band."""
     band = dict(zip(SEARCH_BAND_PATHS, (20.0, 120.0, 2.0, 4.0), strict=True))
-    found = evaluate(scene_of(table_4_1, tnr=2.5) | band, DEFAULT_EFFECTS)
-    assert found["pd_up"] == found["pd_shot"] == 0
-    assert found["p_wrong_range_up"] == pytest.approx(found["pfa_segment"], rel=1e-6)
+    outputs = evaluate(scene_of(table_4_1, tnr=2.5) | band, DEFAULT_EFFECTS)
+    assert outputs["pd_up"] == outputs["pd_shot"] == 0
+    assert outputs["p_wrong_range_up"] == pytest.approx(outputs["pfa_segment"], rel=1e-6)

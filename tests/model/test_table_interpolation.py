@@ -17,8 +17,8 @@ def test_tables_are_interpolated_as_by_scipy_and_hold_their_ends(seed, sizes):
     tables = rng.normal(size=(2, *sizes))
     positions = [rng.uniform(grid[0] - 1, grid[-1] + 1, (5, 7)) for grid in grids]
     clipped = [np.clip(p, grid[0], grid[-1]) for p, grid in zip(positions, grids, strict=True)]
-    found = interpolate_tables(grids, tables, positions)
-    for values, table in zip(found, tables, strict=True):
+    interpolated = interpolate_tables(grids, tables, positions)
+    for values, table in zip(interpolated, tables, strict=True):
         expected = RegularGridInterpolator(grids, table)(np.stack(clipped, axis=-1))
         np.testing.assert_allclose(values, expected, rtol=0, atol=1e-12)
 

@@ -20,8 +20,8 @@ CHANCES = np.array([0.9, 0.1, 1e-3, 1e-9, 1e-100])
 
 def by(parameters, way, value):
     """Parameters with the threshold set in one way, and nothing to be seen."""
-    others = {path: v for path, v in parameters.items() if path not in THRESHOLD_PATHS}
-    return others | {way: value, "target.reflectance": 0.0}
+    other_parameters = {path: v for path, v in parameters.items() if path not in THRESHOLD_PATHS}
+    return other_parameters | {way: value, "target.reflectance": 0.0}
 
 
 def test_ratios_are_of_the_mean_and_the_deviation_of_a_rayleigh_magnitude():
@@ -52,16 +52,16 @@ def test_noise_alone_alarms_as_often_as_designed(table_4_1, way, output, archite
     scene = table_4_1(
         bins_counted="all", fft_size=2**12, architecture=architecture, noise_bins=noise
     )
-    found = evaluation.evaluate(by(scene, way, CHANCES))
-    assert found[f"log10_pfa_{output}"] == pytest.approx(np.log10(CHANCES), rel=1e-12)
-    none = 1 - found["pfa_segment"]
+    outputs = evaluation.evaluate(by(scene, way, CHANCES))
+    assert outputs[f"log10_pfa_{output}"] == pytest.approx(np.log10(CHANCES), rel=1e-12)
+    none = 1 - outputs["pfa_segment"]
     segments = 2 if architecture == "direct" else 3
-    assert found["pfa_shot"] == pytest.approx(1 - none**segments, rel=1e-9, abs=1e-12)
-    assert found["pfa_both_chirps"] == pytest.approx(found["pfa_segment"] ** 2, rel=1e-9)
-    alone = evaluation.evaluate(
+    assert outputs["pfa_shot"] == pytest.approx(1 - none**segments, rel=1e-9, abs=1e-12)
+    assert outputs["pfa_both_chirps"] == pytest.approx(outputs["pfa_segment"] ** 2, rel=1e-9)
+    segment_outputs = evaluation.evaluate(
         by(scene, way, CHANCES[2])
     )  # one value and one of many are the same
-    assert alone["pfa_bin"][0] == found["pfa_bin"][2]
+    assert segment_outputs["pfa_bin"][0] == outputs["pfa_bin"][2]
 
 
 def test_the_threshold_is_set_in_exactly_one_way(table_4_1):

@@ -124,7 +124,7 @@ def test_the_fast_path_is_the_truth_where_each_beamlet_has_a_doppler_shift_of_it
     for phases, v in (("coherent", 150.0), ("incoherent", 150.0), ("coherent", 0.0)):
         scene = table_4_1(fft_size=8192, phases=phases, radial_velocity=v, grazing_angle=0.4)
         shots = prepare_single_category(scene | {"footprint.beamlets": 19, "target.range": 9000.0})
-        own = replace(
+        perturbed_shots = replace(
             shots,
             footprint=shots.footprint._replace(
                 doppler_ratio_offset=rng.uniform(
@@ -132,8 +132,8 @@ def test_the_fast_path_is_the_truth_where_each_beamlet_has_a_doppler_shift_of_it
                 )
             ),
         )
-        assert disagreement(own) < AGREEMENT
-        _, with_shifts = segment_spectra.segment_spectrum(own, 0, 1)
+        assert disagreement(perturbed_shots) < AGREEMENT
+        _, with_shifts = segment_spectra.segment_spectrum(perturbed_shots, 0, 1)
         _, without = segment_spectra.segment_spectrum(shots, 0, 1)
         assert np.abs(with_shifts - without).max() > 0.01 * without.max()
 
@@ -265,7 +265,7 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
     record = replace(shots.record, is_complex=True)
     shots = replace(shots, record=record, echo_record=EchoRecord())
     w, half = window_samples(window, 4096), 2048
-    found = segment_spectra.evaluate_segments(shots)
+    evaluated = segment_spectra.evaluate_segments(shots)
     for segment in range(3):
         records = [
             time_domain_truth.analytic_record(shots, 0, segment, b, with_range_walk=False)
@@ -278,4 +278,4 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
         assert bins.size == 4096
         assert magnitude_error(shots, magnitude, exact[bins % 4096]) <= AGREEMENT
         peak = (exact.argmax() + half) % 4096 - half
-        assert found.frequency[segment, 0] == peak * shots.sample_rate / 4096
+        assert evaluated.frequency[segment, 0] == peak * shots.sample_rate / 4096

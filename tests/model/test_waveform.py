@@ -84,9 +84,9 @@ def test_the_delay_turns_the_optical_frequency_into_phase_or_the_radio_frequency
 
 def test_the_record_ends_with_the_chirp():
     def length(fft_size, delay, rate=600e6, duration=500e-6):
-        given = {"fft_size": fft_size, "acquisition_delay": delay, "sample_rate": rate}
-        given = {f"instrument.processing.{name}": value for name, value in given.items()}
-        return record_length(given | {"instrument.chirp.duration": duration})
+        parameters = {"fft_size": fft_size, "acquisition_delay": delay, "sample_rate": rate}
+        parameters = {f"instrument.processing.{name}": value for name, value in parameters.items()}
+        return record_length(parameters | {"instrument.chirp.duration": duration})
 
     assert length(2**17, 0.0) == 2**17
     assert length(2**18, 0.0) == 2**18
@@ -172,17 +172,19 @@ def test_equal_doppler_and_range_frequencies_cost_bins_and_no_more(sense):
 
 
 @pytest.mark.parametrize("sense", [1, -1])
-@pytest.mark.parametrize("beyond", [-100.3, -3.3, 6.3, 66.3, 1000.3])
-def test_a_peak_near_nyquist_is_read_right_outside_the_bins_that_a_fold_costs(beyond, sense):
-    velocity = sense * (300e6 + beyond * BIN - beats(9000.0, 0.0)[2]) / CARRIER * speed_of_light / 2
+@pytest.mark.parametrize("offset_bins", [-100.3, -3.3, 6.3, 66.3, 1000.3])
+def test_a_peak_near_nyquist_is_read_right_outside_the_bins_that_a_fold_costs(offset_bins, sense):
+    velocity = (
+        sense * (300e6 + offset_bins * BIN - beats(9000.0, 0.0)[2]) / CARRIER * speed_of_light / 2
+    )
     r, v = resolved(*[fold_frequency(b, 600e6) for b in beats(9000.0, velocity)])
     assert (r, v) == pytest.approx((9000.0, velocity), abs=1e-8)
 
 
-@pytest.mark.parametrize("beyond", [1.3, 2.3, 3.3])
-def test_a_peak_just_past_nyquist_is_misread_by_no_more_than_it_lies_past_it(beyond):
+@pytest.mark.parametrize("offset_bins", [1.3, 2.3, 3.3])
+def test_a_peak_just_past_nyquist_is_misread_by_no_more_than_it_lies_past_it(offset_bins):
     """A fold counts as FOLD_PENALTY bins of mismatch, so the nearest bins past it look unfolded."""
-    velocity = (300e6 + beyond * BIN - beats(9000.0, 0.0)[2]) / CARRIER * speed_of_light / 2
+    velocity = (300e6 + offset_bins * BIN - beats(9000.0, 0.0)[2]) / CARRIER * speed_of_light / 2
     past = (beats(9000.0, velocity)[2] - 300e6) / BIN
     r, v = resolved(*[fold_frequency(b, 600e6) for b in beats(9000.0, velocity)])
     assert 0 < past < FOLD_PENALTY_BINS

@@ -62,8 +62,8 @@ def test_a_transform_about_the_middle_is_the_sum_over_the_samples(name, length, 
     w = window_samples(name, length) ** (2 if squared else 1)
     position = np.arange(length) / length - 0.5
     expected = [(w * np.exp(-2j * np.pi * f * position)).sum() for f in y]
-    found = centred_transform(get_window(name, length), y, squared=squared)
-    assert np.abs(found - expected).max() < 1e-13 * np.abs(w).sum()
+    transform = centred_transform(get_window(name, length), y, squared=squared)
+    assert np.abs(transform - expected).max() < 1e-13 * np.abs(w).sum()
 
 
 @pytest.mark.parametrize(

@@ -41,9 +41,9 @@ PUBLISHED = (
 @pytest.mark.parametrize("palette", PALETTES)
 def test_lines_stay_apart_and_stand_out(palette, sight):
     colours, paper, least = PALETTES[palette]
-    found = colour_differences(colours, sight)
-    assert found.min() >= AT_A_GLANCE
-    assert found[:4, :4].min() >= FIRST_FOUR
+    differences = colour_differences(colours, sight)
+    assert differences.min() >= AT_A_GLANCE
+    assert differences[:4, :4].min() >= FIRST_FOUR
     assert colour_differences((*colours, paper), sight)[-1].min() >= 2 * AT_A_GLANCE
     assert min(contrast_ratio(colour, paper) for colour in colours) >= least
 

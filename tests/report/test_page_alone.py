@@ -16,24 +16,24 @@ pwd.getpwuid = unknown
 """
 
 
-@pytest.mark.parametrize("where", ["nobody's home", "a pipe for settings", "other settings"])
-def test_a_page_needs_no_home_and_no_settings(tmp_path, where):
+@pytest.mark.parametrize("home", ["nobody's home", "a pipe for settings", "other settings"])
+def test_a_page_needs_no_home_and_no_settings(tmp_path, home):
     pytest.importorskip("itables")
-    kept = ("HOME", "ITABLES_CONFIG")
-    environment = {name: value for name, value in os.environ.items() if name not in kept}
+    variables = ("HOME", "ITABLES_CONFIG")
+    environment = {name: value for name, value in os.environ.items() if name not in variables}
     environment = {n: v for n, v in environment.items() if not n.startswith("XDG_")}
-    if where == "a pipe for settings":
+    if home == "a pipe for settings":
         os.mkfifo(tmp_path / "itables.toml")
-    elif where == "other settings":
+    elif home == "other settings":
         (tmp_path / "itables.toml").write_text('classes = "theirs"\n')
-    code = UNKNOWN if where == "nobody's home" else ""
+    code = UNKNOWN if home == "nobody's home" else ""
     code += (
         "import os, sweep.report.html_page, itables.options as options\n"
         "assert 'ITABLES_CONFIG' not in os.environ\n"
         "assert options.classes != 'theirs'\n"
     )
-    found = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=environment, timeout=120,
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert found.returncode == 0, found.stderr
+    assert process.returncode == 0, process.stderr

@@ -31,8 +31,8 @@ from sweep.tasks import driver
 
 def _spec_in(page):
     text = re.search(r"<pre[^>]*>(title:.*?)</pre>", page.read_text(), re.S).group(1)
-    for written, meant in (("&lt;", "<"), ("&gt;", ">"), ("&#39;", "'"), ("&#34;", '"')):
-        text = text.replace(written, meant)
+    for escaped, meant in (("&lt;", "<"), ("&gt;", ">"), ("&#39;", "'"), ("&#34;", '"')):
+        text = text.replace(escaped, meant)
     return yaml.safe_load(text.replace("&amp;", "&"))
 
 
@@ -46,9 +46,9 @@ def test_the_page_says_that_it_is_reduced_and_asks_nothing_of_a_network(grid_pag
     text = grid_page.read_text()
     assert "each cell stands for 3 neighbouring points of 3,603" in text
     assert re.search(r"[0-9]+ of 7,206 points, spread over all: reduced for this page", text)
-    own = re.sub(r"<script>.*?</script>", "", text, flags=re.S)
-    assert not re.findall(r"(?:src|href)=[\"']?(?:https?:)?//(?!itables\.org)", own)
-    assert "default-src 'none'" in own
+    page_text = re.sub(r"<script>.*?</script>", "", text, flags=re.S)
+    assert not re.findall(r"(?:src|href)=[\"']?(?:https?:)?//(?!itables\.org)", page_text)
+    assert "default-src 'none'" in page_text
     assert 1e6 < grid_page.stat().st_size < 3e6
     libraries = r'<script type="application/gzip" id="(?:plotly|tables-library)">.*?</script>'
     assert len(re.sub(libraries, "", text, flags=re.S)) < 0.5e6
@@ -56,12 +56,12 @@ def test_the_page_says_that_it_is_reduced_and_asks_nothing_of_a_network(grid_pag
 
 def test_the_options_of_a_table_are_in_one_order_from_run_to_run(grid_page):
     packed = r'compact"></table><script type="application/gzip">(.*?)</script>'
-    for each in re.findall(packed, grid_page.read_text()):
-        options = json.loads(gzip.decompress(base64.b64decode(each)))
+    for table_options in re.findall(packed, grid_page.read_text()):
+        options = json.loads(gzip.decompress(base64.b64decode(table_options)))
         assert list(options) == sorted(options) and len(options) > 5
 
 
-def test_figures_without_points_are_told_and_whole_spectra_have_no_threshold_to_move(tmp_path):
+def test_figures_without_points_are_reported_and_whole_spectra_have_no_threshold_to_move(tmp_path):
     figures = [{"kind": "slices", "variable": "pd_shot", "x": "range", "title": "Elsewhere",
                 "where": {"range": "7 km"}}]  # fmt: skip
     kinds = {"instrument.processing.detector.kind": ["fixed", "ca_cfar"]}
@@ -131,8 +131,8 @@ def test_a_flight_s_page_names_the_floor_of_its_errors(scene_page):
     """Under the chart of navigation, and field by field."""
     page = scene_page.read_text()
     held = " ".join(
-        gzip.decompress(base64.b64decode(own)).decode()
-        for own in re.findall('</table><script type="application/gzip">(.*?)</script>', page)
+        gzip.decompress(base64.b64decode(table)).decode()
+        for table in re.findall('</table><script type="application/gzip">(.*?)</script>', page)
     )
     assert "rrors that no echo lowers: clock error 1e-06, vibration 1 cm/s." in page
     assert all(f"error_floor.{name}" in held for name in ("pointing_error", "wavelength_error"))
@@ -149,14 +149,16 @@ def test_a_grid_s_page_opens_with_reach_alarms_and_tolerance(grid_page, grid_sto
     pd, reach = dataset["pd_shot"], dataset.sweep.maximum_range(0.9)["unbroken"] / 1000
     lacking = int(reach.isnull().sum())
     assert 0 < lacking < reach.size
-    told = _answer(grid_page)
+    answer = _answer(grid_page)
     alarm, of_noise = (
-        told.pop(3),
+        answer.pop(3),
         "Noise alone raises a false alarm in either chirp with probability ",
     )
-    both = 1 - (1 - float(dataset["pfa_segment"].max())) ** 2  # but for the few bins of the echo
-    assert float(alarm.removeprefix(of_noise).rstrip(".")) == pytest.approx(both, rel=1e-2)
-    assert told == [
+    pfa_both = (
+        1 - (1 - float(dataset["pfa_segment"].max())) ** 2
+    )  # but for the few bins of the echo
+    assert float(alarm.removeprefix(of_noise).rstrip(".")) == pytest.approx(pfa_both, rel=1e-2)
+    assert answer == [
         "The probability of detection of a shot is 0.9 or more at "
         f"{int((pd >= 0.9).sum()):,} of {pd.size:,} points; its mean is {float(pd.mean()):.3g}, "
         f"its lowest {float(pd.min()):.3g}.",
@@ -175,12 +177,14 @@ def test_a_flight_s_page_opens_with_its_points_and_velocities(scene_page, scene_
     flags, status = group["flags"].values, group["velocity_status"]
     true = int(((flags & TRUE_FLAG) > 0).sum())
     shots = flags[..., 0].size
-    told = _answer(scene_page)
-    assert told[1] == (
+    answer = _answer(scene_page)
+    assert answer[1] == (
         f"{shots:,} shots brought back {true:,} true points and {int((flags > 0).sum()) - true:,} "
         "false ones; a shot counts once a draw."
     )
-    assert told[2].startswith(f"Velocity was solved in {int((status <= 1).sum())} of {status.size}")
+    assert answer[2].startswith(
+        f"Velocity was solved in {int((status <= 1).sum())} of {status.size}"
+    )
 
 
 def test_an_answer_from_the_parts_that_a_page_shows_says_so():
@@ -193,13 +197,13 @@ def test_an_answer_from_the_parts_that_a_page_shows_says_so():
 
 def test_errors_of_a_flight_are_measured_less_true(scene_store):
     study = SceneResults.from_store(scene_store)
-    seen, _ = flight_charts.select_recordings(study)
-    chart = flight_charts.measurement_error_chart(seen)
+    recordings, _ = flight_charts.select_recordings(study)
+    chart = flight_charts.measurement_error_chart(recordings)
     group = study.tree["four"].to_dataset().isel(draw=0, optical_efficiency=0)
     true = (group["flags"].values & TRUE_FLAG) > 0
     expected = (group["range_interpolated"] - group["true_range"]).values[true]
-    drawn = np.concatenate([line.y for line in chart.panels[0].lines])
-    np.testing.assert_array_equal(np.sort(drawn), np.sort(expected))
+    values = np.concatenate([line.y for line in chart.panels[0].lines])
+    np.testing.assert_array_equal(np.sort(values), np.sort(expected))
     assert f"rms {np.sqrt(np.mean(expected**2)):.3g}" in chart.panels[0].facet_choices["quantity"]
 
 
@@ -261,10 +265,10 @@ def test_a_place_of_a_flight_without_computed_shots_has_no_panel_over_time(scene
     shutil.copytree(scene_store, store)
     shutil.rmtree(store / "four" / "flags" / "c" / "0")  # of the first of two places
     (store / ".sweep" / "receipts.jsonl").unlink()  # what is committed has to be there
-    found, _ = flight_charts.select_recordings(SceneResults.from_store(store))
+    recordings, _ = flight_charts.select_recordings(SceneResults.from_store(store))
     for chart in (
-        flight_charts.shots_over_time_chart(found),
-        flight_charts.measurement_error_chart(found),
+        flight_charts.shots_over_time_chart(recordings),
+        flight_charts.measurement_error_chart(recordings),
     ):
-        assert {panel.facet_choices["cloud"] for panel in chart.panels} == {found[1].label}
+        assert {panel.facet_choices["cloud"] for panel in chart.panels} == {recordings[1].label}
         assert all(panel.lines for panel in chart.panels)

@@ -22,7 +22,7 @@ SPECKLED = GRID_SPEC | {
 }  # fmt: skip
 
 
-def made(directory, mapping):
+def run_study(directory, mapping):
     """The study of a mapping, computed."""
     spec = GridSpec.from_mapping(mapping, base=EXPERIMENTS)
     driver.run(spec, store=directory / "made.zarr", scheduler="none", progress=False)
@@ -30,9 +30,9 @@ def made(directory, mapping):
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
+def drawn_study(tmp_path_factory):
     """A study that draws, and so has intervals."""
-    return made(tmp_path_factory.mktemp("drawn"), SPECKLED)
+    return run_study(tmp_path_factory.mktemp("drawn"), SPECKLED)
 
 
 def drawn_lines(chart, **choices):
@@ -61,7 +61,7 @@ def test_the_maximum_range_is_the_answer_s_in_the_units_of_the_page(grid_store, 
 def test_a_study_of_range_alone_has_its_maximum_range_in_a_table(tmp_path):
     axes = {"target.range": {"step": ["500 m", "12 km", "500 m"]}}
     target = GRID_SPEC["target"] | {"grazing_angle": "50 deg"}
-    study = made(tmp_path, GRID_SPEC | {"axes": axes, "target": target, "figures": []})
+    study = run_study(tmp_path, GRID_SPEC | {"axes": axes, "target": target, "figures": []})
     table = detector_charts.maximum_range_item(study)
     assert isinstance(table, HtmlTable)
     answer = study.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute()
@@ -80,7 +80,7 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
         {"target.range": {"step": ["500 m", "9 km", "500 m"]}, "target.grazing_angle": "85 deg"},
     ]}  # fmt: skip
     axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
-    study = made(tmp_path, GRID_SPEC | {"axes": axes, "figures": []})
+    study = run_study(tmp_path, GRID_SPEC | {"axes": axes, "figures": []})
     chart = detector_charts.maximum_range_item(study)
     parts = list(dict.fromkeys(panel.facet_choices["part"] for panel in chart.panels))
     assert parts == ["grazing angle 30°", "grazing angle 85°"]
@@ -93,37 +93,41 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     target = GRID_SPEC["target"] | {"range": "1 km", "grazing_angle": "50 deg"}
     power = {"instrument.laser.power": ["1 W", "3 W"]}
     (tmp_path / "powers").mkdir()
-    powers = made(tmp_path / "powers", GRID_SPEC | {"axes": power, "target": target, "figures": []})
+    powers = run_study(
+        tmp_path / "powers", GRID_SPEC | {"axes": power, "target": target, "figures": []}
+    )
     assert detector_charts.maximum_range_item(powers) is None
     near = {"target.range": ["50 m", "60 m"], "target.grazing_angle": ["50 deg", "60 deg"]}
     (tmp_path / "near").mkdir()
     sure = detector_charts.maximum_range_item(
-        made(tmp_path / "near", GRID_SPEC | {"axes": near, "figures": []})
+        run_study(tmp_path / "near", GRID_SPEC | {"axes": near, "figures": []})
     )
     assert detector_charts.is_chart_without_values(
         sure
     ) and not detector_charts.is_chart_without_values(chart)
-    (told,) = detector_charts.maximum_range_sentences(sure)
-    assert told.startswith("No maximum range at 2 of 2 places") and "up to the last" in told
+    (sentence,) = detector_charts.maximum_range_sentences(sure)
+    assert sentence.startswith("No maximum range at 2 of 2 places") and "up to the last" in sentence
 
 
-def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
+def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn_study):
     figure = SlicesFigure(kind="slices", variable="pd_shot", x="range", by="grazing_angle")
-    chart = drawn.make_chart(figure, SHEET_SIZE_LIMITS)
-    told = drawn.dataset.sweep.detection_probability("shot").compute()
+    chart = drawn_study.make_chart(figure, SHEET_SIZE_LIMITS)
+    probability = drawn_study.dataset.sweep.detection_probability("shot").compute()
     for angle in (30, 90):
         line = drawn_lines(chart)[f"grazing angle {labels.format_quantity(angle, 'deg')}"]
-        own = told.sel(grazing_angle=angle)
-        assert (own.high - own.low).max() > 0.05
-        np.testing.assert_allclose(line.y, own.pd, atol=1e-6)
-        np.testing.assert_allclose(line.low, own.low, atol=1e-6)
-        np.testing.assert_allclose(line.high, own.high, atol=1e-6)
+        interval = probability.sel(grazing_angle=angle)
+        assert (interval.high - interval.low).max() > 0.05
+        np.testing.assert_allclose(line.y, interval.pd, atol=1e-6)
+        np.testing.assert_allclose(line.low, interval.low, atol=1e-6)
+        np.testing.assert_allclose(line.high, interval.high, atol=1e-6)
     assert "95 % confidence interval of each point" in " ".join(chart.caption)
 
 
-def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
-    chart = detector_charts.maximum_range_item(drawn)
-    expected = drawn.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute() / 1000
+def test_the_maximum_range_has_an_interval_where_pd_has(drawn_study):
+    chart = detector_charts.maximum_range_item(drawn_study)
+    expected = (
+        drawn_study.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute() / 1000
+    )
     (line,) = drawn_lines(chart, answer=detector_charts.UNBROKEN_RANGE_LABEL).values()
     known = np.isfinite(expected.unbroken_low + expected.unbroken_high)
     assert known.any()
@@ -132,17 +136,17 @@ def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
     assert "95 % confidence interval" in " ".join(chart.caption)
 
 
-def test_false_alarms_of_a_shot_are_those_that_are_told_a_second(grid_store):
+def test_false_alarms_per_shot_agree_with_those_per_second(grid_store):
     study = GridResults.from_store(grid_store)
-    found, fewer = detector_charts.grid_profiles(study)
-    chart = detector_charts.false_alarm_chart(study, found, fewer)
-    at = found[0].points.first_indices(found[0].coordinate)
-    shown = drawn_lines(chart, part=found[0].label)
+    profiles, fewer = detector_charts.grid_profiles(study)
+    chart = detector_charts.false_alarm_chart(study, profiles, fewer)
+    at = profiles[0].points.first_indices(profiles[0].coordinate)
+    lines = drawn_lines(chart, part=profiles[0].label)
     for name, leakage in (("noise, both", False), ("either, both", True)):
         a_second = study.dataset.isel(at).sweep.false_alarms_per_second("1 Hz", leakage=leakage)
-        together = -(-a_second.size // len(shown[name].y))
+        together = -(-a_second.size // len(lines[name].y))
         means = np.add.reduceat(a_second.values, np.arange(0, a_second.size, together))
         first = means[:-1] / together
-        np.testing.assert_allclose(shown[name].y[:-1], first, rtol=1e-6)
-        assert (shown[name].low <= shown[name].y * (1 + 1e-6)).all()
-        assert shown[name].high.max() == pytest.approx(a_second.values.max(), rel=1e-6)
+        np.testing.assert_allclose(lines[name].y[:-1], first, rtol=1e-6)
+        assert (lines[name].low <= lines[name].y * (1 + 1e-6)).all()
+        assert lines[name].high.max() == pytest.approx(a_second.values.max(), rel=1e-6)

@@ -7,7 +7,7 @@ import pytest
 
 playwright = pytest.importorskip("playwright.sync_api")
 
-SHOWN = """(chart) => document.querySelector(chart + " .plot").data
+VISIBLE_TRACES = """(chart) => document.querySelector(chart + " .plot").data
     .filter((trace) => trace.visible === true).map((trace) => trace.name ?? "")"""
 
 
@@ -30,7 +30,7 @@ def redrawn(page, selector, act):
     )
     act()
     page.evaluate("window.again.then(() => true)")
-    return page.evaluate(SHOWN, selector)
+    return page.evaluate(VISIBLE_TRACES, selector)
 
 
 @pytest.fixture(scope="module")
@@ -43,45 +43,45 @@ def test_a_grid_s_page_draws_and_its_controls_act(grid):
     assert grid.title() == grid.locator("h1").inner_text() == "Power </script><b>& slant</b>"
     surface = chart(grid, "probability of detection, shot")
     assert grid.evaluate(f"document.querySelector('{surface} .plot').data[0].z.length") == 3
-    assert grid.evaluate(SHOWN, surface) == ["power 1 W"]
+    assert grid.evaluate(VISIBLE_TRACES, surface) == ["power 1 W"]
     power = grid.locator(surface).get_by_label("Shown for")
     assert redrawn(grid, surface, lambda: power.select_option("power 3 W")) == ["power 3 W"]
     kind = grid.locator(surface).get_by_label("Each cell shows the")
     assert redrawn(grid, surface, lambda: kind.select_option("lowest of each cell")) == [
         "power 3 W"
     ]
-    shown = "document.querySelector('{} .plot').data.findIndex((t) => t.visible === true)"
-    assert grid.evaluate(shown.format(surface)) == 3
+    visible_trace = "document.querySelector('{} .plot').data.findIndex((t) => t.visible === true)"
+    assert grid.evaluate(visible_trace.format(surface)) == 3
 
 
 def test_cuts_follow_the_slider_the_keyboard_and_the_side(grid):
     surface = grid.locator(chart(grid, "probability of detection, shot"))
     line = surface.locator(".cut .plot")
-    drawn = "(plot) => Array.from(plot.data[0].y)"
+    drawn_values = "(plot) => Array.from(plot.data[0].y)"
     slider = surface.get_by_role("slider")
     assert slider.get_attribute("aria-valuetext") == "50"
-    middle = line.evaluate(drawn)
+    middle = line.evaluate(drawn_values)
     assert len(middle) == 401
     slider.focus()
     grid.keyboard.press("ArrowRight")
     assert slider.get_attribute("aria-valuetext") == "80"
-    steep = line.evaluate(drawn)
+    steep = line.evaluate(drawn_values)
     assert steep != middle
     rows = surface.locator(".plot").first.evaluate(
         "(plot) => plot.data.find((t) => t.visible === true).z.map((row) => Array.from(row))"
     )
     assert middle == rows[1] and steep == rows[2]
     surface.get_by_label("Along").select_option("grazing angle (°)")
-    assert line.evaluate(drawn) == [row[200] for row in rows]
+    assert line.evaluate(drawn_values) == [row[200] for row in rows]
 
 
 def test_tables_sort_search_and_download(grid, tmp_path):
     points = table(grid, "Points")
     points.get_by_text("Showing 1 to 10 of").wait_for()
     heading = points.get_by_role("columnheader", name="range [m]")
-    for wanted in ("ascending", "descending"):
+    for order in ("ascending", "descending"):
         heading.get_by_role("button").press("Enter")
-        playwright.expect(heading).to_have_attribute("aria-sort", wanted)
+        playwright.expect(heading).to_have_attribute("aria-sort", order)
     assert float(points.locator("tbody tr").first.locator("td").nth(1).inner_text()) == 12000
     with grid.expect_download() as download:
         points.get_by_role("button", name="Download CSV").click()
@@ -121,8 +121,8 @@ def named(page):
         .filter((e) => !e.closest(".js-plotly-plot") && !(e.labels?.length || e.ariaLabel
             || e.textContent.trim())).map((e) => e.outerHTML)""")
     assert nameless == []
-    said = page.evaluate("[...document.querySelectorAll('[role=img]')].map((e) => e.ariaLabel)")
-    assert len(said) >= 4 and all(len(words or "") > 15 for words in said)
+    labels = page.evaluate("[...document.querySelectorAll('[role=img]')].map((e) => e.ariaLabel)")
+    assert len(labels) >= 4 and all(len(words or "") > 15 for words in labels)
     levels = page.evaluate("""[...document.querySelectorAll("h1, h2, h3")]
         .map((e) => Number(e.tagName[1]))""")
     assert levels[0] == 1 and levels.count(1) == 1
@@ -153,7 +153,7 @@ def test_a_scene_s_cloud_is_drawn_coloured_and_turned(opened, scene_page):
     cloud = chart(page, "Points, flight path and terrain")
     assert page.locator(f"{cloud} canvas").count() > 0
     kinds = {"terrain", "flight path", "true points"}
-    assert kinds <= set(page.evaluate(SHOWN, cloud))
+    assert kinds <= set(page.evaluate(VISIBLE_TRACES, cloud))
     choose = page.locator(f"{cloud} .controls").get_by_label
     over = f"document.querySelector('{cloud} .plot').layout.title.text"
     for option, title in (("radial velocity", "radial velocity (m/s)"),
@@ -163,8 +163,8 @@ def test_a_scene_s_cloud_is_drawn_coloured_and_turned(opened, scene_page):
     eye = f"document.querySelector('{cloud} .plot').layout.scene.camera.eye.z"
     redrawn(page, cloud, lambda: choose("View").select_option("from above"))
     assert page.evaluate(eye) > 1.5
-    shown = redrawn(page, cloud, lambda: choose("Terrain").select_option("hidden"))
-    assert "terrain" not in shown and page.evaluate(eye) > 1.5
+    redrawn_cloud = redrawn(page, cloud, lambda: choose("Terrain").select_option("hidden"))
+    assert "terrain" not in redrawn_cloud and page.evaluate(eye) > 1.5
     dim = redrawn(page, cloud, lambda: choose("Shown for").select_option("optical efficiency 0.01"))
     assert "flight path" in dim
 

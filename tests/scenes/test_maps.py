@@ -62,7 +62,7 @@ def test_web_mercator_far_from_the_equator_is_refused_with_its_scale_or_read_wit
     assert ground.spacing == pytest.approx((10.0252, -10.00834), rel=1e-4)
 
 
-def test_a_scale_that_is_stated_wrongly_is_told_or_refused(survey):
+def test_a_scale_that_is_stated_wrongly_is_reported_or_refused(survey):
     path = survey("EPSG:3857", MERCATOR_60N, 20.0, MERCATOR_METRES)
     ground = read_raster_terrain(path, metres_per_unit=(0.51, 0.51))
     assert len(ground.warnings) == 1 and "off by up to 1.9" in ground.warnings[0]
@@ -87,27 +87,27 @@ def test_maps_that_are_true_to_a_thousandth_are_taken_as_they_are(survey, crs, m
 
 
 @pytest.mark.parametrize(
-    ("crs", "middle", "said"),
+    ("crs", "middle", "message"),
     [
         ("EPSG:32633", (-100_000.0, 6_000_000.0), "off by up to 0.4"),  # far outside the zone
         ("EPSG:3035", (2_700_000.0, 1_700_000.0), "right angle|off by up to"),  # equal areas
         ("EPSG:4978", (0.0, 0.0), "centre of the planet"),
     ],
 )
-def test_other_maps_are_refused(survey, crs, middle, said):
-    with pytest.raises(SceneError, match=said):
+def test_other_maps_are_refused(survey, crs, middle, message):
+    with pytest.raises(SceneError, match=message):
         read_raster_terrain(survey(crs, middle, 10.0, 1.0))
 
 
-def test_a_large_raster_in_degrees_is_told_how_far_its_edges_are_off(survey):
+def test_a_large_raster_in_degrees_is_reported_how_far_its_edges_are_off(survey):
     metres = degree_lengths(45.0)
     near = survey("EPSG:4326", (10.0, 45.0), 1e-3, metres[0], name="near.tif")
     assert read_raster_terrain(near, metres_per_degree=metres).warnings == ()
     far = survey("EPSG:4326", (10.0, 45.0), 0.2, metres[0], name="far.tif")
     (warning,) = read_raster_terrain(far, metres_per_degree=metres).warnings
     # Half a degree off, the cosine of latitude differs by tan(45 deg) times that.
-    off = float(warning.split("off by up to ")[1].split(" %")[0]) / 100
-    assert off == pytest.approx(math.radians(0.5), rel=0.02)
+    relative_error = float(warning.split("off by up to ")[1].split(" %")[0]) / 100
+    assert relative_error == pytest.approx(math.radians(0.5), rel=0.02)
     with pytest.raises(SceneError, match="off by up to"):
         read_raster_terrain(
             near, metres_per_degree=metres[::-1]
@@ -126,8 +126,8 @@ def test_a_map_in_feet_asks_for_the_unit_of_its_heights(survey):
     assert slope(read_raster_terrain(path, height_unit="sft")) == pytest.approx(0.2, rel=1e-9)
     assert slope(read_raster_terrain(path, height_unit="ft")) == pytest.approx(0.2, rel=1e-5)
     assert slope(read_raster_terrain(path, height_unit="m")) == pytest.approx(0.656, rel=1e-3)
-    told = survey(FEET, COLORADO, 100.0, 1.0, name="told.tif", unit="US survey foot")
-    assert slope(read_raster_terrain(told)) == pytest.approx(0.2, rel=1e-9)
+    undeclared = survey(FEET, COLORADO, 100.0, 1.0, name="told.tif", unit="US survey foot")
+    assert slope(read_raster_terrain(undeclared)) == pytest.approx(0.2, rel=1e-9)
     assert (
         read_raster_terrain(path, has_height_scale=True).heights[0, 0] == 100
     )  # the spec's factor tells the unit
@@ -154,7 +154,7 @@ def test_a_band_that_contradicts_its_vertical_reference_system_is_refused(survey
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "said"),
+    ("one", "other", "message"),
     [
         ("EPSG:32613+5703", "EPSG:32613+5773", "'EGM96 height', and a above 'NAVD88 height'"),
         ("EPSG:32613+5703", "3d", "'ellipsoid WGS 84', and a above 'NAVD88 height'"),
@@ -163,17 +163,17 @@ def test_a_band_that_contradicts_its_vertical_reference_system_is_refused(survey
         ("3d", "3d", ""),
     ],
 )
-def test_heights_above_two_surfaces_are_refused(survey, one, other, said):
+def test_heights_above_two_surfaces_are_refused(survey, one, other, message):
     def map_frame(text, name):
         crs = pyproj.CRS("EPSG:32613").to_3d() if text == "3d" else pyproj.CRS(text)
         path = survey(crs.to_wkt(), (500_000.0, 4_300_000.0), 10.0, 1.0, name=f"{name}.tif")
         return name, read_raster_terrain(path).map_frame
 
     pair = [map_frame(one, "a"), map_frame(other, "b")]
-    if not said:
+    if not message:
         require_one_map(pair)
         return
-    with pytest.raises(SceneError, match=said):
+    with pytest.raises(SceneError, match=message):
         require_one_map(pair)
 
 
@@ -234,9 +234,9 @@ def test_metres_without_a_reference_system_are_metres(tmp_path):
 
 
 def test_rasters_of_two_maps_are_refused(survey):
-    def map_frame(zone, name, **stated):
+    def map_frame(zone, name, **crs):
         path = survey(f"EPSG:{zone}", (500_000.0, 5e6), 10.0, 1.0, name=name)
-        return name, read_raster_terrain(path, **stated).map_frame
+        return name, read_raster_terrain(path, **crs).map_frame
 
     one, same, other = (
         map_frame(32632, "a.tif"),
@@ -251,14 +251,14 @@ def test_rasters_of_two_maps_are_refused(survey):
     require_one_map([one, ("none", MapFrame(MetresPerUnit(1.0, 1.0)))])
 
 
-WHOLE = np.random.default_rng(3).normal(size=(9, 12))
+HEIGHTS = np.random.default_rng(3).normal(size=(9, 12))
 
 
 def tile(rows, columns, *, spacing=(2.0, -3.0), shift=(0.0, 0.0)):
     """A part of one survey, where it lies in it."""
     corner = columns.start * spacing[0] + shift[0], rows.start * spacing[1] + shift[1]
     origin = np.array([500_000.0 + corner[0], 4e6 + corner[1], 0.0])
-    return Terrain(WHOLE[rows, columns], spacing, origin)
+    return Terrain(HEIGHTS[rows, columns], spacing, origin)
 
 
 def covered(terrains, x, y):
@@ -276,30 +276,32 @@ def test_tiles_of_one_grid_have_no_seam_and_cover_all_once(spacing):
         for i, rows in enumerate((slice(0, 4), slice(4, 9)))
         for j, columns in enumerate((slice(0, 5), slice(5, 12)))
     }
-    joined, told = extend_tiles_to_neighbours(parts)
-    assert not told
-    whole = tile(slice(0, 9), slice(0, 12), spacing=spacing)
+    joined, messages = extend_tiles_to_neighbours(parts)
+    assert not messages
+    raster = tile(slice(0, 9), slice(0, 12), spacing=spacing)
     random = np.random.default_rng(5)
     x = 500_000 + spacing[0] * random.uniform(0, 11, 4000)
     y = 4e6 + spacing[1] * random.uniform(0, 8, 4000)
     number, height = covered(joined.values(), x, y)
     assert (number == 1).all()
-    np.testing.assert_allclose(height, whole.height_at(x, y), atol=1e-9)
-    alone, _ = covered(parts.values(), x, y)
-    assert (alone == 0).mean() > 0.1  # the seams that there were
+    np.testing.assert_allclose(height, raster.height_at(x, y), atol=1e-9)
+    heights, _ = covered(parts.values(), x, y)
+    assert (heights == 0).mean() > 0.1  # the seams that there were
 
 
 def test_tiles_that_overlap_or_lie_apart_stay_as_they_are():
     parts = {"a": tile(slice(0, 9), slice(0, 6)), "b": tile(slice(0, 9), slice(5, 12))}
-    joined, told = extend_tiles_to_neighbours(parts)
-    assert joined["a"] is parts["a"] and joined["b"] is parts["b"] and not told
+    joined, messages = extend_tiles_to_neighbours(parts)
+    assert joined["a"] is parts["a"] and joined["b"] is parts["b"] and not messages
     parts = {"a": tile(slice(0, 9), slice(0, 4)), "b": tile(slice(0, 9), slice(8, 12))}
-    joined, told = extend_tiles_to_neighbours(parts)
-    assert joined["a"] is parts["a"] and not told
+    joined, messages = extend_tiles_to_neighbours(parts)
+    assert joined["a"] is parts["a"] and not messages
 
 
-def test_a_gap_between_grids_that_differ_is_told():
+def test_a_gap_between_grids_that_differ_is_reported():
     shifted = tile(slice(0, 9), slice(6, 12), shift=(0.7, 0.0))
-    joined, told = extend_tiles_to_neighbours({"a": tile(slice(0, 9), slice(0, 6)), "b": shifted})
-    assert len(told) == 1 and "between it and a lies a gap of 2.7 m" in told[0]
+    joined, messages = extend_tiles_to_neighbours(
+        {"a": tile(slice(0, 9), slice(0, 6)), "b": shifted}
+    )
+    assert len(messages) == 1 and "between it and a lies a gap of 2.7 m" in messages[0]
     assert joined["b"] is shifted

@@ -69,10 +69,10 @@ def test_the_parts_of_a_scene_stand_where_its_graph_puts_them(file):
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     mirror[:3, 3] = (-10, 0, 0)
     scene.add_geometry(BOX, transform=mirror)
-    both = read_mesh(file(scene, "two.glb"), up="z")
-    assert len(both.faces) == 24
-    np.testing.assert_allclose(extents(both), (21, 2, 3), rtol=1e-6)
-    assert volume(both) == pytest.approx(12, rel=1e-6)  # the mirrored one is not inside out
+    meshes = read_mesh(file(scene, "two.glb"), up="z")
+    assert len(meshes.faces) == 24
+    np.testing.assert_allclose(extents(meshes), (21, 2, 3), rtol=1e-6)
+    assert volume(meshes) == pytest.approx(12, rel=1e-6)  # the mirrored one is not inside out
 
 
 def test_faces_without_area_and_double_ones_are_reported_when_the_mesh_is_made(tmp_path):
@@ -92,20 +92,20 @@ def test_a_mesh_in_no_unit_of_length_is_refused_with_file_rule_and_remedy(file, 
 
 
 def test_files_that_are_no_mesh_are_refused(tmp_path):
-    for name, said in (
+    for name, message in (
         ("a.stl", "no triangles|no mesh"),
         ("a.foo", "no mesh"),
         ("a.xyz", "no triangles|no mesh"),
     ):
         (tmp_path / name).write_text("0 0 0\n1 0 0\n0 1 0\n")
-        with pytest.raises(SceneError, match=said):
+        with pytest.raises(SceneError, match=message):
             read_mesh(tmp_path / name)
     with pytest.raises(SceneError, match="does not exist"):
         read_mesh(tmp_path / "gone.stl")
 
 
 @pytest.mark.parametrize(
-    ("size", "told"),
+    ("size", "message"),
     [
         (60, "it has 60 bytes, and a binary STL has 84 or more"),
         (84, "counts 12 triangles, which take 684 bytes, and it has 84: it is cut off"),
@@ -113,12 +113,12 @@ def test_files_that_are_no_mesh_are_refused(tmp_path):
         (700, r"which take 684 bytes, and it has 700\)"),
     ],
 )
-def test_a_binary_stl_of_another_size_than_its_triangles_is_refused(file, size, told):
+def test_a_binary_stl_of_another_size_than_its_triangles_is_refused(file, size, message):
     path = file(BOX, "box.stl")
-    whole = path.read_bytes()
-    assert len(whole) == 684
-    path.write_bytes(whole[:size] + bytes(max(0, size - 684)))
-    with pytest.raises(SceneError, match=told):
+    content = path.read_bytes()
+    assert len(content) == 684
+    path.write_bytes(content[:size] + bytes(max(0, size - 684)))
+    with pytest.raises(SceneError, match=message):
         read_mesh(path)
 
 
@@ -131,7 +131,7 @@ def test_an_stl_of_text_is_read_however_it_begins(tmp_path, start):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "told"),
+    ("name", "content", "message"),
     [
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex -1\nend_header\n",
          "declares -1 of the element 'vertex'"),
@@ -141,13 +141,13 @@ def test_an_stl_of_text_is_read_however_it_begins(tmp_path, start):
         ("a.gltf", '{"accessors": [{"count": -3}, {"count": 9}]}', "an array of -3 elements"),
     ],
 )  # fmt: skip
-def test_counts_below_zero_are_told(tmp_path, name, content, told):
+def test_counts_below_zero_are_reported(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
-    with pytest.raises(SceneError, match=told):
+    with pytest.raises(SceneError, match=message):
         read_mesh(tmp_path / name)
 
 
-def test_a_link_that_leads_to_itself_is_told(tmp_path):
+def test_a_link_that_leads_to_itself_is_reported(tmp_path):
     (tmp_path / "self.stl").symlink_to("self.stl")
     (tmp_path / "there.stl").symlink_to("back.stl")
     (tmp_path / "back.stl").symlink_to("there.stl")
@@ -225,9 +225,9 @@ def test_a_soup_of_separate_triangles_becomes_watertight():
 def test_merged_meshes_keep_every_triangle_where_it_was():
     near, _ = clean_mesh(CORNERS, CUBE, 0)
     far, _ = clean_mesh(CORNERS + np.array([4e6, -3e6, 0.5]), CUBE, 1)
-    both = merge_meshes([near, far])
-    assert world(both) == world(near) + world(far)
-    assert both.surface_index.tolist() == [0] * 12 + [1] * 12
+    merged = merge_meshes([near, far])
+    assert world(merged) == world(near) + world(far)
+    assert merged.surface_index.tolist() == [0] * 12 + [1] * 12
 
 
 @pytest.mark.parametrize(

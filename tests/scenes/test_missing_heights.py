@@ -18,10 +18,10 @@ HILLS = 300 + 80 * np.sin(np.arange(30)[:, None] / 5) * np.cos(np.arange(40) / 7
 def dem(tmp_path):
     """A GeoTIFF of heights, of which some are replaced by a value."""
 
-    def write(value=None, where=np.s_[:4, :5], heights=HILLS, kind="float32", **profile):
+    def write(value=None, region=np.s_[:4, :5], heights=HILLS, kind="float32", **profile):
         heights = heights.astype(kind)
         if value is not None:
-            heights[where] = value
+            heights[region] = value
         path = tmp_path / "dem.tif"
         with rasterio.open(
             path, "w", driver="GTiff", width=40, height=30, count=1, dtype=kind,
@@ -33,7 +33,7 @@ def dem(tmp_path):
     return write
 
 
-def test_ground_raises_no_doubts(dem):
+def test_ground_raises_no_warnings(dem):
     ground = read_raster_terrain(dem())
     assert ground.warnings == () and np.isfinite(ground.heights).all()
 
@@ -43,12 +43,14 @@ def test_ground_raises_no_doubts(dem):
     [(-9999, "float32"), (-32768, "int16"), (-99999, "float64"), (9999, "int16"), (0, "int16"),
      (65535, "uint16"), (-1234.5, "float32"), (1e5, "float32")],
 )  # fmt: skip
-def test_an_undeclared_value_is_told_and_can_be_declared_in_the_spec(dem, value, kind):
+def test_an_undeclared_value_is_reported_and_can_be_declared_in_the_spec(dem, value, kind):
     path = dem(value, kind=kind)
     ground = read_raster_terrain(path)
     shared, *cliffs = ground.warnings
     assert f"the value {value:g} stands in 20 cells" in shared and "state 'no_data:" in shared
-    assert len(cliffs) == (value != 0) and all("neighbouring cells" in told for told in cliffs)
+    assert len(cliffs) == (value != 0) and all(
+        "neighbouring cells" in terrain_warning for terrain_warning in cliffs
+    )
     ground = read_raster_terrain(path, no_data=value)
     assert ground.warnings == () and np.isnan(ground.heights).sum() == 20
 
@@ -58,11 +60,15 @@ def test_a_value_that_the_file_declares_needs_no_word(dem):
     assert ground.warnings == () and np.isnan(ground.heights).sum() == 20
 
 
-def test_two_values_are_both_told(dem):
+def test_two_values_are_both_reported(dem):
     heights = HILLS.copy()
     heights[10:12, :6] = -32768
-    told = read_raster_terrain(dem(-9999, heights=heights)).warnings
-    assert len(told) == 3 and "value -32768 stands in 12" in told[0] and "value -9999" in told[1]
+    warnings = read_raster_terrain(dem(-9999, heights=heights)).warnings
+    assert (
+        len(warnings) == 3
+        and "value -32768 stands in 12" in warnings[0]
+        and "value -9999" in warnings[1]
+    )
 
 
 @pytest.mark.parametrize("value", [-3.4028234663852886e38, 3.4e38, -1e20, 2 * PLAUSIBLE_HEIGHT_MAX])
@@ -70,8 +76,8 @@ def test_heights_that_no_planet_has_are_refused_until_they_are_declared(dem, val
     path = dem(value)
     with pytest.raises(SceneError, match="at 20 cells, farther than 1e") as refused:
         read_raster_terrain(path)
-    stated = float(refused.value.remedy.split("no_data: ")[1].rstrip("'"))
-    assert np.isnan(read_raster_terrain(path, no_data=stated).heights).sum() == 20
+    no_data = float(refused.value.remedy.split("no_data: ")[1].rstrip("'"))
+    assert np.isnan(read_raster_terrain(path, no_data=no_data).heights).sum() == 20
     assert np.isnan(read_raster_terrain(path, no_data=value).heights).sum() == 20
 
 
@@ -84,8 +90,8 @@ def test_values_that_are_no_numbers_are_holes(dem, value):
 def test_missing_heights_that_were_blended_as_the_grid_was_resampled_show_as_cliffs(dem):
     heights = HILLS.copy()
     heights[:, 10:15] = np.linspace(-9000, 200, 5)
-    (told,) = read_raster_terrain(dem(heights=heights)).warnings
-    assert "neighbouring cells differ by up to" in told and "state it as no_data" in told
+    (warning,) = read_raster_terrain(dem(heights=heights)).warnings
+    assert "neighbouring cells differ by up to" in warning and "state it as no_data" in warning
 
 
 def test_buildings_and_steep_ground_are_no_cliffs(dem):

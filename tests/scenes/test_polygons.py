@@ -67,9 +67,9 @@ def write_ply(path, vertices, faces, order):
 WRITERS = {
     "a.obj": write_obj,
     "a.off": write_off,
-    "ascii.ply": lambda *given: write_ply(*given, ""),
-    "little.ply": lambda *given: write_ply(*given, "<"),
-    "big.ply": lambda *given: write_ply(*given, ">"),
+    "ascii.ply": lambda *mesh: write_ply(*mesh, ""),
+    "little.ply": lambda *mesh: write_ply(*mesh, "<"),
+    "big.ply": lambda *mesh: write_ply(*mesh, ">"),
 }
 
 
@@ -115,14 +115,14 @@ def test_a_polygon_that_crosses_itself_is_refused_with_its_number(tmp_path, name
 
 
 @pytest.mark.parametrize(
-    ("outline", "said"),
+    ("outline", "message"),
     [
         ([[0, 0], [1, 1], [1, 0], [0, 1]], "crosses itself"),  # the two lobes cancel
         ([[np.cos(0.8 * np.pi * k), np.sin(0.8 * np.pi * k)] for k in range(5)], "crosses itself"),
     ],
 )
-def test_stars_and_bow_ties_are_refused(outline, said):
-    with pytest.raises(PolygonError, match=f"face 1 .*{said}"):
+def test_stars_and_bow_ties_are_refused(outline, message):
+    with pytest.raises(PolygonError, match=f"face 1 .*{message}"):
         cut(flat(outline))
 
 
@@ -210,7 +210,7 @@ def test_polygons_without_area_or_data_are_dropped_and_counted(tmp_path):
     )
 
 
-def test_bent_polygons_are_told_and_those_bent_too_far_refused(tmp_path):
+def test_bent_polygons_are_reported_and_those_bent_too_far_refused(tmp_path):
     quad = flat([[0, 0], [1, 0], [1, 1], [0, 1]], [0, 0.04, 0, 0.04])
     write_obj(tmp_path / "a.obj", quad, [[0, 1, 2, 3]])
     assert (
@@ -257,8 +257,8 @@ def test_a_gltf_reads_plain_files_alone_and_no_pictures(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     path = tmp_path / "a.gltf"
     assert len(read_mesh(gltf(path, images=["pipe"])).faces) == 1
-    for uri, said in (("pipe", "pipe or a device"), ("/dev/zero", "pipe or a device")):
-        with pytest.raises(SceneError, match=said):
+    for uri, message in (("pipe", "pipe or a device"), ("/dev/zero", "pipe or a device")):
+        with pytest.raises(SceneError, match=message):
             read_mesh(gltf(path, uri=uri))
 
 

@@ -97,11 +97,11 @@ def test_feet_become_metres_both_ways(tiff):
 
 
 def test_a_window_cuts_out_its_part_where_it_lies(tiff):
-    whole = read_raster_terrain(tiff())
+    terrain = read_raster_terrain(tiff())
     part = read_raster_terrain(tiff(), window=(500_002.0, 3_999_991.0, 500_008.0, 3_999_997.0))
     np.testing.assert_array_equal(part.heights, HEIGHTS[1:3, 1:4])
     x, y = np.meshgrid([500_003.0, 500_006.5], [3_999_993.0, 3_999_995.0])
-    np.testing.assert_allclose(part.height_at(x, y), whole.height_at(x, y))
+    np.testing.assert_allclose(part.height_at(x, y), terrain.height_at(x, y))
 
 
 def test_another_band_can_be_read(tiff):
@@ -117,8 +117,8 @@ def test_degrees_become_metres_of_a_stated_size(tiff):
     with pytest.raises(SceneError, match="degrees") as refused:
         read_raster_terrain(path)
     # The remedy gives the size on the raster's own ellipsoid, to be copied.
-    said = str(refused.value).split("[")[1].split("]")[0].split(",")
-    assert [float(size) for size in said] == pytest.approx(degree_lengths(36.498333), abs=0.06)
+    names = str(refused.value).split("[")[1].split("]")[0].split(",")
+    assert [float(size) for size in names] == pytest.approx(degree_lengths(36.498333), abs=0.06)
 
 
 def test_degrees_of_the_moon_are_measured_on_the_moon(tiff):
@@ -142,7 +142,7 @@ def test_a_raster_without_scale_needs_the_size_of_a_pixel(tiff):
 
 
 @pytest.mark.parametrize(
-    ("profile", "options", "said"),
+    ("profile", "options", "message"),
     [
         ({"transform": Affine(2, 0.1, 0, 0.1, -3, 0)}, {}, "rotated.*gdalwarp"),
         ({}, {"band": 2}, "1 band"),
@@ -157,10 +157,10 @@ def test_a_raster_without_scale_needs_the_size_of_a_pixel(tiff):
     ],
 )
 def test_a_raster_that_can_not_be_used_is_refused_with_file_rule_and_remedy(
-    tiff, profile, options, said
+    tiff, profile, options, message
 ):
     path = tiff(**profile)
-    with pytest.raises(SceneError, match=said) as refused:
+    with pytest.raises(SceneError, match=message) as refused:
         read_raster_terrain(path, **options)
     assert str(refused.value).startswith(str(path)) and refused.value.remedy
 
@@ -222,11 +222,11 @@ def vrt(path, source):
 
 def test_the_digest_of_a_raster_follows_the_files_that_it_takes_its_heights_from(tiff, tmp_path):
     over = vrt(tmp_path / "over.vrt", tiff())
-    again = vrt(tmp_path / "again.vrt", over)
-    before = raster_digest(over), raster_digest(again)
+    second_path = vrt(tmp_path / "again.vrt", over)
+    before = raster_digest(over), raster_digest(second_path)
     assert before[0] == before[1] == raster_digest(tiff())
     tiff(HEIGHTS + 500)
-    after = raster_digest(over), raster_digest(again)
+    after = raster_digest(over), raster_digest(second_path)
     assert after[0] == after[1] != before[0]
 
 
@@ -255,16 +255,16 @@ def test_the_digest_of_a_raster_follows_its_world_file_and_not_its_encoding(tiff
 )
 def test_a_raster_fetches_nothing_over_the_network(tiff, tmp_path, source):
     tiff()
-    asked = []
+    requests = []
 
-    class Told(http.server.SimpleHTTPRequestHandler):
-        def __init__(self, *given):
-            super().__init__(*given, directory=tmp_path)
+    class RequestLog(http.server.SimpleHTTPRequestHandler):
+        def __init__(self, *arguments):
+            super().__init__(*arguments, directory=tmp_path)
 
         def log_message(self, *words):
-            asked.append(words)
+            requests.append(words)
 
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Told) as server:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), RequestLog) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         url = f"http://127.0.0.1:{server.server_address[1]}/dem.tif"
         over = vrt(tmp_path / "over.vrt", source.replace("URL", url))
@@ -272,7 +272,7 @@ def test_a_raster_fetches_nothing_over_the_network(tiff, tmp_path, source):
             with pytest.raises(SceneError, match=r"over\.vrt: is no raster.*over the network"):
                 read(over)
         server.shutdown()
-    assert not asked
+    assert not requests
 
 
 def test_a_raster_over_one_that_is_lost_is_refused_every_time(tmp_path, tiff):
@@ -325,7 +325,7 @@ def test_the_grid_of_an_archive_is_found_or_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("array", "said"),
+    ("array", "message"),
     [
         (np.arange(5.0), "two-dimensional"),
         (np.full((3, 3), np.nan), "too few heights"),
@@ -333,9 +333,9 @@ def test_the_grid_of_an_archive_is_found_or_named(tmp_path):
         (np.ones((3, 3), complex), "numbers"),
     ],
 )
-def test_arrays_that_are_no_ground_are_refused(tmp_path, array, said):
+def test_arrays_that_are_no_ground_are_refused(tmp_path, array, message):
     np.save(tmp_path / "z.npy", array)
-    with pytest.raises(SceneError, match=said):
+    with pytest.raises(SceneError, match=message):
         read_numpy_terrain(tmp_path / "z.npy", **STEPS)
 
 
@@ -398,10 +398,10 @@ def test_the_default_terrain_has_the_size_and_heights_of_the_survey():
 class Hosts(http.server.BaseHTTPRequestHandler):
     """A host that counts what is asked of it."""
 
-    asked: list[str] = []  # noqa: RUF012
+    requested_paths: list[str] = []  # noqa: RUF012
 
     def do_GET(self):
-        self.asked.append(self.path)
+        self.requested_paths.append(self.path)
         self.send_error(404)
 
     do_HEAD = do_POST = do_GET
@@ -415,12 +415,12 @@ def host(monkeypatch):
     """Address of a host on this machine, which proxies are told to pass by."""
     for name in ("NO_PROXY", "no_proxy"):
         monkeypatch.setenv(name, "127.0.0.1,localhost,*")
-    Hosts.asked = []
+    Hosts.requested_paths = []
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Hosts) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_address[1]}"
         server.shutdown()
-    assert not Hosts.asked
+    assert not Hosts.requested_paths
 
 
 WMS = (
@@ -490,7 +490,7 @@ def test_a_virtual_raster_over_itself_or_a_pipe_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("sidecar", ["dem.tfw", "dem.prj", "dem.tif.aux.xml", "dem.tif.ovr"])
-def test_a_pipe_beside_a_raster_is_not_opened(tiff, tmp_path, sidecar):
+def test_a_pipe_next_to_a_raster_is_not_opened(tiff, tmp_path, sidecar):
     path = tiff(crs=None, transform=None)
     os.mkfifo(tmp_path / sidecar)
     for read in (read_raster_terrain, raster_digest):
@@ -536,13 +536,13 @@ def header(shape, kind="<f8"):
 
 def test_arrays_are_refused_by_their_headers(tmp_path):
     npy, npz = tmp_path / "z.npy", tmp_path / "z.npz"
-    for shape, said in (((10**6, 10**6), "more than 5e"), ((3000, 3000), "bytes are too few")):
+    for shape, message in (((10**6, 10**6), "more than 5e"), ((3000, 3000), "bytes are too few")):
         npy.write_bytes(header(shape) + bytes(100))
-        with pytest.raises(SceneError, match=said):
+        with pytest.raises(SceneError, match=message):
             read_numpy_terrain(npy, **STEPS)
         with zipfile.ZipFile(npz, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("z.npy", header(shape) + bytes(100))
-        with pytest.raises(SceneError, match=said):
+        with pytest.raises(SceneError, match=message):
             read_numpy_terrain(npz, **STEPS)
 
 

@@ -241,16 +241,18 @@ def test_the_volume_dug_is_that_of_a_paraboloid():
 
 
 def test_craters_add_up_and_worn_ones_are_shallower_in_proportion():
-    both = scattered_objects.CraterArrays(
+    craters = scattered_objects.CraterArrays(
         *(np.array(v) for v in ([60, 90], [70, 95], [40, 30], [1.0, 0.3]))
     )
-    first, second = (scattered_objects.CraterArrays(*(v[i : i + 1] for v in both)) for i in (0, 1))
+    first, second = (
+        scattered_objects.CraterArrays(*(v[i : i + 1] for v in craters)) for i in (0, 1)
+    )
     expected = (
         scattered_objects.carve_craters(grid(), first).heights
         + scattered_objects.carve_craters(grid(), second).heights
     )
     np.testing.assert_allclose(
-        scattered_objects.carve_craters(grid(), both).heights, expected, atol=1e-12
+        scattered_objects.carve_craters(grid(), craters).heights, expected, atol=1e-12
     )
     fresh = scattered_objects.carve_craters(grid(), one(90, 95, 30)).heights
     np.testing.assert_allclose(
@@ -258,20 +260,20 @@ def test_craters_add_up_and_worn_ones_are_shallower_in_proportion():
     )
 
 
-def test_no_edge_of_the_ground_is_free_of_craters_from_beside_it():
+def test_no_edge_of_the_ground_is_free_of_craters_from_next_to_it():
     """A crater centred outside throws its ejecta in: the drawn ones reach over every edge."""
-    drawn = scattered_objects.draw_craters(
+    craters = scattered_objects.draw_craters(
         np.random.default_rng(4),
         scattered_objects.lunar_crater_law(),
         bounds=(0.0, 0.0, 300.0, 300.0),
         smallest=5.0,
         largest=100.0,
     )
-    assert (drawn.x < 0).any() and (drawn.x > 300).any()
-    assert (drawn.y < 0).any() and (drawn.y > 300).any()
-    assert ((drawn.x > -2 * drawn.diameter) & (drawn.y > -2 * drawn.diameter)).all()
-    assert drawn.freshness.min() >= 0.1 and drawn.freshness.max() <= 1
-    inside = (drawn.x > 0) & (drawn.x < 300) & (drawn.y > 0) & (drawn.y < 300)
+    assert (craters.x < 0).any() and (craters.x > 300).any()
+    assert (craters.y < 0).any() and (craters.y > 300).any()
+    assert ((craters.x > -2 * craters.diameter) & (craters.y > -2 * craters.diameter)).all()
+    assert craters.freshness.min() >= 0.1 and craters.freshness.max() <= 1
+    inside = (craters.x > 0) & (craters.x < 300) & (craters.y > 0) & (craters.y < 300)
     expected = 10**-1.1 * (5.0**-2 - 100.0**-2) * 300**2
     assert abs(inside.sum() - expected) < 5 * math.sqrt(expected)
 
@@ -281,7 +283,7 @@ def test_a_crater_that_the_grid_can_not_hold_is_refused():
         scattered_objects.carve_craters(grid(), one(50, 50, 2.5))
 
 
-def test_a_crater_beside_the_ground_changes_nothing():
+def test_a_crater_next_to_the_ground_changes_nothing():
     assert not scattered_objects.carve_craters(grid(), one(-500.0, 900.0, 50.0)).heights.any()
 
 
@@ -382,8 +384,10 @@ def test_a_clump_stands_on_its_hill_apart_and_within_its_radius():
     ].reshape(9, -1, 3)
     feet = trunks[:, :8].mean(axis=1)
     feet[:, 2] += 0.5  # the trunk begins below the ground
-    apart = np.linalg.norm(feet[:, None, :2] - feet[None, :, :2], axis=2)[~np.eye(9, dtype=bool)]
-    assert apart.min() >= TREE.crown_diameter / 2
+    distances = np.linalg.norm(feet[:, None, :2] - feet[None, :, :2], axis=2)[
+        ~np.eye(9, dtype=bool)
+    ]
+    assert distances.min() >= TREE.crown_diameter / 2
     assert np.hypot(*(feet[:, :2] - 50.0).T).max() <= 15.0
     np.testing.assert_allclose(feet[:, 2], 0.2 * feet[:, 0], atol=1e-9)
     assert (clump.surface == scattered_objects.LEAF_SURFACE).sum() == 9 * 2 * TREE.number_of_leaves

@@ -86,7 +86,7 @@ def test_the_height_at_a_place_is_that_of_the_facet_over_it(seed, spacing):
     np.testing.assert_allclose(ground.height_at(x, y), expected, atol=1e-10)
 
 
-def test_there_is_no_height_beside_the_grid():
+def test_there_is_no_height_next_to_the_grid():
     ground = terrain(np.zeros((3, 3)))
     west, south, east, north = ground.bounds
     outside = ground.height_at(np.array([west - 1, east + 1, west]), np.array([south, north, 99]))
@@ -105,13 +105,13 @@ def test_joined_facets_keep_their_place_digits_and_surfaces():
     shift = np.array([3.0, -4.0, 5.0])
     one = terrain(hilly(3, 3), origin=FAR).to_facets()
     other = terrain(hilly(4, 4), origin=FAR + shift).to_facets()
-    both = join_facets([one, replace(other, surface=other.surface + 1)])
+    joined = join_facets([one, replace(other, surface=other.surface + 1)])
     # Taking the first origin from the second rounds to the spacing of floats at 8e6 m.
     expected = np.concatenate([one.vertices, other.vertices + shift])
-    np.testing.assert_allclose(both.vertices, expected, rtol=0, atol=2 * np.spacing(8.2e6))
-    triangles = both.vertices[both.faces[len(one.faces) :]]
+    np.testing.assert_allclose(joined.vertices, expected, rtol=0, atol=2 * np.spacing(8.2e6))
+    triangles = joined.vertices[joined.faces[len(one.faces) :]]
     np.testing.assert_allclose(triangles, (other.vertices + shift)[other.faces], atol=1e-8)
-    assert list(np.unique(both.surface, return_counts=True)[1]) == [8, 18]
+    assert list(np.unique(joined.surface, return_counts=True)[1]) == [8, 18]
 
 
 def test_a_placed_object_is_scaled_and_turned_about_its_origin():
@@ -136,10 +136,10 @@ def test_facets_become_a_mesh_at_the_same_place():
 
 def test_refining_keeps_the_given_heights_and_reproduces_cubics():
     rows, columns = np.mgrid[:6, :7].astype(float)
-    given = terrain(0.1 * rows**3 - 0.2 * columns**2 * rows + columns)
-    fine = refine_terrain(given, factor=4)
-    assert fine.heights.shape == (21, 25) and fine.bounds == pytest.approx(given.bounds)
-    np.testing.assert_allclose(fine.heights[::4, ::4], given.heights, atol=1e-11)
+    coarse = terrain(0.1 * rows**3 - 0.2 * columns**2 * rows + columns)
+    fine = refine_terrain(coarse, factor=4)
+    assert fine.heights.shape == (21, 25) and fine.bounds == pytest.approx(coarse.bounds)
+    np.testing.assert_allclose(fine.heights[::4, ::4], coarse.heights, atol=1e-11)
     rows, columns = np.mgrid[:21, :25] / 4
     expected = 0.1 * rows**3 - 0.2 * columns**2 * rows + columns
     np.testing.assert_allclose(fine.heights, expected, atol=1e-11)
@@ -225,8 +225,8 @@ def test_differences_of_height_follow_the_power_law_at_every_distance_and_direct
     for i, j, k, m in ends:
         length = math.hypot((i - k) * dy, (j - m) * dx)
         expected = (0.2 * 3.0 * (length / 3.0) ** hurst) ** 2
-        found = ((z[:, i, j] - z[:, k, m]) ** 2).mean()
-        assert found == pytest.approx(expected, rel=FIVE_SIGMA * math.sqrt(2 / number))
+        structure_function = ((z[:, i, j] - z[:, k, m]) ** 2).mean()
+        assert structure_function == pytest.approx(expected, rel=FIVE_SIGMA * math.sqrt(2 / number))
 
 
 @pytest.mark.parametrize("hurst", [0.05, 0.5, 0.74, 0.76, 0.95, 0.99])
@@ -245,10 +245,10 @@ def test_the_same_seed_gives_the_same_ground_and_another_seed_another():
     parameters = {
         "shape": (20, 30), "spacing": (1.0, -1.0), "hurst": 0.7, "rms_slope": 0.1, "baseline": 5.0,
     }  # fmt: skip
-    once, again, other = (
+    once, second, other = (
         draw_fractal_relief(np.random.default_rng(seed), **parameters) for seed in (1, 1, 2)
     )
-    np.testing.assert_array_equal(once, again)
+    np.testing.assert_array_equal(once, second)
     assert once.shape == (20, 30) and np.abs(once - other).max() > 0.1
 
 

@@ -10,7 +10,7 @@ from sweep.model.geometry.body_motion import Waypoints
 from sweep.model.geometry.quaternion import from_axis_angle, from_heading, multiply, rotate
 from sweep.scenes.scene_files import SceneError, read_first_waypoint_time, read_waypoints
 
-PLAIN = "time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n2, 50, 0, 450\n4, 90, 10, 420\n"
+PLAIN_TABLE = "time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n2, 50, 0, 450\n4, 90, 10, 420\n"
 
 
 @pytest.fixture
@@ -63,29 +63,35 @@ def test_quaternions_of_a_table_are_taken_as_they_are(table):
 
 
 def test_remarks_blank_lines_and_a_byte_order_mark_are_passed_over(table):
-    text = "\ufeff# flown on a Monday\n" + PLAIN.replace("\n2,", "\n\n# here it turns\n2,")
+    text = "\ufeff# flown on a Monday\n" + PLAIN_TABLE.replace("\n2,", "\n\n# here it turns\n2,")
     assert len(read_waypoints(table(text)).time) == 3
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
-        (PLAIN.replace("z [m]", "height [m]"), "unknown column 'height"),
-        (PLAIN.replace(",", ";"), "separates its columns by semicolons"),
-        (PLAIN.replace(",", "\t"), "separates its columns by tabs"),
-        (PLAIN.replace(", z [m]", ""), "no column 'z'"),
-        (PLAIN.replace("z [m]", "y [m]"), "two columns 'y'"),
-        (PLAIN.replace("x [m]", "x"), "has no unit for column 'x'"),
+        (PLAIN_TABLE.replace("z [m]", "height [m]"), "unknown column 'height"),
+        (PLAIN_TABLE.replace(",", ";"), "separates its columns by semicolons"),
+        (PLAIN_TABLE.replace(",", "\t"), "separates its columns by tabs"),
+        (PLAIN_TABLE.replace(", z [m]", ""), "no column 'z'"),
+        (PLAIN_TABLE.replace("z [m]", "y [m]"), "two columns 'y'"),
+        (PLAIN_TABLE.replace("x [m]", "x"), "has no unit for column 'x'"),
         (
-            PLAIN.replace("x [m]", "x [s]"),
+            PLAIN_TABLE.replace("x [m]", "x [s]"),
             "has a wrong unit for column 'x': it needs a unit like m, and 's' is none",
         ),
-        (PLAIN.replace("50, 0,", "50,"), "has 3 cells under 4 columns on line 3"),
-        (PLAIN.replace("50, 0,", "fifty, 0,"), "no finite number in column 'x' on line 3: 'fifty'"),
-        (PLAIN.replace("50, 0,", "inf, 0,"), "no finite number in column 'x' on line 3: 'inf'"),
-        (PLAIN.replace("\n4,", "\n2,"), "has the time 2 s on line 3 and again on 4"),
+        (PLAIN_TABLE.replace("50, 0,", "50,"), "has 3 cells under 4 columns on line 3"),
         (
-            PLAIN.replace("\n4,", "\n1,"),
+            PLAIN_TABLE.replace("50, 0,", "fifty, 0,"),
+            "no finite number in column 'x' on line 3: 'fifty'",
+        ),
+        (
+            PLAIN_TABLE.replace("50, 0,", "inf, 0,"),
+            "no finite number in column 'x' on line 3: 'inf'",
+        ),
+        (PLAIN_TABLE.replace("\n4,", "\n2,"), "has the time 2 s on line 3 and again on 4"),
+        (
+            PLAIN_TABLE.replace("\n4,", "\n1,"),
             "time on line 4, 1 s, that is earlier than the 2 s on line 3",
         ),
         ("time [s], x [m], y [m], z [m]\n0,0,0,1\n", "fewer than two"),
@@ -103,9 +109,9 @@ def test_remarks_blank_lines_and_a_byte_order_mark_are_passed_over(table):
         ("time [s],x [m],y [m],z [m],qw [m]\n0,0,0,1,1\n1,0,0,1,1\n", "quaternions have none"),
     ],
 )
-def test_tables_that_are_no_path_are_refused_with_file_rule_and_remedy(table, text, said):
+def test_tables_that_are_no_path_are_refused_with_file_rule_and_remedy(table, text, message):
     path = table(text)
-    with pytest.raises(SceneError, match=said) as refused:
+    with pytest.raises(SceneError, match=message) as refused:
         read_waypoints(path)
     assert str(refused.value).startswith(str(path)) and refused.value.remedy
 
@@ -118,17 +124,17 @@ def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
         read_waypoints(tmp_path / "b.csv")
 
 
-def test_all_mistakes_of_a_table_are_told_at_once(table):
+def test_all_mistakes_of_a_table_are_reported_at_once(table):
     rows = "0, 0, 0, 500\n0, one, 0, 450\n2, 0, 0\n1, 0, 0, 1\n"
     with pytest.raises(SceneError) as refused:
         read_waypoints(table(f"time, x [m], y [s], height [m]\n{rows}"))
-    for said in (
+    for message in (
         "no unit for column 'time'",
         "column 'y'",
         "unknown column 'height [m]'",
         "no column 'z'",
     ):
-        assert said in refused.value.problem
+        assert message in refused.value.problem
     with pytest.raises(SceneError) as refused:
         read_waypoints(table(f"time [s], x [m], y [m], z [m]\n{rows}"))
     assert refused.value.problem == (
@@ -136,7 +142,7 @@ def test_all_mistakes_of_a_table_are_told_at_once(table):
         "has 3 cells under 4 columns on line 4"
     )
     with pytest.raises(SceneError) as refused:
-        read_waypoints(table(PLAIN + "4, 0, 0, 0\n3, 0, 0, 0\n"))
+        read_waypoints(table(PLAIN_TABLE + "4, 0, 0, 0\n3, 0, 0, 0\n"))
     assert refused.value.problem == (
         "has the time 4 s on line 4 and again on 5, and "
         "has a time on line 6, 3 s, that is earlier than the 4 s on line 5"
@@ -144,9 +150,9 @@ def test_all_mistakes_of_a_table_are_told_at_once(table):
     assert refused.value.remedy == "leave one line of each time; sort the lines by time"
 
 
-def test_of_many_mistakes_the_first_are_told_and_the_others_counted(table):
+def test_of_many_mistakes_the_first_are_reported_and_the_others_counted(table):
     with pytest.raises(SceneError, match="on line 11: 'x', and 30 more mistakes of the kind"):
-        read_waypoints(table(PLAIN.partition("\n")[0] + "\n" + "x, 0, 0, 0\n" * 40))
+        read_waypoints(table(PLAIN_TABLE.partition("\n")[0] + "\n" + "x, 0, 0, 0\n" * 40))
 
 
 GPS = Decimal("1350000000.123456")
@@ -162,9 +168,9 @@ def accelerating(first, unit="s", factor=1):
 def test_seconds_of_gps_keep_all_their_digits(table, unit, factor):
     path = table(accelerating(GPS, unit, factor))
     assert read_first_waypoint_time(path) == GPS
-    found, plain = read_waypoints(path, GPS), np.arange(200) / 100
-    np.testing.assert_array_equal(found.time, plain)
-    motion = Waypoints(found.time, found.position).motion(plain)
+    waypoints, times = read_waypoints(path, GPS), np.arange(200) / 100
+    np.testing.assert_array_equal(waypoints.time, times)
+    motion = Waypoints(waypoints.time, waypoints.position).motion(times)
     assert np.abs(motion.acceleration).max() < 1e-8  # 0.07 by differences of 64-bit seconds
     np.testing.assert_allclose(motion.velocity[:, 0], 100, atol=1e-9)
 
@@ -178,7 +184,7 @@ def test_a_table_without_a_line_or_a_unit_has_no_first_time(table):
     with pytest.raises(SceneError, match="fewer than two lines"):
         read_first_waypoint_time(table("time [s], x [m], y [m], z [m]\n"))
     with pytest.raises(SceneError, match="no unit for column 'time'"):
-        read_first_waypoint_time(table(PLAIN.replace("time [s]", "time")))
+        read_first_waypoint_time(table(PLAIN_TABLE.replace("time [s]", "time")))
 
 
 def test_the_table_that_the_documentation_shows_is_read_as_it_says(table):
@@ -186,10 +192,10 @@ def test_the_table_that_the_documentation_shows_is_read_as_it_says(table):
     text = re.search(r'write_text\("""\\\n(.*?)"""\)', page.read_text("utf-8"), re.S)[1]
     path = table(text)
     assert read_first_waypoint_time(path) == 1350000000
-    found = read_waypoints(path, read_first_waypoint_time(path))
-    np.testing.assert_array_equal(found.time, [0, 0.5, 1, 1.5])
-    np.testing.assert_array_equal(found.position[2], [1, 39, 371])
-    forward, left = (rotate(found.attitude[1], axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]))
+    waypoints = read_waypoints(path, read_first_waypoint_time(path))
+    np.testing.assert_array_equal(waypoints.time, [0, 0.5, 1, 1.5])
+    np.testing.assert_array_equal(waypoints.position[2], [1, 39, 371])
+    forward, left = (rotate(waypoints.attitude[1], axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]))
     np.testing.assert_allclose(forward, [0, math.cos(math.radians(2)), -math.sin(math.radians(2))],
                                atol=1e-15)  # fmt: skip
     assert left[2] == pytest.approx(math.sin(math.radians(1.5)) * math.cos(math.radians(2)))

@@ -69,11 +69,14 @@ def test_one_mode_is_the_default():
 
 
 @pytest.mark.parametrize("changes", [{}, MODE | {"instrument.receiver.architecture": "direct"}])
-def test_a_beam_narrower_than_its_aperture_makes_is_told_where_all_light_mixes(changes, capsys):
+def test_a_beam_narrower_than_its_aperture_makes_is_reported_where_all_light_mixes(changes, capsys):
     """Table 4.1: 50 urad from 25 mm, which make 79 urad."""
     print_spec_warnings(GridSpec.from_mapping(changed_spec(changes)))
-    told = capsys.readouterr()
-    assert not told.out and "a beam of 50 urad is narrower than an aperture of 25 mm" in told.err
-    assert "78.9 urad" in told.err
+    captured = capsys.readouterr()
+    assert (
+        not captured.out
+        and "a beam of 50 urad is narrower than an aperture of 25 mm" in captured.err
+    )
+    assert "78.9 urad" in captured.err
     wide = GridSpec.from_mapping(changed_spec(changes | WIDE))
     assert not describe_narrow_beam(wide.parameters_off_axes(), wide.axes)

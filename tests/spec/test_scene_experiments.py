@@ -52,9 +52,9 @@ def grounded(eyes):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_beam_meets_the_ground(name):
     spec, eyes = flown(name)
-    for seen in eyes.values():
-        assert seen.has_target.all() and (seen.surface >= 0).mean() > 0.999
-        assert 2 * seen.range.max() / 299_792_458 < 0.1 * spec.instrument.chirp.duration
+    for beam_eyepoints in eyes.values():
+        assert beam_eyepoints.has_target.all() and (beam_eyepoints.surface >= 0).mean() > 0.999
+        assert 2 * beam_eyepoints.range.max() / 299_792_458 < 0.1 * spec.instrument.chirp.duration
     parameters = spec.parameters()
     reflectances = {surface.reflectance for surface in spec.surfaces()}
     assert parameters["instrument.telescope.optical_efficiency"] == 1 and reflectances == {0.1}
@@ -166,21 +166,24 @@ def test_the_scan_covers_hills_with_a_clump_of_trees_in_their_middle():
 def test_the_shot_that_is_drawn_sees_a_leaf_and_the_ground_in_equal_parts():
     spec, eyes = only("forest_scan")
     (figure,) = [figure for figure in spec.figures if figure.kind == "shot_spectra"]
-    seen, offset = eyes.surface[figure.shot], eyes.offset[figure.shot]
-    leaf = eyes.weight[seen == 1].sum()
-    assert set(seen.tolist()) == {0, 1} and 0.25 < leaf < 0.75
-    apart = offset[seen == 0].min() - offset[seen == 1].max()
+    surface_numbers, offset = eyes.surface[figure.shot], eyes.offset[figure.shot]
+    leaf = eyes.weight[surface_numbers == 1].sum()
+    assert set(surface_numbers.tolist()) == {0, 1} and 0.25 < leaf < 0.75
+    gap = offset[surface_numbers == 0].min() - offset[surface_numbers == 1].max()
     bandwidth, duration = spec.instrument.chirp.bandwidth, spec.instrument.chirp.duration
     range_bin = 299_792_458 * duration * spec.instrument.processing.sample_rate / (
         2 * bandwidth * spec.instrument.processing.fft_size
     )  # fmt: skip
-    assert apart > 10 * range_bin
+    assert gap > 10 * range_bin
 
 
 def test_patterns_are_compared_at_like_reach_and_rate_of_shots():
     spec, eyes = flown("scan_pattern_comparison")
     assert [spec.shots_per_cycle(name) for name in spec.scanners] == [3, 4, 16]
-    times = {name: len(seen.time) / seen.time[-1] for name, seen in eyes.items()}
+    times = {
+        name: len(beam_eyepoints.time) / beam_eyepoints.time[-1]
+        for name, beam_eyepoints in eyes.items()
+    }
     assert times["four"] == pytest.approx(times["sixteen"], rel=0.01)
     angles = np.degrees(np.arctan(eyes["sixteen"].direction[:16, :2]
                                   / -eyes["sixteen"].direction[:16, 2:]))  # fmt: skip
@@ -193,9 +196,9 @@ def test_patterns_are_compared_at_like_reach_and_rate_of_shots():
 def test_gale_crater_says_where_its_terrain_is_missing(tmp_path):
     (tmp_path / "instruments").symlink_to(EXPERIMENTS / "instruments")
     (tmp_path / "gale.yaml").write_text(GALE.read_text())
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         load(tmp_path / "gale.yaml")
-    (mistake,) = caught.value.mistakes
+    (mistake,) = error_info.value.mistakes
     assert mistake.path == "scene.objects.ground.file" and mistake.line > 5
     assert "gale_crater_hirise_1m.tif" in mistake.value and "does not exist" in mistake.problem
 

@@ -61,9 +61,11 @@ def test_paths_are_those_of_the_model(tmp_path):
         acceleration=["0 m/s^2", "0 m/s^2", "-2 m/s^2"], duration="5 s",
     ).build_flight()  # fmt: skip
     np.testing.assert_allclose(thrown.state(np.array([3.0])).position[0], [1009, 0, 2 + 12 - 9])
-    still = with_path(kind="still", position=["1 m", "2 m", "300 m"], duration="7 s").build_flight()
-    assert still.stop == 7
-    np.testing.assert_array_equal(still.state(np.array([6.0])).velocity, 0)
+    static_flight = with_path(
+        kind="still", position=["1 m", "2 m", "300 m"], duration="7 s"
+    ).build_flight()
+    assert static_flight.stop == 7
+    np.testing.assert_array_equal(static_flight.state(np.array([6.0])).velocity, 0)
     table = "time [s], x [m], y [m], z [km]\n0, 0, 0, 0.5\n5, 10, 0, 0.4\n10, 20, 0, 0.3\n"
     (tmp_path / "path.csv").write_text(table)
     path = {"kind": "waypoints", "file": "path.csv"}
@@ -113,8 +115,8 @@ def test_a_track_follows_the_table_of_the_path_and_of_another_file(tmp_path):
         "time [s], x [m], y [m], z [m], heading [deg]\n0, 0, 0, 0, 90\n10, 0, 0, 0, 90\n"
     )
     path = {"platform.path": {"kind": "waypoints", "file": "path.csv"}}
-    own, _ = forward(path | {"platform.attitude": {"kind": "track"}}, 5.0, tmp_path)
-    np.testing.assert_allclose(own, [math.sqrt(0.5), math.sqrt(0.5), 0], atol=1e-15)
+    track, _ = forward(path | {"platform.attitude": {"kind": "track"}}, 5.0, tmp_path)
+    np.testing.assert_allclose(track, [math.sqrt(0.5), math.sqrt(0.5), 0], atol=1e-15)
     other = {"platform.attitude": {"kind": "track", "file": "turn.csv"}}
     for changes in (other, path | other):
         ahead, _ = forward(changes, 5.0, tmp_path)
@@ -238,7 +240,7 @@ def test_jitter_and_sunlight_are_handed_on():
     assert spec.parameters()["target.solar_irradiance"] == pytest.approx(5e8)
 
 
-def test_parameters_are_set_anew_where_the_rays_stay_the_same():
+def test_parameters_are_set_again_where_the_rays_stay_the_same():
     spec = spec_of()
     assert spec.parameters_with_overrides({"power": "3 W"})["instrument.laser.power"] == 3.0
     for at, words in (
@@ -252,7 +254,7 @@ def test_parameters_are_set_anew_where_the_rays_stay_the_same():
             spec.parameters_with_overrides(at)
 
 
-def test_a_scene_is_told_from_a_target_by_what_the_file_holds(tmp_path):
+def test_a_scene_is_distinguished_from_a_target_by_the_content_of_the_file(tmp_path):
     import yaml
     from base_spec import changed_spec as grid
 
@@ -261,8 +263,8 @@ def test_a_scene_is_told_from_a_target_by_what_the_file_holds(tmp_path):
     scene, target = load(tmp_path / "scene.yaml"), load(tmp_path / "grid.yaml")
     assert isinstance(scene, SceneSpec) and not isinstance(target, SceneSpec)
     for spec in (scene, target):
-        again = from_stored(spec.to_json())
-        assert (type(again), again.id, again) == (type(spec), spec.id, spec)
+        restored = from_stored(spec.to_json())
+        assert (type(restored), restored.id, restored) == (type(spec), spec.id, spec)
 
 
 def test_tables_of_gps_seconds_share_the_origin_of_the_platforms_first_time(tmp_path):

@@ -35,7 +35,7 @@ def spec_of(mapping, base="."):
     return SceneSpec.from_mapping(mapping, base=base)
 
 
-def changed(path, value):
+def changed_spec(path, value):
     mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING))
     *parents, name = path.split(".")
     part = mapping
@@ -113,21 +113,27 @@ def objects_with_another_ground():
 @pytest.mark.parametrize("path", OTHER_GEOMETRY)
 def test_whatever_moves_a_ray_makes_another_geometry_and_another_study(path):
     if path.endswith(".on"):
-        here = spec_of(objects_with_another_ground())
+        expected_spec = spec_of(objects_with_another_ground())
         mapping = objects_with_another_ground()
         mapping["scene"]["objects"]["forest"]["on"] = "other"
-        there = spec_of(mapping)
+        other_spec = spec_of(mapping)
     else:
-        here, there = spec_of(SCENE_WITH_EVERYTHING), changed(path, OTHER_GEOMETRY[path])
-    assert here.geometry_id("three") != there.geometry_id("three")
-    assert here.id != there.id
+        expected_spec, other_spec = (
+            spec_of(SCENE_WITH_EVERYTHING),
+            changed_spec(path, OTHER_GEOMETRY[path]),
+        )
+    assert expected_spec.geometry_id("three") != other_spec.geometry_id("three")
+    assert expected_spec.id != other_spec.id
 
 
 @pytest.mark.parametrize("path", SAME_GEOMETRY)
 def test_radiometry_leaves_the_geometry_alone(path):
-    here, there = spec_of(SCENE_WITH_EVERYTHING), changed(path, SAME_GEOMETRY[path])
-    assert here.geometry_id("three") == there.geometry_id("three")
-    assert (here.id == there.id) is (path in SAME_STUDY)
+    expected_spec, other_spec = (
+        spec_of(SCENE_WITH_EVERYTHING),
+        changed_spec(path, SAME_GEOMETRY[path]),
+    )
+    assert expected_spec.geometry_id("three") == other_spec.geometry_id("three")
+    assert (expected_spec.id == other_spec.id) is (path in SAME_STUDY)
 
 
 def test_every_field_of_a_scene_is_in_its_geometry_unless_it_is_optical():
@@ -135,26 +141,29 @@ def test_every_field_of_a_scene_is_in_its_geometry_unless_it_is_optical():
     text = json.dumps(spec.geometry_identity("three"))
     for part in (*spec.scene.objects.values(), spec.platform, spec.scanners["three"]):
         for path, _, _ in iter_section_values(part):
-            told = f'"{".".join(path)}"' in text
-            assert told is (path[-1] not in OPTICAL_FIELDS), path
+            is_listed = f'"{".".join(path)}"' in text
+            assert is_listed is (path[-1] not in OPTICAL_FIELDS), path
 
 
 def test_a_geometry_knows_no_names():
     text = json.dumps(SCENE_WITH_EVERYTHING)
     for old, new in (("ground", "soil"), ("forest", "wood"), ("three", "trio")):
         text = text.replace(f'"{old}"', f'"{new}"')
-    here, there = spec_of(SCENE_WITH_EVERYTHING), spec_of(json.loads(text))
-    assert here.geometry_id("three") == there.geometry_id("trio")
-    assert here.id != there.id
+    expected_spec, other_spec = spec_of(SCENE_WITH_EVERYTHING), spec_of(json.loads(text))
+    assert expected_spec.geometry_id("three") == other_spec.geometry_id("trio")
+    assert expected_spec.id != other_spec.id
 
 
 def test_the_order_of_objects_numbers_their_surfaces():
     mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING))
     objects = mapping["scene"]["objects"]
     mapping["scene"]["objects"] = {"ball": objects.pop("ball")} | objects
-    here, there = spec_of(SCENE_WITH_EVERYTHING), spec_of(mapping)
-    assert here.geometry_id("three") != there.geometry_id("three") and here.id != there.id
-    assert there.surfaces()[0].name == "ball" and here.surfaces()[0].name == "ground"
+    expected_spec, other_spec = spec_of(SCENE_WITH_EVERYTHING), spec_of(mapping)
+    assert (
+        expected_spec.geometry_id("three") != other_spec.geometry_id("three")
+        and expected_spec.id != other_spec.id
+    )
+    assert other_spec.surfaces()[0].name == "ball" and expected_spec.surfaces()[0].name == "ground"
 
 
 def test_a_geometry_is_seen_through_one_scanner():
@@ -167,7 +176,7 @@ def test_a_geometry_is_seen_through_one_scanner():
 
 
 def test_a_seed_is_part_of_a_geometry_only_where_it_moves_the_beams():
-    steady = [changed("platform.jitter", "0 rad")]
+    steady = [changed_spec("platform.jitter", "0 rad")]
     mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING)) | {"seed": 2}
     mapping["platform"]["jitter"] = "0 urad"
     steady.append(spec_of(mapping))
@@ -176,9 +185,9 @@ def test_a_seed_is_part_of_a_geometry_only_where_it_moves_the_beams():
 
 
 def test_equal_quantities_make_equal_studies_however_they_are_spelt():
-    spelt = changed("scene.objects.ball.radius", "100 cm")
+    spelt = changed_spec("scene.objects.ball.radius", "100 cm")
     assert spelt.id == spec_of(SCENE_WITH_EVERYTHING).id
-    turned = changed("platform.mounting", {"pitch": "0.017453292519943295 rad"})
+    turned = changed_spec("platform.mounting", {"pitch": "0.017453292519943295 rad"})
     assert turned.id == spec_of(SCENE_WITH_EVERYTHING).id
 
 
@@ -187,26 +196,26 @@ def test_equal_quantities_make_equal_studies_however_they_are_spelt():
 )
 def test_a_stored_study_is_the_same_again(mapping):
     spec = spec_of(mapping)
-    again = from_stored(spec.to_json())
-    assert again == spec and again.id == spec.id
-    assert again.geometry_identity("three") == spec.geometry_identity("three")
-    assert again.to_json() == spec.to_json() and hash(again) == hash(spec)
+    restored = from_stored(spec.to_json())
+    assert restored == spec and restored.id == spec.id
+    assert restored.geometry_identity("three") == spec.geometry_identity("three")
+    assert restored.to_json() == spec.to_json() and hash(restored) == hash(spec)
     assert pickle.loads(pickle.dumps(spec)) == spec
 
 
 def test_every_default_is_written_out_so_that_a_store_keeps_it():
     spec = spec_of(SCENE_WITH_EVERYTHING)
-    whole = spec.to_yaml_mapping()
+    mapping = spec.to_yaml_mapping()
     for path, rule, value in iter_section_values(spec):
         if path[0] in ("title", "question", "execution", "axes", "figures"):
             continue
         if ".".join(path) in spec.to_yaml_mapping()["axes"]:
             continue
-        at = whole
+        at = mapping
         for name in path:
             at = at[name]
         assert rule.read(at) == value, path
-    assert "execution" not in whole
+    assert "execution" not in mapping
 
 
 @pytest.fixture
@@ -224,16 +233,21 @@ def study_with_files(tmp_path):
 
 def test_files_count_by_content_and_not_by_place(study_with_files):
     folder, mapping = study_with_files
-    here = spec_of(mapping, folder)
+    first_spec = spec_of(mapping, folder)
     shutil.copytree(folder, folder / "deep")
     (folder / "deep/box.stl").rename(folder / "deep/crate.stl")
     mapping["scene"]["objects"]["thing"]["file"] = "deep/crate.stl"
     mapping["platform"]["path"]["file"] = str(folder / "deep/path.csv")
-    there = spec_of(mapping, folder)
-    assert (there.id, there.geometry_id("three")) == (here.id, here.geometry_id("three"))
+    second_spec = spec_of(mapping, folder)
+    assert (second_spec.id, second_spec.geometry_id("three")) == (
+        first_spec.id,
+        first_spec.geometry_id("three"),
+    )
     (folder / "deep/path.csv").write_text("time [s], x [m], y [m], z [m]\n0,0,0,500\n10,0,0,99\n")
     other = spec_of(mapping, folder)
-    assert other.id != here.id and other.geometry_id("three") != here.geometry_id("three")
+    assert other.id != first_spec.id and other.geometry_id("three") != first_spec.geometry_id(
+        "three"
+    )
 
 
 def test_a_stored_study_needs_its_files_only_where_rays_do(study_with_files):
@@ -248,9 +262,9 @@ def test_a_stored_study_needs_its_files_only_where_rays_do(study_with_files):
     for look in (lost.build_flight, lost.build_scene):
         with pytest.raises(SceneError, match="does not exist"):
             look()
-    found = from_stored(text, base=moved)
-    assert found.number_of_cycles("three") == 21 and found.build_scene().mesh_reports
-    assert found.files.base == moved and found == lost
+    stored_spec = from_stored(text, base=moved)
+    assert stored_spec.number_of_cycles("three") == 21 and stored_spec.build_scene().mesh_reports
+    assert stored_spec.files.base == moved and stored_spec == lost
 
 
 def test_a_file_that_has_changed_since_is_refused(study_with_files):
@@ -322,17 +336,17 @@ def test_an_angle_in_a_difference_reads_back_as_the_same_value(unit_name, value)
     assert unit.to_si(Fraction(text)) == value
 
 
-def test_differences_are_told_with_units():
-    there = changed("scene.objects.ground.size", "120 m")
-    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), there) == [
+def test_differences_show_units():
+    other_spec = changed_spec("scene.objects.ground.size", "120 m")
+    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), other_spec) == [
         "scene.objects.ground.size: 100 m -> 120 m"
     ]
-    there = changed("platform.lever_arm", ["1 m", "0 m", "2 m"])
-    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), there) == [
+    other_spec = changed_spec("platform.lever_arm", ["1 m", "0 m", "2 m"])
+    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), other_spec) == [
         "platform.lever_arm: [1, 0, 0] m -> [1, 0, 2] m"
     ]
-    there = changed("scanners.three.half_angle", "7.3 deg")
-    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), there) == [
+    other_spec = changed_spec("scanners.three.half_angle", "7.3 deg")
+    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), other_spec) == [
         "scanners.three.half_angle: 20 deg -> 7.3 deg"
     ]
     pointed = {"scanners": {"two.beams": [[math.radians(22.5), 0.0], [0.0, 0.6, -0.8]]}}

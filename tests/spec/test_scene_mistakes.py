@@ -23,9 +23,9 @@ from sweep.spec import GridSpec, SceneSpec, SpecError, load
 
 
 def mistakes_of(mapping, base="."):
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         SceneSpec.from_mapping(mapping, base=base)
-    return caught.value.mistakes
+    return error_info.value.mistakes
 
 
 MOVING = {"path": {"kind": "still", "position": ["0 m", "0 m", "9 m"]}}
@@ -243,7 +243,7 @@ def test_a_table_without_attitude_can_not_be_tracked(tmp_path):
     assert "has no attitude to follow; add heading" in str(mistake)
 
 
-def test_a_flight_too_short_for_a_cycle_is_told():
+def test_a_flight_too_short_for_a_cycle_is_reported():
     (mistake,) = mistakes_of(
         changed_scene(scanners={"one": {"kind": "corners", "angle": "1 deg", "rate": "0.05 Hz"}})
     )
@@ -330,7 +330,7 @@ def test_navigation_needs_a_scanner_that_has_it():
     assert mistake.path == "figures[0]" and "needs a scanner of 3 shots a cycle" in str(mistake)
 
 
-def test_figures_that_share_a_file_are_told_and_others_have_names_of_their_own():
+def test_figures_that_share_a_file_are_reported_and_others_have_names_of_their_own():
     several = [
         CLOUD, CLOUD | {"colour": "snr"}, CLOUD | {"scanner": "three"}, NAVIGATION,
         NAVIGATION | {"quantity": "altitude"}, {"kind": "navigation_table"},
@@ -354,7 +354,7 @@ def test_figures_hold_what_was_written_in_si():
 
 
 @pytest.mark.parametrize(
-    ("uri", "told"),
+    ("uri", "message"),
     [
         ("gone.bin", "names a file that needs {folder}/gone.bin, which does not exist"),
         ("folder", "names a file that needs {folder}/folder, which is a folder"),
@@ -363,7 +363,7 @@ def test_figures_hold_what_was_written_in_si():
         ("http://a.org/x.bin", "needs http://a.org/x.bin, and nothing is fetched over the network"),
     ],
 )
-def test_what_is_wrong_with_a_companion_of_a_mesh_is_told_of_it(uri, told, tmp_path):
+def test_what_is_wrong_with_a_companion_of_a_mesh_is_reported_of_it(uri, message, tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "loop").symlink_to("loop")
     buffers = [{"byteLength": 36, "uri": uri}]
@@ -371,7 +371,7 @@ def test_what_is_wrong_with_a_companion_of_a_mesh_is_told_of_it(uri, told, tmp_p
     thing = {"kind": "mesh", "file": "a.gltf", "reflectance": 0.1}
     with pytest.raises(SpecError) as refused:
         SceneSpec.from_mapping(changed_scene({"scene.objects.thing": thing}), base=tmp_path)
-    assert told.format(folder=tmp_path) in str(refused.value)
+    assert message.format(folder=tmp_path) in str(refused.value)
     assert "scene.objects.thing.file" in str(refused.value)
 
 
@@ -398,10 +398,10 @@ figures:
 def test_all_mistakes_of_a_file_are_reported_at_once_with_their_lines(tmp_path):
     path = tmp_path / "many.yaml"
     path.write_text(MANY)
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         load(path)
-    found = {(mistake.line, mistake.path) for mistake in caught.value.mistakes}
-    assert found == {
+    locations = {(mistake.line, mistake.path) for mistake in error_info.value.mistakes}
+    assert locations == {
         (2, "instrument"),
         (4, "scene.origin"),
         (6, "scene.objects.ground.size"),
@@ -416,7 +416,7 @@ def test_all_mistakes_of_a_file_are_reported_at_once_with_their_lines(tmp_path):
         (14, "axes.footprint.beamlets"),
         (16, "figures[0].scanner"),
     }
-    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    assert str(pickle.loads(pickle.dumps(error_info.value))) == str(error_info.value)
 
 
 def places(value, path=()):

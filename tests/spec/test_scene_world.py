@@ -31,7 +31,7 @@ def built(mapping, base="."):
     return spec, spec.build_scene()
 
 
-def seen(spec, world, name="three"):
+def flight_eyepoints(spec, world, name="three"):
     """Eyepoints of a whole flight."""
     return compute_eyepoints(
         np.arange(spec.number_of_cycles(name) * spec.shots_per_cycle(name)),
@@ -57,7 +57,7 @@ def straight_down(world, x, y, height=1000.0, time=0.0):
 
 def test_a_plane_is_seen_at_its_distance_and_closing_speed():
     spec, world = built(changed_scene())
-    eyes = seen(spec, world)
+    eyes = flight_eyepoints(spec, world)
     slant = math.cos(math.radians(20))
     np.testing.assert_allclose(eyes.range, eyes.position[:, 2] / slant, rtol=1e-9)
     np.testing.assert_allclose(eyes.radial_velocity, -eyes.velocity[:, 2] * slant, rtol=1e-9)
@@ -177,7 +177,7 @@ def test_jacksboro_is_cut_about_its_middle_and_refined_through_its_posts():
     np.testing.assert_allclose(height, expected, atol=1e-5)
 
 
-def test_relief_is_added_and_its_seed_draws_it_anew():
+def test_relief_is_added_and_follows_its_seed():
     def heights(**relief):
         fractal = {"hurst": 0.3, "rms_slope": 0.2, "baseline": "10 m"} | relief
         changes = {"scene.objects.ground.spacing": "20 m", "scene.objects.ground.relief": fractal}
@@ -185,10 +185,10 @@ def test_relief_is_added_and_its_seed_draws_it_anew():
         x, y = (v.ravel() for v in np.meshgrid(*[np.arange(-900, 900, 20.0)] * 2))
         return straight_down(world, x + 0.1, y + 0.1, height=5000.0)[0].reshape(90, 90)
 
-    first, again, other, twice = (
+    first, second_heights, other, twice = (
         heights(), heights(), heights(seed=1), heights(rms_slope=0.4)
     )  # fmt: skip
-    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first, second_heights)
     np.testing.assert_allclose(twice, 2 * first, rtol=1e-9, atol=1e-9)
     assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.9
     steps = np.diff(first, axis=1)
@@ -247,8 +247,8 @@ def test_boulders_lie_in_their_square_only():
     _, world = built(mapping)
     mesh = world.caster.meshes[0]
     corners = (mesh.vertices + mesh.origin)[mesh.faces[mesh.surface_index == 1]].reshape(-1, 3)
-    away = np.abs(corners[:, :2] - [30, -20]).max(axis=0)
-    assert (away < 30 + 2).all() and (away > 20).all()  # widened to whole steps of 5 m
+    distance = np.abs(corners[:, :2] - [30, -20]).max(axis=0)
+    assert (distance < 30 + 2).all() and (distance > 20).all()  # widened to whole steps of 5 m
 
 
 def test_a_power_law_strews_as_many_boulders_as_it_says():
@@ -327,7 +327,7 @@ def test_a_moving_box_is_met_where_it_is_and_closes_at_its_own_speed():
     nadir = {"down": {"kind": "fixed", "beams": [[0, 0, -1]], "rate": "1 Hz"}}
     spec, world = built(scene_with_object(BOX_OBJECT, motion=rising) | {"scanners": nadir})
     assert [body is None for body in world.body_motions] == [True, False]
-    eyes = seen(spec, world, "down")
+    eyes = flight_eyepoints(spec, world, "down")
     top = 50 + 5 * eyes.time + 3
     aloft = eyes.position[:, 2] > top
     assert aloft.sum() > 5
@@ -348,7 +348,7 @@ def test_a_spinning_box_stays_throughout_a_flight_that_begins_late(tmp_path):
     mapping["platform"]["path"] = {"kind": "waypoints", "file": "path.csv"}
     mapping["scanners"] = {"down": {"kind": "fixed", "beams": [[0, 0, -1]], "rate": "1 Hz"}}
     spec, world = built(mapping, tmp_path)
-    eyes = seen(spec, world, "down")
+    eyes = flight_eyepoints(spec, world, "down")
     assert eyes.time[0] == 0 and eyes.range[0] == pytest.approx(39)
     # The point that is hit lies at (0, 0.5, 1) from the axis and rises at 3 x 0.5 m/s.
     assert eyes.radial_velocity[0] == pytest.approx(1.5, rel=1e-12)
@@ -420,7 +420,7 @@ def test_tiles_of_a_survey_make_ground_without_a_seam(tmp_path):
     assert set(surface.tolist()) == {0, 1} and not world.warnings
 
 
-def test_rasters_of_two_maps_or_of_none_are_refused_or_told(tmp_path):
+def test_rasters_of_two_maps_or_of_none_are_refused_or_reported(tmp_path):
     write_raster(tmp_path / "ground.tif", ramp())
     write_raster(tmp_path / "east.tif", ramp(), np.add(FAR, [500.0, 0.0]), crs="EPSG:32632")
     ground = {"kind": "raster", "reflectance": 0.1}

@@ -38,9 +38,9 @@ def loaded(tmp_path, text):
 
 
 def mistakes_of(tmp_path, text):
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         loaded(tmp_path, text)
-    return caught.value.mistakes
+    return error_info.value.mistakes
 
 
 def test_merged_fields_count_as_if_they_were_written_and_written_ones_come_first(tmp_path):
@@ -62,7 +62,7 @@ def test_merged_axes_keep_the_order_that_yaml_gives_them(tmp_path):
     assert [axis.name for axis in loaded(tmp_path, text).axes] == ["range", "reflectance"]
 
 
-def test_a_mistake_in_a_merged_field_is_told_on_its_own_line_once(tmp_path):
+def test_a_mistake_in_a_merged_field_is_reported_on_its_own_line_once(tmp_path):
     (mistake,) = mistakes_of(tmp_path, MERGED.replace("1.1 A/W", "1.1 mW"))
     assert (mistake.path, mistake.line) == ("instrument.receiver.responsivity", 3)
     (mistake,) = mistakes_of(tmp_path, MERGED.replace("30 nm", "30 nW"))
@@ -85,9 +85,9 @@ def test_a_mistake_in_a_merged_field_is_told_on_its_own_line_once(tmp_path):
     ],
 )  # fmt: skip
 def test_what_merge_keys_cannot_mean_is_refused(tmp_path, old, new, path, words):
-    told = {m.path: str(m) for m in mistakes_of(tmp_path, MERGED.replace(old, new))}
-    assert words in told[path]
-    assert all(": is missing" in text for other, text in told.items() if other != path)
+    messages_by_path = {m.path: str(m) for m in mistakes_of(tmp_path, MERGED.replace(old, new))}
+    assert words in messages_by_path[path]
+    assert all(": is missing" in text for other, text in messages_by_path.items() if other != path)
 
 
 def test_a_section_x_stands_at_the_top_alone(tmp_path):

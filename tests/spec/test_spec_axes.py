@@ -21,7 +21,7 @@ def member(path, values):
     return GridSpec.from_mapping(changed_spec(axes={path: values})).axes[0].parameters[0]
 
 
-def test_a_list_keeps_the_users_unit_beside_si():
+def test_a_list_keeps_the_users_unit_next_to_si():
     power = member("instrument.laser.power", ["1 W", "3000 mW", "5 W"])
     assert (power.coordinate, power.units) == ("power", "W")
     assert power.values.tolist() == power.display_values.tolist() == [1.0, 3.0, 5.0]
@@ -92,8 +92,8 @@ def test_linear_values_are_evenly_spaced_with_exact_ends():
 
 def test_ends_of_a_generator_may_differ_in_unit():
     mixed = member("target.range", {"linear": ["1 m", "10 km"], "number": 4})
-    plain = member("target.range", {"linear": ["1 m", "10000 m"], "number": 4})
-    assert axis_member_content(mixed) == axis_member_content(plain)
+    member_values = member("target.range", {"linear": ["1 m", "10000 m"], "number": 4})
+    assert axis_member_content(mixed) == axis_member_content(member_values)
 
 
 def test_log_values_have_one_ratio_and_exact_ends_in_whatever_unit():
@@ -200,9 +200,9 @@ def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
     )
     assert spec.parameters()[DESIGN_PFA_SHOT_PATH] == 1e-9 and TNR_PATH not in spec.parameters()
     assert GridSpec.from_mapping(spec.to_yaml_mapping()).id == spec.id
-    found = GridStudy(spec).evaluate(0)
+    outputs = GridStudy(spec).evaluate(0)
     # all but the few bins that the target takes
-    assert found["pfa_shot"].ravel() == pytest.approx([1e-9, 1e-6, 1e-3], rel=5e-3)
+    assert outputs["pfa_shot"].ravel() == pytest.approx([1e-9, 1e-6, 1e-3], rel=5e-3)
     at = spec.parameters_with_overrides({"tnr": 10})
     assert at[TNR_PATH] == 10 and DESIGN_PFA_SHOT_PATH not in at
     first = tnr_from_parameters(spec.parameters() | {DESIGN_PFA_SHOT_PATH: 1e-9})
@@ -217,11 +217,11 @@ def test_a_field_and_its_axis_must_agree_and_a_store_keeps_the_axis_alone():
     """Whether typed in a file or given as a mapping, told with every other mistake."""
     axes = {"target.range": ["1 km", "3 km"]}
     mapping = changed_spec(axes=axes)
-    both = {**mapping, "target": {**mapping["target"], "range": "2 km"}}
+    mapping_with_both = {**mapping, "target": {**mapping["target"], "range": "2 km"}}
     with pytest.raises(SpecError, match=r"range: is on the axis range too.*\(you wrote '2 km'\)"):
-        GridSpec.from_mapping(both)
+        GridSpec.from_mapping(mapping_with_both)
     with pytest.raises(SpecError) as refusal:
-        GridSpec.from_mapping({**both, "seed": -1})
+        GridSpec.from_mapping({**mapping_with_both, "seed": -1})
     assert {mistake.path for mistake in refusal.value.mistakes} == {"target.range", "seed"}
     agreeing = {**mapping, "target": {**mapping["target"], "range": "3000 m"}}
     assert GridSpec.from_mapping(agreeing).to_json() == GridSpec.from_mapping(mapping).to_json()

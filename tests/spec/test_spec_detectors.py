@@ -49,7 +49,7 @@ def test_they_may_vary_and_their_coordinates_bear_their_names():
         ({"detector": "os_cfar"}, SPECTRA, "must be a mapping"),
     ],
 )
-def test_what_does_not_fit_is_told(changes, draws, words):
+def test_what_does_not_fit_is_reported(changes, draws, words):
     with pytest.raises(SpecError, match=r"instrument\.processing|draws") as raised:
         spec({PROCESSING + path: value for path, value in changes.items()}, draws=draws)
     assert words in str(raised.value)
@@ -72,10 +72,10 @@ def test_closed_forms_make_no_figures_of_whole_spectra():
 
 def test_they_are_no_part_of_studies_that_draw_no_spectra():
     assert not [p for p in spec().identity()["parameters"] if "detector.k" in p or "estim" in p]
-    drawn = [
+    specs = [
         spec({PROCESSING + "detector.kind": kind}, draws=SPECTRA) for kind in ("fixed", "ca_cfar")
     ]
-    assert drawn[0].id != drawn[1].id
+    assert specs[0].id != specs[1].id
 
 
 def test_flights_have_them_where_they_draw_whole_spectra():

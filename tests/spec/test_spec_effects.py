@@ -41,7 +41,7 @@ RANDOM = {
     for parameter in effect.parameters if parameter.enables_effect
 }  # fmt: skip
 """Parameters that bring a random effect."""
-THERE = {
+FIELD_VALUES = {
     parameter.path: parameter.example or parameter.options[1]
     for parameter in EFFECT_PARAMETERS if parameter.path in RANDOM
 } | {"target.roughness": "1 um", "target.pointing_jitter": "1 urad",
@@ -81,8 +81,8 @@ def validator():
 
 @BROUGHT
 def test_a_parameter_of_an_effect_is_a_field_by_itself(parameter, validator):
-    plain = {"footprint.speckle": ...}
-    default = spec(plain).parameters()[parameter.path]
+    without_speckle = {"footprint.speckle": ...}
+    default = spec(without_speckle).parameters()[parameter.path]
     assert default == parameter.default and type(default) is type(parameter.default)
     for value in values(parameter):
         mapping = changed_spec(NEEDED | required_values(parameter.path) | {parameter.path: value})
@@ -92,7 +92,10 @@ def test_a_parameter_of_an_effect_is_a_field_by_itself(parameter, validator):
         assert GridSpec.from_stored(read.to_json()).parameters() == read.parameters()
     rule = parameter_rules()[parameter.path]
     assert rule.read(rule.format(parameter.default)) == parameter.default
-    assert spec(plain | {parameter.path: rule.format(parameter.default)}).id == spec(plain).id
+    assert (
+        spec(without_speckle | {parameter.path: rule.format(parameter.default)}).id
+        == spec(without_speckle).id
+    )
 
 
 @BROUGHT
@@ -189,19 +192,21 @@ def test_a_mode_is_read_from_yaml_with_or_without_quotes(text, mode, tmp_path, v
 @pytest.mark.parametrize("kind", [GridSpec, SceneSpec])
 def test_a_mode_is_part_of_the_identity(name, kind):
     base = {GridSpec: changed_spec, SceneSpec: flight}[kind]
-    plain, off = (kind.from_mapping(m) for m in (base(), base({f"effects.{name}": "off"})))
-    assert plain.id != off.id
-    assert describe_differences(plain, off) == [f"effects.{name}: auto -> off"]
-    assert kind.from_mapping(base({f"effects.{name}": False})).id == off.id
+    default_spec, switched_off = (
+        kind.from_mapping(m) for m in (base(), base({f"effects.{name}": "off"}))
+    )
+    assert default_spec.id != switched_off.id
+    assert describe_differences(default_spec, switched_off) == [f"effects.{name}: auto -> off"]
+    assert kind.from_mapping(base({f"effects.{name}": False})).id == switched_off.id
 
 
 @pytest.mark.parametrize("effect", [e for e in EFFECTS if e.parent], ids=lambda e: e.name)
 def test_an_effect_is_on_only_within_one_that_is_not_off(effect):
-    on, off = f"effects.{effect.name}", f"effects.{effect.parent}"
-    (mistake,) = mistakes(GridSpec, changed_spec({on: True, off: False}))
+    on, parent_path = f"effects.{effect.name}", f"effects.{effect.parent}"
+    (mistake,) = mistakes(GridSpec, changed_spec({on: True, parent_path: False}))
     assert mistake.startswith(f"{on}: acts within {effect.parent}, which is off")
     assert f"turn {effect.parent} on" in mistake
-    for changes in ({on: "auto", off: "off"}, {on: "on"}, {on: "off", off: "on"}):
+    for changes in ({on: "auto", parent_path: "off"}, {on: "on"}, {on: "off", parent_path: "on"}):
         assert not mistakes(GridSpec, changed_spec(changes))
 
 
@@ -233,32 +238,32 @@ def test_the_random_effects_are_those_looked_at_here():
 
 @pytest.mark.parametrize("path", RANDOM)
 def test_a_random_effect_needs_draws_or_is_off(path):
-    there, name = {path: THERE[path]}, RANDOM[path]
-    (mistake,) = mistakes(GridSpec, changed_spec(there))
+    axes, name = {path: FIELD_VALUES[path]}, RANDOM[path]
+    (mistake,) = mistakes(GridSpec, changed_spec(axes))
     assert mistake.startswith(f"{path}: is simulated by draws")
     assert "set draws.limit to draw until accuracy.tolerance is met, draws.number" in mistake
     assert mistake.endswith(f"or effects.{name}: off")
-    default = parameter_rules()[path].format(parameter_rules()[path].read(THERE[path]))
+    default = parameter_rules()[path].format(parameter_rules()[path].read(FIELD_VALUES[path]))
     (mistake,) = mistakes(GridSpec, changed_spec(axes={path: [default]}))
     assert mistake.startswith(f"axes.{path}: is simulated by draws")
-    assert not mistakes(GridSpec, changed_spec(there | {"draws.number": 1}))
-    assert not mistakes(GridSpec, changed_spec(there | {"draws.limit": 1}))
-    assert not mistakes(GridSpec, changed_spec(there | {f"effects.{name}": "off"}))
+    assert not mistakes(GridSpec, changed_spec(axes | {"draws.number": 1}))
+    assert not mistakes(GridSpec, changed_spec(axes | {"draws.limit": 1}))
+    assert not mistakes(GridSpec, changed_spec(axes | {f"effects.{name}": "off"}))
 
 
 def test_what_only_says_how_a_random_effect_acts_asks_for_no_draws():
-    how = {"atmosphere.structure_constant": "1e-15 m^(-2/3)",
+    fields = {"atmosphere.structure_constant": "1e-15 m^(-2/3)",
            "atmosphere.scintillation_law": "log_normal"}  # fmt: skip
-    assert not mistakes(GridSpec, changed_spec(how))
+    assert not mistakes(GridSpec, changed_spec(fields))
 
 
 @pytest.mark.parametrize("name", RANDOM.values())
 def test_a_flight_draws_its_air_and_refuses_other_random_effects(name):
-    found = mistakes(SceneSpec, flight({f"effects.{name}": "on"}))
+    refusals = mistakes(SceneSpec, flight({f"effects.{name}": "on"}))
     if name == "scintillation":
-        assert not found
+        assert not refusals
         return
-    (mistake,) = found
+    (mistake,) = refusals
     assert mistake.startswith(f"effects.{name}: is not drawn in flights")
     assert ("platform.jitter" in mistake) is (name == "pointing_jitter")
     assert not mistakes(SceneSpec, flight({f"effects.{name}": "off"}))

@@ -198,9 +198,9 @@ def test_every_parameter_is_part_of_the_id(path):
     if path == PEAKS_PATH:  # of closed forms, without draws
         every = {}
     instead = {TNR_PATH: ...} if path in THRESHOLD_PATHS and path != TNR_PATH else {}
-    base, changed = spec(every), spec(every | instead | {path: other_value(path)})
-    assert changed.id != base.id
-    lines = describe_differences(base, changed)
+    base, changed_spec = spec(every), spec(every | instead | {path: other_value(path)})
+    assert changed_spec.id != base.id
+    lines = describe_differences(base, changed_spec)
     assert len(lines) == 1 + len(instead)
     assert any(line.startswith(f"{path}: ") for line in lines)
 
@@ -270,7 +270,7 @@ def test_differences_tell_angles_as_users_write_them():
     )
 
 
-def test_an_axis_added_is_told():
+def test_an_axis_added_is_reported():
     lines = describe_differences(spec(), spec(axes={"target.range": ["1 m"]}))
     assert lines == ["target.range: 2000 m -> (none)", "axes: (none) -> range",
                      "axes.range.target.range: (none) -> [1] m"]  # fmt: skip
@@ -285,17 +285,17 @@ def test_a_stored_spec_comes_back_the_same():
         question="Ψ?", seed=5, draws={"number": "1e3"},
     )  # fmt: skip
     text = original.to_json()
-    again = GridSpec.from_stored(text)
-    assert again == original and hash(again) == hash(original)
-    assert again.id == original.id
-    for one, other in zip(again.axes, original.axes, strict=True):
+    restored = GridSpec.from_stored(text)
+    assert restored == original and hash(restored) == hash(original)
+    assert restored.id == original.id
+    for one, other in zip(restored.axes, original.axes, strict=True):
         assert one.name == other.name
         assert list(map(axis_member_content, one.parameters)) == list(
             map(axis_member_content, other.parameters)
         )
-    assert again.figures == original.figures
-    assert again.parameters() == original.parameters()
-    assert again.to_json() == text
+    assert restored.figures == original.figures
+    assert restored.parameters() == original.parameters()
+    assert restored.to_json() == text
     assert pickle.loads(pickle.dumps(original)) == original
 
 

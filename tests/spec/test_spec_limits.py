@@ -15,8 +15,8 @@ RANGE = "target.range"
 LIGHT = 299_792_458.0
 
 
-def values_of_zip(written):
-    return written["zip"] if isinstance(written, dict) else ()
+def values_of_zip(value):
+    return value["zip"] if isinstance(value, dict) else ()
 
 
 def refused(changes=None, **sections):
@@ -44,8 +44,8 @@ def test_a_chirp_shorter_than_the_echos_delay_is_refused():
 def test_a_record_that_ends_before_its_echo_arrives_is_refused():
     """2^17 samples at 600 MHz are 218.45 us, 32.745 km, from the acquisition delay on."""
     assert not refused({RANGE: "32.7 km"})
-    told = refused({RANGE: "32.8 km"})
-    assert "end 3.64713e-07 s or more before the echo's delay" in told
+    message = refused({RANGE: "32.8 km"})
+    assert "end 3.64713e-07 s or more before the echo's delay" in message
     assert not refused({RANGE: "60 km", DELAY: "300 us"})
     assert "raise it to the delay" in refused({RANGE: "60 km", DELAY: "100 us"})
 
@@ -80,9 +80,9 @@ def test_a_responsivity_of_more_than_one_electron_a_photon_is_refused():
         ({}, {wavelength: ["1 um", "2 um"]}, path, "0.293 A/W"),
         ({}, {path: ["1 A/W", "2 A/W"]}, f"axes.{path}", "0.75 A/W"),
     ):
-        with pytest.raises(SpecError) as caught:
+        with pytest.raises(SpecError) as error_info:
             GridSpec.from_mapping(changed_spec(changes, axes=axes))
-        (mistake,) = caught.value.mistakes
+        (mistake,) = error_info.value.mistakes
         assert mistake.path == place
         assert over in mistake.problem and "apd_gain" in mistake.suggestion
 
@@ -96,8 +96,8 @@ def test_extremes_of_plain_axes_are_combined():
 def test_a_chirp_that_stands_on_an_axis_alone_is_held_to_the_same_rules():
     mapping = {DURATION: ..., RANGE: "60 km"}
     assert not refused(mapping, axes={DURATION: ["300 us", "401 us"]}, effects=OFF)
-    told = refused(mapping, axes={DURATION: ["300 us", "400 us"]}, effects=OFF)
-    assert "echo's delay 2R/c" in told
+    message = refused(mapping, axes={DURATION: ["300 us", "400 us"]}, effects=OFF)
+    assert "echo's delay 2R/c" in message
 
 
 def test_zipped_values_are_combined_only_as_they_occur():
@@ -141,10 +141,10 @@ def test_a_point_asked_for_later_is_held_to_the_same_rules():
     spec = GridSpec.from_mapping(changed_spec())
     with pytest.raises(SpecError, match="echo's delay"):
         spec.parameters_with_overrides({"range": "80 km"})
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         spec.parameters_with_overrides({"rnge": "2 km", "power": 3})
-    assert "did you mean 'target.range'?" in str(caught.value)
-    assert "needs a unit (you wrote 3)" in str(caught.value)
+    assert "did you mean 'target.range'?" in str(error_info.value)
+    assert "needs a unit (you wrote 3)" in str(error_info.value)
 
 
 def test_a_grid_beyond_counting_is_refused():

@@ -7,9 +7,9 @@ from sweep.spec.sections import parameter_rules
 
 
 def mistakes_of(mapping):
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         GridSpec.from_mapping(mapping)
-    return caught.value.mistakes
+    return error_info.value.mistakes
 
 
 def axes(**kinds):
@@ -126,7 +126,7 @@ def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, w
         (None, "must be the name of an instrument of the library (you wrote nothing); the library"),
     ],
 )
-def test_an_instrument_that_the_library_lacks_is_told_with_those_that_it_has(name, words):
+def test_an_instrument_that_the_library_lacks_is_reported_with_those_that_it_has(name, words):
     (mistake,) = mistakes_of(changed_spec({"instrument": {"like": name}}))
     assert mistake.path == "instrument.like" and words in str(mistake)
 
@@ -154,7 +154,7 @@ target: {{range: {range}, grazing_angle: 30 deg, reflectance: 0.1}}
          "instrument.receiver.record", "samples I and Q"),
     ],
 )  # fmt: skip
-def test_what_a_field_sets_off_in_the_library_s_instrument_is_told_at_the_field(
+def test_what_a_field_sets_off_in_the_library_s_instrument_is_reported_at_the_field(
     tmp_path, fields, reach, line, path, words
 ):
     file = tmp_path / "a.yaml"
@@ -162,15 +162,15 @@ def test_what_a_field_sets_off_in_the_library_s_instrument_is_told_at_the_field(
     if line is None:
         assert load(file).instrument.processing.tnr == 3
         return
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         load(file)
-    told = {mistake.path: mistake for mistake in caught.value.mistakes}
-    assert (told[path].file, told[path].line) == (str(file), line)
-    assert words in str(told[path])
-    assert not any("sweep/instruments" in str(mistake) for mistake in caught.value.mistakes)
+    mistakes_by_path = {mistake.path: mistake for mistake in error_info.value.mistakes}
+    assert (mistakes_by_path[path].file, mistakes_by_path[path].line) == (str(file), line)
+    assert words in str(mistakes_by_path[path])
+    assert not any("sweep/instruments" in str(mistake) for mistake in error_info.value.mistakes)
 
 
-def test_in_plain_data_no_file_of_the_library_is_told():
+def test_in_plain_data_no_file_of_the_library_is_reported():
     mapping = changed_spec({"instrument": {"like": "rogers_2021", "processing": {"tnr": -1}}})
     mapping["target"]["range"] = "900 km"
     mistakes = mistakes_of(mapping)
@@ -365,10 +365,10 @@ axes:
 def test_ten_mistakes_in_one_file_are_reported_at_once_with_their_lines(tmp_path):
     path = tmp_path / "ten.yaml"
     path.write_text(TEN)
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         load(path)
-    found = {(mistake.line, mistake.path) for mistake in caught.value.mistakes}
-    assert found == {
+    locations = {(mistake.line, mistake.path) for mistake in error_info.value.mistakes}
+    assert locations == {
         (3, "instrument.laser.wavelength"),
         (3, "instrument.laser.power"),
         (4, "instrument.chirp.bandwidth"),
@@ -381,7 +381,7 @@ def test_ten_mistakes_in_one_file_are_reported_at_once_with_their_lines(tmp_path
         (12, "axes.target.rnge"),
         (13, "axes.instrument.laser.power[2]"),
     }
-    text = str(caught.value)
+    text = str(error_info.value)
     assert text.startswith("11 mistakes:")
     assert (
         f"{path}:5: instrument.telescope.aperture: has an unknown unit 'mn' (you wrote '25 mn')"
@@ -452,12 +452,12 @@ def test_the_strongest_peak_alone_is_refused_where_no_law_of_it_is_known(changes
 @pytest.mark.parametrize("peaks", ["all", "strongest"])
 def test_a_figure_of_wrong_ranges_needs_a_study_that_has_some(peaks):
     figure = {"kind": "slices", "variable": "p_wrong_range_shot", "x": "range"}
-    given = changed_spec(
+    mapping = changed_spec(
         {"instrument.processing.peaks": peaks}, axes={"target.range": ["1 m", "2 m"]},
         figures=[figure],
     )  # fmt: skip
     if peaks == "strongest":
-        assert GridSpec.from_mapping(given).reports_strongest_peak
+        assert GridSpec.from_mapping(mapping).reports_strongest_peak
         return
     with pytest.raises(SpecError, match=r"processing\.peaks: strongest"):
-        GridSpec.from_mapping(given)
+        GridSpec.from_mapping(mapping)

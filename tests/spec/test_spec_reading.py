@@ -12,9 +12,9 @@ def write(path, mapping):
 
 
 def refusal(path):
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         load(path)
-    return str(caught.value)
+    return str(error_info.value)
 
 
 @pytest.mark.parametrize(
@@ -132,14 +132,14 @@ def test_a_mistake_in_an_override_names_the_study(tmp_path):
 def test_an_instrument_that_cannot_be_read_is_reported_once(tmp_path, reference, path, words):
     instrument_file(tmp_path)
     study = write(tmp_path / "study.yaml", BASE_SPEC | {"instrument": reference, "seed": -1})
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         load(study)
-    assert {mistake.path for mistake in caught.value.mistakes} == {path, "seed"}
-    assert words in str(caught.value)
+    assert {mistake.path for mistake in error_info.value.mistakes} == {path, "seed"}
+    assert words in str(error_info.value)
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         (f"seed: {'9' * 5000}", r"seed: must be .*you wrote '999"),
         (r'title: "\e[2Jred"', r"title: .*'\\x1b\[2Jred'.*can be printed"),
@@ -147,12 +147,12 @@ def test_an_instrument_that_cannot_be_read_is_reported_once(tmp_path, reference,
     ],
     ids=["digits", "title", "question"],
 )
-def test_endless_numbers_and_control_characters_are_refused_in_words(tmp_path, line, said):
+def test_endless_numbers_and_control_characters_are_refused_in_words(tmp_path, line, message):
     from sweep.spec import SpecError, load
 
     file = tmp_path / "odd.yaml"
     file.write_text(line)
-    with pytest.raises(SpecError, match=said) as refusal:
+    with pytest.raises(SpecError, match=message) as refusal:
         load(file)
     assert "\x1b" not in str(refusal.value) and "\x9b" not in str(refusal.value)
 
@@ -167,7 +167,7 @@ def test_an_endless_integer_of_pythons_is_refused_in_words():
 TABLE = "instrument.chirp.error_table"
 
 
-def test_a_table_of_the_chirps_error_is_the_same_in_a_spec_and_in_a_file_beside_it(tmp_path):
+def test_a_table_of_the_chirps_error_is_the_same_in_a_spec_and_in_a_file_next_to_it(tmp_path):
     rows = [[f"{10 * k} us", f"{k * (50 - k)} Hz"] for k in range(51)]
     inline = GridSpec.from_mapping(changed_spec({TABLE: rows}))
     lines = [f"{10 * k},{k * (50 - k) / 1000!r}" for k in range(51)]
@@ -176,14 +176,14 @@ def test_a_table_of_the_chirps_error_is_the_same_in_a_spec_and_in_a_file_beside_
     instrument = changed_spec({TABLE: "error.csv"})["instrument"]
     write(tmp_path / "lidar.yaml", instrument)
     (tmp_path / "below").mkdir()
-    beside = changed_spec() | {"instrument": "../lidar.yaml"}
-    kept = load(write(tmp_path / "below" / "study.yaml", beside))
+    sibling_spec = changed_spec() | {"instrument": "../lidar.yaml"}
+    spec = load(write(tmp_path / "below" / "study.yaml", sibling_spec))
     values = [np.array([row.split() for row in s.parameters()[TABLE].split(",")], float)
-              for s in (inline, named, kept)]  # fmt: skip
+              for s in (inline, named, spec)]  # fmt: skip
     np.testing.assert_allclose(values[1], values[0], rtol=1e-14, atol=1e-18)
-    assert named.id == kept.id != GridSpec.from_mapping(changed_spec()).id
-    again = GridSpec.from_stored(named.to_json())
-    assert again == named and again.id == named.id
+    assert named.id == spec.id != GridSpec.from_mapping(changed_spec()).id
+    restored = GridSpec.from_stored(named.to_json())
+    assert restored == named and restored.id == named.id
     assert (
         GridSpec.from_mapping(changed_spec({TABLE: "none"})).id
         == GridSpec.from_mapping(changed_spec()).id

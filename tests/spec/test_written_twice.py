@@ -21,7 +21,7 @@ ANGLE = "grazing_angle: 20 deg"
 
 
 @pytest.mark.parametrize(
-    ("target", "instrument", "axes", "told"),
+    ("target", "instrument", "axes", "mistaken_path"),
     [
         ("{range: 2 km}", "", "target.range: [1 km, 3 km]", "target.range"),
         ("{range: 1.5 km}", "", "target.range: {step: [1 km, 3 km, 1 km]}", "target.range"),
@@ -37,7 +37,7 @@ ANGLE = "grazing_angle: 20 deg"
         ("", "", "instrument.laser.power: [2 W, 3 W]", ""),
     ],
 )  # fmt: skip
-def test_a_value_that_its_axis_lacks_is_refused(tmp_path, target, instrument, axes, told):
+def test_a_value_that_its_axis_lacks_is_refused(tmp_path, target, instrument, axes, mistaken_path):
     fixed = target.strip("{}") or "range: 2 km"
     if "target.range" in axes and not target:
         fixed = ANGLE
@@ -48,15 +48,15 @@ def test_a_value_that_its_axis_lacks_is_refused(tmp_path, target, instrument, ax
     )
     path = tmp_path / "twice.yaml"
     path.write_text(text)
-    if not told:
+    if not mistaken_path:
         assert sweep.load(path).axes
         return
     with pytest.raises(SpecError) as error:
         sweep.load(path)
     (mistake,) = error.value.mistakes
-    assert mistake.path == told and "on the axis" in mistake.problem and mistake.line
-    written = text.splitlines()[mistake.line - 1]
-    assert told.rsplit(".", 1)[-1] in written
+    assert mistake.path == mistaken_path and "on the axis" in mistake.problem and mistake.line
+    line = text.splitlines()[mistake.line - 1]
+    assert mistaken_path.rsplit(".", 1)[-1] in line
 
 
 def test_a_spec_written_out_whole_is_the_same_study(tmp_path):
@@ -70,6 +70,6 @@ def test_a_spec_written_out_whole_is_the_same_study(tmp_path):
         )
     )  # fmt: skip
     spec = sweep.load(path)
-    whole = tmp_path / "whole.yaml"
-    whole.write_text(yaml.safe_dump(spec.to_yaml_mapping()))
-    assert sweep.load(whole).id == spec.id
+    full_path = tmp_path / "whole.yaml"
+    full_path.write_text(yaml.safe_dump(spec.to_yaml_mapping()))
+    assert sweep.load(full_path).id == spec.id

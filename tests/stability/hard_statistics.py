@@ -241,12 +241,12 @@ def empty_tallies() -> float:
     zero = np.zeros(2)
     empty = ErrorTally(np.array(3), np.array(0), zero, zero, zero)
     single = tally_of_one_error(np.array([0.1, -3.0]))
-    both = empty + single
+    merged = empty + single
     is_equal: Callable[..., bool] = np.array_equal
     return float(
         (not np.isnan(empty.bias).all())
         + (not np.isnan(single.variance).all())
-        + (not is_equal(both.bias, single.bias))
-        + (float(both.availability) != 0.25)
+        + (not is_equal(merged.bias, single.bias))
+        + (float(merged.availability) != 0.25)
         + (not is_equal(single.rmse, np.abs(single.bias)))
     )

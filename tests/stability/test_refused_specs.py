@@ -71,9 +71,9 @@ RULES = parameter_rules()
 
 
 def mistake_of(changes):
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(SpecError) as error_info:
         GridSpec.from_mapping(study_mapping(changes), base=ROOT)
-    (mistake,) = caught.value.mistakes
+    (mistake,) = error_info.value.mistakes
     return mistake
 
 

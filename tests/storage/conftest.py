@@ -22,7 +22,7 @@ SHORT_BACKOFF = {
 
 
 @pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory):
+def serial_store(tmp_path_factory):
     """The store of the small study on disk, run as a plain loop."""
     outcome = run_serially(six_block_spec(), tmp_path_factory.mktemp("undisturbed") / "small.zarr")
     assert outcome.complete

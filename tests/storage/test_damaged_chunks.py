@@ -64,7 +64,7 @@ def flight(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
+def drawn_store(tmp_path_factory):
     """A grid with blocks along all axes, and counts of draws by batch."""
     spec = small_spec(draws={"number": 20}, storage={"block_points": 2})
     return run_serially(spec, tmp_path_factory.mktemp("drawn") / "drawn.zarr").store
@@ -76,7 +76,7 @@ def copy(grid, tmp_path):
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_chunk_is_told_as_it_is_read(copy, damage):
+def test_a_damaged_chunk_is_reported_as_it_is_read(copy, damage):
     harm, words = DAMAGES[damage]
     harm(copy / "pd_shot/c/0/0/0")
     dataset = sweep.open(copy)
@@ -120,20 +120,20 @@ def test_commands_tell_of_a_damaged_chunk_in_words(copy, command, damage):
     harm, words = DAMAGES[damage]
     for name in ("pd_shot", "pd_up"):
         harm(copy / f"{name}/c/0/1/0")
-    done = CliRunner().invoke(main, [word.format(copy) for word in command])
-    assert done.exit_code == 2, done.output
+    result = CliRunner().invoke(main, [word.format(copy) for word in command])
+    assert result.exit_code == 2, result.output
     if (command[0], damage) == ("finalize", "missing"):
-        assert "lacks 1 block: resume it" in done.output  # it counts chunks before it copies
+        assert "lacks 1 block: resume it" in result.output  # it counts chunks before it copies
     else:
-        assert "block 1: pd_" in done.output and f"/c/0/1/0 {words}: `sweep ver" in done.output
-    assert "Traceback" not in done.output
+        assert "block 1: pd_" in result.output and f"/c/0/1/0 {words}: `sweep ver" in result.output
+    assert "Traceback" not in result.output
 
 
 def test_status_tells_the_progress_and_then_of_a_damaged_chunk(copy):
     flip(copy / "beamlets_error/c/0/1/0")
-    done = CliRunner().invoke(main, ["status", str(copy)])
-    assert "72 of 72 points" in done.output and "block 1: beamlets_error/c/0/1/0" in done.output
-    assert done.exit_code == 2
+    result = CliRunner().invoke(main, ["status", str(copy)])
+    assert "72 of 72 points" in result.output and "block 1: beamlets_error/c/0/1/0" in result.output
+    assert result.exit_code == 2
 
 
 def test_a_chunk_that_is_not_computed_yet_is_none_that_is_missing(tmp_path):
@@ -162,7 +162,7 @@ def test_a_chunk_whose_receipt_is_withdrawn_is_not_computed_yet(copy):
     assert np.isfinite(dataset.pd_shot.compute()).all()
 
 
-@pytest.mark.parametrize("kind", ["grid", "drawn", "flight", "eyepoints"])
+@pytest.mark.parametrize("kind", ["grid", "drawn_store", "flight", "eyepoints"])
 def test_each_chunk_has_the_block_that_writes_it(request, kind):
     path = request.getfixturevalue("flight" if kind == "eyepoints" else kind)
     if kind == "eyepoints":
@@ -177,7 +177,7 @@ def test_each_chunk_has_the_block_that_writes_it(request, kind):
     assert all(owners.block_of_chunk(name) == -1 for name in owners.template_objects)
 
 
-def test_eyepoints_are_told_with_the_study_that_has_them(flight, tmp_path):
+def test_eyepoints_are_reported_with_the_study_that_has_them(flight, tmp_path):
     place = shutil.copytree(flight.parent, tmp_path / "flight")
     attributes = sweep.open_scene(place / flight.name)["three"].attrs
     path = eyepoint_store_location(place / flight.name, attributes["geometry_id"])
@@ -188,8 +188,8 @@ def test_eyepoints_are_told_with_the_study_that_has_them(flight, tmp_path):
 
 def test_a_packed_copy_tells_of_a_chunk_in_a_file_of_several(grid, tmp_path):
     copy = pack_store(grid, tmp_path / "packed.zarr", progress=False)
-    whole = sweep.open(copy).pd_shot.compute()
-    assert np.array_equal(whole, sweep.open(grid).pd_shot)
+    pd_values = sweep.open(copy).pd_shot.compute()
+    assert np.array_equal(pd_values, sweep.open(grid).pd_shot)
     (file,) = (path for path in (copy / "pd_shot/c").rglob("*") if path.is_file())
     sound = file.read_bytes()
     for position in (3, len(sound) // 2, len(sound) - 10, len(sound) - 2):
@@ -237,14 +237,14 @@ except (DamagedChunkError, StoreReplacedError) as error:
 
 
 @pytest.mark.parametrize("happens", ["DamagedChunkError", "StoreReplacedError"])
-def test_a_reader_that_meets_an_error_ends_without_further_words(copy, drawn, happens):
+def test_a_reader_that_meets_an_error_ends_without_further_words(copy, drawn_store, happens):
     """Zarr leaves reads that nobody waits for, of which asyncio would print a traceback each."""
     for chunk in (copy / "pd_shot/c/0").glob("*/0"):
         flip(chunk)
-    words = [str(copy)] if happens == "DamagedChunkError" else [str(copy), str(drawn)]
+    words = [str(copy)] if happens == "DamagedChunkError" else [str(copy), str(drawn_store)]
     command = [sys.executable, "-c", READER, *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"{happens}\n", "")
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stdout, process.stderr) == (0, f"{happens}\n", "")
 
 
 @pytest.mark.parametrize(
@@ -254,13 +254,13 @@ def test_a_reader_that_meets_an_error_ends_without_further_words(copy, drawn, ha
         (OSError(28, "No space left on device"), "No space left on device: make room where the"),
     ],
 )
-def test_a_report_that_can_not_be_written_is_told_in_words(
+def test_a_report_that_can_not_be_written_is_reported_in_words(
     grid, tmp_path, monkeypatch, error, words
 ):
     def fail(store, file):
         raise error
 
     monkeypatch.setattr(study_report, "write_report", fail)
-    asked = ["report", str(grid), "-o", str(tmp_path / "page.html")]
-    done = CliRunner().invoke(main, asked)
-    assert done.exit_code == 2 and words in done.output and "Traceback" not in done.output
+    arguments = ["report", str(grid), "-o", str(tmp_path / "page.html")]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2 and words in result.output and "Traceback" not in result.output

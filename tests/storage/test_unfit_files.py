@@ -48,7 +48,7 @@ def patience():
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def complete_store(tmp_path_factory):
     """A complete store of two blocks, not to be changed."""
     path = tmp_path_factory.mktemp("made") / "made.zarr"
     outcome = run_serially(small_spec(storage={"block_points": 36}), path)
@@ -83,12 +83,12 @@ def sparse(file: Path) -> None:
 def bound(file: Path) -> None:
     """A socket."""
     file.unlink()
-    here = os.getcwd()
+    directory = os.getcwd()
     os.chdir(file.parent)
     try:
         socket.socket(socket.AF_UNIX).bind(file.name)
     finally:
-        os.chdir(here)
+        os.chdir(directory)
 
 
 def device(file: Path) -> None:
@@ -107,37 +107,39 @@ KINDS = {
 
 
 @pytest.fixture
-def theirs(made, tmp_path):
+def store_copy(complete_store, tmp_path):
     """A copy that a test may spoil."""
-    return shutil.copytree(made, tmp_path / "theirs.zarr")
+    return shutil.copytree(complete_store, tmp_path / "theirs.zarr")
 
 
 @pytest.mark.parametrize("spoil", KINDS, ids=lambda kind: kind.__name__)
 @pytest.mark.parametrize("name", [CHUNK, COORDINATE, "zarr.json", "pd_up/zarr.json"])
-def test_verify_tells_what_stands_in_a_files_place(theirs, spoil, name):
-    spoil(theirs / name)
-    (report,) = verify(theirs, progress=False)
+def test_verify_tells_what_stands_in_a_files_place(store_copy, spoil, name):
+    spoil(store_copy / name)
+    (report,) = verify(store_copy, progress=False)
     (damage,) = report.damages
     assert damage.object_name == name and damage.description.startswith(KINDS[spoil])
     assert report.undamaged_blocks == (1 if name == CHUNK else 2)
 
 
 @pytest.mark.parametrize("spoil", KINDS, ids=lambda kind: kind.__name__)
-def test_the_readers_of_a_chunk_raise_at_once_and_name_it(theirs, spoil):
-    spoil(theirs / CHUNK)
-    dataset = sweep.open(theirs)
+def test_the_readers_of_a_chunk_raise_at_once_and_name_it(store_copy, spoil):
+    spoil(store_copy / CHUNK)
+    dataset = sweep.open(store_copy)
     with pytest.raises(RefusedFileError, match=f"{CHUNK} {KINDS[spoil]}.*`sweep.verify"):
         dataset.pd_up.compute()
-    result = CliRunner().invoke(main, ["compare", str(theirs), str(theirs)], catch_exceptions=False)
+    result = CliRunner().invoke(
+        main, ["compare", str(store_copy), str(store_copy)], catch_exceptions=False
+    )
     assert result.exit_code == 2 and f"{CHUNK} {KINDS[spoil]}" in result.output
 
 
 @pytest.mark.parametrize("command", ["report S -o x.html", "compare S S", "figures S", "status S"])
 @pytest.mark.parametrize("name", [CHUNK, "pd_shot/c/0/0/0", COORDINATE, "zarr.json"])
-def test_no_command_waits_for_a_pipe(theirs, tmp_path, monkeypatch, command, name):
+def test_no_command_waits_for_a_pipe(store_copy, tmp_path, monkeypatch, command, name):
     monkeypatch.chdir(tmp_path)
-    pipe(theirs / name)
-    words = command.replace("S", theirs.name).split()
+    pipe(store_copy / name)
+    words = command.replace("S", store_copy.name).split()
     result = CliRunner().invoke(main, words, catch_exceptions=False)
     needed = name == "zarr.json" or (name == COORDINATE and "status" not in command)
     if needed or result.exit_code:
@@ -145,69 +147,73 @@ def test_no_command_waits_for_a_pipe(theirs, tmp_path, monkeypatch, command, nam
 
 
 @pytest.mark.parametrize("spoil", [pipe, endless, linked, sparse])
-def test_a_block_with_something_else_for_a_chunk_is_computed_again(theirs, made, tmp_path, spoil):
+def test_a_block_with_something_else_for_a_chunk_is_computed_again(
+    store_copy, complete_store, tmp_path, spoil
+):
     """A new file is renamed into its place: what a link leads to stays as it was."""
-    spoil(theirs / CHUNK)
+    spoil(store_copy / CHUNK)
     before = {file: file.read_bytes() for file in tmp_path.glob("outside")}
     if spoil is sparse:
-        verify(theirs, progress=False)  # there is a file: only a look into it tells
-    assert resume(theirs, progress=False, scheduler="none").blocks_computed == 1
-    assert file_digests(theirs) == file_digests(made)
+        verify(store_copy, progress=False)  # there is a file: only a look into it tells
+    assert resume(store_copy, progress=False, scheduler="none").blocks_computed == 1
+    assert file_digests(store_copy) == file_digests(complete_store)
     assert all(file.read_bytes() == content for file, content in before.items())
 
 
 @pytest.mark.parametrize("spoil", [pipe, endless, linked, bound])
 @pytest.mark.parametrize("name", [COORDINATE, "zarr.json"])
-def test_what_a_store_was_made_of_is_put_back_over_something_else(theirs, made, spoil, name):
-    spoil(theirs / name)
-    verify(theirs, repair=True, progress=False)
-    assert file_digests(theirs) == file_digests(made)
+def test_what_a_store_was_made_of_is_put_back_over_something_else(
+    store_copy, complete_store, spoil, name
+):
+    spoil(store_copy / name)
+    verify(store_copy, repair=True, progress=False)
+    assert file_digests(store_copy) == file_digests(complete_store)
 
 
 @pytest.mark.parametrize("folder", ["pd_up", "pd_up/c", "pd_up/c/0", "range/c"])
-def test_a_folder_behind_a_link_is_no_part_of_a_store(theirs, tmp_path, folder):
-    shutil.move(theirs / folder, tmp_path / "outside")
-    (theirs / folder).symlink_to(tmp_path / "outside")
-    reports = verify(theirs, progress=False)
+def test_a_folder_behind_a_link_is_no_part_of_a_store(store_copy, tmp_path, folder):
+    shutil.move(store_copy / folder, tmp_path / "outside")
+    (store_copy / folder).symlink_to(tmp_path / "outside")
+    reports = verify(store_copy, progress=False)
     named = {damage.object_name for report in reports for damage in report.damages}
     assert {f"{folder.partition('/')[0]}/c/0/0/0", COORDINATE} & named
     with pytest.raises((RefusedFileError, NotAStoreError)):
-        sweep.open(theirs).pd_up.compute()
+        sweep.open(store_copy).pd_up.compute()
 
 
-def test_a_store_that_is_itself_reached_through_links_is_read(made, tmp_path):
-    (tmp_path / "folder").symlink_to(made.parent)
-    (tmp_path / "link.zarr").symlink_to(tmp_path / "folder" / made.name)
+def test_a_store_that_is_itself_reached_through_links_is_read(complete_store, tmp_path):
+    (tmp_path / "folder").symlink_to(complete_store.parent)
+    (tmp_path / "link.zarr").symlink_to(tmp_path / "folder" / complete_store.name)
     assert verify(tmp_path / "link.zarr", progress=False)[0].is_undamaged
     assert sweep.open(tmp_path / "link.zarr").pd_up.notnull().all()
 
 
 @pytest.mark.parametrize("name", ["receipts.jsonl", "sessions.jsonl", "lock", "lock.guard"])
-def test_a_pipe_in_the_journal_is_named_and_hangs_nothing(theirs, name):
-    file = theirs / ".sweep" / name
+def test_a_pipe_in_the_journal_is_named_and_hangs_nothing(store_copy, name):
+    file = store_copy / ".sweep" / name
     file.touch()
     pipe(file)
-    result = CliRunner().invoke(main, ["verify", str(theirs)], catch_exceptions=False)
+    result = CliRunner().invoke(main, ["verify", str(store_copy)], catch_exceptions=False)
     assert (
         result.exit_code == 1 and f".sweep/{name} is a named pipe, no plain file" in result.output
     )
-    result = CliRunner().invoke(main, ["status", str(theirs)], catch_exceptions=False)
+    result = CliRunner().invoke(main, ["status", str(store_copy)], catch_exceptions=False)
     assert result.exit_code == 2 and f"{name} is a named pipe" in result.output
 
 
-def test_a_log_without_end_is_read_in_parts_and_mended(theirs, made):
-    receipts = theirs / ".sweep" / "receipts.jsonl"
-    whole = receipts.read_bytes()
+def test_a_log_without_end_is_read_in_parts_and_mended(store_copy, complete_store):
+    receipts = store_copy / ".sweep" / "receipts.jsonl"
+    content = receipts.read_bytes()
     with open(receipts, "r+b") as log:
         log.truncate(1 << 40)
         log.seek(0, os.SEEK_END)
-        log.write(b"\n" + whole)
-    (report,) = verify(theirs, progress=False)
+        log.write(b"\n" + content)
+    (report,) = verify(store_copy, progress=False)
     assert report.undamaged_blocks == 2 and report.damages[0].object_name.startswith(
         ".sweep/receipts"
     )
-    assert resume(theirs, progress=False, scheduler="none").blocks_computed == 0
-    assert receipts.read_bytes() == whole + whole
+    assert resume(store_copy, progress=False, scheduler="none").blocks_computed == 0
+    assert receipts.read_bytes() == content + content
 
 
 # Chunks that decode to more than they should
@@ -243,30 +249,32 @@ def test_frames_declare_what_zstd_says():
             assert zstd_content_bytes(bytes(Zstd().encode(content))) == size
 
 
-@pytest.mark.parametrize(("bomb", "why"), BOMBS.values(), ids=BOMBS)
-def test_a_chunk_that_would_not_decode_to_its_size_is_not_decoded(theirs, bomb, why):
-    (theirs / CHUNK).write_bytes(bomb)
-    with pytest.raises(RefusedFileError, match=f"{CHUNK} has a chunk that {why}"):
-        sweep.open(theirs).pd_up.compute()
-    result = CliRunner().invoke(main, ["compare", str(theirs), str(theirs)], catch_exceptions=False)
-    assert result.exit_code == 2 and why in result.output
-    assert not verify(theirs, progress=False)[0].is_undamaged
+@pytest.mark.parametrize(("bomb", "message"), BOMBS.values(), ids=BOMBS)
+def test_a_chunk_that_would_not_decode_to_its_size_is_not_decoded(store_copy, bomb, message):
+    (store_copy / CHUNK).write_bytes(bomb)
+    with pytest.raises(RefusedFileError, match=f"{CHUNK} has a chunk that {message}"):
+        sweep.open(store_copy).pd_up.compute()
+    result = CliRunner().invoke(
+        main, ["compare", str(store_copy), str(store_copy)], catch_exceptions=False
+    )
+    assert result.exit_code == 2 and message in result.output
+    assert not verify(store_copy, progress=False)[0].is_undamaged
 
 
-@pytest.mark.parametrize(("bomb", "why"), BOMBS.values(), ids=BOMBS)
+@pytest.mark.parametrize(("bomb", "message"), BOMBS.values(), ids=BOMBS)
 @pytest.mark.parametrize("reading", ["a shard", "a chunk of it"])
-def test_a_shard_with_such_a_chunk_is_not_decoded(made, tmp_path, bomb, why, reading):
-    copy = pack_store(made, tmp_path / "packed.zarr", progress=False)
+def test_a_shard_with_such_a_chunk_is_not_decoded(complete_store, tmp_path, bomb, message, reading):
+    copy = pack_store(complete_store, tmp_path / "packed.zarr", progress=False)
     (shard,) = (file for file in (copy / "pd_up" / "c").rglob("*") if file.is_file())
     content = shard.read_bytes()
     index = np.frombuffer(content[-36:-4], "<u8").reshape(2, 2).copy()
     index[1] = len(content) - 36, len(bomb)
-    room = ArrayFileLayout(36, 8, 2).file_bytes_max - len(content)
-    assert room > len(bomb) or len(bomb) < 400
+    free_bytes = ArrayFileLayout(36, 8, 2).file_bytes_max - len(content)
+    assert free_bytes > len(bomb) or len(bomb) < 400
     shard.write_bytes(content[:-36] + bomb + packed(index.tobytes()))
     dataset = sweep.open(copy)
     part = dataset.pd_up if reading == "a shard" else dataset.pd_up[:, 6:]
-    with pytest.raises(RefusedFileError, match=f"has a chunk that {why}"):
+    with pytest.raises(RefusedFileError, match=f"has a chunk that {message}"):
         part.compute()
 
 
@@ -281,21 +289,21 @@ def test_words_of_an_axis_are_counted_before_room_is_made(tmp_path):
         sweep.open(path)
 
 
-def test_a_dataset_is_checked_on_other_processes_too(theirs):
-    dataset = pickle.loads(pickle.dumps(sweep.open(theirs)))
+def test_a_dataset_is_checked_on_other_processes_too(store_copy):
+    dataset = pickle.loads(pickle.dumps(sweep.open(store_copy)))
     assert dataset.pd_up.notnull().all()
-    (theirs / CHUNK).write_bytes(BOMBS["a declared TB"][0])
+    (store_copy / CHUNK).write_bytes(BOMBS["a declared TB"][0])
     with pytest.raises(RefusedFileError):
         dataset.pd_up.compute()
 
 
-def test_objects_are_looked_at_as_files_are(made):
+def test_objects_are_looked_at_as_files_are(complete_store):
     store = parse_location(f"memory://bucket/{time.time_ns()}/small.zarr")
     assert run_serially(small_spec(storage={"block_points": 36}), store).complete
     assert sweep.open(store).pd_up.notnull().all()
-    for content, why in (*BOMBS.values(), (bytes(1 << 20), "has 1,048,576 bytes")):
+    for content, message in (*BOMBS.values(), (bytes(1 << 20), "has 1,048,576 bytes")):
         (store / CHUNK).write_bytes(content)
-        with pytest.raises(RefusedFileError, match=why):
+        with pytest.raises(RefusedFileError, match=message):
             sweep.open(store).pd_up.compute()
     (store / "zarr.json").write_bytes(bytes(65 << 20))
     with pytest.raises(NotAStoreError, match="damaged"):
@@ -310,36 +318,38 @@ def nested(depth: int) -> str:
 
 
 @pytest.mark.parametrize("depth", [61, 500, 10**5])
-@pytest.mark.parametrize("where", ["attributes", "array", "spec", "log", "listed"])
-def test_deep_nesting_ends_in_words(theirs, where, depth):
-    document = json.loads((theirs / "zarr.json").read_text())
-    if where == "log":
-        (theirs / ".sweep" / "sessions.jsonl").write_bytes(
+@pytest.mark.parametrize("location", ["attributes", "array", "spec", "log", "listed"])
+def test_deep_nesting_ends_in_words(store_copy, location, depth):
+    document = json.loads((store_copy / "zarr.json").read_text())
+    if location == "log":
+        (store_copy / ".sweep" / "sessions.jsonl").write_bytes(
             append_line_digest(b'{"event":"begun","time":' + nested(depth).encode())
         )
-    elif where == "listed":
+    elif location == "listed":
         body = json.dumps({"objects": 0})[:-1].encode() + b',"attributes":' + nested(depth).encode()
-        (theirs / ".sweep" / "template.jsonl").write_bytes(append_line_digest(body))
-        (theirs / "zarr.json").write_text("")
+        (store_copy / ".sweep" / "template.jsonl").write_bytes(append_line_digest(body))
+        (store_copy / "zarr.json").write_text("")
     else:
-        if where == "attributes":
+        if location == "attributes":
             document["attributes"]["more"] = "HERE"
-        elif where == "array":
+        elif location == "array":
             document["consolidated_metadata"]["metadata"]["pd_up"]["attributes"]["more"] = "HERE"
         else:
             document["attributes"]["spec"] = '{"title": ' + nested(depth) + "}"
-        (theirs / "zarr.json").write_text(json.dumps(document).replace('"HERE"', nested(depth)))
+        (store_copy / "zarr.json").write_text(json.dumps(document).replace('"HERE"', nested(depth)))
     for command in ("status", "report", "verify", "resume"):
-        result = CliRunner().invoke(main, [command, str(theirs)], catch_exceptions=False)
+        result = CliRunner().invoke(main, [command, str(store_copy)], catch_exceptions=False)
         assert result.exit_code in (0, 1, 2, 3)
-        if where in ("attributes", "array", "spec") and command in ("status", "report"):
-            assert result.exit_code == 2 and str(theirs) in result.output
+        if location in ("attributes", "array", "spec") and command in ("status", "report"):
+            assert result.exit_code == 2 and str(store_copy) in result.output
 
 
-def test_half_a_surrogate_pair_in_a_title_is_refused(theirs, tmp_path):
-    document = (theirs / "zarr.json").read_text()
-    (theirs / "zarr.json").write_text(document.replace('"title": "Small"', '"title": "\\ud800"'))
-    result = CliRunner().invoke(main, ["report", str(theirs)], catch_exceptions=False)
+def test_half_a_surrogate_pair_in_a_title_is_refused(store_copy, tmp_path):
+    document = (store_copy / "zarr.json").read_text()
+    (store_copy / "zarr.json").write_text(
+        document.replace('"title": "Small"', '"title": "\\ud800"')
+    )
+    result = CliRunner().invoke(main, ["report", str(store_copy)], catch_exceptions=False)
     assert result.exit_code == 2 and "damaged" in result.output
     assert parse_json('"\\ud83d\\ude80"') == "\U0001f680"
     with pytest.raises(ValueError, match="no text"):
@@ -387,16 +397,16 @@ def test_saved_parts_of_others_make_no_room_for_what_they_declare(tmp_path):
 # Specs, and files that they name
 
 
-@pytest.mark.parametrize("how", ["spec", "instrument", "instrument file", "table", "cluster"])
-def test_a_pipe_for_a_spec_or_what_it_names_is_refused(tmp_path, monkeypatch, how):
+@pytest.mark.parametrize("kind", ["spec", "instrument", "instrument file", "table", "cluster"])
+def test_a_pipe_for_a_spec_or_what_it_names_is_refused(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe.yaml")
     study = small_mapping()
-    if how == "instrument":
+    if kind == "instrument":
         study["instrument"] = "./pipe.yaml"
-    elif how == "instrument file":
+    elif kind == "instrument file":
         study["instrument"] = {"file": "pipe.yaml"}
-    elif how == "table":
+    elif kind == "table":
         chirp = {**STUDY_MAPPING["instrument"]["chirp"], "error_table": "pipe.yaml"}
         study["instrument"] = {**STUDY_MAPPING["instrument"], "chirp": chirp}
     Path("study.yaml").write_text(yaml.safe_dump(study))
@@ -405,19 +415,19 @@ def test_a_pipe_for_a_spec_or_what_it_names_is_refused(tmp_path, monkeypatch, ho
         "cluster": ["run", "study.yaml", "--cluster", "pipe.yaml"],
     }
     result = CliRunner().invoke(
-        main, command.get(how, ["plan", "study.yaml"]), catch_exceptions=False
+        main, command.get(kind, ["plan", "study.yaml"]), catch_exceptions=False
     )
     assert result.exit_code == 2 and "pipe" in result.output
 
 
-def test_a_loop_of_links_ends_in_words(made, tmp_path, monkeypatch):
+def test_a_loop_of_links_ends_in_words(complete_store, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("loop.zarr").symlink_to("loop.zarr")
     Path("study.yaml").write_text(yaml.safe_dump(small_mapping()))
     for command in (
         "status loop.zarr", "verify loop.zarr", "resume loop.zarr", "report loop.zarr",
         "compare loop.zarr loop.zarr", "run study.yaml --store loop.zarr --scheduler none",
-        "extend loop.zarr study.yaml", f"finalize {made} loop.zarr",
+        "extend loop.zarr study.yaml", f"finalize {complete_store} loop.zarr",
     ):  # fmt: skip
         result = CliRunner().invoke(main, command.split(), catch_exceptions=False)
         assert result.exit_code == 2 and "loop.zarr" in result.output, command

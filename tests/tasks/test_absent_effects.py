@@ -24,17 +24,17 @@ def calls(monkeypatch):
     counted = Counter()
 
     def watch(owner, name, label):
-        plain = getattr(owner, name)
+        original = getattr(owner, name)
 
         def counting(*arguments, **keywords):
             counted[label] += 1
-            return plain(*arguments, **keywords)
+            return original(*arguments, **keywords)
 
         # effects are frozen: what is compared is their functions, not they themselves
         object.__setattr__(owner, name, counting) if owner in EFFECTS else monkeypatch.setattr(
             owner, name, counting
         )
-        return plain
+        return original
 
     acts = [(effect, watch(effect, "apply", effect.name)) for effect in EFFECTS if effect.apply]
     watch(beamlets, "plane_footprint", "plane_footprint")
@@ -42,8 +42,8 @@ def calls(monkeypatch):
     watch(scintillation, "rytov_variance", "rytov_variance")
     watch(line_shape, "decompose_phase_errors", "decompose_phase_errors")
     yield counted
-    for effect, plain in acts:
-        object.__setattr__(effect, "apply", plain)
+    for effect, original in acts:
+        object.__setattr__(effect, "apply", original)
 
 
 def evaluated(spec):
@@ -69,8 +69,8 @@ def test_over_mars_there_is(calls):
 
 
 def test_a_hovering_lidar_sees_no_doppler_shift(calls):
-    still = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.02}
-    called = evaluated(small_spec(axes=MOON, target=still, effects={"overlap": "off"}))
+    target = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.02}
+    called = evaluated(small_spec(axes=MOON, target=target, effects={"overlap": "off"}))
     assert not {"doppler", "doppler_spread", "range_walk", "acceleration"} & called
     assert calls["doppler"] == calls["range_walk"] == calls["decompose_phase_errors"] == 0
 
@@ -116,14 +116,16 @@ def test_what_spreads_beamlets_does_nothing_where_there_are_none():
             "transverse_velocity": "100 m/s",
         },
     )
-    ((_, alone),) = prepare_shots(spec.parameters(), {"doppler_spread", "several_returns"})
-    ((_, both),) = prepare_shots(spec.parameters(), {"footprint", "doppler_spread"})
-    assert (
-        alone.footprint.doppler_ratio_offset.shape == (1, 1)
-        and not alone.footprint.doppler_ratio_offset.any()
+    ((_, without_footprint),) = prepare_shots(
+        spec.parameters(), {"doppler_spread", "several_returns"}
     )
-    assert both.footprint.doppler_ratio_offset.shape == (1, 9)
-    assert both.footprint.doppler_ratio_offset.any()
+    ((_, with_footprint),) = prepare_shots(spec.parameters(), {"footprint", "doppler_spread"})
+    assert (
+        without_footprint.footprint.doppler_ratio_offset.shape == (1, 1)
+        and not without_footprint.footprint.doppler_ratio_offset.any()
+    )
+    assert with_footprint.footprint.doppler_ratio_offset.shape == (1, 9)
+    assert with_footprint.footprint.doppler_ratio_offset.any()
 
 
 def test_bare_shots_hold_nothing_of_any_effect():

@@ -45,7 +45,7 @@ def test_each_point_keeps_the_promise_that_is_made_of_it(store):
     assert "tolerance" not in dataset.pd_shot_half_width.attrs
 
 
-def test_the_worst_point_is_told_with_its_own_tolerance(store):
+def test_the_worst_point_is_reported_with_its_own_tolerance(store):
     dataset = xr.open_zarr(store)
     over = {name: dataset[f"{name}_half_width"] - dataset.tolerance
             for name in ("pd_up", "pd_doppler", "pd_down", "pd_shot")}  # fmt: skip
@@ -62,11 +62,11 @@ def test_the_worst_point_is_told_with_its_own_tolerance(store):
         assert names_the_place(row.worst_point_label, dataset, over[row.name])
 
 
-def names_the_place(where, dataset, over):
+def names_the_place(place_name, dataset, over):
     """Tell whether some words name the place of the largest excess."""
     i, _, k = np.unravel_index(np.argmax(over.values), over.shape)
     expected = f"range {dataset.range.values[i]:.4g} km, tolerance 0, "
-    return where == expected + f"confidence {dataset.confidence.values[k]:.4g}"
+    return place_name == expected + f"confidence {dataset.confidence.values[k]:.4g}"
 
 
 def test_draws_that_are_said_to_do_about_do(tmp_path):
@@ -83,7 +83,7 @@ def test_draws_that_are_said_to_do_about_do(tmp_path):
         assert row.worst_error < 0.022
 
 
-def test_blocks_that_are_not_computed_are_not_told(tmp_path):
+def test_blocks_that_are_not_computed_are_not_in_the_table(tmp_path):
     from sweep.tasks.driver import run
 
     def broken(study, block):
@@ -125,15 +125,15 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
         1.0,
     )
     assert row.worst_point_label == "grazing_angle 0.5 deg"
-    said = CliRunner().invoke(main, ["status", str(store)]).output
-    assert "What more beamlets may change" in said and "2 of 3" in said
+    output = CliRunner().invoke(main, ["status", str(store)]).output
+    assert "What more beamlets may change" in output and "2 of 3" in output
     met = small_spec(
         footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"}, axes={}
     )
     assert accuracy_rows_of_rays(run_serially(met, tmp_path / "met.zarr").store) == []
 
 
-def test_a_large_study_is_told_by_some_of_its_blocks(tmp_path, monkeypatch):
+def test_a_large_study_is_reported_by_some_of_its_blocks(tmp_path, monkeypatch):
     """Each block is a file or two: `sweep status` would wait for all of them."""
     from sweep.tasks.studies import store_summary
 
@@ -142,11 +142,15 @@ def test_a_large_study_is_told_by_some_of_its_blocks(tmp_path, monkeypatch):
     store = run_serially(
         small_spec(**ROUGH | draws, axes=axes, storage={"block_points": 1}), tmp_path / "l"
     )
-    whole = accuracy_rows_of_draws(store.store)
-    assert {row.block_fraction for row in whole} == {1.0} and {row.n_points for row in whole} == {8}
+    all_rows = accuracy_rows_of_draws(store.store)
+    assert {row.block_fraction for row in all_rows} == {1.0} and {
+        row.n_points for row in all_rows
+    } == {8}
     monkeypatch.setattr(store_summary, "SAMPLED_BLOCKS_MAX", 2)
     rows = accuracy_rows_of_draws(store.store)
     assert {row.block_fraction for row in rows} == {2 / 8} and {row.n_points for row in rows} == {2}
-    assert all(row.worst_error <= all_.worst_error for row, all_ in zip(rows, whole, strict=True))
-    said = CliRunner().invoke(main, ["status", str(store.store)]).output
-    assert "by 25 % of" in " ".join(said.split())
+    assert all(
+        row.worst_error <= all_.worst_error for row, all_ in zip(rows, all_rows, strict=True)
+    )
+    output = CliRunner().invoke(main, ["status", str(store.store)]).output
+    assert "by 25 % of" in " ".join(output.split())

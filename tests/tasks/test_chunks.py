@@ -14,10 +14,10 @@ TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
 
 
 def array_at(path, shape, chunk, dtype, fill):
-    made = zarr.create_array(
+    array = zarr.create_array(
         path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, compressors=CHUNK_CODECS
     )
-    return made.with_config({"write_empty_chunks": True})
+    return array.with_config({"write_empty_chunks": True})
 
 
 def layout_of(array):
@@ -72,4 +72,4 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no space"):
         locations.atomic_write_file(str(file), b"new")
     assert file.read_bytes() == b"old"
-    assert [each.name for each in file.parent.iterdir()] == ["0"]
+    assert [name.name for name in file.parent.iterdir()] == ["0"]

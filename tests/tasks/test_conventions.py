@@ -43,7 +43,7 @@ def test_every_variable_has_units_and_a_name_in_words(datasets):
 
 
 def test_every_flag_has_masks_or_values_and_as_many_meanings(datasets):
-    found = {}
+    flags = {}
     for dataset in datasets:
         for name, variable in dataset.variables.items():
             if name in ("effects", "flags") or name.endswith("_status"):
@@ -54,22 +54,22 @@ def test_every_flag_has_masks_or_values_and_as_many_meanings(datasets):
                 assert np.array(bits).astype(variable.dtype).tolist() == list(bits), name
                 if kind == "flag_masks":
                     assert [bin(bit).count("1") for bit in bits] == [1] * len(bits), name
-                found[name] = meanings
-    assert "effects" in found
+                flags[name] = meanings
+    assert "effects" in flags
     if len(datasets) > 1:
-        assert found.keys() == {"effects", "flags", "velocity_status", "altitude_status"}
-        assert found["flags"][0] == "true" and found["velocity_status"][0] == "solved"
+        assert flags.keys() == {"effects", "flags", "velocity_status", "altitude_status"}
+        assert flags["flags"][0] == "true" and flags["velocity_status"][0] == "solved"
 
 
 def test_pint_reads_the_units_of_every_variable(datasets):
     units = pytest.importorskip("cf_xarray.units").units
     pytest.importorskip("pint_xarray")
     for dataset in datasets:
-        plain = dataset.drop_vars(
+        numeric_dataset = dataset.drop_vars(
             [n for n, v in dataset.variables.items() if v.dtype.kind in "OTU"]
         )
-        assert plain.pint.quantify(unit_registry=units).sizes == plain.sizes
-        for name, variable in plain.variables.items():
+        assert numeric_dataset.pint.quantify(unit_registry=units).sizes == numeric_dataset.sizes
+        for name, variable in numeric_dataset.variables.items():
             if name in ("radial_velocity", "radial_velocity_error"):
                 assert units.Unit(variable.attrs["units"]) == units.Unit("m / s")
 

@@ -33,11 +33,11 @@ from sweep.tasks.studies.store_summary import status
 from sweep.tasks.studies.study_loading import read_study
 
 
-def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undisturbed):
-    dataset = xr.open_zarr(undisturbed)
+def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(serial_store):
+    dataset = xr.open_zarr(serial_store)
     assert bool(dataset.pd_shot.notnull().all())
     assert np.ptp(dataset.pd_shot.values) > 0
-    assert sorted(receipt_blocks(undisturbed)) == list(range(12))
+    assert sorted(receipt_blocks(serial_store)) == list(range(12))
 
 
 @pytest.mark.parametrize(
@@ -50,12 +50,12 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
     ids=["3 processes", "2 workers in threads", "3 threads"],
 )
 def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(
-    undisturbed, tmp_path, place
+    serial_store, tmp_path, place
 ):
     outcome = run_serially(small_spec(), tmp_path / "small.zarr", **place)
     assert outcome.complete and outcome.blocks_computed == 12
     assert sorted(receipt_blocks(outcome.store)) == list(range(12))
-    assert file_digests(outcome.store) == file_digests(undisturbed)
+    assert file_digests(outcome.store) == file_digests(serial_store)
 
 
 FEW = {**STUDY_MAPPING["axes"], "target.range": {"linear": ["10 m", "5 km"], "number": 6}}
@@ -71,37 +71,41 @@ ADAPTIVE = {
 """Drawn until pd is known within 0.09, but 60 times at most."""
 
 
-@pytest.mark.parametrize("drawn", [FIXED, ADAPTIVE], ids=["a fixed number", "to an accuracy"])
-def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn):
-    plain = run_serially(small_spec(**drawn), tmp_path / "plain.zarr")
-    threads = run_serially(small_spec(**drawn), tmp_path / "t.zarr", threads=2)
-    assert file_digests(plain.store) == file_digests(threads.store)
-    expected = xr.open_zarr(plain.store)
-    if drawn is FIXED:
+@pytest.mark.parametrize("sections", [FIXED, ADAPTIVE], ids=["a fixed number", "to an accuracy"])
+def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, sections):
+    outcome = run_serially(small_spec(**sections), tmp_path / "plain.zarr")
+    threads = run_serially(small_spec(**sections), tmp_path / "t.zarr", threads=2)
+    assert file_digests(outcome.store) == file_digests(threads.store)
+    expected = xr.open_zarr(outcome.store)
+    if sections is FIXED:
         assert expected.batch_draws.values.tolist() == [30, 30, 10]
         assert 0 < expected.n_detected_up.values.sum() < 70 * 36
     else:
         numbers = expected.n_draws.values
         assert set(np.unique(numbers)) == {40, 60} and "batch" not in expected.dims
         assert ((expected.accuracy_missed > 0).values <= (numbers == 60)).all()
-    whole = run_serially(
-        small_spec(**drawn, storage={"block_points": 1000}), tmp_path / "whole.zarr"
+    store = run_serially(
+        small_spec(**sections, storage={"block_points": 1000}), tmp_path / "whole.zarr"
     )
     axes = {path: values for path, values in FEW.items() if "power" not in path}
-    one_watt = run_serially(small_spec(**drawn | {"axes": axes}), tmp_path / "one_watt.zarr")
-    again, at_one_watt = xr.open_zarr(whole.store), xr.open_zarr(one_watt.store)
+    one_watt = run_serially(small_spec(**sections | {"axes": axes}), tmp_path / "one_watt.zarr")
+    restored, at_one_watt = xr.open_zarr(store.store), xr.open_zarr(one_watt.store)
     for name, values in expected.data_vars.items():
-        assert again[name].values.tobytes() == values.values.tobytes(), name
+        assert restored[name].values.tobytes() == values.values.tobytes(), name
     for name in (*ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS):
         np.testing.assert_array_equal(at_one_watt[name].values, expected[name].values[0])
 
 
-def test_a_client_of_the_callers_is_used_and_left_open(undisturbed, tmp_path):
+def test_a_client_of_the_callers_is_used_and_left_open(serial_store, tmp_path):
     with thread_cluster_client(1, threads_per_worker=2) as client:
         outcome = run_serially(small_spec(), tmp_path / "small.zarr", client=client)
-        again = run_serially(small_spec(), tmp_path / "again.zarr", client=client)
+        second_outcome = run_serially(small_spec(), tmp_path / "again.zarr", client=client)
         assert client.status == "running"
-    assert file_digests(outcome.store) == file_digests(again.store) == file_digests(undisturbed)
+    assert (
+        file_digests(outcome.store)
+        == file_digests(second_outcome.store)
+        == file_digests(serial_store)
+    )
 
 
 class StopAfter(Progress):
@@ -121,7 +125,7 @@ class StopAfter(Progress):
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
 def test_an_interrupted_run_commits_what_runs_and_resumes_to_the_same_bytes(
-    undisturbed, tmp_path, place
+    serial_store, tmp_path, place
 ):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
     progress = StopAfter(18)
@@ -135,12 +139,12 @@ def test_an_interrupted_run_commits_what_runs_and_resumes_to_the_same_bytes(
     resumed = resume(path, progress=False, scheduler="none", evaluate=make_logging_evaluate(log))
     assert resumed.complete and resumed.blocks_computed == 12 - outcome.blocks_done
     assert Counter(logged_blocks(log)) == Counter(range(12))
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
 def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
-    undisturbed, tmp_path, place
+    serial_store, tmp_path, place
 ):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
     outcome = run(
@@ -157,15 +161,15 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
     recorded = status(path).failures
     assert recorded[2]["error"] == "ValueError: nothing good comes of block 2"
     assert "Traceback" in recorded[7]["traceback"]
-    again = resume(path, progress=False, scheduler="none")
-    assert not again.complete and again.blocks_skipped == 2 and again.blocks_computed == 0
+    resumed = resume(path, progress=False, scheduler="none")
+    assert not resumed.complete and resumed.blocks_skipped == 2 and resumed.blocks_computed == 0
     assert set(status(path).failures) == {2, 7}
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     assert status(path).failures == {}
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
-def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undisturbed, tmp_path):
+def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(serial_store, tmp_path):
     path = tmp_path / "small.zarr"
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
         outcome = run(
@@ -175,7 +179,7 @@ def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undistu
     assert outcome.failures[0].error.startswith("KilledWorker")
     assert outcome.blocks_done == 11
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
 def test_a_study_of_which_every_block_fails_is_given_up_early(tmp_path):
@@ -199,13 +203,13 @@ def full_disk(study, block):
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
-def test_a_full_disk_stops_the_run_and_leaves_what_is_committed(undisturbed, tmp_path, place):
+def test_a_full_disk_stops_the_run_and_leaves_what_is_committed(serial_store, tmp_path, place):
     path = tmp_path / "small.zarr"
     outcome = run(small_spec(), store=path, progress=False, evaluate=full_disk, **place)
     assert "No space left" in outcome.stop_reason and not outcome.complete
     assert set(receipt_blocks(path)) <= {0, 1, 2}
     assert resume(path, progress=False, scheduler="none").complete
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
 def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(tmp_path):
@@ -226,7 +230,7 @@ def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(t
 
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
-    undisturbed, tmp_path, monkeypatch, times
+    serial_store, tmp_path, monkeypatch, times
 ):
     path, lost = tmp_path / "small.zarr", []
     write = BlockWriter.write
@@ -244,25 +248,25 @@ def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
     assert outcome.complete == (times == 1)
     assert all("not in the store here" in failure.error for failure in outcome.failures)
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
 def test_the_client_never_has_more_tasks_out_than_its_window(tmp_path):
     spec = small_spec(storage={"block_points": 1})
-    most = []
+    n_outstanding = []
 
     class Watching(Progress):
         def advance(self, *, points, failed):
-            most.append(len(client.futures))
+            n_outstanding.append(len(client.futures))
 
     with thread_cluster_client(2) as client:
         outcome = run(spec, store=tmp_path / "s.zarr", client=client, progress=Watching())
     assert outcome.complete and outcome.blocks == 72
-    assert max(most) <= 2 * 2 + 1
+    assert max(n_outstanding) <= 2 * 2 + 1
 
 
-def test_receipts_say_what_was_done_where_and_with_what(undisturbed):
-    lines = (undisturbed / ".sweep" / "receipts.jsonl").read_text().splitlines()
+def test_receipts_say_what_was_done_where_and_with_what(serial_store):
+    lines = (serial_store / ".sweep" / "receipts.jsonl").read_text().splitlines()
     for record in map(json.loads, lines):
         assert record["points"] == 6
         assert 0 < record["write_seconds"] < record["seconds"]

@@ -18,7 +18,7 @@ WITHIN = {"range": "1 km", "grazing_angle": "90 deg", "radial_velocity": "0 m/s"
           "reflectance": 0.1}  # fmt: skip
 
 
-def told(spec):
+def warnings_of(spec):
     return list(echo_warnings(make_study(spec, Path("nowhere.zarr").absolute())))
 
 
@@ -35,14 +35,14 @@ def record(**processing):
     }
 
 
-def test_records_that_hold_all_of_their_echoes_are_not_told_of():
-    assert told(along("1 km", "2 km", instrument=record(acquisition_delay="14 us"))) == []
-    assert told(along("1 m", "100 m")) == []
+def test_records_that_hold_all_of_their_echoes_raise_no_warning():
+    assert warnings_of(along("1 km", "2 km", instrument=record(acquisition_delay="14 us"))) == []
+    assert warnings_of(along("1 m", "100 m")) == []
 
 
-def test_no_echo_and_half_an_echo_are_told_with_the_range_from_which_on():
+def test_no_echo_and_half_an_echo_are_reported_with_the_range_from_which_on():
     ranges = [f"{r} m" for r in (500, 1000, 2000, 3000, 4000, 4200, 5000)]
-    none, weak = told(along(*ranges))
+    none, weak = warnings_of(along(*ranges))
     assert none.startswith("no echo arrives") and "28.6 % of the points" in none
     assert "from 4,200 m on" in none and "nothing is detected" in none
     # Hamming's window of 4,093 m has lost 3 dB of its sum where 0.29 of its power is missing
@@ -50,25 +50,25 @@ def test_no_echo_and_half_an_echo_are_told_with_the_range_from_which_on():
     assert "processing.acquisition_delay" in weak
 
 
-def test_nothing_is_told_of_overlap_where_it_is_off():
-    assert told(along("1 km", "5 km", effects={"overlap": "off"})) == []
+def test_no_overlap_warning_where_overlap_is_off():
+    assert warnings_of(along("1 km", "5 km", effects={"overlap": "off"})) == []
 
 
-def test_axes_that_change_no_echo_do_not_change_what_is_told():
+def test_axes_that_change_no_echo_do_not_change_the_warnings():
     ranges, wide = ["1 km", "5 km"], {"linear": ["1 W", "5 W"], "number": 5000}
-    one = told(along(*ranges))
+    one = warnings_of(along(*ranges))
     axes = {"target.range": ranges, "instrument.laser.power": wide}
-    assert told(small_spec(target=WITHIN, axes=axes)) == one
+    assert warnings_of(small_spec(target=WITHIN, axes=axes)) == one
 
 
 @pytest.mark.parametrize("kind", ["real", "complex"])
-def test_beats_that_fold_are_told_with_the_range_from_which_on(kind):
+def test_beats_that_fold_are_reported_with_the_range_from_which_on(kind):
     """1 GHz in 500 us are 13.34 kHz a metre: 300 MHz, half the sample rate, at 22.48 km."""
     instrument = record(fft_size="2^17", acquisition_delay="0 us")
     instrument["receiver"] = instrument["receiver"] | {"record": kind}
     ranges = [f"{km} km" for km in range(1, 61)]
-    off = {"effects": {"overlap": "off"}, "instrument": instrument}
-    (wrong,) = told(along(*ranges, **off))
+    switched_off = {"effects": {"overlap": "off"}, "instrument": instrument}
+    (wrong,) = warnings_of(along(*ranges, **switched_off))
     assert "read as another range or velocity" in wrong
     assert "from 23,000 m on" in wrong
 
@@ -79,9 +79,9 @@ def test_points_that_fold_are_flagged_in_the_store(tmp_path):
         effects={"overlap": "off"},
     )  # fmt: skip
     assert run_serially(spec, tmp_path / "far.zarr").complete
-    found = sweep.open(tmp_path / "far.zarr")
-    assert found.misread.values.tolist() == [0, 0, 1, 1]
-    assert (np.abs(found.range_error.values[2:]) > 1e3).all()
+    dataset = sweep.open(tmp_path / "far.zarr")
+    assert dataset.misread.values.tolist() == [0, 0, 1, 1]
+    assert (np.abs(dataset.range_error.values[2:]) > 1e3).all()
 
 
 def test_plan_and_run_warn_in_the_same_words(tmp_path, monkeypatch):
@@ -125,47 +125,47 @@ def hover(height, **processing):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("height, seen", [("290 m", True), ("1400 m", False)])
-def test_a_flight_sees_nothing_where_echoes_arrive_after_the_record(tmp_path, height, seen):
+@pytest.mark.parametrize("height, is_seen", [("290 m", True), ("1400 m", False)])
+def test_a_flight_sees_nothing_where_echoes_arrive_after_the_record(tmp_path, height, is_seen):
     """Records last from 2 us to 8.83 us: 1,323 m."""
     spec = hover(height)
-    words = told(spec)
-    assert bool(words) != seen
-    if not seen:
+    words = warnings_of(spec)
+    assert bool(words) != is_seen
+    if not is_seen:
         assert "100 % of the shots, at all ranges" in words[0]
     assert run_serially(spec, tmp_path / "hover.zarr").complete
-    found = sweep.open_scene(tmp_path / "hover.zarr")["down"].to_dataset()
-    assert bool((found.pd_shot.fillna(0) > 0.5).all()) == seen
-    assert bool((found.flags.values & FLAG_BITS["true"] > 0).any()) == seen
-    if not seen:
-        assert (found.pd_up.fillna(0) == 0).all() and (found.snr_up.fillna(0) == 0).all()
-        assert not (found.flags.values & FLAG_BITS["misread"]).any()
-        assert (found.surfaces_seen == 0).all()
+    dataset = sweep.open_scene(tmp_path / "hover.zarr")["down"].to_dataset()
+    assert bool((dataset.pd_shot.fillna(0) > 0.5).all()) == is_seen
+    assert bool((dataset.flags.values & FLAG_BITS["true"] > 0).any()) == is_seen
+    if not is_seen:
+        assert (dataset.pd_up.fillna(0) == 0).all() and (dataset.snr_up.fillna(0) == 0).all()
+        assert not (dataset.flags.values & FLAG_BITS["misread"]).any()
+        assert (dataset.surfaces_seen == 0).all()
 
 
-def test_a_flight_in_which_beats_fold_is_told_of_and_flags_its_points(tmp_path):
+def test_a_flight_in_which_beats_fold_is_warned_of_and_flags_its_points(tmp_path):
     """40 MHz in 20 us, 2 THz/s: a beat of 3 MHz, half the sample rate, is 225 m."""
     spec = hover("400 m", sample_rate="6 MHz", fft_size="2^6", acquisition_delay="3 us", tnr=5)
-    words = told(spec)
+    words = warnings_of(spec)
     assert any("read as another range or velocity at 100 % of the shots" in w for w in words)
     assert run_serially(spec, tmp_path / "fold.zarr").complete
-    found = sweep.open_scene(tmp_path / "fold.zarr")["down"].to_dataset()
-    flags = found.flags.values
+    dataset = sweep.open_scene(tmp_path / "fold.zarr")["down"].to_dataset()
+    flags = dataset.flags.values
     assert (flags & FLAG_BITS["misread"]).any() and not (flags & FLAG_BITS["true"]).any()
 
 
-def test_a_phase_that_walks_far_within_a_delay_is_told_but_of_drawn_spectra():
+def test_a_phase_that_walks_far_within_a_delay_is_warned_of_except_for_drawn_spectra():
     laser = {"line_width": "30 kHz", "line_shape": "lorentzian"}
     noisy = {**STUDY_MAPPING["instrument"], "laser": STUDY_MAPPING["instrument"]["laser"] | laser}
     ranges = [f"{r} m" for r in (100, 400, 700, 1000)]
-    (words,) = told(along(*ranges, instrument=noisy))
+    (words,) = warnings_of(along(*ranges, instrument=noisy))
     assert "the laser's phase walks" in words and "50 % of the points, from 700 m on" in words
     assert "draws.method: spectra" in words
     narrow = {**noisy, "laser": noisy["laser"] | {"line_width": "1 kHz"}}
-    assert told(along(*ranges, instrument=narrow)) == []
-    assert told(along(*ranges, instrument=noisy, effects={"line_width": "off"})) == []
-    drawn = {"number": 100, "method": "spectra"}
-    assert told(along(*ranges, instrument=noisy, draws=drawn)) == []
+    assert warnings_of(along(*ranges, instrument=narrow)) == []
+    assert warnings_of(along(*ranges, instrument=noisy, effects={"line_width": "off"})) == []
+    draws_section = {"number": 100, "method": "spectra"}
+    assert warnings_of(along(*ranges, instrument=noisy, draws=draws_section)) == []
 
 
 # Pairs that no Doppler beat confirms
@@ -189,7 +189,7 @@ def flown(heights, speeds, record_kind="real", **processing):
 
 
 def exchanged(spec):
-    return [words for words in told(spec) if "exchanged" in words]
+    return [words for words in warnings_of(spec) if "exchanged" in words]
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def exchanged(spec):
         (("1500 m", "1000 m"), ("40 m/s", "3 m/s"), "fast", None, None),
     ],
 )
-def test_a_flight_is_told_where_its_pairs_are_read_wrong(heights, speeds, set_to, share, remedy):
+def test_a_flight_is_warned_where_its_pairs_are_read_wrong(heights, speeds, set_to, share, remedy):
     words = exchanged(flown(heights, speeds, two_beats=set_to))
     assert len(words) == (share is not None)
     if share:
@@ -215,7 +215,7 @@ def test_a_flight_is_told_where_its_pairs_are_read_wrong(heights, speeds, set_to
     [(("40 m/s", "3 m/s"), "write processing.two_beats: fast, which is wrong at"),
      (("20 m/s", "3 m/s"), "fast would be wrong at more of the shots")],
 )  # fmt: skip
-def test_a_flight_fast_in_part_is_told_the_assumption_that_is_right_more_often(speeds, remedy):
+def test_a_flight_fast_in_part_gets_the_assumption_that_is_right_more_often(speeds, remedy):
     (words,) = exchanged(flown(("1500 m", "1000 m"), speeds))
     assert remedy in words and "the Doppler shift exceeds the beat of the range at" in words
 
@@ -228,7 +228,7 @@ def test_a_flight_fast_in_part_is_told_the_assumption_that_is_right_more_often(s
         ({"shot_detection": "any_two", "two_beats": "fast"}, 0),
     ],
 )
-def test_a_grid_is_told_where_two_beats_decide(changes, number):
+def test_a_grid_is_warned_where_two_beats_decide(changes, number):
     fast = WITHIN | {"radial_velocity": "60 m/s"}
     spec = small_spec(
         target=fast, instrument=record(acquisition_delay="7 us", **changes),
@@ -240,11 +240,11 @@ def test_a_grid_is_told_where_two_beats_decide(changes, number):
         assert "at 100 % of the points, at all ranges" in words[0]
 
 
-def test_two_chirps_without_a_doppler_segment_are_told_the_same_remedy():
+def test_two_chirps_without_a_doppler_segment_get_the_same_remedy():
     chirp = STUDY_MAPPING["instrument"]["chirp"] | {"segments": "up down"}
     instrument = record(acquisition_delay="7 us") | {"chirp": chirp}
     fast = WITHIN | {"radial_velocity": "60 m/s"}
-    words = told(
+    words = warnings_of(
         small_spec(target=fast, instrument=instrument, axes={"target.range": ["1 km", "9 km"]})
     )
     assert ["two_beats: fast" in text for text in words if "misread" in text] == [True]
@@ -285,15 +285,19 @@ def sliding(target, draws=None, **processing):
     """What is told of an instrument with a beam of 5 mrad that slides over the ground."""
     instrument = record(fft_size="2^13", acquisition_delay="3 us", **processing)
     instrument["laser"] = instrument["laser"] | {"beam_divergence": "2 mrad"}
-    given = {} if draws is None else {"draws": {"method": draws, "number": 8}}
+    draws_section = {} if draws is None else {"draws": {"method": draws, "number": 8}}
     footprint = {"speckle": "developed", "phases": "incoherent"}
     spec = small_spec(
-        target=SLIDING | target, axes={}, instrument=instrument, footprint=footprint, **given
+        target=SLIDING | target,
+        axes={},
+        instrument=instrument,
+        footprint=footprint,
+        **draws_section,
     )
-    return [sentence for sentence in told(spec) if ACROSS in sentence]
+    return [sentence for sentence in warnings_of(spec) if ACROSS in sentence]
 
 
-def test_speckle_that_spreads_over_bins_across_dc_is_told_of():
+def test_speckle_that_spreads_over_bins_across_dc_is_warned_of():
     """60 m/s across half a mrad are 3 cm/s, 40 kHz, and a bin has 73 kHz: the Doppler segment's."""
     (sentence,) = sliding({}, detection="any_bin")
     assert "at 100 % of the points" in sentence and "0.06 too high" in sentence
@@ -309,5 +313,5 @@ def test_speckle_that_spreads_over_bins_across_dc_is_told_of():
         ({}, None, {"detection": "peak_bin"}),
     ],
 )
-def test_other_echoes_near_dc_are_not_told_of(target, draws, processing):
+def test_other_echoes_near_dc_raise_no_warning(target, draws, processing):
     assert sliding(target, draws, **processing) == []

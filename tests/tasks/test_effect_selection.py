@@ -39,14 +39,14 @@ WIDE = {
 FORCED = {effect.name: "on" for effect in EFFECTS if not effect.is_random}
 
 
-def whole(spec):
+def study_arrays(spec):
     """Arrays of a study that have one value a point, over its whole grid, by name."""
     study, out = GridStudy(spec), {}
     for block in range(study.n_blocks):
-        here = study.grid.block_slices(block)
+        slices = study.grid.block_slices(block)
         for name, values in study.evaluate(block).items():
             if values.ndim == len(study.grid.shape):
-                out.setdefault(name, np.empty(study.grid.shape, values.dtype))[here] = values
+                out.setdefault(name, np.empty(study.grid.shape, values.dtype))[slices] = values
     return out
 
 
@@ -74,17 +74,17 @@ def test_every_point_lies_in_one_tile_that_has_its_parameters():
         numbers, place = tiles.tiles_of_block(block)
         points = grid.parameters_of_block(block)
         assert place.size == grid.count_block_points(block)
-        for alike in tiles.group_tiles(numbers):
-            within = np.flatnonzero(np.isin(place, alike.requested_indices))
-            window = alike.parameters["instrument.processing.window"]
+        for group in tiles.group_tiles(numbers):
+            within = np.flatnonzero(np.isin(place, group.requested_indices))
+            window = group.parameters["instrument.processing.window"]
             assert set(points["instrument.processing.window"][within]) == {window}
-            for tile, own in enumerate(alike.requested_indices):
-                here = within[place[within] == own]
+            for tile, requested in enumerate(group.requested_indices):
+                own_points = within[place[within] == requested]
                 for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
                     values = np.broadcast_to(
-                        alike.parameters[path], (len(alike.requested_indices), *tiles.block_shape)
+                        group.parameters[path], (len(group.requested_indices), *tiles.block_shape)
                     )
-                    assert np.isin(points[path][here], values[tile]).all()
+                    assert np.isin(points[path][own_points], values[tile]).all()
 
 
 def test_few_points_tell_what_all_of_a_tile_call_for():
@@ -96,13 +96,13 @@ def test_few_points_tell_what_all_of_a_tile_call_for():
     )
     selection = EffectPlanner(spec, ParameterBlockGrid(spec))
     tiles = np.arange(selection.tiles.n_blocks)
-    kept = np.zeros((len(EFFECT_NAMES), tiles.size), bool)
+    is_kept = np.zeros((len(EFFECT_NAMES), tiles.size), bool)
     for chosen, plan in selection.iter_tile_plans(tiles):
-        kept[:, chosen] = plan.is_kept
-    for alike in selection.tiles.group_tiles(tiles):
-        whole = selection._plan_group(alike)
-        assert (kept[:, alike.requested_indices] == whole.is_kept).all()
-    assert not kept.all(axis=1)[kept.any(axis=1)].all()
+        is_kept[:, chosen] = plan.is_kept
+    for group in selection.tiles.group_tiles(tiles):
+        full_plan = selection._plan_group(group)
+        assert (is_kept[:, group.requested_indices] == full_plan.is_kept).all()
+    assert not is_kept.all(axis=1)[is_kept.any(axis=1)].all()
 
 
 def test_few_points_of_a_tile_hold_the_largest_of_each_parameter():
@@ -110,28 +110,35 @@ def test_few_points_of_a_tile_hold_the_largest_of_each_parameter():
     spec = small_spec(axes={**WIDE, "target.radial_velocity": velocities})
     tiles = TileGrid(ParameterBlockGrid(spec))
     (few,) = tiles.group_tiles(np.arange(tiles.n_blocks), 4)
-    found = few.parameters["target.radial_velocity"]
-    assert found.max() == 70 and found.size < len(few.requested_indices) * tiles.block_shape[-1]
+    tile_velocities = few.parameters["target.radial_velocity"]
+    assert (
+        tile_velocities.max() == 70
+        and tile_velocities.size < len(few.requested_indices) * tiles.block_shape[-1]
+    )
 
 
 def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_apart():
     bit = {name: np.uint32(1 << k) for k, name in enumerate(EFFECT_NAMES)}
     base, image, noise = bit["footprint"] | bit["doppler"], bit["image"], bit["signal_shot_noise"]
     flags = np.array([base, base | noise, base | image, base, base | image | noise], np.uint32)
-    found = {
+    effects_by_group = {
         tuple(index): names
-        for index, names, own in SelectedEffects(flags, flags * 0.0).iter_groups_computed_together()
+        for index, names, flags_of_group in SelectedEffects(
+            flags, flags * 0.0
+        ).iter_groups_computed_together()
     }
-    plain = ("footprint", "doppler", "signal_shot_noise")
-    assert found == {(0, 1, 3): plain, (2, 4): (*plain, "image")}
-    for index, _, own in SelectedEffects(flags, flags * 0.0).iter_groups_computed_together():
-        np.testing.assert_array_equal(own, flags[index])
+    group_effects = ("footprint", "doppler", "signal_shot_noise")
+    assert effects_by_group == {(0, 1, 3): group_effects, (2, 4): (*group_effects, "image")}
+    for index, _, flags_of_group in SelectedEffects(
+        flags, flags * 0.0
+    ).iter_groups_computed_together():
+        np.testing.assert_array_equal(flags_of_group, flags[index])
 
 
 def test_flags_and_names_are_each_other():
-    kept = np.zeros((len(EFFECT_NAMES), 3), bool)
-    kept[[0, 3], 0] = kept[-1, 1] = True
-    flags = pack_effect_flags(kept)
+    is_kept = np.zeros((len(EFFECT_NAMES), 3), bool)
+    is_kept[[0, 3], 0] = is_kept[-1, 1] = True
+    flags = pack_effect_flags(is_kept)
     assert unpack_effect_flags(int(flags[0])) == (EFFECT_NAMES[0], EFFECT_NAMES[3])
     assert unpack_effect_flags(int(flags[1])) == (EFFECT_NAMES[-1],)
     assert unpack_effect_flags(int(flags[2])) == ()
@@ -142,7 +149,9 @@ def test_flags_and_names_are_each_other():
 
 def test_what_is_simulated_does_not_depend_on_blocks():
     """Bit for bit: plans are those of tiles, and a point's result depends on its effects alone."""
-    few, many = (whole(small_spec(axes=WIDE, storage={"block_points": n})) for n in (333, 65536))
+    few, many = (
+        study_arrays(small_spec(axes=WIDE, storage={"block_points": n})) for n in (333, 65536)
+    )
     for name in ("effects", "effects_error", "pd_up", "pd_shot", "p_leakage_up", "snr_down"):
         assert few[name].tobytes() == many[name].tobytes(), name
 
@@ -181,7 +190,7 @@ def test_less_is_simulated_the_larger_the_tolerance():
 
 
 def test_an_effect_is_simulated_everywhere_or_nowhere_if_the_spec_says_so():
-    flags = whole(small_spec(effects={"leakage": "on", "image": "off"}))["effects"]
+    flags = study_arrays(small_spec(effects={"leakage": "on", "image": "off"}))["effects"]
     assert (flags >> EFFECT_NAMES.index("leakage") & 1).all()
     assert not (flags >> EFFECT_NAMES.index("image") & 1).any()
 
@@ -201,7 +210,7 @@ def test_a_plan_is_made_once_for_a_tile(monkeypatch):
 def test_some_points_of_a_block_have_the_effects_that_they_have_among_all(monkeypatch):
     """And only their tiles are planned: all those of a block of 10^6 points took a minute."""
     spec = small_spec(axes=WIDE, storage={})
-    whole, selection, planned = (
+    planner, selection, planned = (
         EffectPlanner(spec, ParameterBlockGrid(spec)),
         EffectPlanner(spec, ParameterBlockGrid(spec)),
         [],
@@ -211,9 +220,12 @@ def test_some_points_of_a_block_have_the_effects_that_they_have_among_all(monkey
         selection, "iter_tile_plans", lambda tiles: planned.extend(tiles) or plans(tiles)
     )
     points = np.array([7, 0, 2000, 7, 4199])
-    found, among = selection.select_for_block(0, points), whole.select_for_block(0).subset(points)
-    np.testing.assert_array_equal(found.effect_flags, among.effect_flags)
-    np.testing.assert_array_equal(found.error_bound, among.error_bound)
+    selected, among = (
+        selection.select_for_block(0, points),
+        planner.select_for_block(0).subset(points),
+    )
+    np.testing.assert_array_equal(selected.effect_flags, among.effect_flags)
+    np.testing.assert_array_equal(selected.error_bound, among.error_bound)
     assert 0 < len(planned) <= 4 < selection.tiles.n_blocks
 
 
@@ -238,18 +250,18 @@ def test_a_plan_plans_the_effects_of_few_points_of_a_large_block(monkeypatch):
     assert max(looked) < 1000
 
 
-def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
+def test_a_smooth_target_has_no_speckle_whatever_targets_are_next_to_it():
     """Its beamlets add as powers; rough ones' at random."""
     axes = {"target.roughness": ["0 um", "10 um"], "target.range": ["1 km", "6 km"]}
     footprint = {"beamlets": 7, "phases": "incoherent", "speckle": "none"}
     draws = {"number": 50, "batch": 50}
     same = {"footprint": footprint, "draws": draws}
-    beside = whole(small_spec(axes=axes, **same))
-    alone = whole(small_spec(axes=axes | {"target.roughness": ["0 um"]}, **same))
+    values = study_arrays(small_spec(axes=axes, **same))
+    smooth_arrays = study_arrays(small_spec(axes=axes | {"target.roughness": ["0 um"]}, **same))
     bit = np.uint32(1 << EFFECT_NAMES.index("speckle"))
-    assert (beside["effects"] & bit > 0).tolist() == [[False] * 2, [True] * 2]
-    np.testing.assert_allclose(beside["pd_shot"][0], alone["pd_shot"][0], atol=1e-3, rtol=0)
-    assert (beside["pd_shot_error"][0] == 0).all() and (beside["pd_shot_error"][1] > 0).any()
+    assert (values["effects"] & bit > 0).tolist() == [[False] * 2, [True] * 2]
+    np.testing.assert_allclose(values["pd_shot"][0], smooth_arrays["pd_shot"][0], atol=1e-3, rtol=0)
+    assert (values["pd_shot_error"][0] == 0).all() and (values["pd_shot_error"][1] > 0).any()
 
 
 HALF_ROUGH = {"target.roughness": ["0 um", "10 um"], "target.range": ["1 km", "6 km"]}
@@ -281,5 +293,5 @@ def test_a_plan_measures_few_points_where_each_takes_long(monkeypatch):
     monkeypatch.setattr(planned, "evaluate_points", evaluated)
     monkeypatch.setattr(planned, "time", clock)
     assert planned.measure_seconds_per_point(study) == pytest.approx(0.1)
-    kept = [row for row in effects_table(study).rows if row.simulated_fraction > 0]
-    assert len(kept) > 5 and clock.now < 5 + 2 * len(kept)
+    kept_rows = [row for row in effects_table(study).rows if row.simulated_fraction > 0]
+    assert len(kept_rows) > 5 and clock.now < 5 + 2 * len(kept_rows)

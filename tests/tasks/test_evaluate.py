@@ -47,8 +47,8 @@ def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
     random = together["pd_up_error"] > 0
     assert random.any() if effects == RANDOM else not random.any()
     for i in range(count):
-        alone = evaluate_points(spec, select_parameters(parameters, np.array([i])), 1, effects)
-        for name, values in alone.items():
+        single = evaluate_points(spec, select_parameters(parameters, np.array([i])), 1, effects)
+        for name, values in single.items():
             in_batches = name in DRAW_COUNT_OUTPUTS and "number" in much
             assert values.shape == (1, *((2,) if in_batches else sums.get(name, ())))
             np.testing.assert_array_equal(values[0], together[name][i], err_msg=name)
@@ -68,24 +68,26 @@ def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
     widths = ["0 Hz", "1 kHz", "1 THz", "2 kHz", "2 THz"]
     every = ("line_width", "range_walk", "image", "leakage", "footprint", "doppler_spread")
     modes = dict.fromkeys(every, "on")  # whatever is beside a point
-    given = {"draws": draws, "effects": modes, "axes": {"instrument.laser.line_width": widths}}
-    outcome = run_serially(small_spec(**given), tmp_path / "some.zarr")
+    sections = {"draws": draws, "effects": modes, "axes": {"instrument.laser.line_width": widths}}
+    outcome = run_serially(small_spec(**sections), tmp_path / "some.zarr")
     assert outcome.complete and not outcome.failures
-    kept = given | {"axes": {"instrument.laser.line_width": [widths[k] for k in (0, 1, 3)]}}
-    part = xr.open_zarr(run_serially(small_spec(**kept), tmp_path / "part.zarr").store)
-    whole = xr.open_zarr(outcome.store)
+    reduced_sections = sections | {
+        "axes": {"instrument.laser.line_width": [widths[k] for k in (0, 1, 3)]}
+    }
+    part = xr.open_zarr(run_serially(small_spec(**reduced_sections), tmp_path / "part.zarr").store)
+    dataset = xr.open_zarr(outcome.store)
     for name in part.data_vars:
-        found, there = whole[name].values, part[name].values
+        all_values, part_values = dataset[name].values, part[name].values
         if name != "effects_error":
-            np.testing.assert_array_equal(found[[0, 1, 3]], there, name)
+            np.testing.assert_array_equal(all_values[[0, 1, 3]], part_values, name)
         if not name.startswith("effects"):
-            lost = found[[2, 4]]
+            lost = all_values[[2, 4]]
             assert (np.isnan(lost) if lost.dtype.kind == "f" else lost == -1).all(), name
-    number, why = count_unsupported_points(outcome.store)
-    assert number == 2 and "instrument.laser.line_width" in why and "can be simulated" in why
+    number, reason = count_unsupported_points(outcome.store)
+    assert number == 2 and "instrument.laser.line_width" in reason and "can be simulated" in reason
     assert count_unsupported_points(tmp_path / "part.zarr") == (0, "")
-    told = CliRunner().invoke(main, ["status", str(outcome.store)])
-    assert told.exit_code == 0 and why in told.stderr
+    result = CliRunner().invoke(main, ["status", str(outcome.store)])
+    assert result.exit_code == 0 and reason in result.stderr
 
 
 def test_a_block_beyond_the_model_is_committed_without_results(tmp_path):

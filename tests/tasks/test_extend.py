@@ -64,11 +64,11 @@ RUN: dict[str, dict[str, str]] = {}
 
 def at_once(spec, tmp_path):
     """Files of a study that is run at once, each study once."""
-    written = repr(spec.to_yaml_mapping())
-    if written not in RUN:
-        RUN[written] = file_digests(run_serially(spec, tmp_path / "at_once.zarr").store)
+    text = repr(spec.to_yaml_mapping())
+    if text not in RUN:
+        RUN[text] = file_digests(run_serially(spec, tmp_path / "at_once.zarr").store)
         shutil.rmtree(tmp_path / "at_once.zarr")
-    return RUN[written]
+    return RUN[text]
 
 
 MORE = {
@@ -92,10 +92,10 @@ APPENDED, NEW_AXIS = ({**AXES, POWER: ["1 W", "3 W", "5 W"]}, {**AXES, REFLECTAN
 
 @pytest.mark.parametrize("name", parametrize_product(3, MORE))
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
-    undisturbed, tmp_path, computed, name
+    serial_store, tmp_path, computed, name
 ):
     axes, new = MORE[name]
-    store, spec = copy_store(undisturbed, tmp_path), small_spec(axes=axes)
+    store, spec = copy_store(serial_store, tmp_path), small_spec(axes=axes)
     outcome = larger(store, spec)
     assert outcome.complete and outcome.store == store and sum(computed) == new
     assert not [file.name for file in tmp_path.iterdir() if file.name != store.name]
@@ -112,19 +112,19 @@ def studies(draw):
     """Axes of a study and of a larger one, and points of a block of each."""
     paths = {POWER: "W", RANGE: "km", "target.radial_velocity": "m/s", REFLECTANCE: ""}
     names = draw(st.permutations(list(paths)))
-    ours = draw(st.integers(0, 3))
-    older = {path: draw(few) for path in names[:ours]}
-    wanted = {}
-    for path in draw(st.permutations(names[: draw(st.integers(ours, 4))])):
-        kept = older.get(path, [FIXED[path]])
-        more = [value for value in draw(few) if value not in kept]
-        wanted[path] = draw(st.permutations(kept + more))
+    n_changes = draw(st.integers(0, 3))
+    older = {path: draw(few) for path in names[:n_changes]}
+    larger_axes = {}
+    for path in draw(st.permutations(names[: draw(st.integers(n_changes, 4))])):
+        old_values = older.get(path, [FIXED[path]])
+        new_values = [value for value in draw(few) if value not in old_values]
+        larger_axes[path] = draw(st.permutations(old_values + new_values))
 
-    def written(axes):
+    def axis_text(axes):
         return {p: [f"{v} {paths[p]}".strip() for v in values] for p, values in axes.items()}
 
     blocks = st.integers(1, 40)
-    return (written(older), draw(blocks)), (written(wanted), draw(blocks))
+    return (axis_text(older), draw(blocks)), (axis_text(larger_axes), draw(blocks))
 
 
 FIXED = {POWER: 1.0, RANGE: 2.0, "target.radial_velocity": 3.0, REFLECTANCE: 0.5}
@@ -141,13 +141,13 @@ def of(axes, block_points, **changes):
     return small_spec(axes=axes, target=target, storage={"block_points": block_points}, **changes)
 
 
-def see_that_it_extends(here, pair):
+def see_that_it_extends(directory, pair):
     """The one study is extended to the other, to the bytes of the other run at once."""
-    older, spec = (of(*each) for each in pair)
-    store = run_serially(older, here / "store.zarr").store
+    older, spec = (of(*result) for result in pair)
+    store = run_serially(older, directory / "store.zarr").store
     assert larger(store, spec).complete
-    assert file_digests(store) == at_once(spec, here)
-    shutil.rmtree(here)
+    assert file_digests(store) == at_once(spec, directory)
+    shutil.rmtree(directory)
 
 
 @settings(max_examples=4, deadline=None)
@@ -175,7 +175,7 @@ ON_DEMAND = {
 }
 
 
-def test_points_whose_effects_are_others_in_the_larger_grid_are_computed_anew(tmp_path, computed):
+def test_points_whose_effects_are_others_in_the_larger_grid_are_computed_again(tmp_path, computed):
     store = run_serially(small_spec(**ON_DEMAND), tmp_path / "store.zarr").store
     axes = {**ON_DEMAND["axes"], ANGLE: {"linear": ["2 deg", "178/2 deg"], "number": 30}}
     axes[RANGE] = {"linear": ["100 m", "17.9 km"], "number": 79}
@@ -198,7 +198,7 @@ CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
 
 
 @pytest.fixture
-def drawn(monkeypatch, computed):
+def draw_calls(monkeypatch, computed):
     """Draws that the model takes, call by call."""
     calls: list[int] = []
     real = samplers.Sampler.draw
@@ -232,25 +232,25 @@ MORE_DRAWS = {
 
 
 @pytest.mark.parametrize(
-    "drawn_as, more",
+    "drawn_as, case_name",
     parametrize_product(4, [("probabilities", ROUGH), ("noise", {}), ("noise", ROUGH)], MORE_DRAWS),
 )
-def test_more_draws_go_on_from_those_that_are_there(tmp_path, drawn, drawn_as, more):
+def test_more_draws_go_on_from_those_that_are_there(tmp_path, draw_calls, drawn_as, case_name):
     method, scene = drawn_as
-    before, after, accuracy, tighter = MORE_DRAWS[more]
+    before, after, accuracy, tighter = MORE_DRAWS[case_name]
     older = small_spec(axes=COARSE, draws=before | {"method": method}, accuracy=accuracy, **scene)
     spec = small_spec(
         axes=COARSE, draws=after | {"method": method}, accuracy=accuracy | tighter, **scene
     )
     store = run_serially(older, tmp_path / "store.zarr").store
-    there = number_of_draws(store)
-    drawn.clear()
+    n_draws = number_of_draws(store)
+    draw_calls.clear()
     assert larger(store, spec).complete
-    assert sum(drawn) == number_of_draws(store) - there
+    assert sum(draw_calls) == number_of_draws(store) - n_draws
     assert file_digests(store) == at_once(spec, tmp_path)
 
 
-def test_more_draws_and_more_values_together(tmp_path, drawn):
+def test_more_draws_and_more_values_together(tmp_path, draw_calls):
     draws = {"limit": 60, "batch": 20}
     same = {"accuracy": {"tolerance": 0.09}, "effects": dict.fromkeys(CALLED_FOR, "on")}
     store = run_serially(
@@ -261,16 +261,16 @@ def test_more_draws_and_more_values_together(tmp_path, drawn):
         draws=draws | {"limit": 100},
         **same,
     )
-    there = number_of_draws(store)
-    drawn.clear()
+    n_draws = number_of_draws(store)
+    draw_calls.clear()
     assert larger(store, spec).complete
-    assert sum(drawn) == number_of_draws(store) - there
+    assert sum(draw_calls) == number_of_draws(store) - n_draws
     assert file_digests(store) == at_once(spec, tmp_path)
 
 
 def test_an_axis_of_effects_that_are_drawn_takes_the_points_without_them(tmp_path, computed):
-    kept = dict.fromkeys(("doppler_spread", "range_walk"), "on")
-    same = {"draws": {"number": 30}, "effects": kept}
+    modes = dict.fromkeys(("doppler_spread", "range_walk"), "on")
+    same = {"draws": {"number": 30}, "effects": modes}
     store = run_serially(small_spec(axes=COARSE, **same), tmp_path / "store.zarr").store
     spec = small_spec(axes={**COARSE, "target.roughness": ["0 m", "10 um"]}, **same)
     computed.clear()
@@ -278,7 +278,7 @@ def test_an_axis_of_effects_that_are_drawn_takes_the_points_without_them(tmp_pat
     assert file_digests(store) == at_once(spec, tmp_path)
 
 
-def test_whole_spectra_are_drawn_anew_and_it_says_so(tmp_path, capsys):
+def test_whole_spectra_are_drawn_again_and_reported(tmp_path, capsys):
     changes = {
         "axes": {RANGE: ["1 km"]},
         "target": STUDY_MAPPING["target"] | {"radial_velocity": "0 m/s"},
@@ -314,8 +314,8 @@ def test_a_tighter_tolerance_computes_what_follows_from_it(tmp_path, computed, e
     assert file_digests(store) == at_once(spec, tmp_path)
 
 
-def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, undisturbed, computed):
-    store, spec = copy_store(undisturbed, tmp_path), small_spec(axes=APPENDED)
+def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, serial_store, computed):
+    store, spec = copy_store(serial_store, tmp_path), small_spec(axes=APPENDED)
     log = store / ".sweep" / "receipts.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:5]))
     assert larger(store, spec, to=store, overwrite=True).complete  # its own place, though named
@@ -326,8 +326,8 @@ def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, undist
 
 
 @pytest.mark.parametrize("name", ["pd_shot", "effects"])
-def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name):
-    store, spec = copy_store(undisturbed, tmp_path), small_spec(axes=NEW_AXIS)
+def test_a_damaged_block_is_computed_again(tmp_path, serial_store, computed, name):
+    store, spec = copy_store(serial_store, tmp_path), small_spec(axes=NEW_AXIS)
     chunk = store / name / "c" / "0" / "1" / "0"
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 4
@@ -343,8 +343,8 @@ def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name)
     assert file_digests(store) == at_once(spec, tmp_path)
 
 
-def test_in_another_place_not_a_byte_of_the_store_changes(tmp_path, undisturbed):
-    store, new = copy_store(undisturbed, tmp_path), tmp_path / "elsewhere" / "larger.zarr"
+def test_in_another_place_not_a_byte_of_the_store_changes(tmp_path, serial_store):
+    store, new = copy_store(serial_store, tmp_path), tmp_path / "elsewhere" / "larger.zarr"
     before, spec = file_contents(store), small_spec(axes=APPENDED)
     for file in [store, *store.rglob("*")]:
         file.chmod(0o555 if file.is_dir() else 0o444)
@@ -354,11 +354,11 @@ def test_in_another_place_not_a_byte_of_the_store_changes(tmp_path, undisturbed)
     assert file_digests(new) == at_once(spec, tmp_path)
 
 
-def test_the_same_study_is_nothing_to_extend(tmp_path, undisturbed, computed, capsys):
-    store = copy_store(undisturbed, tmp_path)
+def test_the_same_study_is_nothing_to_extend(tmp_path, serial_store, computed, capsys):
+    store = copy_store(serial_store, tmp_path)
     assert extend(store, small_spec(title="Again"), scheduler="none").blocks_computed == 0
     assert "nothing to extend" in capsys.readouterr().err and not computed
-    assert file_digests(store) == file_digests(undisturbed)
+    assert file_digests(store) == file_digests(serial_store)
 
 
 REFUSED = {
@@ -380,38 +380,40 @@ REFUSED = {
 }  # fmt: skip
 
 
-def see_it_refused(store, spec, *told, match="needs a store of its own"):
+def see_it_refused(store, spec, *messages, match="needs a store of its own"):
     """An extension that is refused in words, and of which nothing is left."""
     before = file_contents(store)
     with pytest.raises(StoreError, match=match) as error:
         larger(store, spec)
-    assert all(line in str(error.value) for line in told)
+    assert all(line in str(error.value) for line in messages)
     assert file_contents(store) == before and not staging_path_for(store).exists()
 
 
-@pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
-def test_what_is_no_larger_study_is_refused_field_by_field(undisturbed, changes, told):
-    see_it_refused(undisturbed, small_spec(**changes), *told)
+@pytest.mark.parametrize("changes, messages", REFUSED.values(), ids=REFUSED)
+def test_what_is_no_larger_study_is_refused_field_by_field(serial_store, changes, messages):
+    see_it_refused(serial_store, small_spec(**changes), *messages)
 
 
-def test_a_flight_is_no_larger_grid(undisturbed):
-    see_it_refused(undisturbed, small_scene_spec(), match="have nothing in common")
+def test_a_flight_is_no_larger_grid(serial_store):
+    see_it_refused(serial_store, small_scene_spec(), match="have nothing in common")
 
 
-def test_another_extension_that_was_begun_is_not_mixed_up(tmp_path, undisturbed):
-    path = copy_store(undisturbed, tmp_path)
-    begun, other = (small_spec(axes={**AXES, POWER: ["1 W", "3 W", p]}) for p in ("5 W", "7 W"))
+def test_another_extension_in_progress_is_not_mixed_up(tmp_path, serial_store):
+    path = copy_store(serial_store, tmp_path)
+    first_spec, other = (
+        small_spec(axes={**AXES, POWER: ["1 W", "3 W", p]}) for p in ("5 W", "7 W")
+    )
     assert (
         larger(
-            path, begun, evaluate=make_failing_evaluate(set(range(99)), tmp_path / "log")
+            path, first_spec, evaluate=make_failing_evaluate(set(range(99)), tmp_path / "log")
         ).blocks_done
         == 0
     )
-    told = CliRunner().invoke(main, ["status", str(path)]).output
-    assert "complete" in told and "being extended: sweep status" in told
+    output = CliRunner().invoke(main, ["status", str(path)]).output
+    assert "complete" in output and "being extended: sweep status" in output
     with pytest.raises(StoreError, match=r"\[1, 3, 5\] W -> \[1, 3, 7\] W"):
         larger(path, other)
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
     assert larger(path, other, overwrite=True).complete
     assert file_digests(path) == at_once(other, tmp_path)
 
@@ -424,14 +426,14 @@ class Interrupting(Progress):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_ctrl_c_leaves_the_store_and_both_commands_go_on(tmp_path, undisturbed, computed):
-    path, spec = copy_store(undisturbed, tmp_path), small_spec(axes=APPENDED)
+def test_ctrl_c_leaves_the_store_and_both_commands_go_on(tmp_path, serial_store, computed):
+    path, spec = copy_store(serial_store, tmp_path), small_spec(axes=APPENDED)
     for _ in range(2):
         outcome = extend(path, spec, progress=Interrupting(), scheduler="none")
         assert outcome.stop_reason == "interrupted" and outcome.store == staging_path_for(path)
-        assert file_digests(path) == file_digests(undisturbed)
-    told = CliRunner().invoke(main, ["resume", str(path), "--scheduler", "none"])
-    assert told.exit_code == 0 and f"{path}: 108 of 108 points" in told.stdout
+        assert file_digests(path) == file_digests(serial_store)
+    result = CliRunner().invoke(main, ["resume", str(path), "--scheduler", "none"])
+    assert result.exit_code == 0 and f"{path}: 108 of 108 points" in result.stdout
     assert sum(computed) == 36 and file_digests(path) == at_once(spec, tmp_path)
 
 
@@ -482,7 +484,7 @@ MOMENTS = (
 
 
 @pytest.mark.parametrize(
-    "moment, how, again",
+    "moment, command, resumes",
     [
         (MOMENTS[0], "extend", "extend"),
         pytest.param(MOMENTS[1], "extend", "resume", marks=pytest.mark.slow),
@@ -491,32 +493,32 @@ MOMENTS = (
     ],
 )
 def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
-    tmp_path, undisturbed, computed, moment, how, again
+    tmp_path, serial_store, computed, moment, command, resumes
 ):
     path, spec = (
-        copy_store(undisturbed, tmp_path),
+        copy_store(serial_store, tmp_path),
         small_spec(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]}),
     )
     larger_tree = at_once(spec, tmp_path)
-    here = str(Path(__file__).parent)
+    test_directory = str(Path(__file__).parent)
     ended = subprocess.run(
-        [sys.executable, "-c", CLIENT, here, str(path), moment, how], check=False
+        [sys.executable, "-c", CLIENT, test_directory, str(path), moment, command], check=False
     )
     assert ended.returncode == -signal.SIGKILL
     grid = GridStudy(spec).grid
-    there = status(path)  # the next command
-    assert there.complete and file_digests(path) in (file_digests(undisturbed), larger_tree)
+    run_status = status(path)  # the next command
+    assert run_status.complete and file_digests(path) in (file_digests(serial_store), larger_tree)
     computed.clear()
-    if again == "extend":
+    if resumes == "extend":
         assert larger(path, spec).complete
     else:
         assert resume(path, progress=False, scheduler="none").complete
     assert file_digests(path) == larger_tree
     assert list(tmp_path.iterdir()) == [path]
-    taken = 72 if how == "extend" else 0
-    done = (
-        sum(map(grid.count_block_points, range(3))) * (1 - taken / 108)
+    n_reused = 72 if command == "extend" else 0
+    n_points = (
+        sum(map(grid.count_block_points, range(3))) * (1 - n_reused / 108)
         if moment == "three blocks"
-        else 108 - taken
+        else 108 - n_reused
     )
-    assert sum(computed) == 108 - taken - done
+    assert sum(computed) == 108 - n_reused - n_points

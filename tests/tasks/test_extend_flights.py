@@ -53,7 +53,7 @@ def flown(tmp_path_factory):
 
 
 @pytest.fixture
-def here(flown, tmp_path):
+def working_directory(flown, tmp_path):
     """A copy of the store, beside it its eyepoints."""
     shutil.copytree(flown.parent, tmp_path, dirs_exist_ok=True)
     return tmp_path / flown.name
@@ -71,16 +71,16 @@ def computed(monkeypatch):
     """What is computed from here on, but for what compiles the model."""
     count, cloud, solve = Computed(), point_cloud.simulate_cloud, navigation.solve_navigation
 
-    def drawn(eyepoints, *, draws, **rest):
+    def draw_shots(eyepoints, *, draws, **rest):
         count.shots += len(eyepoints.time) * draws
         return cloud(eyepoints, draws=draws, **rest)
 
     def solved(shots, points, **rest):
-        found = solve(shots, points, **rest)
-        count.cycles += found["altitude"].size
-        return found
+        solution = solve(shots, points, **rest)
+        count.cycles += solution["altitude"].size
+        return solution
 
-    monkeypatch.setattr(point_cloud, "simulate_cloud", drawn)
+    monkeypatch.setattr(point_cloud, "simulate_cloud", draw_shots)
     monkeypatch.setattr(navigation, "solve_navigation", solved)
     monkeypatch.setattr(FlightStudy, "compile_kernels", lambda self: None)
     return count
@@ -128,28 +128,31 @@ MORE = {
         for name, case in MORE.items()
     ],
 )
-def test_it_ends_as_the_larger_study_run_at_once(here, computed, changes, new):
+def test_it_ends_as_the_larger_study_run_at_once(working_directory, computed, changes, new):
     spec = flight(**changes)
-    outcome = larger(here, spec)
-    assert outcome.complete and outcome.store == here
+    outcome = larger(working_directory, spec)
+    assert outcome.complete and outcome.store == working_directory
     assert outcome.rays_by_scanner == {"three": 0, "line": 0}
     assert computed.shots == outcome.points_computed == SHOTS * new
     assert computed.cycles == CYCLES * new
-    assert sorted(file.name for file in here.parent.iterdir()) == ["eyepoints", here.name]
-    assert file_digests(here) == at_once(spec, here)
+    assert sorted(file.name for file in working_directory.parent.iterdir()) == [
+        "eyepoints",
+        working_directory.name,
+    ]
+    assert file_digests(working_directory) == at_once(spec, working_directory)
 
 
-def test_an_axis_may_come_where_there_was_none(here, computed):
-    one = run_serially(flight(axes={}), here.with_name("one.zarr")).store
+def test_an_axis_may_come_where_there_was_none(working_directory, computed):
+    one = run_serially(flight(axes={}), working_directory.with_name("one.zarr")).store
     computed.shots = 0
     assert larger(one, flight()).complete and computed.shots == SHOTS * 3
-    assert file_digests(one) == file_digests(here)
+    assert file_digests(one) == file_digests(working_directory)
 
 
-def test_a_scanner_may_come_and_nothing_of_the_others_is_computed(here, computed):
+def test_a_scanner_may_come_and_nothing_of_the_others_is_computed(working_directory, computed):
     cone = SCENE_MAPPING["scanners"]["three"] | {"beams": 4, "rate": "2 Hz"}
     spec = flight(scanners={"four": cone, **SMALLER["scanners"]})
-    outcome = larger(here, spec)
+    outcome = larger(working_directory, spec)
     assert outcome.complete and computed.shots == shots_of(spec, "four") * 3 * 2
     assert (
         outcome.rays_by_scanner["four"]
@@ -157,30 +160,34 @@ def test_a_scanner_may_come_and_nothing_of_the_others_is_computed(here, computed
         == outcome.rays_by_scanner["three"]
         == outcome.rays_by_scanner["line"]
     )
-    assert file_digests(here) == at_once(spec, here)
+    assert file_digests(working_directory) == at_once(spec, working_directory)
 
 
 def test_by_workers_in_another_place_and_not_a_byte_of_the_store_changes(
-    here, computed, drawn_more
+    working_directory, computed, drawn_more
 ):
-    before, new = file_contents(here), here.with_name("larger.zarr")
+    before, new = file_contents(working_directory), working_directory.with_name("larger.zarr")
     spec = flight(draws=MORE_DRAWS)
-    outcome = extend(here, spec, to=new, workers=2, processes=False, progress=False)
+    outcome = extend(working_directory, spec, to=new, workers=2, processes=False, progress=False)
     assert outcome.complete and outcome.store == new and computed.shots == SHOTS * 6
-    assert file_contents(here) == before and file_digests(new) == drawn_more
+    assert file_contents(working_directory) == before and file_digests(new) == drawn_more
 
 
-def test_as_it_is_typed(here, monkeypatch):
-    monkeypatch.chdir(here.parent)
+def test_as_it_is_typed(working_directory, monkeypatch):
+    monkeypatch.chdir(working_directory.parent)
     change = f"axes.{POWER}=[0.01 W, 1 W, 3 W]"
-    told = CliRunner().invoke(main, ["extend", here.name, "--set", change, "--scheduler", "none"])
-    done, whole = (f"{SHOTS * 3 * places:,}" for places in (2, 3))
-    assert told.exit_code == 0
-    assert f"{done} of {whole} shots are there; {SHOTS * 3:,} to compute\n" in told.stderr
-    assert f"{here.name}: {whole} of {whole} shots" in told.stdout
-    again = CliRunner().invoke(main, ["extend", here.name, "--set", change])
-    assert again.exit_code == 0 and "nothing to extend" in again.stderr
-    assert all(report.is_undamaged and report.complete for report in verify(here))
+    result = CliRunner().invoke(
+        main, ["extend", working_directory.name, "--set", change, "--scheduler", "none"]
+    )
+    counts_text, all_text = (f"{SHOTS * 3 * places:,}" for places in (2, 3))
+    assert result.exit_code == 0
+    assert (
+        f"{counts_text} of {all_text} shots are there; {SHOTS * 3:,} to compute\n" in result.stderr
+    )
+    assert f"{working_directory.name}: {all_text} of {all_text} shots" in result.stdout
+    second_result = CliRunner().invoke(main, ["extend", working_directory.name, "--set", change])
+    assert second_result.exit_code == 0 and "nothing to extend" in second_result.stderr
+    assert all(report.is_undamaged and report.complete for report in verify(working_directory))
 
 
 #: Errors that are numbers, and do not follow the tolerance.
@@ -188,7 +195,7 @@ CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
 
 
 def test_with_a_tighter_tolerance_only_shots_that_call_for_more_are_computed(
-    here, computed, monkeypatch, capsys
+    working_directory, computed, monkeypatch, capsys
 ):
     """Tiles of 16 shots, which neither blocks nor cycles fit: some cycles are known in part."""
     monkeypatch.setattr(flight_study, "SHOTS_PER_TILE", 16)
@@ -196,23 +203,25 @@ def test_with_a_tighter_tolerance_only_shots_that_call_for_more_are_computed(
     coarse, fine = (
         flight(accuracy={"tolerance": tolerance, **CLOSE}, axes=axes) for tolerance in (0.2, 0.02)
     )
-    store = run_serially(coarse, here.with_name("coarse.zarr")).store
-    whole, solved = computed.shots, computed.cycles
+    store = run_serially(coarse, working_directory.with_name("coarse.zarr")).store
+    shots_cast, solved = computed.shots, computed.cycles
     computed.shots = computed.cycles = 0
     assert extend(store, fine, scheduler="none").complete
-    assert 0 < computed.shots < whole and 0 < computed.cycles < solved
+    assert 0 < computed.shots < shots_cast and 0 < computed.cycles < solved
     assert "shots that call for more effects with the tolerance" in capsys.readouterr().err
-    assert file_digests(store) == at_once(fine, here)
+    assert file_digests(store) == at_once(fine, working_directory)
 
 
-def test_where_the_tolerance_says_how_closely_all_is_computed_anew(here, computed, capsys):
+def test_where_the_tolerance_says_how_closely_all_is_computed_again(
+    working_directory, computed, capsys
+):
     spec = flight(accuracy={"tolerance": 1e-4})
-    assert extend(here, spec, scheduler="none").complete
+    assert extend(working_directory, spec, scheduler="none").complete
     assert computed.shots == SHOTS * 6
-    told = capsys.readouterr().err
-    assert f"0 of {SHOTS * 6:,} shots are there" in told
-    assert "computed more closely, and anew, but where accuracy.line_error and" in told
-    assert file_digests(here) == at_once(spec, here)
+    stderr = capsys.readouterr().err
+    assert f"0 of {SHOTS * 6:,} shots are there" in stderr
+    assert "computed more closely, and anew, but where accuracy.line_error and" in stderr
+    assert file_digests(working_directory) == at_once(spec, working_directory)
 
 
 def chunk(store, name, part, scanner="three"):
@@ -233,33 +242,37 @@ def chunk(store, name, part, scanner="three"):
         ),
     ],
 )
-def test_a_damaged_block_is_computed_anew(here, computed, drawn_more, name, stretch, lost):
+def test_a_damaged_block_is_computed_again(
+    working_directory, computed, drawn_more, name, stretch, lost
+):
     """In place of its own a block has another's chunk, which any reader takes for sound.
 
     With the block of a shot's first draws all of its draws are lost: what it was is not known.
     """
-    other = chunk(here, name, (1, stretch, 0)).read_bytes()
-    damaged = chunk(here, name, (0, stretch, 0))
+    other = chunk(working_directory, name, (1, stretch, 0)).read_bytes()
+    damaged = chunk(working_directory, name, (0, stretch, 0))
     assert damaged.read_bytes() != other
     damaged.write_bytes(other)
-    assert larger(here, flight(draws=MORE_DRAWS)).complete
-    assert computed.shots == SHOTS * 6 + 48 * lost and file_digests(here) == drawn_more
+    assert larger(working_directory, flight(draws=MORE_DRAWS)).complete
+    assert computed.shots == SHOTS * 6 + 48 * lost and file_digests(working_directory) == drawn_more
 
 
-def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed, capsys):
+def test_only_what_is_committed_of_an_incomplete_store_is_taken(
+    working_directory, computed, capsys
+):
     """Without the block of the first draws of some shots, that of their last is of no use."""
-    log = here / ".sweep" / "receipts.jsonl"
+    log = working_directory / ".sweep" / "receipts.jsonl"
     lines = log.read_text().splitlines(keepends=True)[1:7]
     log.write_text("".join(lines))
-    older = FlightStudy(flight(), here)
+    older = FlightStudy(flight(), working_directory)
     useless = older.first_block_of_group("three") + older.scanner_grids["three"].block_at((0, 1, 0))
-    found = {record["block"]: record["points"] for record in map(json.loads, lines)}
-    there = sum(found.values()) - found[useless]
+    points_by_block = {record["block"]: record["points"] for record in map(json.loads, lines)}
+    n_points = sum(points_by_block.values()) - points_by_block[useless]
     spec = flight(axes={POWER: [*TWO, "3 W"]}, storage=LARGE)
-    assert extend(here, spec, scheduler="none").complete
-    assert computed.shots == SHOTS * 9 - there
-    assert f"{there:,} of {SHOTS * 9:,} shots are there" in capsys.readouterr().err
-    assert file_digests(here) == at_once(spec, here)
+    assert extend(working_directory, spec, scheduler="none").complete
+    assert computed.shots == SHOTS * 9 - n_points
+    assert f"{n_points:,} of {SHOTS * 9:,} shots are there" in capsys.readouterr().err
+    assert file_digests(working_directory) == at_once(spec, working_directory)
 
 
 def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeypatch, computed):
@@ -272,13 +285,13 @@ def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeyp
     platform = SCENE_MAPPING["platform"] | {"path": {"kind": "waypoints", "file": "path.csv"}}
     changes = SCENE_MAPPING | SMALLER | {"platform": platform, "draws": {"number": 1}}
     older, spec = (
-        type(small_scene_spec()).from_mapping(changes | more, base=base)
-        for more in ({}, {"draws": {"number": 2}})
+        type(small_scene_spec()).from_mapping(changes | sections, base=base)
+        for sections in ({}, {"draws": {"number": 2}})
     )
     store = run_serially(older, tmp_path / "flight.zarr").store
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    monkeypatch.chdir(elsewhere)
+    other_directory = tmp_path / "elsewhere"
+    other_directory.mkdir()
+    monkeypatch.chdir(other_directory)
     computed.shots = 0
     assert larger(store, None, changes={"draws.number": 2}).complete
     assert computed.shots == shots_of(spec) * 2
@@ -333,21 +346,21 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
-def test_what_is_no_larger_study_is_refused_field_by_field(flown, changes, told):
+@pytest.mark.parametrize("changes, messages", REFUSED.values(), ids=REFUSED)
+def test_what_is_no_larger_study_is_refused_field_by_field(flown, changes, messages):
     words = "new scanners, more draws.* needs a store of its own"
-    see_it_refused(flown, flight(**changes), *told, match=words)
+    see_it_refused(flown, flight(**changes), *messages, match=words)
 
 
 def test_another_study_put_in_the_older_ones_place_is_not_taken_for_it(
-    here, computed, monkeypatch, drawn_more
+    working_directory, computed, monkeypatch, drawn_more
 ):
     """Between two runs of an extension its store was replaced by that of a darker scene."""
-    new = here.with_name("larger.zarr")
+    new = working_directory.with_name("larger.zarr")
     stopped = {"progress": Interrupting(), "scheduler": "none"}
-    extend(here, flight(draws=MORE_DRAWS), to=new, **stopped)
-    shutil.rmtree(here)
-    run_serially(flight(**moved("ground", reflectance=0.01)), here)
+    extend(working_directory, flight(draws=MORE_DRAWS), to=new, **stopped)
+    shutil.rmtree(working_directory)
+    run_serially(flight(**moved("ground", reflectance=0.01)), working_directory)
     worker._cached_block_writer.cache_clear()
     assert resume(new, progress=False, scheduler="none").complete
     assert file_digests(new) == drawn_more

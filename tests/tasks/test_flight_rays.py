@@ -49,11 +49,11 @@ DETECTED = "pd_up", "pd_doppler", "pd_down"
 
 def facets(tolerance=1e-2, beamlets="auto", **changes):
     """The flight at a tolerance."""
-    own = {
+    sections = {
         "footprint": {"beamlets": beamlets, "speckle": "none"},
         "accuracy": {"tolerance": tolerance},
     }
-    return SceneSpec.from_mapping(OVER_FACETS | own | changes, base=".")
+    return SceneSpec.from_mapping(OVER_FACETS | sections | changes, base=".")
 
 
 @pytest.fixture(scope="module")
@@ -105,40 +105,45 @@ def test_the_tolerance_is_on_no_axis_of_a_flight():
 @pytest.mark.parametrize("name, tolerance", [("coarse", 1e-2), ("fine", 1e-3)])
 def test_shots_have_the_rays_that_their_tolerance_needs(flown, name, tolerance):
     """Few where that is enough, more where their own tell that they are too few."""
-    found, many = shots(flown[name]), shots(flown["by hand"])
-    real = sum(abs(found[pd] - many[pd]) for pd in DETECTED).values
-    told, rays = found.beamlets_error.values, found.beamlets.values
-    assert found.beamlets_error.dims == found.beamlets.dims == ("power", "shot")
-    assert (told[rays < 8017] <= tolerance).all() and (real <= tolerance).mean() >= 0.999
+    shot_arrays, many = shots(flown[name]), shots(flown["by hand"])
+    real = sum(abs(shot_arrays[pd] - many[pd]) for pd in DETECTED).values
+    stated_error, rays = shot_arrays.beamlets_error.values, shot_arrays.beamlets.values
+    assert shot_arrays.beamlets_error.dims == shot_arrays.beamlets.dims == ("power", "shot")
+    assert (stated_error[rays < 8017] <= tolerance).all() and (real <= tolerance).mean() >= 0.999
     fewest = initial_ray_count(facets().parameters(), ErrorBudget(tolerance))
     assert set(np.unique(rays)) <= set(RAYS) and rays.min() == fewest
     assert (rays[0] > fewest).mean() > 0.3, "of the weak laser, whose pd is undecided"
-    off = real > 1e-5
-    assert off[0].mean() > 0.5 and (told[off] >= real[off] / 2).mean() >= 0.99
+    is_changed = real > 1e-5
+    assert (
+        is_changed[0].mean() > 0.5
+        and (stated_error[is_changed] >= real[is_changed] / 2).mean() >= 0.99
+    )
 
 
 def test_a_shot_with_more_rays_is_as_if_all_had_so_many(flown, tmp_path):
     """Bit for bit, where the same effects are simulated."""
-    found = shots(flown["coarse"])
-    number = int(np.unique(found.beamlets)[-1])
+    shot_arrays = shots(flown["coarse"])
+    number = int(np.unique(shot_arrays.beamlets)[-1])
     other = shots(run_serially(facets(1e-2, number), tmp_path / "all.zarr").store)
-    alike = ((found.beamlets == number) & (found.effects == other.effects)).values
-    assert alike.any()
+    is_alike = ((shot_arrays.beamlets == number) & (shot_arrays.effects == other.effects)).values
+    assert is_alike.any()
     for name in (*DETECTED, "snr_up", "range_interpolated", "true_range", "surface"):
-        np.testing.assert_array_equal(found[name].values[alike], other[name].values[alike])
+        np.testing.assert_array_equal(
+            shot_arrays[name].values[is_alike], other[name].values[is_alike]
+        )
 
 
-def test_rays_given_by_hand_leave_nothing_that_is_told(flown):
+def test_rays_given_by_hand_state_no_error(flown):
     assert shots(flown["by hand"]).beamlets_error.isnull().all()
     assert accuracy_rows_of_rays(flown["by hand"]) == []
 
 
-def test_a_comparison_allows_what_is_told(flown):
-    both = compare(open_scene(flown["coarse"]), open_scene(flown["by hand"]))["three"]
-    told = shots(flown["coarse"]).beamlets_error
-    assert "beamlets_error" not in both and told.max() > 1e-3
-    assert (both.pd_shot_allowed >= told).all()
-    assert both.pd_shot_agrees.mean() >= 0.98
+def test_a_comparison_allows_the_stated_ray_error(flown):
+    comparison = compare(open_scene(flown["coarse"]), open_scene(flown["by hand"]))["three"]
+    stated_error = shots(flown["coarse"]).beamlets_error
+    assert "beamlets_error" not in comparison and stated_error.max() > 1e-3
+    assert (comparison.pd_shot_allowed >= stated_error).all()
+    assert comparison.pd_shot_agrees.mean() >= 0.98
 
 
 def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypatch):
@@ -148,43 +153,45 @@ def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypa
     spec = facets(1e-3, draws={"number": 1})
     store = run_serially(spec, tmp_path / "most.zarr").store
     (row,) = accuracy_rows_of_rays(store)
-    told, rays = shots(store).beamlets_error, shots(store).beamlets
+    stated_error, rays = shots(store).beamlets_error, shots(store).beamlets
     assert (row.name, row.samples_max, row.tolerance_at_worst_point) == ("three", 37, 1e-3)
     assert row.mean_samples == pytest.approx(float(rays.mean())) == 37
     assert (
-        row.n_points == told.size
-        and row.n_points_within_tolerance == (told <= 1e-3).sum() < row.n_points
+        row.n_points == stated_error.size
+        and row.n_points_within_tolerance == (stated_error <= 1e-3).sum() < row.n_points
     )
-    assert row.worst_error == told.max() and row.excess == pytest.approx(row.worst_error - 1e-3)
-    shot = int(told.values[0].argmax())
+    assert row.worst_error == stated_error.max() and row.excess == pytest.approx(
+        row.worst_error - 1e-3
+    )
+    shot = int(stated_error.values[0].argmax())
     assert row.worst_point_label == f"power 40 uW, time {float(shots(store).time[shot]):.4g} s"
-    said = CliRunner().invoke(main, ["status", str(store)]).output
+    output = CliRunner().invoke(main, ["status", str(store)]).output
     assert (
-        "What more rays may change" in said
-        and f"{row.n_points_within_tolerance} of {row.n_points}" in said
+        "What more rays may change" in output
+        and f"{row.n_points_within_tolerance} of {row.n_points}" in output
     )
     spec_file = tmp_path / "most.yaml"
     spec_file.write_text(json.dumps(spec.to_yaml_mapping()))
-    said = CliRunner().invoke(main, ["plan", str(spec_file)]).output
-    assert "37 a shot, more where it needs them, at most 37" in said
+    output = CliRunner().invoke(main, ["plan", str(spec_file)]).output
+    assert "37 a shot, more where it needs them, at most 37" in output
 
 
 def test_rays_are_added_until_they_are_enough():
     """The error falls as one over their number: whatever the stretches, none is left above."""
     rng = np.random.default_rng(5)
-    rough, asked = 10 ** rng.uniform(-5, 1, 3000), []
+    rough, ray_counts = 10 ** rng.uniform(-5, 1, 3000), []
 
-    def again(places, rays):
-        asked.append((rays, places.size))
+    def cast_again(places, rays):
+        ray_counts.append((rays, places.size))
         latest[places] = rays
         return rough[places] / rays
 
     latest = np.full(rough.size, 37)
-    eyepoint_study.refine_rays(37, rough / 37, ErrorBudget(1e-4), again)
+    eyepoint_study.refine_rays(37, rough / 37, ErrorBudget(1e-4), cast_again)
     error = rough / latest
     assert (error[latest < RAYS[-1]] <= 1e-4).all() and (latest == 37).any()
     assert (latest[error > 1e-4] == RAYS[-1]).all() and (latest < RAYS[-1]).mean() > 0.8
-    assert max(rays * number for rays, number in asked) <= eyepoint_study.RAYS_PER_CAST_MAX
+    assert max(rays * number for rays, number in ray_counts) <= eyepoint_study.RAYS_PER_CAST_MAX
     wasted = latest[latest > 37] / (rough[latest > 37] / 1e-4)
     assert wasted.max() <= 60, "no more than a step of the ladder and the least jump call for"
 
@@ -210,16 +217,16 @@ def test_rays_by_hand_are_no_tighter_tolerance(flown):
         extend(flown["coarse"], facets(1e-3, 37), progress=False)
 
 
-def test_it_is_the_same_however_it_is_cut(flown, tmp_path):
+def test_ray_counts_do_not_depend_on_the_division_into_blocks(flown, tmp_path):
     cut = facets(1e-2, storage={"block_shots": 21, "block_draws": 1})
-    found = shots(run_serially(cut, tmp_path / "cut.zarr").store)
-    np.testing.assert_array_equal(found.beamlets_error, shots(flown["coarse"]).beamlets_error)
+    shot_arrays = shots(run_serially(cut, tmp_path / "cut.zarr").store)
+    np.testing.assert_array_equal(shot_arrays.beamlets_error, shots(flown["coarse"]).beamlets_error)
 
 
 def test_a_report_says_so_too(flown):
-    told = " ".join(accuracy_sentences(shots(flown["coarse"]), facets(1e-2)))
+    sentences = " ".join(accuracy_sentences(shots(flown["coarse"]), facets(1e-2)))
     worst = float(shots(flown["coarse"]).beamlets_error.max())
-    assert f"More beamlets would change one by {worst:.2g} at the most." in told
+    assert f"More beamlets would change one by {worst:.2g} at the most." in sentences
     by_hand = " ".join(accuracy_sentences(shots(flown["by hand"]), facets(1e-4, 8017)))
     assert "What more beamlets would change is not checked." in by_hand
 
@@ -256,6 +263,6 @@ def test_a_flight_has_the_probabilities_of_the_grid_where_footprints_are_wide(tm
     point = sweep.open(tmp_path / "grid")
     shot = open_scene(tmp_path / "flight")["beam"].to_dataset().isel(shot=0)
     for variable in ("pd_up", "pd_doppler", "pd_down"):
-        told = float(shot.beamlets_error) + float(shot.effects_error)
-        assert abs(float(shot[variable]) - float(point[variable])) < min(told, 1e-3)
+        stated_error = float(shot.beamlets_error) + float(shot.effects_error)
+        assert abs(float(shot[variable]) - float(point[variable])) < min(stated_error, 1e-3)
     assert float(shot.snr_up) == pytest.approx(float(point.snr_up), rel=1e-4)

@@ -51,10 +51,10 @@ def test_parameters_of_a_block_are_those_of_its_points_in_c_order():
     spec = small_spec()
     grid = ParameterBlockGrid(spec)
     by_name = {m.path: np.asarray(m.values) for axis in spec.axes for m in axis.parameters}
-    whole = np.meshgrid(*by_name.values(), indexing="ij")
+    all_values = np.meshgrid(*by_name.values(), indexing="ij")
     for i in range(grid.n_blocks):
         parameters = grid.parameters_of_block(i)
-        for path, values in zip(by_name, whole, strict=True):
+        for path, values in zip(by_name, all_values, strict=True):
             np.testing.assert_array_equal(parameters[path], values[grid.block_slices(i)].ravel())
         assert parameters["target.reflectance"] == 0.02
 
@@ -110,17 +110,17 @@ def rows_by_point(grid: ParameterBlockGrid) -> dict[tuple, bytes]:
 
 
 def test_a_points_row_follows_from_its_values_not_from_axes_order_or_blocks():
-    whole = rows_by_point(ParameterBlockGrid(small_spec()))
+    all_rows = rows_by_point(ParameterBlockGrid(small_spec()))
     axes = dict(reversed(list(STUDY_MAPPING["axes"].items())))
     turned = rows_by_point(ParameterBlockGrid(small_spec(axes=axes, storage={"block_points": 5})))
-    assert whole == turned
-    assert len(set(whole.values())) == 72
+    assert all_rows == turned
+    assert len(set(all_rows.values())) == 72
     del axes["instrument.laser.power"]
     one_watt = rows_by_point(
         ParameterBlockGrid(small_spec(axes=axes))
     )  # 1 W is now a parameter, not an axis
     assert len(one_watt) == 36
-    assert all(whole[point] == row for point, row in one_watt.items())
+    assert all(all_rows[point] == row for point, row in one_watt.items())
 
 
 def test_words_and_signed_zeros_are_canonical():
@@ -191,7 +191,7 @@ SPECTRA = {"number": 1000, "method": "spectra"}
 
 
 @pytest.mark.parametrize(
-    ("changes", "most"),
+    ("changes", "block_points"),
     [
         ({}, 50_000),
         ({"draws": {"number": 10}}, 50_000),
@@ -203,11 +203,11 @@ SPECTRA = {"number": 1000, "method": "spectra"}
         ({"draws": SPECTRA}, 18),
     ],
 )
-def test_a_block_of_points_that_take_long_holds_fewer(changes, most):
+def test_a_block_of_points_that_take_long_holds_fewer(changes, block_points):
     """So that no block takes more than a minute or so: (40 us + 0.2 us a beamlet) a draw."""
     axes = {"target.range": {"linear": ["1 km", "2 km"], "number": 100_000}}
     spec = small_spec(axes=axes, storage={"block_points": 50_000}, **changes)
-    assert ParameterBlockGrid(spec).block_shape == (most,)
+    assert ParameterBlockGrid(spec).block_shape == (block_points,)
 
 
 def test_points_in_speckle_are_cut_into_smaller_blocks_than_smooth_ones():

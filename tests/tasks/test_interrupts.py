@@ -101,9 +101,9 @@ def run(tmp_path):
         return started[-1]
 
     yield start
-    for each in started:
-        each.process.kill()
-        each.process.communicate()
+    for driver_process in started:
+        driver_process.process.kill()
+        driver_process.process.communicate()
 
 
 def assert_goes_on(store):
@@ -165,18 +165,18 @@ class Listener(Progress):
 
 def test_after_sigterm_a_block_that_does_not_end_is_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(interrupts, "SIGTERM_GRACE_SECONDS", 1.0)
-    begun = []
+    interruptions = []
 
     def long(study, block):
         if block == 2:
-            begun.append(time.monotonic())
+            interruptions.append(time.monotonic())
             os.kill(os.getpid(), signal.SIGTERM)
-            while time.monotonic() < begun[0] + LONG:
+            while time.monotonic() < interruptions[0] + LONG:
                 time.sleep(0.01)
         return study.evaluate(block)
 
     outcome = run_serially(small_spec(), tmp_path / "store.zarr", scheduler="none", evaluate=long)
-    assert time.monotonic() - begun[0] < 5
+    assert time.monotonic() - interruptions[0] < 5
     assert outcome.stop_reason == "stopped at once" and outcome.blocks_done == 2
     assert_goes_on(tmp_path / "store.zarr")
 
@@ -196,12 +196,12 @@ def test_what_ends_soon_after_sigterm_is_committed(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_announced_at_once_where_python_runs(number):
     listener = Listener()
-    with InterruptHandler(listener) as asked:
+    with InterruptHandler(listener) as handler:
         os.kill(os.getpid(), number)
         end = time.monotonic() + 5
         while not listener.lines and time.monotonic() < end:
             time.sleep(0.01)
-        assert asked.is_stopping and len(listener.lines) == 1
+        assert handler.is_stopping and len(listener.lines) == 1
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), number)
             time.sleep(5)
@@ -209,17 +209,17 @@ def test_a_signal_is_announced_at_once_where_python_runs(number):
 
 
 def test_signals_of_others_leave_a_run_alone(tmp_path):
-    heard = []
-    before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(True))
+    signals = []
+    before = signal.signal(signal.SIGUSR1, lambda *_: signals.append(True))
     try:
-        with InterruptHandler() as asked:
+        with InterruptHandler() as handler:
             for _ in range(3):
                 os.kill(os.getpid(), signal.SIGUSR1)
                 time.sleep(0.05)
             assert run_serially(small_spec(), tmp_path / "s.zarr", scheduler="none").complete
     finally:
         signal.signal(signal.SIGUSR1, before)
-    assert len(heard) == 3 and not asked.is_stopping
+    assert len(signals) == 3 and not handler.is_stopping
 
 
 def test_sigterm_while_workers_start_has_a_deadline_too(tmp_path, monkeypatch):

@@ -105,10 +105,10 @@ def test_runs_are_recorded_with_their_times(tmp_path):
     assert journal.read_last_run(tmp_path) == journal.LastRun(start_time=float("inf"), n_threads=0)
     opened.record_run_event("begun", pid=5, threads=3)
     opened.record_run_event("ended", blocks=3)
-    begun, ended = iter_records(tmp_path / JOURNAL_DIR / journal.SESSION_LOG_FILE)
-    assert begun["event"] == "begun" and begun["pid"] == 5 and ended["blocks"] == 3
+    start_record, ended = iter_records(tmp_path / JOURNAL_DIR / journal.SESSION_LOG_FILE)
+    assert start_record["event"] == "begun" and start_record["pid"] == 5 and ended["blocks"] == 3
     last_run = journal.read_last_run(tmp_path)
-    assert last_run.start_time == begun["time"] > 0 and last_run.n_threads == 3
+    assert last_run.start_time == start_record["time"] > 0 and last_run.n_threads == 3
 
 
 @pytest.mark.parametrize(("n_blocks", "points"), [(2, [5, 0]), (3, [5, 0, 7]), (4, [5, 0, 7, 0])])

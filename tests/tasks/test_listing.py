@@ -45,8 +45,8 @@ def test_the_owner_of_a_chunk_is_the_block_that_writes_it(tmp_path, name):
         np.testing.assert_array_equal(left[array], owner, err_msg=array)
 
 
-def test_a_block_is_whole_where_all_of_its_chunks_are_and_hold_something(undisturbed, tmp_path):
-    store, study = copy_store(undisturbed, tmp_path), GridStudy(small_spec())
+def test_a_block_is_whole_where_all_of_its_chunks_are_and_hold_something(serial_store, tmp_path):
+    store, study = copy_store(serial_store, tmp_path), GridStudy(small_spec())
     every = np.ones(12, bool)
     assert find_complete_blocks(store, study, every).all()
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
@@ -60,7 +60,7 @@ def test_a_block_is_whole_where_all_of_its_chunks_are_and_hold_something(undistu
 
 
 def test_folders_and_object_stores_are_listed_alike(tmp_path):
-    here, there = tmp_path / "c", parse_location(f"memory://bucket{tmp_path}/c")
+    local_path, remote_path = tmp_path / "c", parse_location(f"memory://bucket{tmp_path}/c")
     for name, content in {
         "0/1": b"ab",
         "2/0": b"",
@@ -68,13 +68,13 @@ def test_folders_and_object_stores_are_listed_alike(tmp_path):
         "9/9": b"x",
         "1/x": b"x",
     }.items():
-        (here / name).parent.mkdir(parents=True, exist_ok=True)
-        (here / name).write_bytes(content)
-        (there / name).write_bytes(content)
+        (local_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (local_path / name).write_bytes(content)
+        (remote_path / name).write_bytes(content)
     expected = [[False, True], [False, False], [False, True]]
     assert (
-        find_existing_chunks(here, (3, 2)).tolist()
-        == find_existing_chunks(there, (3, 2)).tolist()
+        find_existing_chunks(local_path, (3, 2)).tolist()
+        == find_existing_chunks(remote_path, (3, 2)).tolist()
         == expected
     )
     (tmp_path / "scalar").write_bytes(b"four")
@@ -85,26 +85,26 @@ def test_folders_and_object_stores_are_listed_alike(tmp_path):
 
 def test_status_says_what_there_is_of_a_run(tmp_path):
     outcome = run_serially(small_spec(draws={"number": 20, "batch": 10}), tmp_path / "small.zarr")
-    found = status(outcome.store)
-    assert found.draws_done == 72 * 20 and found.workers_in_last_run == 1
-    assert found.points_per_second > 0 and found.seconds_left == 0
-    assert found.heartbeat_age == float("inf")
+    statuses = status(outcome.store)
+    assert statuses.draws_done == 72 * 20 and statuses.workers_in_last_run == 1
+    assert statuses.points_per_second > 0 and statuses.seconds_left == 0
+    assert statuses.heartbeat_age == float("inf")
     chunks = [
         file.stat().st_size
         for name in GridStudy(small_spec(draws={"number": 20, "batch": 10})).chunk_owner_blocks()
         for file in (outcome.store / name / "c").rglob("*")
         if file.is_file()
     ]
-    assert found.bytes_stored == sum(chunks)
+    assert statuses.bytes_stored == sum(chunks)
 
 
 def slow_to_look(monkeypatch, seconds):
     """Folders that show what they hold only after some time, and a run that waits for nothing."""
-    there = journal.find_existing_chunks
+    find_existing_chunks = journal.find_existing_chunks
 
     def late(folder, shape):
         time.sleep(seconds)
-        return there(folder, shape)
+        return find_existing_chunks(folder, shape)
 
     monkeypatch.setattr(journal, "find_existing_chunks", late)
     monkeypatch.setattr(session, "CHUNK_SCAN_TIMEOUT_SECONDS", 0.01)
@@ -112,10 +112,10 @@ def slow_to_look(monkeypatch, seconds):
 
 @pytest.mark.parametrize("to_do", ["nothing", "a block"])
 def test_a_run_begins_before_the_folders_are_seen_and_mends_what_they_lack(
-    undisturbed, tmp_path, monkeypatch, to_do
+    serial_store, tmp_path, monkeypatch, to_do
 ):
     """A chunk that is gone is found while other blocks are computed, or when all are done."""
-    store, log = copy_store(undisturbed, tmp_path), tmp_path / "log"
+    store, log = copy_store(serial_store, tmp_path), tmp_path / "log"
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
     (store / "effects" / "c" / "0" / "7" / "0").write_bytes(b"")
     lines = (store / ".sweep" / "receipts.jsonl").read_bytes().splitlines(keepends=True)
@@ -127,11 +127,11 @@ def test_a_run_begins_before_the_folders_are_seen_and_mends_what_they_lack(
     assert logged_blocks(log)[: len(last)] == last
     assert sorted(logged_blocks(log)[len(last) :]) == [5, 7]
     assert outcome.complete and outcome.blocks_computed == 2 + len(last)
-    assert file_digests(store) == file_digests(undisturbed)
+    assert file_digests(store) == file_digests(serial_store)
 
 
-def test_a_look_that_is_stopped_ends_soon(undisturbed, monkeypatch):
+def test_a_look_that_is_stopped_ends_soon(serial_store, monkeypatch):
     slow_to_look(monkeypatch, 0.02)
-    look = ChunkScan(undisturbed, GridStudy(small_spec()), np.ones(12, bool))
+    look = ChunkScan(serial_store, GridStudy(small_spec()), np.ones(12, bool))
     look.stop()
     assert look.wait(1.0) and look.complete_blocks().all()

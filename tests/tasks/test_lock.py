@@ -57,9 +57,9 @@ def test_the_lock_of_a_dead_process_is_taken_over(tmp_path, caplog):
     dead = read_lock_holder(tmp_path)
     assert dead is not None and dead.pid != os.getpid()
     assert not is_holder_alive(tmp_path, dead)
-    mine = StoreLock(tmp_path)
-    assert mine.is_held()
-    mine.release()
+    lock = StoreLock(tmp_path)
+    assert lock.is_held()
+    lock.release()
     waited, taken_over, locked, released = (record.getMessage() for record in caplog.records)
     lock_path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
     assert waited == f"waiting until no other process acquires {lock_path}"
@@ -75,9 +75,9 @@ def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path
         replace(LockHolder.of_this_process(), start=LockHolder.of_this_process().start - 3600),
     )
     assert not is_holder_alive(tmp_path, read_lock_holder(tmp_path))
-    mine = StoreLock(tmp_path)
-    assert mine.is_held()
-    mine.release()
+    lock = StoreLock(tmp_path)
+    assert lock.is_held()
+    lock.release()
 
 
 @pytest.mark.parametrize("pid", [-1, 0, 2**31, 10**30])
@@ -135,11 +135,11 @@ def test_of_many_that_find_a_stale_lock_one_gets_it(tmp_path):
     tries = [context.Process(target=_try, args=(tmp_path, results, over)) for _ in range(6)]
     for process in tries:
         process.start()
-    got = [results.get() for _ in tries]
+    outcomes = [results.get() for _ in tries]
     over.set()
     for process in tries:
         process.join()
-    assert got.count(True) == 1
+    assert outcomes.count(True) == 1
 
 
 def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
@@ -255,7 +255,7 @@ def test_a_dead_process_that_nobody_has_waited_for_holds_no_lock(tmp_path):
         StoreLock(tmp_path).release()
 
 
-def elsewhere(store, *, age):
+def lock_of_other_host(store, *, age):
     """The lock of a process of another host, with a heartbeat of that age by the file's clock."""
     put(store, LockHolder(host="elsewhere", pid=1, start=1, token="t"), age=age)
 
@@ -267,7 +267,7 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
 ):
     """The clock of the file server may have been set: an age that it gives proves nothing."""
     monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 1.0)
-    elsewhere(tmp_path, age=age)
+    lock_of_other_host(tmp_path, age=age)
     stop = threading.Event()
 
     def beat():
@@ -277,20 +277,20 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
             os.utime(path, (at, at))
 
     beating = threading.Thread(target=beat)
-    said = []
+    messages = []
     if kind == "beating":
         beating.start()
     try:
         if kind == "beating":
             with pytest.raises(BusyError, match="process 1 on elsewhere"):
-                StoreLock(tmp_path, said.append)
+                StoreLock(tmp_path, messages.append)
         else:
-            StoreLock(tmp_path, said.append).release()
+            StoreLock(tmp_path, messages.append).release()
     finally:
         stop.set()
         if kind == "beating":
             beating.join()
-    assert said and "waiting up to 1 s to see whether process 1 on elsewhere" in said[0]
+    assert messages and "waiting up to 1 s to see whether process 1 on elsewhere" in messages[0]
 
 
 def test_an_object_whose_heartbeats_are_counted_is_alive(monkeypatch):
@@ -309,7 +309,7 @@ def test_an_object_whose_heartbeats_are_counted_is_alive(monkeypatch):
 
 def test_a_lock_that_changes_hands_while_it_is_watched_is_not_taken(tmp_path, monkeypatch):
     monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 0.5)
-    elsewhere(tmp_path, age=600.0)
+    lock_of_other_host(tmp_path, age=600.0)
     mark = journal._FileLock.heartbeat_version
 
     def overtaken(self):
@@ -350,14 +350,18 @@ def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkey
     """As Lustre without its option, or NFS without lockd."""
     monkeypatch.setattr(fcntl, "flock", fails(number))
     monkeypatch.setattr(journal, "_issued_warnings", set())
-    said = []
-    held = StoreLock(tmp_path, said.append)
-    assert said == [said[0]] and said[0].startswith("warning: ") and "has no flock" in said[0]
+    messages = []
+    held = StoreLock(tmp_path, messages.append)
+    assert (
+        messages == [messages[0]]
+        and messages[0].startswith("warning: ")
+        and "has no flock" in messages[0]
+    )
     with pytest.raises(BusyError):
-        StoreLock(tmp_path, said.append)
+        StoreLock(tmp_path, messages.append)
     held.release()
-    StoreLock(tmp_path, said.append).release()
-    assert len(said) == 1
+    StoreLock(tmp_path, messages.append).release()
+    assert len(messages) == 1
 
 
 @pytest.mark.parametrize(
@@ -367,15 +371,15 @@ def test_a_file_system_without_links_is_warned_of_once_and_used(tmp_path, monkey
     """As FUSE and SMB have none, and exFAT."""
     monkeypatch.setattr(os, "link", fails(number))
     monkeypatch.setattr(journal, "_issued_warnings", set())
-    said = []
-    held = StoreLock(tmp_path, said.append)
-    assert held.is_held() and len(said) == 1 and "has no hard links" in said[0]
+    messages = []
+    held = StoreLock(tmp_path, messages.append)
+    assert held.is_held() and len(messages) == 1 and "has no hard links" in messages[0]
     with pytest.raises(BusyError):
-        StoreLock(tmp_path, said.append)
+        StoreLock(tmp_path, messages.append)
     held.release()
     put(tmp_path, replace(LockHolder.of_this_process(), pid=2**22 + 1))
-    StoreLock(tmp_path, said.append).release()
-    assert len(said) == 1 and sorted(os.listdir(tmp_path / JOURNAL_DIR)) == ["lock.guard"]
+    StoreLock(tmp_path, messages.append).release()
+    assert len(messages) == 1 and sorted(os.listdir(tmp_path / JOURNAL_DIR)) == ["lock.guard"]
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.EACCES])
@@ -422,30 +426,32 @@ def test_a_run_without_flock_or_links_goes_to_its_end(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", fails(errno.ENOLCK))
     monkeypatch.setattr(os, "link", fails(errno.EPERM))
     monkeypatch.setattr(journal, "_issued_warnings", set())
-    said = RecordingProgress()
+    progress = RecordingProgress()
     store = tmp_path / "s.zarr"
-    assert run(small_spec(), store=store, progress=said, scheduler="none").complete
-    assert sum("warning: " in line for line in said) == 2
+    assert run(small_spec(), store=store, progress=progress, scheduler="none").complete
+    assert sum("warning: " in line for line in progress) == 2
     range_ = {"linear": ["10 m", "5 km"], "number": 3}
     axes = {**STUDY_MAPPING["axes"], "target.range": range_}
-    again = run(small_spec(axes=axes), store=store, overwrite=True, progress=said, scheduler="none")
-    assert again.complete and pack_store(store, tmp_path / "packed.zarr", progress=False)
+    outcome = run(
+        small_spec(axes=axes), store=store, overwrite=True, progress=progress, scheduler="none"
+    )
+    assert outcome.complete and pack_store(store, tmp_path / "packed.zarr", progress=False)
     spectra = ["spectra", str(store), "--at", "range=10m", "-o", str(tmp_path / "spectra.zarr")]
     assert CliRunner().invoke(main, spectra, catch_exceptions=False).exit_code == 0
 
 
 def test_what_a_living_process_makes_is_not_cleared_up_after_the_clock_was_set(tmp_path):
-    made = locations._hidden_path(tmp_path / "s.zarr", "creating")
-    made.mkdir()
-    os.utime(made, (1e9, 1e9))
+    hidden_path = locations._hidden_path(tmp_path / "s.zarr", "creating")
+    hidden_path.mkdir()
+    os.utime(hidden_path, (1e9, 1e9))
     locations.recover_interrupted_replace(tmp_path / "other.zarr")
-    assert made.exists()
-    dead = Path(str(made).replace(f"-{os.getpid()}.", f"-{2**22 + 1}."))
+    assert hidden_path.exists()
+    dead = Path(str(hidden_path).replace(f"-{os.getpid()}.", f"-{2**22 + 1}."))
     dead.mkdir()
-    reused = Path(re.sub(rf"-{os.getpid()}\.\d+", f"-{os.getpid()}.7", str(made)))
+    reused = Path(re.sub(rf"-{os.getpid()}\.\d+", f"-{os.getpid()}.7", str(hidden_path)))
     reused.mkdir()
     locations.recover_interrupted_replace(tmp_path / "other.zarr")
-    assert made.exists() and not dead.exists() and not reused.exists()
+    assert hidden_path.exists() and not dead.exists() and not reused.exists()
 
 
 def test_many_stores_on_one_file_system_are_warned_of_once(tmp_path, monkeypatch):
@@ -453,11 +459,11 @@ def test_many_stores_on_one_file_system_are_warned_of_once(tmp_path, monkeypatch
     monkeypatch.setattr(fcntl, "flock", fails(errno.ENOSYS))
     monkeypatch.setattr(os, "link", fails(errno.EPERM))
     monkeypatch.setattr(journal, "_issued_warnings", set())
-    said = []
+    messages = []
     for name in ("one.zarr", "two.zarr", "three.zarr"):
         (tmp_path / name).mkdir()
-        StoreLock(tmp_path / name, said.append).release()
-    assert ["flock" in text for text in said] == [True, False]
+        StoreLock(tmp_path / name, messages.append).release()
+    assert ["flock" in text for text in messages] == [True, False]
 
 
 def test_a_heartbeat_that_fails_is_warned_of_once(tmp_path, monkeypatch):
@@ -472,12 +478,12 @@ def test_a_heartbeat_that_fails_is_warned_of_once(tmp_path, monkeypatch):
         beat(self)
 
     monkeypatch.setattr(journal._FileLock, "send_heartbeat", fails_twice)
-    said = []
-    with StoreLock(tmp_path, said.append):
+    messages = []
+    with StoreLock(tmp_path, messages.append):
         end = time.monotonic() + 20
         while len(beats) < 5 and time.monotonic() < end:
             time.sleep(0.01)
-    (warning,) = said
+    (warning,) = messages
     assert "heartbeat" in warning and "Permission denied" in warning and "other hosts" in warning
     assert len(beats) >= 5  # it goes on
 

@@ -21,37 +21,41 @@ from sweep.tasks.studies.store_verification import pack_store, shard_shape_of_ar
 
 
 @pytest.fixture(scope="module")
-def packed(undisturbed, tmp_path_factory):
-    return pack_store(undisturbed, tmp_path_factory.mktemp("packed") / "final.zarr", progress=False)
+def packed(serial_store, tmp_path_factory):
+    return pack_store(
+        serial_store, tmp_path_factory.mktemp("packed") / "final.zarr", progress=False
+    )
 
 
-def test_a_packed_copy_has_the_same_values_bit_for_bit_in_a_file_an_array(undisturbed, packed):
-    before = file_contents(undisturbed)
+def test_a_packed_copy_has_the_same_values_bit_for_bit_in_a_file_an_array(serial_store, packed):
+    before = file_contents(serial_store)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        expected, found = xr.open_zarr(undisturbed), xr.open_zarr(packed)
-    assert list(found.variables) == list(expected.variables)
+        expected, packed_dataset = xr.open_zarr(serial_store), xr.open_zarr(packed)
+    assert list(packed_dataset.variables) == list(expected.variables)
     for name, values in expected.variables.items():
-        assert found[name].values.tobytes() == values.values.tobytes(), name
-        assert found[name].attrs == values.attrs and found[name].dims == values.dims
+        assert packed_dataset[name].values.tobytes() == values.values.tobytes(), name
+        assert (
+            packed_dataset[name].attrs == values.attrs and packed_dataset[name].dims == values.dims
+        )
         chunks = [f for f in file_sizes_below(packed / name) if f.startswith("c/")]
         assert len(chunks) == 1
-    assert file_contents(undisturbed) == before
-    assert sweep.open(packed).attrs["finished"] == sweep.open(undisturbed).attrs["finished"] != ""
+    assert file_contents(serial_store) == before
+    assert sweep.open(packed).attrs["finished"] == sweep.open(serial_store).attrs["finished"] != ""
 
 
-def test_a_copy_does_not_name_the_machine_that_made_it(undisturbed, packed):
+def test_a_copy_does_not_name_the_machine_that_made_it(serial_store, packed):
     import socket
 
     host = socket.gethostname().encode()
-    assert any(host in content for content in file_contents(undisturbed).values())
+    assert any(host in content for content in file_contents(serial_store).values())
     assert not any(host in content for content in file_contents(packed).values())
-    assert status(packed).points_done == status(undisturbed).points_done == 72
+    assert status(packed).points_done == status(serial_store).points_done == 72
 
 
 def test_what_reads_stores_reads_the_copy_and_what_writes_them_refuses_it(packed):
-    found = status(packed)
-    assert found.complete and found.bytes_stored == sum(file_sizes_below(packed).values())
+    run_status = status(packed)
+    assert run_status.complete and run_status.bytes_stored == sum(file_sizes_below(packed).values())
     with pytest.raises(StoreError, match="nothing to resume"):
         resume(packed, progress=False)
     with pytest.raises(StoreError, match="nothing to resume"):
@@ -73,51 +77,51 @@ def test_a_flipped_bit_in_a_copy_is_found(packed, tmp_path):
     assert [damage.object_name for damage in report.damages] == ["pd_shot/c/0/0/0"]
 
 
-def test_what_is_not_complete_or_in_the_way_is_refused(undisturbed, packed, tmp_path):
+def test_what_is_not_complete_or_in_the_way_is_refused(serial_store, packed, tmp_path):
     from small_studies import copy_store
 
-    store = copy_store(undisturbed, tmp_path)
+    store = copy_store(serial_store, tmp_path)
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
     with pytest.raises(StoreError, match="lacks 1 block"):
         pack_store(store, tmp_path / "final.zarr")
     assert not (tmp_path / "final.zarr").exists()
     with pytest.raises(StoreError, match="is there already"):
-        pack_store(undisturbed, packed)
+        pack_store(serial_store, packed)
 
 
-class Losing(WrapperStore):
+class LosingStore(WrapperStore):
     """A disk that loses what is written to it, and says nothing."""
 
     async def set(self, key, value, *_):
         pass
 
 
-def test_a_copy_that_does_not_read_back_is_not_kept(undisturbed, tmp_path, monkeypatch):
+def test_a_copy_that_does_not_read_back_is_not_kept(serial_store, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "sweep.tasks.studies.store_verification.to_zarr_store",
-        lambda place: Losing(LocalStore(place)),
+        lambda place: LosingStore(LocalStore(place)),
     )
     with pytest.raises(StoreError, match="does not read back as it was written"):
-        pack_store(undisturbed, tmp_path / "final.zarr")
+        pack_store(serial_store, tmp_path / "final.zarr")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_copy_goes_to_an_object_store_too(undisturbed, tmp_path):
-    there = pack_store(undisturbed, f"memory://bucket{tmp_path}/final.zarr", progress=False)
+def test_the_copy_goes_to_an_object_store_too(serial_store, tmp_path):
+    copied_path = pack_store(serial_store, f"memory://bucket{tmp_path}/final.zarr", progress=False)
     np.testing.assert_array_equal(
-        sweep.open(there).pd_shot.values, sweep.open(undisturbed).pd_shot.values
+        sweep.open(copied_path).pd_shot.values, sweep.open(serial_store).pd_shot.values
     )
-    assert all(report.is_undamaged for report in verify(there, progress=False))
+    assert all(report.is_undamaged for report in verify(copied_path, progress=False))
 
 
-def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
-    made = shutil.copytree(flight.parent, tmp_path, dirs_exist_ok=True) / flight.name
-    told = CliRunner().invoke(main, ["finalize", str(made)])
-    assert told.exit_code == 0, told.output
+def test_a_scene_is_packed_with_all_of_its_metadata(flight, tmp_path):
+    store_copy = shutil.copytree(flight.parent, tmp_path, dirs_exist_ok=True) / flight.name
+    result = CliRunner().invoke(main, ["finalize", str(store_copy)])
+    assert result.exit_code == 0, result.output
     copy = tmp_path / "scene_final.zarr"
-    assert len(file_sizes_below(copy)) < len(file_sizes_below(made)) / 2
+    assert len(file_sizes_below(copy)) < len(file_sizes_below(store_copy)) / 2
     assert flight_summary(copy)[0].n_shots > 0
-    for one, other in zip(flight_summary(made), flight_summary(copy), strict=True):
+    for one, other in zip(flight_summary(store_copy), flight_summary(copy), strict=True):
         assert (one.n_shots, one.shots_with_true_return, one.false_points) == (
             other.n_shots,
             other.shots_with_true_return,

@@ -47,7 +47,7 @@ def endless(block, log):
         {"workers": 2, "processes": False},
     ],
 )
-def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path, place):
+def test_a_block_that_takes_longer_than_it_may_is_given_up(serial_store, tmp_path, place):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
     study = small_spec()
     outcome = run(
@@ -61,7 +61,7 @@ def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path
     assert logged_blocks(log).count(4) == 2
     assert resume(path, progress=False, scheduler="none").blocks_skipped == 1
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
 def stuck_or_hungry(stuck, hungry):
@@ -73,9 +73,9 @@ def stuck_or_hungry(stuck, hungry):
         worker.INTERRUPT_GRACE_SECONDS = 0.2
         if block == stuck:
             time.sleep(600)
-        taken = []
+        attempts = []
         while block == hungry:
-            taken.append(b"x" * (50 << 20))
+            attempts.append(b"x" * (50 << 20))
             time.sleep(0.05)
         return study.evaluate(block)
 
@@ -84,7 +84,7 @@ def stuck_or_hungry(stuck, hungry):
 
 @pytest.mark.slow
 def test_workers_that_are_stuck_or_out_of_memory_are_replaced_and_their_blocks_given_up(
-    undisturbed, tmp_path, monkeypatch
+    serial_store, tmp_path, monkeypatch
 ):
     path = tmp_path / "small.zarr"
     monkeypatch.setattr(local_ssh, "worker_memory_limit", lambda cluster, bounds: 1 << 30)
@@ -100,7 +100,7 @@ def test_workers_that_are_stuck_or_out_of_memory_are_replaced_and_their_blocks_g
         assert "--block-timeout" in failure.error and "memory" in failure.error
     assert set(status(path).failures) == {2, 8}
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
 def test_a_block_that_failed_goes_to_another_worker(tmp_path):
@@ -155,43 +155,43 @@ def test_a_time_limit_interrupts_what_it_limits_and_nothing_after_it():
 
 
 def test_an_interruption_that_comes_too_late_is_overtime_and_leaves_no_thread():
-    seen = []
+    interruptions = []
 
     def done_after_all():
-        seen.append(threading.current_thread())
+        interruptions.append(threading.current_thread())
         with contextlib.suppress(BaseException):
             forever()
         return "done"
 
     with pytest.raises(BlockTimeoutError):
         worker.run_with_timeout(done_after_all, 0.05)
-    assert not seen[0].is_alive()
+    assert not interruptions[0].is_alive()
 
 
 def test_limited_work_sees_what_is_set_where_it_was_asked_for_as_dasks_worker_is():
-    here = contextvars.ContextVar("here")
-    here.set("a worker")
-    assert worker.run_with_timeout(here.get, 60.0) == "a worker"
+    variable = contextvars.ContextVar("here")
+    variable.set("a worker")
+    assert worker.run_with_timeout(variable.get, 60.0) == "a worker"
 
 
 def test_a_limited_work_that_raises_or_is_stopped_by_ctrl_c_ends_with_it():
     with pytest.raises(ValueError, match="nothing good"):
         worker.run_with_timeout(lambda: int("nothing good"), 60.0)
-    seen = []
+    interruptions = []
 
     def asleep():
-        seen.append(threading.current_thread())
+        interruptions.append(threading.current_thread())
         forever()
 
     threading.Timer(0.2, os.kill, [os.getpid(), signal.SIGINT]).start()
     with pytest.raises(KeyboardInterrupt):
         worker.run_with_timeout(asleep, 60.0)
-    seen[0].join(10)
-    assert not seen[0].is_alive()
+    interruptions[0].join(10)
+    assert not interruptions[0].is_alive()
 
 
 def test_a_durable_study_is_the_same_and_has_its_disk_synced_before_its_receipts(
-    undisturbed, tmp_path, monkeypatch
+    serial_store, tmp_path, monkeypatch
 ):
     from sweep.tasks.engine import study_store
 
@@ -203,15 +203,15 @@ def test_a_durable_study_is_the_same_and_has_its_disk_synced_before_its_receipts
         lambda place: (sync(place), at.append(receipt_blocks(path))),
     )
     assert run_serially(small_spec(), path, scheduler="none", durable=True).complete
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
     # the store as it is made, then each block before it is committed
     assert [len(before) for before in at] == [0, *range(12)]
 
 
-def test_what_cannot_be_synced_is_not_committed(undisturbed, tmp_path, monkeypatch):
+def test_what_cannot_be_synced_is_not_committed(serial_store, tmp_path, monkeypatch):
     from sweep.tasks.engine import study_store
 
-    path = copy_store(undisturbed, tmp_path)
+    path = copy_store(serial_store, tmp_path)
     (path / "pd_up" / "c" / "0" / "5" / "0").unlink()
 
     def broken(place):

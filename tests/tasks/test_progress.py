@@ -14,7 +14,7 @@ from sweep.tasks.engine import progress
 from sweep.tasks.studies.grid_study import GridStudy
 
 
-class Told(progress.Progress):
+class LinesProgress(progress.Progress):
     """Progress that keeps what is said."""
 
     def __init__(self):
@@ -44,28 +44,28 @@ def compiling():
 
 
 @pytest.mark.usefixtures("at_once")
-def test_functions_are_counted_while_they_are_compiled_and_not_told_of_otherwise():
-    told = Told()
-    with progress.show_activity("planning", told):
-        told.until("planning, 0.0")
-        assert not any("compiling" in line for line in told.lines)
+def test_functions_are_counted_only_while_they_are_compiled():
+    recording = LinesProgress()
+    with progress.show_activity("planning", recording):
+        recording.until("planning, 0.0")
+        assert not any("compiling" in line for line in recording.lines)
         with compiling():
-            told.until("compiling the model, once; functions so far: 0")
+            recording.until("compiling the model, once; functions so far: 0")
             with compiling():
                 pass
-            told.until("compiling the model, once; functions so far: 1")
-        told.lines.clear()
-        told.until("planning")
-    after = len(told.lines)
+            recording.until("compiling the model, once; functions so far: 1")
+        recording.lines.clear()
+        recording.until("planning")
+    after = len(recording.lines)
     time.sleep(0.05)
-    assert len(told.lines) == after and "compiling" not in told.lines[-1]
+    assert len(recording.lines) == after and "compiling" not in recording.lines[-1]
 
 
-def test_what_is_over_soon_is_not_told_of():
-    told = Told()
-    with progress.show_activity("planning", told), compiling():
+def test_short_compilations_are_not_reported():
+    recording = LinesProgress()
+    with progress.show_activity("planning", recording), compiling():
         pass
-    assert told.lines == []
+    assert recording.lines == []
 
 
 @pytest.mark.parametrize("number, words", [(1, "1 thread, 5.0 kB"), (4, "4 threads, 5.0 kB")])
@@ -77,7 +77,7 @@ def test_threads_of_the_command_are_counted_as_threads(capsys, number, words):
 
 
 @pytest.mark.parametrize("base", [progress.Progress, object])
-def test_a_listener_that_knows_workers_alone_is_told_of_threads(base):
+def test_a_listener_that_knows_workers_alone_is_informed_of_threads(base):
     class WorkerCounts(base):
         counts = ()
 
@@ -98,18 +98,20 @@ def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
     bar.update_workers(workers=12, stored=3_100_000)
     bar.advance(points=1_000, failed=3)
     bar.end()
-    shown = capsys.readouterr().err
+    stderr = capsys.readouterr().err
     for number in ("1,235,567", "12,345,678", "3"):
-        assert number in shown
-    assert "…" not in shown and ("12 workers, 3.1 MB" in shown) == (width == 120)
+        assert number in stderr
+    assert "…" not in stderr and ("12 workers, 3.1 MB" in stderr) == (width == 120)
 
 
 @pytest.mark.usefixtures("at_once")
 def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, monkeypatch):
-    told = Told()
-    monkeypatch.setattr(GridStudy, "compile_kernels", lambda study: told.until("loading the model"))
-    run(small_spec(axes={}), store=tmp_path / "small.zarr", scheduler="none", progress=told)
-    assert not any("compiling" in line for line in told.lines)
+    progress = LinesProgress()
+    monkeypatch.setattr(
+        GridStudy, "compile_kernels", lambda study: progress.until("loading the model")
+    )
+    run(small_spec(axes={}), store=tmp_path / "small.zarr", scheduler="none", progress=progress)
+    assert not any("compiling" in line for line in progress.lines)
 
 
 @pytest.mark.usefixtures("at_once")
@@ -130,18 +132,18 @@ def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, mon
         ),
     ],
 )
-def test_commands_say_that_they_compile(undisturbed, tmp_path, monkeypatch, arguments, inner):
+def test_commands_say_that_they_compile(serial_store, tmp_path, monkeypatch, arguments, inner):
     import yaml
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(small_mapping()))
-    (tmp_path / "small.zarr").symlink_to(undisturbed)
-    told = Told()
-    monkeypatch.setattr(progress.ProgressLines, "say", lambda self, text: told.say(text))
+    (tmp_path / "small.zarr").symlink_to(serial_store)
+    recording = LinesProgress()
+    monkeypatch.setattr(progress.ProgressLines, "say", lambda self, text: recording.say(text))
 
     def compiled(*_, **__):
         with compiling():
-            told.until("compiling the model, once; functions so far: 0")
+            recording.until("compiling the model, once; functions so far: 0")
         raise UnsupportedShotError("enough")
 
     monkeypatch.setattr(inner, compiled)

@@ -32,8 +32,8 @@ def altered(store, **changes):
     path.write_text(json.dumps(document))
 
 
-def test_resuming_with_a_changed_spec_is_refused_with_the_differences(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_resuming_with_a_changed_spec_is_refused_with_the_differences(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     before = file_contents(store)
     other = small_spec(seed=4, target={**STUDY_MAPPING["target"], "reflectance": 0.2})
     with pytest.raises(StoreError) as refusal:
@@ -45,14 +45,14 @@ def test_resuming_with_a_changed_spec_is_refused_with_the_differences(undisturbe
     assert file_contents(store) == before
 
 
-def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_a_changed_title_or_place_of_execution_is_the_same_study(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     spec = small_spec(title="Another title", execution={"workers": 7})
     assert resume(store, spec=spec, progress=False, scheduler="none").blocks_computed == 0
 
 
 @pytest.mark.parametrize(
-    ("changes", "shown"),
+    ("changes", "message"),
     [
         (
             {"software": {**current_software_versions(), "numpy": "1.0"}},
@@ -66,47 +66,47 @@ def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tm
     ids=["software", "model", "id", "layout", "spec"],
 )
 def test_resuming_with_other_versions_or_altered_attributes_is_refused(
-    undisturbed, tmp_path, changes, shown
+    serial_store, tmp_path, changes, message
 ):
-    store = copy_store(undisturbed, tmp_path)
+    store = copy_store(serial_store, tmp_path)
     altered(store, **changes)
     before = file_contents(store)
-    with pytest.raises(StoreError, match=shown):
+    with pytest.raises(StoreError, match=message):
         resume(store, progress=False, scheduler="none")
     assert file_contents(store) == before
 
 
 def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
-    theirs = xr.Dataset({"a": ("x", [1.0])})
-    theirs.to_zarr(tmp_path / "theirs.zarr", zarr_format=3, consolidated=False)
+    foreign_dataset = xr.Dataset({"a": ("x", [1.0])})
+    foreign_dataset.to_zarr(tmp_path / "theirs.zarr", zarr_format=3, consolidated=False)
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "text").write_text("mine")
     (tmp_path / "file").write_text("mine")
     before = file_contents(tmp_path)
-    for name, shown in (
+    for name, message in (
         ("theirs.zarr", "not one that"),
         ("notes", "not a"),
         ("file", "no Zarr store"),
     ):
-        with pytest.raises(StoreError, match=shown):
+        with pytest.raises(StoreError, match=message):
             resume(tmp_path / name, progress=False)
         for overwrite in (False, True):
-            with pytest.raises(StoreError, match=shown):
+            with pytest.raises(StoreError, match=message):
                 run(small_spec(), store=tmp_path / name, progress=False, overwrite=overwrite)
     with pytest.raises(StoreError, match="there is no store"):
         resume(tmp_path / "absent", progress=False)
     assert file_contents(tmp_path) == before
 
 
-def test_a_run_into_a_whole_store_of_the_same_study_points_to_status_and_overwrite(undisturbed):
-    before = file_contents(undisturbed)
+def test_a_run_into_a_whole_store_of_the_same_study_points_to_status_and_overwrite(serial_store):
+    before = file_contents(serial_store)
     with pytest.raises(StoreError, match=r"12 of 12 blocks done: `sweep.status\(.*overwrite=True"):
-        run_serially(small_spec(), undisturbed)
-    assert file_contents(undisturbed) == before
+        run_serially(small_spec(), serial_store)
+    assert file_contents(serial_store) == before
 
 
-def test_overwriting_puts_another_study_in_the_place_of_an_older_versions(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_overwriting_puts_another_study_in_the_place_of_an_older_versions(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     altered(store, layout=1)
     outcome = run_serially(small_spec(seed=9), store, scheduler="none", overwrite=True)
     assert outcome.complete and outcome.blocks_computed == 12
@@ -114,8 +114,8 @@ def test_overwriting_puts_another_study_in_the_place_of_an_older_versions(undist
     assert [child.name for child in tmp_path.iterdir()] == ["copy.zarr"]
 
 
-def test_a_store_that_someone_writes_to_is_neither_resumed_nor_overwritten(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_a_store_that_someone_writes_to_is_neither_resumed_nor_overwritten(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     held = StoreLock(store)
     with pytest.raises(StoreError, match="is being written by process"):
         resume(store, progress=False, scheduler="none")
@@ -126,8 +126,8 @@ def test_a_store_that_someone_writes_to_is_neither_resumed_nor_overwritten(undis
     assert status(store).lock_holder is None
 
 
-def test_a_worker_with_other_software_writes_nothing(undisturbed, tmp_path, monkeypatch):
-    store = copy_store(undisturbed, tmp_path)
+def test_a_worker_with_other_software_writes_nothing(serial_store, tmp_path, monkeypatch):
+    store = copy_store(serial_store, tmp_path)
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
     before = file_digests(store)
     monkeypatch.setattr("sweep.tasks.engine.study_store.refuse_other_versions", refusing_on_workers)

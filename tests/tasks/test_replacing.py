@@ -39,7 +39,7 @@ def larger():
     return small_spec(axes=POWERS)
 
 
-def begun(store, tmp_path):
+def start_extension(store, tmp_path):
     """An extension of a store of which no block is done."""
     outcome = extend(store, larger(), progress=False, scheduler="none",
                      evaluate=make_failing_evaluate(set(range(99)), tmp_path / "log"))  # fmt: skip
@@ -49,52 +49,54 @@ def begun(store, tmp_path):
 
 @pytest.mark.parametrize("under_way", [False, True], ids=["nothing", "an extension"])
 def test_overwriting_without_a_cluster_takes_nothing_away(
-    undisturbed, tmp_path, monkeypatch, under_way
+    serial_store, tmp_path, monkeypatch, under_way
 ):
     monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 0.5)
-    store = copy_store(undisturbed, tmp_path)
+    store = copy_store(serial_store, tmp_path)
     if under_way:
-        begun(store, tmp_path)
+        start_extension(store, tmp_path)
         before = file_digests(staging_path_for(store))
     with pytest.raises(ClusterError):
         run_serially(small_spec(seed=9), store, overwrite=True, **NOWHERE)
-    assert file_digests(store) == file_digests(undisturbed) and status(store).complete
+    assert file_digests(store) == file_digests(serial_store) and status(store).complete
     if under_way:
         assert file_digests(staging_path_for(store)) == before
     else:
         assert list(tmp_path.iterdir()) == [store]
 
 
-def test_what_is_to_replace_a_store_does_so_once_it_is_complete(undisturbed, tmp_path):
-    store, other = copy_store(undisturbed, tmp_path), small_spec(seed=9)
+def test_what_is_to_replace_a_store_does_so_once_it_is_complete(serial_store, tmp_path):
+    store, other = copy_store(serial_store, tmp_path), small_spec(seed=9)
     failed = make_failing_evaluate({3}, tmp_path / "log")
     outcome = run_serially(other, store, scheduler="none", overwrite=True, evaluate=failed)
-    assert not outcome.complete and file_digests(store) == file_digests(undisturbed)
-    told = CliRunner().invoke(main, ["status", str(store)]).output
-    assert "complete" in told and f"being replaced: sweep status {staging_path_for(store)}" in told
+    assert not outcome.complete and file_digests(store) == file_digests(serial_store)
+    output = CliRunner().invoke(main, ["status", str(store)]).output
+    assert (
+        "complete" in output and f"being replaced: sweep status {staging_path_for(store)}" in output
+    )
     assert resume(outcome.store, progress=False, scheduler="none", retry_failed=True).complete
     assert file_digests(store) == file_digests(run_serially(other, tmp_path / "at_once.zarr").store)
     assert not staging_path_for(store).exists()
 
 
-def test_a_forgotten_extension_never_takes_another_studys_place(undisturbed, tmp_path):
-    store, other = copy_store(undisturbed, tmp_path), small_spec(seed=9)
-    begun(store, tmp_path)
+def test_a_forgotten_extension_never_takes_another_studys_place(serial_store, tmp_path):
+    store, other = copy_store(serial_store, tmp_path), small_spec(seed=9)
+    start_extension(store, tmp_path)
     assert run_serially(other, store, scheduler="none", overwrite=True).complete
     assert resume(store, progress=False, scheduler="none").blocks_computed == 0
     assert status(store).study_id == other.id and list(tmp_path.iterdir()) == [store]
 
 
 @pytest.mark.parametrize("then", ["gone", "another study"])
-def test_an_extension_of_what_was_removed_by_hand_is_refused(undisturbed, tmp_path, then):
-    store = copy_store(undisturbed, tmp_path)
-    begun(store, tmp_path)
+def test_an_extension_of_what_was_removed_by_hand_is_refused(serial_store, tmp_path, then):
+    store = copy_store(serial_store, tmp_path)
+    start_extension(store, tmp_path)
     shutil.rmtree(store)
     if then != "gone":
-        made = run_serially(
+        new_outcome = run_serially(
             small_spec(seed=9, axes={"target.range": ["1 km"]}), tmp_path / "made.zarr"
         )
-        os.rename(made.store, store)
+        os.rename(new_outcome.store, store)
     for command in (
         lambda: resume(store, progress=False, scheduler="none"),
         lambda: run_serially(larger(), store),
@@ -106,9 +108,9 @@ def test_an_extension_of_what_was_removed_by_hand_is_refused(undisturbed, tmp_pa
     assert status(store).study_id == small_spec(seed=9).id and list(tmp_path.iterdir()) == [store]
 
 
-def test_an_extension_that_is_refused_leaves_nothing(undisturbed, tmp_path, monkeypatch):
+def test_an_extension_that_is_refused_leaves_nothing(serial_store, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 0.5)
-    store = copy_store(undisturbed, tmp_path)
+    store = copy_store(serial_store, tmp_path)
     lock = StoreLock(store)
     with pytest.raises(StoreError, match="is being written by process"):
         extend(store, larger(), progress=False, scheduler="none")
@@ -118,12 +120,12 @@ def test_an_extension_that_is_refused_leaves_nothing(undisturbed, tmp_path, monk
     assert list(tmp_path.iterdir()) == [store]
 
 
-@pytest.mark.parametrize("how", [pytest.param("extend", marks=pytest.mark.slow), "overwrite"])
-def test_links_to_stores_stay_and_lead_to_the_new_one(undisturbed, tmp_path, how):
+@pytest.mark.parametrize("link_kind", [pytest.param("extend", marks=pytest.mark.slow), "overwrite"])
+def test_links_to_stores_stay_and_lead_to_the_new_one(serial_store, tmp_path, link_kind):
     (tmp_path / "disk").mkdir()
-    store, link = copy_store(undisturbed, tmp_path / "disk"), tmp_path / "link.zarr"
+    store, link = copy_store(serial_store, tmp_path / "disk"), tmp_path / "link.zarr"
     link.symlink_to(store)
-    if how == "extend":
+    if link_kind == "extend":
         assert extend(link, larger(), progress=False, scheduler="none").complete
     else:
         assert run_serially(larger(), link, scheduler="none", overwrite=True).complete
@@ -133,23 +135,23 @@ def test_links_to_stores_stay_and_lead_to_the_new_one(undisturbed, tmp_path, how
     assert list((tmp_path / "disk").iterdir()) == [store]
 
 
-def test_a_dataset_that_is_open_says_that_its_store_was_extended(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_a_dataset_that_is_open_says_that_its_store_was_extended(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     (store / "pd_up" / "zarr.json").unlink()
-    kept = sweep.open(store)
+    dataset = sweep.open(store)
     assert verify(store, repair=True, progress=False)  # the same study's metadata, anew
-    values = kept.snr_up.values
+    values = dataset.snr_up.values
     opened, scattered = sweep.open(store), sweep.open(store).snr_up.chunk(range=1)
     assert extend(store, larger(), progress=False, scheduler="none").complete
-    for array in (kept.pd_up, opened.snr_up, scattered, opened.effects):
+    for array in (dataset.pd_up, opened.snr_up, scattered, opened.effects):
         with pytest.raises(StoreReplacedError, match="open it again"):
             array.compute()
-    again = sweep.open(store).snr_up.sel(power=[1, 3])
-    np.testing.assert_array_equal(again.values, values)
+    reopened = sweep.open(store).snr_up.sel(power=[1, 3])
+    np.testing.assert_array_equal(reopened.values, values)
 
 
-def test_a_copy_is_never_of_two_studies(undisturbed, tmp_path, monkeypatch):
-    store, real = copy_store(undisturbed, tmp_path), _pack_array
+def test_a_copy_is_never_of_two_studies(serial_store, tmp_path, monkeypatch):
+    store, real = copy_store(serial_store, tmp_path), _pack_array
 
     def extended_meanwhile(path, output):
         real(path, output)
@@ -178,13 +180,13 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_the_next_command_clears_up_after_dead_processes_only(undisturbed, tmp_path, command):
-    store, maker = copy_store(undisturbed, tmp_path), f"{socket.gethostname()}-{dead()}-ab12cd34"
+def test_the_next_command_clears_up_after_dead_processes_only(serial_store, tmp_path, command):
+    store, maker = copy_store(serial_store, tmp_path), f"{socket.gethostname()}-{dead()}-ab12cd34"
     left = [f".copy.zarr.{state}-{maker}" for state in ("creating", "removing", "replaced")]
     left += [f".copy.zarr.{state}-{dead()}-ab12cd34" for state in ("creating", "packing")]
     for name in left:
-        whole = "replaced" in name  # it is renamed once more before it is removed
-        shutil.copytree(store if whole else store / "pd_up", tmp_path / name)
+        is_complete = "replaced" in name  # it is renamed once more before it is removed
+        shutil.copytree(store if is_complete else store / "pd_up", tmp_path / name)
     living = tmp_path / f".copy.zarr.creating-{socket.gethostname()}-{os.getpid()}-ab12cd34"
     living.mkdir()
     command(store)
@@ -192,11 +194,11 @@ def test_the_next_command_clears_up_after_dead_processes_only(undisturbed, tmp_p
     os.rename(store, tmp_path / f".copy.zarr.replaced-{maker}")  # and killed before what follows
     command(store)
     assert sorted(tmp_path.iterdir()) == sorted([store, living])
-    assert file_digests(store) == file_digests(undisturbed)
+    assert file_digests(store) == file_digests(serial_store)
 
 
-def test_spectra_replace_nothing_but_spectra(undisturbed, tmp_path):
-    store, spectra = copy_store(undisturbed, tmp_path), xr.Dataset({"spectrum": ("draw", [1.0])})
+def test_spectra_replace_nothing_but_spectra(serial_store, tmp_path):
+    store, spectra = copy_store(serial_store, tmp_path), xr.Dataset({"spectrum": ("draw", [1.0])})
     np.savez(tmp_path / "mine.npz", spectrum=[1.0])
     (tmp_path / "mine.zarr").mkdir()
     (tmp_path / "mine.zarr" / "notes.txt").write_text("mine")  # an empty folder is a free place

@@ -67,15 +67,15 @@ def test_a_cached_scene_has_the_arrays_of_a_built_one(root):
         lambda data: b"no header" + data,
     ],
 )
-def test_a_damaged_file_is_built_anew(root, damage):
+def test_a_damaged_file_is_built_again(root, damage):
     spec = small_scene_spec()
     build = CountedBuild(spec)
     built = load_or_build_scene(spec, build)
     (path,) = root.iterdir()
-    whole = path.read_bytes()
-    path.write_bytes(damage(whole))
+    content = path.read_bytes()
+    path.write_bytes(damage(content))
     assert_same_scene(built, load_or_build_scene(spec, build))
-    assert build.count == 2 and path.read_bytes() == whole
+    assert build.count == 2 and path.read_bytes() == content
     load_or_build_scene(spec, build)
     assert build.count == 2
 
@@ -130,7 +130,7 @@ def test_sources_that_can_not_be_read_only_cost_time(root, monkeypatch):
     assert build.count == 1 and not list(root.iterdir())
 
 
-def test_other_versions_of_libraries_build_anew(root, monkeypatch):
+def test_other_versions_of_libraries_build_again(root, monkeypatch):
     build = CountedBuild(small_scene_spec())
     load_or_build_scene(build.spec, build)
     monkeypatch.setattr(scene_cache, "_library_versions", lambda: ("0",))

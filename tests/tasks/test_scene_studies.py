@@ -53,7 +53,7 @@ def small_eyepoint_blocks(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
+def serial_outcome(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(eyepoint_study, "SHOTS_PER_BLOCK_MAX", 96)
         outcome = run_serially(
@@ -77,11 +77,11 @@ def no_rays(monkeypatch):
     monkeypatch.setattr(RayCaster, "cast_bundles", refuse)
 
 
-def test_a_study_holds_every_array_that_the_model_names(undisturbed):
-    found = opened(undisturbed.store)
-    assert set(found.children) == {"three", "line", "scene_map"}
-    assert set(found["scene_map"].data_vars) == {"height"}
-    assert set(found["three"].data_vars) == {
+def test_a_study_holds_every_array_that_the_model_names(serial_outcome):
+    dataset = opened(serial_outcome.store)
+    assert set(dataset.children) == {"three", "line", "scene_map"}
+    assert set(dataset["scene_map"].data_vars) == {"height"}
+    assert set(dataset["three"].data_vars) == {
         *SHOT_VARIABLES,
         *CYCLE_VARIABLES,
         *SHOT_STATISTIC_VARIABLES,
@@ -89,27 +89,27 @@ def test_a_study_holds_every_array_that_the_model_names(undisturbed):
         *POINT_VARIABLES,
         *NAVIGATION_VARIABLES,
     }
-    assert set(found["line"].data_vars) == {
+    assert set(dataset["line"].data_vars) == {
         *SHOT_VARIABLES,
         *CYCLE_VARIABLES,
         *SHOT_STATISTIC_VARIABLES,
         *EFFECT_VARIABLES,
         *POINT_VARIABLES,
     }
-    three = found["three"]
+    three = dataset["three"]
     assert three.range.dims == ("power", "shot", "draw", "return_number")
     assert three.range.shape == (2, 222, 5, 3) and three.velocity.shape == (2, 74, 5, 3)
     assert three.power.values.tolist() == [0.01, 1.0] and three.power.units == "W"
-    assert found.attrs["surfaces"] == ["ground", "stone"]
+    assert dataset.attrs["surfaces"] == ["ground", "stone"]
     assert not np.isnan(three.pd_shot).any() and (three.velocity_status >= 0).all()
     assert set(np.unique(three.beam_surface)) == {0, 1}  # the stone is seen, and the ground
 
 
-def test_rays_are_counted_as_they_are_cast(undisturbed):
-    assert undisturbed.rays_by_scanner == {"three": 222 * 7 + 74, "line": 148 * 7 + 148}
-    plain = FlightStudy(small_scene_spec(), undisturbed.store)
-    for eyepoints in plain.eyepoint_studies():
-        store = eyepoint_store_location(undisturbed.store, eyepoints.id)
+def test_rays_are_counted_as_they_are_cast(serial_outcome):
+    assert serial_outcome.rays_by_scanner == {"three": 222 * 7 + 74, "line": 148 * 7 + 148}
+    study = FlightStudy(small_scene_spec(), serial_outcome.store)
+    for eyepoints in study.eyepoint_studies():
+        store = eyepoint_store_location(serial_outcome.store, eyepoints.id)
         assert sorted(receipt_blocks(store)) == list(range(eyepoints.n_blocks))
         assert eyepoints.n_blocks > 1
 
@@ -118,18 +118,20 @@ def test_rays_are_counted_as_they_are_cast(undisturbed):
     "place",
     [{"workers": 2, "processes": False}, pytest.param({"workers": 2}, marks=pytest.mark.slow)],
 )
-def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monkeypatch, place):
+def test_workers_make_the_same_bytes_as_a_plain_loop(serial_outcome, tmp_path, monkeypatch, place):
     if place.get("processes", True):  # worker processes cut eyepoints as they are installed
         monkeypatch.undo()
     outcome = run_serially(small_scene_spec(), tmp_path / "scene.zarr", **place)
-    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed.store)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(serial_outcome.store)
     if not place.get("processes", True):
-        there, here = (path.parent / "eyepoints" for path in (undisturbed.store, outcome.store))
-        assert file_digests(here) == file_digests(there)
+        serial_eyepoints, local_eyepoints = (
+            path.parent / "eyepoints" for path in (serial_outcome.store, outcome.store)
+        )
+        assert file_digests(local_eyepoints) == file_digests(serial_eyepoints)
 
 
 @pytest.mark.slow
-def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbed, tmp_path):
+def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(serial_outcome, tmp_path):
     script = (
         "from small_flights import small_scene_spec; from sweep.tasks.driver import run;"
         f"run(small_scene_spec(), store={str(tmp_path / 'one.zarr')!r}, scheduler='none',"
@@ -140,11 +142,13 @@ def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbe
     subprocess.run(
         [sys.executable, "-c", script], check=True, env=environment | dict.fromkeys(names, "1")
     )
-    assert file_digests(tmp_path / "one.zarr") == file_digests(undisturbed.store)
+    assert file_digests(tmp_path / "one.zarr") == file_digests(serial_outcome.store)
 
 
-def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_path, monkeypatch):
-    shutil.copytree(undisturbed.store.parent / "eyepoints", tmp_path / "eyepoints")
+def test_another_radiometry_of_the_same_geometry_casts_no_ray(
+    serial_outcome, tmp_path, monkeypatch
+):
+    shutil.copytree(serial_outcome.store.parent / "eyepoints", tmp_path / "eyepoints")
     objects = {
         name: thing | {"reflectance": 0.02, "reflectance_law": "lommel_seeliger"}
         for name, thing in SCENE_MAPPING["scene"]["objects"].items()
@@ -166,12 +170,12 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
     )
     outcome = run_serially(other, tmp_path / "darker.zarr")
     assert outcome.complete and outcome.rays_by_scanner == {"three": 0, "line": 0} and not looks
-    dark, bright = opened(outcome.store)["three"], opened(undisturbed.store)["three"]
+    dark, bright = opened(outcome.store)["three"], opened(serial_outcome.store)["three"]
     assert (dark.snr_up.isel(power=1) < bright.snr_up.isel(power=1)).all()
     assert dark.beam_range.equals(bright.beam_range)
 
 
-def test_another_geometry_is_cast_anew(undisturbed, tmp_path):
+def test_another_geometry_is_cast_again(serial_outcome, tmp_path):
     first = small_scene_spec()
     for changes in (
         {"footprint": {"beamlets": 8, "speckle": "none"}},
@@ -185,7 +189,7 @@ def test_another_geometry_is_cast_anew(undisturbed, tmp_path):
 
 
 @pytest.mark.parametrize("points", [60, 500])
-def test_an_interrupted_study_resumes_to_the_same_bytes(undisturbed, tmp_path, points):
+def test_an_interrupted_study_resumes_to_the_same_bytes(serial_outcome, tmp_path, points):
     """After 60 shots rays are still being cast; after 500 the cloud is being made."""
     path, log = tmp_path / "scene.zarr", tmp_path / "log"
     outcome = run(
@@ -201,7 +205,7 @@ def test_an_interrupted_study_resumes_to_the_same_bytes(undisturbed, tmp_path, p
     eyepoints = [EyepointStudy(small_scene_spec(), name) for name in ("three", "line")]
     blocks = sum(study.n_blocks for study in eyepoints) + outcome.blocks
     assert len(logged_blocks(log)) == blocks  # none was computed twice
-    assert file_digests(path) == file_digests(undisturbed.store)
+    assert file_digests(path) == file_digests(serial_outcome.store)
 
 
 class StopUnder(StopAfter):
@@ -213,8 +217,8 @@ class StopUnder(StopAfter):
             os.kill(os.getpid(), 2)
 
 
-def test_lost_chunks_of_either_store_are_computed_again(undisturbed, tmp_path):
-    shutil.copytree(undisturbed.store.parent, tmp_path / "copy")
+def test_lost_chunks_of_either_store_are_computed_again(serial_outcome, tmp_path):
+    shutil.copytree(serial_outcome.store.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "scene.zarr"
     (path / "three" / "flags" / "c" / "1" / "1" / "0" / "0").unlink()
     eyepoints = eyepoint_store_location(path, small_scene_spec().geometry_id("three"))
@@ -222,11 +226,11 @@ def test_lost_chunks_of_either_store_are_computed_again(undisturbed, tmp_path):
     outcome = resume(path, progress=False, scheduler="none")
     assert outcome.complete and outcome.blocks_computed == 1
     assert outcome.rays_by_scanner == {"three": 96 * 7 + 32, "line": 0}
-    assert file_digests(tmp_path / "copy") == file_digests(undisturbed.store.parent)
+    assert file_digests(tmp_path / "copy") == file_digests(serial_outcome.store.parent)
 
 
-def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturbed, tmp_path):
-    shutil.copytree(undisturbed.store.parent / "eyepoints", tmp_path / "eyepoints")
+def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(serial_outcome, tmp_path):
+    shutil.copytree(serial_outcome.store.parent / "eyepoints", tmp_path / "eyepoints")
     spec = small_scene_spec()
     one, other = (
         eyepoint_store_location(tmp_path / "x.zarr", spec.geometry_id(n)) for n in spec.scanners
@@ -240,64 +244,66 @@ def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturb
 
 
 @pytest.mark.parametrize(
-    "whole",
+    "is_complete",
     [False, pytest.param(True, marks=pytest.mark.slow)],
     ids=["in part", "to their end"],
 )
-def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_path, whole):
+def test_rays_that_another_run_casts_are_waited_for_and_used(serial_outcome, tmp_path, is_complete):
     path = tmp_path / "scene.zarr"
     study = EyepointStudy(small_scene_spec(), "three")
-    theirs = eyepoint_store_location(path, study.id)
-    lock = StoreLock(create_store(theirs, study))
+    eyepoint_store = eyepoint_store_location(path, study.id)
+    lock = StoreLock(create_store(eyepoint_store, study))
 
     class Other(Progress):
         """The other run, which goes on when this one waits."""
 
         def say(self, text):
             if "waiting for rays" in text:
-                if whole:
-                    cast = eyepoint_store_location(undisturbed.store, study.id)
-                    shutil.copytree(cast, theirs, dirs_exist_ok=True)
+                if is_complete:
+                    cast = eyepoint_store_location(serial_outcome.store, study.id)
+                    shutil.copytree(cast, eyepoint_store, dirs_exist_ok=True)
                 lock.release()
 
     outcome = run(small_scene_spec(), store=path, scheduler="none", progress=Other())
     assert outcome.complete
-    assert outcome.rays_by_scanner == undisturbed.rays_by_scanner | ({"three": 0} if whole else {})
-    assert file_digests(tmp_path) == file_digests(undisturbed.store.parent)
+    assert outcome.rays_by_scanner == serial_outcome.rays_by_scanner | (
+        {"three": 0} if is_complete else {}
+    )
+    assert file_digests(tmp_path) == file_digests(serial_outcome.store.parent)
 
 
-def test_a_plan_counts_what_the_run_makes(undisturbed, tmp_path):
-    found = plan_study(small_scene_spec(), store_path=tmp_path / "none.zarr", n_workers=2)
-    assert {s.name: s.n_rays for s in found.scanners} == undisturbed.rays_by_scanner
-    assert found.n_blocks == undisturbed.blocks and not found.scanners[0].has_eyepoints
-    chunks = [p for p in undisturbed.store.rglob("c/**/*") if p.is_file()]
+def test_a_plan_counts_what_the_run_makes(serial_outcome, tmp_path):
+    plan = plan_study(small_scene_spec(), store_path=tmp_path / "none.zarr", n_workers=2)
+    assert {s.name: s.n_rays for s in plan.scanners} == serial_outcome.rays_by_scanner
+    assert plan.n_blocks == serial_outcome.blocks and not plan.scanners[0].has_eyepoints
+    chunks = [p for p in serial_outcome.store.rglob("c/**/*") if p.is_file()]
     known = [p for p in chunks if "scene_map" in str(p) or "power" in str(p)]
-    assert found.n_chunks == len(chunks) - len(known)
-    assert found.nbytes == sum(
-        array.nbytes for group, child in opened(undisturbed.store).children.items()
+    assert plan.n_chunks == len(chunks) - len(known)
+    assert plan.nbytes == sum(
+        array.nbytes for group, child in opened(serial_outcome.store).children.items()
         for array in child.data_vars.values() if group != "scene_map"
     )  # fmt: skip
-    assert plan_study(small_scene_spec(), store_path=undisturbed.store).scanners[0].has_eyepoints
+    assert plan_study(small_scene_spec(), store_path=serial_outcome.store).scanners[0].has_eyepoints
 
 
-def test_the_summary_counts_what_the_arrays_hold(undisturbed):
-    found = opened(undisturbed.store)
-    rows = {row.label: row for row in flight_summary(undisturbed.store)}
+def test_the_summary_counts_what_the_arrays_hold(serial_outcome):
+    dataset = opened(serial_outcome.store)
+    rows = {row.label: row for row in flight_summary(serial_outcome.store)}
     assert len(rows) == 4
     weak = rows["three, power 0.01 W"]
-    flags = found["three"].flags.values[0]
+    flags = dataset["three"].flags.values[0]
     assert (
         weak.n_shots == 222 * 5
         and weak.shots_with_true_return == ((flags & 1) > 0).any(axis=-1).sum()
     )
     assert weak.false_points == ((flags > 0) & (flags & 1 == 0)).sum()
-    assert weak.mean_pd == pytest.approx(float(found["three"].pd_shot[0].mean()), rel=1e-12)
+    assert weak.mean_pd == pytest.approx(float(dataset["three"].pd_shot[0].mean()), rel=1e-12)
     assert weak.n_cycles == 74 * 5
-    assert weak.solved_cycles == (found["three"].velocity_status.values[0] <= 1).sum()
+    assert weak.solved_cycles == (dataset["three"].velocity_status.values[0] <= 1).sum()
     strong = rows["three, power 1 W"]
     assert (
         strong.shots_with_true_return
-        == ((found["three"].flags.values[1] & 1) > 0).any(axis=-1).sum()
+        == ((dataset["three"].flags.values[1] & 1) > 0).any(axis=-1).sum()
     )
     # In one draw of a hundred a leaked peak pairs with the echo; whole spectra have it too.
     assert (
@@ -307,9 +313,9 @@ def test_the_summary_counts_what_the_arrays_hold(undisturbed):
     assert rows["line, power 1 W"].n_cycles == 0
 
 
-def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undisturbed, tmp_path):
+def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(serial_outcome, tmp_path):
     """One block is committed; another has its points written, and no velocity yet."""
-    store = shutil.copytree(undisturbed.store, tmp_path / "copy.zarr")
+    store = shutil.copytree(serial_outcome.store, tmp_path / "copy.zarr")
     log = store / ".sweep" / "receipts.jsonl"
     first = next(line for line in log.read_text().splitlines(True) if '"block":0,' in line)
     log.write_text(first)
@@ -319,7 +325,7 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undist
     rows = {row.label: row for row in flight_summary(store)}
     weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
     assert (weak.n_shots, weak.n_cycles) == (120 * 3, 40 * 3)
-    status = opened(undisturbed.store)["three"].velocity_status.values[0, :40, :3]
+    status = opened(serial_outcome.store)["three"].velocity_status.values[0, :40, :3]
     assert weak.solved_cycles == (status <= 1).sum()
     assert (
         strong.n_shots
@@ -338,11 +344,11 @@ def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
         scanners={"three": SCENE_MAPPING["scanners"]["three"]},
         axes={},
     )
-    found = opened(run_serially(spec, tmp_path / "scene.zarr").store)["three"]
-    unseen = ~np.isfinite(found.beam_range.values)
-    assert 0.5 < unseen.mean() < 1 and np.isfinite(found.true_altitude.values).all()
-    assert np.isnan(found.pd_shot.values[unseen]).all()
-    assert not (found.flags.values[unseen] & 1).any()
+    dataset = opened(run_serially(spec, tmp_path / "scene.zarr").store)["three"]
+    unseen = ~np.isfinite(dataset.beam_range.values)
+    assert 0.5 < unseen.mean() < 1 and np.isfinite(dataset.true_altitude.values).all()
+    assert np.isnan(dataset.pd_shot.values[unseen]).all()
+    assert not (dataset.flags.values[unseen] & 1).any()
 
 
 @pytest.mark.parametrize("n_draws", [1, 10, 64, 65, 100, 1000])

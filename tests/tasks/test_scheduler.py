@@ -19,8 +19,8 @@ from sweep.tasks.engine.worker import BlockQueue, TaskResult, TaskSettings
 
 
 def test_blocks_that_are_done_are_not_handed_out():
-    done = np.array([True, False, False, True, False])
-    blocks = BlockQueue(done)
+    is_done = np.array([True, False, False, True, False])
+    blocks = BlockQueue(is_done)
     assert blocks.n_unassigned == 3
     assert blocks.take_blocks(2) == [1, 2]
     assert blocks.n_unassigned == 1
@@ -53,9 +53,9 @@ def test_a_block_that_failed_and_is_put_back_stays_a_suspect():
 
 
 def test_ten_million_blocks_are_handed_out_without_being_listed():
-    done = np.zeros(10_000_000, dtype=bool)
+    is_done = np.zeros(10_000_000, dtype=bool)
     tracemalloc.start()
-    blocks = BlockQueue(done)
+    blocks = BlockQueue(is_done)
     assert blocks.take_blocks(1000) == list(range(1000))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -90,9 +90,9 @@ def test_tasks_grow_short_towards_the_end():
 
 
 def test_a_pace_learns_from_answers():
-    found = ThroughputEstimator(10, 1000.0)
-    found.add_task_result(TaskResult(receipts=[receipt(i) for i in range(5)]))
-    assert found == ThroughputEstimator(15, 1005.0)
+    estimator = ThroughputEstimator(10, 1000.0)
+    estimator.add_task_result(TaskResult(receipts=[receipt(i) for i in range(5)]))
+    assert estimator == ThroughputEstimator(15, 1005.0)
 
 
 class Client:
@@ -113,14 +113,14 @@ def test_the_same_work_has_the_same_key_and_other_work_another():
     assert task_key(job, [1, 2], False) == task_key(
         TaskSettings("/store", "id", None), [1, 2], False
     )
-    others = [
+    other_keys = [
         task_key(job, [1, 3], False),
         task_key(job, [1, 2], True),
         task_key(job, [1, 2], False, resend_count=1),
         task_key(TaskSettings("/other", "id", None), [1, 2], False),
         task_key(TaskSettings("/store", "other", None), [1, 2], False),
     ]
-    assert len({task_key(job, [1, 2], False), *others}) == 6
+    assert len({task_key(job, [1, 2], False), *other_keys}) == 6
 
 
 def test_an_answer_lost_with_its_worker_whose_second_run_fails_is_a_failure_of_its_blocks():
@@ -150,7 +150,7 @@ def test_a_task_that_is_over_is_not_sent_again_before_its_answer_is_looked_at():
         def __init__(self, key, over=False):
             self.key, self.over = key, over
 
-        def done(self):
+        def finish(self):
             return self.over
 
         def add_done_callback(self, call):

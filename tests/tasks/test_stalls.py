@@ -6,7 +6,7 @@ import threading
 
 import pytest
 from small_studies import file_digests, small_spec, thread_cluster_client
-from test_absence import Told
+from test_absent_workers import ActingProgress
 
 from sweep.tasks.driver import run
 from sweep.tasks.engine import dispatcher, stalls, worker
@@ -32,22 +32,24 @@ def impatient(monkeypatch):
 
 
 def test_a_run_that_stalls_shows_its_tasks_and_workers_and_then_goes_on(
-    undisturbed, tmp_path, impatient, caplog
+    serial_store, tmp_path, impatient, caplog
 ):
-    class Releasing(Told):
+    class Releasing(ActingProgress):
         def say(self, text):
             self.lines.append(text)
             if sum(line.startswith("no block has come back for ") for line in self.lines) == 2:
                 RELEASED.set()
 
-    told = Releasing(lambda: None)
+    progress = Releasing(lambda: None)
     with caplog.at_level(logging.INFO, logger="sweep"):
         outcome = run(
-            small_spec(), store=tmp_path / "s.zarr", client=impatient, progress=told,
+            small_spec(), store=tmp_path / "s.zarr", client=impatient, progress=progress,
             evaluate=blocked_at_block_3,
         )  # fmt: skip
-    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
-    first, second = (line for line in told.lines if line.startswith("no block has come back for "))
+    assert outcome.complete and file_digests(outcome.store) == file_digests(serial_store)
+    first, second = (
+        line for line in progress.lines if line.startswith("no block has come back for ")
+    )
     (address,) = impatient.nthreads()
     assert re.search(r"task of block [0-3] and \d+ more: sent .* ago, .*pending", first)
     assert f"worker {address}: 1 thread, last answer " in first
@@ -55,7 +57,7 @@ def test_a_run_that_stalls_shows_its_tasks_and_workers_and_then_goes_on(
     assert sum("nothing came back" in record.message for record in caplog.records) == 2
 
 
-class ReleasingNamedBlock(Told):
+class ReleasingNamedBlock(ActingProgress):
     """Progress that lets the blocked block go on once a report names it."""
 
     def say(self, text):
@@ -68,7 +70,7 @@ class ReleasingNamedBlock(Told):
     ("options", "thread"), [({"scheduler": "none"}, "MainThread"), ({"threads": 2}, r"compute-\d")]
 )
 def test_a_block_that_holds_up_this_process_is_named_with_its_thread(
-    undisturbed, tmp_path, monkeypatch, caplog, options, thread
+    serial_store, tmp_path, monkeypatch, caplog, options, thread
 ):
     RELEASED.clear()
     monkeypatch.setattr(worker, "IDLE_POLL_SECONDS", 0.05)
@@ -79,7 +81,7 @@ def test_a_block_that_holds_up_this_process_is_named_with_its_thread(
             small_spec(), store=tmp_path / "s.zarr", progress=told, evaluate=blocked_at_block_3,
             **options,
         )  # fmt: skip
-    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(serial_store)
     (report,) = (line for line in told.lines if "block 3: " in line)
     assert report.startswith("no block has come back for ")
     assert re.search(
@@ -128,19 +130,21 @@ def blocked_at_first(study, block):
 def test_workers_that_have_yet_to_answer_are_said_to_compile(tmp_path, impatient, monkeypatch):
     monkeypatch.setattr(dispatcher, "COMPILATION_SECONDS_MAX", 1.2)
 
-    class Releasing(Told):
+    class Releasing(ActingProgress):
         def say(self, text):
             self.lines.append(text)
             if "last answer never" in text:
                 RELEASED.set()
 
-    told = Releasing(lambda: None)
+    progress = Releasing(lambda: None)
     outcome = run(
-        small_spec(), store=tmp_path / "s.zarr", client=impatient, progress=told,
+        small_spec(), store=tmp_path / "s.zarr", client=impatient, progress=progress,
         evaluate=blocked_at_first,
     )  # fmt: skip
     assert outcome.complete
-    *early, late = (line for line in told.lines if line.startswith("no block has come back for "))
+    *early, late = (
+        line for line in progress.lines if line.startswith("no block has come back for ")
+    )
     assert early and all("workers load the model, or compile it" in line for line in early)
     assert not any("last answer" in line for line in early)
     assert "last answer never" in late  # beyond the time that compiling takes

@@ -77,12 +77,12 @@ def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study
     arrays = study_store.BlockWriter(path, study)
     objects = study_store.chunk_names_of_block(study, 3)
     assert not is_whole(path, objects)
-    written = arrays.write(3, results)
+    receipt = arrays.write(3, results)
     assert is_whole(path, objects)
-    assert written.digest == store_format.stored_objects_digest(path, objects)
-    assert written.n_bytes == sum((path / name).stat().st_size for name in objects)
+    assert receipt.digest == store_format.stored_objects_digest(path, objects)
+    assert receipt.n_bytes == sum((path / name).stat().st_size for name in objects)
     (message,) = (record.getMessage() for record in caplog.records)
-    counts = f"{len(objects)} chunks of {written.n_bytes} bytes in all"
+    counts = f"{len(objects)} chunks of {receipt.n_bytes} bytes in all"
     assert re.fullmatch(rf"{re.escape(str(path))}: wrote block 3, {counts}, in .* s", message)
     dataset = xr.open_zarr(path)
     for name, values in results.items():
@@ -123,8 +123,8 @@ def test_a_study_without_axes_and_one_with_draws_store_their_chunks(tmp_path):
     assert dataset.n_detected_up.dims == ("batch",)
     assert dataset.n_detected_up.dtype == np.int64
     assert dataset.batch_draws.values.tolist() == [100, 100, 50]
-    counted, drawn = dataset.n_detected_up.values, dataset.batch_draws.values
-    assert np.all((counted >= 0) & (counted <= drawn))
+    counted, batch_draws = dataset.n_detected_up.values, dataset.batch_draws.values
+    assert np.all((counted >= 0) & (counted <= batch_draws))
 
 
 def test_a_store_is_never_made_in_the_place_of_something_else(path, study):
@@ -144,6 +144,6 @@ def test_a_creation_cut_short_leaves_no_store(tmp_path, study, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_where_no_folder_can_be_made_is_told_with_a_remedy():
+def test_a_place_where_no_directory_can_be_made_is_reported_with_a_remedy():
     with pytest.raises(StoreError, match=r"/proc/x.zarr can't be made: .*; name another place, st"):
         run_serially(small_spec(), Path("/proc/x.zarr"))

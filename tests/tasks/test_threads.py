@@ -27,7 +27,7 @@ from sweep.tasks.studies.store_summary import status
 N_BLOCKS = 12
 
 
-def test_threads_compute_blocks_at_the_same_time(undisturbed, tmp_path):
+def test_threads_compute_blocks_at_the_same_time(serial_store, tmp_path):
     """Each block waits until three are at work; one after the other they would wait in vain."""
     three_at_work = threading.Barrier(3)
 
@@ -38,7 +38,7 @@ def test_threads_compute_blocks_at_the_same_time(undisturbed, tmp_path):
     outcome = run_serially(small_spec(), tmp_path / "s.zarr", threads=3, evaluate=meet)
     assert outcome.complete and not outcome.failures
     assert sorted(receipt_blocks(outcome.store)) == list(range(N_BLOCKS))
-    assert file_digests(outcome.store) == file_digests(undisturbed)
+    assert file_digests(outcome.store) == file_digests(serial_store)
 
 
 class ThreadCounts(Progress):
@@ -57,8 +57,8 @@ def test_progress_and_status_count_threads(tmp_path, options, number):
     outcome = run(small_spec(), store=tmp_path / "s.zarr", progress=counter, **options)
     assert counter.counts == {number}
     assert status(outcome.store).threads_in_last_run == number
-    shown = CliRunner().invoke(main, ["status", str(outcome.store)]).output
-    assert re.search(rf"in the last run, by {number} thread{'s' * (number > 1)}\n", shown)
+    output = CliRunner().invoke(main, ["status", str(outcome.store)]).output
+    assert re.search(rf"in the last run, by {number} thread{'s' * (number > 1)}\n", output)
 
 
 def test_lost_results_leave_the_number_of_threads(tmp_path, monkeypatch):
@@ -91,7 +91,7 @@ def test_a_block_that_fails_twice_is_recorded_and_the_others_are_computed(tmp_pa
     assert resume(outcome.store, retry_failed=True, threads=2, progress=False).complete
 
 
-def test_blocks_that_run_at_sigterm_are_committed_and_no_other_begins(undisturbed, tmp_path):
+def test_blocks_that_run_at_sigterm_are_committed_and_no_other_begins(serial_store, tmp_path):
     both_at_work = threading.Barrier(2)
 
     def stop_at_once(study, block):
@@ -106,10 +106,10 @@ def test_blocks_that_run_at_sigterm_are_committed_and_no_other_begins(undisturbe
     assert outcome.stop_reason == "interrupted"
     assert {0, 1} <= set(receipt_blocks(outcome.store)) and outcome.blocks_done < N_BLOCKS
     assert resume(outcome.store, progress=False).complete
-    assert file_digests(outcome.store) == file_digests(undisturbed)
+    assert file_digests(outcome.store) == file_digests(serial_store)
 
 
-def test_blocks_that_outlast_sigterm_do_not_hold_the_run(undisturbed, tmp_path, monkeypatch):
+def test_blocks_that_outlast_sigterm_do_not_hold_the_run(serial_store, tmp_path, monkeypatch):
     monkeypatch.setattr(interrupts, "SIGTERM_GRACE_SECONDS", 0.5)
     may_end = threading.Event()
 
@@ -125,7 +125,7 @@ def test_blocks_that_outlast_sigterm_do_not_hold_the_run(undisturbed, tmp_path, 
     assert 3 not in receipt_blocks(outcome.store)
     may_end.set()  # the thread now ends its block, while another run computes it too
     assert resume(outcome.store, threads=2, progress=False).complete
-    assert file_digests(outcome.store) == file_digests(undisturbed)
+    assert file_digests(outcome.store) == file_digests(serial_store)
 
 
 def test_a_store_that_is_moved_away_meanwhile_ends_the_run(tmp_path):
@@ -153,10 +153,12 @@ def test_only_as_many_threads_compute_as_memory_suffices_for(tmp_path, monkeypat
             at_work.remove(block)
         return results
 
-    said = RecordingProgress()
-    outcome = run(small_spec(), store=tmp_path / "s.zarr", threads=4, evaluate=count, progress=said)
+    progress = RecordingProgress()
+    outcome = run(
+        small_spec(), store=tmp_path / "s.zarr", threads=4, evaluate=count, progress=progress
+    )
     assert outcome.complete and max(most_at_work) == 2
-    assert "memory suffices for 2 of 4 threads: a block takes up to 10.0 GB" in said
+    assert "memory suffices for 2 of 4 threads: a block takes up to 10.0 GB" in progress
 
 
 def test_a_machine_is_not_asked_for_little_memory():
@@ -164,6 +166,6 @@ def test_a_machine_is_not_asked_for_little_memory():
     assert memory.suffices_for(1e6)
 
 
-def test_threads_are_no_part_of_a_study(undisturbed, tmp_path):
+def test_threads_are_no_part_of_a_study(serial_store, tmp_path):
     outcome = run_serially(small_spec(), tmp_path / "s.zarr", threads=2)
-    assert read_attributes(outcome.store) == read_attributes(undisturbed)
+    assert read_attributes(outcome.store) == read_attributes(serial_store)

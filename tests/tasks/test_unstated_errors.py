@@ -113,12 +113,12 @@ def test_an_instruments_floor_is_a_flights_unless_it_states_its_own():
     lander = "lander_ndl"
     assert floor(instrument=lander) == {"range_noise": 2.0, "vibration": 0.02}
     assert floor(instrument="automotive_fmcw") == {"vibration": 0.02}
-    stated = floor(instrument=lander, error_floor={"vibration": "0 m/s", "clock_error": 1e-6})
-    assert stated == {"range_noise": 2.0, "clock_error": 1e-6}
+    stated_floor = floor(instrument=lander, error_floor={"vibration": "0 m/s", "clock_error": 1e-6})
+    assert stated_floor == {"range_noise": 2.0, "clock_error": 1e-6}
     assert floor() == {}
-    whole = spec_of(instrument="lander_ndl")
-    assert SceneSpec.from_stored(whole.to_json()).id == whole.id
-    assert SceneSpec.from_mapping(whole.to_yaml_mapping()).id == whole.id
+    spec = spec_of(instrument="lander_ndl")
+    assert SceneSpec.from_stored(spec.to_json()).id == spec.id
+    assert SceneSpec.from_mapping(spec.to_yaml_mapping()).id == spec.id
     with pytest.raises(SpecError, match=r"error_floor\.vibration"):
         spec_of(instrument="lander_ndl", error_floor={"vibration": "1 kg"})
     with pytest.raises(SpecError, match="error_floor"):
@@ -165,7 +165,7 @@ def test_a_file_of_an_instrument_may_have_a_floor(text, floor, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("written", "told"),
+    ("first_lines", "message"),
     [
         ("error_floor: {vibraton: 2 cm/s}", "own.yaml:1: error_floor.vibraton: is no field"),
         ("error_floor: 3", "own.yaml:1: error_floor: must be a mapping"),
@@ -174,26 +174,28 @@ def test_a_file_of_an_instrument_may_have_a_floor(text, floor, tmp_path):
         ("eror_floor: {}", "did you mean 'error_floor'"),
     ],
 )
-def test_mistakes_in_the_floor_of_a_file_are_told_where_they_stand(written, told, tmp_path):
+def test_mistakes_in_the_floor_of_a_file_are_reported_where_they_stand(
+    first_lines, message, tmp_path
+):
     fields = yaml.safe_load(library_instrument_files()["lander_ndl"].read_text())["instrument"]
-    text = f"{written}\n{yaml.safe_dump({'instrument': fields})}"
+    text = f"{first_lines}\n{yaml.safe_dump({'instrument': fields})}"
     (tmp_path / "own.yaml").write_text(text)
     with pytest.raises(SpecError) as refused:
         SceneSpec.from_mapping(descent({"file": "own.yaml"}), base=tmp_path)
-    assert told in str(refused.value) and len(refused.value.mistakes) == 1
+    assert message in str(refused.value) and len(refused.value.mistakes) == 1
 
 
-@pytest.mark.parametrize("own", ["lander_ndl", ["lander_ndl"], 3])
-def test_a_file_whose_instrument_is_no_mapping_is_refused(own, tmp_path):
-    (tmp_path / "own.yaml").write_text(yaml.safe_dump({"instrument": own}))
+@pytest.mark.parametrize("instrument", ["lander_ndl", ["lander_ndl"], 3])
+def test_a_file_whose_instrument_is_no_mapping_is_refused(instrument, tmp_path):
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump({"instrument": instrument}))
     with pytest.raises(SpecError, match="must be a mapping of fields to values in an instrument"):
         SceneSpec.from_mapping(descent({"file": "own.yaml"}), base=tmp_path)
 
 
 def test_a_grid_of_an_instrument_with_a_floor_has_none():
     target = {"range": "1 km", "grazing_angle": "60 deg", "reflectance": 0.1}
-    written = {"title": "Grid", "instrument": "lander_ndl", "target": target}
-    assert "error_floor" not in GridSpec.from_mapping(written).to_yaml_mapping()
+    mapping = {"title": "Grid", "instrument": "lander_ndl", "target": target}
+    assert "error_floor" not in GridSpec.from_mapping(mapping).to_yaml_mapping()
 
 
 @pytest.mark.parametrize(("instrument", "velocity", "far"), [
@@ -207,11 +209,11 @@ def test_a_descent_onto_a_slope_is_as_good_as_it_says(tmp_path, instrument, velo
     tree = sweep.open_scene(store)
     four = tree["four"].to_dataset().load()
     for name, least in (("radial_velocity", velocity), ("range", far)):
-        stated = four[f"{name}_interpolated_standard_error"].to_numpy()
-        assert np.nanmin(stated) >= least
-    for each in check_error_consistency(tree):
-        assert each.is_consistent, each.message
+        stated_error = four[f"{name}_interpolated_standard_error"].to_numpy()
+        assert np.nanmin(stated_error) >= least
+    for check in check_error_consistency(tree):
+        assert check.is_consistent, check.message
     if instrument == "lander_ndl":
-        solved = {each.quantity: each.error_ratio for each in check_error_consistency(tree)}
+        solved = {check.quantity: check.error_ratio for check in check_error_consistency(tree)}
         assert solved["velocity"] == pytest.approx(1, abs=0.2)
         assert solved["altitude"] == pytest.approx(1, abs=0.2)

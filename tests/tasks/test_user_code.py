@@ -61,7 +61,7 @@ CODE = """
 
 
 @pytest.fixture
-def mine(tmp_path, monkeypatch):
+def user_module(tmp_path, monkeypatch):
     """A module of the user's in the working directory, not allowed yet."""
     name = f"mine_{tmp_path.name}".replace("-", "_")
     (tmp_path / f"{name}.py").write_text(textwrap.dedent(CODE))
@@ -81,11 +81,11 @@ SHORT = {"fft_size": "2^9", "acquisition_delay": "34 us"}
 def study(detector="fixed", estimator="peak_bin", **changes):
     processing = {"sample_rate": "600 MHz", "tnr": 4} | SHORT
     processing |= {"detector": {"kind": detector}, "estimator": {"kind": estimator}}
-    given = small_spec(draws={"method": "spectra", "number": 3}, axes={})
-    mapping = given.to_yaml_mapping()
+    sections = small_spec(draws={"method": "spectra", "number": 3}, axes={})
+    mapping = sections.to_yaml_mapping()
     mapping["instrument"]["processing"] |= processing
     mapping["axes"] = {"target.range": {"linear": ["500 m", "4 km"], "number": 3}} | changes
-    return type(given).from_mapping(
+    return type(sections).from_mapping(
         remove_fields_on_axes(mapping | {"storage": {"block_points": 2}})
     )
 
@@ -95,21 +95,21 @@ def runs(name, tmp_path):
     return file.read_text() if file.exists() else ""
 
 
-def test_code_runs_only_where_its_module_is_allowed(mine, tmp_path):
-    spec = study(f"{mine}:detect", f"{mine}:estimate")
+def test_code_runs_only_where_its_module_is_allowed(user_module, tmp_path):
+    spec = study(f"{user_module}:detect", f"{user_module}:estimate")
     for ask in (lambda: run_serially(spec, tmp_path / "a.zarr"), lambda: plan_study(spec)):
-        with pytest.raises(CodeError, match=rf"allow_code=\['{mine}'\]"):
+        with pytest.raises(CodeError, match=rf"allow_code=\['{user_module}'\]"):
             ask()
-    assert not (tmp_path / "a.zarr").exists() and not runs(mine, tmp_path)
-    user_code.allow_modules([mine])
+    assert not (tmp_path / "a.zarr").exists() and not runs(user_module, tmp_path)
+    user_code.allow_modules([user_module])
     assert run_serially(spec, tmp_path / "a.zarr").complete
     assert run_serially(study(), tmp_path / "b.zarr").complete
-    own, built_in = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
-    np.testing.assert_array_equal(own.pd_shot, built_in.pd_shot)
-    np.testing.assert_array_equal(own.range_rmse, built_in.range_rmse)
+    user_results, built_in = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
+    np.testing.assert_array_equal(user_results.pd_shot, built_in.pd_shot)
+    np.testing.assert_array_equal(user_results.range_rmse, built_in.range_rmse)
 
 
-def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(mine, tmp_path):
+def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(user_module, tmp_path):
     def flown(detector, estimator):
         processing = {"detector": {"kind": detector}, "estimator": {"kind": estimator}}
         instrument = copy.deepcopy(SCENE_MAPPING["instrument"])
@@ -118,56 +118,58 @@ def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(mine,
         scanners = {"three": SCENE_MAPPING["scanners"]["three"] | {"rate": "0.5 Hz"}}
         return small_scene_spec(instrument=instrument, draws=draws, scanners=scanners, axes={})
 
-    spec = flown(f"{mine}:detect", f"{mine}:estimate")
-    with pytest.raises(CodeError, match=rf"allow_code=\['{mine}'\]"):
+    spec = flown(f"{user_module}:detect", f"{user_module}:estimate")
+    with pytest.raises(CodeError, match=rf"allow_code=\['{user_module}'\]"):
         run_serially(spec, tmp_path / "a.zarr")
-    user_code.allow_modules([mine])
+    user_code.allow_modules([user_module])
     assert run_serially(spec, tmp_path / "a.zarr").complete
     assert run_serially(flown("fixed", "peak_bin"), tmp_path / "b.zarr").complete
-    own, built_in = (sweep.open_scene(tmp_path / f"{n}.zarr")["three"] for n in "ab")
+    user_results, built_in = (sweep.open_scene(tmp_path / f"{n}.zarr")["three"] for n in "ab")
     assert (built_in.flags > 0).any()
-    np.testing.assert_array_equal(own.range_interpolated, built_in.range_interpolated)
-    np.testing.assert_array_equal(own.flags, built_in.flags)
-    assert built_in.pd_shot.notnull().any() and not own.pd_shot.notnull().any()
+    np.testing.assert_array_equal(user_results.range_interpolated, built_in.range_interpolated)
+    np.testing.assert_array_equal(user_results.flags, built_in.flags)
+    assert built_in.pd_shot.notnull().any() and not user_results.pd_shot.notnull().any()
 
 
-def test_opening_a_store_runs_nothing(mine, tmp_path):
-    user_code.allow_modules([mine])
-    assert run_serially(study(f"{mine}:detect"), tmp_path / "a.zarr").complete
-    del os.environ[user_code.ALLOWED_MODULES_VARIABLE], sys.modules[mine]
-    ran = runs(mine, tmp_path)
+def test_opening_a_store_runs_nothing(user_module, tmp_path):
+    user_code.allow_modules([user_module])
+    assert run_serially(study(f"{user_module}:detect"), tmp_path / "a.zarr").complete
+    del os.environ[user_code.ALLOWED_MODULES_VARIABLE], sys.modules[user_module]
+    ran = runs(user_module, tmp_path)
     sweep.open(tmp_path / "a.zarr")
     from sweep.tasks.studies.store_summary import status
     from sweep.tasks.studies.study_loading import read_study
 
     assert status(tmp_path / "a.zarr").complete
-    assert read_study(tmp_path / "a.zarr")[1].spec.id == study(f"{mine}:detect").id
-    assert runs(mine, tmp_path) == ran and mine not in sys.modules
+    assert read_study(tmp_path / "a.zarr")[1].spec.id == study(f"{user_module}:detect").id
+    assert runs(user_module, tmp_path) == ran and user_module not in sys.modules
     user_functions.load_checked_function.cache_clear()
     with pytest.raises(CodeError, match="not allowed"):
         sweep.resume(tmp_path / "a.zarr", progress=False)
 
 
 @pytest.mark.parametrize("extended", [False, True])
-def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, tmp_path, extended):
-    user_code.allow_modules([mine])
+def test_a_module_that_changed_since_a_store_was_created_is_reported_each_time(
+    user_module, tmp_path, extended
+):
+    user_code.allow_modules([user_module])
     store, larger = tmp_path / "a.zarr", {"target.range": ["500 m", "2250 m", "4 km", "5 km"]}
-    assert run_serially(study(f"{mine}:detect"), store).complete
+    assert run_serially(study(f"{user_module}:detect"), store).complete
 
-    def told():
-        sys.modules.pop(mine, None)
+    def warnings_given():
+        sys.modules.pop(user_module, None)
         progress, place = RecordingProgress(), {"scheduler": "none", "overwrite": True}
         if extended:
-            spec = study(f"{mine}:detect", **larger)
+            spec = study(f"{user_module}:detect", **larger)
             sweep.extend(store, spec, to=tmp_path / "b.zarr", progress=progress, **place)
         else:
             sweep.resume(store, scheduler="none", progress=progress)
-        return [line for line in progress if f"the module {mine} has changed" in line]
+        return [line for line in progress if f"the module {user_module} has changed" in line]
 
-    assert told() == []
-    with (tmp_path / f"{mine}.py").open("a") as file:
+    assert warnings_given() == []
+    with (tmp_path / f"{user_module}.py").open("a") as file:
         file.write("changed = True\n")
-    assert len(told()) == len(told()) == 1
+    assert len(warnings_given()) == len(warnings_given()) == 1
 
 
 @pytest.mark.parametrize(
@@ -185,14 +187,16 @@ def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, t
         ("estimator", "detect", "fails with TypeError"),
     ],
 )  # fmt: skip
-def test_a_function_is_held_to_its_word_before_anything_runs(mine, tmp_path, role, function, words):
-    user_code.allow_modules([mine])
+def test_a_function_is_held_to_its_word_before_anything_runs(
+    user_module, tmp_path, role, function, words
+):
+    user_code.allow_modules([user_module])
     with pytest.raises(CodeError, match=words):
-        run_serially(study(**{role: f"{mine}:{function}"}), tmp_path / "a.zarr")
+        run_serially(study(**{role: f"{user_module}:{function}"}), tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr").exists()
 
 
-def test_a_module_that_is_not_there_is_named(mine, tmp_path):
+def test_a_module_that_is_not_there_is_named(user_module, tmp_path):
     user_code.allow_modules(["no_such_module"])
     with pytest.raises(CodeError, match=r"no module no_such_module on .*put no_such_module\.py"):
         user_functions.check_user_functions(study("no_such_module:f"))
@@ -207,7 +211,9 @@ def test_a_module_that_is_not_there_is_named(mine, tmp_path):
         ("raise SystemExit(3)\n", r"SystemExit: 3 \(.*bad_\d+\.py:1\)"),
     ],
 )
-def test_a_module_that_can_not_be_imported_is_told_with_its_line(mine, tmp_path, content, words):
+def test_a_module_that_can_not_be_imported_is_reported_with_its_line(
+    user_module, tmp_path, content, words
+):
     name = f"bad_{len(content)}"
     (tmp_path / f"{name}.py").write_text(content)
     with pytest.raises(CodeError, match=f"the module {name} can't be imported on .*{words}"):
@@ -225,17 +231,17 @@ FAILS_LATER = """
 """
 
 
-def test_code_that_fails_in_a_block_is_told_with_its_file_line_and_name(mine, tmp_path):
-    (tmp_path / f"{mine}.py").write_text(textwrap.dedent(FAILS_LATER))
-    spec = study(f"{mine}:detect")
-    outcome = run_serially(spec, tmp_path / "a.zarr", scheduler="none", allow_code=[mine])
+def test_code_that_fails_in_a_block_is_reported_with_its_file_line_and_name(user_module, tmp_path):
+    (tmp_path / f"{user_module}.py").write_text(textwrap.dedent(FAILS_LATER))
+    spec = study(f"{user_module}:detect")
+    outcome = run_serially(spec, tmp_path / "a.zarr", scheduler="none", allow_code=[user_module])
     assert not outcome.stop_reason and outcome.failures  # the disk has room
     for failure in outcome.failures:
-        assert f"{mine}:detect fails with OSError: [Errno 28]" in failure.error
-        assert f"{mine}.py:7, in detect" in failure.error
+        assert f"{user_module}:detect fails with OSError: [Errno 28]" in failure.error
+        assert f"{user_module}.py:7, in detect" in failure.error
 
 
-def elsewhere(function, *arguments):
+def run_elsewhere(function, *arguments):
     """Answer of a function in another process, whose environment allows no code."""
     import subprocess
 
@@ -249,37 +255,37 @@ def elsewhere(function, *arguments):
     )
 
 
-def test_what_a_run_allows_its_workers_allow_too_if_they_have_the_same_file(mine, tmp_path):
-    spec = study(f"{mine}:detect")
-    user_code.allow_modules([mine])
+def test_what_a_run_allows_its_workers_allow_too_if_they_have_the_same_file(user_module, tmp_path):
+    spec = study(f"{user_module}:detect")
+    user_code.allow_modules([user_module])
     ((module, digest),) = user_code.module_digests(user_module_names(spec)).items()
-    assert module == mine and len(digest) == 32
-    refused = elsewhere(user_functions.check_user_functions, spec)
+    assert module == user_module and len(digest) == 32
+    refused = run_elsewhere(user_functions.check_user_functions, spec)
     assert refused.returncode and b"its module is not allowed" in refused.stderr
-    assert elsewhere(user_code.allow_identical_module, module, digest).returncode == 0
-    (tmp_path / f"{mine}.py").write_text("detect = 3")
-    other = elsewhere(user_code.allow_identical_module, module, digest)
+    assert run_elsewhere(user_code.allow_identical_module, module, digest).returncode == 0
+    (tmp_path / f"{user_module}.py").write_text("detect = 3")
+    other = run_elsewhere(user_code.allow_identical_module, module, digest)
     assert other.returncode and b"is not the same file on" in other.stderr
-    (tmp_path / f"{mine}.py").unlink()
-    lost = elsewhere(user_code.allow_identical_module, module, digest)
-    assert lost.returncode and f"put {mine}.py into the folder".encode() in lost.stderr
+    (tmp_path / f"{user_module}.py").unlink()
+    lost = run_elsewhere(user_code.allow_identical_module, module, digest)
+    assert lost.returncode and f"put {user_module}.py into the folder".encode() in lost.stderr
 
 
-def test_workers_that_are_there_already_run_what_the_run_allows(mine, tmp_path):
+def test_workers_that_are_there_already_run_what_the_run_allows(user_module, tmp_path):
     """A scheduler and a worker were started before: in their environment nothing is allowed."""
     from distributed import LocalCluster
 
-    spec = study(f"{mine}:detect")
+    spec = study(f"{user_module}:detect")
     with LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
     ) as cluster:
         outcome = run_serially(
-            spec, tmp_path / "a.zarr", scheduler=cluster.scheduler_address, allow_code=[mine]
+            spec, tmp_path / "a.zarr", scheduler=cluster.scheduler_address, allow_code=[user_module]
         )
     assert outcome.complete
     assert run_serially(spec, tmp_path / "b.zarr", scheduler="none").complete
-    own, same = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
-    np.testing.assert_array_equal(own.pd_shot, same.pd_shot)
+    user_results, same = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
+    np.testing.assert_array_equal(user_results.pd_shot, same.pd_shot)
 
 
 def test_stores_of_whole_spectra_hold_the_same_whatever_the_blocks(tmp_path):

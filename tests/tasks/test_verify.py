@@ -76,8 +76,8 @@ def flips(store: Path, places):
 def found_where(store: Path, file: Path) -> bool:
     """Tell whether the one damaged file is found, and nothing else."""
     name = str(file.relative_to(store))
-    found = unmarked(store)
-    return len(found) >= 1 and all(f.startswith(name) for f in found)
+    locations = unmarked(store)
+    return len(locations) >= 1 and all(f.startswith(name) for f in locations)
 
 
 def look_only(store: Path, monkeypatch) -> None:
@@ -88,7 +88,7 @@ def look_only(store: Path, monkeypatch) -> None:
     )
     monkeypatch.setattr(
         "sweep.tasks.studies.store_verification._withdraw_receipts",
-        lambda path, blocks, shown: "only looking",
+        lambda path, blocks, label: "only looking",
     )
 
 
@@ -148,8 +148,8 @@ def test_whole_lines_cut_off_the_receipts_leave_their_blocks_to_be_done(tiny, tm
     assert report.is_undamaged and report.undamaged_blocks == 0
 
 
-def test_damaged_blocks_are_named_and_just_they_are_computed_again(undisturbed, tmp_path):
-    store, log = copy_store(undisturbed, tmp_path), tmp_path / "log"
+def test_damaged_blocks_are_named_and_just_they_are_computed_again(serial_store, tmp_path):
+    store, log = copy_store(serial_store, tmp_path), tmp_path / "log"
     flip(store / "pd_up" / "c" / "0" / "5" / "0")
     flip(store / "pd_shot" / "c" / "0" / "6" / "0")
     (store / "pd_shot" / "c" / "0" / "2" / "0").unlink()
@@ -162,13 +162,13 @@ def test_damaged_blocks_are_named_and_just_they_are_computed_again(undisturbed, 
         (6, "pd_shot/c/0/6/0", "fails its checksum"),
     ]
     assert (report.undamaged_blocks, report.blocks, report.withdrawal_error) == (9, 12, "")
-    (again,) = verify(store, progress=False)
-    assert again.is_undamaged and again.undamaged_blocks == 9
+    (second_report,) = verify(store, progress=False)
+    assert second_report.is_undamaged and second_report.undamaged_blocks == 9
     assert resume(
         store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
     ).complete
     assert logged_blocks(log) == [2, 5, 6]
-    assert file_digests(store) == file_digests(undisturbed)
+    assert file_digests(store) == file_digests(serial_store)
     (mended,) = verify(store, progress=False)
     assert mended.is_undamaged and mended.complete
 
@@ -186,23 +186,23 @@ def put_directory(file: Path) -> None:
     (file / "some" / "notes").write_text("what got here")
 
 
-def test_a_directory_in_the_place_of_a_chunk_or_a_log_is_healed(undisturbed, tmp_path):
-    store, log = copy_store(undisturbed, tmp_path), tmp_path / "log"
+def test_a_directory_in_the_place_of_a_chunk_or_a_log_is_healed(serial_store, tmp_path):
+    store, log = copy_store(serial_store, tmp_path), tmp_path / "log"
     put_directory(store / "pd_up" / "c" / "0" / "5" / "0")
     put_directory(store / ".sweep" / "failures.jsonl")
     assert resume(
         store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
     ).complete
     assert logged_blocks(log) == [5] and damages(store) == []
-    assert file_digests(store) == file_digests(undisturbed)
+    assert file_digests(store) == file_digests(serial_store)
 
 
-@pytest.mark.parametrize("how", ["missing", "a directory", "flipped"])
-def test_a_store_without_a_coordinate_is_not_opened(undisturbed, tmp_path, how):
-    store = copy_store(undisturbed, tmp_path)
+@pytest.mark.parametrize("damage", ["missing", "a directory", "flipped"])
+def test_a_store_without_a_coordinate_is_not_opened(serial_store, tmp_path, damage):
+    store = copy_store(serial_store, tmp_path)
     chunk = store / "range" / "c" / "0"
-    flip(chunk) if how == "flipped" else chunk.unlink()
-    if how == "a directory":
+    flip(chunk) if damage == "flipped" else chunk.unlink()
+    if damage == "a directory":
         put_directory(chunk)
     with pytest.raises(
         NotAStoreError, match=r"coordinate.* `sweep.verify\(.*, repair=True\)` puts it"
@@ -219,8 +219,8 @@ def test_a_flight_without_a_coordinate_is_not_opened(flight, tmp_path):
         sweep.open_scene(store)
 
 
-def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_a_chunk_that_is_whole_but_another_blocks_is_found(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     chunks = store / "pd_shot" / "c" / "0"
     shutil.copy(chunks / "2" / "0", chunks / "5" / "0")
     (report,) = verify(store, progress=False)
@@ -228,8 +228,8 @@ def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path
     assert "not the one that was committed" in report.damages[0].description
 
 
-def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp_path):
-    store, log = copy_store(undisturbed, tmp_path), tmp_path / "log"
+def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(serial_store, tmp_path):
+    store, log = copy_store(serial_store, tmp_path), tmp_path / "log"
     receipts = store / ".sweep" / "receipts.jsonl"
     receipts.write_bytes(receipts.read_bytes().replace(b'"block":7,', b'"block":8,'))
     assert damages(store) == [".sweep/receipts.jsonl line 8"]
@@ -237,7 +237,7 @@ def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp
         store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
     ).complete
     assert logged_blocks(log) == [7]
-    assert damages(store) == [] and file_digests(store) == file_digests(undisturbed)
+    assert damages(store) == [] and file_digests(store) == file_digests(serial_store)
 
 
 @pytest.mark.parametrize(
@@ -248,8 +248,8 @@ def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp
         ["flipped", "missing", "a directory"],
     ),
 )
-def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, damage):
-    store = copy_store(undisturbed, tmp_path)
+def test_a_template_is_put_back_as_it_was_made(serial_store, tmp_path, name, damage):
+    store = copy_store(serial_store, tmp_path)
     before = file_contents(store)
     flip(store / name) if damage == "flipped" else (store / name).unlink()
     if damage == "a directory":
@@ -269,24 +269,24 @@ def flip_at(file: Path, place: int) -> None:
     file.write_bytes(content)
 
 
-def lose_what_it_holds(store: Path, how: str) -> None:
+def lose_what_it_holds(store: Path, damage: str) -> None:
     """Have neither the group nor the list of a store say undamaged what is in it."""
     root, listed = store / "zarr.json", store / ".sweep" / "template.jsonl"
-    if how == "gone":
+    if damage == "gone":
         root.unlink()
         listed.write_bytes(b"")
         return
     flip_at(listed, 40)
-    flip_at(root, 0 if how == "no JSON" else root.read_bytes().index(b"0.02") + 3)  # 0.03
+    flip_at(root, 0 if damage == "no JSON" else root.read_bytes().index(b"0.02") + 3)  # 0.03
 
 
-@pytest.mark.parametrize("how", ["no JSON", "JSON", "gone"])
+@pytest.mark.parametrize("damage", ["no JSON", "JSON", "gone"])
 def test_a_store_that_no_longer_says_what_it_holds_is_mended_with_the_spec(
-    undisturbed, tmp_path, how
+    serial_store, tmp_path, damage
 ):
-    store = copy_store(undisturbed, tmp_path)
+    store = copy_store(serial_store, tmp_path)
     before = file_contents(store)
-    lose_what_it_holds(store, how)
+    lose_what_it_holds(store, damage)
     after = file_contents(store)
     with pytest.raises(StoreError, match=r"repair=True, spec=spec"):
         verify(store, progress=False, repair=True)
@@ -302,13 +302,13 @@ def test_a_store_that_no_longer_says_what_it_holds_is_mended_with_the_spec(
 
 
 @pytest.mark.parametrize(
-    "how", ["JSON", *(pytest.param(how, marks=pytest.mark.slow) for how in ("no JSON", "gone"))]
+    "damage", ["JSON", *(pytest.param(how, marks=pytest.mark.slow) for how in ("no JSON", "gone"))]
 )
-def test_a_damaged_store_is_known_for_ours_and_written_over(undisturbed, tmp_path, how):
-    store = copy_store(undisturbed, tmp_path)
-    lose_what_it_holds(store, how)
+def test_a_damaged_store_is_known_for_ours_and_written_over(serial_store, tmp_path, damage):
+    store = copy_store(serial_store, tmp_path)
+    lose_what_it_holds(store, damage)
     assert run(small_spec(), store=store, overwrite=True, progress=False, scheduler="none").complete
-    assert file_digests(store) == file_digests(undisturbed) and damages(store) == []
+    assert file_digests(store) == file_digests(serial_store) and damages(store) == []
 
 
 @pytest.mark.parametrize("content", ['{"attributes": {}}', "no JSON"])
@@ -333,8 +333,8 @@ def test_eyepoints_that_no_longer_say_what_they_are_are_mended_by_the_flight(fli
     assert file_digests(directory) == file_digests(flight.parent)
 
 
-def test_chunks_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_chunks_that_are_no_part_of_a_store_are_named(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     surplus = ["pd_up/c/0/12/0", "range/c/1"]
     for name in surplus:
         (store / name).parent.mkdir(parents=True, exist_ok=True)
@@ -343,15 +343,15 @@ def test_chunks_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
     (store / ".sweep" / "receipts.jsonl").write_bytes(b"")  # blocks are no surplus without them
     (report,) = verify(store, progress=False)
     assert sorted(damage.object_name for damage in report.damages) == sorted(surplus)
-    told = CliRunner().invoke(main, ["verify", str(store), "--repair"])
-    assert told.exit_code == 1 and "range/c/1 is no part of the store" in told.output
-    assert "sweep resume" not in told.output and (store / "range/c/1").exists()
+    result = CliRunner().invoke(main, ["verify", str(store), "--repair"])
+    assert result.exit_code == 1 and "range/c/1 is no part of the store" in result.output
+    assert "sweep resume" not in result.output and (store / "range/c/1").exists()
 
 
 def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(
-    undisturbed, tmp_path, monkeypatch
+    serial_store, tmp_path, monkeypatch
 ):
-    store = copy_store(undisturbed, tmp_path)
+    store = copy_store(serial_store, tmp_path)
     flip(store / "range" / "c" / "0")
     before = file_contents(store)
     monkeypatch.setattr("sweep.tasks.engine.study_store.CHUNK_CODECS", "auto")
@@ -360,8 +360,8 @@ def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(
     assert file_contents(store) == before
 
 
-def test_a_store_that_is_being_written_is_looked_at_and_not_touched(undisturbed, tmp_path):
-    store = copy_store(undisturbed, tmp_path)
+def test_a_store_that_is_being_written_is_looked_at_and_not_touched(serial_store, tmp_path):
+    store = copy_store(serial_store, tmp_path)
     flip(store / "pd_up" / "c" / "0" / "5" / "0")
     receipts = store / ".sweep" / "receipts.jsonl"
     receipts.write_bytes(receipts.read_bytes() + b'{"block":3,')  # about to be written
@@ -385,9 +385,9 @@ def test_a_flights_store_and_its_eyepoints_are_verified_and_mended(flight, tmp_p
     flip(chunk)
     flip(damaged / "zarr.json")
     flip(damaged / ".sweep" / "recipe.json")
-    found = {report.store: report for report in verify(store, progress=False)}
-    assert [path for path, report in found.items() if not report.is_undamaged] == [damaged]
-    assert {d.object_name for d in found[damaged].damages} == {
+    reports = {report.store: report for report in verify(store, progress=False)}
+    assert [path for path, report in reports.items() if not report.is_undamaged] == [damaged]
+    assert {d.object_name for d in reports[damaged].damages} == {
         "zarr.json", ".sweep/recipe.json line 1", str(chunk.relative_to(damaged)),
     }  # fmt: skip
     verify(store, progress=False, repair=True)
@@ -409,9 +409,9 @@ def test_the_command_tells_what_is_wrong_and_what_to_do(tmp_path, monkeypatch):
     Path("small.yaml").write_text(yaml.safe_dump(small_mapping(), sort_keys=False))
     run(load("small.yaml"), store="copy.zarr", scheduler="none", progress=False)
     command = CliRunner()
-    whole = command.invoke(main, ["verify", "copy.zarr"])
-    assert whole.exit_code == 0
-    assert whole.output == "copy.zarr: 12 of 12 blocks committed and undamaged\n"
+    result = command.invoke(main, ["verify", "copy.zarr"])
+    assert result.exit_code == 0
+    assert result.output == "copy.zarr: 12 of 12 blocks committed and undamaged\n"
     flip(Path("copy.zarr/pd_up/c/0/5/0"))
     flip(Path("copy.zarr/pd_up/zarr.json"))
     damaged = command.invoke(main, ["verify", "copy.zarr"])
@@ -428,27 +428,27 @@ def test_the_command_tells_what_is_wrong_and_what_to_do(tmp_path, monkeypatch):
     assert command.invoke(main, ["verify", "nowhere.zarr"]).exit_code == 2
     assert command.invoke(main, ["verify", "copy.zarr", "--spec", "small.yaml"]).exit_code == 2
     lose_what_it_holds(Path("copy.zarr"), "no JSON")
-    asked = command.invoke(main, ["status", "copy.zarr"]).output
-    assert "sweep verify" in asked and "--repair --spec SPEC" in asked
+    output = command.invoke(main, ["status", "copy.zarr"]).output
+    assert "sweep verify" in output and "--repair --spec SPEC" in output
     mended = command.invoke(main, ["verify", "copy.zarr", "--repair", "--spec", "small.yaml"])
     assert mended.exit_code == 0, mended.output
 
 
-def test_what_takes_long_shows_how_far_it_is(undisturbed, monkeypatch):
-    told = []
+def test_what_takes_long_shows_how_far_it_is(serial_store, monkeypatch):
+    lines = []
 
     class Watching(Progress):
         def begin(self, *, points, done, unit):
-            told.append((points, done, unit))
+            lines.append((points, done, unit))
 
         def advance(self, *, points, failed):
-            told.append(points)
+            lines.append(points)
 
         def end(self):
-            told.append("end")
+            lines.append("end")
 
-    verify(undisturbed, progress=Watching())
-    assert told == []
+    verify(serial_store, progress=Watching())
+    assert lines == []
     monkeypatch.setattr("sweep.tasks.studies.store_verification.BLOCKS_PER_READ_BATCH", 5)
-    verify(undisturbed, progress=Watching())
-    assert told == [(12, 0, "blocks"), 5, 5, 2, "end"]
+    verify(serial_store, progress=Watching())
+    assert lines == [(12, 0, "blocks"), 5, 5, 2, "end"]

@@ -662,30 +662,33 @@ class AccuracyStoreTemplate:
 
         return [
             ArrayLayout.from_values(
-                "rung", ("rung",), np.array([setting.name for setting in settings], object), {}
+                "setting",
+                ("setting",),
+                np.array([setting.name for setting in settings], object),
+                {},
             ),
             ArrayLayout.from_values(
-                "kind", ("rung",), np.array([setting.kind for setting in settings], object), {}
+                "kind", ("setting",), np.array([setting.kind for setting in settings], object), {}
             ),
             make_layout(
                 "tolerance",
-                ("rung",),
+                ("setting",),
                 [tolerance_of_setting(setting) for setting in settings],
                 "tolerance of an adaptive setting",
             ),
             make_layout(
-                "times", ("rung",), self.n_timed_points, "points of each stretch that is timed"
+                "times", ("setting",), self.n_timed_points, "points of each stretch that is timed"
             ),
             make_layout(
                 "seconds",
-                ("rung", "round"),
+                ("setting", "round"),
                 seconds,
                 "time a point on one core, planning included",
                 "s",
             ),
-            make_layout("planning", ("rung", "round"), planning, "planning's share of it", "s"),
+            make_layout("planning", ("setting", "round"), planning, "planning's share of it", "s"),
             *(
-                make_layout(name, ("rung", "point"), values, about)
+                make_layout(name, ("setting", "point"), values, about)
                 for (name, about), values in zip(
                     ERROR_ARRAY_LONG_NAMES.items(), errors, strict=True
                 )

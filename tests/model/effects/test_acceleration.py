@@ -28,7 +28,7 @@ def test_the_phase_is_what_acceleration_adds_to_the_delays_own(sign, a):
     }  # fmt: skip
     x = np.linspace(-1, 1, 9)
     start, duration = 4e-5, 4e-4
-    found = phase_errors.acceleration_phase(
+    phase = phase_errors.acceleration_phase(
         x, **{k: np.array([v]) if k != "sign" else v for k, v in scene.items()},
         acceleration=np.array([a]), start=np.array([start]), duration=np.array([duration]),
     )[0]  # fmt: skip
@@ -37,4 +37,4 @@ def test_the_phase_is_what_acceleration_adds_to_the_delays_own(sign, a):
         float(exact_phase(t, **scene, acceleration=a) - exact_phase(t, **scene, acceleration=0))
         for t in times
     ]
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(phase, expected, rtol=1e-12, atol=1e-14)

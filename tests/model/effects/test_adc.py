@@ -28,8 +28,10 @@ def test_rounding_a_tone_with_noise_of_a_step_adds_white_noise(bits):
     assert error.mean() / white == pytest.approx(1, abs=5 / np.sqrt(error.size))
     for band in np.array_split(error, 8):
         assert band.mean() / white == pytest.approx(1, abs=5 / np.sqrt(band.size))
-    heard = abs(np.fft.rfft(record - tone)[1:-1]) ** 2 / number
-    assert heard.mean() / (lsb**2 + white) == pytest.approx(1, abs=5 / np.sqrt(heard.size))
+    noise_power = abs(np.fft.rfft(record - tone)[1:-1]) ** 2 / number
+    assert noise_power.mean() / (lsb**2 + white) == pytest.approx(
+        1, abs=5 / np.sqrt(noise_power.size)
+    )
 
 
 @pytest.mark.parametrize("bits", [4, 6, 8, 12, 14])
@@ -52,17 +54,17 @@ def test_a_quantised_record_past_full_scale_shows_gain_and_noise(bits, amplitude
         )
         for _ in range(2)
     ]
-    found = clipping_gains(amplitude=amplitude, deviation=s, full_scale=full_scale)
+    gains = clipping_gains(amplitude=amplitude, deviation=s, full_scale=full_scale)
     line = ((records[0] + records[1]) * np.cos(turn)).mean()
     bend = lsb**2 / 24 * 0.4 / s * 4 / np.pi
-    assert line == pytest.approx(found.signal_gain * amplitude, abs=5 * s / np.sqrt(number) + bend)
+    assert line == pytest.approx(gains.signal_gain * amplitude, abs=5 * s / np.sqrt(number) + bend)
     bins = abs(np.fft.rfft((records[0] - records[1]) / np.sqrt(2))[1:-1]) ** 2 / number
-    expected = found.noise_gain * s**2
+    expected = gains.noise_gain * s**2
     assert bins.mean() == pytest.approx(
         expected + lsb**2 / 24, abs=5 / np.sqrt(bins.size) * expected + lsb**2 / 24
     )
 
 
 def test_the_gain_of_next_to_nothing_is_the_share_of_unclipped_noise():
-    found = clipping_gains(amplitude=[1e-4, 1e-9, 1e-30], deviation=1.0, full_scale=1.5).signal_gain
-    np.testing.assert_allclose(found, erf(1.5 / np.sqrt(2)), rtol=1e-8)
+    gain = clipping_gains(amplitude=[1e-4, 1e-9, 1e-30], deviation=1.0, full_scale=1.5).signal_gain
+    np.testing.assert_allclose(gain, erf(1.5 / np.sqrt(2)), rtol=1e-8)

@@ -34,16 +34,18 @@ def _variance():
         "local_oscillator_power": OSCILLATOR, "mixing_efficiency": 1.0, "apd_gain": GAIN,
         "responsivity": RESPONSIVITY,
     }  # fmt: skip
-    given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
-    given |= LIGHT | {"instrument.laser.amplifier_gain": 1000.0}
-    isolation = {"instrument.telescope.isolation": spontaneous_emission_density(given) / DENSITY}
-    return emission_beat_current_variance(given | isolation, "sent", RATE / 2)
+    parameters = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
+    parameters |= LIGHT | {"instrument.laser.amplifier_gain": 1000.0}
+    isolation = {
+        "instrument.telescope.isolation": spontaneous_emission_density(parameters) / DENSITY
+    }
+    return emission_beat_current_variance(parameters | isolation, "sent", RATE / 2)
 
 
 def test_emission_beats_with_the_local_oscillator_on_both_diodes_of_a_receiver():
     """A coupler halves both fields, one turned by half a cycle; the diodes' currents subtract."""
-    field, own = _emission(), np.sqrt(OSCILLATOR)
-    one, other = (np.abs(own + sign * field) ** 2 / 2 for sign in (1, -1))
+    field, oscillator_field = _emission(), np.sqrt(OSCILLATOR)
+    one, other = (np.abs(oscillator_field + sign * field) ** 2 / 2 for sign in (1, -1))
     current = GAIN * RESPONSIVITY * (one - other)
     assert current.var() == pytest.approx(_variance(), rel=5 * np.sqrt(2 / NUMBER))
 
@@ -82,21 +84,23 @@ def test_a_shot_has_as_much_noise_more_as_the_law_says_of_its_receiver(table_4_1
         for effects in (DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "spontaneous_emission"))
     )
     own_shot = bare.noise.variances["local_oscillator_shot"]
-    more = noisy.noise.variances["spontaneous_emission"]
-    assert more / own_shot == pytest.approx(2 * 1.1 * on_detector / 1.602176634e-19, rel=1e-9)
+    added_variance = noisy.noise.variances["spontaneous_emission"]
+    assert added_variance / own_shot == pytest.approx(
+        2 * 1.1 * on_detector / 1.602176634e-19, rel=1e-9
+    )
     assert noisy.noise_variance_without_echo == pytest.approx(
-        bare.noise_variance_without_echo + more
+        bare.noise_variance_without_echo + added_variance
     )
     size = error_bound(planner_inputs(parameters))
-    assert size.noise_variance_change == pytest.approx(more / sum(
+    assert size.noise_variance_change == pytest.approx(added_variance / sum(
         value for name, value in bare.noise.variances.items() if name != "signal_shot"
     ))  # fmt: skip
     assert size.threshold_follows_noise
-    seen = [
+    snrs = [
         evaluation.evaluate(parameters, e)["snr_up"]
         for e in (DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "spontaneous_emission"))
     ]
-    assert seen[0] / seen[1] == pytest.approx(noisy.noise_variance / bare.noise_variance)
+    assert snrs[0] / snrs[1] == pytest.approx(noisy.noise_variance / bare.noise_variance)
 
 
 def test_nothing_is_there_without_an_amplifier_or_a_local_oscillator(table_4_1):

@@ -40,30 +40,30 @@ def test_even_air_has_the_closed_form_of_exponential_integrals(extinction, lengt
     a, z = extinction, NEAR
     integral = np.exp(-2j * a * z) * (exp1(-2j * a * z) - exp1(2 * a * (length - 1j * z)))
     expected = 0.8 * AREA * a / 50 * integral.imag / z
-    found = power(even(a), start_height=7.0, end_height=7.0, range=length)
-    assert found == pytest.approx(expected, rel=1e-8)
+    backscatter = power(even(a), start_height=7.0, end_height=7.0, range=length)
+    assert backscatter == pytest.approx(expected, rel=1e-8)
 
 
 def test_diffraction_limited_overlap_is_that_of_the_coherent_lidar():
     """r_0 = pi D^2 / (4 lambda): the nearest air gives 1/r_0^2, whatever its distance."""
     divergence = 4 * 1.55e-6 / (np.pi * 25e-3)
     near = 25e-3 / divergence
-    found = power(even(1e-6), near, start_height=7.0, end_height=7.0, range=1.0)
+    backscatter = power(even(1e-6), near, start_height=7.0, end_height=7.0, range=1.0)
     limit = np.pi * 25e-3**2 / (4 * 1.55e-6)
     assert limit == pytest.approx(316.7, rel=1e-3)
-    assert found == pytest.approx(0.8 * AREA * 2e-8 / limit**2, rel=1e-4)
+    assert backscatter == pytest.approx(0.8 * AREA * 2e-8 / limit**2, rel=1e-4)
 
 
 def scenes(number=150):
     rng = np.random.default_rng(6)
-    drawn = [
+    profiles = [
         *EXTINCTION_PROFILES.values(),
         layer_profile(optical_depth=2.0, depth=40.0),
         exponential_profile(surface_extinction=1e-3, scale_height=50.0),
         ExtinctionProfile((0.0, 200.0, 200.0, 350.0), (1e-5, 1e-5, 2e-3, 1e-3)),
     ]
     for _ in range(number):
-        profile = drawn[rng.integers(len(drawn))]
+        profile = profiles[rng.integers(len(profiles))]
         start, end = 10 ** rng.uniform(0, 4, 2) * (rng.random(2) > 0.3)
         length = abs(end - start) * rng.uniform(1, 5) + rng.uniform(1, 2000)
         yield profile, start, end, length
@@ -84,6 +84,6 @@ def test_slant_paths_agree_with_adaptive_quadrature_over_range():
         total, error = quad(
             local, 0, length, points=breaks or None, limit=400, epsabs=0, epsrel=1e-9
         )
-        found = power(profile, start_height=start, end_height=end, range=length)
+        backscatter = power(profile, start_height=start, end_height=end, range=length)
         expected = 0.8 * AREA / 50 * total
-        assert found == pytest.approx(expected, rel=1e-8, abs=2 * 0.8 * AREA / 50 * error)
+        assert backscatter == pytest.approx(expected, rel=1e-8, abs=2 * 0.8 * AREA / 50 * error)

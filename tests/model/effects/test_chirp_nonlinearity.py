@@ -38,10 +38,10 @@ def error_of(sign, *, quadratic=0.0, cubic=0.0, sinusoidal=0.0, periods=1.0, **s
 def test_the_phase_is_the_frequency_error_integrated_over_the_delay(sign, peaks, range_, velocity):
     scene = error_of(sign, **peaks, range=np.array([range_]), radial_velocity=np.array([velocity]))
     x = np.linspace(-1, 1, 7)
-    found = phase_errors.chirp_nonlinearity_phase(x, **scene)[0]
+    phase = phase_errors.chirp_nonlinearity_phase(x, **scene)[0]
     nodes, weights = np.polynomial.legendre.leggauss(20)
     shape = {k: scene[k] for k in ("quadratic", "cubic", "sinusoidal", "periods")}
-    for value, t in zip(found, START + RECORD * (x + 1) / 2, strict=True):
+    for value, t in zip(phase, START + RECORD * (x + 1) / 2, strict=True):
         delay = 2 * (range_ - velocity * t) / LIGHT
         at = t - delay * (1 + nodes) / 2
         place = (2 * at / CHIRP - 1) * sign
@@ -52,10 +52,12 @@ def test_the_phase_is_the_frequency_error_integrated_over_the_delay(sign, peaks,
 
 def test_no_delay_no_sweep_no_error():
     x = np.linspace(-1, 1, 5)
-    some = {"quadratic": 1e6, "cubic": 1e6, "sinusoidal": 1e6}
-    none = phase_errors.chirp_nonlinearity_phase(x, **error_of(1, **some, range=np.array([0.0])))
+    coefficients = {"quadratic": 1e6, "cubic": 1e6, "sinusoidal": 1e6}
+    none = phase_errors.chirp_nonlinearity_phase(
+        x, **error_of(1, **coefficients, range=np.array([0.0]))
+    )
     assert not none.any()
-    assert not phase_errors.chirp_nonlinearity_phase(x, **error_of(0, **some)).any()
+    assert not phase_errors.chirp_nonlinearity_phase(x, **error_of(0, **coefficients)).any()
 
 
 def table_of(error, *, first=0.0, last=CHIRP, rows=401):
@@ -74,9 +76,9 @@ def test_a_quadratic_error_in_a_table_is_the_quadratic_law(sign, range_, velocit
     x, names = np.linspace(-1, 1, 9), ("sign", "chirp_duration", "start", "duration")
     table = fit_sweep_frequency_error(text)
     assert table.chebyshev_coefficients.size == 3
-    found = phase_errors.error_table_phase(x, table=table, **place, **{n: scene[n] for n in names})
+    phase = phase_errors.error_table_phase(x, table=table, **place, **{n: scene[n] for n in names})
     expected = phase_errors.chirp_nonlinearity_phase(x, **scene)
-    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(phase, expected, rtol=1e-11, atol=1e-13)
 
 
 def test_a_table_is_held_beyond_its_ends():
@@ -118,17 +120,17 @@ def test_a_ripple_in_a_table_is_that_of_the_whole_record(table_4_1, delayed):
         beat = -sign * 1e9 / CHIRP * delay
         record = np.hanning(length + 1)[:-1] * np.exp(2j * np.pi * (beat * t + psi))
         expected = abs(np.fft.fft(record, 2**17))
-        plain = np.hanning(length + 1)[:-1] * np.exp(2j * np.pi * beat * t)
-        peak = int(np.argmax(abs(np.fft.fft(plain, 2**17))))
+        tone = np.hanning(length + 1)[:-1] * np.exp(2j * np.pi * beat * t)
+        peak = int(np.argmax(abs(np.fft.fft(tone, 2**17))))
         near = (peak + np.arange(-60, 61)) % 2**17
         bins, magnitude = segment_spectrum(shots, 0, segment)
-        mine = magnitude[np.searchsorted(bins, np.where(near > 2**16, 2**17 - near, near))]
-        scale = mine.max() / expected[near].max()
+        spectrum = magnitude[np.searchsorted(bins, np.where(near > 2**16, 2**17 - near, near))]
+        scale = spectrum.max() / expected[near].max()
         # The series leaves 1e-3 of the span 2 RIPPLE at the most, over the delay.
         phase = 2 * np.pi * delay * 1e-3 * 2 * RIPPLE
-        assert expected[near].max() < 0.8 * abs(np.fft.fft(plain, 2**17)).max()  # it matters
-        bound = phase * abs(np.fft.fft(plain, 2**17)).max()
-        np.testing.assert_allclose(mine / scale, expected[near], atol=bound)
+        assert expected[near].max() < 0.8 * abs(np.fft.fft(tone, 2**17)).max()  # it matters
+        bound = phase * abs(np.fft.fft(tone, 2**17)).max()
+        np.testing.assert_allclose(spectrum / scale, expected[near], atol=bound)
 
 
 def test_a_tables_size_covers_what_it_does_to_the_record(table_4_1):
@@ -143,9 +145,9 @@ def test_a_tables_size_covers_what_it_does_to_the_record(table_4_1):
         range=np.array([100.0, 3000.0]), radial_velocity=np.array([30.0, 30.0]), start=0.0,
         duration=t,
     )  # fmt: skip
-    most = (smear.constant + smear.non_polynomial + smear.coefficients[0])[0]
+    error_max = (smear.constant + smear.non_polynomial + smear.coefficients[0])[0]
     slope = 2 * np.abs(np.gradient(psi, x, axis=1)).max(axis=1)  # bins of fs/L
-    assert (np.abs(psi).max(axis=1) <= most).all()
-    assert (np.abs(psi).max(axis=1) > 0.8 * most).all()
+    assert (np.abs(psi).max(axis=1) <= error_max).all()
+    assert (np.abs(psi).max(axis=1) > 0.8 * error_max).all()
     assert (slope <= np.asarray(smear.shift_window_bins)[0]).all()
     assert (slope > 0.5 * np.asarray(smear.shift_window_bins)[0]).all()

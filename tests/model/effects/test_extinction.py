@@ -23,11 +23,11 @@ def test_slant_paths_through_an_exponential_atmosphere(start, end, stretch, scal
     """alpha_0 H (e^(-h0/H) - e^(-h1/H)) R / (h1 - h0); a level path has alpha(h) R."""
     profile = exponential_profile(surface_extinction=3e-4, scale_height=scale)
     length = stretch * max(abs(end - start), 1.0)
-    found = optical_depth(profile, start_height=start, end_height=end, range=length)
+    depth = optical_depth(profile, start_height=start, end_height=end, range=length)
     x = (end - start) / scale
     mean = 3e-4 * np.exp(-start / scale) * (-np.expm1(-x) / x if x else 1.0)
     # Heights are known to 2e-12 m; 40 scale heights are kept, e^-40 of 3e-4/m.
-    assert found == pytest.approx(mean * length, rel=1e-10, abs=1e-20 * length)
+    assert depth == pytest.approx(mean * length, rel=1e-10, abs=1e-20 * length)
 
 
 def test_a_table_with_a_step_a_gap_and_an_end_is_integrated_row_by_row():
@@ -53,10 +53,10 @@ def test_a_table_with_a_step_a_gap_and_an_end_is_integrated_row_by_row():
             lambda u, a=start, b=end: local(a + (b - a) * u), 0, 1, limit=500,
             points=np.clip([(h - start) / (end - start) for h in (0, 100, 400, 600, 900)], 0, 1),
         )  # fmt: skip
-        found = optical_depth(profile, start_height=start, end_height=end, range=length)
-        assert found == pytest.approx(mean * length, rel=1e-9, abs=1e-18)
+        depth = optical_depth(profile, start_height=start, end_height=end, range=length)
+        assert depth == pytest.approx(mean * length, rel=1e-9, abs=1e-18)
         back = optical_depth(profile, start_height=end, end_height=start, range=length)
-        assert back == found
+        assert back == depth
 
 
 @pytest.mark.parametrize(
@@ -66,27 +66,32 @@ def test_a_table_with_a_step_a_gap_and_an_end_is_integrated_row_by_row():
 def test_attenuation_at_1550_nm_is_that_published_for_the_visibility(visibility, decibels):
     """dB/km of Kim, McArthur and Korevaar's table (2001), which prints one or two digits."""
     extinction = extinction_from_visibility(visibility=visibility, wavelength=1550e-9)
-    found = 10 * np.log10(np.e) * extinction * 1e3
+    attenuation = 10 * np.log10(np.e) * extinction * 1e3
     digit = 10.0 if decibels > 50 else 10 ** np.floor(np.log10(decibels))
-    assert abs(found - decibels) <= max(0.5 * digit, 0.005 * decibels)
+    assert abs(attenuation - decibels) <= max(0.5 * digit, 0.005 * decibels)
 
 
 def test_visibility_is_where_green_contrast_falls_to_two_percent():
-    seen = extinction_from_visibility(visibility=7e3, wavelength=0.55e-6)
-    assert np.exp(-seen * 7e3) == pytest.approx(0.02, rel=1e-12)
+    coefficient = extinction_from_visibility(visibility=7e3, wavelength=0.55e-6)
+    assert np.exp(-coefficient * 7e3) == pytest.approx(0.02, rel=1e-12)
 
 
 def test_the_tables_have_their_optical_depths():
     """Seen from straight above; the Mars of usual seasons lets 61 % of sunlight through."""
     for name, depth in (("mars_clear", 0.5), ("mars_dusty", 1.0), ("mars_storm", 5.0),
                         ("earth_clear", 0.0530), ("earth_haze", 0.289)):  # fmt: skip
-        found = optical_depth(
+        optical_depths = optical_depth(
             EXTINCTION_PROFILES[name], start_height=0.0, end_height=4e5, range=4e5
         )
-        assert found == pytest.approx(depth, rel=5e-3), name
+        assert optical_depths == pytest.approx(depth, rel=5e-3), name
     dust = layer_profile(optical_depth=1.2, depth=30.0)
-    seen = [(1000.0, 0.0, 1000.0), (15.0, 0.0, 15.0), (10.0, 10.0, 50.0), (1000.0, 40.0, 2000.0)]
-    depths = [optical_depth(dust, start_height=a, end_height=b, range=r) for a, b, r in seen]
+    sight_lines = [
+        (1000.0, 0.0, 1000.0),
+        (15.0, 0.0, 15.0),
+        (10.0, 10.0, 50.0),
+        (1000.0, 40.0, 2000.0),
+    ]
+    depths = [optical_depth(dust, start_height=a, end_height=b, range=r) for a, b, r in sight_lines]
     assert depths == pytest.approx([1.2, 0.6, 2.0, 0.0], rel=1e-12)
 
 
@@ -102,9 +107,9 @@ def test_paths_are_worked_out_together_as_one_by_one():
 
 @pytest.mark.parametrize("height", [1e15, -1e15, 1e25])
 def test_paths_so_high_that_float64_knows_no_difference_have_a_depth(height):
-    found = optical_depth(
+    depth = optical_depth(
         EXTINCTION_PROFILES["earth_haze"], start_height=height, end_height=height + 1e-3, range=10.0
     )
-    assert found == pytest.approx(
+    assert depth == pytest.approx(
         0.0 if height > 0 else EXTINCTION_PROFILES["earth_haze"].extinction[0] * 10
     )

@@ -65,25 +65,25 @@ def db(value):
 
 
 @pytest.mark.parametrize("snr", [0, 10, 20, 30])
-@pytest.mark.parametrize("alike", [0.0, 0.5, 1.0])
-def test_closed_forms_are_the_mean_over_draws(snr, alike):
-    rng, number, level = np.random.default_rng(snr + int(10 * alike)), 200_000, 3.0
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 1.0])
+def test_closed_forms_are_the_mean_over_draws(snr, correlation):
+    rng, number, level = np.random.default_rng(snr + int(10 * correlation)), 200_000, 3.0
     first = amplitudes(rng, number)
-    second = alike * first + np.sqrt(1 - alike**2) * amplitudes(rng, number)
+    second = correlation * first + np.sqrt(1 - correlation**2) * amplitudes(rng, number)
     root = np.sqrt(db(snr))
     up = np.abs(root * first + amplitudes(rng, number)) > level
     down = np.abs(0.7 * root * second + amplitudes(rng, number)) > level
     pd, weaker = of_one_bin(root, level)[0], of_one_bin(0.7 * root, level)[0]
-    both = joint_pd_in_speckle(pd, weaker, np.sqrt(2) * level, np.asarray(alike))
-    for found, told in ((up.mean(), pd), ((up & down).mean(), both)):
-        assert abs(found - told) < 5 * np.sqrt(told * (1 - told) / number)
+    both = joint_pd_in_speckle(pd, weaker, np.sqrt(2) * level, np.asarray(correlation))
+    for actual, expected in ((up.mean(), pd), ((up & down).mean(), both)):
+        assert abs(actual - expected) < 5 * np.sqrt(expected * (1 - expected) / number)
 
 
 @pytest.mark.parametrize(("snr", "pd"), [(6.8, 0.2036), (16.0, 0.7980)])
 def test_printed_values_of_swerlings_first_case(snr, pd):
     level = np.sqrt(-np.log(1e-4))
-    found, missed = of_one_bin(np.sqrt(db(snr)), level)
-    assert found == pytest.approx(pd, abs=6e-5)
+    detection_probability, missed = of_one_bin(np.sqrt(db(snr)), level)
+    assert detection_probability == pytest.approx(pd, abs=6e-5)
     assert missed == pytest.approx(1 - pd, abs=6e-5)
 
 
@@ -116,11 +116,13 @@ def test_it_is_what_drawn_speckle_comes_to(sloping):
     number, key = 10_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=1)
     rough = sloping | {"target.roughness": np.inf}
     drawn = [
-        shot_statistics(each.shots)
-        for each in iter_realisations(rough, (*DEFAULT_EFFECTS, "speckle"), keys=key, draws=number)
+        shot_statistics(realisation.shots)
+        for realisation in iter_realisations(
+            rough, (*DEFAULT_EFFECTS, "speckle"), keys=key, draws=number
+        )
     ]
     for name in ("pd_up", "pd_shot"):
-        values = np.concatenate([each[name] for each in drawn])
+        values = np.concatenate([realisation[name] for realisation in drawn])
         error = values.std() / np.sqrt(number)
         # The random effect's largest bin may be another in each draw.
         assert -5 * error - 0.004 < outputs[name][0] - values.mean() < 5 * error
@@ -140,18 +142,18 @@ def beamlet_correlation(shots, first, second):
         segment = shots.waveform_segments[s]
         rate, carrier = float(segment.chirp_rate), float(segment.carrier)
         start = float(np.ravel(shots.waveform.segment_starts[s])[0])
-        apart = delay * shots.footprint.relative_range_offset[
+        frequency_difference = delay * shots.footprint.relative_range_offset[
             0
         ] - shots.footprint.doppler_ratio_offset[0] * (start + middle)  # of delays, then
-        cycles = -(carrier + rate * (middle - delay)) * apart
+        cycles = -(carrier + rate * (middle - delay)) * frequency_difference
         line = (
             carrier * shots.footprint.doppler_ratio_offset[0]
             - rate * delay * shots.footprint.relative_range_offset[0]
         ) / shots.sample_rate[0]
         axis = carrier * float(np.ravel(segment.doppler_ratio)[0]) - rate * delay
         place = axis / shots.sample_rate[0] * shots.fft_size
-        off = (np.rint(place) - place) / shots.fft_size
-        turns = (off - line)[:, None] * (samples - shots.window.length / 2)
+        fraction = (np.rint(place) - place) / shots.fft_size
+        turns = (fraction - line)[:, None] * (samples - shots.window.length / 2)
         fields.append((w * np.cos(2 * np.pi * turns)).sum(axis=1) * np.exp(2j * np.pi * cycles))
     power = shots.footprint.relative_amplitude[0] ** 2
     strength = [(power * np.abs(field) ** 2).sum() for field in fields]
@@ -160,7 +162,7 @@ def beamlet_correlation(shots, first, second):
 
 @pytest.mark.parametrize("order", ["up doppler down", "down doppler up", "up down doppler"])
 @pytest.mark.parametrize(
-    "changed, near",
+    "changes, near",
     [
         ({}, 5e-4),
         ({"target.radial_velocity": 150.0, "instrument.laser.beam_divergence": 2e-3,
@@ -168,7 +170,7 @@ def beamlet_correlation(shots, first, second):
         ({"target.grazing_angle": 1.5}, 1e-3),
     ],
 )  # fmt: skip
-def test_correlations_are_the_sum_over_many_beamlets(order, changed, near, sloping):
+def test_correlations_are_the_sum_over_many_beamlets(order, changes, near, sloping):
     """Of up and Doppler, up and down, Doppler and down segment.
 
     However few the beamlets that the power of a bin needs: here two.
@@ -177,10 +179,10 @@ def test_correlations_are_the_sum_over_many_beamlets(order, changed, near, slopi
         "instrument.chirp.segments": order, "instrument.chirp.gap": 50e-6, "target.range": 3000.0,
         "instrument.processing.fft_size": 8192,
     }  # fmt: skip
-    shots = prepared(several | changed | {"footprint.beamlets": 2})
-    fine = prepared(several | changed | {"footprint.beamlets": 1024, "footprint.pattern": "square"})
-    for found, pair in zip(shots.speckle.segment_correlations, SEGMENT_PAIRS, strict=True):
-        assert found[0] == pytest.approx(beamlet_correlation(fine, *pair), abs=near)
+    shots = prepared(several | changes | {"footprint.beamlets": 2})
+    fine = prepared(several | changes | {"footprint.beamlets": 1024, "footprint.pattern": "square"})
+    for correlation, pair in zip(shots.speckle.segment_correlations, SEGMENT_PAIRS, strict=True):
+        assert correlation[0] == pytest.approx(beamlet_correlation(fine, *pair), abs=near)
 
 
 @pytest.mark.parametrize("transverse", [1.0, 12.0, 20.0, 32.0])
@@ -223,10 +225,10 @@ def test_drawn_factors_have_the_correlations(near):
     far = 0.1 - 0.4j if near != 1.0 else 1.0
     fading = SegmentCorrelations(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
     key, mixing = (np.uint64(3), np.uint64(4)), speckle_mixing_at(fading.speckle_mixing(), 0)
-    found = [
+    factors = [
         speckle_factors(philox.DrawAddress(*key, draw), 0, mixing) for draw in np.arange(number)
     ]
-    power = np.array(found).T ** 2
+    power = np.array(factors).T ** 2
     assert power.mean(axis=1) == pytest.approx(np.ones(3), abs=5 / np.sqrt(number))
     pairs = np.corrcoef(power)[[0, 1, 0], [1, 2, 2]]  # of powers, |mu|^2
     squares = np.abs([near, near, far]) ** 2
@@ -245,17 +247,18 @@ def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping
         count_in_noise(rows, np.array([0, number]), shots, counts)
     else:
         count_by_probability(rows, np.array([0, number]), outputs, counts)
-    told = [outputs[f"pd_{name}"][0] for name in ("up", "down", "shot")]
+    expected = [outputs[f"pd_{name}"][0] for name in ("up", "down", "shot")]
     share = counts[[0, 1, 3], 0, 0] / number
     assert np.all(
-        np.abs(share - told) < 5 * np.sqrt(np.multiply(told, 1 - np.array(told)) / number)
+        np.abs(share - expected)
+        < 5 * np.sqrt(np.multiply(expected, 1 - np.array(expected)) / number)
     )
-    assert told[2] > told[0] * told[1] + 0.02
+    assert expected[2] > expected[0] * expected[1] + 0.02
     method = "noise" if noisy else "probabilities"
     drawn = draw_returns(shots, list_bin_groups(shots), keys=key, draws=number, method=method)
     paired = ((drawn.group[0, :, :, 0] == 0) & (drawn.group[0, :, :, 2] == 0)).any(axis=1)
     # Flights draw the lines of footprints, which grids do not.
-    spread = np.sqrt(2 * told[2] * (1 - told[2]) / number)
+    spread = np.sqrt(2 * expected[2] * (1 - expected[2]) / number)
     assert abs(paired.mean() - counts[3, 0, 0] / number) < 5 * spread
 
 
@@ -263,28 +266,30 @@ def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping
 def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, noisy):
     number, key = 10_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=9)
     shots = prepared(sloping | {"target.range": 8000.0})
-    apart = np.zeros(1, complex)
+    added = np.zeros(1, complex)
     turn = np.array([0.0, 20.0, 40.0])[:, None] + np.zeros((1, 3, 2))
     shots = replace(
         shots,
         speckle=shots.speckle._replace(
-            segment_correlations=SegmentCorrelations(apart, apart, apart),
+            segment_correlations=SegmentCorrelations(added, added, added),
             line_gradients=shots.speckle.line_gradients._replace(phase=turn),
         ),
     )
     method = "noise" if noisy else "probabilities"
-    found = list_bin_groups(shots)
-    drawn = draw_returns(shots, found, keys=key, draws=number, method=method)
-    there = (drawn.group[0, :, 0, 0] == 0) & (drawn.group[0, :, 0, 2] == 0)
+    groups = list_bin_groups(shots)
+    returns = draw_returns(shots, groups, keys=key, draws=number, method=method)
+    is_first_pair = (returns.group[0, :, 0, 0] == 0) & (returns.group[0, :, 0, 2] == 0)
     sigma, level = shots.line_noise_sigma[0], shots.threshold[0]
-    up, down = found.magnitude[0, 0, 0], found.magnitude[0, 2, 0]
-    loud = drawn.snr[0, there, 0] > (level / sigma) ** 2  # of the weaker one: twice the least
-    told, higher = (
+    up, down = groups.magnitude[0, 0, 0], groups.magnitude[0, 2, 0]
+    loud = (
+        returns.snr[0, is_first_pair, 0] > (level / sigma) ** 2
+    )  # of the weaker one: twice the least
+    expected_mean, higher = (
         np.exp(-(factor * level**2) * (1 / (2 * sigma**2 + up**2) + 1 / (2 * sigma**2 + down**2)))
         for factor in (1, 2)
     )
-    chance = higher / told
-    assert abs(loud.mean() - chance) < 5 * np.sqrt(chance * (1 - chance) / there.sum())
+    chance = higher / expected_mean
+    assert abs(loud.mean() - chance) < 5 * np.sqrt(chance * (1 - chance) / is_first_pair.sum())
 
 
 def test_a_smooth_surface_does_not_fade(sloping):

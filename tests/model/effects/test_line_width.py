@@ -32,8 +32,10 @@ def gaussian_power(name, y, fwhm):
         fwhm=np.array([fwhm]), duration=np.array([DURATION])
     )
     form = get_window(name, LENGTH)
-    each = np.abs(direct_transform(form, (y[:, None] - shifts.offset_window_bins[0]).ravel())) ** 2
-    return each.reshape(y.size, -1) @ shifts.weight[0]
+    powers = (
+        np.abs(direct_transform(form, (y[:, None] - shifts.offset_window_bins[0]).ravel())) ** 2
+    )
+    return powers.reshape(y.size, -1) @ shifts.weight[0]
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hamming"])
@@ -64,9 +66,9 @@ def test_shifts_are_the_gaussian_convolution_to_their_tolerance(name, bins_fwhm)
     deviation = bins_fwhm / np.sqrt(8 * np.log(2))
     lag = np.arange(LENGTH) / LENGTH
     expected = by_lags(name, y, np.exp(-2 * (np.pi * deviation * lag) ** 2))
-    found = gaussian_power(name, y, bins_fwhm / DURATION)
+    power = gaussian_power(name, y, bins_fwhm / DURATION)
     top = window_samples(name, LENGTH).sum() ** 2
-    assert np.abs(found - expected).max() < 10 * laser_line.MEAN_POWER_TOLERANCE * top
+    assert np.abs(power - expected).max() < 10 * laser_line.MEAN_POWER_TOLERANCE * top
 
 
 def lorentzian_power(name, laser_width, delay):
@@ -85,11 +87,11 @@ def test_pure_line_and_pedestal_are_the_autocorrelation_at_every_lag(name, laser
     gamma = 2 * np.pi * laser_width / RATE
     lags = np.arange(LENGTH)
     expected = by_lags(name, np.zeros(1), np.exp(-gamma * np.minimum(lags, delay)))
-    found, pedestal = lorentzian_power(name, laser_width, delay / RATE)
+    pure_power, pedestal = lorentzian_power(name, laser_width, delay / RATE)
     assert pedestal > 0
     # What the integral leaves out: kinks of the third derivative at no lag and at the delay.
     share = 2e-5 + (gamma + 1 / LENGTH) / (10 * delay**2)
-    assert np.abs(found - expected) < share * pedestal + 1e-13 * found
+    assert np.abs(pure_power - expected) < share * pedestal + 1e-13 * pure_power
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hamming", "hann"])
@@ -130,8 +132,8 @@ def test_the_walk_of_a_phase_has_the_lag_and_the_growth_of_a_wiener_process(dela
     for u in (1, 10, 19, 21, 200):
         expected = 2 * per_sample * min(u, delay)
         for start in (0, LENGTH - 1 - u):
-            found = (phases[:, start + u] - phases[:, start]).var()
-            assert found == pytest.approx(expected, rel=5 * np.sqrt(2 / number))
+            phase_variance = (phases[:, start + u] - phases[:, start]).var()
+            assert phase_variance == pytest.approx(expected, rel=5 * np.sqrt(2 / number))
 
 
 @pytest.mark.parametrize("g", [0.4, pytest.param(1.3, marks=pytest.mark.slow), 3.8])
@@ -148,15 +150,17 @@ def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1
     peak = np.abs(np.fft.fft(record)).argmax()
     record *= np.exp(-2j * np.pi * peak * np.arange(length) / length)
     walk = rng.standard_normal((number, length + delay)).cumsum(axis=1) * np.sqrt(g / delay)
-    seen = np.exp(1j * (walk[:, delay:] - walk[:, :length])) @ record
+    signal = np.exp(1j * (walk[:, delay:] - walk[:, :length])) @ record
     noise = rng.standard_normal(number) + 1j * rng.standard_normal(number)
     for line in (0.7, 1.0, 1.3):  # over the threshold, by the pure line's power
         factor = line * shots.threshold[0] * np.exp(g / 2) / abs(record.sum())
-        drawn = np.abs(factor * seen + shots.bin_noise_sigma[0] * noise) >= shots.threshold[0]
+        is_detected = (
+            np.abs(factor * signal + shots.bin_noise_sigma[0] * noise) >= shots.threshold[0]
+        )
         changes = {
             "instrument.laser.power": 1e-4 * factor**2,
             "instrument.laser.line_width": g * rate / (2 * np.pi * delay),
             "instrument.laser.line_shape": "lorentzian",
         }
-        found = float(evaluate(point | changes, ("doppler", "line_width"))["pd_up"][0])
-        assert drawn.mean() == pytest.approx(found, abs=5 * np.sqrt(found * (1 - found) / number))
+        pd = float(evaluate(point | changes, ("doppler", "line_width"))["pd_up"][0])
+        assert is_detected.mean() == pytest.approx(pd, abs=5 * np.sqrt(pd * (1 - pd) / number))

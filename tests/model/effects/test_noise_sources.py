@@ -24,9 +24,9 @@ def fluctuating(density, power, *, rejection=1.0, apd_gain=1.0, responsivity=1.1
         "common_mode_rejection": rejection, "local_oscillator_power": power, "apd_gain": apd_gain,
         "responsivity": responsivity,
     }  # fmt: skip
-    given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
+    parameters = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
     return intensity_noise_current_variance(
-        given | {"instrument.laser.relative_intensity_noise": density}, bandwidth
+        parameters | {"instrument.laser.relative_intensity_noise": density}, bandwidth
     )
 
 
@@ -43,9 +43,9 @@ def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
         solar_irradiance=2.6e8, reflectance=1.0, range=1000.0, beam_divergence=1e-3, fft_size=1024,
         optical_efficiency=0.8,
     )  # fmt: skip
-    found = solar_background_bound(planner_inputs(scene))
-    assert found.threshold_follows_noise
-    assert found.noise_variance_change == pytest.approx(0.8 * 1.125e-19 / OTHERS, rel=1e-3)
+    bound = solar_background_bound(planner_inputs(scene))
+    assert bound.threshold_follows_noise
+    assert bound.noise_variance_change == pytest.approx(0.8 * 1.125e-19 / OTHERS, rel=1e-3)
 
 
 def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
@@ -55,11 +55,11 @@ def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
     """
     distance = np.array([1.0, 2.0, 5.0, 20.0])
     parameters = table_4_1(range=distance, fft_size=1024, radial_velocity=10.0)
-    found = signal_shot_noise_bound(planner_inputs(parameters))
+    bound = signal_shot_noise_bound(planner_inputs(parameters))
     share = 1.40992e-13 / OTHERS * 1.953125e-12 * (2000.0 / distance) ** 2 / 1e-3
-    np.testing.assert_allclose(found.noise_variance_change, share, rtol=1e-4)
-    assert not found.threshold_follows_noise
-    predicted = np.exp(-(4 - np.pi) / 4 * 100 / (1 + found.noise_variance_change))
+    np.testing.assert_allclose(bound.noise_variance_change, share, rtol=1e-4)
+    assert not bound.threshold_follows_noise
+    predicted = np.exp(-(4 - np.pi) / 4 * 100 / (1 + bound.noise_variance_change))
     np.testing.assert_allclose(evaluation.evaluate(parameters)["pfa_bin"], predicted, rtol=1e-5)
     rise = predicted / np.exp(-(4 - np.pi) / 4 * 100) - 1
     assert rise == pytest.approx([0.166, 0.0392, 0.00617, 3.8e-4], rel=0.02)
@@ -88,5 +88,5 @@ def test_two_diodes_that_do_not_match_see_what_is_left_of_a_fluctuating_laser():
 
 def test_a_milliampere_has_as_much_of_it_as_shot_noise_at_minus_155_decibels():
     level = 10**-15.494  # 2 q / 1 mA
-    seen = fluctuating(level, 1e-3 / 1.1)
-    assert seen == pytest.approx(2 * ELECTRON * 1e-3 * 400e6, rel=2e-3)
+    noise_ratio = fluctuating(level, 1e-3 / 1.1)
+    assert noise_ratio == pytest.approx(2 * ELECTRON * 1e-3 * 400e6, rel=2e-3)

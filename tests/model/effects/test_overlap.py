@@ -22,17 +22,17 @@ WINDOWS = (*COSINE_SUM_COEFFICIENTS, "kaiser(8.6)", "chebwin(100)", "tukey(0.3)"
 WITH_OVERLAP = (*DEFAULT_EFFECTS, "overlap")
 
 
-def shots_of(parameters, *further):
+def shots_of(parameters, *further_effects):
     ((_, shots),) = evaluation.prepare_shots(
-        PARAMETER_DEFAULTS | parameters, (*WITH_OVERLAP, *further)
+        PARAMETER_DEFAULTS | parameters, (*WITH_OVERLAP, *further_effects)
     )
     return shots
 
 
-def difference(shots, i, segment, **how):
+def difference(shots, i, segment, **keywords):
     """Largest difference from the truth of any bin, over the peak of all lines in a record."""
     bins, fast = segment_spectra.segment_spectrum(shots, i, segment)
-    exact = time_domain_truth.time_domain_spectrum(shots, i, segment, **how)
+    exact = time_domain_truth.time_domain_spectrum(shots, i, segment, **keywords)
     if shots.complex_record:
         exact = np.roll(exact, -(shots.fft_size // 2))[bins % shots.fft_size]
     scale = (
@@ -73,8 +73,8 @@ def test_lines_are_those_of_the_samples_that_the_echo_has(table_4_1, number):
     shots = shots_of(scene, *moving)
     assert shots.echo_record.n_samples_before_echo is not None
     for segment in np.flatnonzero(shots.has_segment).tolist():
-        off = difference(shots, 0, segment, with_range_walk=bool(moving))
-        assert off < (1e-7 if moving else AGREEMENT), scene
+        error = difference(shots, 0, segment, with_range_walk=bool(moving))
+        assert error < (1e-7 if moving else AGREEMENT), scene
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-4, 0.3, 0.8, 0.97])
@@ -95,21 +95,21 @@ def test_lines_with_a_phase_error_are_those_of_the_samples_that_the_echo_has(
     bent = scene | {
         "instrument.chirp.quadratic_error": 3e5, "instrument.chirp.sinusoidal_error": 1e5,
     }  # fmt: skip
-    whole = shots_of(bent, "chirp_nonlinearity")
-    (error,) = whole.echo_record.phase_errors
+    complete_shots = shots_of(bent, "chirp_nonlinearity")
+    (error,) = complete_shots.echo_record.phase_errors
     first = (
-        int(whole.echo_record.n_samples_before_echo[0, 0])
-        if whole.echo_record.n_samples_before_echo is not None
+        int(complete_shots.echo_record.n_samples_before_echo[0, 0])
+        if complete_shots.echo_record.n_samples_before_echo is not None
         else 0
     )
     length = 2**16 - first
     values = error.select_arguments(0, np.array([0]))
     psi = error.phase(2 * np.arange(length) / length - 1, sign=1, **values)[0]
-    plain = shots_of(bent)
-    record = time_domain_truth.analytic_record(plain, 0, 0, 0, with_range_walk=False)
+    steady_shots = shots_of(bent)
+    record = time_domain_truth.analytic_record(steady_shots, 0, 0, 0, with_range_walk=False)
     record[first:] *= np.exp(2j * np.pi * psi)
     exact = np.abs(np.fft.rfft(get_window(name, 2**16).samples() * record.real))
-    _, fast = segment_spectra.segment_spectrum(whole, 0, 0)
+    _, fast = segment_spectra.segment_spectrum(complete_shots, 0, 0)
     assert np.abs(fast - exact).max() < 1e-9 * 2**16 * np.abs(record).max()
 
 
@@ -118,19 +118,19 @@ def test_lines_with_a_phase_error_are_those_of_the_samples_that_the_echo_has(
 
 def triangle(table, **changes):
     """Short chirps sampled from their start on."""
-    given = {
+    parameters = {
         "duration": 10e-6, "fft_size": 2**13, "window": "hann", "phases": "incoherent",
         "beamlets": 1, "radial_velocity": 0.0, "bandwidth": 2e8,
     }  # fmt: skip
-    return table(**given | changes)
+    return table(**parameters | changes)
 
 
 def test_an_echo_in_the_last_part_of_a_record_has_what_is_left_of_the_window(table_4_1):
     """750 m of a chirp of 10 us: Hann's last half has half its sum; at 1,125 m a 25th."""
     ranges = np.array([1.0, 750.0, 1125.0, 1400.0])
-    found = evaluation.evaluate(triangle(table_4_1, range=ranges), WITH_OVERLAP)
+    outputs = evaluation.evaluate(triangle(table_4_1, range=ranges), WITH_OVERLAP)
     ignored = evaluation.evaluate(triangle(table_4_1, range=ranges), DEFAULT_EFFECTS)
-    loss = 10 * np.log10(found["snr_up"] / ignored["snr_up"])
+    loss = 10 * np.log10(outputs["snr_up"] / ignored["snr_up"])
     n = np.arange(6000)
     w = 0.5 - 0.5 * np.cos(2 * np.pi * n / 6000)
     left = [w[n / 600e6 >= 2 * r / SPEED_OF_LIGHT].sum() / w.sum() for r in ranges]
@@ -138,9 +138,11 @@ def test_an_echo_in_the_last_part_of_a_record_has_what_is_left_of_the_window(tab
     assert loss == pytest.approx(20 * np.log10(left), abs=1.43)
     shots = shots_of(triangle(table_4_1, range=ranges))
     exact = time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False)
-    assert found["pd_up"] == pytest.approx(exact.pd[0], abs=1e-9)
-    assert found["miss_up"] == pytest.approx(exact.miss[0], abs=1e-9)
-    assert np.sqrt(2 * found["snr_up"]) * shots.bin_noise_sigma == pytest.approx(exact.magnitude[0])
+    assert outputs["pd_up"] == pytest.approx(exact.pd[0], abs=1e-9)
+    assert outputs["miss_up"] == pytest.approx(exact.miss[0], abs=1e-9)
+    assert np.sqrt(2 * outputs["snr_up"]) * shots.bin_noise_sigma == pytest.approx(
+        exact.magnitude[0]
+    )
     assert loss[1] == pytest.approx(-6.0, abs=1.0) and loss[2] < -18
 
 
@@ -148,23 +150,25 @@ def test_nothing_is_detected_where_no_echo_arrives_in_time(table_4_1):
     """Neither in probabilities nor in draws, and nothing is nan that should not be."""
     ranges = np.array([300.0, 1490.0, 1501.0, 5000.0])
     scene = triangle(table_4_1, range=ranges, tnr=3.0)
-    found = evaluation.evaluate(scene, WITH_OVERLAP)
-    assert (found["pd_shot"][2:] == 0).all() and (found["miss_shot"][2:] == 1).all()
-    assert (found["snr_up"][2:] == 0).all() and (found["p_leakage_up"][2:] == 0).all()
-    assert np.isnan(found["range_error"][2:]).all() and np.isnan(found["misread"][2:]).all()
-    assert np.isfinite(found["range_error"][:2]).all()
+    outputs = evaluation.evaluate(scene, WITH_OVERLAP)
+    assert (outputs["pd_shot"][2:] == 0).all() and (outputs["miss_shot"][2:] == 1).all()
+    assert (outputs["snr_up"][2:] == 0).all() and (outputs["p_leakage_up"][2:] == 0).all()
+    assert np.isnan(outputs["range_error"][2:]).all() and np.isnan(outputs["misread"][2:]).all()
+    assert np.isfinite(outputs["range_error"][:2]).all()
     unknown = {"range_error", "radial_velocity_error", "misread", "beamlets_error"}
-    rest = [name for name in found if name not in unknown]
-    assert all(np.isfinite(found[name]).all() for name in rest)
+    rest = [name for name in outputs if name not in unknown]
+    assert all(np.isfinite(outputs[name]).all() for name in rest)
     for name in ("pfa_bin", "noise_variance"):
-        assert found[name] == pytest.approx(np.full(4, found[name][0]), rel=1e-3)
+        assert outputs[name] == pytest.approx(np.full(4, outputs[name][0]), rel=1e-3)
     keys = point_keys(ranges[:, None], domain="test", seed=1)
     for method in ("probabilities", "noise"):
-        drawn = samplers.simulate_draws(
+        results = samplers.simulate_draws(
             scene, WITH_OVERLAP, keys=keys, method=method, batch_sizes=[500]
         )
-        assert (drawn["n_detected_shot"][2:] == 0).all() and (drawn["n_detected_up"][2:] == 0).all()
-        assert drawn["n_detected_shot"][0, 0] == 500
+        assert (results["n_detected_shot"][2:] == 0).all() and (
+            results["n_detected_up"][2:] == 0
+        ).all()
+        assert results["n_detected_shot"][0, 0] == 500
 
 
 def test_noise_and_threshold_are_those_of_the_whole_record(table_4_1):
@@ -181,24 +185,26 @@ def test_points_whose_echo_fills_the_record_keep_their_bits(table_4_1):
     early = 2 * ranges / SPEED_OF_LIGHT < 3e-6
     assert 5 < early.sum() < 35
     for effects in (DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "range_walk", "segment_motion")):
-        on, off = (
+        on, without_overlap = (
             evaluation.evaluate(scene, (*effects, "overlap")),
             evaluation.evaluate(scene, effects),
         )
         for name in on:
-            assert np.array_equal(on[name][early], off[name][early], equal_nan=True), name
-        assert (on["snr_up"][~early] != off["snr_up"][~early]).all()
+            assert np.array_equal(on[name][early], without_overlap[name][early], equal_nan=True), (
+                name
+            )
+        assert (on["snr_up"][~early] != without_overlap["snr_up"][~early]).all()
 
 
-def test_a_points_bits_do_not_depend_on_the_points_beside_it(table_4_1):
+def test_a_points_bits_do_not_depend_on_the_points_next_to_it(table_4_1):
     ranges = np.linspace(100.0, 4000.0, 60)
     scene = table_4_1(range=ranges, fft_size=2**14, beamlets=7, radial_velocity=20.0)
     effects = (*WITH_OVERLAP, "range_walk", "segment_motion")
     together = evaluation.evaluate(scene, effects)
     for i in (3, 30, 59):
-        alone = evaluation.evaluate(scene | {"target.range": ranges[i : i + 1]}, effects)
+        single = evaluation.evaluate(scene | {"target.range": ranges[i : i + 1]}, effects)
         for name in together:
-            assert np.array_equal(alone[name][0], together[name][i], equal_nan=True), name
+            assert np.array_equal(single[name][0], together[name][i], equal_nan=True), name
 
 
 # Planning
@@ -206,7 +212,7 @@ def test_a_points_bits_do_not_depend_on_the_points_beside_it(table_4_1):
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-5])
 def test_plans_of_random_instruments_keep_the_tolerance_of_the_truth(table_4_1, tolerance):
-    kept = dropped = 0
+    n_kept = dropped = 0
     for seed in range(6):
         rng = np.random.default_rng((seed, 8))
         number = 8
@@ -220,24 +226,24 @@ def test_plans_of_random_instruments_keep_the_tolerance_of_the_truth(table_4_1, 
             power=10 ** rng.uniform(-6, -1, number),
         ) | {"footprint.speckle": "none"}  # fmt: skip
         modes = {"range_walk": "off", "acceleration": "off"}
-        made = plan_points(planner_inputs(scene), modes, tolerance)
-        row = made.effect_names.index("overlap")
-        kept, dropped = kept + made.is_kept[row].sum(), dropped + (~made.is_kept[row]).sum()
+        plan = plan_points(planner_inputs(scene), modes, tolerance)
+        row = plan.effect_names.index("overlap")
+        n_kept, dropped = n_kept + plan.is_kept[row].sum(), dropped + (~plan.is_kept[row]).sum()
         for i in range(number):
             one = {path: v[i : i + 1] if np.ndim(v) else v for path, v in scene.items()}
             shots = shots_of(one, "segment_motion")
             exact = time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False)
-            found = evaluation.evaluate_segments(
-                *(s for _, s in evaluation.prepare_shots(one, effects_kept_in_tile(made, i)))
+            spectra = evaluation.evaluate_segments(
+                *(s for _, s in evaluation.prepare_shots(one, effects_kept_in_tile(plan, i)))
             )
-            allowed = tolerance + made.total_error[i]
-            assert np.nansum(abs(found.pd - exact.pd)) <= allowed + 1e-9
-            off = abs(found.magnitude - exact.magnitude) / np.maximum(
+            allowed = tolerance + plan.total_error[i]
+            assert np.nansum(abs(spectra.pd - exact.pd)) <= allowed + 1e-9
+            error = abs(spectra.magnitude - exact.magnitude) / np.maximum(
                 exact.magnitude, shots.bin_noise_sigma
             )
-            assert np.nanmax(off) <= allowed + 1e-9
+            assert np.nanmax(error) <= allowed + 1e-9
     # A sample at the start of the chirp never has an echo: 2e-4 of a rectangular record of 4096.
-    assert kept > 5 and (dropped > 5 or tolerance < 1e-4)
+    assert n_kept > 5 and (dropped > 5 or tolerance < 1e-4)
 
 
 def test_what_beamlets_at_other_ranges_leave_is_bounded(table_4_1):
@@ -253,12 +259,14 @@ def test_what_beamlets_at_other_ranges_leave_is_bounded(table_4_1):
         evaluation.evaluate_segments(shots),
         time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False),
     )
-    made = plan_points(planner_inputs(scene), {}, 0.0)
+    plan = plan_points(planner_inputs(scene), {}, 0.0)
     left = overlap.residual_bound(planner_inputs(scene))
-    assert (left > 0).any() and (made.total_error > 0).any()
-    off = abs(fast.magnitude - exact.magnitude) / np.maximum(exact.magnitude, shots.bin_noise_sigma)
-    assert (np.nanmax(off, axis=0) <= made.total_error + 1e-9).all()
-    assert (np.nansum(abs(fast.pd - exact.pd), axis=0) <= made.total_error + 1e-9).all()
+    assert (left > 0).any() and (plan.total_error > 0).any()
+    error = abs(fast.magnitude - exact.magnitude) / np.maximum(
+        exact.magnitude, shots.bin_noise_sigma
+    )
+    assert (np.nanmax(error, axis=0) <= plan.total_error + 1e-9).all()
+    assert (np.nansum(abs(fast.pd - exact.pd), axis=0) <= plan.total_error + 1e-9).all()
 
 
 @pytest.mark.parametrize("number", range(24))
@@ -281,8 +289,8 @@ def test_one_number_of_samples_for_all_beamlets_is_within_its_bound(table_4_1, n
     shots, bound = shots_of(scene), np.atleast_2d(overlap.residual_bound(planner_inputs(scene)))
     for i in range(shots.size):
         for row, segment in enumerate(np.flatnonzero(shots.has_segment).tolist()):
-            off = difference(shots, i, segment, with_range_walk=False)
-            assert off <= np.broadcast_to(bound, (3, shots.size))[row, i] + AGREEMENT
+            error = difference(shots, i, segment, with_range_walk=False)
+            assert error <= np.broadcast_to(bound, (3, shots.size))[row, i] + AGREEMENT
 
 
 def test_looks_that_begin_before_the_middle_one_are_within_its_bound(table_4_1):
@@ -309,16 +317,16 @@ def test_leakage_of_an_echo_that_begins_with_a_step_is_within_its_size(table_4_1
             range=rng.uniform(30.0, 2000.0, 30), power=10 ** rng.uniform(-6, 1, 30),
             tnr=rng.uniform(3, 9, 30), radial_velocity=0.0,
         )  # fmt: skip
-        made = plan_points(planner_inputs(scene), {}, 0.0)
-        most = made.omission_error[made.effect_names.index("leakage")]
-        found = evaluation.evaluate_segments(shots_of(scene))
-        extra = np.nansum(found.leakage, axis=0)
-        assert (np.minimum(extra, 1) <= most * (1 + 1e-9) + 1e-12).all()
-        whole = evaluation.evaluate_segments(
+        plan = plan_points(planner_inputs(scene), {}, 0.0)
+        leakage_bound = plan.omission_error[plan.effect_names.index("leakage")]
+        spectra = evaluation.evaluate_segments(shots_of(scene))
+        extra = np.nansum(spectra.leakage, axis=0)
+        assert (np.minimum(extra, 1) <= leakage_bound * (1 + 1e-9) + 1e-12).all()
+        complete_record = evaluation.evaluate_segments(
             *(s for _, s in evaluation.prepare_shots(scene, DEFAULT_EFFECTS))
         )
-        assert np.nansum(found.leakage) > np.nansum(whole.leakage)
-        noticed += ((most < 0.5) & (most > 1e-9)).sum()
+        assert np.nansum(spectra.leakage) > np.nansum(complete_record.leakage)
+        noticed += ((leakage_bound < 0.5) & (leakage_bound > 1e-9)).sum()
     assert noticed > 10
 
 
@@ -333,10 +341,10 @@ def test_draws_of_noise_and_of_whole_spectra_detect_as_often_as_pd_says(table_4_
     assert pd[0] > 0.9 and pd[-1] < 0.5
     keys = point_keys(ranges[:, None], domain="test", seed=2)
     for method, number in (("noise", 4000), (samplers.SPECTRA_METHOD, 400)):
-        drawn = samplers.simulate_draws(
+        results = samplers.simulate_draws(
             scene, WITH_OVERLAP, keys=keys, method=method, batch_sizes=[number]
         )
-        share = drawn["n_detected_up"][:, 0] / number
+        share = results["n_detected_up"][:, 0] / number
         assert share == pytest.approx(pd, abs=4.5 * np.sqrt(0.25 / number) + 0.01), method
 
 
@@ -347,9 +355,11 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
         "instrument.laser.line_width": width, "instrument.laser.line_shape": "lorentzian",
         "footprint.speckle": "none",
     }  # fmt: skip
-    shots, plain = shots_of(scene, "line_width"), shots_of(scene)
+    shots, steady_shots = shots_of(scene, "line_width"), shots_of(scene)
     first = int(shots.echo_record.n_samples_before_echo[0, 0])
-    share = float((shots.echo_scales.beat_amplitude / plain.echo_scales.beat_amplitude)[0] ** 2)
+    share = float(
+        (shots.echo_scales.beat_amplitude / steady_shots.echo_scales.beat_amplitude)[0] ** 2
+    )
     rng = np.random.default_rng(3)
     delay, rate = 2 * far / SPEED_OF_LIGHT, 600e6
     w, n = get_window("hann", 6000).samples(), np.arange(6000)
@@ -362,21 +372,26 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
     line = (w * (n >= first)).sum() ** 2
     pedestal = float(np.ravel(shots.laser_line.pedestal_variance_under_line)[0])
     amplitude = (
-        float(np.ravel(plain.echo_scales.beat_amplitude)[0]) ** 2 * plain.total_relative_echo[0] / 4
+        float(np.ravel(steady_shots.echo_scales.beat_amplitude)[0]) ** 2
+        * steady_shots.total_relative_echo[0]
+        / 4
     )
-    told = share + pedestal * get_window("hann", 6000).energy / amplitude / line
-    assert np.mean(power) / line == pytest.approx(told, rel=0.15)
+    expected = share + pedestal * get_window("hann", 6000).energy / amplitude / line
+    assert np.mean(power) / line == pytest.approx(expected, rel=0.15)
     assert share < 0.9
 
 
 def test_the_window_with_samples_that_lack_has_their_sums():
-    whole = get_window("hamming", 6400)
-    part = zero_first_samples(whole, 3200)
-    w = whole.samples()
+    complete_window = get_window("hamming", 6400)
+    part = zero_first_samples(complete_window, 3200)
+    w = complete_window.samples()
     w[:3200] = 0
-    assert np.array_equal(part.samples(), w) and part.length == whole.length
+    assert np.array_equal(part.samples(), w) and part.length == complete_window.length
     assert part.sum == pytest.approx(w.sum()) and part.energy == pytest.approx((w**2).sum())
-    assert zero_first_samples(whole, 0) is whole and zero_first_samples(whole, 3200) is part
+    assert (
+        zero_first_samples(complete_window, 0) is complete_window
+        and zero_first_samples(complete_window, 3200) is part
+    )
 
 
 # What is measured
@@ -390,18 +405,18 @@ def test_range_walk_is_put_right_for_the_part_of_the_record_that_the_echo_has(ta
             range=far, radial_velocity=velocity, beamlets=1, fft_size=2**15, duration=110e-6,
             window="hann", sample_rate=300e6, wavelength=1e-3,
         )  # fmt: skip
-        ((_, still),) = evaluation.prepare_shots(scene, WITH_OVERLAP)
+        ((_, without_walk),) = evaluation.prepare_shots(scene, WITH_OVERLAP)
         ((_, walking),) = evaluation.prepare_shots(scene, (*WITH_OVERLAP, "range_walk"))
         padded = 2**19
-        w = get_window("hann", still.window.length).samples()
+        w = get_window("hann", without_walk.window.length).samples()
         place = []
         for walk in (False, True):
-            record = time_domain_truth.analytic_record(still, 0, 0, 0, with_range_walk=walk)
+            record = time_domain_truth.analytic_record(without_walk, 0, 0, 0, with_range_walk=walk)
             place.append(np.argmax(abs(np.fft.fft(w * record, padded))) * 300e6 / padded)
         drift = (place[1] - place[0] + 150e6) % 300e6 - 150e6
-        per_second = float(still.waveform.chirp_rate) * 2 * velocity / SPEED_OF_LIGHT
-        told = np.ravel(chirp_drift_time(walking))[0]
-        assert drift / per_second == pytest.approx(told, abs=3 * 300e6 / padded / per_second)
+        per_second = float(without_walk.waveform.chirp_rate) * 2 * velocity / SPEED_OF_LIGHT
+        expected = np.ravel(chirp_drift_time(walking))[0]
+        assert drift / per_second == pytest.approx(expected, abs=3 * 300e6 / padded / per_second)
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
@@ -410,12 +425,12 @@ def test_beats_that_fold_are_flagged_as_misread(table_4_1, record):
     ranges = np.linspace(1e3, 60e3, 60)
     scene = table_4_1(range=ranges, radial_velocity=0.0, beamlets=1, duration=500e-6)
     scene |= {RECORD_PATH: record, "footprint.speckle": "none"}
-    found = evaluation.evaluate(scene, DEFAULT_EFFECTS)
+    outputs = evaluation.evaluate(scene, DEFAULT_EFFECTS)
     rate = 1e9 / 500e-6 * 2 / SPEED_OF_LIGHT  # Hz a metre
     wrong = ranges * rate > 300e6
-    assert np.array_equal(found["misread"] == 1, wrong)
-    assert (abs(found["range_error"][wrong]) > 1e3).all()
-    assert (abs(found["range_error"][~wrong]) < 1.0).all()
+    assert np.array_equal(outputs["misread"] == 1, wrong)
+    assert (abs(outputs["range_error"][wrong]) > 1e3).all()
+    assert (abs(outputs["range_error"][~wrong]) < 1.0).all()
 
 
 def test_peaks_of_the_echo_that_are_misread_have_a_wrong_range(table_4_1):
@@ -423,11 +438,11 @@ def test_peaks_of_the_echo_that_are_misread_have_a_wrong_range(table_4_1):
     ranges = np.array([5e3, 30e3])
     scene = table_4_1(range=ranges, radial_velocity=0.0, beamlets=1, duration=500e-6, power=100.0)
     scene |= {"footprint.speckle": "none", "instrument.processing.peaks": "strongest"}
-    found = evaluation.evaluate(scene, DEFAULT_EFFECTS)
-    assert found["misread"].tolist() == [0.0, 1.0]
-    assert found["pd_shot"][1] > 0.5
-    assert found["p_wrong_range_shot"][1] >= found["pd_shot"][1]
-    assert found["p_wrong_range_shot"][0] < 1e-3
+    outputs = evaluation.evaluate(scene, DEFAULT_EFFECTS)
+    assert outputs["misread"].tolist() == [0.0, 1.0]
+    assert outputs["pd_shot"][1] > 0.5
+    assert outputs["p_wrong_range_shot"][1] >= outputs["pd_shot"][1]
+    assert outputs["p_wrong_range_shot"][0] < 1e-3
 
 
 def test_a_slope_and_motion_are_no_misreading(table_4_1):
@@ -436,10 +451,10 @@ def test_a_slope_and_motion_are_no_misreading(table_4_1):
         range=ranges, grazing_angle=np.radians(5.0), beam_divergence=1e-3, phases="incoherent",
         radial_velocity=120.0, fft_size=2**14,
     ) | {"target.acceleration": 100.0, "target.transverse_velocity": 100.0}  # fmt: skip
-    found = evaluation.evaluate(
+    outputs = evaluation.evaluate(
         scene, (*DEFAULT_EFFECTS, "range_walk", "acceleration", "segment_motion")
     )
-    assert (found["misread"] == 0).all()
+    assert (outputs["misread"] == 0).all()
 
 
 def test_a_carrier_of_zero_makes_no_velocity_a_misread_one(table_4_1):
@@ -449,5 +464,5 @@ def test_a_carrier_of_zero_makes_no_velocity_a_misread_one(table_4_1):
         "target.radial_velocity": 0.0,
     }  # fmt: skip
     with np.errstate(divide="raise"):
-        found = evaluation.evaluate(scene, DEFAULT_EFFECTS)
-    assert found["misread"] == 0
+        outputs = evaluation.evaluate(scene, DEFAULT_EFFECTS)
+    assert outputs["misread"] == 0

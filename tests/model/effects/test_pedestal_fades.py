@@ -53,7 +53,7 @@ def parameters_of(table_4_1, width, distance, law, rule, ratio, **changes):
     return p
 
 
-def drawn_spectra(shots, plain, draws=DRAWS, seed=1):
+def drawn_spectra(shots, steady_shots, draws=DRAWS, seed=1):
     """Spectra of drawn up-chirps without and with noise, and the bin of their line.
 
     ``plain`` are the same shots with a laser of no width, whose line is that of each record.
@@ -62,10 +62,10 @@ def drawn_spectra(shots, plain, draws=DRAWS, seed=1):
     rate, delay = float(shots.sample_rate[0]), 2 * float(shots.range[0]) / SPEED_OF_LIGHT
     per_step = 2 * np.pi * float(shots.laser_line.lorentzian_width[0]) / (FINER * rate)
     later, size = round(delay * rate * FINER), shots.fft_size
-    beat = float(plain.beat_frequencies[0][0]) / rate
+    beat = float(steady_shots.beat_frequencies[0][0]) / rate
     beat = beat if shots.complex_record else abs(beat)
     tone, line = np.exp(2j * np.pi * beat * np.arange(length)), round(beat * size) % size
-    amplitude = float(evaluate_segments(plain).magnitude[0, 0]) / abs(
+    amplitude = float(evaluate_segments(steady_shots).magnitude[0, 0]) / abs(
         np.fft.fft(w * tone, size)[line]
     )
     fades = shots.speckle.segment_correlations is not None
@@ -92,18 +92,18 @@ def echo_bins(shots, echo, line):
     lobe = np.ceil(main_lobe_half_width(shots.window) * size / shots.window.length)
     strong = np.flatnonzero(power >= power.max() / 4)
     near = np.abs(bins[:, None] - strong).min(axis=1) <= lobe
-    beyond = 4 * lobe  # where no sidelobe is
+    clearance = 4 * lobe  # where no sidelobe is
     smooth = np.convolve(power, np.ones(5) / 5, "same")
     above = np.flatnonzero(smooth >= 2 * float(shots.bin_noise_sigma[0]) ** 2)
     reach = np.abs(above - middle).max(initial=0)
-    if reach > beyond:
+    if reach > clearance:
         near |= np.abs(bins - middle) <= reach
     return np.roll(near, line - size // 2)
 
 
-def drawn_pd(shots, plain, rule, draws=DRAWS):
+def drawn_pd(shots, steady_shots, rule, draws=DRAWS):
     """Share of drawn up-chirps with a detection in their echo's bins."""
-    echo, noisy, line = drawn_spectra(shots, plain, draws)
+    echo, noisy, line = drawn_spectra(shots, steady_shots, draws)
     bins = np.arange(shots.fft_size) == line
     if rule == "any_bin":
         bins = echo_bins(shots, echo, line)
@@ -135,21 +135,21 @@ def test_a_pedestal_fades_with_its_line_and_detects(
     effects = effects_of(law)
     p = parameters_of(table_4_1, width, distance, law, rule, ratio, **changes)
     shots = shots_of(p, effects)
-    plain = shots_of(p, [name for name in effects if name != "line_width"])
-    drawn, expected = drawn_pd(shots, plain, rule), float(shot_statistics(shots)["pd_up"][0])
+    steady_shots = shots_of(p, [name for name in effects if name != "line_width"])
+    drawn, expected = drawn_pd(shots, steady_shots, rule), float(shot_statistics(shots)["pd_up"][0])
     assert abs(drawn - expected) < 0.02 + 3 * np.sqrt(drawn * (1 - drawn) / DRAWS)
 
 
 @pytest.mark.parametrize("law", ["none", "developed"])
 def test_draws_detect_by_the_pedestal_as_probabilities_say(law, table_4_1):
     p = parameters_of(table_4_1, 300e3, 150.0, law, "any_bin", 1.3)
-    chosen, given = effects_of(law), {"keys": make_point_keys(1)}
+    chosen, arguments = effects_of(law), {"keys": make_point_keys(1)}
     expected = float(evaluate(p, chosen)["pd_up"][0])
     for method, draws, slack in (
         ("probabilities", 20_000, 0.0), ("noise", 20_000, 0.02), ("spectra", 1000, 0.02)
     ):  # fmt: skip
-        found = simulate_draws(p, chosen, batch_sizes=[draws], method=method, **given)
-        share = found["n_detected_up"].sum() / draws
+        results = simulate_draws(p, chosen, batch_sizes=[draws], method=method, **arguments)
+        share = results["n_detected_up"].sum() / draws
         error = np.sqrt(expected * (1 - expected) / draws)
         assert abs(share - expected) < 4 * error + slack, method
 

@@ -40,7 +40,7 @@ STILL = {"doppler": "off"}
 """Without it lines lie elsewhere: near DC for the Doppler segment."""
 
 
-def some_of(rng, name):
+def random_effects(rng, name):
     """Any of the other effects, with what they need, but for those within this one."""
     chosen = {n for n in DEFAULT_EFFECTS if n != name and rng.random() < 0.6}
     chosen -= {n for n in DEFAULT_EFFECTS if name and WITHIN[n] == name}
@@ -58,14 +58,17 @@ def counted(parameters, seed):
     }  # fmt: skip
 
 
-def changed(on, off):
+def pd_change(on, without_effect):
     """Sum over segments of what pd changes by; direct detection has two of them."""
-    return np.nansum(abs(on.pd - off.pd), axis=0)
+    return np.nansum(abs(on.pd - without_effect.pd), axis=0)
 
 
-def magnitudes_moved(on, off, sigma):
+def magnitudes_moved(on, without_effect, sigma):
     """Largest change of a segment's |X|, in relation to it or to sigma if that is larger."""
-    return np.nanmax(abs(on.magnitude - off.magnitude) / np.maximum(off.magnitude, sigma), axis=0)
+    return np.nanmax(
+        abs(on.magnitude - without_effect.magnitude) / np.maximum(without_effect.magnitude, sigma),
+        axis=0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -81,32 +84,37 @@ def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, 
             **{"beamlets": 7} | KINDS[kind],
         )  # fmt: skip
         inner = counted(parameters, seed)
-        moving, still = (
+        moving, at_rest = (
             plan_points(planner_inputs(parameters), modes, 1.0, CHOICE).omission_error
             for modes in ({}, STILL)
         )
         for name in DEFAULT_EFFECTS:
-            others = some_of(rng, name)
-            changes = moving if "doppler" in others | {name} else still
-            most = dict(zip(DEFAULT_EFFECTS, changes, strict=True))
-            on, off = find_spectra(inner, others | {name}), find_spectra(inner, others)
-            assert (np.minimum(changed(on, off), 1) <= most[name] + ROUNDING).all(), (name, others)
-            moved = magnitudes_moved(
-                on, off, prepare_single_category(inner, others).bin_noise_sigma
+            other_effects = random_effects(rng, name)
+            changes = moving if "doppler" in other_effects | {name} else at_rest
+            bounds = dict(zip(DEFAULT_EFFECTS, changes, strict=True))
+            on, without_effect = (
+                find_spectra(inner, other_effects | {name}),
+                find_spectra(inner, other_effects),
             )
-            assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all(), (name, others)
+            assert (
+                np.minimum(pd_change(on, without_effect), 1) <= bounds[name] + ROUNDING
+            ).all(), (name, other_effects)
+            moved = magnitudes_moved(
+                on, without_effect, prepare_single_category(inner, other_effects).bin_noise_sigma
+            )
+            assert (np.minimum(moved, 1) <= bounds[name] + ROUNDING).all(), (name, other_effects)
             if name == "leakage":
                 extra = np.nansum(on.leakage, axis=0)
-                assert (np.minimum(extra, 1) <= most[name] * (1 + 1e-9) + 1e-12).all()
+                assert (np.minimum(extra, 1) <= bounds[name] * (1 + 1e-9) + 1e-12).all()
             if name == "signal_shot_noise":
-                seen = [
+                statistics = [
                     evaluation.shot_statistics(prepare_single_category(inner, e))
-                    for e in (others | {name}, others)
+                    for e in (other_effects | {name}, other_effects)
                 ]
                 for alarm in ("pfa_segment", "log10_pfa_segment", "log10_pfa_shot"):
-                    moved = abs(seen[0][alarm] - seen[1][alarm])
-                    assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all()
-            noticed += (most[name] < 1).sum()
+                    moved = abs(statistics[0][alarm] - statistics[1][alarm])
+                    assert (np.minimum(moved, 1) <= bounds[name] + ROUNDING).all()
+            noticed += (bounds[name] < 1).sum()
     assert noticed > 250
 
 
@@ -196,17 +204,22 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, effect):
             table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
             **{"beamlets": 7, "radial_velocity": slow} | KINDS[kind],
         ) | override(rng)  # fmt: skip
-        others = some_of(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set())
-        others = (others | ({"overlap"} if seed > 1 else set())) - {name}
-        made = plan_points(planner_inputs(parameters), {}, 1.0)
-        most = made.omission_error[made.effect_names.index(name)]
-        on, off = find_spectra(parameters, others | {name}), find_spectra(parameters, others)
-        assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
-        moved = magnitudes_moved(
-            on, off, prepare_single_category(parameters, others).bin_noise_sigma
+        other_effects = (
+            random_effects(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set())
         )
-        assert (np.minimum(moved, 1) <= most + ROUNDING).all()
-        noticed += (most < 1).sum()
+        other_effects = (other_effects | ({"overlap"} if seed > 1 else set())) - {name}
+        plan = plan_points(planner_inputs(parameters), {}, 1.0)
+        bound = plan.omission_error[plan.effect_names.index(name)]
+        on, without_effect = (
+            find_spectra(parameters, other_effects | {name}),
+            find_spectra(parameters, other_effects),
+        )
+        assert (np.minimum(pd_change(on, without_effect), 1) <= bound + ROUNDING).all()
+        moved = magnitudes_moved(
+            on, without_effect, prepare_single_category(parameters, other_effects).bin_noise_sigma
+        )
+        assert (np.minimum(moved, 1) <= bound + ROUNDING).all()
+        noticed += (bound < 1).sum()
     assert noticed > 10
 
 
@@ -220,45 +233,49 @@ def test_a_large_loss_changes_pd_no_more_than_its_size(table_4_1, kind):
             **{"beamlets": 7} | KINDS[kind],
         )  # fmt: skip
         parameters |= {"atmosphere.profile": "exponential", "atmosphere.extinction": extinction}
-        made = plan_points(planner_inputs(parameters), {}, 1.0)
-        most = made.omission_error[made.effect_names.index("extinction")]
-        on, off = (find_spectra(parameters, {"doppler"} | also) for also in ({"extinction"}, set()))
-        assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
-        noticed += (most < 1).sum()
+        plan = plan_points(planner_inputs(parameters), {}, 1.0)
+        bound = plan.omission_error[plan.effect_names.index("extinction")]
+        on, without_effect = (
+            find_spectra(parameters, {"doppler"} | also) for also in ({"extinction"}, set())
+        )
+        assert (np.minimum(pd_change(on, without_effect), 1) <= bound + ROUNDING).all()
+        noticed += (bound < 1).sum()
     assert noticed > 10
 
 
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-2, 0.3])
 def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
-    kept = dropped = 0
+    n_kept = dropped = 0
     for seed in range(2):
         parameters = random_parameters(
             table_4_1, POINTS, seed, fft_size=2**13, **{"beamlets": 19} | KINDS[kind]
         )
-        made = plan_points(planner_inputs(parameters), {}, tolerance, CHOICE)
+        plan = plan_points(planner_inputs(parameters), {}, tolerance, CHOICE)
         inner = counted(parameters, seed)
         truth = evaluation.evaluate(inner)
-        assert (made.total_error <= tolerance).all()
-        for column in np.unique(made.is_kept, axis=1).T:
-            names = [name for name, there in zip(made.effect_names, column, strict=True) if there]
-            here = (made.is_kept == column[:, None]).all(axis=0)
+        assert (plan.total_error <= tolerance).all()
+        for column in np.unique(plan.is_kept, axis=1).T:
+            names = [
+                name for name, is_kept in zip(plan.effect_names, column, strict=True) if is_kept
+            ]
+            points = (plan.is_kept == column[:, None]).all(axis=0)
             of_kept = evaluation.evaluate(inner, names)
-            error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
+            error = abs(of_kept["pd_shot"] - truth["pd_shot"])[points]
             assert (error <= tolerance + ROUNDING).all(), names
-            whole, part = (
+            complete, part = (
                 prepare_single_category(inner, DEFAULT_EFFECTS),
                 prepare_single_category(inner, names),
             )
             moved = magnitudes_moved(
-                evaluate_segments(whole), evaluate_segments(part), part.bin_noise_sigma
+                evaluate_segments(complete), evaluate_segments(part), part.bin_noise_sigma
             )
-            assert (moved[here] <= np.expm1(tolerance) + ROUNDING).all(), names
+            assert (moved[points] <= np.expm1(tolerance) + ROUNDING).all(), names
             if "leakage" not in names:
                 extra = truth["p_leakage_up"] + truth["p_leakage_down"]
-                assert (extra[here] <= tolerance).all()
-        kept, dropped = kept + made.is_kept.sum(), dropped + (~made.is_kept).sum()
-    assert kept > 30 and dropped > 30
+                assert (extra[points] <= tolerance).all()
+        n_kept, dropped = n_kept + plan.is_kept.sum(), dropped + (~plan.is_kept).sum()
+    assert n_kept > 30 and dropped > 30
 
 
 def cast_scene(rng, shots, beamlets, beside_chance):
@@ -279,11 +296,11 @@ def cast_scene(rng, shots, beamlets, beside_chance):
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
 @pytest.mark.parametrize("stretch", [1, 5])
 def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, stretch):
-    kept = dropped = 0
+    n_kept = dropped = 0
     for seed in range(4):
         rng = np.random.default_rng((seed, stretch))
         chance = [0.0, 0.3][seed % 2]
-        footprints, beside = cast_scene(rng, POINTS, 7, chance)
+        footprints, other_footprints = cast_scene(rng, POINTS, 7, chance)
         order = np.sort(10 ** rng.uniform(0.5, 3, POINTS))
         parameters = PARAMETER_DEFAULTS | table_4_1(
             range=order, radial_velocity=np.sort(rng.normal(0, 30, POINTS)), beamlets=7,
@@ -291,8 +308,8 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
         )  # fmt: skip
         edges = np.arange(0, POINTS + 1, stretch)
         tile = np.repeat(np.arange(len(edges) - 1), stretch)
-        ground = RayTracedGround(footprints, beside)
-        made, still = (
+        ground = RayTracedGround(footprints, other_footprints)
+        plan, at_rest = (
             plan_points(
                 planner_inputs(parameters, ray_traced_footprint_extent(ground)),
                 modes,
@@ -303,37 +320,40 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
             for modes in ({}, STILL)
         )
         for place, name in enumerate(DEFAULT_EFFECTS):
-            others = some_of(rng, name)
-            changes = (made if "doppler" in others | {name} else still).omission_error
-            most = changes[place, tile]
-            on, off = (
+            other_effects = random_effects(rng, name)
+            changes = (plan if "doppler" in other_effects | {name} else at_rest).omission_error
+            bound = changes[place, tile]
+            on, without_effect = (
                 evaluate_segments(prepare_ray_traced_shots(parameters, ground, e))
-                for e in (others | {name}, others)
+                for e in (other_effects | {name}, other_effects)
             )
-            assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all(), (name, others)
+            assert (np.minimum(pd_change(on, without_effect), 1) <= bound + ROUNDING).all(), (
+                name,
+                other_effects,
+            )
         truth = evaluate_segments(prepare_ray_traced_shots(parameters, ground))
         for i in range(len(edges) - 1):
             of_kept = evaluate_segments(
-                prepare_ray_traced_shots(parameters, ground, effects_kept_in_tile(made, i))
+                prepare_ray_traced_shots(parameters, ground, effects_kept_in_tile(plan, i))
             )
             error = abs(of_kept.pd[0] * of_kept.pd[2] - truth.pd[0] * truth.pd[2])
             assert (error[tile == i] <= 0.05 + ROUNDING).all()
-        has_beside = made.omission_error[DEFAULT_EFFECTS.index("several_returns")].any()
-        assert has_beside == (beside is not None)
-        kept, dropped = kept + made.is_kept.sum(), dropped + (~made.is_kept).sum()
-    assert kept > 30 and dropped > 30
+        has_beside = plan.omission_error[DEFAULT_EFFECTS.index("several_returns")].any()
+        assert has_beside == (other_footprints is not None)
+        n_kept, dropped = n_kept + plan.is_kept.sum(), dropped + (~plan.is_kept).sum()
+    assert n_kept > 30 and dropped > 30
 
 
 def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
     footprints, _ = cast_scene(np.random.default_rng(1), 4, 7, 0.0)
     parameters = PARAMETER_DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
-    seen = ray_traced_footprint_extent(RayTracedGround(footprints))
-    turning, still = (
-        plan_points(planner_inputs(parameters, seen, has_rotating_body=turns), {}, 0.5,
+    extent = ray_traced_footprint_extent(RayTracedGround(footprints))
+    turning, at_rest = (
+        plan_points(planner_inputs(parameters, extent, has_rotating_body=turns), {}, 0.5,
                 [effect for effect in EFFECTS if effect.name == "rotation"])
         for turns in (True, False)
     )  # fmt: skip
-    assert turning.is_kept.all() and not still.is_kept.any() and not still.total_error.any()
+    assert turning.is_kept.all() and not at_rest.is_kept.any() and not at_rest.total_error.any()
 
 
 STRONG_NOISE = {
@@ -375,12 +395,17 @@ def test_noise_of_any_source_that_saturates_an_adc_is_in_the_bound_of_saturation
     for _ in range(3):  # the steps of an ADC follow its full scale
         deviation = np.sqrt(prepare_single_category(parameters, {name}).noise_variance)
         parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1.5, 5, POINTS)
-    made = plan_points(planner_inputs(parameters), {}, 1.0)
-    most = made.omission_error[made.effect_names.index("saturation")]
-    on, off = find_spectra(parameters, {name, "saturation"}), find_spectra(parameters, {name})
-    moved = magnitudes_moved(on, off, prepare_single_category(parameters, {name}).bin_noise_sigma)
-    assert (np.minimum(moved, 1) <= most + ROUNDING).all()
-    assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
+    plan = plan_points(planner_inputs(parameters), {}, 1.0)
+    bound = plan.omission_error[plan.effect_names.index("saturation")]
+    on, without_effect = (
+        find_spectra(parameters, {name, "saturation"}),
+        find_spectra(parameters, {name}),
+    )
+    moved = magnitudes_moved(
+        on, without_effect, prepare_single_category(parameters, {name}).bin_noise_sigma
+    )
+    assert (np.minimum(moved, 1) <= bound + ROUNDING).all()
+    assert (np.minimum(pd_change(on, without_effect), 1) <= bound + ROUNDING).all()
     assert moved.max() > 1e-3
 
 
@@ -400,13 +425,18 @@ def test_steps_of_an_adc_are_compared_with_the_noise_that_filters_leave_at_the_l
         "instrument.receiver.antialias_bandwidth": antialias,
         "instrument.processing.bits": 6.0, "instrument.processing.full_scale": 1.0,
     }  # fmt: skip
-    others = {"doppler"}
-    deviation = np.sqrt(prepare_single_category(parameters, others).noise_variance)
+    other_effects = {"doppler"}
+    deviation = np.sqrt(prepare_single_category(parameters, other_effects).noise_variance)
     parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1, 100, POINTS)
-    made = plan_points(planner_inputs(parameters), {}, 1.0)
-    most = made.omission_error[made.effect_names.index("quantisation")]
-    on, off = find_spectra(parameters, others | {"quantisation"}), find_spectra(parameters, others)
-    assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
-    moved = magnitudes_moved(on, off, prepare_single_category(parameters, others).bin_noise_sigma)
-    assert (np.minimum(moved, 1) <= most + ROUNDING).all()
-    assert (most < 1).any() and changed(on, off).max() > 1e-3 and moved.max() > 1e-3
+    plan = plan_points(planner_inputs(parameters), {}, 1.0)
+    bound = plan.omission_error[plan.effect_names.index("quantisation")]
+    on, without_effect = (
+        find_spectra(parameters, other_effects | {"quantisation"}),
+        find_spectra(parameters, other_effects),
+    )
+    assert (np.minimum(pd_change(on, without_effect), 1) <= bound + ROUNDING).all()
+    moved = magnitudes_moved(
+        on, without_effect, prepare_single_category(parameters, other_effects).bin_noise_sigma
+    )
+    assert (np.minimum(moved, 1) <= bound + ROUNDING).all()
+    assert (bound < 1).any() and pd_change(on, without_effect).max() > 1e-3 and moved.max() > 1e-3

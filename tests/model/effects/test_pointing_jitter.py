@@ -16,15 +16,15 @@ def angles_of(draws, sigma):
 
 @pytest.mark.parametrize("grazing", [0.05, 0.4, 1.2, np.pi / 2])
 def test_turned_beams_meet_the_plane_where_rays_do(grazing):
-    off = angles_of(2000, 3e-3)
-    seen = perturb_geometry(
-        range=1500.0, grazing_angle=grazing, radial_velocity=80.0, jitter_angles=off,
+    jitter_angles = angles_of(2000, 3e-3)
+    geometry = perturb_geometry(
+        range=1500.0, grazing_angle=grazing, radial_velocity=80.0, jitter_angles=jitter_angles,
         transverse_velocity=(30.0, -20.0),
     )  # fmt: skip
-    far, angle, direction = intersect_level_plane(1500.0, grazing, off)
-    np.testing.assert_allclose(seen.range, far, rtol=1e-12)
-    np.testing.assert_allclose(np.sin(seen.grazing_angle), np.sin(angle), rtol=1e-12)
+    far, angle, direction = intersect_level_plane(1500.0, grazing, jitter_angles)
+    np.testing.assert_allclose(geometry.range, far, rtol=1e-12)
+    np.testing.assert_allclose(np.sin(geometry.grazing_angle), np.sin(angle), rtol=1e-12)
     aim = np.array([np.cos(grazing), 0.0, -np.sin(grazing)])
     up = np.array([np.sin(grazing), 0.0, np.cos(grazing)])
     velocity = 80.0 * aim + 30.0 * up - 20.0 * np.array([0.0, 1.0, 0.0])
-    np.testing.assert_allclose(seen.radial_velocity, direction @ velocity, rtol=1e-12)
+    np.testing.assert_allclose(geometry.radial_velocity, direction @ velocity, rtol=1e-12)

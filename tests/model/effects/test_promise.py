@@ -18,15 +18,23 @@ def promise_instruments():
         yield tolerance_of_random_instruments
 
 
-@pytest.mark.parametrize("asked", ["nothing", "leakage", "jitter"])
-def test_random_instruments_keep_each_tolerance(promise_instruments, asked):
+@pytest.mark.parametrize("title_end", ["nothing", "leakage", "jitter"])
+def test_random_instruments_keep_each_tolerance(promise_instruments, title_end):
     studies = promise_instruments.random_study_mappings(36, np.random.default_rng(6))
-    chosen = [study for study in studies if study["title"].endswith(asked)]
+    chosen = [study for study in studies if study["title"].endswith(title_end)]
     for study in chosen:
-        for tolerance, off in zip(
+        for tolerance, error_of_tolerance in zip(
             TOLERANCES, promise_instruments.errors_at_tolerances(study, TOLERANCES), strict=True
         ):
-            for errors in (off.pd, off.magnitude, off.leakage):
-                there = errors[np.isfinite(errors)]
-                assert (there <= tolerance).all(), (study["title"], tolerance, there.max())
-            assert (off.error_bound <= tolerance).all()
+            for errors in (
+                error_of_tolerance.pd,
+                error_of_tolerance.magnitude,
+                error_of_tolerance.leakage,
+            ):
+                finite_errors = errors[np.isfinite(errors)]
+                assert (finite_errors <= tolerance).all(), (
+                    study["title"],
+                    tolerance,
+                    finite_errors.max(),
+                )
+            assert (error_of_tolerance.error_bound <= tolerance).all()

@@ -49,14 +49,16 @@ def test_the_phase_is_what_the_truth_keeps_beyond_the_line(table_4_1, segment, v
             acquisition_delay=delay,
         )
     )  # fmt: skip
-    kept, dropped = (
+    with_walk, dropped = (
         time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=walk)
         for walk in (True, False)
     )
-    x = 2 * np.arange(kept.size) / kept.size - 1
+    x = 2 * np.arange(with_walk.size) / with_walk.size - 1
     walk = phase_errors.range_walk_phase(x, **motion(shots, segment))[0]
     # The truth rounds f tau: 1e10 cycles of 1e-16 at 10 km/s.
-    assert np.abs(kept / dropped - np.exp(2j * np.pi * walk)).max() < 2e-5 * abs(velocity) / 1e4
+    assert (
+        np.abs(with_walk / dropped - np.exp(2j * np.pi * walk)).max() < 2e-5 * abs(velocity) / 1e4
+    )
 
 
 @pytest.mark.parametrize("name", WINDOWS)
@@ -90,11 +92,11 @@ def test_the_phase_of_the_beams_axis_serves_all_beamlets(table_4_1):
     x = 2 * np.arange(shots.window.length) / shots.window.length - 1
     factor = np.exp(2j * np.pi * phase_errors.range_walk_phase(x, **motion(shots, 0))[0])
     for beamlet in (0, 50, 108):
-        kept, dropped = (
+        with_walk, dropped = (
             time_domain_truth.analytic_record(shots, 0, 0, beamlet, with_range_walk=walk)
             for walk in (True, False)
         )
-        assert np.abs(kept - dropped * factor).max() < 5e-6 * np.abs(kept).max()
+        assert np.abs(with_walk - dropped * factor).max() < 5e-6 * np.abs(with_walk).max()
 
 
 @pytest.mark.parametrize("acceleration", [50.0, -400.0])
@@ -103,16 +105,16 @@ def test_a_target_that_starts_from_rest_walks_in_the_down_segment(table_4_1, acc
     parameters = table_4_1(fft_size=2**14, sample_rate=100e6, beamlets=1, radial_velocity=0.0)
     parameters |= {"target.acceleration": acceleration, "target.range": 50.0}
     effects = *DEFAULT_EFFECTS, "segment_motion", "acceleration"
-    found = [
+    magnitudes = [
         evaluation.evaluate_segments(
-            *(shots for _, shots in prepare_shots(parameters, some))
+            *(shots for _, shots in prepare_shots(parameters, chosen_effects))
         ).magnitude[:, 0]
-        for some in (effects, (*effects, "range_walk"))
+        for chosen_effects in (effects, (*effects, "range_walk"))
     ]
-    changed = np.abs(found[0] / found[1] - 1)
+    relative_change = np.abs(magnitudes[0] / magnitudes[1] - 1)
     points = planner_inputs(parameters)
     points.phase_error_bounds["range_walk"] = phase_errors.range_walk_phase_bound(points)
     size = phase_errors.RANGE_WALK.error_bound(points)
-    told = np.broadcast_to(np.ravel(size.magnitude_change + size.coherent_sum_change), 3)
-    assert changed[0] < 1e-9 and changed[2] > 1e-7
-    assert (changed <= told + 1e-9).all()
+    bound = np.broadcast_to(np.ravel(size.magnitude_change + size.coherent_sum_change), 3)
+    assert relative_change[0] < 1e-9 and relative_change[2] > 1e-7
+    assert (relative_change <= bound + 1e-9).all()

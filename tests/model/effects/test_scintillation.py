@@ -24,7 +24,7 @@ WAVENUMBER = 2 * np.pi / 1.55e-6
 
 def index(legs):
     """Variance of the whole factor of unit mean, exp(sum of log variances) - 1, for either law."""
-    return np.expm1(sum(each.large_eddies + each.small_eddies for each in legs))
+    return np.expm1(sum(leg.large_eddies + leg.small_eddies for leg in legs))
 
 
 def leg(large, small=0.0):
@@ -58,11 +58,11 @@ def test_slant_paths_through_a_profile_agree_with_adaptive_quadrature(wave, star
     cuts = [0.001, 0.003, 0.01, 0.03, 0.1, 0.9, 0.97, 0.99, 0.997, 0.999]
     mean, _ = quad(integrand, 0, 1, points=cuts, limit=1000, epsrel=1e-11, epsabs=0)
     expected = 2.25 * WAVENUMBER ** (7 / 6) * length ** (11 / 6) * mean
-    found = rytov_variance(
+    rytov = rytov_variance(
         wave, HUFNAGEL_VALLEY, wavelength=1.55e-6, range=length, start_height=start,
         end_height=end,
     )  # fmt: skip
-    assert found == pytest.approx(expected, rel=1e-6)
+    assert rytov == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("wave", ["plane", "spherical"])
@@ -83,19 +83,19 @@ def test_weak_twinkling_through_an_aperture_is_the_integral_over_kolmogorovs_spe
     scale = z if wave == "spherical" else np.ones_like(z)
     phase = q**2 * length * (1 - z) * scale / k
     x = np.maximum(q * aperture * scale / 2, 1e-9)
-    seen = 1.0 if aperture == 0 else (2 * special.j1(x) / x) ** 2
-    inner = (weight * 2 * np.sin(phase / 2) ** 2 * seen).sum(axis=1)
+    aperture_filter = 1.0 if aperture == 0 else (2 * special.j1(x) / x) ** 2
+    inner = (weight * 2 * np.sin(phase / 2) ** 2 * aperture_filter).sum(axis=1)
     total = np.trapezoid(q[:, 0] ** (-8 / 3) * inner * q[:, 0], np.log(q[:, 0]))
     exact = 8 * np.pi**2 * k**2 * 0.033e-17 * length * total
     rytov = rytov_variance(
         wave, TurbulenceProfile(uniform=1e-17), wavelength=1.55e-6, range=length, start_height=0.0,
         end_height=0.0,
     )  # fmt: skip
-    found = index(
+    scintillation_index = index(
         [log_irradiance_variances(wave, rytov_variance=rytov, wavelength=1.55e-6, range=length,
                        aperture=aperture)]
     )  # fmt: skip
-    assert 0.995 < found / exact < excess
+    assert 0.995 < scintillation_index / exact < excess
 
 
 def test_strong_twinkling_saturates_as_theory_has_it():
@@ -105,15 +105,17 @@ def test_strong_twinkling_saturates_as_theory_has_it():
     """
     for wave, share, factor in (("plane", 1.0, 0.86), ("spherical", 0.4065, 2.73)):
         strong = np.array([1e4, 1e9])
-        found = index(
+        scintillation_index = index(
             [
                 log_irradiance_variances(
                     wave, rytov_variance=strong * share, wavelength=1.55e-6, range=1e3, aperture=0.0
                 )
             ]
         )
-        assert found[1] == pytest.approx(1, abs=0.005)
-        slope = (found[0] - found[1]) / (strong[0] ** -0.4 - strong[1] ** -0.4)
+        assert scintillation_index[1] == pytest.approx(1, abs=0.005)
+        slope = (scintillation_index[0] - scintillation_index[1]) / (
+            strong[0] ** -0.4 - strong[1] ** -0.4
+        )
         assert slope == pytest.approx(factor, rel=0.035)
 
 
@@ -137,16 +139,16 @@ SURE = np.sqrt(-0.5 * np.log(5.7e-7 / 2))
 
 
 def test_log_normal_draws_follow_their_law():
-    drawn = draws_of("log_normal", LEGS, 2, 50_000, 5).ravel()
+    factors = draws_of("log_normal", LEGS, 2, 50_000, 5).ravel()
     law = stats.norm(loc=-0.65 / 2, scale=np.sqrt(0.65))
-    assert stats.kstest(np.log(drawn), law.cdf).statistic < SURE / np.sqrt(drawn.size)
+    assert stats.kstest(np.log(factors), law.cdf).statistic < SURE / np.sqrt(factors.size)
 
 
 def test_gamma_gamma_draws_follow_the_law_with_the_bessel_function():
     """2 (ab)^((a+b)/2) / (G(a) G(b)) I^((a+b)/2 - 1) K_(a-b)(2 sqrt(ab I)), Al-Habash et al."""
     one = (leg(0.35, 0.6),)
     a, b = 1 / np.expm1(0.35), 1 / np.expm1(0.6)
-    drawn = draws_of("gamma_gamma", one, 2, 50_000, 0).ravel()
+    factors = draws_of("gamma_gamma", one, 2, 50_000, 0).ravel()
     value = np.geomspace(1e-6, 60, 40_000)
     half = (a + b) / 2
     log_scale = np.log(2) + half * np.log(a * b) - special.gammaln(a) - special.gammaln(b)
@@ -155,14 +157,14 @@ def test_gamma_gamma_draws_follow_the_law_with_the_bessel_function():
     steps = np.diff(value) * (density[1:] + density[:-1]) / 2
     cumulative = np.concatenate([[0.0], np.cumsum(steps)])
     assert cumulative[-1] == pytest.approx(1, abs=1e-5)
-    distance = stats.kstest(drawn, lambda x: np.interp(x, value, cumulative)).statistic
-    assert distance < SURE / np.sqrt(drawn.size)
+    distance = stats.kstest(factors, lambda x: np.interp(x, value, cumulative)).statistic
+    assert distance < SURE / np.sqrt(factors.size)
 
 
 def test_still_air_is_exactly_one_and_faint_turbulence_the_same_by_either_law():
-    still = (leg(0.0), leg(0.0))
+    factors = (leg(0.0), leg(0.0))
     for law in ("log_normal", "gamma_gamma"):
-        assert np.all(draws_of(law, still, 3, 4, 0) == 1.0)
+        assert np.all(draws_of(law, factors, 3, 4, 0) == 1.0)
     faint = (leg(4e-6, 9e-6), leg(2e-5, 0.0))
     a, b = (draws_of(law, faint, 3, 1000, 0) for law in ("log_normal", "gamma_gamma"))
     np.testing.assert_allclose(a, b, atol=0.01 * np.sqrt(3.3e-5) * 5)
@@ -174,9 +176,9 @@ def test_two_ways_take_the_footprint_out_and_the_aperture_back():
                 "telescope.aperture": aperture}  # fmt: skip
         place = {"atmosphere.target_height": 0.0, "atmosphere.path": "slant",
                  "target.grazing_angle": np.arcsin(0.75)}  # fmt: skip
-        given = {f"instrument.{name}": value for name, value in beam.items()}
-        given = PARAMETER_DEFAULTS | given | place
-        return two_way_log_variances(HUFNAGEL_VALLEY, given, np.array(2000.0))
+        parameters = {f"instrument.{name}": value for name, value in beam.items()}
+        parameters = PARAMETER_DEFAULTS | parameters | place
+        return two_way_log_variances(HUFNAGEL_VALLEY, parameters, np.array(2000.0))
 
     (out, back), (wide_out, wide_back) = ways(25e-3, 50e-6), ways(25e-3, 5e-3)
     assert wide_out.large_eddies < out.large_eddies and wide_out.small_eddies < out.small_eddies

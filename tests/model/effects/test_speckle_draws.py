@@ -85,10 +85,10 @@ def test_a_draws_peak_is_that_of_its_record(scene, table_4_1):
     (drawn,) = iter_realisations(
         with_share(parameters, share), STILL, keys=make_point_keys(1), draws=20
     )
-    found = evaluate_segments(drawn.shots)
+    spectra = evaluate_segments(drawn.shots)
     for segment in range(3):
         exact = true_magnitudes(true_spectra(shots, segment), g).max(axis=1)
-        np.testing.assert_allclose(found.magnitude[segment], exact, rtol=AGREEMENT)
+        np.testing.assert_allclose(spectra.magnitude[segment], exact, rtol=AGREEMENT)
 
 
 def test_detection_over_several_bins_is_that_of_plain_sums(table_4_1):
@@ -109,9 +109,9 @@ def test_detection_over_several_bins_is_that_of_plain_sums(table_4_1):
         pd[name] = marcum_q1(peaks / shots.bin_noise_sigma[0], beta).q
         assert 0.05 < pd[name].mean() < 0.95
         assert means[f"pd_{name}"][0] == pytest.approx(pd[name].mean(), rel=1e-7)
-    both = pd["up"] * pd["down"]
-    assert means["pd_shot"][0] == pytest.approx(both.mean(), rel=1e-7)
-    error = both.std(ddof=1) / np.sqrt(draws)
+    joint_pd = pd["up"] * pd["down"]
+    assert means["pd_shot"][0] == pytest.approx(joint_pd.mean(), rel=1e-7)
+    error = joint_pd.std(ddof=1) / np.sqrt(draws)
     assert means["pd_shot_error"][0] == pytest.approx(error, rel=1e-5)
 
 
@@ -122,18 +122,18 @@ SNRS = np.array([10.0, 30.0, 200.0])
 def at_snrs(table_4_1, snrs, **changes):
     """Points whose mean power in the up segment's bin is so many times the noise's."""
     parameters = table_4_1(**ONE_BIN | {"fft_size": 4096} | changes) | ROUGH
-    plain = evaluate_without(parameters)["snr_up"]
+    snr = evaluate_without(parameters)["snr_up"]
     # The echo's shot noise moves the SNR by some 1e-7 of itself.
-    return parameters | {"instrument.laser.power": np.asarray(snrs) / plain}
+    return parameters | {"instrument.laser.power": np.asarray(snrs) / snr}
 
 
 def in_one_bin(parameters, steady=0.0, diffuse=1.0):
     """Closed form of each segment: shares of the steady amplitude's square and diffuse power."""
-    shots, plain = prepare_single_category(parameters), evaluate_without(parameters)
+    shots, outputs = prepare_single_category(parameters), evaluate_without(parameters)
     powers = evaluate_without(parameters | {"footprint.phases": "incoherent"})
     return {
         s: marcum_q1(
-            np.sqrt(2 * steady * plain[f"snr_{s}"]) / deviation,
+            np.sqrt(2 * steady * outputs[f"snr_{s}"]) / deviation,
             shots.threshold / shots.bin_noise_sigma / deviation,
         ).q
         for s in ("up", "doppler", "down")
@@ -176,15 +176,15 @@ def joint_detection(powers, covariance, level):
 def test_one_beamlet_fades_alike_in_up_and_down(table_4_1):
     """All that parts the two segments is noise: the bivariate Rayleigh law of one amplitude."""
     parameters = at_snrs(table_4_1, SNRS, beamlets=1)
-    shots, plain = prepare_single_category(parameters), evaluate_without(parameters)
-    powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
+    shots, outputs = prepare_single_category(parameters), evaluate_without(parameters)
+    powers = 2 * outputs["snr_up"], 2 * outputs["snr_down"]
     exact = joint_detection(
         powers, np.sqrt(powers[0] * powers[1]), shots.threshold / shots.bin_noise_sigma
     )
     means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(3), draws=10_000)
     assert (abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 1e-6).all()
-    alone = means["pd_up"] * means["pd_down"]
-    assert (means["pd_shot"] > alone + 10 * means["pd_shot_error"]).all()
+    product = means["pd_up"] * means["pd_down"]
+    assert (means["pd_shot"] > product + 10 * means["pd_shot_error"]).all()
 
 
 @pytest.mark.parametrize(
@@ -256,8 +256,8 @@ def test_up_and_down_speckles_part_as_depth_and_frequency_make_them(table_4_1):
 
 def joint(parameters, phase):
     """Chance of both chirps where beamlets part by normal phases [rad] of this deviation."""
-    shots, plain = prepare_single_category(parameters), evaluate_without(parameters)
-    powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
+    shots, outputs = prepare_single_category(parameters), evaluate_without(parameters)
+    powers = 2 * outputs["snr_up"], 2 * outputs["snr_down"]
     return joint_detection(
         powers,
         np.exp(-0.5 * phase**2) * np.sqrt(powers[0] * powers[1]),
@@ -276,9 +276,9 @@ def test_what_moves_across_the_beam_turns_speckles_apart_between_segments(table_
         assert abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 2e-3
         gains.append((means["pd_shot"] / (means["pd_up"] * means["pd_down"]))[0])
     assert gains[0] > 1.5 > 1.05 > gains[-1]
-    still = mean_statistics(moving, STILL, keys=make_point_keys(1), draws=100)
+    without_motion = mean_statistics(moving, STILL, keys=make_point_keys(1), draws=100)
     at_rest = mean_statistics(parameters, STILL, keys=make_point_keys(1), draws=100)
-    np.testing.assert_allclose(still["pd_shot"], at_rest["pd_shot"], rtol=1e-9)
+    np.testing.assert_allclose(without_motion["pd_shot"], at_rest["pd_shot"], rtol=1e-9)
 
 
 @pytest.mark.parametrize("radial_velocity", [150.0, 0.0])
@@ -306,10 +306,10 @@ def test_turning_adds_to_what_depth_does_or_takes_it_back(radial_velocity, table
 def test_a_smooth_surface_is_what_the_shot_is_without(across, table_4_1):
     parameters = table_4_1(grazing_angle=0.3, range=np.array([2500.0, 4000.0]), beamlets=19)
     parameters |= {"target.roughness": 0.0, "target.transverse_velocity": across}
-    plain = evaluate_without(parameters)
+    outputs = evaluate_without(parameters)
     means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(2), draws=2)
     for name in ("pd_up", "pd_doppler", "pd_down", "pd_shot", "snr_doppler", "pfa_segment"):
-        np.testing.assert_allclose(means[name], plain[name], rtol=1e-7)
+        np.testing.assert_allclose(means[name], outputs[name], rtol=1e-7)
 
 
 def test_what_stands_under_a_line_fades_with_it(table_4_1):

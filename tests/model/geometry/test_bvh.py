@@ -67,7 +67,7 @@ def walk(tree, origins, directions):
 
 def walk_alone(tree, origins, directions):
     """The same of single rays."""
-    return (found[:, 0] for found in walk(tree, origins, directions[:, None]))
+    return (hit_leaf[:, 0] for hit_leaf in walk(tree, origins, directions[:, None]))
 
 
 def fan(rng, towards, b, spread):
@@ -106,9 +106,9 @@ def test_a_bundle_finds_what_its_rays_find_alone_bit_for_bit(kind, spread):
     directions = fan(rng, inside_points(rng, vertices, faces, 60) - origins, 19, spread)
     directions[0] = np.eye(3)[0]
     together = walk(tree, origins, directions)
-    alone = walk_alone(tree, np.repeat(origins, 19, axis=0), directions.reshape(-1, 3))
+    single = walk_alone(tree, np.repeat(origins, 19, axis=0), directions.reshape(-1, 3))
     assert (together[1] >= 0).mean() > 0.1
-    for bundle, ray in zip(together, alone, strict=True):
+    for bundle, ray in zip(together, single, strict=True):
         np.testing.assert_array_equal(bundle.ravel(), ray)
 
 
@@ -143,13 +143,13 @@ def test_every_triangle_lies_in_just_one_leaf_and_inside_its_box():
     tree = build_tree(vertices, faces)
     np.testing.assert_array_equal(np.sort(tree.mesh_face_index), np.arange(5000))
     np.testing.assert_array_equal(tree.vertices[tree.faces], vertices[faces[tree.mesh_face_index]])
-    seen = 0
-    for box, which in leaves(tree):
-        corners = tree.vertices[tree.faces[which]].reshape(-1, 3)
+    n_triangles = 0
+    for box, triangles in leaves(tree):
+        corners = tree.vertices[tree.faces[triangles]].reshape(-1, 3)
         assert corners.size <= 9 * LEAF_TRIANGLES_MAX
         assert (box[:3] < corners).all() and (box[3:] > corners).all()
-        seen += which.stop - which.start
-    assert seen == 5000
+        n_triangles += triangles.stop - triangles.start
+    assert n_triangles == 5000
 
 
 def test_triangles_that_no_plane_can_part_are_still_divided():

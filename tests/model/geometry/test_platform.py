@@ -116,7 +116,7 @@ def test_a_fixed_attitude_does_not_turn(t, angle):
 
 
 @pytest.mark.parametrize("t", [-0.1, 10.1, math.nan])
-def test_times_beside_the_path_are_refused(t):
+def test_times_outside_the_path_are_refused(t):
     with pytest.raises(ValueError, match="on the path"):
         BURN.motion(np.array([1.0, t]))
 

@@ -43,11 +43,11 @@ def unit(v):
 
 def cast(caster, origins, directions, **poses):
     """First hits of single rays: those of bundles, without the dimension of beamlets."""
-    found = caster.cast_bundles(origins, np.asarray(directions, float)[..., None, :], **poses)
+    hits = caster.cast_bundles(origins, np.asarray(directions, float)[..., None, :], **poses)
     of_beamlets = (
         "range_offset", "is_hit", "cos_incidence", "surface_index", "face_index", "body_index",
     )  # fmt: skip
-    return found._replace(**{name: getattr(found, name)[:, 0] for name in of_beamlets})
+    return hits._replace(**{name: getattr(hits, name)[:, 0] for name in of_beamlets})
 
 
 def bumpy_sphere(subdivisions=3, seed=0, roughness=0.1):
@@ -201,11 +201,11 @@ def test_the_order_and_the_grouping_of_rays_change_no_bit(closed):
     rng = np.random.default_rng(11)
     origins = rng.uniform(-2, 2, (5000, 3))
     directions = unit(rng.normal(size=(5000, 3)))
-    whole = cast(caster, origins, directions)
+    cast_at_once = cast(caster, origins, directions)
     order = rng.permutation(5000)
     for part in np.array_split(order, [1, 2, 50, 3000]):
         piece = cast(caster, origins[part], directions[part])
-        for a, b in zip(whole, piece, strict=True):
+        for a, b in zip(cast_at_once, piece, strict=True):
             np.testing.assert_array_equal(a[part], b)
 
 
@@ -233,18 +233,20 @@ def test_a_bundle_sees_what_its_rays_see_alone(closed, divergence):
     np.testing.assert_array_equal(bundle.face_index.ravel(), hits.face_index)
     np.testing.assert_array_equal(bundle.surface_index.ravel(), hits.surface_index)
     np.testing.assert_array_equal(bundle.body_index.ravel(), hits.body_index)
-    some = bundle.is_hit.any(axis=1)
-    rows, first = np.flatnonzero(some), bundle.reference_beamlet[some]
-    np.testing.assert_array_equal(bundle.range[some], hits.range.reshape(shape)[rows, first])
-    np.testing.assert_array_equal(bundle.normal[some], hits.normal.reshape(300, 19, 3)[rows, first])
+    hits_any = bundle.is_hit.any(axis=1)
+    rows, first = np.flatnonzero(hits_any), bundle.reference_beamlet[hits_any]
+    np.testing.assert_array_equal(bundle.range[hits_any], hits.range.reshape(shape)[rows, first])
+    np.testing.assert_array_equal(
+        bundle.normal[hits_any], hits.normal.reshape(300, 19, 3)[rows, first]
+    )
     assert (bundle.range_offset[rows, first] == 0.0).all()
     total = (bundle.range[:, None] + bundle.range_offset)[bundle.is_hit]
     np.testing.assert_allclose(total, hits.range.reshape(shape)[bundle.is_hit], rtol=3e-16)
     cosine = hits.cos_incidence.reshape(shape)
     np.testing.assert_allclose(bundle.cos_incidence, cosine, rtol=1e-14, atol=1e-15)
     assert np.isnan(bundle.range_offset[~bundle.is_hit]).all()
-    assert (bundle.reference_beamlet[~some] == -1).all()
-    assert np.isinf(bundle.range[~some]).all()
+    assert (bundle.reference_beamlet[~hits_any] == -1).all()
+    assert np.isinf(bundle.range[~hits_any]).all()
 
 
 @pytest.mark.parametrize("offset", [0.0, 4e6])
@@ -323,8 +325,8 @@ def test_bodies_that_tumble_are_met_where_their_moved_meshes_would_be():
         world = [
             clean_mesh(v, f, k)[0] for k, (v, (_, f)) in enumerate(zip(moved, shapes, strict=True))
         ]
-        still = RayCaster(merge_meshes(world))
-        truth = still.cast_bundles(origins[i : i + 1], directions[i : i + 1])
+        unmoved = RayCaster(merge_meshes(world))
+        truth = unmoved.cast_bundles(origins[i : i + 1], directions[i : i + 1])
         np.testing.assert_array_equal(bundle.body_index[i], truth.surface_index[0])
         np.testing.assert_array_equal(bundle.surface_index[i], truth.surface_index[0])
         np.testing.assert_allclose(bundle.range[i], truth.range[0], atol=1e-12)

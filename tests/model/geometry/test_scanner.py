@@ -100,7 +100,7 @@ SCANS = [
 
 @pytest.mark.parametrize("scan", SCANS)
 @given(duration=st.floats(0, 50))
-def test_the_number_of_shots_is_that_of_the_shots_begun(scan, duration):
+def test_the_number_of_shots_counts_all_that_begin(scan, duration):
     number = scan.count_shots(duration)
     times = scan.shots(np.arange(number + 10)).time
     assert (times[:number] <= duration * (1 + 1e-9) + 1e-7).all()
@@ -120,8 +120,8 @@ def test_a_shot_that_begins_just_at_the_end_is_counted_however_its_time_was_roun
 
 @pytest.mark.parametrize("scan", SCANS)
 def test_any_stretch_of_shots_is_what_it_is_in_the_whole(scan):
-    whole, part = scan.shots(np.arange(1000)), scan.shots(np.arange(700, 730))
-    for one, other in zip(whole, part, strict=True):
+    all_shots, part = scan.shots(np.arange(1000)), scan.shots(np.arange(700, 730))
+    for one, other in zip(all_shots, part, strict=True):
         np.testing.assert_array_equal(one[700:730], other)
 
 

@@ -37,7 +37,7 @@ BY_PHASE = {
         | {"tnr": 10, "estimator": {"kind": "candan"}}
     },
 }
-WAYWARD = {
+PATH_OUTSIDE_THE_SCENE = {
     "platform": {
         "path": SCENE_MAPPING["platform"]["path"] | {"to": ["6 km", "0 m", "300 m"]},
         "attitude": {"kind": "nadir"},
@@ -52,15 +52,19 @@ def show(message, category, filename, lineno, file=None, line=None):
 
 def warned(spec, path):
     """Texts of the warnings of a run, and the files that they are told at."""
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("always")
         assert sweep.run(spec, store=path, scheduler="none", progress=False).complete
-    ours = [each for each in caught if each.category is sweep.StudyWarning]
-    return [str(each.message) for each in ours], {each.filename for each in ours}
+    study_warnings = [
+        warning for warning in caught_warnings if warning.category is sweep.StudyWarning
+    ]
+    return [str(warning.message) for warning in study_warnings], {
+        warning.filename for warning in study_warnings
+    }
 
 
 @pytest.mark.parametrize(
-    ("spec", "told"),
+    ("spec", "pattern"),
     [
         (small_spec(**LATE), "no echo arrives before its record ends"),
         (small_spec(**OFF), "doppler"),
@@ -71,12 +75,12 @@ def warned(spec, path):
             small_spec(**BY_PHASE),
             "estimator.kind candan takes .* at 100 % of the points, at all",
         ),
-        (small_scene_spec(**WAYWARD), "of the shots hit something"),
+        (small_scene_spec(**PATH_OUTSIDE_THE_SCENE), "of the shots hit something"),
     ],
 )
-def test_a_doubtful_study_warns_at_the_line_of_the_program(spec, told, tmp_path):
+def test_a_questionable_study_warns_at_the_line_of_the_program(spec, pattern, tmp_path):
     texts, files = warned(spec, tmp_path / "s.zarr")
-    assert any(re.search(told, text) for text in texts), texts
+    assert any(re.search(pattern, text) for text in texts), texts
     assert files == {__file__}
 
 
@@ -87,10 +91,10 @@ def test_program_and_command_warn_in_the_same_words(changes, tmp_path, monkeypat
     texts, _ = warned(sweep.load("late.yaml"), tmp_path / "s.zarr")
     with warnings.catch_warnings():
         warnings.simplefilter("error", sweep.StudyWarning)  # the command prints, once
-        done = CliRunner().invoke(main, ["run", "late.yaml", "--scheduler", "none"])
-    assert done.exit_code == 0 and len(texts) >= 2
+        result = CliRunner().invoke(main, ["run", "late.yaml", "--scheduler", "none"])
+    assert result.exit_code == 0 and len(texts) >= 2
     for text in texts:
-        assert done.stderr.count(text) == 1
+        assert result.stderr.count(text) == 1
 
 
 def test_an_extension_warns_in_a_program_and_in_the_command(tmp_path, monkeypatch):
@@ -100,15 +104,15 @@ def test_an_extension_warns_in_a_program_and_in_the_command(tmp_path, monkeypatc
         warnings.simplefilter("ignore", sweep.StudyWarning)
         sweep.run(near, store="s.zarr", scheduler="none", progress=False)
     far = {"axes.target.range": ["100 m", "20 km"]}
-    with pytest.warns(sweep.StudyWarning, match="no echo arrives") as caught:
+    with pytest.warns(sweep.StudyWarning, match="no echo arrives") as caught_warnings:
         sweep.extend("s.zarr", changes=far, to="t.zarr", scheduler="none", progress=False)
-    assert {warning.filename for warning in caught} == {__file__}
+    assert {warning.filename for warning in caught_warnings} == {__file__}
     command = ["extend", "s.zarr", "--set", "axes.target.range=['100 m', '20 km']"]
-    done = CliRunner().invoke(main, [*command, "--scheduler", "none"])
-    assert done.exit_code == 0 and done.stderr.count("warning: no echo arrives") == 1
+    result = CliRunner().invoke(main, [*command, "--scheduler", "none"])
+    assert result.exit_code == 0 and result.stderr.count("warning: no echo arrives") == 1
 
 
-class Heard(Progress):
+class WarningProgress(Progress):
     """Progress that keeps what is said."""
 
     def __init__(self):
@@ -119,7 +123,7 @@ class Heard(Progress):
 
 
 def test_what_a_flight_leaves_unstated_is_noted_in_a_program_too(tmp_path):
-    spec, progress = small_scene_spec(), Heard()
+    spec, progress = small_scene_spec(), WarningProgress()
     sentences = spec.unstated_error_sentences()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", sweep.StudyWarning)
@@ -154,13 +158,13 @@ def test_a_warning_that_nobody_can_read_ends_no_run(stream, tmp_path, monkeypatc
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = show
-        done = sweep.run(
+        outcome = sweep.run(
             small_spec(**LATE), store=tmp_path / "s.zarr", scheduler="none", progress=False
         )
-    assert done.complete
+    assert outcome.complete
 
 
-def test_a_study_without_doubts_does_not_warn(tmp_path):
+def test_a_sound_study_does_not_warn(tmp_path):
     laser = STUDY_MAPPING["instrument"]["laser"] | {"beam_divergence": "100 urad"}
     processing = STUDY_MAPPING["instrument"]["processing"] | {"tnr": 10}
     instrument = STUDY_MAPPING["instrument"] | {"laser": laser, "processing": processing}

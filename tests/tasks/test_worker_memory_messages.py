@@ -56,7 +56,7 @@ def batch(memory):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"client": ClientOf(64 * 10**9, 2 * 10**9)}, "a worker of the client has 2.0 GB"),
         ({"cluster": batch("2 GB")}, "each worker of the cluster has 2.0 GB"),
@@ -65,10 +65,10 @@ def batch(memory):
         ({"workers": 16}, r"each worker has 3.6 GB.*fewer points of the FFT, or workers=13$"),
     ],
 )  # fmt: skip
-def test_an_fft_is_held_against_the_memory_of_the_workers(options, told, tmp_path, monkeypatch):
+def test_an_fft_is_held_against_the_memory_of_the_workers(options, message, tmp_path, monkeypatch):
     set_machine_memory(monkeypatch, 64 * 10**9)
     spec = small_spec(axes={"instrument.processing.fft_size": [2**16, 2**24]})  # 4.2 GB
-    with pytest.raises(SpecError, match=rf"fft_size: makes a point take about 4.2 GB.*{told}"):
+    with pytest.raises(SpecError, match=rf"fft_size: makes a point take about 4.2 GB.*{message}"):
         driver.run(spec, store=tmp_path / "huge.zarr", progress=False, **options)
     assert not (tmp_path / "huge.zarr").exists()
 
@@ -92,19 +92,21 @@ def test_a_scene_is_held_against_the_memory_of_each_worker(tmp_path, monkeypatch
 
 
 def test_a_store_that_goes_on_is_held_against_memory_too(tmp_path, monkeypatch):
-    spec, whole = small_scene_spec(), small_scene_spec(draws={"number": 6, "returns": 3})
+    spec, larger_spec = small_scene_spec(), small_scene_spec(draws={"number": 6, "returns": 3})
     runs(spec, tmp_path / "s.zarr")
     limit = memory_limits.point_memory_bytes(spec) + memory_limits.scene_memory_bytes(spec) - 1
     set_machine_memory(monkeypatch, limit)
-    plain = {"scheduler": "none", "progress": False}
+    arguments = {"scheduler": "none", "progress": False}
     with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
-        driver.extend(tmp_path / "s.zarr", whole, to=tmp_path / "t.zarr", **plain)
+        driver.extend(tmp_path / "s.zarr", larger_spec, to=tmp_path / "t.zarr", **arguments)
     assert not (tmp_path / "t.zarr").exists()
-    assert driver.resume(tmp_path / "s.zarr", **plain).complete  # nothing is left to compute
-    begun = tmp_path / "begun" / "s.zarr"
-    create_store(begun, make_study(spec, begun), recipe={"base": str(Path.cwd())})
+    assert driver.resume(tmp_path / "s.zarr", **arguments).complete  # nothing is left to compute
+    incomplete_path = tmp_path / "begun" / "s.zarr"
+    create_store(
+        incomplete_path, make_study(spec, incomplete_path), recipe={"base": str(Path.cwd())}
+    )
     with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
-        driver.resume(begun, **plain)
+        driver.resume(incomplete_path, **arguments)
 
 
 @pytest.mark.parametrize("kind", ["grid", "flight"])
@@ -185,7 +187,7 @@ def test_the_memory_of_a_plan_counts_a_point():
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"platform": {"path": {
             "kind": "straight", "from": ["0 m", "0 m", "100 m"], "to": ["10 m", "0 m", "100 m"],
@@ -196,11 +198,11 @@ def test_the_memory_of_a_plan_counts_a_point():
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("use", [runs, make_study])
-def test_a_flight_of_too_many_shots_is_refused(changes, told, use, tmp_path, monkeypatch):
+def test_a_flight_of_too_many_shots_is_refused(changes, message, use, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "path.csv").write_text(
         "time [s],x [m],y [m],z [m]\n1e300,0,0,100\n2e300,10,0,100\n"
     )
-    with pytest.raises(SpecError, match=told):
+    with pytest.raises(SpecError, match=message):
         use(small_scene_spec(**changes), tmp_path / "huge.zarr")
     assert not (tmp_path / "huge.zarr").exists()

@@ -39,7 +39,7 @@ KINDS = {
 }
 
 
-def drawn(kind="fixed", ranges=("2 km",), **draws):
+def drawn_spec(kind="fixed", ranges=("2 km",), **draws):
     """Points that are drawn; their ground is rough but where noise alone is to be random."""
     rough = {**STUDY_MAPPING["target"], "roughness": "10 um", "reflectance": 0.2}
     return small_spec(
@@ -62,9 +62,9 @@ def saved(monkeypatch):
     """Points of a block that were saved, piece by piece."""
     points, real = [], journal.write_checkpoint
 
-    def write(path, study_id, block, found):
-        points.append(found.points)
-        real(path, study_id, block, found)
+    def write(path, study_id, block, checkpoint):
+        points.append(checkpoint.points)
+        real(path, study_id, block, checkpoint)
 
     monkeypatch.setattr(journal, "write_checkpoint", write)
     cut(monkeypatch.setattr)
@@ -72,27 +72,27 @@ def saved(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def undivided_stores(tmp_path_factory):
     """Stores computed in one piece, by what is drawn."""
     stores = {}
 
-    def made(kind, ranges=("2 km",)):
+    def computed_store(kind, ranges=("2 km",)):
         if (kind, ranges) not in stores:
             store = tmp_path_factory.mktemp("whole") / "whole.zarr"
             with pytest.MonkeyPatch.context() as context:
                 cut(context.setattr, piece=1 << 16, rows=4096, samples=1 << 18, seconds=600.0)
                 context.setattr(journal, "write_checkpoint", None)  # short blocks are never saved
-                assert run_serially(drawn(kind, ranges), store).complete
+                assert run_serially(drawn_spec(kind, ranges), store).complete
             stores[kind, ranges] = file_digests(store)
         return stores[kind, ranges]
 
-    return made
+    return computed_store
 
 
-class Told(Progress):
+class PointsProgress(Progress):
     """Notes how far a run is, and does something then."""
 
-    def __init__(self, then=lambda told: None):
+    def __init__(self, then=lambda progress: None):
         self.points, self.then = [], then
 
     def begin(self, *, points, done, unit):
@@ -109,10 +109,12 @@ PLACES = [{"scheduler": "none"}, {"workers": 2, "processes": False}]
 
 def interrupted(spec, store, pieces=2, place=PLACES[0]):
     """A run that is told to stop, once, as soon as some pieces of a block are there."""
-    told = Told(lambda told: len(told.points) == 1 + pieces and os.kill(os.getpid(), signal.SIGINT))
-    outcome = run(spec, store=store, progress=told, **place)
+    progress = PointsProgress(
+        lambda progress: len(progress.points) == 1 + pieces and os.kill(os.getpid(), signal.SIGINT)
+    )
+    outcome = run(spec, store=store, progress=progress, **place)
     assert outcome.stop_reason == "interrupted" and not outcome.complete
-    return told
+    return progress
 
 
 def left(store):
@@ -128,12 +130,14 @@ def left(store):
         ("fixed", PLACES[1]),
     ],
 )
-def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whole, saved, tmp_path):
-    told, store = Told(), tmp_path / "pieces.zarr"
-    assert run(drawn(kind), store=store, progress=told, **place).complete
-    assert file_digests(store) == whole(kind)
+def test_pieces_of_a_block_come_to_the_same_bytes_and_are_reported(
+    kind, place, undivided_stores, saved, tmp_path
+):
+    progress, store = PointsProgress(), tmp_path / "pieces.zarr"
+    assert run(drawn_spec(kind), store=store, progress=progress, **place).complete
+    assert file_digests(store) == undivided_stores(kind)
     assert len(saved) >= 3 and saved == sorted(set(saved)) and 0 < saved[0] < saved[-1] < 1
-    assert told.points == [0, *saved, 1] and receipt_blocks(store) == [0] and left(store) == []
+    assert progress.points == [0, *saved, 1] and receipt_blocks(store) == [0] and left(store) == []
 
 
 @pytest.mark.parametrize(
@@ -141,38 +145,38 @@ def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whol
     ["fixed", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "fixed")],
 )
 def test_a_block_of_several_points_is_stopped_at_any_of_them(
-    kind, whole, saved, tmp_path, monkeypatch
+    kind, undivided_stores, saved, tmp_path, monkeypatch
 ):
     ranges = ("100 m", "1 km", "2 km", "6 km")
-    expected = whole(kind, ranges)
+    expected = undivided_stores(kind, ranges)
     monkeypatch.setattr("sweep.tasks.studies.grid_study.POINTS_PER_CALL_MAX", 2)
-    assert run_serially(drawn(kind, ranges), tmp_path / "pieces.zarr").complete
+    assert run_serially(drawn_spec(kind, ranges), tmp_path / "pieces.zarr").complete
     assert file_digests(tmp_path / "pieces.zarr") == expected
     assert any(0 < points < 2 for points in saved) and any(2 < points < 4 for points in saved)
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_one_ctrl_c_stops_after_a_piece_and_resume_goes_on_from_there(
-    place, whole, saved, tmp_path
+    place, undivided_stores, saved, tmp_path
 ):
     store = tmp_path / "stopped.zarr"
-    interrupted(drawn(), store, place=place)
+    interrupted(drawn_spec(), store, place=place)
     assert len(saved) == 2 and left(store) == ["begun-0"] and receipt_blocks(store) == []
     assert status(store).points_in_unfinished_blocks == saved[-1] and status(store).points_done == 0
     assert verify(store)[0].is_undamaged and not verify(store)[0].complete
     with pytest.raises(StoreError, match="lacks 1 block"):
         pack_store(store, tmp_path / "packed.zarr")
-    told = Told()
-    assert resume(store, progress=told, **place).complete
-    assert told.points[0] == saved[1] < saved[2] and saved == sorted(set(saved))
-    assert file_digests(store) == whole("fixed") and left(store) == []
+    progress = PointsProgress()
+    assert resume(store, progress=progress, **place).complete
+    assert progress.points[0] == saved[1] < saved[2] and saved == sorted(set(saved))
+    assert file_digests(store) == undivided_stores("fixed") and left(store) == []
     assert status(store).points_in_unfinished_blocks == 0
 
 
 KILLED = """
 import os, sys
 from pathlib import Path
-from test_begun import cut, drawn, run_serially
+from test_checkpoints import cut, drawn_spec, run_serially
 from sweep.tasks.engine import journal
 
 def write(path, study_id, block, found, real=journal.write_checkpoint):
@@ -182,34 +186,35 @@ def write(path, study_id, block, found, real=journal.write_checkpoint):
 
 journal.write_checkpoint = write
 cut()
-run_serially(drawn(sys.argv[2]), Path(sys.argv[1]))
+run_serially(drawn_spec(sys.argv[2]), Path(sys.argv[1]))
 """
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fixed", "spectra"])
 def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
-    kind, whole, saved, tmp_path, monkeypatch
+    kind, undivided_stores, saved, tmp_path, monkeypatch
 ):
     store = tmp_path / "killed.zarr"
-    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    python_path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     killed = subprocess.run(
-        [sys.executable, "-c", KILLED, str(store), kind], env={**os.environ, "PYTHONPATH": here}
+        [sys.executable, "-c", KILLED, str(store), kind],
+        env={**os.environ, "PYTHONPATH": python_path},
     )
     assert killed.returncode == -signal.SIGKILL and left(store) == ["begun-0"]
-    before = status(store).points_in_unfinished_blocks * drawn(kind).draws.number
+    before = status(store).points_in_unfinished_blocks * drawn_spec(kind).draws.number
     monkeypatch.setattr(GridStudy, "compile_kernels", lambda study: None)  # it draws once
-    taken, real = [], samplers.Sampler.draw
+    pieces, real = [], samplers.Sampler.draw
 
     def take(self, points, number):
-        taken.append((self.number[points[0]], number))
+        pieces.append((self.number[points[0]], number))
         real(self, points, number)
 
     monkeypatch.setattr(samplers.Sampler, "draw", take)
     assert quiet_resume(store).complete
-    assert taken[0][0] == before > 0
-    assert sum(number for _, number in taken) == drawn(kind).draws.number - before
-    assert file_digests(store) == whole(kind) and left(store) == []
+    assert pieces[0][0] == before > 0
+    assert sum(number for _, number in pieces) == drawn_spec(kind).draws.number - before
+    assert file_digests(store) == undivided_stores(kind) and left(store) == []
 
 
 def quiet_resume(store, **changes):
@@ -232,19 +237,21 @@ def emptied(file):
 
 def anothers(file):
     """A saved piece of the same block of another study."""
-    interrupted(drawn(number=600), file.parents[2] / "other.zarr")
+    interrupted(drawn_spec(number=600), file.parents[2] / "other.zarr")
     file.write_bytes((file.parents[2] / "other.zarr" / ".sweep" / file.name).read_bytes())
 
 
 @pytest.mark.parametrize("damage", [flipped, cut_short, emptied, anothers])
-def test_what_is_saved_and_damaged_or_foreign_is_drawn_anew(damage, whole, saved, tmp_path):
+def test_what_is_saved_and_damaged_or_foreign_is_drawn_again(
+    damage, undivided_stores, saved, tmp_path
+):
     store = tmp_path / "damaged.zarr"
-    interrupted(drawn(), store)
+    interrupted(drawn_spec(), store)
     damage(store / ".sweep" / "begun-0")
     assert status(store).points_in_unfinished_blocks == 0
     saved.clear()
     assert quiet_resume(store).complete
-    assert saved[0] < 0.5 and file_digests(store) == whole("fixed") and left(store) == []
+    assert saved[0] < 0.5 and file_digests(store) == undivided_stores("fixed") and left(store) == []
 
 
 @pytest.mark.parametrize("place", [Path, lambda path: ObjectPath("memory://bucket", str(path))])
@@ -261,14 +268,14 @@ def test_what_is_saved_is_read_as_it_was_in_a_folder_and_in_an_object_store(plac
         journal.write_checkpoint(
             store, "one", 7, Checkpoint(EarlierResults(unfinished=part), points, 1.5)
         )
-    found = journal.read_checkpoint(store, "one", 7)
-    assert (found.points, found.seconds) == (
+    checkpoint = journal.read_checkpoint(store, "one", 7)
+    assert (checkpoint.points, checkpoint.seconds) == (
         0.5,
         1.5,
-    ) and not found.results.finished.local_indices.size
-    np.testing.assert_array_equal(found.results.unfinished.local_indices, part.local_indices)
+    ) and not checkpoint.results.finished.local_indices.size
+    np.testing.assert_array_equal(checkpoint.results.unfinished.local_indices, part.local_indices)
     for name, values in part.results.items():
-        np.testing.assert_array_equal(found.results.unfinished.results[name], values)
+        np.testing.assert_array_equal(checkpoint.results.unfinished.results[name], values)
     assert (
         journal.read_checkpoint_points(store, "one") == {7: 0.5}
         and journal.read_checkpoint_points(store, "two") == {}
@@ -278,30 +285,34 @@ def test_what_is_saved_is_read_as_it_was_in_a_folder_and_in_an_object_store(plac
     assert journal.read_checkpoint_points(store, "one") == {}
 
 
-def test_an_extended_study_goes_on_in_pieces_too(whole, saved, tmp_path):
+def test_an_extended_study_goes_on_in_pieces_too(undivided_stores, saved, tmp_path):
     store = tmp_path / "extended.zarr"
-    assert run_serially(drawn(number=170), store).complete
+    assert run_serially(drawn_spec(number=170), store).complete
     saved.clear()
     changes = {"draws.number": 500}
     assert extend(store, changes=changes, scheduler="none", progress=False).complete
-    assert len(saved) >= 2 and saved[0] > 170 / 500 and file_digests(store) == whole("fixed")
+    assert (
+        len(saved) >= 2
+        and saved[0] > 170 / 500
+        and file_digests(store) == undivided_stores("fixed")
+    )
     assert left(store) == []
 
 
 def test_workers_that_do_not_find_what_others_saved_end_the_run(saved, tmp_path, monkeypatch):
     monkeypatch.setattr(journal, "read_checkpoint", lambda *place: Checkpoint())
     with pytest.raises(StoreError, match="do all of them see the same store"):
-        run_serially(drawn(), tmp_path / "lost.zarr")
+        run_serially(drawn_spec(), tmp_path / "lost.zarr")
     assert len(saved) == 2
 
 
 def test_a_block_may_take_no_longer_in_pieces_than_at_once(saved, tmp_path):
     store = tmp_path / "slow.zarr"
-    interrupted(drawn(), store)
+    interrupted(drawn_spec(), store)
     place = store, status(store).study_id, 0
-    found = journal.read_checkpoint(*place)
+    checkpoint = journal.read_checkpoint(*place)
     journal.delete_checkpoints(store, 0)
-    journal.write_checkpoint(*place, found._replace(seconds=100.0))
+    journal.write_checkpoint(*place, checkpoint._replace(seconds=100.0))
     outcome = quiet_resume(store, block_timeout=99.0)
     assert "longer than the 99 s" in outcome.failures[0].error and left(store) == ["begun-0"]
     assert quiet_resume(store, block_timeout=1000.0, retry_failed=True).complete
@@ -310,7 +321,7 @@ def test_a_block_may_take_no_longer_in_pieces_than_at_once(saved, tmp_path):
 
 def test_the_time_of_a_block_is_that_of_all_its_pieces(saved, tmp_path):
     store = tmp_path / "timed.zarr"
-    interrupted(drawn(), store)
+    interrupted(drawn_spec(), store)
     spent = journal.read_checkpoint(store, status(store).study_id, 0).seconds
     outcome = quiet_resume(store)
     assert outcome.work_seconds > spent > 0
@@ -322,5 +333,5 @@ def test_lines_tell_the_part_of_a_point(capsys, monkeypatch):
     lines.begin(points=2, done=0, unit="points")
     for part in (0.31, 0.69, 1.0):
         lines.advance(points=part, failed=0)
-    told = [line.split(",")[0] for line in capsys.readouterr().err.splitlines()]
-    assert told == ["0 of 2 points", "0.31 of 2 points", "1 of 2 points", "2 of 2 points"]
+    starts = [line.split(",")[0] for line in capsys.readouterr().err.splitlines()]
+    assert starts == ["0 of 2 points", "0.31 of 2 points", "1 of 2 points", "2 of 2 points"]

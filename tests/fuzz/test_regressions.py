@@ -30,22 +30,22 @@ def quick():
         yield
 
 
-def judged(tmp_path, written):
+def judged(tmp_path, mapping):
     """A verdict over a study as written."""
-    (tmp_path / "found.yaml").write_text(to_yaml(written))
+    (tmp_path / "found.yaml").write_text(to_yaml(mapping))
     return check_study(tmp_path / "found.yaml")
 
 
-def refused(written):
+def refused(mapping):
     """The words that a study is refused with."""
-    with pytest.raises(SpecError) as caught:
-        GridSpec.from_mapping(written)
-    return str(caught.value)
+    with pytest.raises(SpecError) as error_info:
+        GridSpec.from_mapping(mapping)
+    return str(error_info.value)
 
 
-def planned(tmp_path, written):
+def planned(tmp_path, mapping):
     """`sweep plan` over a study."""
-    (tmp_path / "found.yaml").write_text(to_yaml(written))
+    (tmp_path / "found.yaml").write_text(to_yaml(mapping))
     return CliRunner().invoke(main, ["plan", str(tmp_path / "found.yaml")], catch_exceptions=False)
 
 
@@ -64,10 +64,10 @@ BEYOND = {
 
 @pytest.mark.parametrize("name", BEYOND)
 def test_a_shot_beyond_the_model_is_refused_with_field_limit_value_and_remedy(name, tmp_path):
-    told = planned(tmp_path, base_study_mapping(BEYOND[name]))
-    assert told.exit_code == 2 and told.stdout == ""
-    assert re.search(r"(instrument|target)\.\w+", told.stderr)
-    assert "can be simulated: " in told.stderr and re.search(r"\d", told.stderr)
+    result = planned(tmp_path, base_study_mapping(BEYOND[name]))
+    assert result.exit_code == 2 and result.stdout == ""
+    assert re.search(r"(instrument|target)\.\w+", result.stderr)
+    assert "can be simulated: " in result.stderr and re.search(r"\d", result.stderr)
 
 
 def test_the_limits_of_the_model_are_where_they_are_said_to_be():
@@ -111,9 +111,9 @@ def test_nobody_can_be_inside_the_sun():
     GridSpec.from_mapping(base_study_mapping({"target.sun_distance": f"{1.01 * SUN_RADIUS} m"}))
 
 
-@pytest.mark.parametrize("written", ["1e400 m", "-1e9999 W", "9e300 m"])
-def test_a_pure_number_with_a_unit_is_refused_however_large(written):
-    words = refused(base_study_mapping({"instrument.processing.tnr": written}))
+@pytest.mark.parametrize("text", ["1e400 m", "-1e9999 W", "9e300 m"])
+def test_a_pure_number_with_a_unit_is_refused_however_large(text):
+    words = refused(base_study_mapping({"instrument.processing.tnr": text}))
     assert "is a pure number and takes no unit" in words
 
 
@@ -171,9 +171,9 @@ EXTREME = {
 
 @pytest.mark.parametrize("name", EXTREME)
 def test_the_ends_of_the_bounds_are_computed_without_a_warning(name, tmp_path):
-    beyond = name == "a spread of 1e160 bins"
-    assert planned(tmp_path, base_study_mapping(EXTREME[name])).exit_code == 2 * beyond
-    assert bool(judged(tmp_path, base_study_mapping(EXTREME[name])).refusals) == beyond
+    is_beyond_limit = name == "a spread of 1e160 bins"
+    assert planned(tmp_path, base_study_mapping(EXTREME[name])).exit_code == 2 * is_beyond_limit
+    assert bool(judged(tmp_path, base_study_mapping(EXTREME[name])).refusals) == is_beyond_limit
 
 
 def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
@@ -198,7 +198,7 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
     assert np.ptp(middles[:, :2], axis=0).min() > 55
 
 
-def test_boulders_beside_the_ground_are_refused():
+def test_boulders_next_to_the_ground_are_refused():
     from sweep.scenes.terrain import clipped_square_bounds
     from sweep.spec.fields import SpecFiles
     from sweep.spec.ground_sections import PlaneGround
@@ -221,8 +221,8 @@ def test_a_ground_is_not_blurred_by_more_than_its_own_size():
 def test_a_plan_measures_once_however_late_it_is(monkeypatch):
     """As of a process that is held up between two looks at the clock."""
     monkeypatch.setattr("sweep.tasks.studies.study_plan.POINT_TIMING_SECONDS", 0.0)
-    found = plan_study(GridSpec.from_mapping(base_study_mapping({})))
-    assert np.isfinite(found.wall_seconds) and found.wall_seconds > 0
+    plan = plan_study(GridSpec.from_mapping(base_study_mapping({})))
+    assert np.isfinite(plan.wall_seconds) and plan.wall_seconds > 0
 
 
 @pytest.mark.parametrize("window", ["hann", "rectangular", "tukey(0.6)"])
@@ -234,9 +234,9 @@ def test_lines_that_lie_next_to_nothing_off_a_bin_are_on_it(window, width):
     """
     with_width, without = (
         GridStudy(
-            GridSpec.from_mapping(base_study_mapping(instrument_with(window) | own))
+            GridSpec.from_mapping(base_study_mapping(instrument_with(window) | mapping))
         ).evaluate(0)
-        for own in (
+        for mapping in (
             {"instrument.laser.line_width": width, "effects": {"line_width": "on"}},
             {"effects": {"line_width": "off"}},
         )
@@ -312,10 +312,10 @@ def test_a_flight_whose_echoes_are_late_or_elsewhere_has_no_nan(tmp_path, name, 
     if name.startswith("late"):
         assert (statistics["snr_up"] == 0).all()
     else:  # the signal is there, as that of grids, though not searched for
-        seen = {k: v for k, v in WITHOUT_GROUP[name].items() if k not in ELSEWHERE}
-        (tmp_path / "flight.yaml").write_text(to_yaml(flight_mapping(seen)))
-        there = statistics_of(tmp_path / "flight.yaml")["snr_up"]
-        np.testing.assert_allclose(statistics["snr_up"], there, rtol=1e-9)
+        visible_changes = {k: v for k, v in WITHOUT_GROUP[name].items() if k not in ELSEWHERE}
+        (tmp_path / "flight.yaml").write_text(to_yaml(flight_mapping(visible_changes)))
+        snr = statistics_of(tmp_path / "flight.yaml")["snr_up"]
+        np.testing.assert_allclose(statistics["snr_up"], snr, rtol=1e-9)
 
 
 def statistics_of(file):

@@ -32,7 +32,7 @@ class Payload:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def empty_store(tmp_path_factory):
     """A store without results, with a text coordinate."""
     study = small_spec(
         axes={"instrument.processing.window": ["hann", "hamming"], "target.range": ["9 m", "8 m"]}
@@ -41,9 +41,9 @@ def made(tmp_path_factory):
 
 
 @pytest.fixture
-def theirs(made, tmp_path):
+def store_copy(empty_store, tmp_path):
     """A copy that a test may spoil."""
-    return shutil.copytree(made, tmp_path / "theirs.zarr")
+    return shutil.copytree(empty_store, tmp_path / "theirs.zarr")
 
 
 def spoil(path, change):
@@ -103,14 +103,16 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("change", SPOILT.values(), ids=SPOILT)
-def test_a_store_with_metadata_that_sweep_never_writes_is_refused_unread(theirs, tmp_path, change):
-    (theirs / "range" / "0").write_bytes(pickle.dumps(Payload(tmp_path / "ran")))
-    spoil(theirs, change)
+def test_a_store_with_metadata_that_sweep_never_writes_is_refused_unread(
+    store_copy, tmp_path, change
+):
+    (store_copy / "range" / "0").write_bytes(pickle.dumps(Payload(tmp_path / "ran")))
+    spoil(store_copy, change)
     with pytest.raises(NotAStoreError) as refusal:
-        sweep.open(theirs)
-    with pytest.raises(StoreError, match="(?s)^" + str(theirs)):
-        status(theirs)
-    assert "\n" not in str(refusal.value) and str(theirs) in str(refusal.value)
+        sweep.open(store_copy)
+    with pytest.raises(StoreError, match="(?s)^" + str(store_copy)):
+        status(store_copy)
+    assert "\n" not in str(refusal.value) and str(store_copy) in str(refusal.value)
     assert not (tmp_path / "ran").exists()
 
 
@@ -121,40 +123,44 @@ def test_a_store_with_metadata_that_sweep_never_writes_is_refused_unread(theirs,
         "finalize S there.zarr", "extend S --set seed=5",
     ],
 )  # fmt: skip
-def test_every_command_refuses_a_hostile_store_in_one_line(theirs, tmp_path, monkeypatch, command):
+def test_every_command_refuses_a_hostile_store_in_one_line(
+    store_copy, tmp_path, monkeypatch, command
+):
     monkeypatch.chdir(tmp_path)
-    spoil(theirs, SPOILT["pickled objects"])
-    words = command.replace("S ", f"{theirs.name} ").split()
-    told = CliRunner().invoke(main, words, catch_exceptions=False)
-    assert told.exit_code == 2, told.output
-    assert told.output.count("\n") == 1 and "range" in told.output
+    spoil(store_copy, SPOILT["pickled objects"])
+    words = command.replace("S ", f"{store_copy.name} ").split()
+    result = CliRunner().invoke(main, words, catch_exceptions=False)
+    assert result.exit_code == 2, result.output
+    assert result.output.count("\n") == 1 and "range" in result.output
     assert sorted(os.listdir(tmp_path)) == ["theirs.zarr"]
 
 
 @pytest.mark.parametrize("study_id", ["\x1b[31mred", "", "a study", "0" * 33])
-def test_an_id_that_is_no_digest_is_told_by_every_command_that_reads(theirs, study_id):
-    path = theirs / "zarr.json"
+def test_an_id_that_is_no_digest_is_reported_by_every_command_that_reads(store_copy, study_id):
+    path = store_copy / "zarr.json"
     document = json.loads(path.read_text())
     document["attributes"]["study_id"] = study_id
     path.write_text(json.dumps(document))
     with pytest.raises(NotAStoreError, match=r"its study_id is .*, and no digest"):
-        sweep.open(theirs)
+        sweep.open(store_copy)
     for command in ("status", "report", "figures"):
-        told = CliRunner().invoke(main, [command, str(theirs)], catch_exceptions=False)
-        assert told.exit_code == 2 and "no digest" in told.output and "\x1b" not in told.output
+        result = CliRunner().invoke(main, [command, str(store_copy)], catch_exceptions=False)
+        assert (
+            result.exit_code == 2 and "no digest" in result.output and "\x1b" not in result.output
+        )
 
 
-def test_metadata_of_single_arrays_are_not_read(theirs):
+def test_metadata_of_single_arrays_are_not_read(store_copy):
     """Those of the root's document are, which are checked."""
-    (theirs / ".sweep" / "template.jsonl").unlink()  # has digests of them, which they can forge
+    (store_copy / ".sweep" / "template.jsonl").unlink()  # has digests of them, which they can forge
     for name in ("range", "pd_up", "window"):
-        (theirs / name / "zarr.json").write_text(json.dumps(OBJECTS))
-        (theirs / name / ".zarray").write_text(json.dumps(OBJECTS))
-    dataset = sweep.open(theirs)
+        (store_copy / name / "zarr.json").write_text(json.dumps(OBJECTS))
+        (store_copy / name / ".zarray").write_text(json.dumps(OBJECTS))
+    dataset = sweep.open(store_copy)
     assert dataset.range.values.tolist() == [9, 8]
     assert dataset.window.values.tolist() == ["hann", "hamming"]
     assert np.isnan(dataset.pd_up.values).all()
-    assert status(theirs).points == 4
+    assert status(store_copy).points == 4
 
 
 def leaves(value, place=()):
@@ -175,13 +181,13 @@ ODD = [
 @pytest.mark.parametrize(
     "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))]
 )
-def test_random_changes_of_metadata_end_in_words_or_change_nothing(theirs, seed):
-    chance, text = random.Random(seed), (theirs / "zarr.json").read_text()
-    whole = json.loads(text)
-    places = list(leaves(whole))
+def test_random_changes_of_metadata_end_in_words_or_change_nothing(store_copy, seed):
+    chance, text = random.Random(seed), (store_copy / "zarr.json").read_text()
+    original = json.loads(text)
+    places = list(leaves(original))
     places += [place for place in places if place[0] == "attributes"] * 10
     for _ in range(60):
-        document = copy.deepcopy(whole)
+        document = copy.deepcopy(original)
         place = chance.choice(places)
         parent = document
         for key in place[:-1]:
@@ -190,57 +196,57 @@ def test_random_changes_of_metadata_end_in_words_or_change_nothing(theirs, seed)
             del parent[place[-1]]
         else:
             parent[place[-1]] = chance.choice(ODD)
-        (theirs / "zarr.json").write_text(json.dumps(document))
+        (store_copy / "zarr.json").write_text(json.dumps(document))
         for read, error in ((sweep.open, NotAStoreError), (status, StoreError)):
             try:
-                read(theirs)
+                read(store_copy)
             except error as refusal:
                 assert "\n" not in str(refusal) or place == ("attributes", "spec"), place
                 assert "\x1b" not in str(refusal)
 
 
-def test_bytes_in_place_of_a_document_end_in_words(theirs):
+def test_bytes_in_place_of_a_document_end_in_words(store_copy):
     for text in (b"[" * 10**5, b'{"attributes": ' + b"9" * 5000 + b"}", b"\xff", b"null", b"[1]"):
-        (theirs / "zarr.json").write_bytes(text)
+        (store_copy / "zarr.json").write_bytes(text)
         with pytest.raises(NotAStoreError, match="damaged"):
-            sweep.open(theirs)
+            sweep.open(store_copy)
 
 
 @pytest.mark.parametrize("kind", ["link", "pipe"])
-def test_a_journal_that_leads_out_of_a_store_is_not_read_or_written(theirs, tmp_path, kind):
+def test_a_journal_that_leads_out_of_a_store_is_not_read_or_written(store_copy, tmp_path, kind):
     outside = tmp_path / "outside"
     outside.write_text("mine\n")
-    receipts = theirs / ".sweep" / "receipts.jsonl"
+    receipts = store_copy / ".sweep" / "receipts.jsonl"
     receipts.unlink(missing_ok=True)
     if kind == "link":
         receipts.symlink_to(outside)
     else:
         os.mkfifo(receipts)
-    told = CliRunner().invoke(main, ["resume", str(theirs)], catch_exceptions=False)
-    assert told.exit_code == 2 and "receipts.jsonl is a " in told.output
+    result = CliRunner().invoke(main, ["resume", str(store_copy)], catch_exceptions=False)
+    assert result.exit_code == 2 and "receipts.jsonl is a " in result.output
     assert outside.read_text() == "mine\n"
 
 
 @pytest.mark.parametrize("place", ["pd_up", "pd_up/c", "effects/c/0"])
-def test_resuming_writes_through_no_link_out_of_a_store(theirs, tmp_path, place):
+def test_resuming_writes_through_no_link_out_of_a_store(store_copy, tmp_path, place):
     outside = tmp_path / "outside"
     outside.mkdir()
-    linked = theirs / place
+    linked = store_copy / place
     shutil.rmtree(linked, ignore_errors=True)
     linked.parent.mkdir(parents=True, exist_ok=True)
     linked.symlink_to(outside)
     if place == "pd_up":
-        shutil.copy(theirs / "pd_down" / "zarr.json", outside)
+        shutil.copy(store_copy / "pd_down" / "zarr.json", outside)
     before = os.listdir(outside)
-    command = ["resume", str(theirs), "--scheduler", "none"]
-    told = CliRunner().invoke(main, command, catch_exceptions=False)
-    assert told.exit_code == 2 and "\n" not in told.output.strip()
+    command = ["resume", str(store_copy), "--scheduler", "none"]
+    result = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert result.exit_code == 2 and "\n" not in result.output.strip()
     assert os.listdir(outside) == before
 
 
 @pytest.mark.parametrize("body", [b"[1", b'{"block":', b'{"a":' + b"[" * 10**5, b'"x'])
-def test_a_log_whose_lines_have_digests_but_no_records_is_read_as_damaged(theirs, body):
+def test_a_log_whose_lines_have_digests_but_no_records_is_read_as_damaged(store_copy, body):
     for name in ("receipts.jsonl", "sessions.jsonl"):
-        (theirs / ".sweep" / name).write_bytes(append_line_digest(body))
-    assert sweep.open(theirs).attrs["blocks_committed"] == 0
-    assert status(theirs).blocks_done == 0
+        (store_copy / ".sweep" / name).write_bytes(append_line_digest(body))
+    assert sweep.open(store_copy).attrs["blocks_committed"] == 0
+    assert status(store_copy).blocks_done == 0

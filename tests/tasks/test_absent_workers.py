@@ -37,7 +37,7 @@ from sweep.tasks.engine.worker import worker_address
 from sweep.tasks.studies.grid_study import GridStudy
 
 
-class Told(Progress):
+class ActingProgress(Progress):
     """Progress that does something when a line is said, and once as the first points arrive."""
 
     def __init__(self, at_line, at_first=lambda: None) -> None:
@@ -67,7 +67,7 @@ def without_workers(monkeypatch):
 
 
 def test_that_workers_do_not_come_or_went_away_is_said_and_the_run_goes_on_with_the_next(
-    undisturbed, tmp_path, without_workers
+    serial_store, tmp_path, without_workers
 ):
     cluster = without_workers.cluster
 
@@ -75,38 +75,42 @@ def test_that_workers_do_not_come_or_went_away_is_said_and_the_run_goes_on_with_
         time.sleep(0.05)
         return study.evaluate(block)
 
-    told = Told(lambda: cluster.scale(1), lambda: cluster.scale(0))
+    progress = ActingProgress(lambda: cluster.scale(1), lambda: cluster.scale(0))
     outcome = run(
         small_spec(),
         store=tmp_path / "s.zarr",
         client=without_workers,
-        progress=told,
+        progress=progress,
         evaluate=slowly,
     )
-    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
-    assert told.lines[0].startswith("no worker yet (")
-    assert "Ctrl-C stops, nothing is lost" in told.lines[0]
-    assert any(line.startswith("no worker is left (") for line in told.lines)
-    assert {0, 1} <= {workers for workers, _ in told.work}
-    assert told.work[-1][1] > 72 * 8
+    assert outcome.complete and file_digests(outcome.store) == file_digests(serial_store)
+    assert progress.lines[0].startswith("no worker yet (")
+    assert "Ctrl-C stops, nothing is lost" in progress.lines[0]
+    assert any(line.startswith("no worker is left (") for line in progress.lines)
+    assert {0, 1} <= {workers for workers, _ in progress.work}
+    assert progress.work[-1][1] > 72 * 8
 
 
 def test_one_ctrl_c_stops_a_run_that_no_worker_will_end(tmp_path, without_workers):
-    told = Told(lambda: os.kill(os.getpid(), signal.SIGINT) if len(told.lines) == 1 else None)
-    outcome = run(small_spec(), store=tmp_path / "s.zarr", client=without_workers, progress=told)
+    progress = ActingProgress(
+        lambda: os.kill(os.getpid(), signal.SIGINT) if len(progress.lines) == 1 else None
+    )
+    outcome = run(
+        small_spec(), store=tmp_path / "s.zarr", client=without_workers, progress=progress
+    )
     assert outcome.stop_reason == "interrupted" and outcome.blocks_done == 0
-    assert told.lines[0].startswith("no worker yet (")
+    assert progress.lines[0].startswith("no worker yet (")
 
 
 def test_word_of_absent_workers_comes_ever_less_often(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(session.time, "monotonic", lambda: clock[0])
-    absence, said = session.NoWorkerMonitor(), []
+    absence, messages = session.NoWorkerMonitor(), []
     for clock[0] in range(1000):
         workers = 1 if 300 <= clock[0] < 310 else 0
         if absence.warning_text(workers):
-            said.append(clock[0])
-    assert said == [20, 40, 80, 160, 329, 349, 389, 469, 629, 949]
+            messages.append(clock[0])
+    assert messages == [20, 40, 80, 160, 329, 349, 389, 469, 629, 949]
 
 
 def test_a_worker_that_went_before_it_was_counted_had_been_there_if_it_answered(monkeypatch):
@@ -147,20 +151,22 @@ def silent_from_block_3(study, block):
 
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
-    undisturbed, tmp_path, two_workers, interrupted
+    serial_store, tmp_path, two_workers, interrupted
 ):
     SILENT.clear(), FROZEN.clear(), THAWED.clear()
-    told = Told(lambda: None)
+    progress = ActingProgress(lambda: None)
     if interrupted:
-        told = Told(lambda: None, lambda: FROZEN.wait(60) and os.kill(os.getpid(), signal.SIGINT))
+        progress = ActingProgress(
+            lambda: None, lambda: FROZEN.wait(60) and os.kill(os.getpid(), signal.SIGINT)
+        )
     try:
         outcome = run(
-            small_spec(), store=tmp_path / "s.zarr", client=two_workers, progress=told,
+            small_spec(), store=tmp_path / "s.zarr", client=two_workers, progress=progress,
             evaluate=silent_from_block_3,
         )  # fmt: skip
     finally:
         THAWED.set()
-    assert any(line.startswith(f"worker {SILENT[0]} is silent (") for line in told.lines)
+    assert any(line.startswith(f"worker {SILENT[0]} is silent (") for line in progress.lines)
     assert len(receipt_blocks(outcome.store)) == len(set(receipt_blocks(outcome.store)))
     assert 3 in receipt_blocks(outcome.store)  # it ran as the run was interrupted
     if interrupted:
@@ -168,21 +174,23 @@ def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
         assert resume(outcome.store, scheduler="none", progress=False).complete
     else:
         assert outcome.complete and outcome.blocks_computed == 12
-    assert file_digests(outcome.store) == file_digests(undisturbed)
+    assert file_digests(outcome.store) == file_digests(serial_store)
 
 
 @pytest.mark.parametrize("lost", ["client", "cluster"])
-def test_a_client_closed_before_is_told_in_words_where_blocks_are_left(undisturbed, tmp_path, lost):
+def test_a_client_closed_before_is_reported_in_words_where_blocks_are_left(
+    serial_store, tmp_path, lost
+):
     with thread_cluster_client(1) as client:
         (client if lost == "client" else client.cluster).close()
         outcome = run(small_spec(), store=tmp_path / "s.zarr", client=client, progress=False)
         assert outcome.stop_reason == "the scheduler is gone (the client is closed)"
         assert outcome.blocks_done == 0
-        whole = resume(copy_store(undisturbed, tmp_path), client=client, progress=False)
-    assert whole.complete and not whole.blocks_computed
+        complete_outcome = resume(copy_store(serial_store, tmp_path), client=client, progress=False)
+    assert complete_outcome.complete and not complete_outcome.blocks_computed
 
 
-class Leaving:
+class LeavingPlugin:
     """A client whose scheduler goes as it is asked."""
 
     status = "running"
@@ -198,21 +206,21 @@ class Leaving:
     "error", [OSError("gone"), TimeoutError(), RuntimeError("IOLoop is closed"), CancelledError()]
 )
 def test_nothing_is_known_of_the_memory_of_workers_that_go(error):
-    assert worker_memory.worker_memory(Leaving(error), None).bytes_max == float("inf")
+    assert worker_memory.worker_memory(LeavingPlugin(error), None).bytes_max == float("inf")
 
 
-def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path, two_workers):
+def test_a_scheduler_that_goes_away_ends_the_run_in_words(serial_store, tmp_path, two_workers):
     def slowly(study, block):
         time.sleep(0.05)
         return study.evaluate(block)
 
     cluster = two_workers.cluster
-    told = Told(lambda: None, lambda: cluster.sync(cluster.scheduler.close))
+    progress = ActingProgress(lambda: None, lambda: cluster.sync(cluster.scheduler.close))
     path = tmp_path / "s.zarr"
-    outcome = run(small_spec(), store=path, client=two_workers, progress=told, evaluate=slowly)
+    outcome = run(small_spec(), store=path, client=two_workers, progress=progress, evaluate=slowly)
     assert outcome.stop_reason.startswith("the scheduler is gone") and outcome.blocks_done < 12
     assert resume(path, scheduler="none", progress=False).complete
-    assert file_digests(path) == file_digests(undisturbed)
+    assert file_digests(path) == file_digests(serial_store)
 
 
 def versions_differ(path, opened):
@@ -239,18 +247,18 @@ UNFIT = [
 
 
 @pytest.mark.parametrize(
-    ("fault", "said", "all_unfit"),
+    ("fault", "message", "all_unfit"),
     [
-        *((*each, False) for each in UNFIT),
-        *(pytest.param(*each, True, marks=pytest.mark.slow) for each in UNFIT[:2]),
+        *((*case, False) for case in UNFIT),
+        *(pytest.param(*case, True, marks=pytest.mark.slow) for case in UNFIT[:2]),
         (*UNFIT[2], True),
     ],
 )
 def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_none_is_left(
-    undisturbed, tmp_path, two_workers, monkeypatch, fault, said, all_unfit
+    serial_store, tmp_path, two_workers, monkeypatch, fault, message, all_unfit
 ):
     monkeypatch.setattr(dispatcher, "FILE_VISIBILITY_SECONDS_MAX", 0.5)
-    path = copy_store(undisturbed, tmp_path)
+    path = copy_store(serial_store, tmp_path)
     (path / ".sweep" / "receipts.jsonl").unlink()
     held = GridStudy(small_spec())
     for block in range(12):
@@ -258,7 +266,7 @@ def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_non
             held, block
         ):  # of the right size, and of another study
             (path / name).write_bytes(bytes((path / name).stat().st_size))
-    shutil.copytree(undisturbed, f"{path}-copy")
+    shutil.copytree(serial_store, f"{path}-copy")
     unfit = sorted(two_workers.nthreads())[: 1 + all_unfit]
 
     def study(path, study_id, read_study):
@@ -270,22 +278,22 @@ def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_non
         return study.evaluate(block)
 
     monkeypatch.setattr(worker, "get_block_writer", study)
-    told, outcome = Told(lambda: None), None
-    options = {"client": two_workers, "progress": told, "evaluate": evaluate}
+    progress, outcome = ActingProgress(lambda: None), None
+    options = {"client": two_workers, "progress": progress, "evaluate": evaluate}
     try:
         outcome = resume(path, **options)
     except StoreError as error:
-        assert all_unfit and said in str(error)
-    lines = [line for line in told.lines if "is left out" in line]
+        assert all_unfit and message in str(error)
+    lines = [line for line in progress.lines if "is left out" in line]
     assert lines[0].startswith(
         tuple(f"worker {w} on {os.uname().nodename} is left out" for w in unfit)
     )
-    assert said in lines[0] and len(lines) == 1
+    assert message in lines[0] and len(lines) == 1
     if all_unfit:
-        assert outcome is None or (not outcome.blocks_done and said in outcome.stop_reason)
+        assert outcome is None or (not outcome.blocks_done and message in outcome.stop_reason)
     else:
         assert outcome.complete and not outcome.failures
-        assert file_digests(path) == file_digests(undisturbed)
+        assert file_digests(path) == file_digests(serial_store)
 
 
 def test_an_asynchronous_client_is_refused_in_words(tmp_path):
@@ -295,9 +303,9 @@ def test_an_asynchronous_client_is_refused_in_words(tmp_path):
 
     # In a thread of its own: a browser that other tests drive leaves a loop running in this one.
     with ThreadPoolExecutor(1) as pool:
-        asked = pool.submit(asyncio.run, ask())
+        future = pool.submit(asyncio.run, ask())
         with pytest.raises(ClusterError, match="the client is asynchronous"):
-            asked.result()
+            future.result()
     assert not (tmp_path / "s.zarr").exists()
 
 
@@ -306,25 +314,27 @@ def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
     compiled = threading.Event()
     monkeypatch.setattr(progress, "ACTIVITY_MESSAGE_DELAY_SECONDS", 0.1)
     monkeypatch.setattr(GridStudy, "compile_kernels", lambda self: compiled.wait(60))
-    told = Told(lambda: os.kill(os.getpid(), number) if len(told.lines) == 1 else None)
-    begun = time.monotonic()
+    recorder = ActingProgress(
+        lambda: os.kill(os.getpid(), number) if len(recorder.lines) == 1 else None
+    )
+    start_time = time.monotonic()
     try:
-        outcome = run(small_spec(), store=tmp_path / "s.zarr", scheduler="none", progress=told)
+        outcome = run(small_spec(), store=tmp_path / "s.zarr", scheduler="none", progress=recorder)
     finally:
         compiled.set()
-    assert told.lines[0].startswith("loading the model") and time.monotonic() - begun < 50
+    assert recorder.lines[0].startswith("loading the model") and time.monotonic() - start_time < 50
     assert outcome.stop_reason == "interrupted" and outcome.blocks_done == 0
 
 
-def test_an_address_at_which_no_scheduler_answers_is_told_in_time(tmp_path, monkeypatch):
+def test_an_address_at_which_no_scheduler_answers_is_reported_in_time(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 1.0)
-    begun = time.monotonic()
+    start_time = time.monotonic()
     with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:1: Timed out trying"):
         run(small_spec(), store=tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1", progress=False)
-    assert time.monotonic() - begun < 20 and not (tmp_path / "s.zarr").exists()
+    assert time.monotonic() - start_time < 20 and not (tmp_path / "s.zarr").exists()
 
 
-def test_what_is_no_scheduler_is_told_as_that(tmp_path):
+def test_what_is_no_scheduler_is_reported_as_that(tmp_path):
     def answer(server):
         connection, _ = server.accept()
         with connection:

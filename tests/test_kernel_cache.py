@@ -68,13 +68,13 @@ class SmallPackage:
         """Output of a process that imports the package."""
         environment = {name: value for name, value in os.environ.items() if "NUMBA" not in name}
         environment |= {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"} | variables
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", code, first], capture_output=True, text=True, cwd=self.folder,
             env=environment, timeout=120,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        self.said = done.stderr
-        return done.stdout.strip()
+        assert process.returncode == 0, process.stderr
+        self.said = process.stderr
+        return process.stdout.strip()
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ NOWHERE = dict.fromkeys(("HOME", "XDG_CACHE_HOME"), os.devnull)
     ],
     ids=["named", "user's cache", "temporary"],
 )
-def test_a_kernel_is_compiled_anew_where_a_constant_of_one_that_it_calls_has_changed(
+def test_a_kernel_is_compiled_again_where_a_constant_of_one_that_it_calls_has_changed(
     small, tmp_path, place
 ):
     """numba's own cache would go on with the old constant: the caller's file is as it was."""
@@ -153,15 +153,15 @@ def test_functions_of_others_are_cached_where_numba_has_them(small, tmp_path):
     (small.folder / "mine.py").write_text("import numba\n@numba.njit(cache=True)\ndef f(): pass\n")
     code = "import sweep.kernel_cache, sweep.model.caller, mine, os; print(mine.f.stats.cache_path)"
     cache = tmp_path / "cache"
-    found = small.run(code=code, NUMBA_CACHE_DIR=str(cache))
-    assert Path(found).parent == cache and not Path(found).name.startswith("sweep-kernels")
+    compiled = small.run(code=code, NUMBA_CACHE_DIR=str(cache))
+    assert Path(compiled).parent == cache and not Path(compiled).name.startswith("sweep-kernels")
     assert "NUMBA_CACHE_DIR" not in small.run(code=CODE + "import os; print(*os.environ)")
 
 
 FULL = "resource.setrlimit(resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))"
 
 
-def test_a_disk_without_room_for_kernels_is_told_once_and_computing_goes_on(small, tmp_path):
+def test_a_disk_without_room_for_kernels_is_reported_once_and_computing_goes_on(small, tmp_path):
     cache = {"NUMBA_CACHE_DIR": str(tmp_path)}
     assert small.run(first=FULL, **cache) == "4.0 0"
     assert small.said.count("can't be written (File too large)") == 1
@@ -189,7 +189,7 @@ def test_a_folder_that_others_can_write_to_is_not_used(small, tmp_path):
     [("*.nbi", b""), ("*.nbi", None), ("*.nbc", b"garbage"), ("*.nbc", None)],
     ids=["empty index", "index cut short", "garbage", "kernel cut short"],
 )
-def test_damaged_kernels_are_compiled_anew(small, tmp_path, pattern, content):
+def test_damaged_kernels_are_compiled_again(small, tmp_path, pattern, content):
     cache = {"NUMBA_CACHE_DIR": str(tmp_path)}
     small.run(**cache)
     for path in files(tmp_path, pattern):
@@ -198,7 +198,7 @@ def test_damaged_kernels_are_compiled_anew(small, tmp_path, pattern, content):
     assert small.run(**cache) == "4.0 1"
 
 
-def test_a_kernel_of_another_signature_in_its_file_is_compiled_anew(small, tmp_path):
+def test_a_kernel_of_another_signature_in_its_file_is_compiled_again(small, tmp_path):
     """As where two processes have saved two signatures at once, each as the first."""
     cache = {"NUMBA_CACHE_DIR": str(tmp_path)}
     code = CODE.replace("1.0", "1")  # by integers, in the same function
@@ -298,11 +298,11 @@ def test_a_package_without_sources_compiles_uncached(small, tmp_path):
     """As in an archive, or of compiled modules alone."""
     archive = shutil.make_archive(str(tmp_path / "sweep"), "zip", small.folder)
     cache = tmp_path / "cache"
-    found = small.run(NUMBA_CACHE_DIR=str(cache), PYTHONPATH=archive, code=CODE.replace(
+    compiled = small.run(NUMBA_CACHE_DIR=str(cache), PYTHONPATH=archive, code=CODE.replace(
         "import resource", f"import os; os.chdir({str(tmp_path)!r}); sys = __import__('sys'); "
         "sys.path.remove('') if '' in sys.path else None; import resource"
     ))  # fmt: skip
-    assert found == "4.0 0" and not files(cache)
+    assert compiled == "4.0 0" and not files(cache)
 
 
 def test_all_kernels_of_the_package_are_cached_by_the_fingerprint():
@@ -312,8 +312,8 @@ def test_all_kernels_of_the_package_are_cached_by_the_fingerprint():
         for path in PACKAGE.rglob("*.py")
         if "njit" in path.read_text()
     }
-    others = {name for name in users if not name.startswith("model/")}
-    assert others == {"kernel_cache.py"} and len(users) > 15
+    other_users = {name for name in users if not name.startswith("model/")}
+    assert other_users == {"kernel_cache.py"} and len(users) > 15
     for name in users - {"kernel_cache.py"}:
         assert "from numba" not in (PACKAGE / name).read_text()
 
