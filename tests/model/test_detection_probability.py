@@ -104,9 +104,13 @@ def test_pd_given_other_segments_adds_up_to_pd():
     np.testing.assert_allclose(pd_up[1:] * down.if_holds[1:], pd_both[1:])
     one, doppler = pd_up + pd_down - 2 * pd_both, np.array([0.4, 0.5, 0.6, 0.7])
     added = one * np.array([0.5, 0.6, 0.7, 0.8])
-    given = doppler_pd_given_chirps(doppler, one, added, np.array([True, True, True, False]))
-    np.testing.assert_allclose(given.if_holds, [0.5, 0.6, 0.7, 0.7])
-    np.testing.assert_allclose(one * given.if_holds + (1 - one) * given.if_fails, doppler)
+    conditional_pd = doppler_pd_given_chirps(
+        doppler, one, added, np.array([True, True, True, False])
+    )
+    np.testing.assert_allclose(conditional_pd.if_holds, [0.5, 0.6, 0.7, 0.7])
+    np.testing.assert_allclose(
+        one * conditional_pd.if_holds + (1 - one) * conditional_pd.if_fails, doppler
+    )
 
 
 def test_a_segment_reports_the_echo_or_another_peak_or_none():
@@ -135,6 +139,6 @@ def test_independent_bins_together_are_detected_as_the_echo(n_bins):
     pd = np.array([1e-30, 1e-9, 0.2, 0.999])
     bin_pd = independent_bin_pd(pd, n_bins)
     np.testing.assert_allclose(bin_pd[2:], 1 - (1 - pd[2:]) ** (1 / n_bins), rtol=1e-12)
-    for whole, single in zip(pd, bin_pd, strict=True):
-        assert independent_bin_pd_kernel(whole, n_bins) == pytest.approx(single, rel=1e-14)
-        assert pd_of_independent_bins(single, n_bins) == pytest.approx(whole, rel=1e-12)
+    for echo_pd, single in zip(pd, bin_pd, strict=True):
+        assert independent_bin_pd_kernel(echo_pd, n_bins) == pytest.approx(single, rel=1e-14)
+        assert pd_of_independent_bins(single, n_bins) == pytest.approx(echo_pd, rel=1e-12)

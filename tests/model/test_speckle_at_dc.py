@@ -174,9 +174,9 @@ def test_looks_near_dc_are_detected_alike_in_the_time_domain(speckle, waveform, 
         tuple(name for name in COMPARED_EFFECTS if name != "range_walk"),
     )
     in_time = evaluate_segments_in_time_domain(shots, with_range_walk=False)
-    found = evaluate_segments(shots)
+    results = evaluate_segments(shots)
     for name in ("pd", "miss", "magnitude", "frequency"):
-        np.testing.assert_allclose(getattr(in_time, name), getattr(found, name), rtol=1e-4)
+        np.testing.assert_allclose(getattr(in_time, name), getattr(results, name), rtol=1e-4)
 
 
 @pytest.mark.parametrize("share", [-1.0, -0.4, 0.0, 1e-6, 0.3, 0.9, 0.9999, 1.0])

@@ -23,7 +23,7 @@ def blocked_at_block_3(study, block):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """A client of one worker, whose stalls are told after half a second."""
+    """A client of one worker, whose stalls are reported after half a second."""
     RELEASED.clear()
     monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.05)
     monkeypatch.setattr(stalls, "STALL_REPORT_SECONDS", 0.5)
@@ -75,14 +75,14 @@ def test_a_block_that_holds_up_this_process_is_named_with_its_thread(
     RELEASED.clear()
     monkeypatch.setattr(worker, "IDLE_POLL_SECONDS", 0.05)
     monkeypatch.setattr(stalls, "STALL_REPORT_SECONDS", 0.5)
-    told = ReleasingNamedBlock(lambda: None)
+    progress = ReleasingNamedBlock(lambda: None)
     with caplog.at_level(logging.INFO, logger="sweep.stalls"):
         outcome = run(
-            small_spec(), store=tmp_path / "s.zarr", progress=told, evaluate=blocked_at_block_3,
+            small_spec(), store=tmp_path / "s.zarr", progress=progress, evaluate=blocked_at_block_3,
             **options,
         )  # fmt: skip
     assert outcome.complete and file_digests(outcome.store) == file_digests(serial_store)
-    (report,) = (line for line in told.lines if "block 3: " in line)
+    (report,) = (line for line in progress.lines if "block 3: " in line)
     assert report.startswith("no block has come back for ")
     assert re.search(
         r"\d+ blocks? not yet begun, [12] blocks? being computed; \d+ blocks? ", report
@@ -96,17 +96,17 @@ def test_patience_grows_with_the_time_of_a_task_and_waits_for_nothing_that_is_no
     monkeypatch,
 ):
     monkeypatch.setattr(stalls, "STALL_REPORT_SECONDS", 0.0)
-    said = []
-    monitor = stalls.InProcessMonitor(said.append, lambda: 7)
+    messages = []
+    monitor = stalls.InProcessMonitor(messages.append, lambda: 7)
     monitor.report_if_stalled()
-    assert not said
+    assert not messages
     with monitor.computing(5):
         monitor.report_if_stalled()
-        assert "7 blocks not yet begun, 1 block being computed; 0 blocks done" in said[0]
-        assert "block 5: computed by thread MainThread since " in said[0]
+        assert "7 blocks not yet begun, 1 block being computed; 0 blocks done" in messages[0]
+        assert "block 5: computed by thread MainThread since " in messages[0]
         monitor.record_result(2, 100.0)  # 50 s a block: the patience is 250 s
         monitor.report_if_stalled()
-    assert len(said) == 1
+    assert len(messages) == 1
 
 
 def test_a_run_is_quiet_by_default_and_logs_its_steps_where_asked(tmp_path, caplog, capfd):
