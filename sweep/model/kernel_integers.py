@@ -14,5 +14,7 @@ INTEGER_ZERO = np.int64(0)
 INTEGER_ONE = np.int64(1)
 NO_INDEX = np.int64(-1)
 """Index that stands for none."""
+THREE_BINS = np.int64(3)
+"""Number of bins of a peak and its two neighbours."""
 STEP_UP, STEP_DOWN = np.int64(1), np.int64(-1)
 """Steps from a bin to the next one above and below."""

@@ -50,6 +50,7 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.added_crossings import crossing_rate, edge_crossing_probability
 from sweep.model.detection.looks import Looks
 from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
+from sweep.model.kernel_integers import INTEGER_ZERO, NO_INDEX
 from sweep.model.pointcloud.bin_groups import BinGroups, allocate_bin_groups, find_groups_in_spans
 from sweep.model.preparation import Shots
 from sweep.model.sampling import philox
@@ -74,7 +75,7 @@ LEAKAGE_MIN = 1e-9
 """Smallest probability of a false peak by leaked signal in a segment for which such peaks are
 drawn."""
 
-PERMANENT_LINE_RANDOM_OFFSET = 1 << 24
+PERMANENT_LINE_RANDOM_OFFSET = np.int64(1 << 24)
 """Index of the first random number used for the line of leaked light. Lower indices of the same
 stream are used for signal leaked from echoes."""
 
@@ -1365,12 +1366,12 @@ def draw_leaked_peaks(
         bound_index += 1
     if bound_index < N_BOUND_SPECKLE_POWERS:
         rate_sum_bound = leakage_bins.crossing_rate_sum_bounds[point, segment, bound_index]
-    n_peaks = 0
+    n_peaks = INTEGER_ZERO
     if rate_sum_bound > 0.0:
         n_peaks = _draw_raised_bins(
             address,
             segment,
-            0,
+            INTEGER_ZERO,
             leakage_bins.bins_begin[point, segment],
             leakage_bins.bins_end[point, segment],
             leakage_bins.bins,
@@ -1475,7 +1476,7 @@ def _draw_raised_bins(
         return n_peaks
     root_looks = math.sqrt(float(n_looks))
     scaled_threshold = threshold_ratio * root_looks
-    previous_bin, peak_bin, peak_ratio, is_echo = np.int64(-2), np.int64(-1), 0.0, False
+    previous_bin, peak_bin, peak_ratio, is_echo = np.int64(-2), NO_INDEX, 0.0, False
     for k in range(bins_begin, bins_end):
         fading_factor = fading_factors[group[k]] if group.size > 0 else 1.0
         log_amplitude_k = log_amplitude[k] + math.log(fading_factor)
@@ -1484,9 +1485,9 @@ def _draw_raised_bins(
             continue
         if bins[k] != previous_bin + 1:
             n_peaks = insert_peak(
-                np.int64(-1) if is_echo else peak_bin, peak_ratio, peak_bins, peak_ratios, n_peaks
+                NO_INDEX if is_echo else peak_bin, peak_ratio, peak_bins, peak_ratios, n_peaks
             )
-            peak_bin, peak_ratio, is_echo = np.int64(-1), 0.0, False
+            peak_bin, peak_ratio, is_echo = NO_INDEX, 0.0, False
         previous_bin, signal = bins[k], math.exp(log_amplitude_k) * root_looks
         probability = philox.uniform(
             key_0, key_1, draw, stream, first_random + 1
@@ -1519,7 +1520,7 @@ def _draw_raised_bins(
         first_random += 2
         exponent_left = -math.log1p(-philox.uniform(key_0, key_1, draw, stream, first_random))
     return insert_peak(
-        np.int64(-1) if is_echo else peak_bin, peak_ratio, peak_bins, peak_ratios, n_peaks
+        NO_INDEX if is_echo else peak_bin, peak_ratio, peak_bins, peak_ratios, n_peaks
     )
 
 

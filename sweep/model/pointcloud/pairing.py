@@ -38,6 +38,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
+from sweep.model.kernel_integers import NO_INDEX
 from sweep.model.waveform import (
     FOLD_PENALTY_BINS,
     N_READINGS,
@@ -105,7 +106,7 @@ Exactly one of the first five bits is set. They follow from a comparison with th
 """
 
 
-FALSE_PEAK_GROUP = -1
+FALSE_PEAK_GROUP = NO_INDEX
 """Group number of a false peak, which belongs to no group of bins of an echo."""
 NO_PEAK_GROUP = -2
 """Group number that stands for a missing peak: no Doppler peak confirms the return, or the segment

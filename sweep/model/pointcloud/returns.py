@@ -84,6 +84,7 @@ from sweep.model.detection.sub_bin_interpolation import (
     sub_bin_standard_error,
 )
 from sweep.model.evaluation import fit_peaks
+from sweep.model.kernel_integers import INTEGER_ZERO, NO_INDEX, THREE_BINS
 from sweep.model.pointcloud.bin_groups import BinGroups
 from sweep.model.pointcloud.ego_motion import EgoMotion
 from sweep.model.pointcloud.leaked_peaks import (
@@ -2032,7 +2033,7 @@ def draw_segment_peaks(
         inputs.line_noise_ratio[point],
         inputs.strongest_bin[point, segment],
     )
-    n_peaks = 0
+    n_peaks = INTEGER_ZERO
     for g in range(strongest_bins.size):
         if strongest_bins[g] < 0:
             break
@@ -2231,7 +2232,7 @@ def list_noisy_leaked_peaks(
         Number of peaks.
     """
     key_0, key_1, draw = address
-    n_peaks, previous_bin, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
+    n_peaks, previous_bin, peak, largest = INTEGER_ZERO, np.int64(-2), NO_INDEX, 0.0
     correlation, is_echo = interpolation.sidelobe_bin_noise_correlation, False
     independent_part = math.sqrt(1.0 - correlation * correlation)
     for n in range(spectra.leaked_begin[point, segment], spectra.leaked_end[point, segment]):
@@ -2244,8 +2245,8 @@ def list_noisy_leaked_peaks(
             continue
         bin_number = spectra.first_bin[point, segment] + spectra.leaked_index[n]
         if bin_number != previous_bin + 1:
-            n_peaks = insert_peak(np.int64(-1) if is_echo else peak, largest, bins, ratios, n_peaks)
-            peak, largest, is_echo = np.int64(-1), 0.0, False
+            n_peaks = insert_peak(NO_INDEX if is_echo else peak, largest, bins, ratios, n_peaks)
+            peak, largest, is_echo = NO_INDEX, 0.0, False
         previous_bin = bin_number
         if ratio > largest:
             peak, largest = bin_number, ratio
@@ -2263,7 +2264,7 @@ def list_noisy_leaked_peaks(
                 math.hypot(in_phase, correlation * im + independent_part * im_own)
                 >= threshold_ratio
             )
-    return insert_peak(np.int64(-1) if is_echo else peak, largest, bins, ratios, n_peaks)
+    return insert_peak(NO_INDEX if is_echo else peak, largest, bins, ratios, n_peaks)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -2313,7 +2314,9 @@ def draw_peak_bin(
     if is_real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * line_noise_ratio, im * line_noise_ratio
-    near_end = speckle.n_bins[group, segment] > 0 and is_near_end(strongest_bin - 1, 3, config)
+    near_end = speckle.n_bins[group, segment] > 0 and is_near_end(
+        strongest_bin - 1, THREE_BINS, config
+    )
     noise = workspace.noise
     if near_end:
         draw_noise_near_end(
@@ -2321,7 +2324,7 @@ def draw_peak_bin(
             stream,
             ECHO_NOISE_FIRST_INDEX * (1 + group),
             strongest_bin - 1,
-            3,
+            THREE_BINS,
             config,
             noise,
         )

@@ -293,7 +293,7 @@ def list_flagged_peaks(
     for group_index in np.argsort(-np.array(group_power), kind="stable"):
         start, end = int(starts[group_index]), int(ends[group_index])
         touches_echo = (echo_bounds.first_bin < end) & (start <= echo_bounds.last_bin)
-        echo_number = int(touches_echo.argmax()) if touches_echo.any() else FALSE_PEAK_GROUP
+        echo_number = int(touches_echo.argmax()) if touches_echo.any() else int(FALSE_PEAK_GROUP)
         if echo_number == FALSE_PEAK_GROUP and (
             start > end_index - first_searched or end <= first_searched
         ):

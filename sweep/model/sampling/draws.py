@@ -37,6 +37,7 @@ from sweep.model.detection.echo_detection import (
 )
 from sweep.model.detection.hoyt import pseudo_variance_ratio_at
 from sweep.model.detection.marcum import at_least_one_probability
+from sweep.model.kernel_integers import INTEGER_ZERO
 from sweep.model.preparation import Shots
 from sweep.model.sampling import philox
 from sweep.model.sampling.philox import (
@@ -458,7 +459,7 @@ def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarra
     return threshold_ratio, line_noise_ratio
 
 
-ECHO_NOISE_FIRST_INDEX = 1 << 24
+ECHO_NOISE_FIRST_INDEX = np.int64(1 << 24)
 """Index in the noise stream of the first random number for the noise of all bins of an echo. Lower
 indices are used for bins that are drawn one by one."""
 
@@ -661,7 +662,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
             for d in range(n_draws if in_speckle else 0):
                 amplitudes = speckle_amplitudes(
                     DrawAddress(address.key_0, address.key_1, first + d),
-                    0,
+                    INTEGER_ZERO,
                     speckle_mixing_at(inputs.speckle_mixing, j),
                 )
                 for s in range(3):
@@ -1052,11 +1053,13 @@ def _draw_echo_amplitudes(address, n_draws, row, spectra, line_grid, line_centre
     for d in range(n_draws):
         address_of_draw = DrawAddress(address.key_0, address.key_1, address.draw + d)
         if factor_rank > 0:
-            draw_factored_amplitudes(address_of_draw, 0, factor, factor_rank, drawn_amplitudes)
+            draw_factored_amplitudes(
+                address_of_draw, INTEGER_ZERO, factor, factor_rank, drawn_amplitudes
+            )
         else:
             draw_bin_amplitudes(
                 address_of_draw,
-                0,
+                INTEGER_ZERO,
                 line_grid,
                 row,
                 line_centre,
