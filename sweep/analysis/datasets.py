@@ -402,8 +402,8 @@ class SweepAccessor:
     false_alarms_per_second = _as_accessor_method(
         probability.false_alarms_per_second, require_axes=True
     )
-    false_alarms_per_kilometre = _as_accessor_method(
-        probability.false_alarms_per_kilometre, require_axes=True
+    false_alarms_per_flight_kilometre = _as_accessor_method(
+        probability.false_alarms_per_flight_kilometre, require_axes=True
     )
     range_error = _as_accessor_method(measurement_errors.range_error, require_axes=True)
     velocity_error = _as_accessor_method(measurement_errors.velocity_error, require_axes=True)

@@ -235,7 +235,7 @@ def _segment_spectrum(
         segment.chirp_slope,
         carrier=carrier_frequency,
         chirp_rate=np.asarray(prepared_shot.waveform.chirp_rate),
-        range=prepared_shot.range[0] - np.ravel(segment.range_decrease)[0],
+        range=prepared_shot.range[0] - np.ravel(segment.range_decrease_since_shot_start)[0],
         radial_velocity=np.ravel(segment.doppler_ratio)[0] * SPEED_OF_LIGHT / 2,
     )
     return DisplayedSegment(

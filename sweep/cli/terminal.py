@@ -156,7 +156,7 @@ WORKERS_OPTION = click.option(
     type=click.IntRange(min=1),
     help="Worker processes to start in the place of threads [none, or as --cluster says].",
 )
-SCHEDULER_OPTION = click.option(
+scheduler_option = click.option(
     "--scheduler",
     metavar="ADDRESS|none",
     help="Address of a Dask scheduler; none: a plain loop without Dask.",
@@ -238,7 +238,7 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     options = (
         THREADS_OPTION,
         WORKERS_OPTION,
-        SCHEDULER_OPTION,
+        scheduler_option,
         CLUSTER_OPTION,
         ALLOW_CODE_OPTION,
         BLOCK_TIMEOUT_OPTION,
@@ -863,7 +863,7 @@ def _effect_row_cells(row: EffectRow) -> list[str]:
 
 
 class PrintedMeasurement(NamedTuple):
-    """What is left of a measurement of accuracy once it is printed."""
+    """Files of a printed measurement of accuracy, and whether the measurement is complete."""
 
     files: list[Location]
     """Store, figure and tables."""

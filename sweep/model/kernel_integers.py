@@ -10,8 +10,8 @@ np.True_
 
 import numpy as np
 
-INTEGER_ZERO = np.int64(0)
-INTEGER_ONE = np.int64(1)
+INTEGER_ZERO, INTEGER_ONE = np.int64(0), np.int64(1)
+"""The integers 0 and 1."""
 NO_INDEX = np.int64(-1)
 """Index that stands for none."""
 THREE_BINS = np.int64(3)

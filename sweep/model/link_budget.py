@@ -93,7 +93,7 @@ class ReceiverFilter:
             amplifier_bandwidth=self.amplifier_bandwidth,
         )
 
-    def antialias_gain(self, frequency: np.ndarray) -> np.ndarray | float:
+    def antialias_amplitude_gain(self, frequency: np.ndarray) -> np.ndarray | float:
         """Return the amplitude gain of the anti-alias filter for a signal; 1 without a filter.
 
         Parameters
@@ -115,7 +115,7 @@ class ReceiverFilter:
         frequency : ndarray
             Signed frequency [Hz], before the ADC folds it.
         """
-        return np.abs(self._pole_transfer(frequency) * self.antialias_gain(frequency))
+        return np.abs(self._pole_transfer(frequency) * self.antialias_amplitude_gain(frequency))
 
     def relative_noise_density(self, frequency: np.ndarray) -> np.ndarray | float:
         """Return the receiver's noise density, over that of white noise of the same variance.
@@ -173,7 +173,7 @@ class ReceiverFilter:
             beat_frequency if bin_frequency is None else bin_frequency
         )
         gain = (density + (1 - density) * adc_noise_fraction) ** -0.5
-        return np.asarray(gain * self.antialias_gain(beat_frequency))
+        return np.asarray(gain * self.antialias_amplitude_gain(beat_frequency))
 
 
 @dataclass(frozen=True, eq=False)

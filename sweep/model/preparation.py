@@ -475,7 +475,8 @@ class Shots:
         }
         if self.target_moves_between_segments:
             motion["range"] = tuple(
-                self.range - segment.range_decrease for segment in self.waveform_segments
+                self.range - segment.range_decrease_since_shot_start
+                for segment in self.waveform_segments
             )
             if np.any(self.target.acceleration):
                 motion["radial_velocity"] = tuple(
@@ -624,7 +625,9 @@ class Shots:
                     chirp_rate=segment.chirp_rate,
                     carrier=segment.carrier,
                     whitening_gain=gain,
-                    range_decrease=np.asarray(segment.range_decrease),
+                    range_decrease_since_shot_start=np.asarray(
+                        segment.range_decrease_since_shot_start
+                    ),
                     doppler_ratio=np.asarray(segment.doppler_ratio),
                     start_time=np.asarray(segment.start_time),
                 ),

@@ -194,11 +194,13 @@ def analytic_record(
         shots.footprint.relative_range_offset[shots.footprint.row_of_point[point], beamlet]
     )
     range_offset -= SPEED_OF_LIGHT / 2 * doppler_ratio_offset * segment_start
-    range_decrease = approach_speed * segment_start + acceleration_value * segment_start**2 / 2
+    range_decrease_since_shot_start = (
+        approach_speed * segment_start + acceleration_value * segment_start**2 / 2
+    )
     t = float(_value_of_point(shots.record.acquisition_delay, point)) + np.arange(
         shots.window.length
     ) / float(shots.sample_rate[point])
-    start_delay = 2 * (axis_range - range_decrease + range_offset) / SPEED_OF_LIGHT
+    start_delay = 2 * (axis_range - range_decrease_since_shot_start + range_offset) / SPEED_OF_LIGHT
     delay_change = -doppler_ratio * t - with_acceleration * alpha * t**2  # tau(t) - tau_0
     chirp_phase = delay_change * (2 * start_delay + delay_change) / 2 - t * (
         start_delay + delay_change
@@ -210,7 +212,7 @@ def analytic_record(
         chirp_phase = start_delay * (delay_change - t)
     cycles = -carrier * delay_change + chirp_slope * chirp_rate * chirp_phase
     start_phase = _start_phase_cycles(
-        chirp_slope, carrier, chirp_rate, axis_range, range_offset, range_decrease
+        chirp_slope, carrier, chirp_rate, axis_range, range_offset, range_decrease_since_shot_start
     )
     beat = carrier * doppler_ratio - chirp_slope * chirp_rate * start_delay * (1 + doppler_ratio)
     gain = receiver_chain.receiver_transfer(
@@ -238,15 +240,17 @@ def _start_phase_cycles(
     chirp_rate: float,
     axis_range: float,
     range_offset: float,
-    range_decrease: float,
+    range_decrease_since_shot_start: float,
 ) -> float:
     """Compute the phase of a beamlet's beat at the segment's start [cycles], in exact fractions.
 
     The phase is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is
     ``carrier``, s ``chirp_slope``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR
-    ``range_offset`` and decrease ``range_decrease``.
+    ``range_offset`` and decrease ``range_decrease_since_shot_start``.
     """
-    delay = Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease)
+    delay = (
+        Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease_since_shot_start)
+    )
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
     phase = -Fraction(carrier) * delay + Fraction(chirp_slope) * Fraction(chirp_rate) * delay**2 / 2
     return float(phase - round(phase))

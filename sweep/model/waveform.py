@@ -105,7 +105,7 @@ class WaveformSegment(NamedTuple):
     includes_leakage: bool
     """True if leakage, false alarms due to the echo's signal far from its line, is evaluated
     here."""
-    range_decrease: np.ndarray | float
+    range_decrease_since_shot_start: np.ndarray | float
     """Decrease of the target's range from the start of the shot to that of the segment [m]."""
     doppler_ratio: np.ndarray | float
     """Doppler ratio 2 v_r / c of the line on the beam's axis at the start of the segment."""
@@ -122,7 +122,7 @@ class WaveformSegment(NamedTuple):
         range : ndarray or float
             Range at the shot's start [m].
         """
-        return np.asarray(2 / SPEED_OF_LIGHT * (range - self.range_decrease))
+        return np.asarray(2 / SPEED_OF_LIGHT * (range - self.range_decrease_since_shot_start))
 
     def beat_frequency(self, range: np.ndarray | float) -> np.ndarray:
         """Return the signed beat frequency [Hz] of a line at a range [m] at the shot's start.

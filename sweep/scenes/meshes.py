@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_consistent_mesh
+from sweep.model.geometry.mesh import Mesh, rounded_centre, facet_normals, require_consistent_mesh
 from sweep.model.geometry.quaternion import from_axis_angle, rotate
 from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygon_file
 from sweep.scenes.polygons import triangulate_polygons
@@ -146,7 +146,7 @@ class Facets:
             )
         if self.is_clean:
             _require_faces(len(self.faces), len(self.faces))
-            centre = exact_centre(self.vertices)
+            centre = rounded_centre(self.vertices)
             mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
             report = MeshCleaningReport(len(self.vertices), len(self.faces), notes=self.notes)
             return CleanedMesh(mesh, report)
@@ -267,7 +267,7 @@ def clean_mesh(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> Cle
         len(used) - len(kept_vertices),
     )
     positions = positions[kept_vertices]
-    origin = exact_centre(positions)
+    origin = rounded_centre(positions)
     positions -= origin
     has_area = np.flatnonzero(_mask_faces_with_area(positions, face_corners))
     kept_faces = has_area[_first_unique_rows(np.sort(face_corners[has_area], axis=1))[0]]

@@ -475,7 +475,9 @@ def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
         powers = {beam.QUALITY_PATH: 1.0, beam.WAVELENGTH_PATH: 1.0, path: -1.0}
         narrowest_waist = _argmax_of_product(grid, powers, {path: is_positive})
         if narrowest_waist and narrowest_waist[path] < (
-            waist_min := _divergence_or_waist(narrowest_waist, beam.FOOTPRINT_ANGLE_MAX)
+            waist_min := _convert_between_waist_and_divergence(
+                narrowest_waist, beam.FOOTPRINT_ANGLE_MAX
+            )
         ):
             problem = (
                 f"must be at least {1e6 * waist_min:.3g} um, for the beam to spread by 90 deg at "
@@ -536,13 +538,17 @@ def _narrowest_impossible_beam(
     powers = dict.fromkeys(rising, 1.0) | dict.fromkeys(falling, -1.0)
     narrowest = _argmax_of_product(grid, powers, {**conditions, beam.DIVERGENCE_PATH: is_positive})
     if narrowest and narrowest[beam.DIVERGENCE_PATH] < (
-        limit := _divergence_or_waist(narrowest, narrowest[beam.APERTURE_DIAMETER_PATH] / 2)
+        limit := _convert_between_waist_and_divergence(
+            narrowest, narrowest[beam.APERTURE_DIAMETER_PATH] / 2
+        )
     ):
         return narrowest, limit
     return None
 
 
-def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: float) -> float:
+def _convert_between_waist_and_divergence(
+    parameters: Mapping[str, float], waist_or_divergence: float
+) -> float:
     """Convert a beam's waist radius [m] to its full divergence [rad], or the reverse."""
     return float(
         beam.divergence_from_waist(

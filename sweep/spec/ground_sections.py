@@ -384,7 +384,7 @@ class SquareGround(PlacedGround):
     size: float = declare.positive_length_field("Side of the square", "3 km")
 
     def unrefined_step(self) -> float:
-        """Return the grid step before refining [m]; the side of the square without a spacing."""
+        """Return the grid step before refining [m]: the spacing, or else the side of the square."""
         spacing = self.spacing  # type: ignore[attr-defined]
         return float(self.size if spacing is None else spacing)
 

@@ -294,7 +294,10 @@ def _flight_findings(
     objects: Mapping[str, Any],
     base: Path | None,
 ) -> list[Finding]:
-    """Return the mistakes in platform, scanners and moving objects that can be read."""
+    """Return the mistakes in platform, scanners and moving objects.
+
+    Parts that could not be read (None, or missing), and tables if ``base`` is None, are skipped.
+    """
     span: flight_sections.TimeSpan | None = None
     findings: list[Finding] = []
     files = SpecFiles(base or Path())

@@ -162,11 +162,11 @@ def test_false_alarms_are_counted_by_time_and_by_way(surface):
     assert surface.sweep.false_alarms_per_second().values == pytest.approx((pfa / PERIODS).values)
     assert surface.sweep.false_alarms_per_second("20 Hz").values == pytest.approx(20 * pfa.values)
     # 20 shots a second at 180 km/h: one every 2.5 m, 400 a kilometre
-    along = surface.sweep.false_alarms_per_kilometre("180 km/h", "20 Hz")
+    along = surface.sweep.false_alarms_per_flight_kilometre("180 km/h", "20 Hz")
     assert along.values == pytest.approx(400 * pfa.values)
     assert along.attrs["units"] == "km-1"
     with pytest.raises(ValueError, match="the speed needs a unit like m/s"):
-        surface.sweep.false_alarms_per_kilometre("50 m")
+        surface.sweep.false_alarms_per_flight_kilometre("50 m")
     with pytest.raises(ValueError, match="positive"):
         surface.sweep.false_alarms_per_second(0)
 

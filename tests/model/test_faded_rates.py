@@ -138,10 +138,12 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     first = np.min(np.maximum(steady[1] - echo_detection._IMPOSSIBLE_BELOW_SIGMA, 0.0) / steady[0])
     last = min(
         np.min((steady[1] + echo_detection._CERTAIN_ABOVE_SIGMA) / steady[0]),
-        echo_detection._MODE_MAGNITUDE_MAX,
+        echo_detection._SPECKLE_MODE_MAGNITUDE_MAX,
     )
-    first, last = (min(v, echo_detection._MODE_MAGNITUDE_MAX) for v in (first, last))
-    last = min(last, np.sqrt(min(ratio.min(), echo_detection._MODE_MAGNITUDE_MAX) ** 2 + 10.0))
+    first, last = (min(v, echo_detection._SPECKLE_MODE_MAGNITUDE_MAX) for v in (first, last))
+    last = min(
+        last, np.sqrt(min(ratio.min(), echo_detection._SPECKLE_MODE_MAGNITUDE_MAX) ** 2 + 10.0)
+    )
     z = first + (last - first) * 0.5 * (echo_detection._GAUSS_NODES + 1)
     weight = 0.5 * (last - first) * echo_detection._GAUSS_WEIGHTS * 2 * z * np.exp(-z * z)
     z, weight = np.append(0.6 * first, z), np.append(-np.expm1(-first * first), weight)

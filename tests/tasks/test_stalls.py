@@ -100,7 +100,7 @@ def test_patience_grows_with_the_time_of_a_task_and_waits_for_nothing_that_is_no
     monitor = stalls.InProcessMonitor(messages.append, lambda: 7)
     monitor.report_if_stalled()
     assert not messages
-    with monitor.computing(5):
+    with monitor.list_while_computed(5):
         monitor.report_if_stalled()
         assert "7 blocks not yet begun, 1 block being computed; 0 blocks done" in messages[0]
         assert "block 5: computed by thread MainThread since " in messages[0]

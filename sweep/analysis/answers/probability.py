@@ -158,7 +158,7 @@ def false_alarms_per_second(
     )
 
 
-def false_alarms_per_kilometre(
+def false_alarms_per_flight_kilometre(
     dataset: xr.Dataset,
     speed: str | float,
     rate: str | float | None = None,
@@ -189,7 +189,7 @@ def false_alarms_per_kilometre(
         raise ValueError("the speed is a positive number")
     alarms_per_second = false_alarms_per_second(dataset, rate, leakage=leakage)
     alarms_per_kilometre = (alarms_per_second * (1000 / metres_per_second)).rename(
-        "false_alarms_per_kilometre"
+        "false_alarms_per_flight_kilometre"
     )
     return alarms_per_kilometre.assign_attrs(
         alarms_per_second.attrs, units="km-1", long_name="false alarms a kilometre"

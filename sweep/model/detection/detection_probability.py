@@ -26,7 +26,8 @@ of a real record, lines overlap their images, and the laws are corrected by
 :mod:`sweep.model.detection.pseudo_variance`.
 
 :mod:`sweep.model.spectrum.strongest_peak` applies the first law at higher thresholds, to find how
-often another peak is larger than the echo's.
+often another peak is larger than the echo's. The time-domain truth and the thesis's way apply it to
+whole spectra (:func:`sweep.model.detection.echo_detection.detect_in_spectra`).
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple

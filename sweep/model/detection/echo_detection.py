@@ -1182,7 +1182,7 @@ _IMPOSSIBLE_BELOW_SIGMA, _CERTAIN_ABOVE_SIGMA = 4.5, 2.7
 units of the noise per quadrature. A bin misses with a probability of 3e-3 at the upper end, and
 crosses with 3e-5 or less at the lower one, as small pd require. The error of pd is at most 2e-3,
 and mostly 1e-4."""
-_MODE_MAGNITUDE_MAX = 6.0
+_SPECKLE_MODE_MAGNITUDE_MAX = 6.0
 """Upper end of the quadrature over the magnitude of the strongest speckle mode, in units of its
 root mean square."""
 _RARE_CROSSING_MAX = 1e-5
@@ -1338,7 +1338,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
         Fields of :class:`DetectionRule`.
     """
     is_echo = echo.is_echo
-    z_first = z_last = z_middle = _MODE_MAGNITUDE_MAX
+    z_first = z_last = z_middle = _SPECKLE_MODE_MAGNITUDE_MAX
     pedestal_ratio_max, strongest_index = 0.0, NO_INDEX
     for k in range(is_echo.size):
         pedestal_ratio_max = max(pedestal_ratio_max, bins_given_mode.pedestal[k])

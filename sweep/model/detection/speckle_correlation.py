@@ -83,7 +83,7 @@ class LinePairGradients(NamedTuple):
     unit of frequency is fs/L, the sample rate over the number of samples in the record.
     """
 
-    bin_distance: tuple[np.ndarray, np.ndarray]
+    strongest_bin_offset: tuple[np.ndarray, np.ndarray]
     """Frequency [fs/L] of each segment's strongest bin less that of the line on the beam's axis.
     fs/L is the sample rate over the number of samples in the record."""
     line_shift: tuple[np.ndarray, np.ndarray]
@@ -106,7 +106,7 @@ class LinePairGradients(NamedTuple):
     def select(self, points: np.ndarray) -> "LinePairGradients":
         """Return the gradients of some points, given by their indices."""
         (distance_first, distance_second), (shift_first, shift_second) = (
-            self.bin_distance,
+            self.strongest_bin_offset,
             self.line_shift,
         )
         return LinePairGradients(
@@ -137,7 +137,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
     fill_peak_bin_correlation(
         np.flatnonzero(is_resolved),
         half_interval,
-        np.stack(gradients.bin_distance),
+        np.stack(gradients.strongest_bin_offset),
         np.stack(gradients.line_shift),
         gradients.phase_difference,
         gradients.power_slope,
@@ -159,7 +159,7 @@ def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.nd
     transform_variance = _half_maximum_distance(window) ** 2 / (4 * np.log(2))
     (shift_first, shift_second), (distance_first, distance_second) = (
         gradients.line_shift,
-        gradients.bin_distance,
+        gradients.strongest_bin_offset,
     )
     quadratic_coefficient = 1 + (shift_first * shift_first + shift_second * shift_second) / (
         2 * transform_variance
@@ -174,8 +174,10 @@ def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.nd
     )
     log_powers = sum(
         -np.log1p(line_shift * line_shift / transform_variance) / 2
-        - bin_distance * bin_distance / (2 * (transform_variance + line_shift * line_shift))
-        for line_shift, bin_distance in (
+        - strongest_bin_offset
+        * strongest_bin_offset
+        / (2 * (transform_variance + line_shift * line_shift))
+        for line_shift, strongest_bin_offset in (
             (shift_first, distance_first),
             (shift_second, distance_second),
         )

@@ -14,7 +14,7 @@ from sweep.kernel_cache import njit
 def fill_peak_bin_correlation(
     point_indices,
     half_interval,
-    bin_distance,
+    strongest_bin_offset,
     line_shift,
     phase_difference,
     power_slope,
@@ -34,7 +34,7 @@ def fill_peak_bin_correlation(
         Indices of the points.
     half_interval
         (n,): half-width of the integration interval of y [standard deviations of the beam].
-    bin_distance, line_shift, phase_difference, power_slope
+    strongest_bin_offset, line_shift, phase_difference, power_slope
         Fields of :class:`sweep.model.detection.speckle_correlation.LinePairGradients`; the first
         two are stacked to (2, n).
     transform, samples_per_bin
@@ -58,10 +58,14 @@ def fill_peak_bin_correlation(
             y = previous_half_interval * nodes[node]
             line_power = node_power[node] * max(1.0 + power_slope[point] * y, 0.0)
             transform_first = _interpolate_transform(
-                bin_distance[0, point] - line_shift[0, point] * y, transform, samples_per_bin
+                strongest_bin_offset[0, point] - line_shift[0, point] * y,
+                transform,
+                samples_per_bin,
             )
             transform_second = _interpolate_transform(
-                bin_distance[1, point] - line_shift[1, point] * y, transform, samples_per_bin
+                strongest_bin_offset[1, point] - line_shift[1, point] * y,
+                transform,
+                samples_per_bin,
             )
             product = line_power * transform_first * transform_second
             re += product * math.cos(phase_difference[point] * y)

@@ -175,7 +175,7 @@ DOPPLER_SPREAD = Effect(
             example="100 m/s",
             limits=("-1000 km/s", "1000 km/s"),
             si_unit="m/s",
-            is_sole_cause=False,
+            can_cause_effect=False,
         ),
     ),
     parent="footprint",

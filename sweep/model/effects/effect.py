@@ -48,7 +48,7 @@ class Parameter:
     is_table: bool = False
     """True if the value is a table over time, given as text
     (:mod:`sweep.model.effects.sweep_error_table`)."""
-    is_sole_cause: bool = True
+    can_cause_effect: bool = True
     """True if the effect is absent unless this parameter, or another with this flag, differs from
     its default."""
     is_category_key: bool = False
@@ -69,7 +69,9 @@ class Parameter:
 
         False if the parameter only modifies the effect.
         """
-        return self.is_sole_cause and self.default in ((1.0,) if self.unit == "dB" else (0, "none"))
+        return self.can_cause_effect and self.default in (
+            (1.0,) if self.unit == "dB" else (0, "none")
+        )
 
 
 class EffectContext(NamedTuple):

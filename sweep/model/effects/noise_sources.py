@@ -240,9 +240,8 @@ def intensity_noise_current_variance(
     local oscillator, RIN the relative intensity noise [1/Hz] and B_e the electrical bandwidth. The
     two diodes of a balanced receiver see the same fluctuation and subtract it, except for their
     mismatch. The common-mode rejection (in dB 20 log10 of the ratio of their currents) divides the
-    variance. Both are assumed to be constant over
-    the electrical bandwidth. The echo's own intensity noise is neglected: it is smaller by P /
-    P_lo.
+    variance. Both are assumed to be constant over the electrical bandwidth. The echo's own
+    intensity noise is neglected: it is smaller by P / P_lo.
     """
     current = (
         parameters[RECEIVER_PREFIX + "apd_gain"] * parameters[RECEIVER_PREFIX + "responsivity"]
@@ -305,7 +304,7 @@ RELATIVE_INTENSITY_NOISE = Effect(
             default=1.0,
             example="25 dB",
             limits=("0 dB", "300 dB"),
-            is_sole_cause=False,
+            can_cause_effect=False,
         ),
     ),
 )

@@ -153,7 +153,7 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
             2 / SPEED_OF_LIGHT
         ) * (
             closing_speed * (1 + segment.doppler_ratio)
-            - (shots.range - segment.range_decrease) * doppler_ratio_rate
+            - (shots.range - segment.range_decrease_since_shot_start) * doppler_ratio_rate
         )
         drift_bins[segment_index] = (
             beat_rate * shots.waveform.look_period * shots.fft_size / shots.sample_rate

@@ -460,7 +460,7 @@ def _look_powers(shots: Shots, beam_gradients: BeamGradients) -> np.ndarray:
     for segment in map(int, np.flatnonzero(shots.has_segment)):
         gradients = _line_pair_gradients(shots, (segment, segment), zero_phase, beam_gradients)
         line_position = (
-            gradients.bin_distance[0][:, None] - drift[segment][:, None] * looks_from_middle
+            gradients.strongest_bin_offset[0][:, None] - drift[segment][:, None] * looks_from_middle
         )
         line_distance = line_position[..., None] - gradients.line_shift[0][:, None, None] * node
         look_power[segment] = (window_transform(shots.window, line_distance) ** 2 * weight).sum(

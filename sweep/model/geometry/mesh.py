@@ -77,7 +77,7 @@ def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
         for mesh in meshes
         for corner_function in (np.min, np.max)
     ]
-    origin = exact_centre(np.array(corners))
+    origin = rounded_centre(np.array(corners))
     if len(meshes) == 1 and np.array_equal(meshes[0].origin, origin):
         return meshes[0]
     vertices = np.empty((sum(len(mesh.vertices) for mesh in meshes), 3))
@@ -122,7 +122,7 @@ def require_consistent_mesh(
         raise ValueError(f"a face names a vertex outside 0..{len(vertices) - 1}")
 
 
-def exact_centre(vertices: np.ndarray) -> np.ndarray:
+def rounded_centre(vertices: np.ndarray) -> np.ndarray:
     """Return the centre of the vertices' bounding box, rounded so that subtracting it is exact.
 
     Along an axis it is zero if zero is no farther from the mesh than the mesh is large, since small

@@ -269,7 +269,7 @@ def _bin_powers(
     """
     segment = shots.waveform_segments[segment_index]
     columns = (
-        shots.range - segment.range_decrease,
+        shots.range - segment.range_decrease_since_shot_start,
         segment.doppler_ratio,
         shots.waveform.chirp_rate,
         shots.sample_rate,

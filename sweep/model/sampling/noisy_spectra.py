@@ -158,10 +158,10 @@ class SegmentSignal(NamedTuple):
     """Number of bins on either side of an echo's strongest bin that the echo occupies, if a shot
     has several echoes."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """Record of each echo, from which its speckle is drawn; None until
-    :func:`add_footprint_records` sets it. The tuple is empty if speckle is not drawn from records,
-    because the lines spread over more than RECORD_LINE_DEVIATION_MAX_BINS or the echo has no
-    samples in the record."""
+    """One :class:`FootprintRecord` for each echo, from which the echo's speckle is drawn; None
+    until :func:`add_footprint_records` sets the field. An empty tuple means that the speckle of
+    this segment is drawn in another way: its lines spread over more than
+    RECORD_LINE_DEVIATION_MAX_BINS, or an echo has no samples in the segment."""
     record_scalings: tuple[np.ndarray, ...] = ()
     """(bins,) complex for each echo: factors from the transform of a drawn record to the speckle by
     which the bins of ``spectrum`` are multiplied."""

@@ -230,7 +230,7 @@ class Sampler(ABC):
         excess = widths - error_budget.select(point_indices, self.n_draws.size).tolerance
         return np.fmax.reduce(excess, axis=0, initial=0.0)
 
-    def accuracy_outputs(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
+    def accuracy_arrays(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
         """Return numbers of draws, half-widths and their excess over the tolerance, (n,) by name.
 
         The names are those of ACCURACY_OUTPUTS.
@@ -533,7 +533,7 @@ class DetectionSampler(Sampler):
             running_sums = np.concatenate([self._running_means.running_sums(), group_sums], axis=1)
             outputs = self._running_means.results() | self._standard_errors()
             outputs[RUNNING_SUMS] = running_sums
-        return outputs | self.accuracy_outputs(error_budget)
+        return outputs | self.accuracy_arrays(error_budget)
 
     def _standard_errors(self) -> dict[str, np.ndarray]:
         """Return the standard errors of mean probabilities of detection, (n,) by name.
@@ -709,4 +709,4 @@ class SpectraSampler(Sampler):
                     + np.where(n[bound_name] > 0, 0.0, np.nan),
                 }
         running_sums = np.concatenate([values.state(), self._statistic_means.state()]).T
-        return outputs | self.accuracy_outputs(error_budget) | {RUNNING_SUMS: running_sums}
+        return outputs | self.accuracy_arrays(error_budget) | {RUNNING_SUMS: running_sums}

@@ -135,7 +135,8 @@ class DetectedSpan(NamedTuple):
 class AveragingShifts(NamedTuple):
     """Frequency shifts of all lines, with weights, over which |X|^2 is averaged.
 
-    X is the spectrum. The arrays are empty if there is no average.
+    They stand for the laser's line width, and for the drift of lines over looks. X is the spectrum.
+    The arrays are empty if there is no average.
     """
 
     offset: np.ndarray
@@ -162,7 +163,9 @@ class EndStrengths(NamedTuple):
 class FarBins(NamedTuple):
     """Trigonometric values and scratch arrays for a batch of bins k far from the lines.
 
-    Arrays have one element per bin. N is the FFT size, L the number of samples.
+    Arrays have one element per bin. N is the FFT size, L the number of samples. A and B are the
+    polynomials that give a line's far spectrum, from the start and from the end of the record
+    (:mod:`sweep.model.spectrum.line_shape`).
     """
 
     tangent: np.ndarray
@@ -275,7 +278,7 @@ _SCRATCH_BYTES_KEPT_MAX = 1 << 28
 _thread_scratch = threading.local()
 
 
-def _scratch_rows(width: int) -> np.ndarray:
+def _reused_scratch_array(width: int) -> np.ndarray:
     """Return a scratch array (_N_SCRATCH_ROWS, width), reused in all batches of a thread.
 
     The operating system has to clear every page of a new array that a batch writes. With wide
@@ -295,7 +298,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
     does not need the values of the batch before.
     """
     width = max(width, BATCH_SCRATCH_SIZE, LINE_BATCH_CELLS_MAX)
-    rows = iter(_scratch_rows(width))
+    rows = iter(_reused_scratch_array(width))
 
     def next_rows(n_rows: int) -> list[np.ndarray]:
         return [next(rows) for _ in range(n_rows)]

@@ -413,7 +413,8 @@ def late_echo_has_modes(
     Returns
     -------
     ndarray (n,) bool
-        True if the echo is long enough, and of one length class in all segments.
+        True if the echo is long enough, and of one length class in all segments
+        (:func:`late_echo_length_classes`).
     """
     if window.name not in COSINE_SUM_COEFFICIENTS:
         return np.zeros(length_min.shape, np.bool_)

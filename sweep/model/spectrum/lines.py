@@ -226,7 +226,7 @@ class SegmentParameters(NamedTuple):
     [cycles]."""
     whitening_gain: np.ndarray
     """Factor on the signal's amplitude in the spectrum whose noise is whitened."""
-    range_decrease: np.ndarray
+    range_decrease_since_shot_start: np.ndarray
     """Decrease of the range from the start of the shot to that of the segment [m]."""
     doppler_ratio: np.ndarray
     """Doppler ratio 2 v_r / c at the start of the segment, with the radial velocity v_r."""
@@ -239,7 +239,7 @@ class BeatParameters(NamedTuple):
 
     range: float
     """Range along the beam's axis at the start of the shot [m]."""
-    range_decrease: float
+    range_decrease_since_shot_start: float
     """Decrease of the range from the start of the shot to that of the segment [m]."""
     doppler_ratio: float
     """Doppler ratio 2 v_r / c at the start of the segment, with the radial velocity v_r."""
@@ -267,7 +267,7 @@ def beat_parameters_at(point_parameters, segment_parameters, segment, point):
     """Return the :class:`BeatParameters` of one segment of one point."""
     return BeatParameters(
         point_parameters.range[point],
-        segment_parameters.range_decrease[segment, point],
+        segment_parameters.range_decrease_since_shot_start[segment, point],
         segment_parameters.doppler_ratio[segment, point],
         segment_parameters.start_time[segment, point],
         segment_parameters.chirp_rate[segment, point],
@@ -368,7 +368,7 @@ def compute_lines(
     is white. It includes the two poles of the receiver, and the phase in the middle of the record.
     """
     fft_size, record_length = layout.fft_size, layout.record_length
-    range_0 = beat.range - beat.range_decrease
+    range_0 = beat.range - beat.range_decrease_since_shot_start
     range_per_doppler = 0.5 * SPEED_OF_LIGHT * beat.start_time
     bins_per_hertz = fft_size / beat.sample_rate
     hertz_per_metre = beat.chirp_rate * (2.0 / SPEED_OF_LIGHT)
@@ -386,7 +386,7 @@ def compute_lines(
         cycles_per_metre_high, cycles_per_metre_low, beat.range
     ) + fraction_of_cycle(centre_frequency * beat.record_start)
     axis_phase += product_cycle_fraction(
-        cycles_per_metre_high, cycles_per_metre_low, beat.range_decrease
+        cycles_per_metre_high, cycles_per_metre_low, beat.range_decrease_since_shot_start
     )
     half_record_ratio = 0.5 * (record_length / fft_size)
     origin_phase = (record_length * origin_bin % (2 * fft_size)) / (2.0 * fft_size)

@@ -271,7 +271,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
     """Apply a permanent line to spectra: mask some bins and raise the magnitude of others.
 
     The line is light other than the echo that is in every record. Probabilities of detection are
-    those before; :func:`sweep.model.detection.detection_probability.detect_in_spans` computes them
+    not set here: :func:`sweep.model.detection.detection_probability.detect_in_spans` computes them
     from the changed bins.
 
     Parameters

@@ -144,7 +144,7 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
         beta = by_point(segment.doppler_ratio) + beamlet_doppler
         range_drift = SPEED_OF_LIGHT / 2 * beamlet_doppler * by_point(segment.start_time)
         range_beat = axis_range_beat * relative_range - hertz_per_metre * (
-            by_point(segment.range_decrease) + range_drift
+            by_point(segment.range_decrease_since_shot_start) + range_drift
         )
         beat = by_point(segment.carrier) * beta - segment.chirp_slope * range_beat * (1 + beta)
         beat += by_point(shots.mid_record_drifts[s])

@@ -88,9 +88,6 @@ SPAN_BINS_PER_BATCH = 1 << 21
 """Least number of bins, over all spans, for which memory is allocated in one step. A span is a
 range of bins around a segment's lines."""
 
-POINTS_PER_BATCH_MAX = 1 << 13
-"""Largest number of points whose spans are allocated in one step."""
-
 THRESHOLD_RATIO_STEP = 1e-7
 """Step to which the threshold over the noise sigma is rounded. Rates of false alarms due to leaked
 signal in developed speckle are tabulated per rounded threshold."""
@@ -785,14 +782,12 @@ def _evaluate_batch(
 ) -> BinSpans:
     """Compute the spectra around the lines for the next batch of points of a group.
 
-    The batch begins with the group's point number ``batch_begin``. It has at most
-    POINTS_PER_BATCH_MAX points, and as many as fit into SPAN_BINS_PER_BATCH bins, at least one. The
-    points of a group share the tables of line shapes. ``parameters`` and ``parameters_by_segment``
-    are those of all n points. ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be
-    left out.
+    The batch begins with the group's point number ``batch_begin``. It has as many points as fit
+    into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
+    shapes. ``parameters`` and ``parameters_by_segment`` are those of all n points.
+    ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be left out.
     """
-    batch, tables = slice(batch_begin, batch_begin + POINTS_PER_BATCH_MAX), group.tables
-    points = np.ascontiguousarray(group.point_numbers[batch])
+    points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
     segments, n_points = len(shots.waveform_segments), points.size
     shifts = _averaging_shifts(shots, points)
     n_lines_max = max(2 * shots.footprint.n_beamlets, NODES_MAX) * max(shifts.offset.shape[2], 1)
@@ -821,7 +816,7 @@ def _evaluate_batch(
         lowest_levels,
         shots.beamlet_arrays,
         np.ascontiguousarray(shots.footprint.row_of_point, np.int64),
-        np.ascontiguousarray(group.line_shape_index[batch]),
+        np.ascontiguousarray(group.line_shape_index[batch_begin:]),
         shifts,
         group.modes,
         tables._replace(layout=tables.layout._replace(spectrum_type=spectrum_type(shots))),
@@ -900,7 +895,7 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
         np.repeat(rows[:, None], segments, axis=1) for rows in (offset_rows, weight_rows)
     )
     drift = np.broadcast_to(shots.motion.line_drift_per_look, (segments, shots.size))[:, points].T
-    if shots.looks.n_power_averaged == 1 or not drift.any():
+    if shots.looks.n_power_averaged == 1 or not np.any(shots.motion.line_drift_per_look):
         return AveragingShifts(offset, weight)
     if not offset.shape[2]:
         offset, weight = np.zeros((*drift.shape, 1)), np.ones((*drift.shape, 1))
@@ -1063,7 +1058,7 @@ def _beat_parameters_of_late_echo(beat, n_missing_samples):
     """Return the beat parameters of an echo that lacks the record's first ``n_missing_samples``."""
     return BeatParameters(
         beat.range,
-        beat.range_decrease,
+        beat.range_decrease_since_shot_start,
         beat.doppler_ratio,
         beat.start_time,
         beat.chirp_rate,
@@ -1136,7 +1131,7 @@ def _evaluate_segment(
     speckle_rates,
     spans,
 ):
-    """Compute the spectrum and detection around the lines of one segment of one point.
+    """Compute the spectrum, the echo's bins and the leakage of one segment of one point.
 
     Parameters
     ----------
@@ -1171,9 +1166,6 @@ def _evaluate_segment(
         Settings common to all points.
     shape : LineShape
         Line shape of this segment (:class:`sweep.model.spectrum.line_shape.LineShape`).
-    bin_speckle : BinSpeckle
-        Speckle in the bins of this segment
-        (:class:`sweep.model.detection.echo_detection.BinSpeckle`).
     workspace : SpectrumWorkspace
         Scratch arrays, overwritten (:class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`).
     crossing_series : ndarray (SERIES_TERMS_MAX,)

@@ -129,6 +129,11 @@ def strongest_peak_probabilities(
         |X| of the strongest bin [V, summed over the record].
     is_range_misread : ndarray (n,) bool
         True where the peaks of the echo itself are resolved to a wrong range.
+
+    Returns
+    -------
+    StrongestPeakResults
+        Probabilities by segment, and of the shot.
     """
     pd_loss, p_alarm, shared_speckle_gain = (
         np.zeros((3, shots.size)),
@@ -350,7 +355,7 @@ def _evaluate_levels(
             )
             for k in range(levels.shape[2]):
                 level = levels[s, j, k]
-                if spans.peak_is_searched[s, j]:
+                if spans.peak_is_searched[s, j] and not spans.peak_is_masked[s, j]:
                     at_level = pd_and_miss(
                         EchoBins(magnitudes, is_echo, first_bin),
                         spans.peak_index[s, j],

@@ -170,7 +170,7 @@ class TimeDomainComparison(NamedTuple):
 
     time_domain: SampleResults
     """Results from simulated time-domain records."""
-    simulated: SampleResults
+    model_results: SampleResults
     """Results of the model, with the same effects."""
 
 
@@ -644,7 +644,7 @@ class FlightSample(StudySample):
                     if scanner_grid.axes_shape
                     else ()
                 )
-                flight_block = scanner_grid.first_flight_block(tuple(map(int, axis_indices)))
+                flight_block = scanner_grid.first_block_at_axes_point(tuple(map(int, axis_indices)))
                 yield ShotsOfBlock(flight_block, shot_numbers)
 
     def _make_study(self, setting: AccuracySetting) -> FlightStudy:

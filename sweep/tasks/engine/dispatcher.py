@@ -21,7 +21,7 @@ from sweep.messages import number_with_noun, option_name
 from sweep.storage.store_format import NotAStoreError
 from sweep.tasks.engine.journal import Receipt
 from sweep.tasks.engine.progress import SchedulerLostError, StoreError, duration_text
-from sweep.tasks.engine.stalls import PrintMessage, StallMonitor
+from sweep.tasks.engine.stalls import COMPILATION_SECONDS_MAX, PrintMessage, StallMonitor
 from sweep.tasks.engine.worker import (
     IDLE_POLL_SECONDS,
     RESULTS_NOT_VISIBLE_MESSAGE,
@@ -56,10 +56,6 @@ WORKER_SILENCE_SECONDS = 30.0
 #: Largest time until files that a worker has written are visible to this process [s]. NFS clients
 #: on Linux cache folders for as long.
 FILE_VISIBILITY_SECONDS_MAX = 60.0
-
-#: Time for the first result of a run before a message says that it stalls [s]. Workers compile the
-#: model before it.
-COMPILATION_SECONDS_MAX = 600.0
 
 #: Largest numbers of tasks and of workers that a summary of the state lists.
 TASKS_IN_SUMMARY_MAX, WORKERS_IN_SUMMARY_MAX = 5, 10

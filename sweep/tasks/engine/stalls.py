@@ -26,6 +26,12 @@ STALL_TASK_DURATION_FACTOR = 5.0
 #: Largest number of blocks in progress that a summary lists.
 BLOCKS_IN_SUMMARY_MAX = 10
 
+#: Time for which a run without any result may be loading or compiling the model [s].
+COMPILATION_SECONDS_MAX = 600.0
+
+#: Longest wait for the thread that watches the plain loop to end [s]; it may be printing.
+WATCHER_END_SECONDS_MAX = 1.0
+
 PrintMessage = Callable[[str], None]
 
 _log = logging.getLogger("sweep.stalls")
@@ -43,18 +49,21 @@ class StallMonitor:
         self._last_result_at = time.monotonic()
         self._patience = STALL_REPORT_SECONDS  # time after it until the next report [s]
         self._has_printed_state = False  # since the last result
+        self._lock = threading.Lock()  # results and reports may come from different threads
 
     def record_result(self, expected_task_seconds: float) -> None:
         """Begin to wait for the next result, which is expected to take as long as given [s]."""
-        self.restart_waiting()
-        self._patience = max(
-            STALL_REPORT_SECONDS, STALL_TASK_DURATION_FACTOR * expected_task_seconds
-        )
-        self._has_printed_state = False
+        with self._lock:
+            self._last_result_at = time.monotonic()
+            self._patience = max(
+                STALL_REPORT_SECONDS, STALL_TASK_DURATION_FACTOR * expected_task_seconds
+            )
+            self._has_printed_state = False
 
     def restart_waiting(self) -> None:
-        """Begin to wait anew, as nothing is being computed."""
-        self._last_result_at = time.monotonic()
+        """Begin to wait again, as nothing is being computed."""
+        with self._lock:
+            self._last_result_at = time.monotonic()
 
     def report_if_stalled(self, *, explanation: str = "", explained_seconds: float = 0.0) -> None:
         """Print a message and log the state of the run if no result has arrived for long.
@@ -62,19 +71,24 @@ class StallMonitor:
         In the first ``explained_seconds`` the message gives the ``explanation`` instead of the
         state.
         """
-        seconds_waited = time.monotonic() - self._last_result_at
-        if seconds_waited < self._patience:
-            return
+        with self._lock:
+            seconds_waited = time.monotonic() - self._last_result_at
+            if seconds_waited < self._patience:
+                return
+            is_explained = seconds_waited < explained_seconds
+            self._patience = 2 * seconds_waited
+            if is_explained:
+                self._patience = min(self._patience, explained_seconds)
+            shows_state = not is_explained and not self._has_printed_state
+            self._has_printed_state |= shows_state
         summary = self._state_summary()
         _log.info("nothing came back for %s:\n%s", duration_text(seconds_waited), summary)
         stall_text = f"no block has come back for {duration_text(seconds_waited)}"
-        if seconds_waited < explained_seconds:
-            self._patience = min(2 * seconds_waited, explained_seconds)
+        if is_explained:
             self._say(f"{stall_text}: {explanation}")
-            return
-        is_first, self._has_printed_state = not self._has_printed_state, True
-        self._patience = 2 * seconds_waited
-        self._say(f"{stall_text}:\n{textwrap.indent(summary, '  ')}" if is_first else stall_text)
+        else:
+            state_text = f":\n{textwrap.indent(summary, '  ')}" if shows_state else ""
+            self._say(stall_text + state_text)
 
 
 class BlockInProgress(NamedTuple):
@@ -101,8 +115,8 @@ class InProcessMonitor:
         self._stall_monitor = StallMonitor(say, self.state_summary)
 
     @contextmanager
-    def computing(self, block: int) -> Iterator[None]:
-        """Context manager: list a block as being computed by this thread."""
+    def list_while_computed(self, block: int) -> Iterator[None]:
+        """List a block as being computed by this thread, inside a `with` statement."""
         thread = threading.current_thread()
         self._in_progress[threading.get_ident()] = BlockInProgress(block, time.time(), thread.name)
         try:
@@ -119,7 +133,11 @@ class InProcessMonitor:
     def report_if_stalled(self) -> None:
         """Print a message and log the state of the run if no result has arrived for long."""
         if self._in_progress:
-            self._stall_monitor.report_if_stalled()
+            self._stall_monitor.report_if_stalled(
+                explanation="the model is being loaded, or compiled once, which takes minutes "
+                "where the machine is busy",
+                explained_seconds=0.0 if self._n_blocks else COMPILATION_SECONDS_MAX,
+            )
         else:
             self._stall_monitor.restart_waiting()
 
@@ -142,10 +160,10 @@ class InProcessMonitor:
         return "\n".join(lines)
 
     @contextmanager
-    def watching(self, interval_seconds: float) -> Iterator[None]:
-        """Context manager: check for a stall at intervals, in a thread of its own.
+    def watch_in_thread(self, interval_seconds: float) -> Iterator[None]:
+        """Check for a stall at intervals, in a thread of its own, inside a `with` statement.
 
-        It serves the plain loop, whose thread is busy with a block.
+        It serves the plain loop, whose thread is busy with a block. Messages come from that thread.
         """
         is_over = threading.Event()
 
@@ -159,4 +177,4 @@ class InProcessMonitor:
             yield
         finally:
             is_over.set()
-            watcher.join()
+            watcher.join(WATCHER_END_SECONDS_MAX)

@@ -404,9 +404,9 @@ def run_serial(
     for the user about a block that takes long.
     """
     monitor = InProcessMonitor(say, lambda: block_queue.n_unassigned)
-    with monitor.watching(IDLE_POLL_SECONDS):
+    with monitor.watch_in_thread(IDLE_POLL_SECONDS):
         while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
-            with monitor.computing(task_blocks[0]):
+            with monitor.list_while_computed(task_blocks[0]):
                 task_result = run_blocks(settings, task_blocks)
             _record_result(monitor, task_result)
             yield _accept_result(task_result, task_blocks, block_queue, verify_receipt)
@@ -453,7 +453,7 @@ def run_in_threads(
     def compute_assigned_blocks() -> None:
         while (task_blocks := assigned_blocks.get()) is not None:
             try:
-                with monitor.computing(task_blocks[0]):
+                with monitor.list_while_computed(task_blocks[0]):
                     task_result = run_blocks(settings, task_blocks)
             except BaseException as error:  # else the run would wait for this thread for good
                 task_result = TaskResult(

@@ -589,7 +589,7 @@ def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
         if not hitting_shots.size:
             continue
         for corner in sorted(axis_corners):
-            flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(corner)
+            flight_block = study.scanner_grids[eyepoints.scanner].first_block_at_axes_point(corner)
             parameters = PARAMETER_DEFAULTS | dict(study.parameters_at(flight_block))
             hitting_eyepoints = eyepoints_of_sample.select(hitting_shots)
             shot_parameters, _ = parameters_and_ground_of_eyepoints(

@@ -186,7 +186,7 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
             self.scanner, tuple(axis_range.start for axis_range in axis_ranges), draws, cycles
         )
 
-    def first_flight_block(self, axis_indices: tuple[int, ...]) -> FlightBlock:
+    def first_block_at_axes_point(self, axis_indices: tuple[int, ...]) -> FlightBlock:
         """Return the block with the first draws and cycles at a point of the axes."""
         return self.flight_block(self.block_at((*axis_indices, 0, 0)))
 

@@ -129,7 +129,7 @@ PARAMETERS_CONSTANT_IN_TILE = (
 class EffectGroup(NamedTuple):
     """Points at which the same effects are simulated."""
 
-    members: np.ndarray
+    point_indices: np.ndarray
     """Indices (m,) of the points."""
     effect_names: tuple[str, ...]
     """Names of the effects."""
@@ -138,7 +138,7 @@ class EffectGroup(NamedTuple):
 class EffectBatch(NamedTuple):
     """Points that are computed together though their effects may differ."""
 
-    members: np.ndarray
+    point_indices: np.ndarray
     """Indices (m,) of the points."""
     effect_names: tuple[str, ...]
     """Names of the effects that are simulated at any of the points."""

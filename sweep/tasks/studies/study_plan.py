@@ -470,7 +470,7 @@ class _ScannerTimer:
         axis_points = list(np.ndindex(self.grid.axes_shape))
         draws_max = TIMED_SPECTRA_MAX if study.spec.draws.draws_whole_spectra else TIMED_DRAWS_MAX
         flight_blocks = [
-            self.grid.first_flight_block(axis_point)
+            self.grid.first_block_at_axes_point(axis_point)
             for axis_point in _select_evenly_spaced(axis_points, TIMED_AXIS_POINTS_MAX)
         ]
         self._flight_blocks = [
@@ -720,7 +720,7 @@ def _flight_effects_table(study: FlightStudy) -> EffectsTable:
             np.linspace(0, len(axis_points) - 1, AXIS_POINTS_SAMPLED).astype(int)
         ).tolist():
             n_shots += len(shot_numbers)
-            flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(
+            flight_block = study.scanner_grids[eyepoints.scanner].first_block_at_axes_point(
                 axis_points[place]
             )
             shot_plan = study.plan_effects(
