@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry.mesh import Mesh, rounded_centre, facet_normals, require_consistent_mesh
+from sweep.model.geometry.mesh import Mesh, facet_normals, require_consistent_mesh, rounded_centre
 from sweep.model.geometry.quaternion import from_axis_angle, rotate
 from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygon_file
 from sweep.scenes.polygons import triangulate_polygons
