@@ -194,6 +194,14 @@ def open_scene(path: str | Location) -> xr.DataTree:
     ------
     NotAStoreError
         The path has no store of a scene.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> outcome = sweep.run(sweep.load("flight.yaml"), store="flight.zarr", progress=False)
+    >>> tree = sweep.open_scene("flight.zarr")
+    >>> list(tree.children)
+    ['scene_map', 'three']
     """
     return open_scene_tree(parse_location(path), chunks={})
 

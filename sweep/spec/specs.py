@@ -990,6 +990,13 @@ def load(path: str | Path) -> GridSpec | SceneSpec:
         The error holds every mistake in the file, each with its path, its line and a remedy.
     TypeError
         If `path` is no path.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> spec = sweep.load("study.yaml")
+    >>> spec.title
+    'Small'
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(

@@ -147,6 +147,14 @@ def run(
         If no scheduler or worker is available.
     CodeError
         If the study names a function that may not run (:mod:`sweep.tasks.studies.user_functions`).
+
+    Examples
+    --------
+    >>> import sweep
+    >>> spec = sweep.load("study.yaml")
+    >>> outcome = sweep.run(spec, store="study.zarr", progress=False)
+    >>> outcome.complete
+    True
     """
     final_path, run_options = resolve_links(parse_location(store)), RunOptions.from_mapping(options)
     if overwrite and resume:
@@ -191,6 +199,14 @@ def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any
         does not change.
     ClusterError
         If no scheduler or worker is available.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> spec = sweep.load("study.yaml")
+    >>> outcome = sweep.run(spec, store="night.zarr", progress=False)  # say that it is interrupted
+    >>> sweep.resume("night.zarr", progress=False).complete
+    True
     """
     final_path, run_options = resolve_links(parse_location(store)), RunOptions.from_mapping(options)
     if spec is not None:
@@ -265,6 +281,16 @@ def extend(
     ------
     StoreError, ClusterError
         As in `run` and `resume`, and if the study is not larger than the one in the store.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> outcome = sweep.run(sweep.load("study.yaml"), store="near.zarr", progress=False)
+    >>> changes = {"axes.target.range": ["500 m", "1 km", "2 km", "4 km"]}
+    >>> sweep.extend("near.zarr", changes=changes, progress=False).complete
+    True
+    >>> sweep.open("near.zarr").pd_shot.sizes["range"]
+    4
     """
     source_path, run_options = (
         resolve_links(parse_location(store)),

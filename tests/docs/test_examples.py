@@ -5,14 +5,29 @@ import importlib
 import pkgutil
 
 import pytest
+import yaml
+from small_flights import SCENE_MAPPING
+from small_studies import small_mapping
 
 import sweep
+from sweep.spec.axes import remove_fields_on_axes
 
 MODULES = sorted(
     module.name
     for module in pkgutil.walk_packages(sweep.__path__, "sweep.")
     if "__main__" not in module.name
 )
+STUDY = small_mapping(
+    axes={"target.range": ["500 m", "1 km"], "target.grazing_angle": ["30 deg", "90 deg"]}
+)
+"""Study that examples read from study.yaml."""
+FLIGHT = remove_fields_on_axes({
+    **SCENE_MAPPING,
+    "axes": {},
+    "scanners": {"three": SCENE_MAPPING["scanners"]["three"] | {"rate": "1 Hz"}},
+    "draws": {"number": 1, "returns": 1},
+})  # fmt: skip
+"""Flight that examples read from flight.yaml."""
 FINDER = doctest.DocTestFinder(exclude_empty=True)
 
 
@@ -34,6 +49,8 @@ def test_there_are_examples():
 @pytest.mark.parametrize("module_name", MODULES)
 def test_examples_of_a_module_show_what_they_say(module_name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY))
+    (tmp_path / "flight.yaml").write_text(yaml.safe_dump(FLIGHT))
     report = []
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     for test in examples(module_name):

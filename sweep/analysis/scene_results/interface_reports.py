@@ -106,6 +106,14 @@ def reports(
         The request has mistakes, all of which are listed.
     OSError
         The file can't be written.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> outcome = sweep.run(sweep.load("flight.yaml"), store="reports.zarr", progress=False)
+    >>> reports = sweep.reports("reports.zarr", "reports.csv", interface={"rate": "1 Hz"})
+    >>> reports.sizes["report"] > 0
+    True
     """
     results, mistakes = SceneResults.from_store(store), []
     if file is not None and Path(file).suffix.lower() != ".csv":

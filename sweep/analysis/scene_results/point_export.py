@@ -383,6 +383,14 @@ def export(
         The request has mistakes, all of which are listed.
     OSError
         The file can't be written.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> outcome = sweep.run(sweep.load("flight.yaml"), store="export.zarr", progress=False)
+    >>> n_points = sweep.export("export.zarr", "points.csv")
+    >>> n_points > 0
+    True
     """
     results, file, mistakes = SceneResults.from_store(store), Path(file), []
     if file.suffix.lower() not in WRITER_BY_SUFFIX:

@@ -562,6 +562,14 @@ def status(store: str | Location) -> Status:
     ------
     StoreError
         If there is no store of sweep, or if its study can't be read.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> outcome = sweep.run(sweep.load("study.yaml"), store="asked.zarr", progress=False)
+    >>> status = sweep.status("asked.zarr")
+    >>> status.points_done, status.points
+    (4, 4)
     """
     store_path = parse_location(store)
     attributes, study = study_loading.read_study_of_blocks(store_path)

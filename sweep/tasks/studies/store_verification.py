@@ -131,6 +131,14 @@ def verify(
     StoreError
         If there is no store of sweep, if it holds another study than `spec`, or if it can't be
         repaired.
+
+    Examples
+    --------
+    >>> import sweep
+    >>> outcome = sweep.run(sweep.load("study.yaml"), store="copied.zarr", progress=False)
+    >>> (report,) = sweep.verify("copied.zarr", progress=False)
+    >>> report.complete, report.is_undamaged
+    (True, True)
     """
     path, listener = parse_location(path).absolute(), make_progress(progress)
     recover_interrupted_replace(path)
