@@ -44,7 +44,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.added_crossings import crossing_rate, edge_crossing_probability
@@ -660,6 +659,8 @@ def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> C
     rate_table = _tabulate_log_crossing_rates(looks, threshold_ratio)
     mean_probabilities = np.empty(0)
     if in_speckle:
+        from scipy.interpolate import CubicSpline  # slow to import
+
         coarse_means, coarse_positions = (
             np.empty(N_TABLE_AMPLITUDES // MEAN_CROSSING_TABLE_STRIDE + 1),
             np.arange(N_TABLE_AMPLITUDES) / MEAN_CROSSING_TABLE_STRIDE,
