@@ -316,7 +316,7 @@ def noise_false_alarm_reference(
     return NoiseAlarmReference(record, float(outputs["pfa_bin"].item()))
 
 
-class SettingPart(NamedTuple):
+class PointsOfSetting(NamedTuple):
     """Points with one setting of the instrument."""
 
     name: str
@@ -327,14 +327,14 @@ class SettingPart(NamedTuple):
     """Points with this setting."""
 
 
-def split_by_setting(points: PointSelection, spec: GridSpec, by: str) -> list[SettingPart]:
+def split_by_setting(points: PointSelection, spec: GridSpec, by: str) -> list[PointsOfSetting]:
     """Group points by the setting of the instrument: all coordinates except range and angle.
 
     The coordinate `by` comes first in the names of the groups.
 
     Returns
     -------
-    list of SettingPart
+    list of PointsOfSetting
         Name, parameters and points of each setting.
     """
     cut_names = {name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_name)}
@@ -343,7 +343,7 @@ def split_by_setting(points: PointSelection, spec: GridSpec, by: str) -> list[Se
     parts = split_by_coordinates(points, names, TABLE_ROWS_MAX).parts
     parameters_of_parts = [parameters_at(spec, part.points.first_indices()) for part in parts]
     return [
-        SettingPart(name, {path: parameters[path] for path in paths}, part)
+        PointsOfSetting(name, {path: parameters[path] for path in paths}, part)
         for (name, part), parameters in zip(parts, parameters_of_parts, strict=True)
     ]
 

@@ -156,7 +156,7 @@ WORKERS_OPTION = click.option(
     type=click.IntRange(min=1),
     help="Worker processes to start in the place of threads [none, or as --cluster says].",
 )
-scheduler_option = click.option(
+SCHEDULER_OPTION = click.option(
     "--scheduler",
     metavar="ADDRESS|none",
     help="Address of a Dask scheduler; none: a plain loop without Dask.",
@@ -238,7 +238,7 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     options = (
         THREADS_OPTION,
         WORKERS_OPTION,
-        scheduler_option,
+        SCHEDULER_OPTION,
         CLUSTER_OPTION,
         ALLOW_CODE_OPTION,
         BLOCK_TIMEOUT_OPTION,

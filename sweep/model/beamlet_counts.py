@@ -639,9 +639,10 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
 
 
 def _substitute_for_unbounded_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
-    """Return the distance between nodes [bins], at least 1, in place of an unbounded error.
+    """Return the number that tables hold where the error of a quadrature has no bound, at least 1.
 
-    More nodes are then preferred where no error has a bound.
+    It is the distance between ``n_nodes`` nodes over lines of the standard deviation or curvature
+    ``spread`` [bins of fs/L]. It falls as nodes are added, so that more nodes are preferred.
     """
     return np.maximum(1.0, 2 * UNIFORM_QUADRATURE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
 

@@ -19,8 +19,8 @@ from sweep.model.detection.detection_probability import (
 from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 from sweep.model.effects.catalogue import (
     DEFAULT_EFFECTS,
-    EFFECT_CATEGORY_PATHS,
     EFFECT_NAMES,
+    EFFECT_SHARED_PARAMETER_PATHS,
     EFFECTS,
     PARAMETER_DEFAULTS,
 )
@@ -89,7 +89,7 @@ def prepare_shots(
         Prepared shots of these points.
     """
     for point_indices, category_parameters in split_with_beamlet_counts(
-        PARAMETER_DEFAULTS | dict(parameters), effects, EFFECT_CATEGORY_PATHS
+        PARAMETER_DEFAULTS | dict(parameters), effects, EFFECT_SHARED_PARAMETER_PATHS
     ):
         ground = FlatGround(
             category_parameters,

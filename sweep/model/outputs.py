@@ -246,7 +246,7 @@ OUTPUT_HAS_SQUARED_DEVIATIONS = OUTPUT_IS_LOGARITHM | np.array(
 over draws."""
 
 N_GROUP_SUMS = 3 * len(PD_OUTPUTS)
-"""Number of values in a row of running sums that describe the means of groups of draws: mean, sum
+"""Number of columns of a row of running sums that describe the means of groups of draws: mean, sum
 of squared deviations, and sum over the unfinished group, of each probability of detection."""
 
 N_RUNNING_SUMS = (

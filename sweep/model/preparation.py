@@ -38,10 +38,10 @@ from sweep.model.shot_records import (
     DetectionSettings,
     EchoRecord,
     EchoSpeckle,
-    ErrorTolerances,
     FootprintLines,
     LineImages,
     PermanentLine,
+    SpectrumTolerances,
 )
 from sweep.model.shot_settings import LineMotion, RecordSettings, TargetState, WaveformSettings
 from sweep.model.unsupported_shot import UnsupportedShotError
@@ -61,7 +61,7 @@ present if that number follows from the tolerance."""
 CHIRP_SLOPE_PATHS = waveform.DOPPLER_SEGMENT_SLOPE_PATH, waveform.DOWN_SEGMENT_SLOPE_PATH
 """Parameter paths of the chirp rates of Doppler segment and down-chirp, over that of the up-chirp.
 """
-CATEGORY_PATHS = (
+SHARED_PARAMETER_PATHS = (
     PROCESSING_PREFIX + "fft_size",
     "footprint.beamlets",
     "record",
@@ -131,7 +131,7 @@ class Shots:
     """Detection threshold, searched bins, and rules of detection."""
     looks: Looks
     """Number of looks, the records of each segment, and the way they are combined."""
-    tolerances: ErrorTolerances
+    tolerances: SpectrumTolerances
     """Errors of magnitudes and probabilities that the evaluation of spectra may cause."""
     motion: LineMotion = LineMotion()  # noqa: RUF009  # a tuple, as all records below
     """Motion of the target during a shot that affects lines and measured values."""
@@ -559,8 +559,8 @@ class Shots:
     def split_by_look(self) -> "list[Shots]":
         """Return one set of shots for each look, with the lines where that look observes them.
 
-        A look is one of several records of a segment. If lines do not drift, the shots are
-        unchanged.
+        A look is one of several records of a segment. If lines do not drift, every
+        set is these shots, unchanged.
         """
         if not np.any(self.motion.line_drift_per_look):
             return [self] * self.looks.number
@@ -673,7 +673,7 @@ class Shots:
         from sweep.model.detection.joint_tail import joint_tail_quadrature
         from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
         from sweep.model.detection.speckle_modes import NO_MODES, mode_table
-        from sweep.model.detection.sub_bin_interpolation import sidelobe_bin_noise_correlation
+        from sweep.model.detection.sub_bin_interpolation import sidelobe_neighbour_noise_correlation
 
         in_speckle, any_bin = (
             self.speckle.segment_correlations is not None,
@@ -701,7 +701,7 @@ class Shots:
             neighbour_crossing_quadrature=joint_tail_quadrature(self.noise_bin_correlation),
             noise_pseudo_variance_ratio=noise_ratio,
             mode_table=modes,
-            sidelobe_bin_noise_correlation=sidelobe_bin_noise_correlation(
+            sidelobe_neighbour_noise_correlation=sidelobe_neighbour_noise_correlation(
                 self.window, self.fft_size
             ),
         )
@@ -782,7 +782,7 @@ def split_by_category(
     parameters : mapping
         Parameters by dotted path: scalars or (n,) arrays.
     further_paths : collection of str
-        Numeric parameters that points must share besides :data:`CATEGORY_PATHS`.
+        Numeric parameters that points must share besides :data:`SHARED_PARAMETER_PATHS`.
 
     Yields
     ------
@@ -793,7 +793,7 @@ def split_by_category(
     """
     arrays = parameters_as_arrays(parameters)
     n_points = max((a.size for a in arrays.values() if a.ndim), default=1)
-    shared_paths = {*CATEGORY_PATHS, *further_paths}
+    shared_paths = {*SHARED_PARAMETER_PATHS, *further_paths}
     varying_paths = [
         path
         for path, a in arrays.items()
@@ -876,7 +876,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
         ),
         detection_settings=DetectionSettings.from_budget(budget, n_points),
         looks=budget.looks,
-        tolerances=ErrorTolerances.from_parameters(parameters, budget.looks),
+        tolerances=SpectrumTolerances.from_parameters(parameters, budget.looks),
     )
 
 

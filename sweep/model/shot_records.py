@@ -127,7 +127,7 @@ class DetectionSettings(NamedTuple):
         )
 
 
-class ErrorTolerances(NamedTuple):
+class SpectrumTolerances(NamedTuple):
     """Tolerated errors of bin magnitudes and leakage in the evaluation of spectra."""
 
     line_error: np.ndarray
@@ -145,7 +145,7 @@ class ErrorTolerances(NamedTuple):
     @classmethod
     def from_parameters(
         cls, parameters: Mapping[str, np.ndarray], looks: "Looks"
-    ) -> "ErrorTolerances":
+    ) -> "SpectrumTolerances":
         """Return the tolerances for parameters by dotted path, and for the looks of a shot."""
         budget = ErrorBudget.from_parameters(parameters)
         return cls(

@@ -80,7 +80,7 @@ class Axis:
     """One dimension of a study's grid, along which one parameter or several vary."""
 
     name: str
-    """Name of the dimension in the store."""
+    """Name of the dimension in the store; the paths of parameters are in ``parameters``."""
     parameters: tuple[AxisParameter, ...]
     """Parameters along the axis: one, or several that vary together."""
 

@@ -542,7 +542,7 @@ class FileField(NamedTuple):
     key_path: KeyPath
     """Keys that lead to the field."""
     rule: FilePathRule
-    """Rule of the field."""
+    """Rule that reads the field's path."""
     raw_path: str
     """Path of the file, as written in the spec."""
 

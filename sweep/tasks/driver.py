@@ -69,7 +69,7 @@ from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.memory_limits import (
-    block_bytes_max,
+    block_peak_bytes,
     refuse_too_large_blocks,
     refuse_too_large_point,
     refuse_too_large_study,
@@ -593,7 +593,7 @@ def _compute_missing_blocks(
     """
     backend.max_workers = study.n_blocks
     backend.check_memory = partial(refuse_too_large_study, study)
-    backend.bytes_per_thread = block_bytes_max(study)
+    backend.bytes_per_thread = block_peak_bytes(study)
     refuse_too_large_blocks(study, backend.memory)
     with (
         backend.interrupts,

@@ -22,7 +22,7 @@ from sweep.model.detection.echo_detection import (
     threshold_from_tnr,
 )
 from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
-from sweep.model.detection.sub_bin_interpolation import sidelobe_bin_noise_correlation
+from sweep.model.detection.sub_bin_interpolation import sidelobe_neighbour_noise_correlation
 from sweep.model.error_budget import AUTOMATIC
 from sweep.model.spectrum.bin_spectrum import SpanArrays
 from sweep.model.spectrum.leakage import LeakageLimits, false_peak_probability_of_bins
@@ -171,7 +171,7 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
         pfa, alarms = np.exp(-0.5 * (level / sigma) ** 2), {}
         for segment, name in ((0, "up"), (2, "down")):
             exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
-            near = sidelobe_bin_noise_correlation(shots.window, shots.fft_size)
+            near = sidelobe_neighbour_noise_correlation(shots.window, shots.fft_size)
             peak, excluded, leakage = by_brute_force(exact, sigma, level, 0.0, near)
             assert results[f"snr_{name}"][0] == pytest.approx(
                 exact[peak] ** 2 / (2 * sigma**2), rel=1e-8

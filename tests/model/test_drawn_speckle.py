@@ -175,7 +175,7 @@ def test_correlations_of_bins_are_the_sums_of_a_fine_grid_of_scatterers(shape):
         window_transform(w, d[:, None] - s[:, None] * y)
         for d, s in zip(distance, spread, strict=True)
     )
-    power = np.exp(-0.5 * y * y) * np.maximum(1 + lines.power_slope[:, None] * y, 0.0)
+    power = np.exp(-0.5 * y * y) * np.maximum(1 + lines.relative_power_gradient[:, None] * y, 0.0)
     shared = (power * first * second * np.exp(1j * lines.phase_difference[:, None] * y)).sum(axis=1)
     strength = (power * first**2).sum(axis=1) * (power * second**2).sum(axis=1)
     together = peak_bin_correlation(w, lines)

@@ -10,7 +10,7 @@ from sweep.model.detection.added_crossings import (
 )
 from sweep.model.detection.echo_detection import mark_exempt_bins
 from sweep.model.detection.marcum import marcum_q1
-from sweep.model.detection.sub_bin_interpolation import sidelobe_bin_noise_correlation
+from sweep.model.detection.sub_bin_interpolation import sidelobe_neighbour_noise_correlation
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.evaluation import evaluate, prepare_shots
 from sweep.model.spectrum import leakage
@@ -76,7 +76,7 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
         counts = ~exempt & (bins > 0)
         quiet = -np.expm1(-((level / sigma) ** 2) / 2)
         powers, raised = np.linspace(0, 16, 321)[1:], []
-        near = sidelobe_bin_noise_correlation(shots.window, shots.fft_size)
+        near = sidelobe_neighbour_noise_correlation(shots.window, shots.fft_size)
         for u in powers:
             stays = marcum_q1(np.sqrt(u) * magnitude / sigma, np.array(level / sigma)).p / quiet
             chances = np.where(counts, np.maximum(1.0 - stays, 0.0), 0.0)

@@ -393,7 +393,7 @@ def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
     chances = np.where(counts, (crosses - quiet) / (1 - quiet), 0.0)
     # By one record that detects as often: groups that join the echo are no further ones.
     scaled = sigma * np.sqrt((level / sigma) ** 2 - 2 * 3 / 4)
-    near = shots.detection_rule.sidelobe_bin_noise_correlation
+    near = shots.detection_rule.sidelobe_neighbour_noise_correlation
     product = 1 - np.prod(1 - chances)
     exclude_bins_joining_echo(chances, 0, chances.size, magnitude, is_echo, sigma / 2, scaled, near)
     expected = 1 - np.prod(1 - chances)

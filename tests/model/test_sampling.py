@@ -204,7 +204,7 @@ class Coins:
         interval = COUNT_INTERVALS[self.method](successes=k, trials=n, confidence=0.95)
         return interval_half_width(k / n, interval)[place]
 
-    def half_width_excess(self, points, error_budget):
+    def half_width_over_tolerance(self, points, error_budget):
         return np.maximum(self.widths(points) - error_budget.tolerance, 0.0)
 
 

@@ -126,7 +126,7 @@ def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
         1e-3: frozenset({"doppler"}),
         1e-6: frozenset(EFFECT_NAMES[:2]),
     }
-    ladder = settings.add_fixed_effect_settings(
+    ladder = settings.add_settings_for_effect_sets(
         settings.build_setting_ladder(small_spec()), small_spec(), sets
     )
     fixed = [setting for setting in ladder.settings if setting.kind == FIXED_EFFECTS_KIND]

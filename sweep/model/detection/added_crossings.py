@@ -252,7 +252,7 @@ def weighted_crossing_rate(probabilities, weights):
 
 @njit(cache=True, error_model="numpy")
 def edge_crossing_probability(
-    edge_ratio, neighbour_ratio, threshold_ratio, sidelobe_bin_noise_correlation
+    edge_ratio, neighbour_ratio, threshold_ratio, sidelobe_neighbour_noise_correlation
 ):
     """Return the probability that an echo's outermost bin crosses, given that its neighbour does.
 
@@ -263,7 +263,7 @@ def edge_crossing_probability(
         noise per quadrature sigma.
     threshold_ratio
         Threshold b over sigma.
-    sidelobe_bin_noise_correlation
+    sidelobe_neighbour_noise_correlation
         Correlation rho of the two bins' noise components in phase with their signals.
 
     Notes
@@ -276,7 +276,7 @@ def edge_crossing_probability(
     (m - d). The bin, of amplitude a_edge, crosses like one of the amplitude b - (b - a_edge -
     rho m) / s in noise of unit variance.
     """
-    if sidelobe_bin_noise_correlation != 0.0:
+    if sidelobe_neighbour_noise_correlation != 0.0:
         distance_to_threshold = threshold_ratio - neighbour_ratio
         noise_mean = max(distance_to_threshold, 0.0)
         if -8.0 < distance_to_threshold < 30.0:
@@ -286,8 +286,8 @@ def edge_crossing_probability(
             )
         noise_variance = (
             1.0
-            - sidelobe_bin_noise_correlation
-            * sidelobe_bin_noise_correlation
+            - sidelobe_neighbour_noise_correlation
+            * sidelobe_neighbour_noise_correlation
             * noise_mean
             * (noise_mean - distance_to_threshold)
         )
@@ -296,7 +296,7 @@ def edge_crossing_probability(
         )
         edge_ratio = max(
             threshold_ratio
-            - (threshold_ratio - edge_ratio - sidelobe_bin_noise_correlation * noise_mean)
+            - (threshold_ratio - edge_ratio - sidelobe_neighbour_noise_correlation * noise_mean)
             / noise_deviation,
             0.0,
         )
@@ -312,7 +312,7 @@ def exclude_bins_joining_echo(
     is_exempt,
     noise_sigma,
     threshold,
-    sidelobe_bin_noise_correlation,
+    sidelobe_neighbour_noise_correlation,
 ):
     """Remove crossings that join an echo from the bins' crossing probabilities, in place.
 
@@ -335,7 +335,7 @@ def exclude_bins_joining_echo(
         Standard deviation of the noise per quadrature [V].
     threshold
         Threshold on |X| [V]; adjacent bins above it form a group.
-    sidelobe_bin_noise_correlation
+    sidelobe_neighbour_noise_correlation
         Correlation of neighbouring bins' noise components in phase with the signal.
     """
     gap_end = first_index
@@ -352,7 +352,7 @@ def exclude_bins_joining_echo(
                 magnitudes[gap_begin - 1] / noise_sigma,
                 magnitudes[gap_begin] / noise_sigma,
                 threshold / noise_sigma,
-                sidelobe_bin_noise_correlation,
+                sidelobe_neighbour_noise_correlation,
             )
         if n_bins > 0 and gap_end < end_index and probabilities[gap_end - 1] > 0.0:
             n_joining_above = _count_joining_bins(probabilities, gap_end - 1, STEP_DOWN, n_bins)
@@ -360,7 +360,7 @@ def exclude_bins_joining_echo(
                 magnitudes[gap_end] / noise_sigma,
                 magnitudes[gap_end - 1] / noise_sigma,
                 threshold / noise_sigma,
-                sidelobe_bin_noise_correlation,
+                sidelobe_neighbour_noise_correlation,
             )
         if n_joining_below + n_joining_above > n_bins:
             _fill_further_group_probability(

@@ -126,7 +126,7 @@ class DetectionRule(NamedTuple):
     mode_table: ModeTable
     """Table of the strongest speckle mode, the part of an echo that fades with one amplitude in all
     its bins. ``NO_MODES`` unless ``any_bin`` and ``in_speckle``."""
-    sidelobe_bin_noise_correlation: float = 0.0
+    sidelobe_neighbour_noise_correlation: float = 0.0
     """Correlation, -1..1, of two neighbouring bins' noise components in phase with a line's
     sidelobes. Sidelobes alternate in sign from bin to bin."""
 

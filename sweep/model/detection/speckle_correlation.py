@@ -92,7 +92,7 @@ class LinePairGradients(NamedTuple):
     phase_difference: np.ndarray
     """Change across the beam of the phase between the two segments [rad per standard deviation of
     the beam]."""
-    power_slope: np.ndarray
+    relative_power_gradient: np.ndarray
     """Relative change of the echo's power across the beam, per standard deviation of the beam."""
 
     @property
@@ -113,7 +113,7 @@ class LinePairGradients(NamedTuple):
             (distance_first[points], distance_second[points]),
             (shift_first[points], shift_second[points]),
             self.phase_difference[points],
-            self.power_slope[points],
+            self.relative_power_gradient[points],
         )
 
 
@@ -140,7 +140,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
         np.stack(gradients.strongest_bin_offset),
         np.stack(gradients.line_shift),
         gradients.phase_difference,
-        gradients.power_slope,
+        gradients.relative_power_gradient,
         transform,
         TRANSFORM_SAMPLES_PER_BIN,
         _GAUSS_NODES,

@@ -17,7 +17,7 @@ def fill_peak_bin_correlation(
     strongest_bin_offset,
     line_shift,
     phase_difference,
-    power_slope,
+    relative_power_gradient,
     transform,
     samples_per_bin,
     nodes,
@@ -34,7 +34,7 @@ def fill_peak_bin_correlation(
         Indices of the points.
     half_interval
         (n,): half-width of the integration interval of y [standard deviations of the beam].
-    strongest_bin_offset, line_shift, phase_difference, power_slope
+    strongest_bin_offset, line_shift, phase_difference, relative_power_gradient
         Fields of :class:`sweep.model.detection.speckle_correlation.LinePairGradients`; the first
         two are stacked to (2, n).
     transform, samples_per_bin
@@ -56,7 +56,7 @@ def fill_peak_bin_correlation(
         re, im, power_first, power_second = 0.0, 0.0, 0.0, 0.0
         for node in range(nodes.size):
             y = previous_half_interval * nodes[node]
-            line_power = node_power[node] * max(1.0 + power_slope[point] * y, 0.0)
+            line_power = node_power[node] * max(1.0 + relative_power_gradient[point] * y, 0.0)
             transform_first = _interpolate_transform(
                 strongest_bin_offset[0, point] - line_shift[0, point] * y,
                 transform,

@@ -43,13 +43,14 @@ same shape."""
 _POWER_ITERATIONS = 80
 _NODES_MIN = 41
 _NODE_DISTANCE = 0.4
-"""Largest spacing of the lines that represent a Gaussian density, in units of LINE_DEVIATIONS."""
+"""Spacing, at most about this, of the lines that represent a Gaussian density, in the unit in which
+LINE_DEVIATIONS is stated."""
 _NODE_DEVIATIONS_MAX = 4.5
 """Distance from the centre of the outermost line that represents a Gaussian density, in standard
 deviations of the density."""
 _FULL_REACH_LINE_DEVIATION_MAX = 3.0
-"""Largest standard deviation, in units of LINE_DEVIATIONS, for which tables reach two deviations
-beyond the main lobe."""
+"""Largest standard deviation, in the unit in which LINE_DEVIATIONS is stated, for which tables reach
+two deviations beyond the main lobe."""
 
 
 class ModeTable(NamedTuple):

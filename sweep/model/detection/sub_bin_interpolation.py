@@ -120,7 +120,7 @@ class Interpolator(NamedTuple):
     holds if the centre bin's |X| equals the noise per quadrature, and falls as 1/|X|."""
     noise_mixing: NoiseMixing
     """Factors that make the noise of three adjacent bins from independent normal numbers."""
-    sidelobe_bin_noise_correlation: float
+    sidelobe_neighbour_noise_correlation: float
     """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Of N
     successive sidelobe bins, L change sign from one to the next. N is the FFT size, L the number of
     samples in the record."""
@@ -143,10 +143,10 @@ def in_phase_noise_correlations(window: Window, fft_size: int) -> tuple[float, f
     return correlation_1 / window.energy, correlation_2 / window.energy
 
 
-def sidelobe_bin_noise_correlation(window: Window, fft_size: int) -> float:
+def sidelobe_neighbour_noise_correlation(window: Window, fft_size: int) -> float:
     """Return the correlation of adjacent bins' noise components in phase with a tone's sidelobes.
 
-    See :attr:`Interpolator.sidelobe_bin_noise_correlation`.
+    See :attr:`Interpolator.sidelobe_neighbour_noise_correlation`.
     """
     correlation_1, _ = in_phase_noise_correlations(window, fft_size)
     return correlation_1 * (1.0 - 2.0 * window.length / fft_size)
@@ -185,7 +185,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         weights=NeighbourWeights(*(0 * weight if neighbours_vanish else weight)),
         error_at_sigma=error,
         noise_mixing=_noise_mixing(correlation_1, correlation_2),
-        sidelobe_bin_noise_correlation=sidelobe_bin_noise_correlation(window, fft_size),
+        sidelobe_neighbour_noise_correlation=sidelobe_neighbour_noise_correlation(window, fft_size),
         spread_error_factor=np.zeros(0),
     )
     return interpolation._replace(

@@ -70,7 +70,7 @@ EFFECT_PARAMETERS: tuple[Parameter, ...] = tuple(
 )
 """All fields that effects add to a spec, effect by effect."""
 
-EFFECT_CATEGORY_PATHS = tuple(
+EFFECT_SHARED_PARAMETER_PATHS = tuple(
     parameter.path for parameter in EFFECT_PARAMETERS if parameter.is_category_key
 )
 """Dotted paths of the effects' numeric parameters that must be equal in all points that are

@@ -124,7 +124,7 @@ class RayCaster:
         is_hit = face_index >= 0
         reference_beamlet = np.where(is_hit.any(axis=1), is_hit.argmax(axis=1), -1)
         n_bundles, hit_bundles = len(origin), np.flatnonzero(reference_beamlet >= 0)
-        range_high, range_low = np.full(n_bundles, np.inf), np.zeros(n_bundles)
+        range_rounded, range_remainder = np.full(n_bundles, np.inf), np.zeros(n_bundles)
         normal = np.full((n_bundles, 3), np.nan)
         reference_rays = _RayIndices(hit_bundles, reference_beamlet[hit_bundles])
         reference_hits = self._intersect_facets(
@@ -134,8 +134,8 @@ class RayCaster:
             reference_rays,
             _HitFacets(face_index[reference_rays], body_index[reference_rays]),
         )
-        range_high[hit_bundles] = reference_hits.range_high
-        range_low[hit_bundles] = reference_hits.range_low
+        range_rounded[hit_bundles] = reference_hits.range_rounded
+        range_remainder[hit_bundles] = reference_hits.range_remainder
         normal[hit_bundles] = reference_hits.normal.T
         normal[hit_bundles[reference_hits.cosine > 0]] *= -1.0  # towards the ray's origin
         # On one facet t_b - t_0 = -t_0 n.delta / (n.d_b), delta = d_b - d_0, without cancellation.
@@ -149,7 +149,7 @@ class RayCaster:
             range_offset += normal_component * (
                 direction_component - direction_component[all_bundles, reference_beamlet][:, None]
             )
-        range_offset *= -range_high[:, None]
+        range_offset *= -range_rounded[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):  # misses, or another facet
             range_offset /= cos_incidence
         is_other_facet = face_index != face_index[all_bundles, reference_beamlet][:, None]
@@ -163,8 +163,8 @@ class RayCaster:
             other_rays,
             _HitFacets(face_index[other_rays], body_index[other_rays]),
         )
-        range_offset[other_rays] = (other_hits.range_high - range_high[other_rays.bundle]) + (
-            other_hits.range_low - range_low[other_rays.bundle]
+        range_offset[other_rays] = (other_hits.range_rounded - range_rounded[other_rays.bundle]) + (
+            other_hits.range_remainder - range_remainder[other_rays.bundle]
         )
         cos_incidence[other_rays] = other_hits.cosine
         surface_index = np.full(face_index.shape, -1, dtype=np.int16)
@@ -172,7 +172,7 @@ class RayCaster:
             is_body = body_index == body_number
             surface_index[is_body] = mesh.surface_index[face_index[is_body]]
         return BundleHits(
-            range_high,
+            range_rounded,
             reference_beamlet,
             normal,
             range_offset,
@@ -272,10 +272,10 @@ class _HitFacets(NamedTuple):
 class _FacetIntersections(NamedTuple):
     """Intersections of m rays with the planes of the facets (triangles) that they hit."""
 
-    range_high: np.ndarray
+    range_rounded: np.ndarray
     """(m,): range at which each ray meets the plane, rounded to float64 [m]."""
-    range_low: np.ndarray
-    """(m,): exact range minus ``range_high`` [m]."""
+    range_remainder: np.ndarray
+    """(m,): exact range minus ``range_rounded`` [m]."""
     normal: np.ndarray
     """(3, m): unit normal of the facet in the world's frame, oriented by its winding."""
     cosine: np.ndarray

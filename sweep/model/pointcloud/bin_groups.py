@@ -140,7 +140,7 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
     n_bins, magnitudes = (
         (spans.n_bins, spans.magnitudes)
         if shots.detection_settings.search_band is None
-        else _echo_bins_only(spans)
+        else _zero_leakage_of_unsearched_echoes(spans)
     )
     _fill_groups(
         spans.point_numbers,
@@ -177,7 +177,7 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
     )
 
 
-def _echo_bins_only(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
+def _zero_leakage_of_unsearched_echoes(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
     """Return the numbers of bins and |X| [V], with |X| set to 0 outside unsearched echoes.
 
     This holds for segments whose strongest bin is outside the search band. Sidelobes of such an

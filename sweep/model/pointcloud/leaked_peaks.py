@@ -215,7 +215,7 @@ class LeakageBins(NamedTuple):
     amplitude_gain_max: float
     """Factor from |X| / sigma in one look (record) to |X| / sigma in the single record that is
     equivalent to all looks."""
-    sidelobe_bin_noise_correlation: float
+    sidelobe_neighbour_noise_correlation: float
     """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
     the signal."""
 
@@ -252,7 +252,7 @@ class LeakageBins(NamedTuple):
             log_amplitude_step=np.zeros(1),
             threshold_ratio=np.zeros(1),
             amplitude_gain_max=1.0,
-            sidelobe_bin_noise_correlation=0.0,
+            sidelobe_neighbour_noise_correlation=0.0,
         )
 
     def select_points(self, points: np.ndarray) -> "LeakageBins":
@@ -603,7 +603,7 @@ def _add_crossing_rate_tables(
         log_amplitude_step=np.array([table.log_amplitude_step for table in tables]),
         threshold_ratio=shots.looks.equivalent_threshold_ratio(threshold_ratios),
         amplitude_gain_max=float(shots.looks.amplitude_gain_max),
-        sidelobe_bin_noise_correlation=shots.detection_rule.sidelobe_bin_noise_correlation,
+        sidelobe_neighbour_noise_correlation=shots.detection_rule.sidelobe_neighbour_noise_correlation,
     )
     _fill_rate_sums(
         leakage_bins,
@@ -1160,7 +1160,7 @@ def _evaluate_joining_bins(
             edge_ratio * root_power,
             neighbour_ratio * root_power,
             leakage_bins.threshold_ratio[threshold_index],
-            leakage_bins.sidelobe_bin_noise_correlation,
+            leakage_bins.sidelobe_neighbour_noise_correlation,
         )
         p_edge_slope = (p_edge_after - p_edge_before) / nodes_per_step
         if step_begin < 0:
@@ -1384,7 +1384,7 @@ def draw_leaked_peaks(
             rate_table,
             threshold_ratio,
             n_looks,
-            interpolation.sidelobe_bin_noise_correlation,
+            interpolation.sidelobe_neighbour_noise_correlation,
             peak_bins,
             peak_ratios,
             n_peaks,

@@ -362,10 +362,10 @@ def _covariance_scale(
 ) -> np.ndarray:
     """Return the factor (n,) that scales covariances where residuals contradict the stated errors.
 
-    If true errors make such residuals with :data:`_CONTRADICTION_PROBABILITY` or less, the
-    residuals determine the size of the errors. The factor is then chi-square over the residuals'
-    degrees of freedom (at least 1), times the square of Student's t at one standard deviation. The
-    error over a deviation so estimated follows Student's t, and the scaled deviation covers its
+    Residuals contradict the stated errors if these would give a chi-square this large with
+    :data:`_CONTRADICTION_PROBABILITY` or less. The factor is then ``chi_square`` over
+    ``residual_degrees`` (at least 1), times the square of Student's t at one standard deviation.
+    The error over a deviation so estimated follows Student's t, and the scaled deviation covers its
     central 68 %. Other solutions have the factor 1.
 
     Parameters

@@ -254,8 +254,8 @@ class Returns(NamedTuple):
     """uint8: bits that compare the return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """int32: index of the beamlet to which the peaks of a return belong, if its flag is true or
-    misread (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); else -1."""
+    """(n, draws, returns) int32: index of the beamlet that gave the peaks of a true or misread
+    return (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); -1 for other returns, and none."""
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group (adjacent bins above the threshold) of the
     up, Doppler and down peak; -1 for no peak or a false peak."""
@@ -632,7 +632,7 @@ class DrawWorkspace(NamedTuple):
     """(bins,) bool: mask that marks all bins as bins of the echo (all True)."""
     false_peak_bins: np.ndarray
     """(groups + 1,) int64: numbers of the bins of a segment's false peaks."""
-    false_peak_ratios: np.ndarray
+    false_peak_magnitude_ratios: np.ndarray
     """(groups + 1,): |X| of a segment's false peaks over sigma, the noise of a bin per quadrature.
     """
     peak_positions: np.ndarray
@@ -1593,7 +1593,7 @@ class GroupSpeckle(NamedTuple):
     pseudo_variance_ratio: np.ndarray
     """(groups, 3, bins): pseudo-variance E[A^2] of a bin's complex amplitude A over its mean power
     E[|A|^2]."""
-    rms_ratio: np.ndarray
+    rms_magnitude_ratio: np.ndarray
     """(groups, 3, bins): root mean square over speckle of the echo's |X|, over sigma, the noise of
     a bin per quadrature."""
     amplitudes: np.ndarray
@@ -1626,7 +1626,7 @@ def empty_group_speckle(groups_max):
         n_bins=bins,
         mean_power=powers,
         pseudo_variance_ratio=powers,
-        rms_ratio=powers,
+        rms_magnitude_ratio=powers,
         amplitudes=no_amplitudes,
         factor_rank=factor_rank,
         factor=no_amplitudes,
@@ -1717,7 +1717,7 @@ def prepare_group_speckle(point, config, inputs, spectra):
     amplitudes = np.zeros((groups_max, n_looks, 3, n_bins_max), np.complex128)
     _, _, _, n_independent_sets = inputs.look_covariance_root.shape
     independent_amplitudes = np.zeros((n_independent_sets, 3, n_bins_max), np.complex128)
-    rms_ratio, pd_amplitude_bin_weights = (
+    rms_magnitude_ratio, pd_amplitude_bin_weights = (
         np.zeros((groups_max, 3, n_bins_max)),
         np.zeros((groups_max, 3, n_bins_max)),
     )
@@ -1747,16 +1747,16 @@ def prepare_group_speckle(point, config, inputs, spectra):
                     magnitude = inputs.magnitude_below[point, s, g]
                 elif k == strongest_index + 1:
                     magnitude = inputs.magnitude_above[point, s, g]
-                rms_ratio[g, s, k] = magnitude / noise_sigma
+                rms_magnitude_ratio[g, s, k] = magnitude / noise_sigma
                 if abs(k - strongest_index) > 1:
                     relative_power = mean_power[g, s, k] / mean_power[g, s, strongest_index]
-                    rms_ratio[g, s, k] *= math.sqrt(relative_power)
+                    rms_magnitude_ratio[g, s, k] *= math.sqrt(relative_power)
     return GroupSpeckle(
         first_bin=first_bin,
         n_bins=n_bins,
         mean_power=mean_power,
         pseudo_variance_ratio=pseudo_variance_ratio,
-        rms_ratio=rms_ratio,
+        rms_magnitude_ratio=rms_magnitude_ratio,
         amplitudes=amplitudes,
         factor_rank=factor_rank,
         factor=factor,
@@ -2107,12 +2107,12 @@ def draw_segment_peaks(
             n_peaks += 1
     _, n_peaks_max = peak_lists.group.shape
     n_free = n_peaks_max - n_peaks
-    false_peak_bins, false_peak_ratios, n_false = (
+    false_peak_bins, false_peak_magnitude_ratios, n_false = (
         workspace.false_peak_bins[:n_free],
-        workspace.false_peak_ratios[:n_free],
+        workspace.false_peak_magnitude_ratios[:n_free],
         0,
     )
-    false_peak_ratios[:] = 0.0
+    false_peak_magnitude_ratios[:] = 0.0
     if config.in_noise:
         n_false = list_noisy_leaked_peaks(
             address,
@@ -2124,7 +2124,7 @@ def draw_segment_peaks(
             threshold_ratio,
             interpolation,
             false_peak_bins,
-            false_peak_ratios,
+            false_peak_magnitude_ratios,
         )
     else:
         n_false = draw_leaked_peaks(
@@ -2137,7 +2137,7 @@ def draw_segment_peaks(
             config.n_looks,
             interpolation,
             false_peak_bins,
-            false_peak_ratios,
+            false_peak_magnitude_ratios,
         )
     stream = (
         philox.STREAM_NOISE_MAXIMUM[segment]
@@ -2169,16 +2169,18 @@ def draw_segment_peaks(
             2 * config.nyquist_bin,
             config.down_beat_sign,
         )
-        n_false = insert_peak(false_bin, ratio, false_peak_bins, false_peak_ratios, n_false)
-    for n in range(n_false):
-        error = sub_bin_standard_error(0.0, false_peak_ratios[n], interpolation) / math.sqrt(
-            config.n_looks
+        n_false = insert_peak(
+            false_bin, ratio, false_peak_bins, false_peak_magnitude_ratios, n_false
         )
+    for n in range(n_false):
+        error = sub_bin_standard_error(
+            0.0, false_peak_magnitude_ratios[n], interpolation
+        ) / math.sqrt(config.n_looks)
         peak = fold_peak(
             false_peak_bins[n],
             float(false_peak_bins[n]),
             error,
-            false_peak_ratios[n],
+            false_peak_magnitude_ratios[n],
             0.0,
             config,
             interpolation,
@@ -2233,7 +2235,7 @@ def list_noisy_leaked_peaks(
     """
     key_0, key_1, draw = address
     n_peaks, previous_bin, peak, largest = INTEGER_ZERO, np.int64(-2), NO_INDEX, 0.0
-    correlation, is_echo = interpolation.sidelobe_bin_noise_correlation, False
+    correlation, is_echo = interpolation.sidelobe_neighbour_noise_correlation, False
     independent_part = math.sqrt(1.0 - correlation * correlation)
     for n in range(spectra.leaked_begin[point, segment], spectra.leaked_end[point, segment]):
         re, im = philox.normal_pair(
@@ -2492,7 +2494,7 @@ def detect_in_speckle(
         bin_amplitudes = speckle.amplitudes[group, look if n_speckle_looks > 1 else 0, segment]
         for k in range(n_bins):
             magnitude_ratio, bin_weight = (
-                speckle.rms_ratio[group, segment, k],
+                speckle.rms_magnitude_ratio[group, segment, k],
                 echo_weight * speckle.pd_amplitude_bin_weights[group, segment, k],
             )
             re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * noise.in_phase[k]

@@ -89,7 +89,7 @@ class DrawCountConfig(NamedTuple):
     noise_filter: "NoiseFilter"
     """Filter that makes the correlated noise of an echo's bins. It has no bins if only the
     strongest bin may detect the echo."""
-    sidelobe_bin_noise_correlation: float
+    sidelobe_neighbour_noise_correlation: float
     """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
     the signal."""
     pseudo_variance_ratio: np.ndarray
@@ -307,7 +307,7 @@ def count_in_noise(
         config = DrawCountConfig(
             True,
             make_echo_noise_filter(shots, spectra),
-            shots.detection_rule.sidelobe_bin_noise_correlation,
+            shots.detection_rule.sidelobe_neighbour_noise_correlation,
             speckle_table.pseudo_variance_ratio,
             shots.fft_size // 2,
         )
@@ -341,7 +341,8 @@ class NoiseScratch(NamedTuple):
     number_in_phase: np.ndarray
     """(k,): independent normal numbers from which the filter makes ``in_phase``."""
     number_in_quadrature: np.ndarray
-    """(k,): independent normal numbers from which the filter makes ``in_quadrature``."""
+    """(k,): independent normal numbers from which the filter of NOISE_FILTER_TAPS makes
+    ``in_quadrature``."""
 
     @classmethod
     def allocate(cls, n_bins: int) -> "NoiseScratch":
@@ -775,7 +776,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     s,
                     spectra,
                     threshold_ratio,
-                    config.sidelobe_bin_noise_correlation,
+                    config.sidelobe_neighbour_noise_correlation,
                     segment_factors[s],
                     random_words,
                     has_alarm[s],
@@ -810,7 +811,7 @@ def _mark_leakage_alarms(
     segment,
     spectra,
     threshold_ratio,
-    sidelobe_bin_noise_correlation,
+    sidelobe_neighbour_noise_correlation,
     magnitude_factors,
     random_words,
     has_alarm,
@@ -831,7 +832,7 @@ def _mark_leakage_alarms(
         :class:`NoiselessSpectra`.
     threshold_ratio
         Threshold [sigma].
-    sidelobe_bin_noise_correlation
+    sidelobe_neighbour_noise_correlation
         Correlation of the noise of neighbouring bins in phase with the signal.
     magnitude_factors
         (draws,): factors that speckle puts on magnitudes.
@@ -843,7 +844,7 @@ def _mark_leakage_alarms(
     key_0, key_1, first_draw = address
     stream = STREAM_NOISE[segment]
     independent_part = math.sqrt(
-        1.0 - sidelobe_bin_noise_correlation * sidelobe_bin_noise_correlation
+        1.0 - sidelobe_neighbour_noise_correlation * sidelobe_neighbour_noise_correlation
     )
     zeros, joins_echo = np.zeros(n_draws), np.zeros(n_draws, np.bool_)
     begin, end = spectra.leaked_begin[point, segment], spectra.leaked_end[point, segment]
@@ -893,10 +894,12 @@ def _mark_leakage_alarms(
                 )
                 in_phase = (
                     spectra.exempt_neighbour_ratio[leaked_bin] * magnitude_factors[d]
-                    + sidelobe_bin_noise_correlation * re
+                    + sidelobe_neighbour_noise_correlation * re
                     + independent_part * re_edge
                 )
-                in_quadrature = sidelobe_bin_noise_correlation * im + independent_part * im_edge
+                in_quadrature = (
+                    sidelobe_neighbour_noise_correlation * im + independent_part * im_edge
+                )
                 joins_echo[d] |= math.hypot(in_phase, in_quadrature) >= threshold_ratio
             is_pending[d] = not joins_echo[d]
     for d in range(n_draws):

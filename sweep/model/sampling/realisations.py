@@ -19,7 +19,7 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model.beamlet_counts import split_with_beamlet_counts
-from sweep.model.effects.catalogue import EFFECT_CATEGORY_PATHS, PARAMETER_DEFAULTS
+from sweep.model.effects.catalogue import EFFECT_SHARED_PARAMETER_PATHS, PARAMETER_DEFAULTS
 from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext
 from sweep.model.evaluation import apply_effects, select_effects, use_beamlet_velocities
 from sweep.model.ground import FlatGround
@@ -89,7 +89,7 @@ def iter_realisations(
     # One parameter has n values, so that there are n points even if they differ in nothing.
     all_parameters["target.range"] = np.broadcast_to(all_parameters["target.range"], len(keys))
     for indices, category_parameters in split_with_beamlet_counts(
-        all_parameters, effects, EFFECT_CATEGORY_PATHS
+        all_parameters, effects, EFFECT_SHARED_PARAMETER_PATHS
     ):
         batch_size = min(
             DRAWS_PER_BATCH,
@@ -211,9 +211,11 @@ class RunningMeans:
             )
 
     def running_sums(self) -> np.ndarray:
-        """Return the sums, besides the means, from which further draws continue.
+        """Return what further draws need in addition to the stored means, (n, columns).
 
-        The result is (n, columns).
+        A row holds a point's numbers of values of all outputs, the sums of squared deviations of
+        those in OUTPUT_HAS_SQUARED_DEVIATIONS, and the largest logarithms of those in
+        OUTPUT_IS_LOGARITHM.
         """
         arrays = (
             self.n_values,

@@ -220,7 +220,9 @@ class Sampler(ABC):
         )
         return interval_half_width(counts / n, interval)
 
-    def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    def half_width_over_tolerance(
+        self, point_indices: np.ndarray, error_budget: ErrorBudget
+    ) -> np.ndarray:
         """Return the excess of each point's largest half-width over the tolerance, (points,).
 
         The half-widths are those of the confidence intervals of detection probabilities. The result
@@ -240,7 +242,7 @@ class Sampler(ABC):
         return {
             "n_draws": self.n_draws,
             **{f"{name}_half_width": width for name, width in widths},
-            "accuracy_missed": self.half_width_excess(point_indices, error_budget),
+            "accuracy_missed": self.half_width_over_tolerance(point_indices, error_budget),
         }
 
 
@@ -404,7 +406,7 @@ def draw_until_accurate(
             is_checked = n_draws <= check_at
             is_open = ~is_checked
             is_open[is_checked] = (
-                sampler.half_width_excess(point_indices[is_checked], error_budget) > 0
+                sampler.half_width_over_tolerance(point_indices[is_checked], error_budget) > 0
             )
             point_indices = point_indices[is_open]
             if not point_indices.size:

@@ -137,7 +137,7 @@ class LeakageLimits(NamedTuple):
     """Detection threshold on a bin's magnitude [V, summed over the record]."""
     tolerance: float
     """Leakage that may be neglected [probability of at least one false alarm]."""
-    sidelobe_bin_noise_correlation: float
+    sidelobe_neighbour_noise_correlation: float
     """Correlation coefficient of the noise of adjacent bins, in phase with a line's sidelobes."""
 
 
@@ -241,7 +241,7 @@ def detect_with_leakage(
         limits.noise_sigma * inverse_root,
         limits.threshold * inverse_root,
         limits.tolerance,
-        limits.sidelobe_bin_noise_correlation,
+        limits.sidelobe_neighbour_noise_correlation,
     )
     nyquist_bin, clearance, far_weight = layout.fft_size // 2, layout.clearance_bins, weight_sum
     if lobe_half_width > clearance // 2:  # an echo whose pedestal reaches far
@@ -377,7 +377,7 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
         Crossing rates at the same threshold, used in developed speckle.
     """
     if speckle_power_max > 1.0:
-        return _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates)
+        return _false_peak_probability_averaged_over_speckle(n_bins, limits, span, speckle_rates)
     return _further_group_probability(n_bins, limits, span, crossing_series)
 
 
@@ -427,7 +427,7 @@ def false_peak_probability_of_bins_in_speckle(
         Crossing rates at the threshold over sigma, by speckle power.
     """
     _clear_negligible_bins(n_bins, limits.noise_sigma, negligible_signal_ratio, span)
-    return _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates)
+    return _false_peak_probability_averaged_over_speckle(n_bins, limits, span, speckle_rates)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -457,13 +457,13 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
         span.is_exempt,
         limits.noise_sigma,
         limits.threshold,
-        limits.sidelobe_bin_noise_correlation,
+        limits.sidelobe_neighbour_noise_correlation,
     )
     return any_crossing_probability(span.crossing_probability, INTEGER_ZERO, n_bins)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_false_peak_probability_of_bins(n_bins, limits, span, speckle_rates):
+def _false_peak_probability_averaged_over_speckle(n_bins, limits, span, speckle_rates):
     """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
     The bins are the computed ones around a segment's lines (a span).
@@ -551,7 +551,7 @@ def _mean_leakage_over_speckle(
                 is_echo,
                 noise_sigma / root_power,
                 threshold / root_power,
-                limits.sidelobe_bin_noise_correlation,
+                limits.sidelobe_neighbour_noise_correlation,
             )
             for i in range(n_listed):
                 rate += crossing_rate(probabilities[i])
@@ -961,7 +961,7 @@ def _leakage_of_all_bins(
         span.is_exempt,
         noise_sigma,
         threshold,
-        limits.sidelobe_bin_noise_correlation,
+        limits.sidelobe_neighbour_noise_correlation,
     )
     span_leakage = any_crossing_probability(span.crossing_probability, first_index, end_index)
     while n_points % 8:  # whole vectors: a remainder takes as long

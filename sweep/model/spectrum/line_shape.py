@@ -184,7 +184,7 @@ class LineEnvelope(NamedTuple):
     magnitude: np.ndarray
     """(..., m): largest magnitude of the line's spectrum at this distance or farther."""
     square_integral: np.ndarray
-    """(..., m): upper bound of the integral of the squared magnitude from this distance on [bins].
+    """(..., m): upper bound of the integral of the squared magnitude from ``distance`` on [bins].
     """
 
 
@@ -345,7 +345,9 @@ def line_shape_tables(
     weighted_modes = np.cos(np.outer(np.arange(n_modes), np.arccos(node))) * (
         w.sum(axis=1) * weight * length / 2
     )
-    chebyshev_transforms = _mode_integrals(weighted_modes, node, ratio * cell_distances)
+    chebyshev_transforms = _chebyshev_fourier_integrals(
+        weighted_modes, node, ratio * cell_distances
+    )
     taylor_coefficients = _taylor_coefficients(COSINE_SUM_COEFFICIENTS[window.name], n_modes)
     chebyshev_transforms += _euler_maclaurin_corrections(
         taylor_coefficients, ratio * cell_distances, length
@@ -533,7 +535,7 @@ def _late_mode_transforms(tier: int) -> LateModeTransforms:
     node, weight = _gauss_legendre(n_nodes)
     weighted_modes = np.cos(np.outer(np.arange(n_modes), np.arccos(node))) * weight / 2
     return LateModeTransforms(
-        _mode_integrals(
+        _chebyshev_fourier_integrals(
             weighted_modes / spreading_kernel_transform(np.pi / _LATE_VALUES_PER_BIN * node),
             node,
             frequency,
@@ -673,8 +675,8 @@ def spreading_kernel(cell_distance: np.ndarray) -> np.ndarray:
 
 _kernel_coordinate = np.cos(np.pi * (np.arange(KERNEL_DEGREE + 1) + 0.5) / (KERNEL_DEGREE + 1))
 KERNEL_BASIS = np.zeros((KERNEL_DEGREE + 1, KERNEL_CELLS + ZERO_WEIGHT_CELLS))
-"""Polynomial coefficients of the spreading kernel, (powers, cells). Their variable runs from -1 to
-1 across a cell."""
+"""Polynomial coefficients of the spreading kernel, (powers, cells), from power 0 up. Their variable
+runs from -1 to 1 across a cell. The last ZERO_WEIGHT_CELLS columns are 0."""
 
 for _j in range(KERNEL_CELLS):
     KERNEL_BASIS[:, _j] = cheb2poly(
@@ -829,7 +831,7 @@ def _cotangents(distance: np.ndarray, fft_size: int) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def _mode_integrals(weighted_modes, node, distance):
+def _chebyshev_fourier_integrals(weighted_modes, node, distance):
     """Integrate Chebyshev modes times exp(-i pi y x) over x by a quadrature, (modes, places).
 
     ``weighted_modes`` (modes, nodes) are the modes' values times quadrature weights at the

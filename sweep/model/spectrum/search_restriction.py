@@ -326,7 +326,7 @@ def _restrict_spans(
                     bin_threshold.noise_without_pedestal,
                     negligible_signal_ratio[j],
                     threshold,
-                    rule.sidelobe_bin_noise_correlation,
+                    rule.sidelobe_neighbour_noise_correlation,
                 )
 
 
@@ -383,7 +383,7 @@ def span_leakage_probability(
     noise_sigma,
     negligible_signal_ratio,
     group_threshold,
-    sidelobe_bin_noise_correlation,
+    sidelobe_neighbour_noise_correlation,
 ):
     """Return the probability that leaked signal raises a false peak apart from the echo.
 
@@ -403,7 +403,7 @@ def span_leakage_probability(
         |X| over sigma below which a bin counts as noise alone.
     group_threshold
         Threshold on |X| by which adjacent bins form a group.
-    sidelobe_bin_noise_correlation
+    sidelobe_neighbour_noise_correlation
         Correlation of neighbouring bins' noise components in phase with the signal.
     """
     threshold_ratio, probabilities = alarm_threshold / noise_sigma, np.zeros(magnitudes.size)
@@ -425,6 +425,6 @@ def span_leakage_probability(
         is_exempt,
         noise_sigma,
         group_threshold,
-        sidelobe_bin_noise_correlation,
+        sidelobe_neighbour_noise_correlation,
     )
     return any_crossing_probability(probabilities, 0, magnitudes.size)

@@ -409,8 +409,8 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
         equivalent_threshold_ratio = float(
             looks.equivalent_threshold_ratio(threshold[column] / noise_sigma[column])
         )
-        sidelobe_bin_noise_correlation, mean_leakage = (
-            shots.detection_rule.sidelobe_bin_noise_correlation,
+        sidelobe_neighbour_noise_correlation, mean_leakage = (
+            shots.detection_rule.sidelobe_neighbour_noise_correlation,
             0.0,
         )
         for root_power, weight, probabilities in zip(
@@ -424,7 +424,7 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
                 is_exempt,
                 1 / (looks.amplitude_gain_max * root_power),
                 equivalent_threshold_ratio / (looks.amplitude_gain_max * root_power),
-                sidelobe_bin_noise_correlation,
+                sidelobe_neighbour_noise_correlation,
             )
             mean_leakage += weight * any_crossing_probability(probabilities, 0, probabilities.size)
         leakage_in_looks[s, column] = mean_leakage
@@ -1204,7 +1204,7 @@ def _evaluate_segment(
         noise_sigma,
         threshold,
         parameters.leakage_tolerance[point],
-        rule.sidelobe_bin_noise_correlation,
+        rule.sidelobe_neighbour_noise_correlation,
     )
     lobe_half_width = max(rule.lobe_half_width, int(bin_threshold.pedestal.reach_bins))
     beat = beat_parameters_at(parameters, parameters_by_segment, s, point)

@@ -380,7 +380,7 @@ def _evaluate_levels(
                         bin_threshold.noise_without_pedestal,
                         negligible_signal_ratio[j],
                         levels[s, j, THRESHOLD_LEVEL_INDEX],
-                        rule.sidelobe_bin_noise_correlation,
+                        rule.sidelobe_neighbour_noise_correlation,
                     )
                     p_leak = min(p_leak, 1.0 - 1e-16)
                     exponents[s, j, k] -= math.log1p(-p_leak)

@@ -33,7 +33,7 @@ from sweep.storage.locations import Location, can_create_store, resolve_links
 from sweep.tasks.accuracy.settings import (
     AccuracySetting,
     SettingLadder,
-    add_fixed_effect_settings,
+    add_settings_for_effect_sets,
     build_setting_ladder,
 )
 from sweep.tasks.accuracy.study_sample import (
@@ -482,7 +482,9 @@ def add_settings_with_fixed_effects(
         if tolerance in setting_by_tolerance
     }
     sample.clear_caches()
-    return add_fixed_effect_settings(setting_ladder, sample.spec, effects_by_tolerance, tolerances)
+    return add_settings_for_effect_sets(
+        setting_ladder, sample.spec, effects_by_tolerance, tolerances
+    )
 
 
 ERROR_ARRAY_LONG_NAMES = {

@@ -214,7 +214,7 @@ def build_setting_ladder(spec: AnySpec) -> SettingLadder:
     return SettingLadder(tuple(settings), reference_text, tuple(notes))
 
 
-def add_fixed_effect_settings(
+def add_settings_for_effect_sets(
     settings_ladder: SettingLadder,
     spec: AnySpec,
     effects_by_tolerance: Mapping[float, frozenset[str]],

@@ -59,7 +59,7 @@ def _effect_flags_of_names(effect_names: Collection[str]) -> np.uint32:
     return np.uint32(sum(1 << EFFECT_NAMES.index(effect_name) for effect_name in effect_names))
 
 
-THESIS_EFFECT_FLAGS = _effect_flags_of_names(
+THESIS_EFFECT_MASK = _effect_flags_of_names(
     [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
 )
 """Effects that the thesis's method can simulate, one bit each.
@@ -67,7 +67,7 @@ THESIS_EFFECT_FLAGS = _effect_flags_of_names(
 They move or scale a spectral line as a whole.
 """
 
-TIME_DOMAIN_EFFECT_FLAGS = ~_effect_flags_of_names(
+TIME_DOMAIN_EFFECT_MASK = ~_effect_flags_of_names(
     [effect.name for effect in EFFECTS if effect.is_random or not effect.is_in_time_domain_truth]
 )
 """Effects that simulated time-domain records contain, one bit each."""
@@ -234,7 +234,7 @@ class StudySample(ABC):
         """
         point_index = self.point_indices[[sample_row]]
         planned_flags = self._plan_effect_flags(setting, point_index).effect_flags
-        effect_flags = planned_flags & TIME_DOMAIN_EFFECT_FLAGS
+        effect_flags = planned_flags & TIME_DOMAIN_EFFECT_MASK
         # Records contain range walk, whatever effects are named.
         time_domain, simulated = (
             self._collect_results(
@@ -276,7 +276,7 @@ class StudySample(ABC):
     def _thesis_effect_flags(self) -> np.uint32:
         """Effects of the study that the thesis's method can simulate, one bit each."""
         return (
-            _effect_flags_of_names(self.simulated_effects(AS_WRITTEN_SETTING)) & THESIS_EFFECT_FLAGS
+            _effect_flags_of_names(self.simulated_effects(AS_WRITTEN_SETTING)) & THESIS_EFFECT_MASK
         )
 
     def _run_setting(self, setting: AccuracySetting, point_indices: np.ndarray) -> Trial:

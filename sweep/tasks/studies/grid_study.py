@@ -24,7 +24,7 @@ from sweep.model.beamlet_counts import (
 )
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH
 from sweep.model.effects.catalogue import (
-    EFFECT_CATEGORY_PATHS,
+    EFFECT_SHARED_PARAMETER_PATHS,
     PARAMETER_DEFAULTS,
     SEPARATE_BATCHES_MASK,
     effect_flag_attributes,
@@ -269,7 +269,7 @@ class TileGrid(BlockGrid):
         return any(
             values.dtype.kind in "UO"
             or path in PARAMETERS_CONSTANT_IN_TILE
-            or path in EFFECT_CATEGORY_PATHS
+            or path in EFFECT_SHARED_PARAMETER_PATHS
             for path, values in self.grid.values_by_axis[axis].items()
         )
 

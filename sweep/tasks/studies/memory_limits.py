@@ -47,7 +47,7 @@ def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
     )
 
 
-def block_bytes_max(study: GridStudy | FlightStudy) -> int:
+def block_peak_bytes(study: GridStudy | FlightStudy) -> int:
     """Return the peak memory that a thread needs to compute and write one block [bytes]."""
     return point_memory_bytes(study.spec) + 2 * study.block_nbytes_max
 

@@ -372,7 +372,11 @@ class AccuracyRow:
         samples: np.ndarray,
         start_index: tuple[int, ...],
     ) -> None:
-        """Add the errors of points, the first of which is at ``start_index`` of the array."""
+        """Count points by their errors, tolerances and samples, and keep the worst point.
+
+        Points of unknown error are not counted. ``start_index`` is the index of the first point in
+        the stored array of errors, and ``samples`` are numbers of draws or rays.
+        """
         is_known = np.isfinite(errors)
         samples = np.where(is_known, np.nan_to_num(samples), 0)
         excess = np.where(is_known, errors - tolerances, -np.inf)
@@ -520,7 +524,7 @@ class Status:
     failures: dict[int, dict[str, Any]]  # last failure by block that is not done
     lock_holder: journal.LockHolder | None  # process that holds the lock
     is_lock_holder_alive: bool
-    draws_done: int  # number of draws if each point has a fixed number, else 0
+    draws_done: int  # number of draws done, of all points; 0 if the number varies by point
     bytes_stored: int  # size of all results as stored, or of all files of a packed copy
     points_per_second: float  # points per second in the last run; 0 if it committed nothing
     workers_in_last_run: int  # number of processes that computed in the last run

@@ -32,7 +32,7 @@ from sweep.tasks.studies.grid_study import (
     select_parameters,
 )
 from sweep.tasks.studies.memory_limits import (
-    block_bytes_max,
+    block_peak_bytes,
     refuse_too_large_blocks,
     refuse_too_large_point,
     refuse_too_large_scene,
@@ -229,7 +229,7 @@ def plan_study(
         busy_ratio=min(max(wall_seconds / cpu_seconds, 1.0), BUSY_RATIO_MAX),
         # with the model loaded, and for each block at work its results and their encoded copy
         memory_bytes=psutil.Process().memory_info().rss
-        + (1 if has_workers else n_parallel) * block_bytes_max(study),
+        + (1 if has_workers else n_parallel) * block_peak_bytes(study),
         scanners=scanners,
         scene_reports=scene_reports,
     )
@@ -445,13 +445,13 @@ def time_points(
     )
 
 
-class ShotTimes(NamedTuple):
+class TimedShots(NamedTuple):
     """Processor times of some shots."""
 
     n_shots: int
     """Number of shots."""
     casting_seconds: float
-    """Time of casting their rays [s]."""
+    """Time of casting the rays of all of them together [s]."""
     simulation_seconds: float
     """Time of simulating their draws [s], averaged over points of the axes."""
 
@@ -493,7 +493,7 @@ class _ScannerTimer:
             TIMED_CYCLE_SHOTS_MAX, self.n_shots_max
         )
 
-    def time_shots(self, n_shots: int) -> ShotTimes:
+    def time_shots(self, n_shots: int) -> TimedShots:
         """Time some shots. Return their number, and times of casting and of simulating [s].
 
         The time of simulating is that of ``n_draws`` draws, averaged over points of the axes.
@@ -518,7 +518,7 @@ class _ScannerTimer:
                 solves_navigation=self._takes_cycles,
             )
         simulation_seconds = (time.process_time() - cast_at) / len(self._flight_blocks)
-        return ShotTimes(len(shot_numbers), cast_at - start, simulation_seconds)
+        return TimedShots(len(shot_numbers), cast_at - start, simulation_seconds)
 
 
 def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
