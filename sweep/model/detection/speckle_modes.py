@@ -49,8 +49,8 @@ _NODE_DEVIATIONS_MAX = 4.5
 """Distance from the centre of the outermost line that represents a Gaussian density, in standard
 deviations of the density."""
 _FULL_REACH_LINE_DEVIATION_MAX = 3.0
-"""Largest standard deviation, in the unit in which LINE_DEVIATIONS is stated, for which tables reach
-two deviations beyond the main lobe."""
+"""Largest standard deviation for which tables reach two deviations beyond the main lobe, in the
+unit in which LINE_DEVIATIONS is stated."""
 
 
 class ModeTable(NamedTuple):
