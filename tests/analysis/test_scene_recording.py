@@ -197,3 +197,5 @@ def test_shots_are_computed_draw_by_draw_as_their_chunks_are_there(scene_store, 
         and strong.computed_shot_mask(all_shots, 2).all()
     )
     assert not weak.computed_shot_mask(slice(150, 160), 2).any()
+    n_rows = [weak.read_thinned_rows(["time"], 10**6, draw=draw).n_total for draw in (1, 2)]
+    assert n_rows == [316, 316 - 128]

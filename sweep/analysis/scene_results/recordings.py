@@ -296,7 +296,7 @@ class Recording:
                 names_read = list(dict.fromkeys([*names, "flags", "time"]))
                 column_arrays = self.point_columns(names_read, shot_slice, draw, ranges)
             else:
-                is_computed = self.computed_shot_mask(shot_slice)
+                is_computed = self.computed_shot_mask(shot_slice, draw)
                 names_read = list(dict.fromkeys([*names, "time"]))
                 column_arrays = {
                     name: self.shot_values(name, shot_slice)[is_computed] for name in names_read
