@@ -113,7 +113,7 @@ _VARIABLE_NAME_FIELD = _store_name_field(
 class FigureBase(SpecSection):
     """Base of all figures and tables."""
 
-    FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ("kind",)
+    FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ()
     """Names of the fields whose values make up the file name.
 
     Entries that name no field are used as they are.
@@ -129,7 +129,7 @@ class FigureBase(SpecSection):
 
     @property
     def file_stem(self) -> str:
-        """File name of the picture without suffix: `name`, or the values of `FILE_NAME_PARTS`."""
+        """File name of the picture without suffix: `name`, or `FILE_NAME_PARTS` and the kind."""
         words = [
             getattr(self, name_part, name_part) for name_part in (*self.FILE_NAME_PARTS, "kind")
         ]

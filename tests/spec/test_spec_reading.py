@@ -4,6 +4,7 @@ import yaml
 from base_spec import BASE_SPEC, changed_spec
 
 from sweep.spec import GridSpec, SpecError, load
+from sweep.spec.figure_sections import FalseAlarmTable
 
 
 def write(path, mapping):
@@ -209,3 +210,8 @@ def test_a_table_that_cannot_stand_for_the_chirp_is_refused_in_words(rows, words
 def test_a_table_is_no_axis():
     with pytest.raises(SpecError, match="one table for a whole study"):
         GridSpec.from_mapping(changed_spec(axes={TABLE: ["none"]}))
+
+
+def test_a_figure_without_a_name_is_saved_under_its_kind_once():
+    table = FalseAlarmTable(kind="false_alarm_table", by="power")
+    assert table.file_stem == "false_alarm_table"
