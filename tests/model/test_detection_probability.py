@@ -19,6 +19,7 @@ from sweep.model.detection.echo_detection import (
 )
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.effects.circulator_leak import ISOLATION_PATH, LEAK_LENGTH_PATH
+from sweep.model.spectrum import strongest_peak
 from sweep.model.spectrum.segment_spectra import evaluate_segments, iter_spans
 from sweep.model.waveform import SEARCH_BAND_PATHS
 
@@ -93,6 +94,12 @@ def test_a_permanent_line_masks_the_peak_and_pd_is_computed_on_demand(detection,
     assert (spans.pd[[0, 2], 1:] > 0).all()
     results = evaluate_segments(shots)  # the echo is there, though it is not detected
     assert (results.magnitude[[0, 2], 0] > 0).all() and np.isfinite(results.frequency).all()
+    # Nor does it lose to a larger peak what it does not have.
+    unmasked = without_pd._replace(peak_is_masked=np.zeros_like(without_pd.peak_is_masked))
+    lost = strongest_peak._span_probabilities(shots, without_pd, results.pd).pd_loss
+    lost_if_unmasked = strongest_peak._span_probabilities(shots, unmasked, results.pd).pd_loss
+    assert (lost_if_unmasked[spans.peak_is_masked] > 0).any()
+    np.testing.assert_array_equal(lost, np.where(spans.peak_is_masked, 0.0, lost_if_unmasked))
 
 
 def test_pd_given_other_segments_adds_up_to_pd():
