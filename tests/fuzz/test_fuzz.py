@@ -53,7 +53,7 @@ def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, mapping):
 
 def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder):
     @settings(FEW, max_examples=MANY // 3 or 5)
-    @given(written=flights(folder))
+    @given(mapping=flights(folder))
     def holds(mapping):
         (folder / "now.yaml").write_text(to_yaml(mapping), encoding="utf-8")
         check_flight(folder / "now.yaml")

@@ -150,7 +150,7 @@ def test_a_task_that_is_over_is_not_sent_again_before_its_answer_is_looked_at():
         def __init__(self, key, over=False):
             self.key, self.over = key, over
 
-        def finish(self):
+        def done(self):
             return self.over
 
         def add_done_callback(self, call):

@@ -733,7 +733,8 @@ def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) ->
     0.85
     """
     (a, b, c), (no_a, no_b, no_c) = probabilities, complements
-    return np.asarray(a * b * c + a * b * no_c + a * no_b * c + no_a * b * c)
+    probability = a * b * c + a * b * no_c + a * no_b * c + no_a * b * c
+    return np.minimum(probability, 1.0)  # rounding may exceed 1
 
 
 @njit(cache=True, error_model="numpy", borrows=True)

@@ -36,7 +36,8 @@ def leaking(table_4_1):
 def test_the_line_is_that_of_simulated_records(leaking, segment, sign, record):
     further_parameters = {"instrument.receiver.record": record}
     shots = prepare_single_category(
-        leaking(path=40.0, further=further_parameters, range=1500.0, fft_size=2**14), WITH
+        leaking(path=40.0, further_parameters=further_parameters, range=1500.0, fft_size=2**14),
+        WITH,
     )
     scale, line = permanent_line.line_of_point(shots, 0, segment)
     # By hand: 2 Re sqrt(P_lo P_tx / I) [A] by 7 kohm, two poles of 400 MHz, at S d / c.
@@ -108,7 +109,7 @@ def test_leaked_light_makes_shot_noise_and_the_beats_noise(leaking):
         "instrument.laser.relative_intensity_noise": 1e-15,
         "instrument.receiver.common_mode_rejection": 300.0,
     }  # fmt: skip
-    sources = prepare_single_category(leaking(further=laser), WITH).noise.variances
+    sources = prepare_single_category(leaking(further_parameters=laser), WITH).noise.variances
     light, volts = 1 / ISOLATION, 7e3**2
     assert sources["leak_shot"] == pytest.approx(2 * CHARGE * 1.1 * light * 4e8 * volts)
     power = (2 * 1.1) ** 2 * 1e-3 * light / 2  # of the beat [A^2]
@@ -201,7 +202,7 @@ def test_near_echoes_are_hidden_and_far_ones_are_not(leaking):
 def test_several_looks_next_to_a_line_of_no_power_detect_as_without_it(leaking, combine):
     """A line 250 dB down hides nothing, so that the looks' law is left as it is."""
     looks = {LOOKS_NUMBER_PATH: 8, LOOKS_COMBINE_PATH: combine, LOOKS_VOTES_PATH: 2}
-    parameters = leaking(isolation=1e25, range=12e3, radial_velocity=0.0, further=looks)
+    parameters = leaking(isolation=1e25, range=12e3, radial_velocity=0.0, further_parameters=looks)
     with_line, without = (
         evaluation.evaluate(parameters, effects) for effects in (WITH, DEFAULT_EFFECTS)
     )
@@ -215,6 +216,6 @@ def test_several_looks_next_to_a_line_of_no_power_detect_as_without_it(leaking, 
 def test_a_line_leaves_undetected_an_echo_just_outside_the_search_band(leaking):
     """The echo's strongest bin is outside, and bins of its main lobe are inside."""
     band = dict(zip(SEARCH_BAND_PATHS, (2000.3, 3000.0, -0.001, 0.001), strict=True))
-    parameters = leaking(isolation=1e25, range=2000.0, radial_velocity=0.0, further=band)
+    parameters = leaking(isolation=1e25, range=2000.0, radial_velocity=0.0, further_parameters=band)
     result = evaluation.evaluate(parameters, WITH)
     assert result["pd_up"] == 0 and result["miss_up"] == 1
