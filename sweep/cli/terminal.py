@@ -868,7 +868,7 @@ class PrintedMeasurement(NamedTuple):
     files: list[Location]
     """Store, figure and tables."""
     is_complete: bool
-    """Whether the user has not interrupted the measurement."""
+    """True if the user has not interrupted the measurement."""
 
 
 def print_accuracy_measurement(store: Location, *, has_results: bool) -> PrintedMeasurement:

@@ -23,7 +23,7 @@ from sweep.spec import GridSpec, SceneSpec, SpecError, from_stored
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
 
-FEW_EXAMPLES = settings(
+PROPERTY_TEST_SETTINGS = settings(
     derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
     phases=[Phase.generate], max_examples=8,
 )  # fmt: skip
@@ -98,7 +98,7 @@ def rounded(name, values):
         ("target.reflectance", (0.01, 0.4, 0.41, 1)),
     ],
 )
-@settings(FEW_EXAMPLES)
+@settings(PROPERTY_TEST_SETTINGS)
 @given(mapping=studies())
 def test_more_light_is_never_worse(path, factors, mapping):
     """SNR and pd of a segment rise with the echo E: SNR goes as E / (a + b E), as E^2 / (a + b E)
@@ -120,7 +120,7 @@ def test_more_light_is_never_worse(path, factors, mapping):
         assert not falls(*rounded(name, results[name])), (name, results[name])
 
 
-@settings(FEW_EXAMPLES)
+@settings(PROPERTY_TEST_SETTINGS)
 @given(mapping=studies())
 def test_a_higher_threshold_detects_less_and_alarms_less(mapping):
     mapping = steady(mapping)
@@ -134,7 +134,7 @@ def test_a_higher_threshold_detects_less_and_alarms_less(mapping):
         assert not falls(*rounded(name, values)), name
 
 
-@settings(FEW_EXAMPLES)
+@settings(PROPERTY_TEST_SETTINGS)
 @given(mapping=studies())
 def test_without_movement_up_and_down_chirp_are_alike(mapping):
     """Their beats then are range beats of either sign. Phases differ by the carriers, so that it
@@ -156,7 +156,7 @@ def test_without_movement_up_and_down_chirp_are_alike(mapping):
     assert np.isnan(error) or abs(error) < 1e-9  # rounding, where three beats are fitted
 
 
-@settings(FEW_EXAMPLES)
+@settings(PROPERTY_TEST_SETTINGS)
 @given(mapping=studies())
 def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(mapping):
     mapping = without_rejected_parts(mapping)
@@ -173,7 +173,7 @@ def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(mapping):
         )
 
 
-@settings(FEW_EXAMPLES)
+@settings(PROPERTY_TEST_SETTINGS)
 @given(mapping=studies(), seed=st.integers(0, 2**63), blocks=st.integers(1, 7))
 def test_neither_seed_nor_blocks_change_what_is_not_random(mapping, seed, blocks):
     mapping = without_rejected_parts(mapping)
@@ -247,7 +247,7 @@ def seen_in(instrument, turn=0.0, shift=(0.0, 0.0, 0.0)):
     )
 
 
-@settings(FEW_EXAMPLES, max_examples=6)
+@settings(PROPERTY_TEST_SETTINGS, max_examples=6)
 @given(
     turn=st.floats(-4, 4).map(lambda x: round(x, 3)),
     shift=st.tuples(*[st.integers(-100_000, 100_000)] * 3),

@@ -505,7 +505,7 @@ def describe_common_shots(differences: xr.Dataset) -> str:
 
 
 class AgreementVerdict(NamedTuple):
-    """Whether two stores agree."""
+    """True if two stores agree."""
 
     verdict: Literal["same", "different", "nothing"]
     """``same`` if all probabilities of detection agree, ``different`` if one does not, and
