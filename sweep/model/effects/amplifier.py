@@ -17,9 +17,9 @@ of it. M is the detector's gain and Re its responsivity. The emission takes two 
 - **With the transmitted light.** A circulator of isolation I, a window or a splice sends 1 / I of
   the transmitted light, and of its emission, onto the detector. P is the part eta P_lo that mixes,
   and N' = N / I. A balanced receiver sees this beat in full.
-- **With the local oscillator**, if that is tapped behind the amplifier. N' = N P_lo / P_sent, and
-  the emission beats on each diode as a fluctuation of the local oscillator does, of a relative
-  intensity noise of 4 N / P_sent. The common-mode rejection divides it.
+- **With the local oscillator**, if that is tapped behind the amplifier. Then N' = N P_lo / P_sent.
+  On each diode the emission acts like a relative intensity noise of the local oscillator, of 4 N /
+  P_sent. The common-mode rejection divides it.
 
 Emission that returns with the echo is neglected: it is below the echo's own beat by P_sent / (2 N
 B_e), some 60 dB before the FFT. The beat of emission with itself is neglected too; it is lower by N

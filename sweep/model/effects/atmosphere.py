@@ -3,8 +3,7 @@
 The extinction coefficient alpha [1/m] is a table over height above the ground. Between two heights
 it is exponential (linear if one end is 0). Below the first height it is constant, above the last it
 is 0. An exponential atmosphere is thus a table of two rows, and its optical depth has a closed
-form. The path is straight and the ground level, which holds for paths short against a planet's
-radius.
+form. Paths are straight and the ground is level: they are short against the planet's radius.
 
 Sources of the tables:
 
@@ -42,7 +41,7 @@ from sweep.model.link_budget import BEAM_ELEVATION_PATH, LASER_PREFIX, TELESCOPE
 from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
 
-_HEIGHT_DIFFERENCE_MIN = 1e-9
+_PATH_HEIGHT_DIFFERENCE_MIN = 1e-9
 """Smallest difference of height [m] between the ends of a path. Paths that are more level count as
 having this difference, so that the mean extinction over height is defined."""
 
@@ -165,7 +164,7 @@ def optical_depth(
     low, high = np.minimum(*end_heights), np.maximum(*end_heights)
     # At great heights, where float64 cannot resolve this difference, the smallest that it can.
     difference_min = np.maximum(
-        _HEIGHT_DIFFERENCE_MIN, 4 * np.spacing(np.maximum(np.abs(low), np.abs(high)))
+        _PATH_HEIGHT_DIFFERENCE_MIN, 4 * np.spacing(np.maximum(np.abs(low), np.abs(high)))
     )
     widening = np.maximum(difference_min - (high - low), 0.0) / 2
     low, high = low - widening, high + widening
@@ -211,7 +210,7 @@ def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfil
     return EXTINCTION_PROFILES.get(name)
 
 
-def path_heights(
+def path_end_heights(
     parameters: Mapping[str, np.ndarray], range: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the heights of lidar and target above the ground [m], (n,) each."""
@@ -226,7 +225,7 @@ def _path_geometry(
     parameters: Mapping[str, np.ndarray], range: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return heights and length of the path, as arguments of :func:`optical_depth`."""
-    lidar_height, target_height = path_heights(parameters, range)
+    lidar_height, target_height = path_end_heights(parameters, range)
     return {"start_height": lidar_height, "end_height": target_height, "range": range}
 
 
@@ -335,10 +334,10 @@ EXTINCTION = Effect(
 
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(16)
-_SPLIT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
-"""Positions at which the backscatter integral is split between two rows of the extinction table.
-The unit is one e-folding of the extinction between these rows."""
-_SPLIT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
+_INTEGRAL_SPLIT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
+"""Positions between two rows of the extinction table at which the backscatter integral is split.
+The unit is one e-folding of the extinction."""
+_INTEGRAL_SPLIT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
 """Ranges at which the backscatter integral splits the path, in units of the near range (aperture
 diameter over full angle of the field of view)."""
 
@@ -365,8 +364,8 @@ def backscatter_integral(
     Returns
     -------
     ndarray
-        Integral of alpha(r) T(r)^2 / (r^2 + r_0^2) over 0..R [1/m^2], to 1e-8, with the one-way
-        transmission T(r) to the range r.
+        Integral of alpha(r) T(r)^2 / (r^2 + r_0^2) over 0..R [1/m^2], with a relative error of
+        1e-8. T(r) is the one-way transmission to the range r.
 
     Notes
     -----
@@ -389,12 +388,12 @@ def backscatter_integral(
         np.expand_dims(column, -1) for column in np.broadcast_arrays(*columns)
     )
     height_difference = target_height - lidar_height
-    crossing_fraction = (_integration_heights(profile) - lidar_height) / np.where(
+    crossing_fraction = (_integral_split_heights(profile) - lidar_height) / np.where(
         height_difference == 0, np.inf, height_difference
     )
     inner_cuts = [
         np.clip(crossing_fraction, 0, 1) * target_range,
-        np.minimum(np.asarray(_SPLIT_RANGE_RATIOS) * near_range, target_range),
+        np.minimum(np.asarray(_INTEGRAL_SPLIT_RANGE_RATIOS) * near_range, target_range),
     ]
     cuts = np.sort(
         np.concatenate([np.zeros_like(target_range), *inner_cuts, target_range], axis=-1), axis=-1
@@ -414,7 +413,7 @@ def backscatter_integral(
     return np.asarray(total / near_range[..., 0])
 
 
-def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
+def _integral_split_heights(profile: ExtinctionProfile) -> np.ndarray:
     """Return the heights [m] at which the backscatter integral is split.
 
     Between two of them extinction is smooth and falls by at most a few factors of e.
@@ -424,7 +423,9 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
     for (z0, a0), (z1, a1) in itertools.pairwise(rows):
         e_foldings = abs(math.log(a1 / a0)) if a0 > 0 and a1 > 0 else 0.0
         steps = [
-            e_folding / e_foldings for e_folding in _SPLIT_E_FOLDINGS if e_folding < e_foldings
+            e_folding / e_foldings
+            for e_folding in _INTEGRAL_SPLIT_E_FOLDINGS
+            if e_folding < e_foldings
         ]
         cuts += [z0 + step * (z1 - z0) if a1 < a0 else z1 - step * (z1 - z0) for step in steps]
         cuts.append(z1)
@@ -434,7 +435,7 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
 def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
     """Return the power [W] of light that the air returns to the detector.
 
-    The power follows from :func:`backscatter_integral`.
+    ``integral`` [1/m^2] is that of :func:`backscatter_integral`.
     """
     collected_power = parameters[LASER_PREFIX + "power"] * aperture_area(
         beam.receiving_aperture_and_angle(parameters)[0]
@@ -467,12 +468,12 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     )
 
 
-def backscatter_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return a bound on the shot noise of backscattered light, over the receiver's noise.
+def backscatter_error_bound(points: PlannerInputs) -> ErrorBound | None:
+    """Return a bound on the shot noise of backscattered light, relative to the receiver's noise.
 
     The threshold is set on noise that includes this shot noise. The bound is the smaller of two.
-    The first takes the path as filled with the air of its lower end, without extinction. The second
-    returns all light that is lost on the path from the beam's near end.
+    The first assumes that the air of the path's lower end fills the path, without extinction. The
+    second assumes that all light lost on the path returns from the beam's near end.
     """
     parameters = points.parameters
     profile = extinction_profile(parameters)
@@ -500,7 +501,7 @@ BACKSCATTER = Effect(
     name="backscatter",
     description="shot noise of light that the air sends back",
     stage="noise",
-    error_bound=backscatter_bound,
+    error_bound=backscatter_error_bound,
     apply=apply_backscatter,
     parameters=(
         Parameter(

@@ -10,20 +10,20 @@ oscillator and S the chirp rate.
   echo does. Its photocurrent is i = 2 M Re sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0
   in the Doppler segment. Its phase drifts with the path's temperature.
 - **Shot noise** 2 q M^2 F Re P_tx / I B_e.
-- **Intensity noise**. A balanced receiver rejects that of the light, but not that of the beat. The
-  variance is RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2). RIN is the laser's relative
-  intensity noise, CMRR the common-mode rejection, and P_l = P_tx / I.
+- **Intensity noise**. A balanced receiver rejects the noise of the light, but not that of the
+  beat. The variance is RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2). RIN is the laser's
+  relative intensity noise, CMRR the common-mode rejection, and P_l = P_tx / I.
 - **Phase noise** of a Lorentzian laser of width v. The beat carries theta(t) - theta(t - tau), of
-  density 4 v sin^2(pi f tau) / (pi f^2), which is 4 pi v tau^2 for f << 1 / tau [1]_. A line turns
-  it into noise of i^2 / 2 times that density. It is assumed to be white within B_e, and at most 2
-  pi v tau in total.
+  density 4 v sin^2(pi f tau) / (pi f^2), which is 4 pi v tau^2 for f << 1 / tau [1]_. The line
+  turns this phase into noise, of i^2 / 2 times that density. The noise is assumed to be white
+  within B_e, and at most 2 pi v tau in total.
 
 The line begins at its own delay tau, as an echo does (:mod:`sweep.model.effects.overlap`): a path
 of a metre takes 3 ns of a record that begins with the chirp. With overlap off the line fills the
 record.
 
-Neglected are saturation of the ADC by the line, the line's own image of I and Q, and skirts of echo
-and line that together raise one bin. The spectrum of
+Three things are neglected: saturation of the ADC by the line, the line's image due to I/Q
+imbalance, and bins that only the skirts of echo and line together raise. The spectrum of
 :func:`sweep.model.spectrum.segment_spectra.segment_spectrum` is that of the echo alone.
 
 References

@@ -4,8 +4,8 @@ v_r is the radial velocity and lambda the wavelength. Without the shift, nothing
 velocity, whatever the detection probability. The shift is skipped only if lines would not move by a
 significant fraction of a bin. Let v_perp be the velocity across the beam and div the beam's
 divergence. The spread matters if 2/lambda |v_perp| div is not small against a bin (100 m/s across
-and 50 urad: 1.4 bins of 4.6 kHz). So does v (1 - cos theta), for a velocity v along a wide beam and
-the angle theta from its axis.
+and 50 urad: 1.4 bins of 4.6 kHz). In a wide beam, a velocity v along the beam spreads lines as
+well, by v (1 - cos theta) at the angle theta from the axis.
 
 The surface of a rotating body moves with V + omega x (P - X) at the point P, with the velocity V of
 the body's centre X and the angular velocity omega. A beamlet from O along d_b meets it at the range
@@ -35,7 +35,7 @@ OMITTED_SHIFT_MAX_BINS = 0.1
 counts as an error of 1, so that the effect is always simulated."""
 
 
-def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
+def doppler_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if the lines' Doppler shift is omitted.
 
     Notes
@@ -47,12 +47,12 @@ def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if not points.any_nonzero("target.radial_velocity"):
         return None
-    return line_shift_bound(
+    return line_shift_error_bound(
         points, np.abs(points.target.radial_velocity) * points.bins_per_velocity
     )
 
 
-def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBound:
+def line_shift_error_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBound:
     """Return a bound on the change of the largest bin due to a common shift of all lines.
 
     Parameters
@@ -76,14 +76,16 @@ def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBoun
     coherent_change: np.ndarray | float = 0.0
     if points.waveform.architecture != "direct":
         near_change = magnitude_change_from_power(
-            points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins)
+            points.peak_power_change_bound(NO_SPREAD, points.line_spread, shift_bins)
         )
         magnitude_change = np.where(is_far, 0.0, near_change)
     if points.adds_amplitudes:
         stretched_shift_bins = shift_bins * (
             1 + points.line_spread.largest_magnitude
         )  # the Doppler ratio scales range beats as well
-        coherent_change = np.where(is_far, 0.0, points.coherent_sum_bound(stretched_shift_bins))
+        coherent_change = np.where(
+            is_far, 0.0, points.coherent_sum_change_bound(stretched_shift_bins)
+        )
     return ErrorBound(
         magnitude_change=magnitude_change,
         coherent_sum_change=coherent_change,
@@ -106,33 +108,34 @@ DOPPLER = Effect(
     name="doppler",
     description="shift of all lines by the radial velocity",
     stage="lines",
-    error_bound=doppler_bound,
+    error_bound=doppler_error_bound,
     apply=apply_doppler,
 )
 """Effect that shifts all lines of an echo by the radial velocity on the beam's axis."""
 
 
-def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
+def doppler_spread_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if all beamlets have one velocity.
 
     Notes
     -----
     Let v_b be the radial velocity of beamlet b, and v_0 that on the axis. The bound follows from
-    mean and rms of the lines' shifts 2 (v_b - v_0) / lambda
-    (:meth:`~sweep.model.effects.planner_inputs.PlannerInputs.power_change_bound`). If beamlets add
-    as amplitudes, the bound is relative to their sum in phase and follows from the largest shift.
+    mean and rms of the lines' shifts 2 (v_b - v_0) / lambda. If beamlets add as amplitudes, the
+    bound is relative to their sum in phase and follows from the largest shift.
     """
-    velocity_spread = points.velocity_spread
-    if not np.any(velocity_spread.largest_magnitude):
+    line_spread_by_velocity = points.line_spread_by_velocity
+    if not np.any(line_spread_by_velocity.largest_magnitude):
         return None
     coherent_change = (
-        points.coherent_sum_bound(velocity_spread.largest_magnitude)
+        points.coherent_sum_change_bound(line_spread_by_velocity.largest_magnitude)
         if points.adds_amplitudes
         else 0.0
     )
     if points.waveform.architecture == "direct":
         return ErrorBound(coherent_sum_change=coherent_change)
-    power_change = points.power_change_bound(velocity_spread, points.range_spread)
+    power_change = points.peak_power_change_bound(
+        line_spread_by_velocity, points.line_spread_by_range
+    )
     return ErrorBound(
         magnitude_change=magnitude_change_from_power(power_change),
         coherent_sum_change=coherent_change,
@@ -150,7 +153,7 @@ def apply_doppler_spread(shots: Shots, context: EffectContext) -> Shots:
     doppler_ratios = context.ground.beamlets.doppler_ratio_offset
     if shots.footprint.doppler_ratio_offset.shape != doppler_ratios.shape:
         return shots
-    doppler_ratios = context.select_beamlets(
+    doppler_ratios = context.select_beamlet_values(
         "doppler_spread",
         shots.footprint.row_of_point,
         doppler_ratios,
@@ -163,7 +166,7 @@ DOPPLER_SPREAD = Effect(
     name="doppler_spread",
     description="radial velocities that differ over the footprint",
     stage="lines",
-    error_bound=doppler_spread_bound,
+    error_bound=doppler_spread_error_bound,
     apply=apply_doppler_spread,
     uses_beamlet_velocities=True,
     needs_separate_batches=False,
@@ -183,7 +186,7 @@ DOPPLER_SPREAD = Effect(
 """Effect that gives each beamlet of a footprint the Doppler shift of its own radial velocity."""
 
 
-def rotation_bound(points: PlannerInputs) -> ErrorBound | None:
+def rotation_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return an error of 1 if any body of the scene rotates, else None.
 
     The effect is thus kept wherever it is present. The velocities of rotating surfaces are part of
@@ -196,6 +199,6 @@ ROTATION = Effect(
     name="rotation",
     description="surfaces of turning bodies",
     stage="lines",
-    error_bound=rotation_bound,
+    error_bound=rotation_error_bound,
 )
 """Effect of rotating bodies; their surface velocities are part of the scene."""

@@ -49,8 +49,8 @@ class Parameter:
     """True if the value is a table over time, given as text
     (:mod:`sweep.model.effects.sweep_error_table`)."""
     can_cause_effect: bool = True
-    """True if the effect is absent unless this parameter, or another with this flag, differs from
-    its default."""
+    """True if a value other than the default can make the effect present. The effect is absent if
+    all parameters with this flag have their defaults."""
     is_category_key: bool = False
     """True if only points with an equal value can be computed together. This always holds for text
     fields, whatever the flag."""
@@ -88,11 +88,11 @@ class EffectContext(NamedTuple):
     def effect_mask(self, effect: str) -> np.ndarray | float:
         """Return the mask of a named effect, (n,): 1 for points that have it, 0 for others.
 
-        If all points are alike, the result is a single number.
+        The result is the number 1.0 if all points have the effect.
         """
         return self.masks_by_effect.get(effect, 1.0)
 
-    def select_beamlets(
+    def select_beamlet_values(
         self, effect: str, row: np.ndarray, with_effect: np.ndarray, without_effect: np.ndarray
     ) -> np.ndarray:
         """Select values of beamlets by the presence of an effect.
@@ -102,7 +102,7 @@ class EffectContext(NamedTuple):
         effect : str
             Name of the effect.
         row : ndarray (n,)
-            Row of each point.
+            Row of each point's footprint in the values.
         with_effect, without_effect : ndarray (rows, beamlets)
             Values with and without the effect.
 
@@ -124,18 +124,18 @@ class DrawAddresses(NamedTuple):
     point_keys: np.ndarray
     """(n, 2) uint64: key of each point's own random stream."""
     draw_numbers: np.ndarray
-    """(n,) int64: number of each point's draw, that is of one realisation of all that is random."""
+    """(n,) int64: number of each point's draw (realisation of everything random)."""
     are_grouped: bool = False
     """True if consecutive draws of a point form groups over which random numbers are spread evenly
     (:mod:`sweep.model.sampling.draw_groups`); False for independent draws."""
 
     def uniforms(self, stream: int, count: int, *, are_polar: bool = False) -> np.ndarray:
-        """Return the first uniform numbers of a stream in each draw.
+        """Return the first ``count`` uniform random numbers of a stream, for each draw.
 
         Parameters
         ----------
         stream : int
-            Number of the stream, that is of the physical cause.
+            Number of the random stream; each physical cause has its own.
         count : int
             Number of uniform numbers.
         are_polar : bool
@@ -214,7 +214,7 @@ class Effect:
 
     @property
     def is_random(self) -> bool:
-        """True if the effect is simulated by random draws, and not once for all."""
+        """True if the effect changes parameters or shots at random, draw by draw."""
         return self.perturb_parameters is not None or self.perturb_shots is not None
 
     def is_absent(self, parameters: Parameters) -> np.ndarray:

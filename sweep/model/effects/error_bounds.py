@@ -18,7 +18,7 @@ class ErrorBound(NamedTuple):
     nothing is known of |X|."""
     coherent_sum_change: ArrayOrFloat = 0.0
     """Further change of |X| in the largest bin, as a fraction of the sum of all amplitudes in
-    phase. It serves sums of amplitudes that may cancel, which have no relative change."""
+    phase. It is for amplitudes that may cancel, whose sum has no bounded relative change."""
     noise_variance_change: ArrayOrFloat = 0.0
     """Relative change of a bin's noise variance if the effect is omitted."""
     threshold_follows_noise: bool = True
@@ -31,8 +31,8 @@ class ErrorBound(NamedTuple):
     """Change of log10 of a shot's false-alarm probability if the effect is omitted. It is due to
     bins that the effect moves across the threshold."""
     leaking_bin_change_sigma: ArrayOrFloat = 0.0
-    """Change of |X| in bins with signal from sidelobes, in units of the noise per quadrature. It
-    adds to their part of the largest bin's change."""
+    """Further change of |X| in bins with leaked signal (from sidelobes), in units of the noise per
+    quadrature. It is added to the change that these bins share with the largest bin."""
     probability_change: ArrayOrFloat = 0.0
     """Change of a probability (of detection or false alarm) if the effect is omitted, 0..1. Values
     by segment are summed."""

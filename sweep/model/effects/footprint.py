@@ -21,7 +21,7 @@ from sweep.model.preparation import Shots
 from sweep.model.shot_settings import CHIRP_PREFIX
 
 
-def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
+def axis_surface_line_spread(points: PlannerInputs) -> OffsetMoments:
     """Return moments of the lines' offsets [FFT bins] from the line on the beam's axis.
 
     The offsets are due to the ranges of beamlets on the surface that the axis meets.
@@ -31,7 +31,7 @@ def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
     )
 
 
-def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
+def footprint_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if the echo is one line on the axis.
 
     Notes
@@ -43,7 +43,7 @@ def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if points.n_beamlets == 1:
         return None
-    power_change = points.power_change_bound(axis_surface_spread(points), NO_SPREAD)
+    power_change = points.peak_power_change_bound(axis_surface_line_spread(points), NO_SPREAD)
     echo_change = 2 * np.abs(points.footprint_extent.total_echo_ratio - 1)
     if points.waveform.architecture != "direct":
         return ErrorBound(magnitude_change=magnitude_change_from_power(power_change + echo_change))
@@ -89,7 +89,7 @@ FOOTPRINT = Effect(
     name="footprint",
     description="beamlets at ranges of their own",
     stage="lines",
-    error_bound=footprint_bound,
+    error_bound=footprint_error_bound,
     apply=apply_footprint,
     parameters=(
         Parameter(
@@ -106,7 +106,7 @@ FOOTPRINT = Effect(
 """Effect that gives each beamlet (ray of the beam) its own range and echo."""
 
 
-def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
+def coherent_footprint_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin due to optical phases of beamlets.
 
     Lines with these phases may cancel or amplify each other.
@@ -123,7 +123,7 @@ def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
     if not points.adds_field_amplitudes:
         return None
     if points.n_beamlets == 1:
-        return image_and_leakage.image_bound(points)
+        return image_and_leakage.image_error_bound(points)
     return ErrorBound(magnitude_change=points.footprint_extent.amplitude_gain_max)
 
 
@@ -148,14 +148,14 @@ FOOTPRINT_PHASE = Effect(
     name="footprint_phase",
     description="optical phases of a smooth surface",
     stage="lines",
-    error_bound=footprint_phase_bound,
+    error_bound=coherent_footprint_error_bound,
     apply=apply_footprint_phase,
     parent="footprint",
 )
 """Effect that adds beamlets as complex amplitudes, with the optical phases of a smooth surface."""
 
 
-def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
+def several_returns_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if all surfaces are at one range.
 
     The common range is the one on the beam's axis. The result is None if all power is on the
@@ -181,7 +181,7 @@ def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
     line_distance_bins = (
         points.footprint_extent.off_axis_range_offset_max * points.bins_per_relative_range
     )
-    power_min = points.peak_power_bounds_for_spread(axis_surface_spread(points)).power_min
+    power_min = points.peak_power_bounds_for_spread(axis_surface_line_spread(points)).power_min
     gain_ratio_max = np.minimum(
         np.exp(np.minimum(points.gain_slope_max * line_distance_bins, 50.0)),
         1 / points.transfer_gain**2,
@@ -210,7 +210,7 @@ def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
         or shots.footprint.relative_range_offset.shape != range_offset.shape
     ):
         return shots
-    range_offset = context.select_beamlets(
+    range_offset = context.select_beamlet_values(
         "several_returns",
         shots.footprint.row_of_point,
         range_offset,
@@ -223,7 +223,7 @@ SEVERAL_RETURNS = Effect(
     name="several_returns",
     description="more than one surface in a footprint",
     stage="lines",
-    error_bound=several_returns_bound,
+    error_bound=several_returns_error_bound,
     apply=apply_several_returns,
     parent="footprint",
     needs_separate_batches=False,

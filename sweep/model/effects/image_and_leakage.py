@@ -7,7 +7,8 @@ conjugated, W(k + nu). Past Nyquist the visible line is itself an image. Without
 transform of the folded line is summed, where it is visible. The effect acts on the spectrum. Its
 error bound follows from the envelope E of the window's sidelobes. Let all light of a line, wherever
 footprint and record put it, be at least e bins from the edge (DC or Nyquist). Then bins within e/2
-have images of at most E(3/2 e), and all others at most E(e/2) + E(e).
+of the light have images of at most E(3/2 e). All other bins have at most E(e/2) from the lines and
+E(e) from the images.
 
 A bin at the threshold, far down the lines' sidelobes, is much smaller than the largest bin. An
 image too small to change the largest bin may still move it across the threshold. It then joins the
@@ -19,7 +20,7 @@ lie there with a probability of x d.
 **Leakage**: further groups of bins that cross the threshold because of signal in sidelobes. A group
 is a run of adjacent bins above the threshold.
 
-Leakage changes no detecting bin, and so no detection probability, but ``p_leakage``. It acts on the
+Leakage changes ``p_leakage``, but no detecting bin, and so no detection probability. It acts on the
 detection: without the effect only bins of the echo's groups are evaluated. By the union bound, with
 Marcum's Q_1,
 
@@ -29,8 +30,8 @@ over the bins that may leak. A is the magnitude of all lines together and b the 
 the noise per quadrature. E_k is the largest relative |W| at the distances that light may have from
 bin k. The detecting bin and its neighbours are excluded. By Parseval's theorem the bins together
 have at most ENBW (the window's equivalent noise bandwidth in bins) times the power A^2, and the
-probability rises faster than a^2. So the sum is at most ENBW times that of
-one bin of A, or A^2 / b^2 times that of one at the threshold.
+probability rises faster than a^2. So the sum is at most ENBW times the probability of one bin with
+all of A; or, if A is above b, ENBW A^2 / b^2 times that of one bin at the threshold.
 
 References
 ----------
@@ -55,14 +56,14 @@ from sweep.model.window import get_window
 from sweep.model.window_response import window_response
 
 _LN_10 = math.log(10)
-_RATIO_MAX = 1e12
+_SIGNAL_RATIO_MAX = 1e12
 """Upper limit of signals over the noise per quadrature, which avoids overflow."""
-_EXPECTED_BINS_MIN = 1e-4
+_EXPECTED_MOVED_BINS_MIN = 1e-4
 """Limit on the expected number of a shot's bins that images may move across the threshold. Fewer
 bins are neglected."""
 
 
-def image_bound(points: PlannerInputs) -> ErrorBound | None:
+def image_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if images are omitted.
 
     Complex records have no images.
@@ -76,22 +77,25 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if points.shared_option(RECORD_PATH) == "complex":
         return None
-    log10_pfa_change, bins_to_image = _log10_pfa_change(points), points.bins_to_image
-    leaking_bin_change = _leaking_bin_change(points)
+    log10_pfa_change, bins_from_light_to_edge = (
+        _image_log10_pfa_change(points),
+        points.bins_from_light_to_edge,
+    )
+    leaking_bin_change = _image_leaking_bin_change(points)
     if points.adds_amplitudes:
         return ErrorBound(
-            coherent_sum_change=points.image_bound,
+            coherent_sum_change=points.image_magnitude_bound,
             log10_pfa_change=log10_pfa_change,
             leaking_bin_change_sigma=leaking_bin_change,
         )
-    power_min = points.power_min_with_missing_samples(
+    power_min = points.peak_power_min_with_missing_samples(
         points.peak_power_bounds.power_min
         / (1 + 2 * points.phase_error_shift_bins / points.padding_factor)
     )
-    response_outside = points.magnitude_max_beyond(bins_to_image)
+    response_outside = points.magnitude_max_beyond(bins_from_light_to_edge)
     response_inside, response_beyond = (
-        points.magnitude_max_beyond(1.5 * bins_to_image),
-        points.magnitude_max_beyond(0.5 * bins_to_image),
+        points.magnitude_max_beyond(1.5 * bins_from_light_to_edge),
+        points.magnitude_max_beyond(0.5 * bins_from_light_to_edge),
     )
     power_elsewhere = response_beyond * response_beyond + response_outside * response_outside
     image_power = (
@@ -105,38 +109,38 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
     )
 
 
-def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
-    """Return a bound on the change of leaked signal's false peaks due to images.
+def _image_leaking_bin_change(points: PlannerInputs) -> np.ndarray:
+    """Return a bound on the change of |X| due to images in bins with leaked signal [noise sigma].
 
-    Lines add as powers. The bound is that on the change of one bin at the threshold, or of all
-    bins, whichever is larger. For small amplitudes a, bins cross with probabilities of y e^-y a^2 /
-    2, with y = b^2 / 2 and the threshold b, all over the noise per quadrature. Images fall at least
-    as the inverse distance from ``bins_to_image`` on. All bins together thus have ``bins_to_image``
-    times the a^2 of the nearest.
+    Lines add as powers. The bound is the larger of two: the change of one bin at the threshold, and
+    a change of one bin that stands for those of all bins. For small amplitudes a, bins cross with
+    probabilities of y e^-y a^2 / 2, with y = b^2 / 2 and the threshold b, all over the noise per
+    quadrature. Let d be ``bins_from_light_to_edge``. Beyond d, images fall at least as the inverse
+    distance. All bins together thus have d times the a^2 of the nearest.
     """
     image_ratio = (
         points.line_magnitude_over_sigma
         * points.footprint_extent.amplitude_gain_max
-        * points.magnitude_max_beyond(points.bins_to_image)
+        * points.magnitude_max_beyond(points.bins_from_light_to_edge)
     )
     squared_ratio, threshold_ratio = (
-        np.minimum(image_ratio, _RATIO_MAX) ** 2,
+        np.minimum(image_ratio, _SIGNAL_RATIO_MAX) ** 2,
         points.threshold_ratio,
     )
     y = 0.5 * threshold_ratio * threshold_ratio
     single_bin_change = np.minimum(squared_ratio / threshold_ratio, np.sqrt(squared_ratio))
     return np.maximum(
         single_bin_change,
-        0.5 * squared_ratio * points.bins_to_image * np.minimum(y / np.expm1(y), 1.0),
+        0.5 * squared_ratio * points.bins_from_light_to_edge * np.minimum(y / np.expm1(y), 1.0),
     )
 
 
-def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
+def _image_log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     """Return a bound on the change of log10 of a shot's false-alarm probability due to images.
 
     Images move bins across the threshold, which then count as part of an echo or no longer do. The
-    bound is that of the expected number of such bins, and at least of one. It is 0 if fewer than
-    ``_EXPECTED_BINS_MIN`` are expected.
+    bound counts the expected number of such bins, but at least one bin. It is 0 if fewer than
+    ``_EXPECTED_MOVED_BINS_MIN`` bins are expected.
     """
     if points.shared_option(PROCESSING_PREFIX + "bins_counted") == "all":
         return 0.0
@@ -164,8 +168,10 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
         )
     moved_fraction: np.ndarray | float = 0.0
     for distance in (
-        np.maximum(2 * points.bins_to_image - threshold_distance, points.bins_to_image),
-        2 * points.bins_to_image + threshold_distance,
+        np.maximum(
+            2 * points.bins_from_light_to_edge - threshold_distance, points.bins_from_light_to_edge
+        ),
+        2 * points.bins_from_light_to_edge + threshold_distance,
     ):
         threshold_fraction = np.minimum(
             total_ratio * points.magnitude_max_beyond(distance) / points.threshold_ratio, 1.0
@@ -179,7 +185,7 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     expected_bins = (moved_fraction * reach_bins)[chirp_slice].sum(axis=0)
     bins_left = np.maximum(nyquist_bin - 2 * reach_bins[chirp_slice].max(axis=0) - 4, 1.0)
     return np.where(
-        expected_bins > _EXPECTED_BINS_MIN,
+        expected_bins > _EXPECTED_MOVED_BINS_MIN,
         np.maximum(expected_bins, 1.0) / (_LN_10 * bins_left),
         0.0,
     )
@@ -200,25 +206,25 @@ IMAGE = Effect(
     name="image",
     description="lines at negative frequencies, near DC and Nyquist",
     stage="spectrum",
-    error_bound=image_bound,
+    error_bound=image_error_bound,
     apply=apply_image,
 )
 """Effect that adds the images of lines, at negative frequencies, in bins of real records."""
 
 
-_TABULATED_REACH_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
+_TABULATED_LIGHT_SHIFTS_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
 """Largest shifts of light from its line [bins]. There is a table of leakage bounds for each of
 them."""
 _ROWS_PER_OCTAVE, _OCTAVE_MIN, _OCTAVE_MAX = 2, -8, 30
 """Rows of tables of leakage bounds: number per octave, and first and last octave, of the magnitude
 of all lines over the threshold."""
-_THRESHOLD_STEP = 1.04
+_THRESHOLD_TABLE_STEP_FACTOR = 1.04
 """Ratio of the thresholds of successive tables of leakage bounds. Each threshold uses the table of
 the next lower tabulated one."""
 _SINGLE_BINS, _FAR_STRETCHES = 48, 24
-"""Numbers in the bound of leakage: that of bins near the line that count singly, and that of the
-intervals that hold all bins farther away."""
-_IMAGE_FACTOR = 1.1
+"""Number of bins near the line that count singly in the bound of leakage, and number of intervals
+that hold all bins farther away."""
+_DISTANT_IMAGE_FACTOR = 1.1
 """Factor on sidelobes far from DC and Nyquist, which allows for the images that add to them. Near
 DC and Nyquist the factor is 2."""
 
@@ -233,7 +239,7 @@ def leakage_bound(points: PlannerInputs) -> ErrorBound:
     ratio_to_threshold = (
         points.line_magnitude_over_sigma
         * points.footprint_extent.amplitude_gain_max
-        * np.where(is_near_image, 2.0, _IMAGE_FACTOR)
+        * np.where(is_near_image, 2.0, _DISTANT_IMAGE_FACTOR)
         / threshold_ratio
     )
     ratio_to_threshold = np.where(np.isnan(ratio_to_threshold), np.inf, ratio_to_threshold)
@@ -242,24 +248,24 @@ def leakage_bound(points: PlannerInputs) -> ErrorBound:
     )
     if points.missing_samples is None:
         return ErrorBound(
-            probability_change=_leakage_probability(
+            probability_change=_leakage_probability_bound(
                 points, points.window.name, ratio_to_threshold, reach_bins
             )
         )
     # Sidelobes of the window and of the step; in each bin one of the two is the larger.
     step_ratio = 2 * ratio_to_threshold * points.missing_samples.step_sidelobe_factor
-    probability = _leakage_probability(
+    probability = _leakage_probability_bound(
         points, points.window.name, 2 * ratio_to_threshold, reach_bins
     )
     return ErrorBound(
         probability_change=probability
-        + _leakage_probability(
+        + _leakage_probability_bound(
             points, "rectangular", step_ratio, reach_bins + points.padding_factor
         )
     )
 
 
-def _leakage_probability(
+def _leakage_probability_bound(
     points: PlannerInputs, window_name: str, ratio_to_threshold: np.ndarray, reach_bins: np.ndarray
 ) -> np.ndarray:
     """Return a bound on the probability of leakage in all segments, by one window's sidelobes.
@@ -277,7 +283,7 @@ def _leakage_probability(
     """
     threshold_ratio, row = (
         points.threshold_ratio,
-        np.searchsorted(_TABULATED_REACH_BINS, reach_bins),
+        np.searchsorted(_TABULATED_LIGHT_SHIFTS_BINS, reach_bins),
     )
     octave = np.clip(np.log2(ratio_to_threshold), _OCTAVE_MIN, _OCTAVE_MAX)
     column = np.minimum(
@@ -286,17 +292,17 @@ def _leakage_probability(
     )
     column = column.astype(np.int64)
     threshold_step = np.floor(
-        np.log(np.clip(threshold_ratio, 1e-3, 1e4)) / math.log(_THRESHOLD_STEP)
+        np.log(np.clip(threshold_ratio, 1e-3, 1e4)) / math.log(_THRESHOLD_TABLE_STEP_FACTOR)
     )
     distinct_steps, step_index = np.unique(threshold_step, return_inverse=True)
     length = points.window.length
     tables = np.array(
         [
-            leakage_table(
+            leakage_bound_table(
                 window_name,
                 length,
                 points.fft_size,
-                _THRESHOLD_STEP ** float(distinct_step),
+                _THRESHOLD_TABLE_STEP_FACTOR ** float(distinct_step),
                 points.looks,
             )
             for distinct_step in distinct_steps
@@ -308,7 +314,7 @@ def _leakage_probability(
 
 
 @lru_cache(maxsize=256)
-def leakage_table(
+def leakage_bound_table(
     window_name: str, length: int, fft_size: int, threshold_ratio: float, looks: Looks = SINGLE_LOOK
 ) -> np.ndarray:
     """Tabulate bounds of the probability that leaked signal makes bins cross the threshold.
@@ -366,7 +372,7 @@ def leakage_table(
             )
             * bins_in_stretch
         ).sum(axis=1)
-        for reach_bins in _TABULATED_REACH_BINS
+        for reach_bins in _TABULATED_LIGHT_SHIFTS_BINS
     ]
     return np.minimum(np.minimum([*bound_by_reach, parseval_bound], parseval_bound), 1.0)
 
@@ -374,7 +380,7 @@ def leakage_table(
 def _added_crossing_probability(
     signal: np.ndarray, threshold_ratio: float, noise_crossing: float, looks: Looks
 ) -> np.ndarray:
-    """Return the probability that a signal lifts a bin above the threshold that noise alone misses.
+    """Return the probability that signal makes a bin cross the threshold where noise does not.
 
     ``signal`` (...) and ``threshold_ratio`` are magnitudes over the noise per quadrature;
     ``noise_crossing`` is the probability that the bin crosses by noise alone.

@@ -97,17 +97,17 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     if not points.any_nonzero(_WIDTH_PATH):
         return None
     if points.shared_option(_SHAPE_PATH) == "lorentzian":
-        return _lorentzian_bound(points)
+        return _lorentzian_error_bound(points)
     moments, line_deviation = window_moments(points.window), _line_deviation_window_bins(points)
     spread_loss = np.minimum((2 * np.pi * line_deviation) ** 2 * moments.position_variance, 1.0)
     smear_factor = 1 + 2 * points.phase_error_shift_bins / points.padding_factor
-    power_min = points.power_min_with_missing_samples(
+    power_min = points.peak_power_min_with_missing_samples(
         points.peak_power_bounds.power_min
         / np.where(points.is_near_image, 2.0, 1.01)
         / smear_factor
     )
     magnitude_change = magnitude_change_from_power(
-        moments.magnitude_sum**2 * spread_loss / power_min
+        moments.magnitude_sum_ratio**2 * spread_loss / power_min
     )
     if not points.amplitudes_may_add:
         return ErrorBound(magnitude_change=magnitude_change)
@@ -121,7 +121,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     )
 
 
-def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
+def _lorentzian_error_bound(points: PlannerInputs) -> ErrorBound:
     """Return bounds on the changes if the width of a Lorentzian laser line is omitted.
 
     The changes are the power that the pure line loses, and the pedestal of noise around it.
@@ -149,7 +149,7 @@ def _line_fraction_and_pedestal(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the power fraction that a laser's pure line keeps, and the pedestal of phase noise.
 
-    Both are those of the samples of the record that hold the echo.
+    Both, (n,), refer to the samples of the record that hold the echo.
     """
     looks = shots.looks.n_coherent
     if shots.echo_record.n_samples_before_echo is None:

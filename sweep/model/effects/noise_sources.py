@@ -314,7 +314,7 @@ RELATIVE_INTENSITY_NOISE = Effect(
 _BITS_PATH = PROCESSING_PREFIX + "bits"
 
 
-def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
+def quantisation_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the noise of the ADC's rounding over the receiver's noise, without clipping.
 
     Rounding noise is white, and is compared with the density of the receiver's noise at the line.
@@ -352,7 +352,7 @@ QUANTISATION = Effect(
     name="quantisation",
     description="the ADC's steps",
     stage="noise",
-    error_bound=quantisation_bound,
+    error_bound=quantisation_error_bound,
     apply=apply_quantisation,
     parameters=(
         Parameter(

@@ -98,7 +98,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     summed_change = np.where(
         points.amplitudes_may_cancel,
         2 * missing.lost_fraction / points.window_response.scalloping_gain_min,
-        points.image_bound,
+        points.image_magnitude_bound,
     )
     coherent_change = np.where(missing.lost_fraction > 0, summed_change, 0.0)
     return ErrorBound(
@@ -110,9 +110,10 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def residual_bound(points: PlannerInputs) -> np.ndarray:
-    """Return a bound on the error of one number of missing samples for all beamlets and looks.
+    """Return a bound on the error of using one number of missing samples for all echoes.
 
-    The number used is that of the samples before the echo on the beam's axis, in the middle look.
+    The echoes are those of all beamlets and looks. The number used is that of the samples before
+    the echo on the beam's axis, in the middle look.
 
     Returns
     -------
@@ -161,7 +162,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     -----
     Of L samples, the first n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s) lack the echo, limited to
     0..L. tau_0 is the delay of the echo, beta its Doppler ratio, t_0 the start of the record and
-    f_s the sample rate. It is counted by
+    f_s the sample rate. The first n_0 samples are counted by
     :meth:`sweep.model.shot_settings.RecordSettings.count_samples_before_echo`.
     """
     n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)

@@ -4,8 +4,8 @@ Each effect has a phase psi(t) [cycles], added to the beat of every line
 (:mod:`sweep.model.waveform`). It also has a phase-error bound, a polynomial in the position x in
 the record, from which its error bound follows.
 
-Range walk and acceleration are all terms in t^2 and beyond of a target whose delay is tau(t) =
-tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:
+Range walk and acceleration are the beat's terms in t^2 and beyond, for a target of the delay tau(t)
+= tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:
 
     psi(t) = s S beta (1 + beta / 2) t^2                                                range walk
     psi(t) = f_seg alpha t^2 + s S [ -tau_0 alpha t^2 + alpha (1 + beta) t^3 + alpha^2 t^4 / 2 ]
@@ -85,7 +85,7 @@ from sweep.model.shot_records import PhaseError
 from sweep.model.shot_settings import CHIRP_PREFIX
 from sweep.model.window import Window, window_samples
 
-_N_NODES = 256
+_N_WINDOW_NODES = 256
 """Number of positions in the record at which the window is sampled, for means weighted by it."""
 _RADIANS_PER_CYCLE = 2 * math.pi
 """Factor 2 pi that converts a phase from cycles to radians."""
@@ -94,7 +94,7 @@ _REMAINING_AMPLITUDE_WITH_IMAGE_MIN = 0.9
 opposite frequency far away, are added to it."""
 
 
-class MomentsByPower(NamedTuple):
+class MomentsByExponent(NamedTuple):
     """Moments of the powers x^1 .. x^4 of the position x in the record, -1..1."""
 
     linear: float
@@ -113,18 +113,18 @@ class WindowMoments(NamedTuple):
     The mean < > is the sum weighted with |w| / sum w.
     """
 
-    mean_absolute: MomentsByPower
+    absolute_moments: MomentsByExponent
     """Means of |x^k| for k = 1, 3, and of |x^k - <x^k>| for k = 2, 4. x is the position in the
     record, -1..1, and < > the mean weighted by the window."""
-    root_mean_square: MomentsByPower
+    rms_moments: MomentsByExponent
     """Root mean squares of x^k about its mean for k = 2, 4, and 0 for k = 1, 3. x is the position
     in the record, -1..1; means are weighted by the window."""
-    fitted_slopes: MomentsByPower
+    fitted_slopes: MomentsByExponent
     """Slopes of the best straight line to x^k, k = 1 .. 4, with the position x in the record,
     -1..1. They are 0 for even k."""
     fitted_slope_max: float
     """Largest slope of the best straight line to any function of x with values in -1..1."""
-    magnitude_sum: float
+    magnitude_sum_ratio: float
     """Sum of the window's magnitudes |w| over the sum of its values w, >= 1."""
     first_sample_weight: float
     """Magnitude of the window's first value over the sum of its values."""
@@ -136,36 +136,36 @@ class WindowMoments(NamedTuple):
 @lru_cache(maxsize=16)
 def window_moments(window: Window) -> WindowMoments:
     """Return the means of powers of the position in the record, weighted by a window."""
-    node = (2 * np.arange(_N_NODES) + 1) / _N_NODES - 1
+    node = (2 * np.arange(_N_WINDOW_NODES) + 1) / _N_WINDOW_NODES - 1
     w = window_samples(window.name, window.length)
     sample_position = 2 * np.arange(window.length + 1) / window.length - 1
     window_at_nodes = np.interp(node, sample_position, np.append(w, w[:1]))
     weight = np.abs(window_at_nodes) / window_at_nodes.sum()
-    magnitude_sum, second_moment = float(weight.sum()), float((node * node * weight).sum())
-    mean_absolute, root_mean_square, fitted_slopes = [], [], []
+    magnitude_sum_ratio, second_moment = float(weight.sum()), float((node * node * weight).sum())
+    absolute_moments, rms_moments, fitted_slopes = [], [], []
     for k in range(1, 5):
         power = node**k
         fitted_slopes.append(float((power * node * weight).sum()) / second_moment if k % 2 else 0.0)
         if k % 2 == 0:
-            power = power - (power * weight).sum() / magnitude_sum
-        mean_absolute.append(float((abs(power) * weight).sum()))
-        root_mean_square.append(float(np.sqrt((power**2 * weight).sum())) if k % 2 == 0 else 0.0)
-    mean_absolute_by_power = MomentsByPower(*mean_absolute)
+            power = power - (power * weight).sum() / magnitude_sum_ratio
+        absolute_moments.append(float((abs(power) * weight).sum()))
+        rms_moments.append(float(np.sqrt((power**2 * weight).sum())) if k % 2 == 0 else 0.0)
+    absolute_moments_by_exponent = MomentsByExponent(*absolute_moments)
     return WindowMoments(
-        mean_absolute=mean_absolute_by_power,
-        root_mean_square=MomentsByPower(*root_mean_square),
-        fitted_slopes=MomentsByPower(*fitted_slopes),
-        fitted_slope_max=mean_absolute_by_power.linear / second_moment,
-        magnitude_sum=magnitude_sum,
+        absolute_moments=absolute_moments_by_exponent,
+        rms_moments=MomentsByExponent(*rms_moments),
+        fitted_slopes=MomentsByExponent(*fitted_slopes),
+        fitted_slope_max=absolute_moments_by_exponent.linear / second_moment,
+        magnitude_sum_ratio=magnitude_sum_ratio,
         first_sample_weight=abs(window.first_value) / window.sum,
-        position_variance=second_moment / 4 / magnitude_sum,
+        position_variance=second_moment / 4 / magnitude_sum_ratio,
     )
 
 
-def phase_over_record(
+def polynomial_phase_bound(
     points: PlannerInputs, coefficient_by_power: Mapping[int, np.ndarray]
 ) -> PhaseErrorBound:
-    """Return the phase sum_j c_j t^j as a polynomial in the position x in the record.
+    """Return a bound on the phase sum_j c_j t^j, as a polynomial in the position x in the record.
 
     Parameters
     ----------
@@ -210,10 +210,10 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
         Bound, the mean of |phi| over the record [rad], weighted with |w| / sum w for the window w.
     """
     moments = window_moments(window)
-    total = phase_bound.non_polynomial * moments.magnitude_sum
-    for value, mean in zip(phase_bound.coefficients, moments.mean_absolute, strict=True):
+    total = phase_bound.non_polynomial * moments.magnitude_sum_ratio
+    for value, mean in zip(phase_bound.coefficients, moments.absolute_moments, strict=True):
         total = total + value * mean
-    return np.minimum(_RADIANS_PER_CYCLE * total, 2 * moments.magnitude_sum)
+    return np.minimum(_RADIANS_PER_CYCLE * total, 2 * moments.magnitude_sum_ratio)
 
 
 def coherent_sum_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
@@ -230,11 +230,13 @@ def coherent_sum_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> 
     )
     phase_change = np.where(
         points.is_near_image,
-        moments.magnitude_sum * phase_anywhere,
+        moments.magnitude_sum_ratio * phase_anywhere,
         mean_phase_bound(phase_bound, points.window),
     )
     near_change = 2 * phase_change / points.window_response.scalloping_gain_min
-    return np.where(points.amplitudes_may_cancel, near_change, points.image_bound * phase_anywhere)
+    return np.where(
+        points.amplitudes_may_cancel, near_change, points.image_magnitude_bound * phase_anywhere
+    )
 
 
 def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
@@ -245,7 +247,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     Parameters
     ----------
     points : PlannerInputs
-        Points that are planned together, whose `phase_error_bounds` are known.
+        Points that are planned together, with their `phase_error_bounds`.
     name : str
         Name of the effect.
 
@@ -262,17 +264,17 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
         other_bounds = other_bounds if other_name == name else other_bounds.plus(other_bound)
     linear, quadratic, cubic, quartic = own_bound.coefficients
     non_polynomial = _RADIANS_PER_CYCLE * own_bound.non_polynomial
-    odd_phase = non_polynomial * moments.magnitude_sum
+    odd_phase = non_polynomial * moments.magnitude_sum_ratio
     odd_phase = odd_phase + _RADIANS_PER_CYCLE * (
-        linear * moments.mean_absolute.linear + cubic * moments.mean_absolute.cubic
+        linear * moments.absolute_moments.linear + cubic * moments.absolute_moments.cubic
     )
-    even_phase = non_polynomial * moments.magnitude_sum
+    even_phase = non_polynomial * moments.magnitude_sum_ratio
     even_phase = even_phase + _RADIANS_PER_CYCLE * (
-        quadratic * moments.mean_absolute.quadratic + quartic * moments.mean_absolute.quartic
+        quadratic * moments.absolute_moments.quadratic + quartic * moments.absolute_moments.quartic
     )
-    even_root_mean_square = non_polynomial * math.sqrt(moments.magnitude_sum)
+    even_root_mean_square = non_polynomial * math.sqrt(moments.magnitude_sum_ratio)
     even_root_mean_square = even_root_mean_square + _RADIANS_PER_CYCLE * (
-        quadratic * moments.root_mean_square.quadratic + quartic * moments.root_mean_square.quartic
+        quadratic * moments.rms_moments.quadratic + quartic * moments.rms_moments.quartic
     )
     turned_by_others: np.ndarray | float = 0.0
     others_phase: np.ndarray | float = 0.0
@@ -290,11 +292,13 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
             _RADIANS_PER_CYCLE * (sum(own_bound.coefficients) + own_bound.non_polynomial), 2.0
         )
     a = (
-        np.minimum(odd_phase, 2 * moments.magnitude_sum)
-        + np.minimum(even_root_mean_square * even_root_mean_square / 2, 2 * moments.magnitude_sum)
+        np.minimum(odd_phase, 2 * moments.magnitude_sum_ratio)
+        + np.minimum(
+            even_root_mean_square * even_root_mean_square / 2, 2 * moments.magnitude_sum_ratio
+        )
         + turned_by_others
     )
-    b = np.minimum(even_phase, moments.magnitude_sum) + turned_by_others
+    b = np.minimum(even_phase, moments.magnitude_sum_ratio) + turned_by_others
     power_min = (
         points.peak_power_bounds.power_min
         / np.where(points.is_near_image, 2.0, 1.01)
@@ -327,7 +331,8 @@ def _add_phase_error(
 ) -> Shots:
     """Return shots whose records have an additional phase error.
 
-    ``phase_function`` gives the phase [cycles] at positions in the record, from ``values``.
+    ``phase_function`` returns the phase [cycles] at positions in the record. ``values`` are its
+    other arguments.
     """
     phase_error = PhaseError(phase_function, values | shots.echo_interval_in_record)
     return replace(
@@ -338,7 +343,7 @@ def _add_phase_error(
     )
 
 
-def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
+def times_in_record(position: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
     """Return the times since the segment's start at positions of the record.
 
     Parameters
@@ -404,7 +409,7 @@ def range_walk_phase(
     )
     return (
         np.atleast_1d(drift_rate)[:, None]
-        * record_times(position, start=start, duration=duration) ** 2
+        * times_in_record(position, start=start, duration=duration) ** 2
     )
 
 
@@ -424,7 +429,7 @@ def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     drift_ratio = doppler_ratio * (1 + doppler_ratio / 2) + slide_speed / SPEED_OF_LIGHT
     if not drift_ratio.any():
         return None
-    return phase_over_record(
+    return polynomial_phase_bound(
         points, {2: points.existing_chirp_rates * points.waveform.chirp_rate * drift_ratio}
     )
 
@@ -462,14 +467,14 @@ def chirp_drift_time(shots: Shots) -> np.ndarray:
     drift_time = 2 * shots.record.acquisition_delay + shots.record.duration
     if shots.echo_record.n_samples_before_echo is None:
         return np.asarray(drift_time)
-    slope = _slope_of_square_by_first_sample(shots.window)[
+    slope = _squared_position_slopes(shots.window)[
         shots.echo_record.n_samples_before_echo[::2]
     ].mean(axis=0)
     return np.asarray(drift_time + 0.5 * shots.record.duration * slope)
 
 
 @lru_cache(maxsize=8)
-def _slope_of_square_by_first_sample(window: Window) -> np.ndarray:
+def _squared_position_slopes(window: Window) -> np.ndarray:
     """Return the slope of the best straight line to x^2 without the first k samples, (L + 1,).
 
     x is the position in the record, -1..1, and element k = 0 .. L of the result is for the samples
@@ -542,7 +547,7 @@ def acceleration_phase(
     alpha = _as_column(np.asarray(acceleration) / SPEED_OF_LIGHT)
     beta = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
     delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT)
-    t = record_times(position, start=start, duration=duration)
+    t = times_in_record(position, start=start, duration=duration)
     chirp_term = -delay + (1 + beta) * t + alpha * t**2 / 2
     signed_chirp_rate = _as_column(sign * np.asarray(chirp_rate))
     return np.asarray(alpha * t**2 * (_as_column(carrier) + signed_chirp_rate * chirp_term))
@@ -559,10 +564,10 @@ def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
         3: alpha * signed_chirp_rate * (1 + points.target.doppler_ratio),
         4: alpha**2 * signed_chirp_rate * 0.5,
     }
-    return phase_over_record(points, coefficient_by_power)
+    return polynomial_phase_bound(points, coefficient_by_power)
 
 
-def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
+def acceleration_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if acceleration is omitted.
 
     The target's acceleration makes lines drift within a record and from look to look (record of
@@ -607,7 +612,7 @@ ACCELERATION = Effect(
     name="acceleration",
     description="drift of the Doppler frequency",
     stage="record",
-    error_bound=acceleration_bound,
+    error_bound=acceleration_error_bound,
     phase_error_bound=acceleration_phase_bound,
     apply=apply_acceleration,
     is_in_time_domain_truth=False,
@@ -623,9 +628,9 @@ ACCELERATION = Effect(
 """Effect that lets the Doppler frequency drift over the record, as the target accelerates."""
 
 
-_ERROR_SHAPES = ("quadratic", "cubic", "sinusoidal")
-_ERROR_PEAK_PATHS = tuple(f"{CHIRP_PREFIX}{shape}_error" for shape in _ERROR_SHAPES)
-_ERROR_PERIODS_PATH = CHIRP_PREFIX + "error_periods"
+_SWEEP_ERROR_SHAPES = ("quadratic", "cubic", "sinusoidal")
+_SWEEP_ERROR_PEAK_PATHS = tuple(f"{CHIRP_PREFIX}{shape}_error" for shape in _SWEEP_ERROR_SHAPES)
+_SWEEP_ERROR_PERIODS_PATH = CHIRP_PREFIX + "error_periods"
 ERROR_TABLE_PATH, NO_TABLE = CHIRP_PREFIX + "error_table", "none"
 
 
@@ -670,7 +675,7 @@ def error_table_phase(
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(position)))
-    t = record_times(position, start=start, duration=duration)
+    t = times_in_record(position, start=start, duration=duration)
     doppler_ratio = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
     delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT) - doppler_ratio * t
     sweep_time = t if sign > 0 else _as_column(chirp_duration) - t  # time in the up-chirp
@@ -719,7 +724,7 @@ def chirp_nonlinearity_phase(
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(position)))
-    t = record_times(position, start=start, duration=duration)
+    t = times_in_record(position, start=start, duration=duration)
     doppler_ratio = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
     delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT)
     sweep_duration, periods = _as_column(chirp_duration), _as_column(periods)
@@ -742,17 +747,17 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
     """Return the bound of the phase that the sweep's frequency error adds over the record.
 
     Quadratic and cubic errors are polynomials in the position in the record. A sine, and a table's
-    departure from the middle of its range of values, are taken at their largest. The result is None
-    without an error.
+    departure from the middle of its range of values, are bounded by their largest values. The
+    result is None without an error.
     """
     table_text = points.shared_option(ERROR_TABLE_PATH)
-    if not points.any_nonzero(*_ERROR_PEAK_PATHS):
+    if not points.any_nonzero(*_SWEEP_ERROR_PEAK_PATHS):
         return (
             None
             if table_text == NO_TABLE
-            else _error_table_phase_bound(points, fit_sweep_frequency_error(table_text))
+            else _sweep_error_table_phase_bound(points, fit_sweep_frequency_error(table_text))
         )
-    quadratic, cubic, sinusoidal = (points[path] for path in _ERROR_PEAK_PATHS)
+    quadratic, cubic, sinusoidal = (points[path] for path in _SWEEP_ERROR_PEAK_PATHS)
     half_duration, chirp_rates = 0.5 * points.record.duration, points.existing_chirp_rates
     record_middle, position_per_second = (
         points.record.acquisition_delay + half_duration,
@@ -796,7 +801,9 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
         slope_magnitude * np.abs(part) for part in _polynomial_product(delay, mean_error)
     )
     sine_phase = slope_magnitude * (np.abs(middle_delay) + np.abs(delay_slope)) * np.abs(sinusoidal)
-    sine_phase_slope = 2 * np.pi * points[_ERROR_PERIODS_PATH] * position_per_second * half_duration
+    sine_phase_slope = (
+        2 * np.pi * points[_SWEEP_ERROR_PERIODS_PATH] * position_per_second * half_duration
+    )
     phase_bound = PhaseErrorBound(
         tuple(coefficients), sine_phase, constant, sine_phase * sine_phase_slope
     )
@@ -804,12 +811,14 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
         phase_bound
         if table_text == NO_TABLE
         else phase_bound.plus(
-            _error_table_phase_bound(points, fit_sweep_frequency_error(table_text))
+            _sweep_error_table_phase_bound(points, fit_sweep_frequency_error(table_text))
         )
     )
 
 
-def _error_table_phase_bound(points: PlannerInputs, table: SweepFrequencyError) -> PhaseErrorBound:
+def _sweep_error_table_phase_bound(
+    points: PlannerInputs, table: SweepFrequencyError
+) -> PhaseErrorBound:
     """Return a bound on the phase that a measured error of the sweep adds over the record.
 
     The phase is about minus the echo's delay times the error. It is bounded by the middle of the
@@ -877,9 +886,9 @@ def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
         **phase_inputs,
         **{
             error_shape: parameters[path]
-            for error_shape, path in zip(_ERROR_SHAPES, _ERROR_PEAK_PATHS, strict=True)
+            for error_shape, path in zip(_SWEEP_ERROR_SHAPES, _SWEEP_ERROR_PEAK_PATHS, strict=True)
         },
-        periods=parameters[_ERROR_PERIODS_PATH],
+        periods=parameters[_SWEEP_ERROR_PERIODS_PATH],
     )
 
 
@@ -899,10 +908,10 @@ CHIRP_NONLINEARITY = Effect(
                 example="100 kHz",
                 limits=("-1e15 Hz", "1e15 Hz"),
             )
-            for path, form in zip(_ERROR_PEAK_PATHS, ("square", "cube", "sine"), strict=True)
+            for path, form in zip(_SWEEP_ERROR_PEAK_PATHS, ("square", "cube", "sine"), strict=True)
         ),
         Parameter(
-            path=_ERROR_PERIODS_PATH,
+            path=_SWEEP_ERROR_PERIODS_PATH,
             description="Periods of the sinusoidal error over the sweep",
             default=1.0,
             example="5",

@@ -42,7 +42,7 @@ from sweep.model.window_response import (
     window_response,
 )
 
-_CHEBYSHEV_DEVIATIONS = (1.4, 2.5, 8.0)
+_CHEBYSHEV_INEQUALITY_DEVIATIONS = (1.4, 2.5, 8.0)
 """Half-widths, in standard deviations of the lines' positions, for which Chebyshev's inequality
 bounds the power of the largest bin. The best of these bounds is taken."""
 _NEAR_IMAGE_WINDOW_BINS = 8.0
@@ -52,12 +52,15 @@ its derivatives are below 5 %."""
 
 
 class PeakPowerBounds(NamedTuple):
-    """Bounds on the largest bin's power, over the power that all lines would have on one bin."""
+    """Bounds on the power of the largest bin.
+
+    They are relative to the power that all lines would have if they lay on one bin.
+    """
 
     power_min: np.ndarray
-    """(n,): lower bound."""
+    """(segments, n): lower bound, without images."""
     power_max: np.ndarray
-    """(n,): upper bound."""
+    """(segments, n): upper bound, with images."""
 
 
 class PlannerInputs(LinkBudget):
@@ -174,10 +177,10 @@ class PlannerInputs(LinkBudget):
 
     @property
     def noise_maximum_ratio(self) -> float | None:
-        """Level that the noise of all bins together exceeds with a probability of at most 0.001.
+        """Level of |X| over the noise per quadrature that the noise in any bin hardly ever exceeds.
 
-        The level is one of |X| over the noise per quadrature. It is None if segments report all
-        peaks that cross the threshold.
+        The probability that noise exceeds it in any bin is at most 0.001. The result is None if
+        segments report all peaks that cross the threshold.
         """
         if self.shared_option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
@@ -289,7 +292,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def missing_samples(self) -> MissingSamples | None:
-        """Samples of the record without an echo; None if echoes fill all records."""
+        """Samples without an echo, and bounds on their effect; None if echoes fill all records."""
         if "overlap" in self.effects_off:
             return None
         delay = self.stack_segments(*(s.delay(self.range) for s in self.existing_segments))
@@ -329,7 +332,7 @@ class PlannerInputs(LinkBudget):
             response_max + np.minimum(step_sidelobe, self.missing_samples.lost_fraction)
         )
 
-    def power_min_with_missing_samples(self, power: np.ndarray) -> np.ndarray:
+    def peak_power_min_with_missing_samples(self, power: np.ndarray) -> np.ndarray:
         """Return a lower bound of the largest bin's power if the echo lacks samples of the record.
 
         ``power`` is the bound in a record that the echo fills. Both are relative to the power that
@@ -407,12 +410,12 @@ class PlannerInputs(LinkBudget):
         )  # fmt: skip
 
     @cached_property
-    def range_spread(self) -> OffsetMoments:
+    def line_spread_by_range(self) -> OffsetMoments:
         """Moments of the offsets [FFT bins] of beamlets' lines from the axis's, due to range."""
         return self.footprint_extent.range_offsets.scaled_by(self.bins_per_relative_range)
 
     @cached_property
-    def velocity_spread(self) -> OffsetMoments:
+    def line_spread_by_velocity(self) -> OffsetMoments:
         """Mean, rms and extreme of the offsets [FFT bins] of beamlets' lines from the axis's.
 
         These offsets are due to the beamlets' radial velocities.
@@ -425,7 +428,7 @@ class PlannerInputs(LinkBudget):
 
         The bounds include offsets due to both range and radial velocity.
         """
-        return self.range_spread.bound_on_summed_offsets(self.velocity_spread)
+        return self.line_spread_by_range.bound_on_summed_offsets(self.line_spread_by_velocity)
 
     @cached_property
     def total_phase_error_bound(self) -> PhaseErrorBound:
@@ -441,17 +444,17 @@ class PlannerInputs(LinkBudget):
         return self.total_phase_error_bound.shift_window_bins * self.padding_factor
 
     @cached_property
-    def bins_to_image(self) -> np.ndarray:
-        """Distance from DC and Nyquist to the nearest light of any line [FFT bins]."""
+    def bins_from_light_to_edge(self) -> np.ndarray:
+        """Distance of the nearest light of any line from DC or Nyquist [FFT bins]."""
         return self.bins_to_edge - self.line_spread.largest_magnitude - self.phase_error_shift_bins
 
     @cached_property
     def is_near_image(self) -> np.ndarray:
         """True where lines and their images are so close that they may add up or cancel."""
-        return ~(2 * self.bins_to_image >= _NEAR_IMAGE_WINDOW_BINS * self.padding_factor)
+        return ~(2 * self.bins_from_light_to_edge >= _NEAR_IMAGE_WINDOW_BINS * self.padding_factor)
 
     @cached_property
-    def image_bound(self) -> np.ndarray:
+    def image_magnitude_bound(self) -> np.ndarray:
         """Largest |X| that images (at negative frequencies) can add to the largest bin.
 
         The result is relative to the |X| of all lines in phase.
@@ -460,7 +463,9 @@ class PlannerInputs(LinkBudget):
         gain_rise = np.exp(
             np.minimum(self.gain_slope_max * self.line_spread.largest_magnitude, 50.0)
         )
-        image_response = self.magnitude_max_beyond(self.bins_to_image) * np.sqrt(smear_factor)
+        image_response = self.magnitude_max_beyond(self.bins_from_light_to_edge) * np.sqrt(
+            smear_factor
+        )
         return np.asarray(
             gain_rise * image_response / self.window_response.scalloping_gain(self.bin_offset)
         )
@@ -479,7 +484,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def peak_power_bounds(self) -> PeakPowerBounds:
-        """Lower and upper bound of the largest bin's power."""
+        """Bounds on the largest bin's power, for the offsets of all beamlets' lines."""
         return self.peak_power_bounds_for_spread(self.line_spread)
 
     def peak_power_bounds_for_spread(self, moments: OffsetMoments) -> PeakPowerBounds:
@@ -493,7 +498,7 @@ class PlannerInputs(LinkBudget):
         Returns
         -------
         PeakPowerBounds
-            Bounds over the power of all lines on a bin, with images included.
+            Bounds relative to the power of all lines if they lay on one bin.
 
         Notes
         -----
@@ -519,7 +524,7 @@ class PlannerInputs(LinkBudget):
             power_min,
             np.exp(-gain_slope * extreme) * (response.scalloping_gain_min**2 / self.n_beamlets),
         )
-        for t in _CHEBYSHEV_DEVIATIONS:
+        for t in _CHEBYSHEV_INEQUALITY_DEVIATIONS:
             half_width = t * rms
             power_max = (
                 (1 - 1 / t**2)
@@ -533,7 +538,7 @@ class PlannerInputs(LinkBudget):
         power_max = power_max * (1 + gain_rise * np.minimum(gain_slope * rms, 50.0))
         return PeakPowerBounds(np.minimum(power_min, power_max), power_max)
 
-    def power_change_bound(
+    def peak_power_change_bound(
         self,
         added_moments: OffsetMoments,
         present_moments: OffsetMoments,
@@ -576,7 +581,7 @@ class PlannerInputs(LinkBudget):
         image_factor = np.where(self.is_near_image, 2.0, 1.05)
         return image_factor * np.exp(np.minimum(gain_exponent, 50.0)) * power_change / power_min
 
-    def coherent_sum_bound(self, shift_bins: np.ndarray | float) -> np.ndarray:
+    def coherent_sum_change_bound(self, shift_bins: np.ndarray | float) -> np.ndarray:
         """Return a bound on the relative change of a sum of amplitudes whose lines move.
 
         Lines move by ``shift_bins``. The change is relative to the sum in phase. Its bound follows

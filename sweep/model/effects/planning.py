@@ -34,11 +34,11 @@ from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 
 _LN_10 = math.log(10.0)
-_CHANGE_MAX = 1e12
+_RELATIVE_CHANGE_MAX = 1e12
 """Upper limit of relative changes and of signals over noise, which avoids overflow."""
-_LOSS_MAX = 1.0 - 1e-12
+_RELATIVE_LOSS_MAX = 1.0 - 1e-12
 """Upper limit of relative losses of magnitude, whose logarithm stays finite."""
-_BIN_MOVING_STAGES = ("lines", "record", "spectrum")
+_LIGHT_MOVING_STAGES = ("lines", "record", "spectrum")
 """Stages whose effects move light from bin to bin of the spectrum."""
 
 
@@ -112,7 +112,7 @@ def plan_effects(
         bounds = error_bounds(points, effects)
         moves_light = None
         if forced_modes.get("leakage") == "on" and "leakage" in bounds:
-            moves_light = {effect.name: effect.stage in _BIN_MOVING_STAGES for effect in effects}
+            moves_light = {effect.name: effect.stage in _LIGHT_MOVING_STAGES for effect in effects}
         errors_by_effect = {
             name: tile_max(omission_error)
             for name, omission_error in omission_errors(bounds, points, moves_light).items()
@@ -210,7 +210,7 @@ def _select_effects(
     forced_modes: Mapping[str, str],
     tolerance: float,
 ) -> np.ndarray:
-    """Choose the effects to keep, (effects, tiles) bool, of those that the scene has, `is_present`.
+    """Choose which of the present effects to keep, (effects, tiles) bool.
 
     The effects with the smallest changes are omitted first, as long as the sum is within the
     remaining tolerance. Children are omitted before their parents, and equal changes in reverse
@@ -268,8 +268,8 @@ def omission_errors(
     Notes
     -----
     The change of pd is the sum over all segments, which bounds that of their product. If
-    `moves_light` is given, bins that leak change by as many sigmas as the largest bin; this counts
-    up to the leakage's own error.
+    `moves_light` is given, bins with leaked signal change by as many sigmas as the largest bin.
+    This counts at most as much as the error if leakage is omitted.
     """
     signal_ratio_min, signal_ratio_max = signal_ratio_bounds(bounds, points)
     threshold = points.threshold_ratio
@@ -287,23 +287,23 @@ def omission_errors(
     errors_by_effect = {}
     for name, bound in bounds.items():
         pd_change, other_change = 0.0, np.maximum(bound.shift_bins, bound.log10_pfa_change)
-        if _is_nonzero(bound.magnitude_change):
-            relative_change = np.minimum(bound.magnitude_change, _CHANGE_MAX)
+        if _may_be_nonzero(bound.magnitude_change):
+            relative_change = np.minimum(bound.magnitude_change, _RELATIVE_CHANGE_MAX)
             # The slope is that over ln |X|, which falls by -ln(1 - d) where |X| falls by d.
             log_change = np.maximum(
-                relative_change, -np.log1p(-np.minimum(relative_change, _LOSS_MAX))
+                relative_change, -np.log1p(-np.minimum(relative_change, _RELATIVE_LOSS_MAX))
             )
             pd_change, other_change = (
                 pd_change + log_change * slope,
                 np.maximum(other_change, relative_change * relative_weight),
             )
-        if _is_nonzero(bound.coherent_sum_change):
+        if _may_be_nonzero(bound.coherent_sum_change):
             added_signal = bound.coherent_sum_change * signal_ratio_max
             pd_change = pd_change + 0.5 * near_threshold * added_signal
             other_change = np.maximum(
                 other_change, added_signal / np.maximum(signal_ratio_min, 1.0)
             )
-        if _is_nonzero(bound.noise_variance_change):
+        if _may_be_nonzero(bound.noise_variance_change):
             noise_change = np.abs(bound.noise_variance_change)
             pd_change = pd_change + 0.5 * noise_change * slope
             other_change = np.maximum(other_change, 0.5 * noise_change * relative_weight)
@@ -314,7 +314,7 @@ def omission_errors(
                 other_change = np.maximum(other_change, b * b * noise_change / _LN_10)
         if moves_light and moves_light[name]:
             leaking_bin_change = (
-                np.minimum(bound.magnitude_change, _CHANGE_MAX) + bound.coherent_sum_change
+                np.minimum(bound.magnitude_change, _RELATIVE_CHANGE_MAX) + bound.coherent_sum_change
             ) * signal_ratio_max + bound.leaking_bin_change_sigma
             other_change = np.maximum(
                 other_change, np.minimum(leaking_bin_change, bounds["leakage"].probability_change)
@@ -337,7 +337,7 @@ def residual_errors(
     residuals = {
         name: bound.residual_magnitude_change
         for name, bound in bounds.items()
-        if _is_nonzero(bound.residual_magnitude_change)
+        if _may_be_nonzero(bound.residual_magnitude_change)
     }
     if not residuals:
         return {}
@@ -382,26 +382,26 @@ def signal_ratio_bounds(
     signal_ratio_min = signal_ratio_max = points.peak_ratio * points.looks.amplitude_gain_max
     coherent_change: np.ndarray | float = 0.0
     for bound in bounds.values():
-        if _is_nonzero(bound.magnitude_change):
-            relative_change = np.minimum(bound.magnitude_change, _CHANGE_MAX)
+        if _may_be_nonzero(bound.magnitude_change):
+            relative_change = np.minimum(bound.magnitude_change, _RELATIVE_CHANGE_MAX)
             signal_ratio_min, signal_ratio_max = (
                 signal_ratio_min * np.maximum(1 - relative_change, 0.0),
                 signal_ratio_max * (1 + relative_change),
             )
-        if _is_nonzero(bound.noise_variance_change):
+        if _may_be_nonzero(bound.noise_variance_change):
             noise_factor = np.sqrt(1 + np.maximum(bound.noise_variance_change, -1 + 1e-9))
             signal_ratio_min, signal_ratio_max = (
                 signal_ratio_min / np.maximum(noise_factor, 1.0),
                 signal_ratio_max / np.minimum(noise_factor, 1.0),
             )
         coherent_change = coherent_change + bound.coherent_sum_change
-    signal_ratio_max = np.minimum(signal_ratio_max, _CHANGE_MAX)
+    signal_ratio_max = np.minimum(signal_ratio_max, _RELATIVE_CHANGE_MAX)
     return np.maximum(
         signal_ratio_min - signal_ratio_max * coherent_change, 0.0
     ), signal_ratio_max * (1 + coherent_change)
 
 
-def _is_nonzero(value: np.ndarray | float) -> bool:
+def _may_be_nonzero(value: np.ndarray | float) -> bool:
     """Return False for the number 0; an array counts as nonzero."""
     return isinstance(value, np.ndarray) or value != 0.0
 

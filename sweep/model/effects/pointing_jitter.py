@@ -56,7 +56,7 @@ class PerturbedGeometry(NamedTuple):
 
 
 def draw_jitter_angles(draw_addresses: DrawAddresses, sigma: np.ndarray) -> np.ndarray:
-    """Draw the deflection angles (a, b) of beams for a standard deviation [rad], (n, 2) [rad]."""
+    """Draw deflection angles (a, b) of beams, (n, 2) [rad], of standard deviation ``sigma``."""
     from sweep.model.sampling.philox import STREAM_POINTING_JITTER, to_normals_by_row
 
     uniform_draws = draw_addresses.uniforms(STREAM_POINTING_JITTER, 2, are_polar=True)
@@ -168,13 +168,15 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     range_ratio, shift_bins = _largest_range_change_and_line_shift(points)
     echo_change = 3 * range_ratio * (1 + range_ratio) ** 2
     power_change = (
-        points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins) + echo_change
+        points.peak_power_change_bound(NO_SPREAD, points.line_spread, shift_bins) + echo_change
     )
     is_unknown = points.amplitudes_may_cancel & (points[_JITTER_PATH] > 0)
     coherent_change: np.ndarray | float = 0.0
     if points.amplitudes_may_add:  # the phase between line and image changes with range
         turned_cycles = points.carriers * points.target.delay * np.minimum(range_ratio, 1e6)
-        coherent_change = points.image_bound * np.minimum(4 * math.pi * turned_cycles, 2.0)
+        coherent_change = points.image_magnitude_bound * np.minimum(
+            4 * math.pi * turned_cycles, 2.0
+        )
     return ErrorBound(
         magnitude_change=np.where(is_unknown, 1.0, magnitude_change_from_power(power_change)),
         coherent_sum_change=coherent_change,

@@ -37,7 +37,7 @@ from sweep.model.preparation import Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
-_SPLIT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
+_INTEGRAL_SPLIT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
 """Voltages minus full scale [standard deviations of the noise] at which integrals over a quarter
 period of the sine are split. Between these voltages the integrands are smooth."""
 _ZERO_AMPLITUDE_SUBSTITUTE_VOLTS = 1e-30
@@ -45,8 +45,8 @@ _ZERO_AMPLITUDE_SUBSTITUTE_VOLTS = 1e-30
 _UNLIMITED_VOLTAGE = 1e100
 """Full-scale voltage [V] of an ADC that never clips."""
 _AMPLITUDE_MIN_SIGMA = 1e-5
-"""Smallest beat amplitude for which the gain is computed, in standard deviations of the noise. The
-gain of weaker beats is the same to the square of this number."""
+"""Smallest beat amplitude for which the gain is computed, in standard deviations of the noise.
+Weaker beats have the same gain, with a relative error of the square of this number."""
 
 
 class ClippingGains(NamedTuple):
@@ -82,7 +82,7 @@ def clipping_gains(
     a = np.maximum(a, _AMPLITUDE_MIN_SIGMA * s)
     phase, weight = _phase_quadrature(a, s, v)
     sine = np.sin(phase)
-    voltage_loss, variance_left = _clipping_loss(a * sine, s, v)
+    voltage_loss, variance_left = _clipping_loss_and_variance(a * sine, s, v)
     amplitude_loss = 2 * (weight * voltage_loss * sine).sum(axis=-1)  # loss of the line's amplitude
     return ClippingGains(
         signal_gain=1 - amplitude_loss / a[..., 0],
@@ -92,7 +92,7 @@ def clipping_gains(
 
 def _phase_quadrature(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return phases in a quarter period and weights whose sum is 1, (n, nodes) each."""
-    split_phases = np.arcsin(np.clip((v + _SPLIT_DEVIATIONS * s) / a, 0.0, 1.0))
+    split_phases = np.arcsin(np.clip((v + _INTEGRAL_SPLIT_DEVIATIONS * s) / a, 0.0, 1.0))
     zeros = np.zeros(a.shape)
     cuts = np.concatenate([zeros, split_phases, zeros + math.pi / 2], axis=-1)
     half_width = np.diff(cuts)[..., None] / 2
@@ -102,7 +102,9 @@ def _phase_quadrature(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.n
     return phase.reshape(flat_shape), weight.reshape(flat_shape)
 
 
-def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _clipping_loss_and_variance(
+    x: np.ndarray, s: np.ndarray, v: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean loss of a noisy voltage by clipping, and the variance of the clipped voltage.
 
     Parameters
@@ -221,8 +223,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Notes
     -----
-    Line and noise lose at most the probability that the highest sample is clipped, because the mean
-    slope of the clipped signal is 1 less that probability. The threshold does not follow.
+    Let p be the probability that the highest sample is clipped. Line and noise lose at most the
+    fraction p, because the mean slope of the clipped signal is 1 - p. The threshold does not
+    follow.
     """
     if not points.any_nonzero(_FULL_SCALE_PATH):
         return None

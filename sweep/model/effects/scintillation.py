@@ -31,14 +31,14 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from sweep.model import beam
-from sweep.model.effects.atmosphere import path_heights
+from sweep.model.effects.atmosphere import path_end_heights
 from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import ECHO_NOISE_SOURCES, LASER_PREFIX, TELESCOPE_PREFIX
 from sweep.model.preparation import Shots
 
-_DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
+_RYTOV_DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
 """Exponents of two factors in the Rytov variance's integral over the path, by kind of wave. The
 factors are the distance to the receiver and the distance to the source."""
 _LARGE_EDDY_COEFFICIENTS = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
@@ -61,13 +61,13 @@ class TurbulenceProfile(NamedTuple):
     ground, 1.7e-14 in the 5/7 model. It falls by the factor e over a height of 100 m."""
     wind_speed: float = 0.0
     """Rms wind speed at high altitude in Hufnagel and Valley's model [m/s]; 21 in the 5/7 model."""
-    mid_altitude: float = 0.0
+    mid_altitude_strength: float = 0.0
     """Coefficient of Hufnagel and Valley's term for middle altitudes [m^(-2/3)], 2.7e-16 in the 5/7
     model. The term falls by the factor e over a height of 1500 m."""
 
 
 HUFNAGEL_VALLEY = TurbulenceProfile(
-    surface_layer_strength=1.7e-14, wind_speed=21.0, mid_altitude=2.7e-16
+    surface_layer_strength=1.7e-14, wind_speed=21.0, mid_altitude_strength=2.7e-16
 )
 """Hufnagel and Valley's 5/7 model of turbulence [Valley 1980]. At a wavelength of 0.5 um its
 coherence length is 5 cm, and its isoplanatic angle 7 urad."""
@@ -99,16 +99,17 @@ def structure_constant(turbulence: TurbulenceProfile, height: ArrayLike) -> np.n
 
     Notes
     -----
-    Hufnagel and Valley's model, with the wind speed v: 0.00594 (v / 27)^2 (1e-5 h)^10 exp(-h /
-    1000) + mid_altitude exp(-h / 1500) + surface_layer_strength exp(-h / 100); and a uniform part.
+    The uniform part is added to Hufnagel and Valley's model, 0.00594 (v / 27)^2 (1e-5 h)^10 exp(-h
+    / 1000) + mid_altitude_strength exp(-h / 1500) + surface_layer_strength exp(-h / 100), with the
+    wind speed v.
     """
     h = np.maximum(np.asarray(height, float), 0.0)
     aloft = 0.00594 * (turbulence.wind_speed / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
-    mid_altitude = turbulence.mid_altitude * np.exp(-h / 1.5e3)
+    mid_altitude_strength = turbulence.mid_altitude_strength * np.exp(-h / 1.5e3)
     return (
         turbulence.uniform
         + aloft
-        + mid_altitude
+        + mid_altitude_strength
         + turbulence.surface_layer_strength * np.exp(-h / 100)
     )
 
@@ -167,7 +168,7 @@ def _path_quadrature(wave: str) -> tuple[np.ndarray, np.ndarray]:
     Nodes are fractions of the path from source to receiver. Weights include the powers of the
     distances to both.
     """
-    to_receiver, to_source = _DISTANCE_EXPONENTS[wave]
+    to_receiver, to_source = _RYTOV_DISTANCE_EXPONENTS[wave]
     nodes, weights = special.roots_jacobi(64, to_receiver, to_source)
     return (1 + nodes) / 2, weights / 2 ** (1 + to_receiver + to_source)
 
@@ -202,9 +203,9 @@ def log_irradiance_variances(
     -----
     exp(large + small) - 1 is the scintillation index: the Rytov variance for a point in weak
     turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong turbulence. The published fit
-    serves any strength and averages too little over wide apertures. In weak turbulence it is 1.3
-    times Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) times where
-    it is 10.
+    serves any strength and averages too little over wide apertures. In weak turbulence its
+    scintillation index is 1.3 times Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or
+    1.5 (spherical) times where it is 10.
     """
     rytov = np.asarray(rytov_variance, float)
     wavenumber = 2 * math.pi / np.asarray(wavelength, float)
@@ -229,7 +230,8 @@ _GAMMA_VARIANCE_MIN = 1e-5
 quantiles."""
 _PD_SLOPE_MAX, _PD_CURVATURE_MAX = 0.5, 0.5
 """Bounds on derivatives of Marcum's Q_1(a, b) by ln a, with the signal a and the threshold b over
-the noise per quadrature. The first is 1 + b, the second 1 + b^2, times these numbers."""
+the noise per quadrature. The first derivative is at most the first number times 1 + b, the second
+at most the second number times 1 + b^2."""
 
 
 def draw_scintillation_factors(
@@ -260,7 +262,7 @@ def draw_scintillation_factors(
     uniform_draws = draw_addresses.uniforms(philox.STREAM_SCINTILLATION, 4)
     factor = np.ones(draw_addresses.draw_numbers.size)
     for i, variance in enumerate(v for leg in legs for v in leg):
-        factor *= _inverse_distribution(
+        factor *= _irradiance_quantile(
             distribution, uniform_draws[:, i], np.asarray(variance, float)
         )
     return factor
@@ -287,7 +289,7 @@ def _log_amplitude_moments(
     return np.asarray(mean / 2), np.asarray((mean**2 + variance) / 4)
 
 
-def _inverse_distribution(
+def _irradiance_quantile(
     distribution: str, probability: np.ndarray, variance: np.ndarray
 ) -> np.ndarray:
     """Return the quantile of a factor of unit mean and a given log variance.
@@ -345,7 +347,7 @@ def two_way_log_variances(
     out, back : LogIrradianceVariances
         A plane wave averaged over the footprint, and a spherical wave averaged over the aperture.
     """
-    lidar_height, target_height = path_heights(parameters, range)
+    lidar_height, target_height = path_end_heights(parameters, range)
     aperture = np.asarray(parameters[TELESCOPE_PREFIX + "aperture"], float)
     footprint_diameter = aperture + beam.far_field_divergence(parameters) * range
     legs = (

@@ -21,8 +21,9 @@ or on a beam that slides over sloping ground.
 
 With several looks (:mod:`sweep.model.detection.looks`) segments start as those of the middle look,
 to whose time interpolated ranges are corrected. Lines move by the same number of bins from look to
-look. Averaged powers are smeared by this drift. Looks that are counted, added in amplitude, or that
-fade independently do not model the drift, and must lie within :data:`LOOK_DRIFT_MAX_WINDOW_BINS`.
+look. Averaged powers are smeared by this drift. The drift is not modelled for looks that are
+counted, added in amplitude, or fade independently; it must then be within
+:data:`LOOK_DRIFT_MAX_WINDOW_BINS`.
 """
 
 import math
@@ -32,7 +33,7 @@ import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import DRIFT_POSITIONS_MAX, LOOKS_NUMBER_PATH
-from sweep.model.effects.doppler import line_shift_bound
+from sweep.model.effects.doppler import line_shift_error_bound
 from sweep.model.effects.effect import Effect, EffectContext
 from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
@@ -46,7 +47,7 @@ sample rate over the number of samples in the record. The error is 1 % of the po
 
 
 def range_drift_max(points: PlannerInputs) -> np.ndarray:
-    """Return an upper bound [m] of the change of range from the shot's start to each segment's."""
+    """Return an upper bound [m] of the change of range from the shot's to each segment's start."""
     end_time = points.segment_starts + points.middle_look_delay
     target = points.target
     return np.asarray(
@@ -55,7 +56,7 @@ def range_drift_max(points: PlannerInputs) -> np.ndarray:
 
 
 def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
-    """Return an upper bound [bins] of the line's shift from the shot's start to each segment's.
+    """Return an upper bound [bins] of the line's shift from the shot's to each segment's start.
 
     The line shifts because the range and velocity of the target change.
     """
@@ -76,8 +77,8 @@ def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if segments share range and velocity.
 
-    Phases of lines that add are included. A line meets its image at the phase of its new position.
-    Beamlets with velocities of their own turn against each other.
+    The bound includes phases of lines that add. The phase between a line and its image changes with
+    the line's position, and that between beamlets of different velocities with time.
     """
     if not any(
         np.any(speed)
@@ -89,17 +90,19 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     ):
         return None
     shift_bins = line_drift_max_bins(points)
-    bound = line_shift_bound(points, shift_bins)
+    bound = line_shift_error_bound(points, shift_bins)
     if not points.adds_amplitudes:
         return bound
     spread_cycles = (
-        points.velocity_spread.largest_magnitude * points.record.bin_width * points.segment_starts
+        points.line_spread_by_velocity.largest_magnitude
+        * points.record.bin_width
+        * points.segment_starts
     )
     spread_change = (
         np.minimum(2 * np.pi * spread_cycles, 2.0) / points.window_response.scalloping_gain_min
     )
     cycles = 2 / SPEED_OF_LIGHT * points.carriers * range_drift_max(points)
-    image_change = points.image_bound * np.minimum(4 * np.pi * cycles, 2.0)
+    image_change = points.image_magnitude_bound * np.minimum(4 * np.pi * cycles, 2.0)
     coherent_change = bound.coherent_sum_change + 2 * spread_change + image_change
     return bound._replace(coherent_sum_change=coherent_change)
 

@@ -65,7 +65,7 @@ from sweep.model.shot_records import EchoSpeckle
 
 _ROUGHNESS_PATH = "target.roughness"
 _SPECKLE_PATH = "footprint.speckle"
-_DIFFUSE_RATIO_MAX = 5.0
+_DIFFUSE_AMPLITUDE_RATIO_MAX = 5.0
 """Bound on the ratio of a bin's diffuse (random) amplitude to its root mean square. It is exceeded
 in one of a million draws."""
 
@@ -148,7 +148,7 @@ def draw_speckle_factors(
     )
 
 
-def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
+def speckle_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of results if speckle is omitted; None if it is absent.
 
     The bound holds in all draws but a fraction of 1e-6.
@@ -165,7 +165,7 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
     kappa = coherent_echo_fraction(
         roughness=points[_ROUGHNESS_PATH], wavelength=points["instrument.laser.wavelength"]
     )
-    diffuse_change = _DIFFUSE_RATIO_MAX * np.sqrt(1 - kappa)
+    diffuse_change = _DIFFUSE_AMPLITUDE_RATIO_MAX * np.sqrt(1 - kappa)
     if not points.adds_amplitudes:
         is_near_image = points.is_near_image | (points.n_beamlets > 1)
         return ErrorBound(
@@ -273,7 +273,7 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     )
 
 
-def fading_bound(points: PlannerInputs) -> ErrorBound | None:
+def fading_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return an error of 1 where developed speckle is selected, so that fading is simulated.
 
     Without the effect, the probability of detection would be that of a steady echo of the mean
@@ -308,7 +308,7 @@ def apply_fading(shots: Shots, context: EffectContext) -> Shots:
     beam_spread = _beam_spread(shots, context.ground)
     line_deviation = _line_deviation_bins(shots, beam_spread.beamlet_moments)
     correlations = [
-        beam_spread.correlation(shots, pair, phase)
+        beam_spread.speckle_correlation(shots, pair, phase)
         for pair, phase in zip(SEGMENT_PAIRS, segment_phase_differences(shots), strict=True)
     ]
     line_gradients = _line_gradients(shots, context.ground)
@@ -346,7 +346,7 @@ def _line_deviation_bins(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
 _N_LINE_NODES, _LINE_DEVIATIONS_MAX = 81, 4.0
 """Number of evenly spaced lines that represent the lines of a footprint, and distance of the
 outermost ones from the centre, in standard deviations of the beam."""
-_DECORRELATION_MIN = 1e-9
+_LOOK_DECORRELATION_MIN = 1e-9
 """Largest loss of correlation between looks (records of a segment) for which all looks count as
 having the same speckle."""
 
@@ -358,7 +358,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     """
     looks = shots.looks
     n_looks, n_points = looks.number, shots.size
-    echo_frequencies, _ = _echo_frequencies(shots)
+    echo_frequencies, _ = _mid_record_frequencies_and_times(shots)
     cycles_per_look = [
         np.broadcast_to(echo_frequency * shots.waveform.look_period, n_points)
         for echo_frequency in echo_frequencies
@@ -374,7 +374,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     for segment in map(int, np.flatnonzero(shots.has_segment)):
         for lag in range(1, n_looks):
             phase = PhaseDifference(cycles_per_look[segment] * lag, zeros)
-            correlation_by_lag[segment, :, lag] = beam_spread.correlation(
+            correlation_by_lag[segment, :, lag] = beam_spread.speckle_correlation(
                 shots, (segment, segment), phase
             )
     if looks.n_coherent > 1:
@@ -388,8 +388,8 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
         return replace(shots, echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gain))
     look_power = _look_powers(shots, beam_spread.beam_gradients)
     if (
-        np.abs(correlation_by_lag - 1).max() < _DECORRELATION_MIN
-        and np.abs(look_power - 1).max() < _DECORRELATION_MIN
+        np.abs(correlation_by_lag - 1).max() < _LOOK_DECORRELATION_MIN
+        and np.abs(look_power - 1).max() < _LOOK_DECORRELATION_MIN
     ):
         return shots
     segment_correlation = np.abs(np.array(shots.speckle.segment_correlations))
@@ -423,7 +423,9 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
             turned_phase = PhaseDifference(
                 phase.doppler_cycles + lag * cycles_per_look[second], phase.delay_cycles
             )
-            squared_correlation = np.abs(beam_spread.correlation(shots, pair, turned_phase)) ** 2
+            squared_correlation = (
+                np.abs(beam_spread.speckle_correlation(shots, pair, turned_phase)) ** 2
+            )
             squared_sum = squared_sum + (n_looks - abs(lag)) * squared_correlation
         segment_correlation[pair_index] = (
             np.sqrt(squared_sum)
@@ -481,7 +483,7 @@ class BeamSpread(NamedTuple):
     beamlet_moments: "BeamletMoments"
     """Power-weighted moments of the Doppler ratio and the relative range of the beam's rays."""
 
-    def correlation(
+    def speckle_correlation(
         self, shots: Shots, pair: tuple[int, int], phase: "PhaseDifference"
     ) -> np.ndarray:
         """Return the correlation of the speckle in two records.
@@ -537,7 +539,7 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
         beam_gradients, doppler_across = ground.gradients, np.zeros(shots.size)
     else:
         row, offset, doppler, echo = ground.beamlets
-        moments = _moments_by_surface(
+        moments = _moments_about_surface_means(
             echo, np.array([doppler, offset]), ground.off_axis_surface, row
         )
         beam_gradients = _ray_traced_gradients(moments)
@@ -595,7 +597,7 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
 
     Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
-    echo_frequencies, record_middles = _echo_frequencies(shots)
+    echo_frequencies, record_middles = _mid_record_frequencies_and_times(shots)
     delay = 2 * shots.range / SPEED_OF_LIGHT
     phase_cycles = [
         frequency * (start + middle)
@@ -612,11 +614,11 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
     ]
 
 
-def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
+def _mid_record_frequencies_and_times(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the echo's optical frequency F at mid-record of each segment, and mid-record's time.
 
-    The time is the centroid of the window over the samples that hold the echo. There the phase of a
-    bin is that of the line, to first order in their distance.
+    The time is the centroid of the window over the samples that hold the echo. At this time the
+    phase of a bin is that of the line, to first order in their distance.
     """
     delay = 2 * shots.range / SPEED_OF_LIGHT
     middle_shift = (
@@ -671,9 +673,10 @@ def _line_pair_gradients(
     )
 
 
-_IMAGE_REACH_BINS = 2.0
-"""Reach from DC or Nyquist within which the image of an echo may make another bin the strongest. It
-is this number times the sum of padding factor and standard deviation of the lines [FFT bins]."""
+_IMAGE_REACH_FACTOR = 2.0
+"""Factor of the distance from DC or Nyquist within which the image of an echo may make another bin
+the strongest. The distance is this factor times the sum of padding factor and standard deviation of
+the lines [FFT bins]."""
 
 
 def _strongest_bins_with_images(
@@ -693,7 +696,7 @@ def _strongest_bins_with_images(
     padding_factor = shots.fft_size / shots.window.length
     near_end = np.flatnonzero(
         np.abs(line_positions - spectrum_ends)
-        < _IMAGE_REACH_BINS * (padding_factor + np.abs(line_deviation_bins))
+        < _IMAGE_REACH_FACTOR * (padding_factor + np.abs(line_deviation_bins))
     )
     if not near_end.size:
         return nearest_bins
@@ -736,7 +739,7 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     and the ground below, are separate echoes, which fade independently.
     """
     values = np.array([shots.footprint.doppler_ratio_offset, shots.footprint.relative_range_offset])
-    return _moments_by_surface(
+    return _moments_about_surface_means(
         shots.footprint.relative_amplitude**2,
         values,
         ground.off_axis_surface,
@@ -744,7 +747,7 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     )
 
 
-def _moments_by_surface(
+def _moments_about_surface_means(
     power: np.ndarray, values: np.ndarray, off_axis_surface: np.ndarray | None, row: np.ndarray
 ) -> BeamletMoments:
     """Return power-weighted moments of values (2, rows, beamlets), for points with the given rows.
@@ -782,7 +785,7 @@ def _phase_moments(
 
 
 def _ray_traced_gradients(moments: BeamletMoments) -> BeamGradients:
-    """Return the gradients of ray-traced ground along its steepest range, (n,) each."""
+    """Return the gradients of ray-traced ground in the direction of steepest range, (n,) each."""
     deviation = np.sqrt(moments.covariance[1, 1])
     doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _ZERO_DIVISOR_SUBSTITUTE)
     return BeamGradients(doppler_along, deviation, np.zeros(deviation.shape))
@@ -792,7 +795,7 @@ FADING = Effect(
     name="fading",
     description="developed speckle of a rough surface, in closed form",
     stage="detection",
-    error_bound=fading_bound,
+    error_bound=fading_error_bound,
     apply=apply_fading,
     required_effects=("footprint", "doppler_spread"),
     parameters=(
@@ -814,7 +817,7 @@ SPECKLE = Effect(
     name="speckle",
     description="amplitudes of a rough surface, at random",
     stage="draws",
-    error_bound=speckle_bound,
+    error_bound=speckle_error_bound,
     perturb_shots=perturb_shots,
     required_effects=("footprint", "doppler_spread"),  # these decorrelate the segments' speckle
     parameters=(

@@ -28,12 +28,12 @@ from sweep.model.detection.echo_detection import mark_exempt_bins
 from sweep.model.elementary_functions import sincos_cycles
 from sweep.model.kernel_integers import INTEGER_ZERO
 from sweep.model.spectrum.line_shape import (
-    KERNEL_BASIS,
-    KERNEL_CELLS,
-    KERNEL_DEGREE,
+    KERNEL_POLYNOMIAL_DEGREE,
+    KERNEL_POLYNOMIALS,
     N_END_COEFFICIENTS,
+    N_KERNEL_CELLS,
+    N_ZERO_WEIGHT_CELLS,
     TABLE_CELLS_PER_BIN,
-    ZERO_WEIGHT_CELLS,
 )
 from sweep.model.spectrum.lines import (
     BATCH_SCRATCH_SIZE,
@@ -59,12 +59,12 @@ LINE_BATCH_WIDTH_BINS = 8
 """Width [bins] of a frequency interval whose lines are spread over table cells in one pass. A bin
 is computed from the table only if the table of every line in the interval contains it."""
 
-LINE_BATCH_EDGE_BINS = KERNEL_CELLS // 2 // min(TABLE_CELLS_PER_BIN) + 1
+LINE_BATCH_EDGE_BINS = N_KERNEL_CELLS // 2 // min(TABLE_CELLS_PER_BIN) + 1
 """Greatest distance [bins] outside an interval of LINE_BATCH_WIDTH_BINS at which its lines occupy
 cells."""
 
 LINE_BATCH_CELLS_MAX = (
-    LINE_BATCH_WIDTH_BINS * max(TABLE_CELLS_PER_BIN) + KERNEL_CELLS + ZERO_WEIGHT_CELLS
+    LINE_BATCH_WIDTH_BINS * max(TABLE_CELLS_PER_BIN) + N_KERNEL_CELLS + N_ZERO_WEIGHT_CELLS
 )
 """Maximum number of table cells over which the lines of one interval of LINE_BATCH_WIDTH_BINS are
 spread."""
@@ -97,7 +97,7 @@ class LineBundle(NamedTuple):
 class FoldedLineRange(NamedTuple):
     """Lowest and highest bin of lines in a spectrum, after negative frequencies are folded at DC.
 
-    In a spectrum that is not folded, lines of negative frequency keep it.
+    In a spectrum that is not folded, negative frequencies remain negative.
     """
 
     lowest_position: float
@@ -145,7 +145,7 @@ class AveragingShifts(NamedTuple):
     """(shifts,): weight of each shift in the average; the sum is 1."""
 
 
-class EndStrengths(NamedTuple):
+class EndAmplitudes(NamedTuple):
     """Lines, or equivalent lines, with their complex amplitudes at both ends of the record."""
 
     position: np.ndarray
@@ -200,9 +200,9 @@ class FieldWorkspace(NamedTuple):
     """Real part of the weights in the table cells over which lines are spread."""
     cell_im: np.ndarray
     """Imaginary part of the weights in the table cells over which lines are spread."""
-    line_ends: EndStrengths
+    line_ends: EndAmplitudes
     """Amplitudes of the segment's lines at the record's start and end."""
-    far_equivalent_lines: EndStrengths
+    far_equivalent_lines: EndAmplitudes
     """Equivalent lines (sources), which replace the segment's lines in bins far away."""
     far_bins: FarBins
     """Trigonometric values and scratch arrays for a batch of bins far from the lines."""
@@ -309,8 +309,8 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
         line_scratch=LineScratch(*next_rows(3)),
         cell_re=next(rows),
         cell_im=next(rows),
-        line_ends=EndStrengths(lines.position, *next_rows(4)),
-        far_equivalent_lines=EndStrengths(*next_rows(5)),
+        line_ends=EndAmplitudes(lines.position, *next_rows(4)),
+        far_equivalent_lines=EndAmplitudes(*next_rows(5)),
         far_bins=FarBins(*next_rows(8)),
         re=next(rows),
         im=next(rows),
@@ -347,7 +347,7 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
     layout : SpectrumLayout
         Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
     field : FieldWorkspace
-        Lines and scratch arrays. The results are ``re`` and ``im`` [V], to which is added.
+        Lines and scratch arrays. The spectrum is added to ``re`` and ``im`` [V].
     """
     fft_size, cells_per_bin = layout.fft_size, layout.cells_per_bin
     lines, last_line_bin = field.lines, math.floor(bundle.highest_position)
@@ -360,32 +360,37 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
         if n_periods_min > n_periods_max:  # the table holds none of these bins
             continue
         n_cells = (
-            min(LINE_BATCH_WIDTH_BINS, last_line_bin + 1 - batch_bin) * cells_per_bin + KERNEL_CELLS
+            min(LINE_BATCH_WIDTH_BINS, last_line_bin + 1 - batch_bin) * cells_per_bin
+            + N_KERNEL_CELLS
         )
-        for c in range(n_cells + ZERO_WEIGHT_CELLS):
+        for c in range(n_cells + N_ZERO_WEIGHT_CELLS):
             field.cell_re[c], field.cell_im[c] = 0.0, 0.0
         for line in range(bundle.n_lines):
             if batch_bin <= lines.position[line] < batch_bin + LINE_BATCH_WIDTH_BINS:
                 cell_position = (lines.position[line] - batch_bin) * cells_per_bin
-                _spread_line(
+                _spread_line_over_cells(
                     cell_position, lines.re[line], lines.im[line], field.cell_re, field.cell_im
                 )
         for n_periods in range(n_periods_min, n_periods_max + 1):
-            _add_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field)
+            _add_spectrum_of_cells(
+                first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field
+            )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _spread_line(cell_position, re, im, cell_re, cell_im):
-    """Add a line of complex weight ``re`` + i ``im`` to KERNEL_CELLS cells around its position.
+def _spread_line_over_cells(cell_position, re, im, cell_re, cell_im):
+    """Add a line of complex weight ``re`` + i ``im`` to N_KERNEL_CELLS cells around its position.
 
     ``cell_position`` is the line's position in cells from the first cell.
     """
     cell = np.uint64(math.floor(cell_position))
     cell_coordinate = 2.0 * (cell_position - math.floor(cell_position)) - 1.0
-    for j in range(np.uint64(KERNEL_CELLS + ZERO_WEIGHT_CELLS)):
-        weight = KERNEL_BASIS[KERNEL_DEGREE, j]
-        for d in range(KERNEL_DEGREE):
-            weight = weight * cell_coordinate + KERNEL_BASIS[KERNEL_DEGREE - 1 - d, j]
+    for j in range(np.uint64(N_KERNEL_CELLS + N_ZERO_WEIGHT_CELLS)):
+        weight = KERNEL_POLYNOMIALS[KERNEL_POLYNOMIAL_DEGREE, j]
+        for d in range(KERNEL_POLYNOMIAL_DEGREE):
+            weight = (
+                weight * cell_coordinate + KERNEL_POLYNOMIALS[KERNEL_POLYNOMIAL_DEGREE - 1 - d, j]
+            )
         cell_re[cell + j] += re * weight
         cell_im[cell + j] += im * weight
 
@@ -412,10 +417,10 @@ def _end_bin_in_table(batch_bin, n_periods, layout):
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def _add_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field):
+def _add_spectrum_of_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field):
     """Add the spectrum of the cells of one interval of lines to ``field``.
 
-    The first cell lies KERNEL_CELLS / 2 - 1 cells below ``batch_bin``, the interval's first bin.
+    The first cell lies N_KERNEL_CELLS / 2 - 1 cells below ``batch_bin``, the interval's first bin.
     """
     cells_per_bin, adds_powers = layout.cells_per_bin, layout.adds_powers
     n_columns = shape.table_re.size // cells_per_bin
@@ -427,7 +432,7 @@ def _add_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, 
         return
     for c in range(n_cells):
         re, im = sign * field.cell_re[c], sign * field.cell_im[c]
-        cell_index = c + 1 - KERNEL_CELLS // 2
+        cell_index = c + 1 - N_KERNEL_CELLS // 2
         bin_, row = begin_bin + cell_index // cells_per_bin, cell_index % cells_per_bin
         if layout.holds_all_bins:
             low, high = max(first_bin, bin_), min(first_bin + n_bins, bin_ + n_columns)
@@ -513,7 +518,7 @@ def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layo
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def far_line_weight(weight_sum, n_sources, layout, sources):
-    """Return the total weight [V] of the lines that determines the spectrum in bins far from them.
+    """Return the total weight [V] that the lines have in bins far from them.
 
     Parameters
     ----------
@@ -523,7 +528,7 @@ def far_line_weight(weight_sum, n_sources, layout, sources):
         Number of equivalent lines.
     layout : SpectrumLayout
         Sizes and type of the spectrum.
-    sources : EndStrengths
+    sources : EndAmplitudes
         Equivalent lines, with their amplitudes at both ends of the record.
     """
     start_sum, end_sum = 0.0, 0.0
@@ -535,7 +540,7 @@ def far_line_weight(weight_sum, n_sources, layout, sources):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def tangent_at(bin_, fft_size, bin_tangents):
+def tangent_of_bin(bin_, fft_size, bin_tangents):
     """Return tan(pi k / N) of any bin k, for the FFT size N.
 
     Parameters
@@ -597,7 +602,7 @@ def add_line_by_record_ends(
     field_offset
         Index in F of the first bin.
     strengths
-        :class:`EndStrengths` of lines or sources.
+        :class:`EndAmplitudes` of lines or sources.
     line
         Index of the line or source.
     log_accuracy
@@ -1030,7 +1035,7 @@ def bins_around_lines(margin_bins, folded_range, layout):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def distance_below_level_with_images(level, weight_sum, folded_range, envelope, layout):
+def falloff_distance_with_images(level, weight_sum, folded_range, envelope, layout):
     """Return the distance [bins] beyond which the spectrum of lines and images is below a level.
 
     Parameters
@@ -1115,7 +1120,7 @@ def detect_in_span(
         bundle.highest_position + shift_max,
         layout,
     )
-    margin_bins = distance_below_level_with_images(
+    margin_bins = falloff_distance_with_images(
         lowest_level, weight_sum, folded_range, shape.envelope, layout
     )
     if not lowest_level > 0.0:
@@ -1133,7 +1138,7 @@ def detect_in_span(
             weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
         )
         margin_bins = max(
-            distance_below_level_with_images(
+            falloff_distance_with_images(
                 lowest_level, far_weight, folded_range, shape.envelope, layout
             ),
             2.0 * layout.clearance_bins,
@@ -1160,7 +1165,7 @@ def detect_in_span(
         largest = span.magnitude[peak_index]
         if largest >= lowest_level or n_bins >= n_bins_max:
             return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0)
-        margin_needed = distance_below_level_with_images(
+        margin_needed = falloff_distance_with_images(
             largest, weight_sum, folded_range, shape.envelope, layout
         )
         if margin_needed <= margin_bins:

@@ -66,12 +66,12 @@ from sweep.model.spectrum.bin_spectrum import (
     bins_around_lines,
     compute_end_strengths_and_far_lines,
     compute_magnitudes,
-    distance_below_level_with_images,
     envelope_index,
+    falloff_distance_with_images,
     far_line_weight,
     folded_line_range,
     is_mirrored,
-    tangent_at,
+    tangent_of_bin,
 )
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
@@ -102,17 +102,21 @@ CERTAIN_LEAKAGE_RATE = 34.5
 """Upper limit of the bins' summed rate of false alarms due to leaked signal. Larger sums count as
 this value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
 
-_SPECKLE_INTEGRATION_STEPS = 160
-_RELATIVE_ROOT_POWERS = np.arange(1, _SPECKLE_INTEGRATION_STEPS + 1) / _SPECKLE_INTEGRATION_STEPS
-_POWER_NODES = np.concatenate([[0.0], SPECKLE_POWER_MAX * _RELATIVE_ROOT_POWERS**2])
+_N_SPECKLE_INTEGRATION_STEPS = 160
+_RELATIVE_ROOT_SPECKLE_POWERS = (
+    np.arange(1, _N_SPECKLE_INTEGRATION_STEPS + 1) / _N_SPECKLE_INTEGRATION_STEPS
+)
+_SPECKLE_POWER_NODES = np.concatenate([[0.0], SPECKLE_POWER_MAX * _RELATIVE_ROOT_SPECKLE_POWERS**2])
 """Speckle powers, over their mean, at which a mean over speckle is evaluated. Small powers are
 closer together."""
-_OCTAVES_BELOW_MAX = -2 * np.log2(_RELATIVE_ROOT_POWERS)
+_SPECKLE_OCTAVES_BELOW_MAX = -2 * np.log2(_RELATIVE_ROOT_SPECKLE_POWERS)
 """Distance of each speckle power, except 0, below SPECKLE_POWER_MAX [octaves]."""
-_POWER_WEIGHTS = (
-    np.exp(-_POWER_NODES[1:])
+_SPECKLE_POWER_WEIGHTS = (
+    np.exp(-_SPECKLE_POWER_NODES[1:])
     * 0.5
-    * np.append(_POWER_NODES[2:] - _POWER_NODES[:-2], np.diff(_POWER_NODES[-2:]))
+    * np.append(
+        _SPECKLE_POWER_NODES[2:] - _SPECKLE_POWER_NODES[:-2], np.diff(_SPECKLE_POWER_NODES[-2:])
+    )
 )
 """Weight of each speckle power, except 0, in a mean over speckle. It is the density e^-u of the
 power u, times its trapezoidal interval."""
@@ -255,7 +259,7 @@ def detect_with_leakage(
         else math.inf
     )
     distance_min = crossing_distance = max(
-        distance_below_level_with_images(
+        falloff_distance_with_images(
             brightest_limits.threshold, weight_sum, folded_range, envelope, layout
         ),
         float(clearance),
@@ -271,7 +275,7 @@ def detect_with_leakage(
             weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
         )
         crossing_distance = max(
-            distance_below_level_with_images(
+            falloff_distance_with_images(
                 brightest_limits.threshold, far_weight, folded_range, envelope, layout
             ),
             float(clearance),
@@ -378,7 +382,7 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
     """
     if speckle_power_max > 1.0:
         return _false_peak_probability_averaged_over_speckle(n_bins, limits, span, speckle_rates)
-    return _further_group_probability(n_bins, limits, span, crossing_series)
+    return _false_peak_probability(n_bins, limits, span, crossing_series)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -403,7 +407,7 @@ def false_peak_probability_of_bins(n_bins, limits, negligible_signal_ratio, span
         sigma.
     """
     _clear_negligible_bins(n_bins, limits.noise_sigma, negligible_signal_ratio, span)
-    return _further_group_probability(n_bins, limits, span, crossing_series)
+    return _false_peak_probability(n_bins, limits, span, crossing_series)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -442,7 +446,7 @@ def _clear_negligible_bins(n_bins, noise_sigma, negligible_signal_ratio, span):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _further_group_probability(n_bins, limits, span, crossing_series):
+def _false_peak_probability(n_bins, limits, span, crossing_series):
     """Return the probability that leaked signal raises a false peak apart from the echo.
 
     A false peak is a group of adjacent bins above the threshold. The crossing probabilities of the
@@ -644,8 +648,8 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
     """
     last_index, mean, interval = log_rates.size - 1, 0.0, -1
     slope_at_start, slope_at_end, slope = 0.0, 0.0, 0.0
-    for i in range(_SPECKLE_INTEGRATION_STEPS - 1, -1, -1):
-        table_position = powers_per_octave * _OCTAVES_BELOW_MAX[i]
+    for i in range(_N_SPECKLE_INTEGRATION_STEPS - 1, -1, -1):
+        table_position = powers_per_octave * _SPECKLE_OCTAVES_BELOW_MAX[i]
         k = int(table_position)
         if k >= last_index:
             log_rate = (
@@ -675,7 +679,7 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
             )
         rate = math.exp(min(log_rate, 4.0))
         p_leakage = rate * (1.0 - rate * (0.5 - rate / 6.0)) if rate < 1e-4 else -math.expm1(-rate)
-        mean += _POWER_WEIGHTS[i] * p_leakage
+        mean += _SPECKLE_POWER_WEIGHTS[i] * p_leakage
     return mean
 
 
@@ -757,12 +761,12 @@ def _leakage_bound_of_span(n_bins, limits, span):
 
     Notes
     -----
-    Leakage is the probability of false alarms due to the echo's signal. With x = a^2/2 and y =
-    b^2/2, of the signal a and the threshold b over the noise sigma, Q_1 is convex in x up to y - 2.
-    Q_1 is the Marcum function. The reason is I_2(z) / I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z =
-    a b. Relative to the strongest bin each bin then adds at most the ratio of their powers. The
-    strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2 allows for the probability that
-    noise alone stays below the threshold, at least 1 - e^-2.
+    Leakage is the probability of false alarms due to the echo's signal. Let a be the signal and b
+    the threshold over the noise sigma, x = a^2/2, y = b^2/2 and z = a b. Marcum's Q_1 is convex in
+    x up to y - 2, because I_2(z) / I_1(z) >= z / (2 + sqrt(z^2 + 4)). Relative to the strongest bin
+    each bin then adds at most the ratio of their powers. The strongest bin adds at most e^{-(b -
+    a)^2 / 2}. The factor 1.2 allows for the probability that noise alone stays below the threshold,
+    at least 1 - e^-2.
     """
     largest, square_sum = 0.0, 0.0
     for i in range(n_bins):
@@ -782,7 +786,7 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
     """Compute the increase of each bin's crossing probability that signal causes over noise alone.
 
     Bins of the echo are left out. Bins above the threshold, which bright speckle may contain, are
-    outside the range of the series.
+    outside the range of the series and are computed by Marcum's function.
 
     Parameters
     ----------
@@ -1126,7 +1130,7 @@ def _fill_far_powers(
     line_direction = -1 if is_mirror_image else 1
     for image_pass in range(2 if layout.spectrum_type == REAL_WITH_IMAGES else 1):
         direction = line_direction if image_pass == 0 else -line_direction
-        tangent_shift = tangent_at(
+        tangent_shift = tangent_of_bin(
             centre_bin - direction * bundle.origin_bin, layout.fft_size, bin_tangents
         )
         for i in range(n_points):

@@ -12,7 +12,7 @@ whose phase counts from the middle of the record. G has three representations:
   on either side. Each line is spread over the fourteen cells around it by a Kaiser-Bessel kernel,
   as in non-uniform FFTs [Fessler and Sutton 2003]. The table is divided by the kernel's transform.
   The error is 1e-12 of the peak.
-- **Beyond the table** the two ends of the record alone. With c = cot(pi y / N),
+- **Beyond the table** the two ends of the record alone determine G. With c = cot(pi y / N),
 
       G(y) = e^{i pi r y} A(c) - e^{-i pi r y} B(c)
 
@@ -51,13 +51,13 @@ TABLE_CELLS_PER_BIN = (2, 4)
 """Number of table cells in a bin of width fs/N: if amplitudes add, and if powers add. fs is the
 sample rate, N the FFT size."""
 
-KERNEL_CELLS = 14
+N_KERNEL_CELLS = 14
 """Number of table cells over which a line is spread: cells -6 .. 7 for a line between cells 0 and
 1."""
 
 KERNEL_BETA = 32.32432
 """Parameter b of the Kaiser-Bessel kernel that spreads a line over table cells. At a distance of z
-cells it is I_0(b sqrt(1 - (2 z / KERNEL_CELLS)^2)) / I_0(b)."""
+cells it is I_0(b sqrt(1 - (2 z / N_KERNEL_CELLS)^2)) / I_0(b)."""
 
 DECONVOLUTION_TAPS = np.array([
     27.059814524108916, -24.069297462538476, 18.21886188994693, -12.301303141361002,
@@ -71,7 +71,7 @@ transform. Its relative error is 1e-13 below a phase of pi / 2 per cell."""
 
 
 class LineShapeTier(NamedTuple):
-    """Sizes of the tables of line shapes whose phase errors need up to a number of modes.
+    """Sizes of line-shape tables, for phase errors of up to ``n_modes_max`` Chebyshev modes.
 
     Distances are in bins of fs/L, with the sample rate fs and L samples in the record.
     """
@@ -96,12 +96,13 @@ SHARED_TABLE_BINS = 256
 """Half-width [bins of fs/L, L samples] of a line-shape table that many points share. It is wide
 enough for wide footprints."""
 
-END_DERIVATIVES_MAX = 12
-"""Highest order of derivatives at the record's ends in a line's spectrum far from the line."""
+END_DERIVATIVE_ORDER_MAX = 12
+"""Highest order of the derivatives at the record's ends from which a line's spectrum far from the
+line is computed."""
 
-N_END_COEFFICIENTS = END_DERIVATIVES_MAX + 2
-"""Number of coefficients of each polynomial, of the record's start or end, that gives a line's
-spectrum far from the line."""
+N_END_COEFFICIENTS = END_DERIVATIVE_ORDER_MAX + 2
+"""Number of coefficients of each of the two polynomials, one of the record's start and one of its
+end, that give a line's spectrum far from the line."""
 
 MODE_COEFFICIENT_MIN = 1e-13
 """Smallest Chebyshev coefficient of a phase error's phasor that counts as a mode. The last modes
@@ -121,11 +122,11 @@ _ENVELOPE_MARGIN = 1.05
 _TAP_REACH_CELLS = DECONVOLUTION_TAPS.size - 1
 """Number of extra cells on each side of a table that DECONVOLUTION_TAPS needs."""
 
-KERNEL_DEGREE = 13
+KERNEL_POLYNOMIAL_DEGREE = 13
 """Degree of the polynomials that approximate the spreading kernel within a cell."""
 
-ZERO_WEIGHT_CELLS = 2
-"""Number of cells of weight 0 after the KERNEL_CELLS cells of a line. They fill the processor's
+N_ZERO_WEIGHT_CELLS = 2
+"""Number of cells of weight 0 after the N_KERNEL_CELLS cells of a line. They fill the processor's
 vectors."""
 
 ECHO_LENGTH_CLASS_RATIO = math.sqrt(2.0)
@@ -139,7 +140,7 @@ echo's number of samples. Sums over samples are then integrals with six Euler-Ma
 
 _LATE_TABLE_MARGIN_BINS = 16
 """Extra bins in the table of a late echo, for lines that are spread together. A bin is fs/L' wide,
-L' being the echo's number of samples. The bins follow the distance beyond which the record's ends
+L' being the echo's number of samples. They are added to the distance beyond which the record's ends
 determine the shape."""
 
 _LATE_PADDING_MAX = 16
@@ -250,13 +251,13 @@ class LineShapeTables(NamedTuple):
     layout: SpectrumLayout
     """Sizes of the spectrum and of a line-shape table."""
     chebyshev_transforms: np.ndarray
-    """(modes, places): Fourier transform of each Chebyshev mode without the record's first sample.
-    It is real for even modes; for odd modes it is the imaginary part.
+    """(modes, places): Fourier transform of each Chebyshev mode times the window, in which both
+    ends of the record count half. It is real for even modes; for odd modes it is the imaginary
+    part.
 
-    Places are the table's cells at :func:`_cell_distances`. If amplitudes add, the values of a
-    shape's table follow in further places. For late echoes places are distances u = -U .. U from
-    the line in steps of half a bin of fs/L', with L' samples of the echo. The spreading kernel's
-    transform is then divided out.
+    Places are the table's cells, at :func:`_cell_distances`. If amplitudes add, further places hold
+    each mode's part of :attr:`LineShape.table_re`. For late echoes, the array is that of
+    :class:`LateModeTransforms`.
     """
     first_sample_cosine: np.ndarray
     """(places,): the window's first sample times cos(pi L y / N) at y bins from the line. L is the
@@ -289,9 +290,8 @@ class LineShapeTables(NamedTuple):
     array is empty for other tables. A late echo fills only the last samples of its record.
     """
     taylor_coefficients: np.ndarray
-    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of late echoes' modes at the record's
-    end. The array is empty for other tables.
-    """
+    """(modes, END_DERIVATIVE_ORDER_MAX + 1): Taylor coefficients of late echoes' modes at the
+    record's end. The array is empty for other tables."""
 
 
 _NO_END_POLYNOMIALS = EndPolynomials(*(np.empty((0, 1)) for _ in EndPolynomials._fields))
@@ -299,7 +299,7 @@ _NO_LINE_SHAPE_TABLE = np.empty((0, 0))
 _NO_ECHO_LENGTHS = np.empty((0, 0), np.int64)
 
 
-def _no_full_envelope(distance: np.ndarray) -> LineEnvelope:
+def _empty_full_envelope(distance: np.ndarray) -> LineEnvelope:
     """Return an empty :class:`LineEnvelope` for tables that do not hold all bins."""
     return LineEnvelope(distance, _NO_LINE_SHAPE_TABLE, _NO_LINE_SHAPE_TABLE)
 
@@ -380,14 +380,14 @@ def line_shape_tables(
         cotangent_at_envelope_distance=_cotangents(distance, fft_size),
         full_table_re=_NO_LINE_SHAPE_TABLE,
         full_table_im=_NO_LINE_SHAPE_TABLE,
-        full_envelope=_no_full_envelope(distance),
+        full_envelope=_empty_full_envelope(distance),
         echo_lengths=_NO_ECHO_LENGTHS,
         taylor_coefficients=_NO_LINE_SHAPE_TABLE,
     )
 
 
 def late_echo_length_classes(window: Window, length_min: np.ndarray) -> np.ndarray:
-    """Return the length classes of late echoes of ``length_min`` samples, (n,) int64.
+    """Return the length classes, (n,) int64, of late echoes of ``length_min`` samples.
 
     Late echoes of one class share a table. With a record of L samples, those of class c have at
     most L / :data:`ECHO_LENGTH_CLASS_RATIO` ** (c - 1) samples.
@@ -503,7 +503,7 @@ def late_line_shape_tables(
         cotangent_at_envelope_distance=_cotangents(distance, fft_size),
         full_table_re=_NO_LINE_SHAPE_TABLE,
         full_table_im=_NO_LINE_SHAPE_TABLE,
-        full_envelope=_no_full_envelope(distance),
+        full_envelope=_empty_full_envelope(distance),
         echo_lengths=_NO_ECHO_LENGTHS,
         taylor_coefficients=transforms.taylor_coefficients,
     )
@@ -513,12 +513,13 @@ class LateModeTransforms(NamedTuple):
     """Fourier transforms and Taylor coefficients of the Chebyshev modes of late echoes."""
 
     chebyshev_transforms: np.ndarray
-    """(modes, distances): half the integral of T_j(x) exp(-i pi u x) over x = -1 .. 1, divided by
-    the spreading kernel's transform. T_j is the Chebyshev polynomial of mode j, and u the distance
-    from the line [bins of fs/L'], with the echo's L' samples.
-    """
+    """(modes, distances): half the integral of T_j(x) exp(-i pi u x) / K(x) over x = -1 .. 1. T_j
+    is the Chebyshev polynomial of mode j, K the spreading kernel's transform, and u the distance
+    from the line [bins of fs/L'], with the echo's L' samples. u has a step of half a bin, and 0 in
+    the middle."""
     taylor_coefficients: np.ndarray
-    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of the modes at the record's end."""
+    """(modes, END_DERIVATIVE_ORDER_MAX + 1): Taylor coefficients of the modes at the record's end.
+    """
 
 
 @lru_cache(maxsize=len(LINE_SHAPE_TIERS))
@@ -528,7 +529,7 @@ def _late_mode_transforms(tier: int) -> LateModeTransforms:
     half_count = math.ceil(
         (1.02 * ECHO_LENGTH_CLASS_RATIO * (clearance_bins + _LATE_TABLE_MARGIN_BINS) + 14)
         * _LATE_VALUES_PER_BIN
-        + KERNEL_CELLS
+        + N_KERNEL_CELLS
     )
     frequency = np.arange(-half_count, half_count + 1) / _LATE_VALUES_PER_BIN
     n_nodes = 4 * ((math.ceil(math.pi * frequency[-1]) + n_modes) // 4) + 96
@@ -667,31 +668,33 @@ def _fill_full_line_envelope(
 def spreading_kernel(cell_distance: np.ndarray) -> np.ndarray:
     """Evaluate the kernel that spreads lines over table cells.
 
-    ``cell_distance`` is the distance from the line [cells], at most KERNEL_CELLS / 2.
+    ``cell_distance`` is the distance from the line [cells], at most N_KERNEL_CELLS / 2.
     """
-    root = np.sqrt(np.maximum(1 - (2 * cell_distance / KERNEL_CELLS) ** 2, 0.0))
+    root = np.sqrt(np.maximum(1 - (2 * cell_distance / N_KERNEL_CELLS) ** 2, 0.0))
     return np.asarray(i0(KERNEL_BETA * root) / i0(KERNEL_BETA))
 
 
-_kernel_coordinate = np.cos(np.pi * (np.arange(KERNEL_DEGREE + 1) + 0.5) / (KERNEL_DEGREE + 1))
-KERNEL_BASIS = np.zeros((KERNEL_DEGREE + 1, KERNEL_CELLS + ZERO_WEIGHT_CELLS))
+_kernel_coordinate = np.cos(
+    np.pi * (np.arange(KERNEL_POLYNOMIAL_DEGREE + 1) + 0.5) / (KERNEL_POLYNOMIAL_DEGREE + 1)
+)
+KERNEL_POLYNOMIALS = np.zeros((KERNEL_POLYNOMIAL_DEGREE + 1, N_KERNEL_CELLS + N_ZERO_WEIGHT_CELLS))
 """Polynomial coefficients of the spreading kernel, (powers, cells), from power 0 up. Their variable
-runs from -1 to 1 across a cell. The last ZERO_WEIGHT_CELLS columns are 0."""
+runs from -1 to 1 across a cell. The last N_ZERO_WEIGHT_CELLS columns are 0."""
 
-for _j in range(KERNEL_CELLS):
-    KERNEL_BASIS[:, _j] = cheb2poly(
+for _j in range(N_KERNEL_CELLS):
+    KERNEL_POLYNOMIALS[:, _j] = cheb2poly(
         chebfit(
             _kernel_coordinate,
-            spreading_kernel((_kernel_coordinate + 1) / 2 - _j + KERNEL_CELLS // 2 - 1),
-            KERNEL_DEGREE,
+            spreading_kernel((_kernel_coordinate + 1) / 2 - _j + N_KERNEL_CELLS // 2 - 1),
+            KERNEL_POLYNOMIAL_DEGREE,
         )
     )
 
 
 def spreading_kernel_transform(theta: np.ndarray) -> np.ndarray:
     """Evaluate the Fourier transform of the spreading kernel at ``theta`` [rad/cell], up to pi."""
-    root = np.sqrt(KERNEL_BETA**2 - (KERNEL_CELLS * theta / 2) ** 2)
-    return np.asarray(KERNEL_CELLS * np.sinh(root) / root / i0(KERNEL_BETA))
+    root = np.sqrt(KERNEL_BETA**2 - (N_KERNEL_CELLS * theta / 2) ** 2)
+    return np.asarray(N_KERNEL_CELLS * np.sinh(root) / root / i0(KERNEL_BETA))
 
 
 def table_size(layout: SpectrumLayout) -> int:
@@ -856,9 +859,9 @@ def _taylor_coefficients(coefficient_texts: tuple[str, ...], n_modes: int) -> np
 
     The window is the sum of cosines with the coefficients ``coefficient_texts``. The cosines may
     almost cancel at the record's end, so their sums are exact fractions. The result is (modes,
-    END_DERIVATIVES_MAX + 1).
+    END_DERIVATIVE_ORDER_MAX + 1).
     """
-    order = np.arange(END_DERIVATIVES_MAX + 1)
+    order = np.arange(END_DERIVATIVE_ORDER_MAX + 1)
     even = np.where(order % 2 == 0, (-1.0) ** (order // 2), 0.0)
     exact_sums = [
         sum(
@@ -875,10 +878,10 @@ def _taylor_coefficients(coefficient_texts: tuple[str, ...], n_modes: int) -> np
     j = np.arange(n_modes, dtype=float)[:, None]
     ratio = (j * j - order[:-1] ** 2) / (2 * order[:-1] + 1) / (order[:-1] + 1)
     mode_coefficients = np.cumprod(np.hstack([np.ones((n_modes, 1)), ratio]), axis=1)
-    coefficients = np.zeros((n_modes, END_DERIVATIVES_MAX + 1))
-    for i in range(END_DERIVATIVES_MAX + 1):
+    coefficients = np.zeros((n_modes, END_DERIVATIVE_ORDER_MAX + 1))
+    for i in range(END_DERIVATIVE_ORDER_MAX + 1):
         coefficients[:, i:] += (
-            window_coefficients[i] * mode_coefficients[:, : END_DERIVATIVES_MAX + 1 - i]
+            window_coefficients[i] * mode_coefficients[:, : END_DERIVATIVE_ORDER_MAX + 1 - i]
         )
     return coefficients
 
@@ -916,32 +919,37 @@ def _euler_maclaurin_corrections(
 def _power_sum_polynomials() -> np.ndarray:
     """Return the coefficients of sum_n n^j e^{-i theta n} as a polynomial in cot(theta / 2).
 
-    The result is (END_DERIVATIVES_MAX + 1, N_END_COEFFICIENTS), by j and by power of the cotangent.
+    The result is (END_DERIVATIVE_ORDER_MAX + 1, N_END_COEFFICIENTS), by j and by power of the
+    cotangent.
     """
     n_coefficients = N_END_COEFFICIENTS
-    sums = np.zeros((END_DERIVATIVES_MAX + 1, n_coefficients), complex)
+    sums = np.zeros((END_DERIVATIVE_ORDER_MAX + 1, n_coefficients), complex)
     sums[0, :2] = 0.5, -0.5j
-    for j in range(END_DERIVATIVES_MAX):
+    for j in range(END_DERIVATIVE_ORDER_MAX):
         derivative = sums[j, 1:] * np.arange(1, n_coefficients)
         sums[j + 1, : n_coefficients - 1] -= 0.5j * derivative
         sums[j + 1, 2:] -= 0.5j * derivative[: n_coefficients - 2]
     return sums
 
 
-_POWER_SUMS = _power_sum_polynomials()
-_POWER_SUMS_RE, _POWER_SUMS_IM = (
-    np.ascontiguousarray(_POWER_SUMS.real),
-    np.ascontiguousarray(_POWER_SUMS.imag),
+_POWER_SUM_POLYNOMIALS = _power_sum_polynomials()
+_POWER_SUM_POLYNOMIALS_RE, _POWER_SUM_POLYNOMIALS_IM = (
+    np.ascontiguousarray(_POWER_SUM_POLYNOMIALS.real),
+    np.ascontiguousarray(_POWER_SUM_POLYNOMIALS.imag),
 )
 
-_CORRECTION_FACTORS = np.zeros((_EULER_MACLAURIN_ORDER_MAX + 1, _EULER_MACLAURIN_ORDER_MAX + 1))
+_EULER_MACLAURIN_FACTORS = np.zeros(
+    (_EULER_MACLAURIN_ORDER_MAX + 1, _EULER_MACLAURIN_ORDER_MAX + 1)
+)
 """Matrix (d, i) of the Euler-Maclaurin correction for one end of the record. It turns the Taylor
 coefficients i of the phasor there into the coefficients d of the correction, a polynomial in
 -i theta. theta is the phase per sample [rad]."""
 
 for _m, _coefficient in EULER_MACLAURIN_COEFFICIENTS.items():
     for _i in range(_m + 1):
-        _CORRECTION_FACTORS[_m - _i, _i] += _coefficient * math.comb(_m, _i) * math.factorial(_i)
+        _EULER_MACLAURIN_FACTORS[_m - _i, _i] += (
+            _coefficient * math.comb(_m, _i) * math.factorial(_i)
+        )
 
 
 def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> EndPolynomials:
@@ -950,11 +958,11 @@ def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> EndPolynom
     ``taylor_coefficients`` are those of the modes at the record's end; ``length`` is the number of
     samples.
     """
-    power_sums = _POWER_SUMS
-    step_powers = (2 / length) ** np.arange(END_DERIVATIVES_MAX + 1)
+    power_sums = _POWER_SUM_POLYNOMIALS
+    step_powers = (2 / length) ** np.arange(END_DERIVATIVE_ORDER_MAX + 1)
     polynomial_last = ((taylor_coefficients * step_powers)[:, :, None] * power_sums).sum(axis=1)
     parity = (-1.0) ** (
-        np.arange(len(taylor_coefficients))[:, None] + np.arange(END_DERIVATIVES_MAX + 1)
+        np.arange(len(taylor_coefficients))[:, None] + np.arange(END_DERIVATIVE_ORDER_MAX + 1)
     )
     polynomial_first = ((taylor_coefficients * step_powers * parity)[:, :, None] * power_sums).sum(
         axis=1
@@ -1048,8 +1056,8 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
 
         G(y) = sum_j a_j M_j(y) + (f(-1) e^{i pi r y} - f(1) e^{-i pi r y}) / 2.
 
-    The transforms count both ends of the record half, but it has the sample at its start and not
-    that at its end.
+    In the transforms both ends of the record count half. The last term corrects this: the record
+    has a sample at its start and none at its end.
     """
     layout, chebyshev_transforms, mode_end_polynomials = (
         tables.layout,
@@ -1202,7 +1210,7 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
     n_modes, ends = modes.n_modes[segment, line_shape_index], shape.end_polynomials
     half_length, sample_step = 0.5 * record_length, 2.0 / record_length
     length_ratio = record_length / layout.fft_size
-    n_values, n_derivatives = chebyshev_transforms.shape[1], END_DERIVATIVES_MAX + 1
+    n_values, n_derivatives = chebyshev_transforms.shape[1], END_DERIVATIVE_ORDER_MAX + 1
     mode_sum_re, mode_sum_im = np.zeros(n_values), np.zeros(n_values)
     # Taylor coefficients of f at the start and at the end, by order of the derivative.
     start_re, start_im = np.zeros(n_derivatives), np.zeros(n_derivatives)
@@ -1228,7 +1236,7 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
     _zero_end_polynomials(ends)
     for i in range(n_derivatives):
         for d in range(N_END_COEFFICIENTS):
-            p, q = _POWER_SUMS_RE[i, d], _POWER_SUMS_IM[i, d]
+            p, q = _POWER_SUM_POLYNOMIALS_RE[i, d], _POWER_SUM_POLYNOMIALS_IM[i, d]
             ends.start_re[d] += start_re[i] * p - start_im[i] * q
             ends.start_im[d] += start_re[i] * q + start_im[i] * p
             ends.end_re[d] += end_re[i] * p - end_im[i] * q
@@ -1240,7 +1248,7 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
     for d in range(n_corrections):
         a, b, c, e = 0.0, 0.0, 0.0, 0.0
         for i in range(n_corrections - d):
-            factor = _CORRECTION_FACTORS[d, i]
+            factor = _EULER_MACLAURIN_FACTORS[d, i]
             a, b = a - factor * start_re[i], b - factor * start_im[i]
             c, e = c + factor * end_re[i], e + factor * end_im[i]
         if d == 0:  # the first sample counts whole, the end not at all
@@ -1254,7 +1262,7 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
     n_cells = 2 * table_bins * cells_per_bin + cells_per_bin + 2 * _TAP_REACH_CELLS
     first_cell = -table_bins * cells_per_bin - cells_per_bin + 1 - _TAP_REACH_CELLS
     transform_re, transform_im = np.empty(n_cells), np.empty(n_cells)
-    kernel_weights = np.empty(KERNEL_CELLS + ZERO_WEIGHT_CELLS)
+    kernel_weights = np.empty(N_KERNEL_CELLS + N_ZERO_WEIGHT_CELLS)
     middle = n_values // 2
     for i in range(n_cells):
         y = (first_cell + i) / cells_per_bin
@@ -1262,13 +1270,13 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
         value_position = u * _LATE_VALUES_PER_BIN + middle
         cell = math.floor(value_position)
         kernel_coordinate = 2.0 * (value_position - cell) - 1.0
-        _copy_values(KERNEL_BASIS[KERNEL_DEGREE], kernel_weights)
-        for d in range(KERNEL_DEGREE - 1, -1, -1):
-            for j in range(KERNEL_CELLS + ZERO_WEIGHT_CELLS):
-                kernel_weights[j] = kernel_weights[j] * kernel_coordinate + KERNEL_BASIS[d, j]
+        _copy_values(KERNEL_POLYNOMIALS[KERNEL_POLYNOMIAL_DEGREE], kernel_weights)
+        for d in range(KERNEL_POLYNOMIAL_DEGREE - 1, -1, -1):
+            for j in range(N_KERNEL_CELLS + N_ZERO_WEIGHT_CELLS):
+                kernel_weights[j] = kernel_weights[j] * kernel_coordinate + KERNEL_POLYNOMIALS[d, j]
         sum_re, sum_im = 0.0, 0.0
-        first_value = np.uint64(cell - KERNEL_CELLS // 2 + 1)
-        for j in range(np.uint64(KERNEL_CELLS)):
+        first_value = np.uint64(cell - N_KERNEL_CELLS // 2 + 1)
+        for j in range(np.uint64(N_KERNEL_CELLS)):
             sum_re += kernel_weights[j] * mode_sum_re[first_value + j]
             sum_im += kernel_weights[j] * mode_sum_im[first_value + j]
         theta = 2.0 * np.pi * y / layout.fft_size

@@ -38,8 +38,8 @@ POWER_TOLERANCES = (
     1e-18, 1e-15, 1e-13, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3
 )  # fmt: skip
 """Tabulated errors of a summed power when few equivalent lines replace all lines. They are relative
-to the sum of the lines' powers. Where the spectrum's magnitude is zero, it shows the square root of
-the error."""
+to the sum of the lines' powers. Where the magnitude should be zero, its error is the square root of
+the power's error."""
 
 NODES_MAX = 128
 """Maximum number of equivalent lines that replace all lines. Lines that would need more are kept.
@@ -66,6 +66,7 @@ N_SUM_LANES = 8
 does not depend on the machine."""
 
 CHEBYSHEV_NODES = np.zeros((NODES_MAX + 1, NODES_MAX))
+"""Chebyshev nodes, -1 .. 1. Row n holds the n nodes of a series of n terms, then zeros."""
 for _n in range(1, NODES_MAX + 1):
     CHEBYSHEV_NODES[_n, :_n] = np.cos(np.pi * (np.arange(_n) + 0.5) / _n)
 
@@ -305,19 +306,20 @@ def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...])
     low, high = np.full((len(tolerances), n_nodes.size), -60.0), np.log(2.0 * n_nodes) + 0 * targets
     for _ in range(24):  # to 4e-6, on the side that serves
         middle = (low + high) / 2
-        is_sufficient = _truncation_bound(middle, n_nodes, np.array(weights)) < targets
+        is_sufficient = _chebyshev_truncation_bound(middle, n_nodes, np.array(weights)) < targets
         low, high = np.where(is_sufficient, middle, low), np.where(is_sufficient, high, middle)
     return np.concatenate([targets, np.exp(low)], axis=1)
 
 
-def _truncation_bound(log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _chebyshev_truncation_bound(
+    log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
     """Return a bound on the remainder of a Chebyshev series after J terms, (tolerances, J).
 
     The bound holds for ln z < ln 2 J. The series represents exp(i z x t) at the position x of a
-    line, -1
-    .. 1, and the time t in the record. J_m is the Bessel function. The remainder is the weighted
-    mean over t of 2 sum_{m >= J} |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m! exp(-x^2
-    / (4 m + 4)).
+    line, -1 .. 1, and the time t in the record. J_m is the Bessel function. The remainder is the
+    weighted mean over t of 2 sum_{m >= J} |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m!
+    exp(-x^2 / (4 m + 4)).
     """
     phase_span, weighted_sum = np.exp(log_z), np.zeros(log_z.shape)
     for record_position, weight in zip(np.linspace(0, 1, weights.size), weights, strict=True):

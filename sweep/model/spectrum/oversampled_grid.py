@@ -7,11 +7,11 @@ Studies do not use them.
 
 [T 3.3.1] convolves the spectra with the window's transform "with much higher sampling rate in the
 frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
-16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
-follows, a product with the transform of the window's own, and the way back. The improvements
+16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. An FFT,
+a product with the FFT of the window's transform, and an inverse FFT follow. The improvements
 `uses_real_transform` ("real" in docs/accuracy.md), `transforms_to_bins_only` ("folded") and
-`degree` are described there. Changes of lines within a record (range walk, line width) are skipped,
-and leakage beyond the grid.
+`degree` are described there. Changes of lines within a record (range walk, line width) and leakage
+beyond the grid are neglected.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def find_peaks_on_grid(
     Returns
     -------
     SegmentResults
-        Arrays (3, n), as of :func:`sweep.model.evaluation.evaluate_segments`. Leakage is 0.
+        Arrays (3, n), like those of :func:`sweep.model.evaluation.evaluate_segments`. Leakage is 0.
     """
     results = allocate_segment_results(shots.size)
     parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()

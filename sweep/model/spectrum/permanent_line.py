@@ -1,4 +1,4 @@
-"""Line of light other than the echo's, which is in every record, such as leaked transmitted light.
+"""Permanent line: the beat of light other than the echo, such as leaked light, in every record.
 
 The line's beat has the amplitude A, the delay tau and the phase phi. With the window's transform W,
 the receiver's transfer function H, the chirp rate S, the FFT size N and the sample rate fs, its
@@ -86,8 +86,8 @@ def line_of_point(
     i, segment : int
         Indices of the point and of the segment.
     noise_frequency : float, optional
-        Frequency [Hz] at which the noise density is taken that whitens the line. It is given for
-        the line's skirts; by default it is the line's own frequency.
+        Frequency [Hz] of the noise density by which the line is whitened; by default that of the
+        line. For skirts of the line under an echo it is the frequency of the echo's largest bin.
 
     Returns
     -------

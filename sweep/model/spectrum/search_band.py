@@ -72,7 +72,7 @@ def search_band_start_and_size(
     beats_by_segment = np.split(np.array(np.broadcast_arrays(*beats)), len(SEGMENT_NAMES))
     band_bins = np.array(
         [
-            _nearest_bins(
+            _bins_of_beat_interval(
                 corner_beats.min(axis=0), corner_beats.max(axis=0), record.fft_size,
                 record.is_complex,
             )
@@ -82,7 +82,7 @@ def search_band_start_and_size(
     return band_bins if n_points is None else np.broadcast_to(band_bins.T, (n_points, 2, 3)).T
 
 
-def _nearest_bins(
+def _bins_of_beat_interval(
     beat_min: np.ndarray, beat_max: np.ndarray, fft_size: int, is_signed: bool
 ) -> np.ndarray:
     """Return the first bin and the number of bins nearest to beats in an interval, (2, ...).
@@ -154,7 +154,7 @@ def is_searched(shots: Any, segment: int, point: int, bins: ArrayLike) -> np.nda
     Returns
     -------
     ndarray of bool
-        True for searched bins; all are without a search band.
+        True for searched bins. Without a search band all bins are searched.
     """
     if shots.detection_settings.search_band is None:
         return np.ones(np.shape(bins), bool)

@@ -40,9 +40,9 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     """Restrict spans, adjacent bins around the lines, to the bins of the search band.
 
     Bins outside the band neither detect nor raise a false alarm. If the strongest bin of an echo is
-    outside, the echo is not detected. Only adjacent bins above the threshold at lines of its
-    footprint then remain unable to raise false alarms. The peak magnitude stays that of the
-    strongest bin of all.
+    outside, the echo is not detected. Its only bins that then remain exempt from false alarms are
+    groups of adjacent bins above the threshold that hold a line of the footprint and have their
+    strongest bin in the band. The peak magnitude stays that of the strongest bin of all.
 
     Parameters
     ----------

@@ -81,8 +81,8 @@ from sweep.model.spectrum.search_restriction import restrict_to_band
 from sweep.model.window import Window
 
 POINTS_PER_BATCH = 256
-"""Number of points that are processed in one batch. If few line shapes serve them, it is 16 times
-as many."""
+"""Number of points that are processed in one batch. It is 16 times as large if all points share few
+line shapes."""
 
 SPAN_BINS_PER_BATCH = 1 << 21
 """Least number of bins, over all spans, for which memory is allocated in one step. A span is a
@@ -115,7 +115,7 @@ class SegmentResults(NamedTuple):
     magnitude: np.ndarray
     """|X| of the echo's largest bin without noise [V, summed over the record]."""
     frequency: np.ndarray
-    """Frequency of that bin [Hz]; nan if the search band does not contain it."""
+    """Frequency of the echo's largest bin [Hz]; nan if the search band does not contain it."""
     n_exempt: np.ndarray
     """Number of bins that belong to the echo or are masked, and so cannot raise a false alarm."""
     leakage: np.ndarray
@@ -205,7 +205,7 @@ class LineShapeGroup(NamedTuple):
     """Tables from which the line shapes are computed."""
     modes: PhaseErrorModes
     """Chebyshev coefficients of the phase errors of the line shapes."""
-    is_late: bool = False
+    has_late_echoes: bool = False
     """True if some echoes arrive after the record has begun and lack its first samples."""
 
 
@@ -341,7 +341,7 @@ def iter_spans(
                 else restrict_to_band(shots, _clear_spans_without_echo(shots, spans))
             )
             if shots.looks.is_noncoherent and leakage_method:
-                spans = _leakage_in_looks(shots, spans)
+                spans = _apply_looks_to_leakage(shots, spans)
             if shots.permanent_line is not None:
                 spans = apply_permanent_line(shots, spans)
             yield detect_in_spans(shots, spans) if computes_pd else spans
@@ -368,7 +368,7 @@ def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
     )
 
 
-def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
+def _apply_looks_to_leakage(shots: Shots, spans: BinSpans) -> BinSpans:
     """Convert the spans' leakage from that of one record to that of several looks.
 
     A look is one of several records of the same shot. Leakage is a probability of false alarm.
@@ -434,7 +434,7 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
 def segment_spectrum(
     shots: Shots, point: int, segment: int, *, level_min: float = 0.0
 ) -> SegmentSpectrum:
-    """Return the spectrum of one point's segment around its lines, without noise.
+    """Return the echo's spectrum in one segment of one point, without noise and permanent line.
 
     Parameters
     ----------
@@ -450,7 +450,7 @@ def segment_spectrum(
     Returns
     -------
     SegmentSpectrum
-        Magnitudes of adjacent bins, and the echo in them.
+        Numbers and magnitudes of adjacent bins around the echo's lines.
     """
     shots = replace(shots, permanent_line=None)
     (spans,) = iter_spans(
@@ -514,7 +514,7 @@ def _leakage_method(shots: Shots, group: LineShapeGroup, bin_by_bin: bool) -> in
         shots.looks.is_noncoherent
         or bin_by_bin
         or shots.detection_settings.search_band is not None
-        or group.is_late
+        or group.has_late_echoes
     )
     is_smooth = layout.fft_size == layout.record_length and not layout.holds_all_bins
     if is_smooth and not is_averaged and spectrum_type(shots) != COMPLEX_RECORD:
@@ -620,7 +620,7 @@ def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[L
         tables = _tables_without_echo(window, fft_size, adds_powers, segments)
         batch = points[lacks_echo]
         yield LineShapeGroup(
-            batch, 0 * batch, tables, _unused_phase_error_modes(segments), is_late=True
+            batch, 0 * batch, tables, _unused_phase_error_modes(segments), has_late_echoes=True
         )
         points = points[~lacks_echo]
     for batch_begin in range(0, points.size, POINTS_PER_BATCH):
@@ -665,7 +665,7 @@ def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[L
                         tables,
                         modes.select(is_resolved),
                     )
-                    yield group._replace(is_late=True)
+                    yield group._replace(has_late_echoes=True)
         for distinct in np.flatnonzero(is_remaining):  # shapes whose tables hold all bins
             selected = batch[line_shape_index == distinct]
             first_sample = window.length - echo_lengths[:, distinct]
@@ -684,7 +684,7 @@ def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[L
                     window, fft_size, adds_powers, phase, first_sample
                 ),
                 _unused_phase_error_modes(segments),
-                is_late=True,
+                has_late_echoes=True,
             )
 
 
@@ -827,7 +827,7 @@ def _evaluate_batch(
             ),
             window_sum=shots.window.sum,
             detection_rule=shots.detection_rule,
-            phase_limits=_group_node_limits(shots, group),
+            phase_limits=_node_phase_limits_of_group(shots, group),
             bin_tangents=bin_tangents(shots.fft_size),
         ),
         line_shape.allocate_line_shapes(tables, segments),
@@ -852,13 +852,13 @@ def _evaluate_batch(
     )
 
 
-def _group_node_limits(shots: Shots, group: LineShapeGroup) -> np.ndarray:
+def _node_phase_limits_of_group(shots: Shots, group: LineShapeGroup) -> np.ndarray:
     """Return the table that gives the number of equivalent lines for a group of points.
 
     The table is that of :func:`sweep.model.spectrum.lines.node_phase_limits`. For late echoes it
     assumes a window whose whole weight is at the record's end.
     """
-    if not group.is_late:
+    if not group.has_late_echoes:
         return shots.window.node_phase_limits(shots.footprint.adds_powers)
     tolerances = POWER_TOLERANCES if shots.footprint.adds_powers else AMPLITUDE_TOLERANCES
     return node_phase_limits((0.0, 1.0), tolerances)
@@ -920,8 +920,8 @@ def _copy_lines_to_shifts(lines, n_lines, shifts):
     Parameters
     ----------
     lines
-        :class:`sweep.model.spectrum.bin_spectrum.LineArrays`. The copies are written to it, and the
-        first ``n_lines`` are replaced.
+        :class:`sweep.model.spectrum.lines.LineArrays`. The copies are written to it, and the first
+        ``n_lines`` are replaced.
     n_lines
         Number of lines.
     shifts

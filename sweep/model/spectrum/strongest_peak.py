@@ -86,16 +86,17 @@ class SpanProbabilities(NamedTuple):
 
 
 class LevelProbabilities(NamedTuple):
-    """Magnitude levels that an echo has to exceed in one segment, (m, levels), the threshold first.
+    """Probabilities at the magnitude levels that an echo may have to exceed in one segment.
 
-    A level is the larger one of the threshold and the largest other bin.
+    Arrays are (m, levels), the threshold first. The level to exceed is the threshold, or the
+    largest other bin if that is larger.
     """
 
     probability: np.ndarray
     """Probability that the echo has to exceed this level."""
     exponent: np.ndarray
     """-ln of the probability that the echo exceeds this level."""
-    echo_fraction: np.ndarray
+    echo_power_fraction: np.ndarray
     """Echo's share of the mean power, noise included, of a bin equivalent to the echo. The bin
     exceeds this level as often as the whole echo.
     """
@@ -262,7 +263,7 @@ def _noise_exponents(shots: Shots, spans: BinSpans, half_squares: np.ndarray) ->
 
 
 def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
-    """Return the probability weights of the Gauss points of the largest bin outside the echo.
+    """Return the probability that the largest bin outside the echo is at each Gauss point's level.
 
     Their sum is ``p_alarm`` (3, m), the probability that any bin outside the echo crosses the
     threshold. ``exponents`` (3, m, points) is -ln of the probability that none exceeds the point's
@@ -278,7 +279,7 @@ def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def _joint_excess(exponent_first, exponent_second, squared_correlation):
+def _joint_probability_increase(exponent_first, exponent_second, squared_correlation):
     """Return the increase of two Rayleigh magnitudes' joint probability due to correlation.
 
     Each magnitude has to exceed a level of its own. Alone, the first exceeds its level with the
@@ -411,10 +412,12 @@ def _fill_joint_probability_increase(up, down, squared_correlation, joint_excess
                     down_alarm if i != THRESHOLD_LEVEL_INDEX else 1.0
                 ):
                     squared_product = min(
-                        squared_correlation[j] * up.echo_fraction[j, k] * down.echo_fraction[j, i],
+                        squared_correlation[j]
+                        * up.echo_power_fraction[j, k]
+                        * down.echo_power_fraction[j, i],
                         1.0 - 1e-12,
                     )
-                    total += probability * _joint_excess(
+                    total += probability * _joint_probability_increase(
                         up.exponent[j, k], down.exponent[j, i], squared_product
                     )
         joint_excess[j] = total
