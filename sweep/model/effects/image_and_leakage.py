@@ -229,7 +229,7 @@ _DISTANT_IMAGE_FACTOR = 1.1
 DC and Nyquist the factor is 2."""
 
 
-def leakage_bound(points: PlannerInputs) -> ErrorBound:
+def leakage_error_bound(points: PlannerInputs) -> ErrorBound:
     """Return a bound on the probability that leaked signal raises an additional group.
 
     The group may be in any segment. A group is a run of adjacent bins above the threshold. Leaked
@@ -407,7 +407,7 @@ LEAKAGE = Effect(
     name="leakage",
     description="further groups raised by sidelobes below the threshold",
     stage="detection",
-    error_bound=leakage_bound,
+    error_bound=leakage_error_bound,
     apply=apply_leakage,
     is_in_time_domain_truth=False,
 )

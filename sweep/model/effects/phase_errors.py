@@ -217,9 +217,9 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
 
 
 def coherent_sum_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
-    """Return the change that a phase error makes to sums of lines and images as amplitudes.
+    """Return a bound on the change by a phase error if amplitudes of lines and images add.
 
-    The change is :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters
+    The bound is an :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters
     to lines next to their images, and to a line to which a distant image is added.
     """
     moments = window_moments(points.window)

@@ -349,7 +349,7 @@ class PlannerInputs(LinkBudget):
         return np.abs(bin_position - np.rint(bin_position))
 
     @cached_property
-    def bins_to_edge(self) -> np.ndarray:
+    def bins_from_line_to_edge(self) -> np.ndarray:
         """Distance of the line from the nearer of DC and Nyquist [FFT bins], after aliasing."""
         nyquist_bin = self.fft_size / 2
         nyquist_position = self.beat_frequency / (self.record.bin_width * nyquist_bin)
@@ -446,7 +446,11 @@ class PlannerInputs(LinkBudget):
     @cached_property
     def bins_from_light_to_edge(self) -> np.ndarray:
         """Distance of the nearest light of any line from DC or Nyquist [FFT bins]."""
-        return self.bins_to_edge - self.line_spread.largest_magnitude - self.phase_error_shift_bins
+        return (
+            self.bins_from_line_to_edge
+            - self.line_spread.largest_magnitude
+            - self.phase_error_shift_bins
+        )
 
     @cached_property
     def is_near_image(self) -> np.ndarray:

@@ -421,7 +421,8 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
         squared_sum = zeros
         for lag in range(1 - n_looks, n_looks):
             turned_phase = PhaseDifference(
-                phase.doppler_cycles + lag * cycles_per_look[second], phase.delay_cycles
+                phase.cycles_per_doppler_ratio + lag * cycles_per_look[second],
+                phase.delay_cycles_per_relative_range,
             )
             squared_correlation = (
                 np.abs(beam_spread.speckle_correlation(shots, pair, turned_phase)) ** 2
@@ -563,7 +564,7 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
     ):
         phase_gradient[second] = (
             phase.phase_per_deviation(beam_gradients),
-            2 * np.pi * phase.doppler_cycles * doppler_across,
+            2 * np.pi * phase.cycles_per_doppler_ratio * doppler_across,
         )
     return LineGradients(np.moveaxis(line_shift, -1, 0), np.moveaxis(phase_gradient, -1, 0))
 
@@ -574,11 +575,10 @@ class PhaseDifference(NamedTuple):
     The phase difference is linear in the scatterer's Doppler ratio (2 v / c) and relative range.
     """
 
-    doppler_cycles: np.ndarray
+    cycles_per_doppler_ratio: np.ndarray
     """Phase difference between two segments [cycles] per unit of the Doppler ratio 2 v / c."""
-    delay_cycles: np.ndarray
-    """Phase difference between two segments [cycles] per unit of relative range, with the sign
-    reversed."""
+    delay_cycles_per_relative_range: np.ndarray
+    """Decrease of the phase difference between two segments [cycles] per unit of relative range."""
 
     def phase_per_deviation(self, beam_gradients: BeamGradients) -> np.ndarray:
         """Return the phase difference per standard deviation of the beam [rad], (n,)."""
@@ -586,8 +586,8 @@ class PhaseDifference(NamedTuple):
             2
             * np.pi
             * (
-                self.doppler_cycles * beam_gradients.doppler_ratio
-                - self.delay_cycles * beam_gradients.relative_range
+                self.cycles_per_doppler_ratio * beam_gradients.doppler_ratio
+                - self.delay_cycles_per_relative_range * beam_gradients.relative_range
             )
         )
 
@@ -778,7 +778,14 @@ def _phase_moments(
     by whole cycles.
     """
     weights = (
-        2 * np.pi * np.array([[phase.doppler_cycles, -phase.delay_cycles] for phase in phases])
+        2
+        * np.pi
+        * np.array(
+            [
+                [phase.cycles_per_doppler_ratio, -phase.delay_cycles_per_relative_range]
+                for phase in phases
+            ]
+        )
     )
     variance = np.einsum("pin,ijn,pjn->pn", weights, moments.covariance, weights)
     return (weights * moments.mean).sum(axis=1), variance

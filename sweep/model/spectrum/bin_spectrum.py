@@ -145,7 +145,7 @@ class AveragingShifts(NamedTuple):
     """(shifts,): weight of each shift in the average; the sum is 1."""
 
 
-class EndAmplitudes(NamedTuple):
+class RecordEndAmplitudes(NamedTuple):
     """Lines, or equivalent lines, with their complex amplitudes at both ends of the record."""
 
     position: np.ndarray
@@ -200,9 +200,9 @@ class FieldWorkspace(NamedTuple):
     """Real part of the weights in the table cells over which lines are spread."""
     cell_im: np.ndarray
     """Imaginary part of the weights in the table cells over which lines are spread."""
-    line_ends: EndAmplitudes
+    line_ends: RecordEndAmplitudes
     """Amplitudes of the segment's lines at the record's start and end."""
-    far_equivalent_lines: EndAmplitudes
+    far_equivalent_lines: RecordEndAmplitudes
     """Equivalent lines (sources), which replace the segment's lines in bins far away."""
     far_bins: FarBins
     """Trigonometric values and scratch arrays for a batch of bins far from the lines."""
@@ -309,8 +309,8 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
         line_scratch=LineScratch(*next_rows(3)),
         cell_re=next(rows),
         cell_im=next(rows),
-        line_ends=EndAmplitudes(lines.position, *next_rows(4)),
-        far_equivalent_lines=EndAmplitudes(*next_rows(5)),
+        line_ends=RecordEndAmplitudes(lines.position, *next_rows(4)),
+        far_equivalent_lines=RecordEndAmplitudes(*next_rows(5)),
         far_bins=FarBins(*next_rows(8)),
         re=next(rows),
         im=next(rows),
@@ -351,7 +351,7 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
     """
     fft_size, cells_per_bin = layout.fft_size, layout.cells_per_bin
     lines, last_line_bin = field.lines, math.floor(bundle.highest_position)
-    table_reach = layout.table_bins + LINE_BATCH_WIDTH_BINS
+    table_reach = layout.table_half_width_bins + LINE_BATCH_WIDTH_BINS
     for batch_bin in range(
         math.floor(bundle.lowest_position), last_line_bin + 1, LINE_BATCH_WIDTH_BINS
     ):
@@ -403,7 +403,7 @@ def _first_bin_in_table(batch_bin, n_periods, layout):
     """
     return (
         batch_bin + n_periods * layout.fft_size + LINE_BATCH_WIDTH_BINS + LINE_BATCH_EDGE_BINS
-    ) - layout.table_bins
+    ) - layout.table_half_width_bins
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -413,7 +413,12 @@ def _end_bin_in_table(batch_bin, n_periods, layout):
     ``batch_bin`` is the first bin of the interval. ``n_periods`` is the number of FFT lengths by
     which the periodic spectrum is shifted.
     """
-    return batch_bin + n_periods * layout.fft_size - LINE_BATCH_EDGE_BINS + layout.table_bins
+    return (
+        batch_bin
+        + n_periods * layout.fft_size
+        - LINE_BATCH_EDGE_BINS
+        + layout.table_half_width_bins
+    )
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -427,7 +432,7 @@ def _add_spectrum_of_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, sha
     sign = -1.0 if n_periods & 1 and layout.record_length & 1 and not adds_powers else 1.0
     low = max(first_bin, _first_bin_in_table(batch_bin, n_periods, layout))
     high = min(first_bin + n_bins, _end_bin_in_table(batch_bin, n_periods, layout))
-    begin_bin = batch_bin + n_periods * layout.fft_size - layout.table_bins
+    begin_bin = batch_bin + n_periods * layout.fft_size - layout.table_half_width_bins
     if not layout.holds_all_bins and low >= high:
         return
     for c in range(n_cells):
@@ -528,7 +533,7 @@ def far_line_weight(weight_sum, n_sources, layout, sources):
         Number of equivalent lines.
     layout : SpectrumLayout
         Sizes and type of the spectrum.
-    sources : EndAmplitudes
+    sources : RecordEndAmplitudes
         Equivalent lines, with their amplitudes at both ends of the record.
     """
     start_sum, end_sum = 0.0, 0.0
@@ -602,7 +607,7 @@ def add_line_by_record_ends(
     field_offset
         Index in F of the first bin.
     strengths
-        :class:`EndAmplitudes` of lines or sources.
+        :class:`RecordEndAmplitudes` of lines or sources.
     line
         Index of the line or source.
     log_accuracy
@@ -708,7 +713,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
     for i in range(n_bins):
         field.re[i], field.im[i] = 0.0, 0.0
     add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field)
-    table_reach = layout.table_bins - TABLE_SHORTFALL_BINS  # from any line
+    table_reach = layout.table_half_width_bins - TABLE_SHORTFALL_BINS  # from any line
     if layout.holds_all_bins or (
         highest_position - first_bin < table_reach
         and first_bin + n_bins - lowest_position < table_reach

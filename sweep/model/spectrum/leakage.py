@@ -285,9 +285,9 @@ def detect_with_leakage(
             far_weight, distance_min, image_distance, brightest_limits, envelope
         )
         while (
-            tolerance_left < 0.0 and distance_min < layout.table_bins
+            tolerance_left < 0.0 and distance_min < layout.table_half_width_bins
         ):  # bins of the table take less time than an integral
-            distance_min = min(1.25 * distance_min, float(layout.table_bins))
+            distance_min = min(1.25 * distance_min, float(layout.table_half_width_bins))
             tolerance_left = limits.tolerance - _far_leakage_bound(
                 far_weight, distance_min, image_distance, brightest_limits, envelope
             )

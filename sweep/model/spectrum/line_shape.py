@@ -329,10 +329,10 @@ def line_shape_tables(
     n_modes, clearance_bins, table_half_width = LINE_SHAPE_TIERS[tier]
     table_half_width = SHARED_TABLE_BINS if shared else table_half_width
     ratio, length = window.length / fft_size, window.length
-    table_bins = math.ceil(table_half_width / ratio)
+    table_half_width_bins = math.ceil(table_half_width / ratio)
     cell_density, cell_distances = (
         TABLE_CELLS_PER_BIN[adds_powers],
-        _cell_distances(table_bins, adds_powers),
+        _cell_distances(table_half_width_bins, adds_powers),
     )
     n_nodes = 4 * ((math.ceil(math.pi * table_half_width) + n_modes) // 4) + 64
     node, weight = _gauss_legendre(n_nodes)
@@ -361,12 +361,12 @@ def line_shape_tables(
             np.concatenate([values, _deconvolve_into_rows(values, cell_density)], axis=-1)
             for values in (chebyshev_transforms, first_sample_cosine, first_sample_sine)
         )
-    distance = _envelope_distances(table_bins, fft_size)
+    distance = _envelope_distances(table_half_width_bins, fft_size)
     return LineShapeTables(
         layout=SpectrumLayout(
             fft_size=fft_size,
             record_length=length,
-            table_bins=table_bins,
+            table_half_width_bins=table_half_width_bins,
             cells_per_bin=cell_density,
             adds_powers=adds_powers,
             holds_all_bins=False,
@@ -482,14 +482,14 @@ def late_line_shape_tables(
     clearance_bins = LINE_SHAPE_TIERS[tier].clearance_bins
     table_half_width = clearance_bins + _LATE_TABLE_MARGIN_BINS
     filled_fraction = window.length * ECHO_LENGTH_CLASS_RATIO ** (-float(length_class)) / fft_size
-    table_bins = math.ceil(table_half_width / filled_fraction)
+    table_half_width_bins = math.ceil(table_half_width / filled_fraction)
     transforms = _late_mode_transforms(tier)
-    distance = _envelope_distances(table_bins, fft_size)
+    distance = _envelope_distances(table_half_width_bins, fft_size)
     return LineShapeTables(
         layout=SpectrumLayout(
             fft_size=fft_size,
             record_length=window.length,
-            table_bins=table_bins,
+            table_half_width_bins=table_half_width_bins,
             cells_per_bin=TABLE_CELLS_PER_BIN[adds_powers],
             adds_powers=adds_powers,
             holds_all_bins=False,
@@ -619,7 +619,7 @@ def full_line_shape_tables(
         layout=SpectrumLayout(
             fft_size=fft_size,
             record_length=length,
-            table_bins=nyquist_bin,
+            table_half_width_bins=nyquist_bin,
             cells_per_bin=cells_per_bin,
             adds_powers=adds_powers,
             holds_all_bins=True,
@@ -699,7 +699,7 @@ def spreading_kernel_transform(theta: np.ndarray) -> np.ndarray:
 
 def table_size(layout: SpectrumLayout) -> int:
     """Return the number of values in the table of a line shape, cells per bin times columns."""
-    columns = layout.fft_size if layout.holds_all_bins else 2 * layout.table_bins + 1
+    columns = layout.fft_size if layout.holds_all_bins else 2 * layout.table_half_width_bins + 1
     return layout.cells_per_bin * columns
 
 
@@ -786,7 +786,7 @@ def chebyshev_coefficient_matrix(n_nodes: int) -> np.ndarray:
     return matrix
 
 
-def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
+def _cell_distances(table_half_width_bins: int, adds_powers: bool) -> np.ndarray:
     """Return the distances from the line [bins of fs/N] of a table's cells, in steps of one cell.
 
     Cells that the filter DECONVOLUTION_TAPS needs on each side are included.
@@ -794,8 +794,8 @@ def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
     cells_per_bin = TABLE_CELLS_PER_BIN[adds_powers]
     return (
         np.arange(
-            -table_bins * cells_per_bin - cells_per_bin + 1 - _TAP_REACH_CELLS,
-            table_bins * cells_per_bin + _TAP_REACH_CELLS + 1,
+            -table_half_width_bins * cells_per_bin - cells_per_bin + 1 - _TAP_REACH_CELLS,
+            table_half_width_bins * cells_per_bin + _TAP_REACH_CELLS + 1,
         )
         / cells_per_bin
     )
@@ -815,16 +815,16 @@ def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
     return np.concatenate(rows, axis=-1)
 
 
-def _envelope_distances(table_bins: int, fft_size: int) -> np.ndarray:
+def _envelope_distances(table_half_width_bins: int, fft_size: int) -> np.ndarray:
     """Return the distances from the line at which envelopes are tabulated [bins of fs/N].
 
     There is one distance per bin of the table. A geometric progression up to N/2 follows, N being
     the FFT size.
     """
     far_distances = np.geomspace(
-        table_bins + 1, max(fft_size / 2, table_bins + 2), _N_FAR_DISTANCES
+        table_half_width_bins + 1, max(fft_size / 2, table_half_width_bins + 2), _N_FAR_DISTANCES
     )
-    return np.append(np.arange(table_bins + 1.0), far_distances)
+    return np.append(np.arange(table_half_width_bins + 1.0), far_distances)
 
 
 def _cotangents(distance: np.ndarray, fft_size: int) -> np.ndarray:
@@ -1258,9 +1258,9 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
             a, b, c, e = b, -a, e, -c
         start_correction_re[d], start_correction_im[d] = a, b
         end_correction_re[d], end_correction_im[d] = c, e
-    cells_per_bin, table_bins = layout.cells_per_bin, layout.table_bins
-    n_cells = 2 * table_bins * cells_per_bin + cells_per_bin + 2 * _TAP_REACH_CELLS
-    first_cell = -table_bins * cells_per_bin - cells_per_bin + 1 - _TAP_REACH_CELLS
+    cells_per_bin, table_half_width_bins = layout.cells_per_bin, layout.table_half_width_bins
+    n_cells = 2 * table_half_width_bins * cells_per_bin + cells_per_bin + 2 * _TAP_REACH_CELLS
+    first_cell = -table_half_width_bins * cells_per_bin - cells_per_bin + 1 - _TAP_REACH_CELLS
     transform_re, transform_im = np.empty(n_cells), np.empty(n_cells)
     kernel_weights = np.empty(N_KERNEL_CELLS + N_ZERO_WEIGHT_CELLS)
     middle = n_values // 2
@@ -1308,7 +1308,7 @@ def _fill_line_shape_table(values, layout, table):
 
     ``values`` are at the distances of :func:`_cell_distances`. The result goes to ``table``.
     """
-    cells_per_bin, columns = layout.cells_per_bin, 2 * layout.table_bins + 1
+    cells_per_bin, columns = layout.cells_per_bin, 2 * layout.table_half_width_bins + 1
     n_values = np.uint64(cells_per_bin * columns)
     filtered = np.empty(cells_per_bin * columns)
     for i in range(n_values):
@@ -1330,12 +1330,12 @@ def _fill_line_envelope(squared_magnitude, layout, cotangent_at_envelope_distanc
     distance as a sine with a period of one bin. It is therefore nowhere larger than the sum of two
     values that are half a bin apart.
     """
-    table_bins, cells_per_bin = layout.table_bins, layout.cells_per_bin
+    table_half_width_bins, cells_per_bin = layout.table_half_width_bins, layout.cells_per_bin
     distance, ends = shape.envelope.distance, shape.end_polynomials
     magnitude, square_integral = shape.envelope.magnitude, shape.envelope.square_integral
-    line_cell = table_bins * cells_per_bin + cells_per_bin - 1 + _TAP_REACH_CELLS
+    line_cell = table_half_width_bins * cells_per_bin + cells_per_bin - 1 + _TAP_REACH_CELLS
     half_bin_cells = cells_per_bin // 2
-    for i in range(np.uint64(table_bins + 1), np.uint64(distance.size)):
+    for i in range(np.uint64(table_half_width_bins + 1), np.uint64(distance.size)):
         c, a, b, p, q = cotangent_at_envelope_distance[i], 0.0, 0.0, 0.0, 0.0
         for k in range(N_END_COEFFICIENTS):
             d = N_END_COEFFICIENTS - 1 - k
@@ -1344,7 +1344,7 @@ def _fill_line_envelope(squared_magnitude, layout, cotangent_at_envelope_distanc
         squared_first, squared_last = a * a + b * b, p * p + q * q
         magnitude[i] = squared_first + squared_last + 2.0 * math.sqrt(squared_first * squared_last)
     # Sums of two values half a bin apart, from the cell before the line on.
-    half_bin_sums = np.empty(table_bins * cells_per_bin + cells_per_bin + 1)
+    half_bin_sums = np.empty(table_half_width_bins * cells_per_bin + cells_per_bin + 1)
     for i in range(half_bin_sums.size):
         cell_above, cell_below = np.uint64(line_cell - 1 + i), np.uint64(line_cell + 1 - i)
         sum_above = (
@@ -1358,7 +1358,7 @@ def _fill_line_envelope(squared_magnitude, layout, cotangent_at_envelope_distanc
         half_bin_sums[i] = _ENVELOPE_MARGIN * _ENVELOPE_MARGIN * max(sum_above, sum_below)
     maximum_beyond, area, previous_maximum = 0.0, 0.0, 0.0  # of |G|^2
     for i in range(distance.size - 1, -1, -1):
-        if i > table_bins:
+        if i > table_half_width_bins:
             maximum_beyond = max(maximum_beyond, magnitude[i])
         else:
             for k in range(i * cells_per_bin, (i + 1) * cells_per_bin + 1):

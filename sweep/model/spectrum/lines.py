@@ -86,7 +86,7 @@ class SpectrumLayout(NamedTuple):
     """Number of samples of the record. For an echo that arrives late, it is the number of samples
     with the echo.
     """
-    table_bins: int
+    table_half_width_bins: int
     """Number of FFT bins that the line-shape table holds on each side of a line."""
     cells_per_bin: int
     """Number of line-shape table cells in an FFT bin."""

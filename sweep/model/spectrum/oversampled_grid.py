@@ -192,7 +192,7 @@ def grid_magnitudes(
         SpectrumLayout(
             fft_size=shots.fft_size,
             record_length=record_length,
-            table_bins=0,
+            table_half_width_bins=0,
             cells_per_bin=0,
             adds_powers=adds_powers,
             holds_all_bins=False,

@@ -231,7 +231,7 @@ class EvaluationSettings(NamedTuple):
     """Sum of the window's samples, the peak of its transform."""
     detection_rule: DetectionRule
     """Rule by which the bins of an echo detect it."""
-    phase_limits: np.ndarray
+    node_phase_limits: np.ndarray
     """Table of :func:`sweep.model.spectrum.lines.node_phase_limits` for the record's window. It
     gives the number of equivalent lines that replace all lines.
     """
@@ -827,7 +827,7 @@ def _evaluate_batch(
             ),
             window_sum=shots.window.sum,
             detection_rule=shots.detection_rule,
-            phase_limits=_node_phase_limits_of_group(shots, group),
+            node_phase_limits=_node_phase_limits_of_group(shots, group),
             bin_tangents=bin_tangents(shots.fft_size),
         ),
         line_shape.allocate_line_shapes(tables, segments),
@@ -1077,7 +1077,7 @@ def _layout_of_late_echo(layout, n_samples):
     return SpectrumLayout(
         layout.fft_size,
         n_samples,
-        layout.table_bins,
+        layout.table_half_width_bins,
         layout.cells_per_bin,
         layout.adds_powers,
         layout.holds_all_bins,
@@ -1232,7 +1232,7 @@ def _evaluate_segment(
         settings.window_sum,
         bin_error_allowed,
         threshold,
-        settings.phase_limits,
+        settings.node_phase_limits,
         layout,
         workspace,
     )

@@ -92,9 +92,9 @@ class LevelProbabilities(NamedTuple):
     largest other bin if that is larger.
     """
 
-    probability: np.ndarray
+    level_probability: np.ndarray
     """Probability that the echo has to exceed this level."""
-    exponent: np.ndarray
+    exceedance_exponent: np.ndarray
     """-ln of the probability that the echo exceeds this level."""
     echo_power_fraction: np.ndarray
     """Echo's share of the mean power, noise included, of a bin equivalent to the echo. The bin
@@ -403,11 +403,11 @@ def _fill_joint_probability_increase(up, down, squared_correlation, joint_excess
         (m,): result.
     """
     for j in range(joint_excess.size):
-        up_alarm = 1.0 - up.probability[j, THRESHOLD_LEVEL_INDEX]
-        down_alarm, total = 1.0 - down.probability[j, THRESHOLD_LEVEL_INDEX], 0.0
-        for k in range(up.probability.shape[1]):
-            for i in range(1 if k == THRESHOLD_LEVEL_INDEX else 0, down.probability.shape[1]):
-                probability = up.probability[j, k] * down.probability[j, i]
+        up_alarm = 1.0 - up.level_probability[j, THRESHOLD_LEVEL_INDEX]
+        down_alarm, total = 1.0 - down.level_probability[j, THRESHOLD_LEVEL_INDEX], 0.0
+        for k in range(up.level_probability.shape[1]):
+            for i in range(1 if k == THRESHOLD_LEVEL_INDEX else 0, down.level_probability.shape[1]):
+                probability = up.level_probability[j, k] * down.level_probability[j, i]
                 if probability > 1e-9 * (up_alarm if k != THRESHOLD_LEVEL_INDEX else 1.0) * (
                     down_alarm if i != THRESHOLD_LEVEL_INDEX else 1.0
                 ):
@@ -418,6 +418,8 @@ def _fill_joint_probability_increase(up, down, squared_correlation, joint_excess
                         1.0 - 1e-12,
                     )
                     total += probability * _joint_probability_increase(
-                        up.exponent[j, k], down.exponent[j, i], squared_product
+                        up.exceedance_exponent[j, k],
+                        down.exceedance_exponent[j, i],
+                        squared_product,
                     )
         joint_excess[j] = total
