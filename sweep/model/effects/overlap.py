@@ -23,9 +23,9 @@ that begin at 0 and are complete (``overlap: off``).
 
 One n_0, that of the beam's axis, serves all lines of a footprint's segment. A beamlet that is d
 farther away has 2 d f_s / c samples fewer. One n_0, that of the middle look, serves all looks of a
-shot, between which the range changes. Both differences are neglected; :func:`residual_bound` bounds
-the error, which counts in ``effects_error``. Positions between bins are corrected for n_0
-(:func:`sweep.model.detection.sub_bin_interpolation.late_echo_correction`).
+shot, between which the range changes. Both differences are neglected. The error counts in
+``effects_error``, and :func:`residual_bound` bounds it. Positions between bins are
+corrected for n_0 (:func:`sweep.model.detection.sub_bin_interpolation.late_echo_correction`).
 
 Error bound: let c be the largest bin's magnitude over that of all lines on a bin, and b the
 fraction of sum |w| in the missing samples. No bin changes by more than b, so the largest changes by

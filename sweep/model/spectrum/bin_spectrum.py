@@ -329,7 +329,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
-    """Add the lines' spectrum to ``field``, only in bins that the line-shape table contains.
+    """Add the lines' spectrum in bins of the line-shape table to ``field``.
 
     Each line is spread over cells around its position. The table holds the spectrum of a line in a
     cell.
@@ -473,8 +473,8 @@ def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layo
     layout
         :class:`SpectrumLayout`.
     field
-        :class:`FieldWorkspace`, whose ``line_ends`` and ``far_equivalent_lines`` (the sources)
-        are results.
+        :class:`FieldWorkspace`. Results are ``line_ends``, and the sources in
+        ``far_equivalent_lines``.
 
     Returns
     -------
@@ -687,7 +687,7 @@ def add_line_by_record_ends(
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bin_tangents, field):
-    """Compute the lines' spectrum F in ``n_bins`` bins into ``field.re`` and ``field.im``.
+    """Compute the lines' spectrum F in ``n_bins`` bins: ``re`` and ``im`` of ``field``.
 
     Parameters
     ----------

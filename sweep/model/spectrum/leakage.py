@@ -21,7 +21,7 @@ false alarm with the probability 1 - exp(-R(u)). The mean is
     P = int_0^inf e^{-u} (1 - exp(-R(u))) du.
 
 ln R is computed at powers an octave or half an octave apart, and interpolated by a monotone cubic
-(:func:`mean_leakage_in_speckle`). Bins that are exempt at the mean power are exempt at any power.
+(:func:`mean_leakage_in_speckle`). Bins exempt at the mean power are exempt at any power.
 
 Bins that cross next to an echo whose outermost bin crosses are part of the echo
 (:func:`sweep.model.detection.added_crossings.exclude_bins_joining_echo`), and no leakage.
