@@ -46,8 +46,8 @@ class ErrorBound(NamedTuple):
 class PhaseErrorBound(NamedTuple):
     """Upper bound on the phase error that an effect adds to lines over the record.
 
-    The bound is a polynomial in the position x in the record, -1..1, with a remainder; or a shift
-    of frequencies. Values are by segment, or scalars.
+    The bound has a polynomial in the position x in the record, -1..1, a remainder, and a shift of
+    frequencies. Values are by segment, or scalars.
     """
 
     coefficients: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)
@@ -60,8 +60,8 @@ class PhaseErrorBound(NamedTuple):
     """Largest magnitude of the phase error in the record's middle [cycles]. It only matters to
     lines near their images."""
     extra_shift_window_bins: np.ndarray | float = 0.0
-    """Shift of a line's light in frequency, beyond that of the polynomial's slopes. The unit is the
-    sample rate over the number of samples in the record."""
+    """Further shift of a line's light in frequency, in addition to that by the polynomial's slopes.
+    The unit is the sample rate over the number of samples in the record."""
 
     @property
     def shift_window_bins(self) -> np.ndarray | float:

@@ -252,9 +252,10 @@ def intensity_noise_current_variance(
 
 
 def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the variance of the local oscillator's intensity noise over that of the receiver's.
+    """Return the ratio of the local oscillator's intensity noise to the receiver's noise.
 
-    The variance is exact, not a bound. The threshold is set on noise that includes this source.
+    The ratio is that of variances, and exact, not a bound. The threshold is set on noise that
+    includes this source.
     """
     if points.waveform.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
@@ -318,9 +319,9 @@ def quantisation_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the noise of the ADC's rounding over the receiver's noise, without clipping.
 
     Rounding noise is white, and is compared with the density of the receiver's noise at the line.
-    The threshold is set on noise that includes this source. A whitened spectrum has its lines
-    divided by the root of the noise density: of both noises with the effect, of the receiver's
-    alone without it.
+    The threshold is set on noise that includes this source. In a whitened spectrum lines are
+    divided by the root of the noise density. With the effect it is the density of both noises,
+    without it that of the receiver's alone.
     """
     if not points.any_nonzero(_BITS_PATH):
         return None

@@ -19,7 +19,7 @@ class ParameterRequirement(NamedTuple):
     other_path: str
     """Dotted path of the required parameter."""
     is_broken_by: ValueCondition
-    """Condition on the values of the required parameter that break the requirement."""
+    """Condition that values of the required parameter meet if they break the requirement."""
     problem: str
     """Text of the finding: the end of a sentence about the parameter that has the requirement."""
     remedy: str

@@ -531,7 +531,7 @@ def _beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
 
 
 def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineGradients:
-    """Return gradients of line position and phase across the beam, along the slope and across it.
+    """Return gradients of line position and phase over the beam, along the slope and across it.
 
     Across the slope only Doppler ratios change. The gradients are set even where the effects of the
     footprint are too small to change probabilities, because peak positions wander with them.

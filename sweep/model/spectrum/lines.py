@@ -366,8 +366,9 @@ def compute_lines(
 
         f = carrier beta - S (2 R / c) (1 + beta)
 
-    with the signed chirp rate S. C_b is half the amplitude of the beat, in a spectrum whose noise
-    is white. It includes the two poles of the receiver, and the phase in the middle of the record.
+    with the signed chirp rate S. The weight C_b of line b is half the amplitude of its beat, in a
+    spectrum whose noise is white. It includes the two poles of the receiver, and the phase in the
+    middle of the record. If powers add, the weight is |C_b|^2.
     """
     fft_size, record_length = layout.fft_size, layout.record_length
     range_0 = beat.range - beat.range_decrease_since_shot_start

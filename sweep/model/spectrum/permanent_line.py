@@ -32,8 +32,8 @@ from sweep.model.waveform import count_samples_before_echo
 from sweep.model.window import Window, window_samples
 
 MASK_THRESHOLD_FRACTION = 0.5
-"""Fraction of the threshold that a permanent line reaches in a bin for the bin to be masked. A
-masked bin raises no alarm; a smaller line raises few alarms."""
+"""Fraction of the threshold from which on a permanent line masks a bin. A masked bin raises no
+alarm; a smaller line raises few alarms."""
 N_PHASES = 16
 """Number of phases of the permanent line over which its false alarms are averaged."""
 

@@ -165,9 +165,8 @@ class BinSpans(NamedTuple):
     is_exempt: np.ndarray
     """(bins,) bool: true in bins that belong to an echo and so cannot raise a false alarm."""
     peak_is_searched: np.ndarray
-    """Bool: true if the largest bin of the echo is in the search band. Otherwise no span contains
-    it.
-    """
+    """Bool: true if the largest bin of the echo is in the search band. Otherwise the span does not
+    contain that bin."""
     peak_is_masked: np.ndarray
     """Bool: true if a permanent line masks the largest bin of the echo, which is then not detected.
     """
