@@ -352,7 +352,6 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, n_noise_bins
         line_grid=NO_LINES,
         line_centre=np.zeros((1, 3, 1)),
         echo_fraction=np.zeros((1, 3, 1)),
-        wander_deviation=np.zeros((1, 3, 1)),
         n_independent_bins=np.ones((1, 3, 1)),
         speckle_mixing=SpeckleMixing(*np.zeros((6, 1))),
         look_covariance_root=np.zeros((1, 3, 1, 0), complex),

@@ -142,7 +142,7 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
         if shots.detection_settings.search_band is None
         else _zero_leakage_of_unsearched_echoes(spans)
     )
-    _fill_groups(
+    _find_and_write_groups(
         spans.point_numbers,
         # In C order: numba compiles anew for each order.
         np.ascontiguousarray(spans.first_bin),
@@ -178,10 +178,10 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
 
 
 def _zero_leakage_of_unsearched_echoes(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of bins and |X| [V], with |X| set to 0 outside unsearched echoes.
+    """Return ``n_bins`` and ``magnitudes`` of spans without the sidelobes of unsearched echoes.
 
-    This holds for segments whose strongest bin is outside the search band. Sidelobes of such an
-    echo are leaked signal and no groups.
+    An echo whose strongest bin is outside the search band is unsearched. Its sidelobes are leaked
+    signal and no groups, so |X| is set to 0 in all bins of its segment outside the echo.
     """
     n_bins, magnitudes = spans.n_bins.copy(), spans.magnitudes.copy()
     for s, j in np.argwhere(~spans.peak_is_searched):
@@ -194,7 +194,7 @@ def _zero_leakage_of_unsearched_echoes(spans: BinSpans) -> tuple[np.ndarray, np.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_groups(
+def _find_and_write_groups(
     point_numbers,
     first_bin,
     n_bins,
@@ -266,8 +266,13 @@ def _fill_groups(
                     bin_speckle_at(speckle_table, segment, i),
                 )
                 for side in range(3):
-                    bin_groups.neighbour_magnitudes[i, segment, group, side] = _mirrored_magnitude(
-                        magnitude, first_bin[segment, j], strongest_index + side - 1, nyquist_bin
+                    bin_groups.neighbour_magnitudes[i, segment, group, side] = (
+                        _magnitude_of_bin_or_mirror(
+                            magnitude,
+                            first_bin[segment, j],
+                            strongest_index + side - 1,
+                            nyquist_bin,
+                        )
                     )
                 bounds.strongest[group] += first_bin[segment, j]  # from indices to bin numbers
                 bounds.first[group] += first_bin[segment, j]
@@ -275,7 +280,7 @@ def _fill_groups(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
+def _magnitude_of_bin_or_mirror(magnitude, first_bin, index, nyquist_bin):
     """Return |X| of a bin given by its index in a span (adjacent bins from ``first_bin`` on).
 
     Bins beyond DC or Nyquist are mirrored. Bins outside the span have magnitude 0.
@@ -291,8 +296,9 @@ def _list_groups(magnitude, is_echo, peak_index, threshold, bounds):
     """List the strongest groups of adjacent bins at or above the threshold; return their number.
 
     The result is written into ``bounds``, a :class:`GroupBounds` of indices in ``magnitude``.
-    Groups whose strongest bin is not ``is_echo`` are leaked signal, and omitted. If ``is_echo`` is
-    empty, none is omitted.
+    Groups whose strongest bin is no bin of an echo (``is_echo``) are leaked signal, and omitted. If
+    ``is_echo`` is empty, none is omitted. If the bin ``peak_index`` is below the threshold, it is
+    listed alone.
     """
     if not magnitude[peak_index] >= threshold:
         bounds.strongest[0] = bounds.first[0] = bounds.last[0] = peak_index

@@ -87,14 +87,14 @@ class EgoMotion(NamedTuple):
     """Slip [m/s] at range 0: closing speed minus the speed at which the range to level ground
     falls."""
     slip_per_range: np.ndarray
-    """Derivative with respect to the range [(m/s)/m] of the slip, the closing speed minus the speed
-    at which the range falls."""
+    """Derivative of the slip with respect to the range [(m/s)/m]. The slip is the closing speed
+    minus the speed at which the range falls."""
     slip_per_slope: np.ndarray
-    """(n, 3): derivative of the slip at range 0 [m/s] with respect to the gradient (rise over run)
-    of the surface. The slip is the closing speed minus the speed at which the range falls."""
+    """(n, 3): derivative of the slip [m/s] with respect to the gradient (rise over run) of the
+    surface, at range 0. The slip is the closing speed minus the speed at which the range falls."""
     slip_per_slope_per_range: np.ndarray
-    """(n, 3): derivative of ``slip_per_slope``, which is at range 0, with respect to the range
-    [(m/s)/m]."""
+    """(n, 3): growth of the derivative ``slip_per_slope`` with the range [(m/s)/m]. At range R the
+    derivative is ``slip_per_slope`` + R ``slip_per_slope_per_range``."""
     slip_per_target_speed: np.ndarray
     """Ratio of two standard deviations: that of the slip due to motion of the surface, and that of
     one component of the surface's velocity. The slip is the closing speed minus the speed at which
@@ -129,7 +129,7 @@ class EgoMotion(NamedTuple):
         return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
 
     def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:
-        """Return the standard deviation [m/s] of the slip at ranges (n, ...) [m] that priors imply.
+        """Return the standard deviation [m/s] of the slip, by the priors, at ranges (n, ...) [m].
 
         The slip is the closing speed minus the speed at which the range falls.
 
@@ -158,7 +158,7 @@ class EgoMotion(NamedTuple):
 
     @property
     def acceleration_standard_error(self) -> np.ndarray:
-        """Standard deviation (n,) [m/s^2] of the acceleration along each beam, by the priors."""
+        """Standard deviation (n,) [m/s^2], by the priors, of the acceleration along each beam."""
         return np.hypot(self.priors.target_acceleration, self.priors.target_speed * self.turn_rate)
 
 

@@ -46,7 +46,7 @@ INSTRUMENT_KEY_NUMBER = -1.0
 
 
 class ErrorFloor(NamedTuple):
-    """Standard deviations of those errors of an instrument that do not depend on the echo.
+    """Standard deviations of an instrument's errors that do not depend on the echo.
 
     All are 0 for an instrument without such errors.
 
@@ -61,8 +61,8 @@ class ErrorFloor(NamedTuple):
     wavelength: float = 0.0
     """Standard deviation of the relative error of the known wavelength."""
     vibration: float = 0.0
-    """Standard deviation of the velocity along the beam that vibration of the instrument causes
-    [m/s]."""
+    """Standard deviation of the instrument's velocity along the beam due to its vibration [m/s].
+    """
     range_noise: float = 0.0
     """Standard deviation of an additional error of each measured range [m]."""
 
@@ -129,14 +129,14 @@ def apply_error_floor(
     """
     n, draws = points["flags"].shape[:2]
     draw_numbers = np.arange(first_draw, first_draw + draws)
-    (instrument_normals,) = _draw_beam_normals(
+    (instrument_normals,) = _draw_normal_numbers_by_beam(
         np.array([INSTRUMENT_KEY_NUMBER]), draw_numbers, seed
     )
     clock, wavelength = instrument_normals.T
     beam_numbers, beam_index = np.unique(eyepoints.beam, return_inverse=True)
     pointing_errors = (
         error_floor.pointing
-        * _draw_beam_normals(beam_numbers.astype(float), draw_numbers, seed)[beam_index]
+        * _draw_normal_numbers_by_beam(beam_numbers.astype(float), draw_numbers, seed)[beam_index]
     )
     uniform_numbers = uniforms(
         np.repeat(keys, draws, axis=0), np.tile(draw_numbers, n), STREAM_ERROR_FLOOR, 2
@@ -180,7 +180,9 @@ def apply_error_floor(
     return results
 
 
-def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed: int) -> np.ndarray:
+def _draw_normal_numbers_by_beam(
+    beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed: int
+) -> np.ndarray:
     """Draw two standard normal random numbers for each beam and draw, (beams, draws, 2).
 
     The numbers are the beam's pointing errors on two axes, in standard deviations.

@@ -41,8 +41,8 @@ at range 0, with an infinite echo.
 """
 
 _GRAZING_SINE_MIN = 0.01
-"""Smallest sine of the angle between a ray and the surface that it hits. Smaller sines are replaced
-by it when the speed at which the range falls is computed."""
+"""Smallest sine of the angle between a ray and the surface that it hits. It replaces smaller sines
+in the speed at which the range falls."""
 
 
 class Eyepoints(NamedTuple):
@@ -168,7 +168,7 @@ def compute_eyepoints(
     Raises
     ------
     UnsupportedShotError
-        If the geometry of a shot is not finite; names the first such shot.
+        If the geometry of a shot is not finite. The message names the first such shot.
 
     Notes
     -----
@@ -209,7 +209,7 @@ def compute_eyepoints(
     reference_velocity = radial_velocity[rows, np.maximum(bundle.reference_beamlet, 0)]
     scanner_rate = rotate(state.attitude, shots.direction_rate)
     _require_finite(shot_numbers, time, state, bundle, radial_velocity)
-    acceleration, approach_speed, turn_rate = _reference_beam_motion(
+    acceleration, approach_speed, turn_rate = _reference_beamlet_motion(
         state, scanner_rate, ray_directions, bundle, body_states, bodies_rotate
     )
     direction = rotate(state.attitude, shots.direction)
@@ -323,7 +323,7 @@ def _radial_velocities(
     return closing_speed
 
 
-def _reference_beam_motion(
+def _reference_beamlet_motion(
     state: BodyState,
     scanner_rate: np.ndarray,
     ray_directions: np.ndarray,
@@ -413,7 +413,7 @@ def prepare_eyepoint_shots(
     surfaces: Sequence[SurfaceMaterial],
     effects: Collection[str] = DEFAULT_EFFECTS,
 ) -> Shots:
-    """Prepare shots with a given geometry (eyepoints) for simulation; each shot hits a surface.
+    """Prepare shots for simulation from their geometry (eyepoints); each shot must hit a surface.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ N_TABLE_AMPLITUDES = 2048
 """Number of signal amplitudes at which the rate -ln(1 - c) is tabulated. c is the probability that
 signal lifts a bin above the threshold."""
 
-CERTAIN_MARGIN_SIGMA = 12.0
+CERTAIN_CROSSING_MARGIN_SIGMA = 12.0
 """Amplitude above the threshold, in standard deviations of the noise, from which signal is taken to
 raise a bin above the threshold with certainty."""
 
@@ -74,11 +74,11 @@ LEAKAGE_MIN = 1e-9
 """Smallest probability of a false peak by leaked signal in a segment for which such peaks are
 drawn."""
 
-PERMANENT_LINE_RANDOM_OFFSET = np.int64(1 << 24)
+PERMANENT_LINE_FIRST_RANDOM_INDEX = np.int64(1 << 24)
 """Index of the first random number used for the line of leaked light. Lower indices of the same
 stream are used for signal leaked from echoes."""
 
-ECHO_EDGE_RANDOM_OFFSET = 1 << 25
+ECHO_EDGE_FIRST_RANDOM_INDEX = 1 << 25
 """Index of the first random number used for the noise of an echo's outermost bins, which are next
 to bins of leaked signal."""
 
@@ -93,31 +93,32 @@ of 1e-11."""
 LOG_SPECKLE_POWER_MIN, LOG_SPECKLE_POWER_MAX = -10.0, 3.5
 """Limits of the integral over speckle, in ln(speckle power). The mean speckle power is 1."""
 
-LOG_SPECKLE_POWER_MIN_FAINT = -5.0
-"""Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal, whose
-sum of rates is at most FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX. The part below this limit is
-extrapolated."""
+FAINT_LEAKAGE_LOG_SPECKLE_POWER_MIN = -5.0
+"""Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal. The part
+below this limit is extrapolated. Signal is faint if its sum of rates is at most
+FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX."""
 FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX = 0.1
-"""Limit below which leaked signal counts as faint, so that the integral over speckle may begin at
-LOG_SPECKLE_POWER_MIN_FAINT. It applies to the sum of -ln(1 - c) over the bins of a segment at mean
-speckle power, with the probability c that leaked signal lifts a bin above the threshold."""
+"""Largest sum of rates -ln(1 - c) over the bins of a segment for which leaked signal counts as
+faint. The integral over speckle then begins at FAINT_LEAKAGE_LOG_SPECKLE_POWER_MIN. c is the
+probability, at mean speckle power, that leaked signal lifts a bin above the threshold."""
 
 LOG_SPECKLE_POWER_STEP_MAX = 0.25
 """Largest step in ln(speckle power) of the integral over speckle. The relative error of the mean is
 then 1e-8."""
 
 JOINING_CROSSING_RATE_MIN = 1e-2
-"""Smallest rate -ln(1 - c), in bright speckle, at which one more adjacent bin is considered part of
-an echo. c is the probability that leaked signal lifts the bin before it above the threshold."""
+"""Smallest rate -ln(1 - c) of a bin, in bright speckle, at which the next bin may still join an
+echo. c is the probability that leaked signal lifts the bin above the threshold. At lower rates the
+run of bins that may join the echo ends."""
 BRIGHT_SPECKLE_LOG_AMPLITUDE = math.log(4.0)
-"""ln of the factor on the signal amplitude in bright speckle, at which JOINING_CROSSING_RATE_MIN is
-tested."""
+"""ln of the factor by which bright speckle raises the signal amplitude, where rates are compared
+with JOINING_CROSSING_RATE_MIN."""
 
 FAINT_LEAKAGE_MAX = 1e-5
-"""Largest probability of a false peak by leaked signal that is computed as a sum of means over
-speckle, one of each bin.
+"""Largest probability of a false peak by leaked signal for which the means over speckle of the
+bins' probabilities are simply added.
 
-So faint bins hardly ever cross the threshold together, or together with an adjacent echo.
+Bins as faint as that hardly ever cross the threshold together, or together with an adjacent echo.
 """
 
 MEAN_CROSSING_TABLE_STRIDE = 8
@@ -136,9 +137,9 @@ ECHO_EDGE_LOG_SPECKLE_POWER_DEPTH = 3.0
 threshold is computed. At lower powers the value at this power is used."""
 
 LOG_CROSSING_RATE_STEP_MAX = 0.5
-"""Largest difference of ln(rate) between successive nodes of the integral over speckle; with more
-the mean errs by over 1e-7. The rate is -ln(1 - c), with c the probability that signal lifts a bin
-above the threshold."""
+"""Largest difference of ln(rate) between successive nodes of the integral over speckle. With a
+larger one the mean errs by more than 1e-7. The rate is -ln(1 - c), with c the probability that
+signal lifts a bin above the threshold."""
 
 
 class LeakageBins(NamedTuple):
@@ -199,8 +200,8 @@ class LeakageBins(NamedTuple):
     no_noise_peak_bins: np.ndarray
     """(excluded,) int64: numbers of the bins in which no false peak of noise alone is drawn."""
     threshold_index: np.ndarray
-    """(m,) int64: index of each point's threshold in the tables of all distinct thresholds, such as
-    ``log_crossing_rates``."""
+    """(m,) int64: index of each point's threshold in ``log_crossing_rates`` and the other arrays
+    by threshold."""
     log_crossing_rates: np.ndarray
     """(thresholds, N_TABLE_AMPLITUDES): ln of the rate -ln(1 - c) at evenly spaced ln(|X| / sigma),
     for each threshold. c is the probability that signal lifts a bin above the threshold."""
@@ -285,10 +286,10 @@ class LeakageBins(NamedTuple):
         return leakage
 
 
-class _LeakedBins(NamedTuple):
+class _LeakedBinLocations(NamedTuple):
     """Bins of leaked signal in the spectra of a batch of points, (bins,) each."""
 
-    number: np.ndarray
+    bin_number: np.ndarray
     """(bins,) int64: number of the bin."""
     batch_index: np.ndarray
     """(bins,) int64: index of the point in the batch."""
@@ -299,7 +300,7 @@ class _LeakedBins(NamedTuple):
 def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
     """Return indices of points with a notable probability of a false peak by leaked signal.
 
-    It exceeds LEAKAGE_MIN in at least one segment.
+    The probability exceeds LEAKAGE_MIN in at least one segment.
     """
     return np.flatnonzero((groups.leakage > LEAKAGE_MIN).any(axis=1))
 
@@ -327,9 +328,9 @@ def fading_group_of_bins(
     ndarray (bins,) int64
         Index of the group in the segment of each bin.
     """
-    bins = _leaked_bins(spectra)
+    bins = _locate_leaked_bins(spectra)
     group_bins = groups.strongest_bin[points[bins.batch_index], bins.segment]
-    distance = np.abs(bins.number[:, None] - group_bins)
+    distance = np.abs(bins.bin_number[:, None] - group_bins)
     if shots.complex_record:
         distance = np.minimum(distance % shots.fft_size, -distance % shots.fft_size)
     return np.where(group_bins < 0, np.iinfo(np.int64).max, distance).argmin(axis=1)
@@ -362,7 +363,7 @@ def bins_without_noise_peaks(
         group=fading_group_of_bins(shots, groups, points, spectra),
         no_noise_peak_begin=spectra.leaked_begin,
         no_noise_peak_end=spectra.leaked_end,
-        no_noise_peak_bins=_leaked_bins(spectra).number,
+        no_noise_peak_bins=_locate_leaked_bins(spectra).bin_number,
     )
 
 
@@ -397,16 +398,16 @@ def iter_leakage_bins(
             echoes_alone, points[batch_begin : batch_begin + PERMANENT_LINE_BATCH_POINTS]
         ):
             fading_group = fading_group_of_bins(shots, groups, batch, spectra)
-            spectra, fading_group, leakage_bins = _mask_leaked_light(
+            spectra, fading_group, leakage_bins = _remove_bins_masked_by_leaked_light(
                 shots, batch, spectra, fading_group
             )
             leakage_bins = leakage_bins._replace(
                 bins_begin=spectra.leaked_begin,
                 bins_end=spectra.leaked_end,
-                bins=_leaked_bins(spectra).number,
-                log_amplitude=np.log(spectra.leaked_ratio),
+                bins=_locate_leaked_bins(spectra).bin_number,
+                log_amplitude=np.log(spectra.leaked_magnitude_ratio),
                 group=fading_group,
-                exempt_neighbour=spectra.exempt_neighbour_ratio,
+                exempt_neighbour=spectra.exempt_neighbour_magnitude_ratio,
                 side_of_adjacent_echo_bin=spectra.side_of_adjacent_echo_bin,
             )
             yield batch, _add_crossing_rate_tables(shots, batch, leakage_bins)
@@ -593,7 +594,7 @@ def _add_crossing_rate_tables(
     threshold_ratios, threshold_index = _distinct_thresholds(point_threshold_ratio)
     in_speckle = shots.speckle.segment_correlations is not None
     tables = [
-        _tabulate_rates(shots.looks, float(threshold_ratio), in_speckle)
+        _make_crossing_tables(shots.looks, float(threshold_ratio), in_speckle)
         for threshold_ratio in threshold_ratios
     ]
     leakage_bins = leakage_bins._replace(
@@ -651,10 +652,10 @@ class CrossingTables(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> CrossingTables:
+def _make_crossing_tables(looks: Looks, threshold_ratio: float, in_speckle: bool) -> CrossingTables:
     """Return :class:`CrossingTables` for a threshold [sigma].
 
-    Means over speckle are included if ``in_speckle``.
+    ``in_speckle`` is True to include the probabilities averaged over speckle.
     """
     rate_table = _tabulate_log_crossing_rates(looks, threshold_ratio)
     mean_probabilities = np.empty(0)
@@ -698,20 +699,23 @@ def _fill_mean_probabilities(rate_table, mean_probabilities):
         mean_probabilities[k] = _mean_leakage_from_rate_sums(rate_sums, quadrature.weights)
 
 
-def _leaked_bins(spectra: NoiselessSpectra) -> _LeakedBins:
+def _locate_leaked_bins(spectra: NoiselessSpectra) -> _LeakedBinLocations:
     """Return number, point and segment of each bin of leaked signal."""
     n_bins = (spectra.leaked_end - spectra.leaked_begin).ravel()
     span = np.repeat(np.arange(n_bins.size), n_bins)
-    return _LeakedBins(spectra.first_bin.ravel()[span] + spectra.leaked_index, span // 3, span % 3)
+    return _LeakedBinLocations(
+        spectra.first_bin.ravel()[span] + spectra.leaked_index, span // 3, span % 3
+    )
 
 
-def _mask_leaked_light(
+def _remove_bins_masked_by_leaked_light(
     shots: Shots, batch: np.ndarray, spectra: NoiselessSpectra, group: np.ndarray
 ) -> tuple[NoiselessSpectra, np.ndarray, LeakageBins]:
     """Remove bins that a line of leaked light masks, and list the bins that the line raises.
 
-    Returns the reduced spectra, ``group`` of the remaining bins (:func:`fading_group_of_bins`), and
-    :class:`LeakageBins` with the fields ``permanent_line_*`` and ``no_noise_peak_*`` only.
+    ``group`` is the result of :func:`fading_group_of_bins`. The results are the spectra and the
+    groups of the remaining bins, and :class:`LeakageBins` with the fields ``permanent_line_*`` and
+    ``no_noise_peak_*`` alone.
     """
     is_kept = np.ones(spectra.leaked_index.size, bool)
     n_kept, n_raised, n_masked = np.zeros((3, batch.size, 3), np.int64)
@@ -750,8 +754,8 @@ def _mask_leaked_light(
             leaked_begin=kept_end - n_kept,
             leaked_end=kept_end,
             leaked_index=spectra.leaked_index[is_kept],
-            leaked_ratio=spectra.leaked_ratio[is_kept],
-            exempt_neighbour_ratio=spectra.exempt_neighbour_ratio[is_kept],
+            leaked_magnitude_ratio=spectra.leaked_magnitude_ratio[is_kept],
+            exempt_neighbour_magnitude_ratio=spectra.exempt_neighbour_magnitude_ratio[is_kept],
             side_of_adjacent_echo_bin=spectra.side_of_adjacent_echo_bin[is_kept],
         ),
         group[is_kept],
@@ -806,7 +810,7 @@ def _fill_log_crossing_rates(threshold_ratio, log_crossing_rates):
     """
     first_log_amplitude = math.log(TABLE_AMPLITUDE_MIN_SIGMA)
     log_amplitude_step = (
-        math.log(threshold_ratio + CERTAIN_MARGIN_SIGMA) - first_log_amplitude
+        math.log(threshold_ratio + CERTAIN_CROSSING_MARGIN_SIGMA) - first_log_amplitude
     ) / (N_TABLE_AMPLITUDES - 1)
     p_noise_stay = -math.expm1(-0.5 * threshold_ratio * threshold_ratio)
     for k in range(N_TABLE_AMPLITUDES):
@@ -934,18 +938,18 @@ class SpeckleQuadrature(NamedTuple):
     node_stride: int
     """Distance of successive nodes of the rule, in steps of ln(amplitude) of the table of rates. A
     node's ln(power) is twice its ln(amplitude)."""
-    n_below_mean: int
+    n_nodes_below_mean: int
     """Number of nodes whose speckle power is below the mean, which is 1."""
     weights: np.ndarray
     """(nodes,): weights of the trapezoidal rule. Node i has the speckle power e^(2 node_stride step
-    (i - n_below_mean)), with the ``step`` of the table's ln(amplitude)."""
+    (i - n_nodes_below_mean)), with the ``step`` of the table's ln(amplitude)."""
     rates_by_node_phase: np.ndarray
     """(node_stride * columns,): rates -ln(1 - c) at evenly spaced ln(amplitude), one row after the
     other.
 
-    Step 0 is ``n_below_mean`` strides below the table. The row p (phase of the nodes) has the rates
-    at the steps p, p + node_stride, p + 2 node_stride .. in its columns. The nodes of a bin lie in
-    one row, so that they are adjacent in memory.
+    Step 0 is ``n_nodes_below_mean`` strides below the table. The row p (phase of the nodes) has the
+    rates at the steps p, p + node_stride, p + 2 node_stride .. in its columns. The nodes of a bin
+    lie in one row, so that they are adjacent in memory.
     """
 
 
@@ -972,24 +976,26 @@ def _make_speckle_quadrature(rate_table):
         1,
     )
     log_power_step = 2.0 * node_stride * log_amplitude_step
-    n_below_mean, n_above_mean = (
+    n_nodes_below_mean, n_nodes_above_mean = (
         int(-LOG_SPECKLE_POWER_MIN / log_power_step) + 1,
         int(LOG_SPECKLE_POWER_MAX / log_power_step) + 1,
     )
-    weights = np.empty(n_below_mean + n_above_mean + 1)
+    weights = np.empty(n_nodes_below_mean + n_nodes_above_mean + 1)
     for i in range(weights.size):
-        power = math.exp((i - n_below_mean) * log_power_step)
+        power = math.exp((i - n_nodes_below_mean) * log_power_step)
         weights[i] = log_power_step * power * math.exp(-power)
-    # From `n_below_mean` strides beyond the table a bin crosses even at the faintest node.
-    n_columns = 2 * n_below_mean + n_above_mean + log_crossing_rates.size // node_stride + 4
+    # From `n_nodes_below_mean` strides beyond the table a bin crosses even at the faintest node.
+    n_columns = (
+        2 * n_nodes_below_mean + n_nodes_above_mean + log_crossing_rates.size // node_stride + 4
+    )
     rates_by_node_phase = np.empty(node_stride * n_columns)
     for k in range(rates_by_node_phase.size):
-        table_position = float(k - n_below_mean * node_stride - 1)
+        table_position = float(k - n_nodes_below_mean * node_stride - 1)
         rate = _crossing_rate(
             rate_table.first_log_amplitude + table_position * log_amplitude_step, rate_table
         )
         rates_by_node_phase[k % node_stride * n_columns + k // node_stride] = rate
-    return SpeckleQuadrature(node_stride, n_below_mean, weights, rates_by_node_phase)
+    return SpeckleQuadrature(node_stride, n_nodes_below_mean, weights, rates_by_node_phase)
 
 
 @njit(cache=True, error_model="numpy")
@@ -1058,8 +1064,8 @@ def _mean_leakage_from_rate_sums(rate_sums, weights):
 
     R is the sum of the bins' rates. ``rate_sums`` holds it at the last nodes of speckle power.
 
-    Terms below the first node continue as a geometric series. They are proportional to the power if
-    all draws leak, else to its square.
+    Below the first node the terms of the sum are continued as a geometric series. They are
+    proportional to the power if all draws leak, else to its square.
     """
     mean, lowest_term, next_term = 0.0, 0.0, 0.0
     for i in range(rate_sums.size - 1, -1, -1):
@@ -1072,7 +1078,7 @@ def _mean_leakage_from_rate_sums(rate_sums, weights):
 
 
 @njit(cache=True, error_model="numpy")
-def _evaluate_joining_bins(
+def _compute_separate_peak_rates(
     bin_index,
     bins_begin,
     bins_end,
@@ -1081,11 +1087,11 @@ def _evaluate_joining_bins(
     rate_table,
     quadrature,
     is_evaluated,
-    joining_rates,
+    separate_peak_rates,
 ):
-    """Compute the rates of false peaks in leaked bins next to an echo, unless they join the echo.
+    """Compute the rates of false peaks, in leaked bins next to an echo, that do not join the echo.
 
-    Adjacent crossing bins belong to the echo if the echo's outermost bin crosses the threshold.
+    Adjacent crossing bins join the echo if the echo's outermost bin crosses the threshold.
 
     Parameters
     ----------
@@ -1101,16 +1107,16 @@ def _evaluate_joining_bins(
         :class:`CrossingRateTable` and :class:`SpeckleQuadrature` for this threshold.
     is_evaluated
         (bins,) bool: True for bins that were evaluated before.
-    joining_rates
+    separate_peak_rates
         Result: rates -ln(1 - p) at the last nodes of speckle power. p is the probability of a peak
-        in these bins that does not join the echo.
+        that does not join the echo, in the bin ``bin_index`` or in bins farther from the echo.
 
     Returns
     -------
     int
-        Index of the last of these bins.
+        Index of the bin farthest from the echo that p includes.
     """
-    n_nodes, step = joining_rates.size, -leakage_bins.side_of_adjacent_echo_bin[bin_index]
+    n_nodes, step = separate_peak_rates.size, -leakage_bins.side_of_adjacent_echo_bin[bin_index]
     end_index = bin_index + step
     while (
         bins_begin <= end_index < bins_end
@@ -1143,7 +1149,7 @@ def _evaluate_joining_bins(
     _add_rates_at_nodes(leakage_bins.log_amplitude[bin_index], rate_table, quadrature, bin_rates)
     log_power_step = 2.0 * quadrature.node_stride * rate_table.log_amplitude_step
     nodes_per_step = max(int(ECHO_EDGE_LOG_SPECKLE_POWER_STEP / log_power_step), 1)
-    mean_power_node = n_nodes - quadrature.weights.size + quadrature.n_below_mean
+    mean_power_node = n_nodes - quadrature.weights.size + quadrature.n_nodes_below_mean
     first_edge_node = max(
         mean_power_node - int(ECHO_EDGE_LOG_SPECKLE_POWER_DEPTH / log_power_step), 0
     )
@@ -1169,7 +1175,7 @@ def _evaluate_joining_bins(
             p_edge = p_edge_before + p_edge_slope * (i - step_begin)
             p_cross = _crossing_probability(bin_rates[i])
             p_apart = 1.0 - p_edge + p_edge * p_any_after_quiet[i]
-            joining_rates[i] = crossing_rate(p_cross * p_apart + (1.0 - p_cross) * p_any[i])
+            separate_peak_rates[i] = crossing_rate(p_cross * p_apart + (1.0 - p_cross) * p_any[i])
         step_begin = step_end
     return end_index - step
 
@@ -1210,7 +1216,7 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
             node_scratch = np.empty((2, quadrature.weights.size))
             log_power_step = 2.0 * quadrature.node_stride * rate_table.log_amplitude_step
             faint_first_node = int(
-                (LOG_SPECKLE_POWER_MIN_FAINT - LOG_SPECKLE_POWER_MIN) / log_power_step
+                (FAINT_LEAKAGE_LOG_SPECKLE_POWER_MIN - LOG_SPECKLE_POWER_MIN) / log_power_step
             )
         for j in range(leakage_probability.shape[0]):
             if leakage_bins.threshold_index[j] != threshold_index:
@@ -1222,7 +1228,7 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
                     if leakage_bins.crossing_rate_sum[j, s] <= FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX
                     else 0
                 )
-                rate_sums, joining_rates = (
+                rate_sums, separate_peak_rates = (
                     node_scratch[0, first_node:],
                     node_scratch[1, first_node:],
                 )
@@ -1239,7 +1245,7 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
                             and leakage_bins.group[k] == group
                             and not is_evaluated[k]
                         ):
-                            last_joined = _evaluate_joining_bins(
+                            last_joined = _compute_separate_peak_rates(
                                 k,
                                 begin,
                                 end,
@@ -1248,10 +1254,10 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
                                 rate_table,
                                 quadrature,
                                 is_evaluated,
-                                joining_rates,
+                                separate_peak_rates,
                             )
                             is_evaluated[min(k, last_joined) : max(k, last_joined) + 1] = True
-                            rate_sums += joining_rates
+                            rate_sums += separate_peak_rates
                     for k in range(begin, end):
                         if leakage_bins.group[k] == group and not is_evaluated[k]:
                             _add_rates_at_nodes(
@@ -1391,13 +1397,13 @@ def draw_leaked_peaks(
         )
     if leakage_bins.permanent_line_crossing_rate_sum[point, segment] > 0.0:
         uniform_phase = philox.uniform(
-            key_0, key_1, draw, philox.STREAM_LEAKAGE[segment], PERMANENT_LINE_RANDOM_OFFSET
+            key_0, key_1, draw, philox.STREAM_LEAKAGE[segment], PERMANENT_LINE_FIRST_RANDOM_INDEX
         )
         phase = int(uniform_phase * leakage_bins.permanent_line_log_amplitude.shape[0])
         n_peaks = _draw_raised_bins(
             address,
             segment,
-            PERMANENT_LINE_RANDOM_OFFSET + 1,
+            PERMANENT_LINE_FIRST_RANDOM_INDEX + 1,
             leakage_bins.permanent_line_begin[point, segment],
             leakage_bins.permanent_line_end[point, segment],
             leakage_bins.permanent_line_bins,
@@ -1438,7 +1444,7 @@ def _draw_raised_bins(
     peak_ratios,
     n_peaks,
 ):
-    """Draw which bins of leaked signal cross the threshold, list their peaks, and return the count.
+    """Draw which bins of leaked signal cross the threshold; list their peaks, and return how many.
 
     Adjacent raised bins make one peak. Peaks adjacent to a bin of the echo that crosses belong to
     the echo. Bins are skipped by exponential random numbers, as the module describes.
@@ -1497,7 +1503,7 @@ def _draw_raised_bins(
             exempt_neighbour.size > 0 and exempt_neighbour[k] > 0.0
         ):  # its noise is correlated with that of this bin
             re, im = philox.normal_pair(
-                key_0, key_1, draw, stream, ECHO_EDGE_RANDOM_OFFSET + k - bins_begin
+                key_0, key_1, draw, stream, ECHO_EDGE_FIRST_RANDOM_INDEX + k - bins_begin
             )
             echo_bin_signal = exempt_neighbour[k] * fading_factor * root_looks
             echo_bin_in_phase = echo_bin_signal + noise_correlation * (
@@ -1543,7 +1549,7 @@ def _magnitude_at_crossing_probability(signal, threshold_ratio, probability):
     c(z) is the probability that ``signal`` lifts a bin to z, if noise alone does not. z is at least
     ``threshold_ratio``.
     """
-    low, high = threshold_ratio, max(signal, threshold_ratio) + CERTAIN_MARGIN_SIGMA
+    low, high = threshold_ratio, max(signal, threshold_ratio) + CERTAIN_CROSSING_MARGIN_SIGMA
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         if _added_crossing_probability(signal, middle) > probability:

@@ -69,27 +69,27 @@ BEAMS_PER_BATCH = 1 << 14
 arrays then fit into the processor's cache."""
 
 GRAZING_SINE_MIN = 0.05
-"""Smallest sine of the angle between beam and ground that the weights of ground points use. It is
-the sine of some 3 deg."""
+"""Smallest sine of the angle between beam and ground in the weights of ground points: that of some
+3 deg."""
 
 _CONDITION_NUMBER_MAX = 1e6
 """Largest condition number of a cycle's least-squares equations. Above it the beams count as
 coplanar, and no velocity is computed."""
 
-_INTERPOLATION_ERROR_MIN = 1e-6
+_INTERPOLATION_ERROR_RATIO_MIN = 1e-6
 """Smallest standard error of a value interpolated between bins, as a fraction of the standard error
 of the value by whole bins."""
 
 _BELOW_ONE_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal random number is below its mean plus one standard deviation."""
 
-_ROUNDING_ERROR = 1e-14
-"""Relative rounding error of a squared standard error. It limits the difference when a common part
-of the variance is subtracted."""
+_RELATIVE_VARIANCE_ROUNDING_ERROR = 1e-14
+"""Relative rounding error of a squared standard error. It limits how small a variance may get when
+a common part is subtracted from it."""
 
 _CONTRADICTION_PROBABILITY = 1e-4
-"""Probability of a larger chi-square by chance, below which residuals contradict the stated errors.
-The covariance then follows from the residuals."""
+"""Probability below which a chi-square contradicts the stated errors. It is the probability that
+true errors give a chi-square as large. The covariance then follows from the residuals."""
 
 STATUS_SOLVED = 0
 """Status of a cycle whose solution uses all beams with a return."""
@@ -276,10 +276,10 @@ def solve_altitude(
         scale = _covariance_scale(
             chi_square, degrees_of_freedom, n_used - 1 - plane.n_fitted_slopes
         )
-        off_plane_variance = n_used * np.where(scale > 1, plane.point_variance, 0.0)
+        off_plane_variance = n_used * np.where(scale > 1, plane.centroid_height_variance, 0.0)
         return FittedCycles(
-            plane.height,
-            scale * (plane.variance + off_plane_variance),
+            plane.platform_height,
+            scale * (plane.platform_height_variance + off_plane_variance),
             chi_square,
             degrees_of_freedom,
         )
@@ -362,11 +362,11 @@ def _covariance_scale(
 ) -> np.ndarray:
     """Return the factor (n,) that scales covariances where residuals contradict the stated errors.
 
-    Residuals contradict the stated errors if these would give a chi-square this large with
-    :data:`_CONTRADICTION_PROBABILITY` or less. The factor is then ``chi_square`` over
-    ``residual_degrees`` (at least 1), times the square of Student's t at one standard deviation.
-    The error over a deviation so estimated follows Student's t, and the scaled deviation covers its
-    central 68 %. Other solutions have the factor 1.
+    Residuals contradict the stated errors if true errors would give a chi-square as large with a
+    probability below :data:`_CONTRADICTION_PROBABILITY`. The factor is then ``chi_square`` over
+    ``residual_degrees`` (at least 1), times the square of Student's t at one standard deviation: an
+    error over a deviation estimated from residuals follows Student's t. The scaled deviation covers
+    68 % of the errors. Other solutions have the factor 1.
 
     Parameters
     ----------
@@ -383,14 +383,16 @@ def _covariance_scale(
         / n_residual_degrees
         * stdtrit(n_residual_degrees, _BELOW_ONE_SIGMA_PROBABILITY) ** 2
     )
-    return np.where(_residuals_contradict(chi_square, degrees_of_freedom), scale, 1.0)
+    return np.where(_residuals_contradict_errors(chi_square, degrees_of_freedom), scale, 1.0)
 
 
-def _residuals_contradict(chi_square: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
-    """Return True for solutions whose residuals contradict the stated errors, (...,) bool.
+def _residuals_contradict_errors(
+    chi_square: np.ndarray, degrees_of_freedom: np.ndarray
+) -> np.ndarray:
+    """Return a mask (...,), True for solutions whose residuals contradict the stated errors.
 
-    By chance, true errors give such a large ``chi_square`` with a probability of less than
-    ``_CONTRADICTION_PROBABILITY``.
+    True errors would give a ``chi_square`` as large with a probability below
+    :data:`_CONTRADICTION_PROBABILITY`.
     """
     return (degrees_of_freedom > 0) & (
         chi_square > chdtri(np.maximum(degrees_of_freedom, 1), _CONTRADICTION_PROBABILITY)
@@ -400,10 +402,10 @@ def _residuals_contradict(chi_square: np.ndarray, degrees_of_freedom: np.ndarray
 class _GroundPlane(NamedTuple):
     """Planes fitted to the ground points of n cycles; arrays are (n,) unless stated otherwise."""
 
-    height: np.ndarray
-    """Height of the platform above the plane, along the vertical [m]."""
-    variance: np.ndarray
-    """Variance of the error of ``height`` [m^2]."""
+    platform_height: np.ndarray
+    """Height of the platform above the plane [m]."""
+    platform_height_variance: np.ndarray
+    """Variance of the error of ``platform_height`` [m^2]."""
     chi_square: np.ndarray
     """Sum of squared residuals of the ground points over their variances."""
     gradient: np.ndarray
@@ -411,9 +413,9 @@ class _GroundPlane(NamedTuple):
     n_fitted_slopes: np.ndarray
     """Effective number, 0..2, of the plane's two slopes that the points determine. The prior
     determines the rest."""
-    point_variance: np.ndarray
-    """Harmonic mean of the height variances of the ground points, divided by the number of points
-    [m^2]."""
+    centroid_height_variance: np.ndarray
+    """Variance of the height of the ground points' centroid [m^2]: 1 over the sum of the inverse
+    variances of the points' heights."""
 
 
 def _fit_plane(
@@ -628,8 +630,8 @@ def solve_navigation(
     Returns
     -------
     dict of str to ndarray
-        Arrays of :data:`sweep.model.outputs.NAVIGATION_VARIABLES`. Numbers of beams are 0 without a
-        solution.
+        Arrays of :data:`sweep.model.outputs.NAVIGATION_VARIABLES` by name. A cycle without a
+        solution has 0 as its number of beams.
     """
     n, draws = point_arrays["flags"].shape[:2]
     cycles = n // shots_per_cycle
@@ -644,14 +646,14 @@ def solve_navigation(
         )
         known_motion = assumed_motion_along_beams(
             beam_motion.direction,
-            beam_motion.velocity,
+            beam_motion.platform_velocity,
             beam_motion.direction_rate,
-            beam_motion.acceleration,
+            beam_motion.platform_acceleration,
             motion_priors,
         )
         solutions = _solve_cycles(
             beam_motion.reshape_by_cycle(shots_per_cycle),
-            _select_beams(point_arrays, shot_slice, shots_per_cycle, error_floor, known_motion),
+            _select_points(point_arrays, shot_slice, shots_per_cycle, error_floor, known_motion),
             {"test_level": test_level or None},
             {"slope": ground_slope, "relief": relief},
             pointing_jitter,
@@ -679,15 +681,15 @@ class BeamMotion(NamedTuple):
     Arrays are (..., 3), in the axes of the world frame.
     """
 
-    position: np.ndarray
+    platform_position: np.ndarray
     """(..., 3): position of the instrument in the world's frame [m]."""
-    velocity: np.ndarray
+    platform_velocity: np.ndarray
     """(..., 3): velocity of the instrument in the world's frame [m/s]."""
     direction: np.ndarray
     """(..., 3): unit vector along the beam, away from the instrument."""
     direction_rate: np.ndarray
     """(..., 3): time derivative of the beam's ``direction`` [1/s]."""
-    acceleration: np.ndarray
+    platform_acceleration: np.ndarray
     """(..., 3): acceleration of the instrument in the world's frame [m/s^2]."""
 
     def reshape_by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
@@ -695,24 +697,24 @@ class BeamMotion(NamedTuple):
         return BeamMotion(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
 
 
-def _select_beams(
+def _select_points(
     point_arrays: ArraysByName,
     shot_slice: slice,
     shots_per_cycle: int,
     error_floor: ErrorFloor,
     known_motion: EgoMotion,
 ) -> dict[str, np.ndarray]:
-    """Select the measured point of each shot and draw that navigation uses.
+    """Select the point that navigation uses of each shot and draw.
 
-    That point is the first point that a Doppler peak confirms and whose value and standard error
-    are finite.
+    It is the first point that a Doppler peak confirms and whose values and standard errors are
+    finite.
 
     Parameters
     ----------
     point_arrays
         Arrays of :data:`sweep.model.outputs.POINT_VARIABLES` by name.
     shot_slice
-        Shots of whole cycles that are selected.
+        The shots, those of whole cycles.
     shots_per_cycle
         Number of shots in a cycle.
     error_floor
@@ -749,7 +751,9 @@ def _select_beams(
             point_arrays["range_interpolated"][shot_slice]
         )
         # The slip's error depends on the range, and so is known no better than the clock.
-        error_min = 2 * math.sqrt(error_floor.clock + _ROUNDING_ERROR) * slip_error
+        error_min = (
+            2 * math.sqrt(error_floor.clock + _RELATIVE_VARIANCE_ROUNDING_ERROR) * slip_error
+        )
         error = np.sqrt(np.maximum(error**2 - slip_error**2, error_min**2))
         if name == "range":
             range_at_delay = value - per_slip * known_motion.approach_speed_at(value)
@@ -760,7 +764,8 @@ def _select_beams(
                 "radial_velocity_slip_error": slip_error,
             }
         error = np.maximum(
-            error, _INTERPOLATION_ERROR_MIN * point_arrays[f"{name}_standard_error"][shot_slice]
+            error,
+            _INTERPOLATION_ERROR_RATIO_MIN * point_arrays[f"{name}_standard_error"][shot_slice],
         )
         is_trusted &= np.isfinite(value) & np.isfinite(error) & (error > 0)
         values_by_name |= {name: value, f"{name}_standard_error": error}
@@ -791,7 +796,7 @@ def _solve_cycles(
     beam_motion
         Motion of the instrument and its beams, (cycles, beams, 3).
     beams
-        Measurements, as in :func:`_select_beams`.
+        Measurements, as in :func:`_select_points`.
     test_arguments, ground_arguments
         Arguments ``test_level``, and ``slope`` and ``relief``, of :func:`solve_altitude`.
     pointing_jitter
@@ -826,10 +831,10 @@ def _solve_cycles(
     altitude_solution = solve_altitude(**ground_points, **test_arguments)
     is_used = altitude_solution.is_used & altitude_solution.is_available[..., None]
     gradient = ground_gradient(**ground_points, is_used=is_used)
-    missing_slip = _slip_of_ground_gradient(beam_motion, beams["range"], gradient)
+    missing_slip = _slip_due_to_ground_gradient(beam_motion, beams["range"], gradient)
     unknown_slip = beams["radial_velocity_slip_error"]
     if ground_arguments["relief"] == 0:
-        is_plane = altitude_solution.is_available & ~_residuals_contradict(
+        is_plane = altitude_solution.is_available & ~_residuals_contradict_errors(
             altitude_solution.chi_square, altitude_solution.degrees_of_freedom
         )
         unknown_slip = np.where(is_plane[..., None], 0.0, unknown_slip)
@@ -863,7 +868,7 @@ def _solve_cycles(
     ]
 
 
-def _slip_of_ground_gradient(
+def _slip_due_to_ground_gradient(
     beam_motion: BeamMotion, ranges: np.ndarray, gradient: np.ndarray
 ) -> np.ndarray:
     """Return the slip over a sloping plane minus the slip over level ground [m/s].
@@ -909,7 +914,7 @@ def _add_pointing_errors(
     pointing_jitter: float,
     pointing: float,
 ) -> dict[str, np.ndarray]:
-    """Return standard errors of range and radial velocity that include the errors of pointing.
+    """Return the standard errors of range and radial velocity with those of pointing included.
 
     Parameters
     ----------
@@ -918,7 +923,7 @@ def _add_pointing_errors(
     offset
         (cycles, 1, beams, 3): position of the instrument relative to that at the first shot [m].
     beams
-        Measurements, as in :func:`_select_beams`.
+        Measurements, as in :func:`_select_points`.
     ground_arguments
         Arguments ``slope`` and ``relief`` of :func:`ground_gradient`.
     pointing_jitter

@@ -57,11 +57,11 @@ probability of at most 16 (2 tolerance) / (N/2), with N the FFT size: 1.5e-3 at 
 """
 
 CHANCE_MATCH_PROBABILITY = 0.01
-"""Probability that a false Doppler peak selects the reading of an unconfirmed pair. It sets how
-near a Doppler peak must be to the predicted position. A reading interprets beats as range and
-velocity."""
+"""Largest probability that a false Doppler peak selects the reading of an unconfirmed pair. It sets
+how near a Doppler peak must be to the predicted position. A reading is one way to interpret the
+beats as range and velocity."""
 
-_UNPAIRED_COST = 1e9
+_UNPAIRED_COST_BINS = 1e9
 """Cost [bins] of an up peak that stays without a down peak. It exceeds any sum of distances between
 Doppler peaks and their predicted positions."""
 
@@ -109,8 +109,8 @@ Exactly one of the first five bits is set. They follow from a comparison with th
 FALSE_PEAK_GROUP = NO_INDEX
 """Group number of a false peak, which belongs to no group of bins of an echo."""
 NO_PEAK_GROUP = -2
-"""Group number that stands for a missing peak: no Doppler peak confirms the return, or the segment
-does not exist."""
+"""Group number of a missing peak: no Doppler peak confirms the return, or the segment does not
+exist."""
 
 
 class DopplerPrediction(NamedTuple):
@@ -138,11 +138,11 @@ class PeakPairs(NamedTuple):
     Peaks have indices in the list of their segment.
     """
 
-    up: np.ndarray
+    up_index: np.ndarray
     """(pairs,) int64: index of the up peak."""
-    doppler: np.ndarray
+    doppler_index: np.ndarray
     """(pairs,) int64: index of the Doppler peak that confirms the pair; -1 for none."""
-    down: np.ndarray
+    down_index: np.ndarray
     """(pairs,) int64: index of the down peak."""
     reading: np.ndarray
     """(pairs,) int64: which reading of the beats gave range and velocity, as numbered by
@@ -205,8 +205,8 @@ def pair_peaks(
             up[0], doppler, down[0], doppler_prediction, fft_size, down_beat_sign, tolerance
         )
         if math.isfinite(confirming_peak.cost):
-            pairs.up[0], pairs.down[0] = 0, 0
-            pairs.doppler[0], pairs.reading[0] = (
+            pairs.up_index[0], pairs.down_index[0] = 0, 0
+            pairs.doppler_index[0], pairs.reading[0] = (
                 confirming_peak.doppler_index,
                 confirming_peak.reading,
             )
@@ -219,13 +219,13 @@ def pair_peaks(
             cost[i, j], doppler_of_pair[i, j], reading_of_pair[i, j] = find_confirming_peak(
                 up[i], doppler, down[j], doppler_prediction, fft_size, down_beat_sign, tolerance
             )
-    down_of_up, is_down_used = _match_pairs(cost)
+    down_of_up, is_down_used = _find_best_pairing(cost)
     n_pairs = 0
     for i in range(up.size):
         j = down_of_up[i]
         if j >= 0:
-            pairs.up[n_pairs], pairs.down[n_pairs] = i, j
-            pairs.doppler[n_pairs] = doppler_of_pair[i, j]
+            pairs.up_index[n_pairs], pairs.down_index[n_pairs] = i, j
+            pairs.doppler_index[n_pairs] = doppler_of_pair[i, j]
             pairs.reading[n_pairs] = reading_of_pair[i, j]
             n_pairs += 1
     n_confirmed, j = n_pairs, 0
@@ -244,7 +244,11 @@ def pair_peaks(
                 down_beat_sign,
                 chance_tolerance,
             ).reading
-            pairs.up[n_pairs], pairs.doppler[n_pairs], pairs.down[n_pairs] = i, -1, j
+            pairs.up_index[n_pairs], pairs.doppler_index[n_pairs], pairs.down_index[n_pairs] = (
+                i,
+                -1,
+                j,
+            )
             pairs.reading[n_pairs] = reading if reading >= 0 else two_beat_reading
             n_pairs, j = n_pairs + 1, j + 1
     return n_confirmed, n_pairs
@@ -316,8 +320,8 @@ def find_confirming_peak(
 
 
 @njit(cache=True, error_model="numpy")
-def _match_pairs(cost):
-    """Find the one-to-one pairing with the most pairs, and of such pairings that of least cost.
+def _find_best_pairing(cost):
+    """Find the one-to-one pairing with the most pairs and, among these, the least total cost.
 
     Parameters
     ----------
@@ -328,7 +332,7 @@ def _match_pairs(cost):
     Returns
     -------
     best_down
-        (ups,) int64: index of the down peak of each up peak, -1 for none.
+        (ups,) int64: index of the down peak paired with each up peak, -1 for none.
     is_down_used
         (downs,) bool: True for down peaks that are paired.
 
@@ -354,7 +358,7 @@ def _match_pairs(cost):
             depth -= 1
             continue
         partial_costs[depth + 1] = partial_costs[depth] + (
-            cost[depth, j] if j < n_down else _UNPAIRED_COST
+            cost[depth, j] if j < n_down else _UNPAIRED_COST_BINS
         )
         if j < n_down:
             is_down_used[j] = True
@@ -394,7 +398,7 @@ def compare_return_with_truth(
     flag
         TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG or SIDELOBE_FLAG.
     beamlet
-        Beamlet nearest to the peaks, of those whose lines are in all peaks; -1 for none.
+        The nearest to the peaks of all beamlets with a line in every peak; -1 for none.
     """
     for s in range(3):
         if groups[s] == FALSE_PEAK_GROUP:

@@ -168,7 +168,7 @@ def simulate_cloud(
                 bin_groups.strongest_bin[:, :, 0],
                 bin_groups.magnitude[:, :, 0],
             )
-        part_results = _statistics_before_draws(shots, bin_groups) | _cloud_points(
+        part_results = _draw_independent_statistics(shots, bin_groups) | _cloud_points(
             part_eyepoints, part_returns, shots.footprint.n_beamlets
         )
         part_results["beamlets_error"] = np.where(part_eyepoints.has_target, rays_error, np.nan)
@@ -189,8 +189,8 @@ class _PreparedBatch(NamedTuple):
     """Runs of adjacent bins above the threshold in the noiseless spectra; none for a shot without a
     target."""
     leakage_bins: list[tuple[np.ndarray, LeakageBins]] | None
-    """Pairs of indices of shots, and of the bins in which leaked signal may raise false peaks. It
-    is None if these bins were not listed, or are too many to keep."""
+    """List of pairs: indices of shots, and the bins in which leaked signal may raise false peaks in
+    these shots. It is None if the bins were not listed, or are too many to keep."""
 
 
 def _prepare_batch(
@@ -259,7 +259,7 @@ def _prepare_batch(
     return _PreparedBatch(shots, ground.beamlets, bin_groups, known_leakage_bins)
 
 
-def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
+def _draw_independent_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
     """Return the statistics (n,) of shots that do not depend on draws, by name.
 
     The names are those of :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`.

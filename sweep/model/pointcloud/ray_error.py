@@ -48,8 +48,8 @@ _CHIRP_SIGNS = 1.0, 0.0, -1.0
 """Signs of the chirp rates (frequency slopes) of the up, Doppler and down segment."""
 
 _LOBE_REACH_BINS = 4
-"""Largest distance from a line [bins of fs/L] at which the table of its power ends. fs is the
-sampling rate and L the number of samples of the record."""
+"""Distance from a line [bins of fs/L] at which the table of its power ends. fs is the sampling rate
+and L the number of samples of the record."""
 _LOBE_STEPS_PER_BIN = 1024
 """Number of entries per bin of fs/L in the table of a line's power by distance. fs is the sampling
 rate and L the number of samples of the record."""
@@ -66,12 +66,13 @@ _QUARTIC_RAYS_MIN = 37
 rays too few residuals would remain."""
 
 _NEGLIGIBLE_DENSITY_DISTANCE_SIGMA = 15.0
-"""Difference between magnitude and threshold, in standard deviations of the noise, beyond which a
-magnitude's error changes no probability. The density there is e^-112 of the largest."""
+"""Difference between magnitude and threshold, in standard deviations of the noise, beyond which an
+error of the magnitude changes no probability. The noise's density there is e^-112 of its maximum.
+"""
 
-_PROBABILITY_CHANGE_MIN = 1e-9
-"""Smallest effect on a result for which the error of a shot due to too few rays is computed. It is
-a bound on the change of a probability of detection, or a relative change of a peak's magnitude."""
+_RESULT_CHANGE_MIN = 1e-9
+"""Smallest possible change of a result for which the error of a shot due to too few rays is
+computed. The result is a probability of detection, or a peak's magnitude (relative change)."""
 
 
 class OppositeBeamletPairs(NamedTuple):
@@ -92,7 +93,7 @@ class OppositeBeamletPairs(NamedTuple):
     orthonormal with the power fractions of the pairs as weights."""
     weighted_polynomials: np.ndarray
     """(k, h): ``polynomials`` times the power fractions of the pairs."""
-    density_change: np.ndarray
+    relative_density_change: np.ndarray
     """(h,): relative difference (u - w) / w of two fractions of the beam's power: u in the area
     about a beamlet, and w, the beamlet's weight."""
     first_neighbouring_pair: np.ndarray
@@ -138,9 +139,9 @@ def estimate_ray_error(
         counts_magnitude = has_peak if s == 0 else has_peak & ~(peak_bins[:, 0] >= 0)
         if shots.detection_rule.in_speckle:
             counts_magnitude = np.zeros(shots.size, bool)
-        is_relevant = (
-            counts_magnitude & (_magnitude_change(a, 1.0) >= _PROBABILITY_CHANGE_MIN)
-        ) | (_pd_change_bound(shots, a, b, 1.0) >= _PROBABILITY_CHANGE_MIN)
+        is_relevant = (counts_magnitude & (_magnitude_change(a, 1.0) >= _RESULT_CHANGE_MIN)) | (
+            _pd_change_bound(shots, a, b, 1.0) >= _RESULT_CHANGE_MIN
+        )
         indices = np.flatnonzero(has_peak & is_relevant)
         relative_power_error = np.empty(indices.size)
         bin_powers = _bin_powers(shots, beamlet_table, s, indices, peak_bins[indices, s])
@@ -160,7 +161,7 @@ def estimate_ray_error(
 
 
 def _pd_change_bound(
-    shots: Shots, a: np.ndarray, b: np.ndarray, relative: np.ndarray | float
+    shots: Shots, a: np.ndarray, b: np.ndarray, relative_power_change: np.ndarray | float
 ) -> np.ndarray:
     """Return an upper bound on the change of probabilities of detection, 0..1.
 
@@ -171,65 +172,76 @@ def _pd_change_bound(
     a, b
         Magnitude and threshold of a single record that detects as often as the looks, over the
         standard deviation of the noise per quadrature.
-    relative
+    relative_power_change
         Relative change of a^2.
     """
     if not shots.detection_rule.in_speckle:
-        return _steady_pd_change_bound(a, b, relative)
+        return _steady_pd_change_bound(a, b, relative_power_change)
     if shots.looks.is_noncoherent:
-        return _pd_change_bound_of_looks(shots.looks.number, relative)
-    return _speckled_pd_change(a, b, relative)
+        return _pd_change_bound_of_looks(shots.looks.number, relative_power_change)
+    return _speckled_pd_change(a, b, relative_power_change)
 
 
 def _steady_pd_change_bound(
-    a: np.ndarray, b: np.ndarray, relative: np.ndarray | float
+    a: np.ndarray, b: np.ndarray, relative_power_change: np.ndarray | float
 ) -> np.ndarray:
     """Return an upper bound on the change of Marcum's Q_1(a, b), a probability of detection.
 
-    ``a``, ``b`` and ``relative`` are as in :func:`_pd_change_bound`.
+    ``a``, ``b`` and ``relative_power_change`` are as in :func:`_pd_change_bound`.
 
     Notes
     -----
     dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), where the exponent takes the value of a
     that is nearest to b.
     """
-    distance = np.maximum(np.abs(a - b) - 0.5 * relative * a, 0.0)
-    bound = 0.5 * relative * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * distance**2)
+    distance = np.maximum(np.abs(a - b) - 0.5 * relative_power_change * a, 0.0)
+    bound = (
+        0.5 * relative_power_change * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * distance**2)
+    )
     return np.where(distance > _NEGLIGIBLE_DENSITY_DISTANCE_SIGMA, 0.0, np.minimum(bound, 1.0))
 
 
-def _speckled_pd_change(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
+def _speckled_pd_change(
+    a: np.ndarray, b: np.ndarray, relative_power_change: np.ndarray | float
+) -> np.ndarray:
     """Return by how much a probability of detection rises or falls as the signal power changes.
 
-    The mean power a^2 is multiplied by 1 + relative and by 1 - relative; the larger of the two
-    absolute changes counts. The probability is that of a bin in developed speckle,
+    The mean power a^2 rises or falls by the fraction ``relative_power_change``; the larger change
+    of the probability counts. The probability is that of a bin in developed speckle,
     exp(-(b^2 / 2) / (1 + a^2 / 2)). The arguments are as in :func:`_pd_change_bound`.
     """
     snr, squared_threshold = 0.5 * a * a, 0.5 * b * b
     less, equal, more = (
         np.exp(-squared_threshold / (1.0 + snr * factor))
-        for factor in (np.maximum(1.0 - np.asarray(relative), 0.0), 1.0, 1.0 + np.asarray(relative))
+        for factor in (
+            np.maximum(1.0 - np.asarray(relative_power_change), 0.0),
+            1.0,
+            1.0 + np.asarray(relative_power_change),
+        )
     )
     return np.asarray(np.maximum(more - equal, equal - less))
 
 
-def _pd_change_bound_of_looks(n_looks: int, relative: np.ndarray | float) -> np.ndarray:
+def _pd_change_bound_of_looks(
+    n_looks: int, relative_power_change: np.ndarray | float
+) -> np.ndarray:
     """Return an upper bound on the change of a detection probability of several faded looks.
 
     The summed power of N looks is gamma-distributed with the shape N. Its logarithm has a density
-    of at most sqrt(N / (2 pi)). A loss of ``relative`` changes the logarithm by -ln(1 - relative).
+    of at most sqrt(N / (2 pi)). A loss of the fraction x, ``relative_power_change``, changes the
+    logarithm by -ln(1 - x).
     """
-    log_change = -np.log1p(-np.minimum(relative, 1.0 - 1e-12))
+    log_change = -np.log1p(-np.minimum(relative_power_change, 1.0 - 1e-12))
     return np.asarray(np.minimum(log_change * math.sqrt(n_looks / (2.0 * math.pi)), 1.0))
 
 
-def _magnitude_change(a: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
+def _magnitude_change(a: np.ndarray, relative_power_change: np.ndarray | float) -> np.ndarray:
     """Return the change of a magnitude a, over the larger of a and 1.
 
-    ``relative`` is the relative change of a^2. ``a`` is a magnitude over the standard deviation of
-    the noise per quadrature.
+    ``a`` is a magnitude over the standard deviation of the noise per quadrature, and
+    ``relative_power_change`` the relative change of a^2.
     """
-    return np.asarray(0.5 * relative * np.minimum(a, 1.0))
+    return np.asarray(0.5 * relative_power_change * np.minimum(a, 1.0))
 
 
 class BinPowers(NamedTuple):
@@ -370,14 +382,16 @@ def pair_opposite_beamlets(n_beamlets: int) -> OppositeBeamletPairs:
     neighbour_weights = neighbour_weights * (
         representatives.size / (representatives.size - len(polynomials))
     )
-    density_change = _density_change(offsets, weights)[representatives] / weights[representatives]
+    relative_density_change = (
+        _density_change(offsets, weights)[representatives] / weights[representatives]
+    )
     return OppositeBeamletPairs(
         representatives,
         opposite[representatives],
         1 / folded_weights,
         polynomials,
         folded_weights * polynomials,
-        density_change,
+        relative_density_change,
         neighbour_keys // n_beamlets,
         neighbour_keys % n_beamlets,
         neighbour_weights,
@@ -463,7 +477,10 @@ def _fill_power_errors(powers, beamlet_pairs, relative_errors):
         (m,): output array, at most 1.
     """
     beamlet, opposite_beamlet = beamlet_pairs.beamlet, beamlet_pairs.opposite_beamlet
-    inverse_weight, density_change = beamlet_pairs.inverse_weight, beamlet_pairs.density_change
+    inverse_weight, relative_density_change = (
+        beamlet_pairs.inverse_weight,
+        beamlet_pairs.relative_density_change,
+    )
     polynomials, weighted_polynomials = (
         beamlet_pairs.polynomials,
         beamlet_pairs.weighted_polynomials,
@@ -481,7 +498,7 @@ def _fill_power_errors(powers, beamlet_pairs, relative_errors):
             if opposite_beamlet[f] != beamlet[f]:
                 pair_power += powers[i, opposite_beamlet[f]]
             total_power += pair_power
-            bias += density_change[f] * pair_power
+            bias += relative_density_change[f] * pair_power
             residual[f] = pair_power * inverse_weight[f]
         for j in range(polynomials.shape[0]):  # orthonormal, so one at a time suffices
             projection = 0.0

@@ -37,8 +37,8 @@ Noise alone makes at most one false peak in a segment and draw, the largest. Its
 searched bins outside the listed groups, with equal probability. False peaks of leaked signal are in
 the bins of that signal; if there are many, only the strongest count. They are drawn by the noise of
 the bins, or with ``probabilities`` by the bins' probabilities
-(:mod:`sweep.model.pointcloud.leaked_peaks`). Groups beyond the strongest that are listed are
-neither detected nor false alarms.
+(:mod:`sweep.model.pointcloud.leaked_peaks`). Groups too weak to be listed are neither detected nor
+false alarms.
 """
 
 import math
@@ -110,7 +110,7 @@ from sweep.model.pointcloud.pairing import (
 from sweep.model.preparation import Shots
 from sweep.model.sampling import philox
 from sweep.model.sampling.draws import (
-    ECHO_NOISE_FIRST_INDEX,
+    ECHO_NOISE_FIRST_RANDOM_INDEX,
     NoiseFilter,
     NoiselessSpectra,
     NoiseScratch,
@@ -133,9 +133,9 @@ from sweep.model.sampling.speckle_lines import (
     draw_bin_amplitudes,
     draw_factored_amplitudes,
     factor_bin_covariance,
+    fill_mean_bin_powers,
     folding_signs,
     interpolate_transform,
-    mean_bin_powers,
     position_error_moments,
     speckle_line_grid,
 )
@@ -312,32 +312,32 @@ def draw_returns(
     known_leakage_bins
         Results of :func:`iter_leakage_bins` for all points that may leak, if already computed.
     """
-    in_noise = method == "noise"
+    adds_noise = method == "noise"
     inputs, drawn_peaks = (
         make_draw_inputs(shots, bin_groups, motion),
         DrawnPeaks.empty(bin_groups, draws),
     )
     pfa_bin = np.exp(shots.looks.log_pfa(inputs.threshold_ratio[:, None]))
     config, interpolation = (
-        DrawConfig.from_shots(shots, first_draw, in_noise),
+        DrawConfig.from_shots(shots, first_draw, adds_noise),
         interpolator(shots.window, shots.fft_size),
     )
     window_bins = int(2 * inputs.line_grid.peak_search_half_width.max(initial=0) + 1)
     _, _, groups_max = bin_groups.strongest_bin.shape
     noise_roots: dict[int, np.ndarray] = {}
     for indices, spectra, part_leakage_bins in _iter_spectra(
-        shots, bin_groups, in_noise, known_leakage_bins
+        shots, bin_groups, adds_noise, known_leakage_bins
     ):
         part_inputs = inputs.select(indices)
         part_inputs = part_inputs._replace(
             pfa_noise=at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins)
         )
-        filter_rule = make_echo_noise_filter(shots, spectra, 0 if in_noise else window_bins)
+        filter_rule = make_echo_noise_filter(shots, spectra, 0 if adds_noise else window_bins)
         n_noise_bins = len(filter_rule.weights)
         if n_noise_bins not in noise_roots:
             noise_roots[n_noise_bins] = noise_covariance_root(filter_rule)
         part_config = config._replace(
-            noise_filter=filter_rule, noise_root=noise_roots[n_noise_bins]
+            noise_filter=filter_rule, noise_covariance_root=noise_roots[n_noise_bins]
         )
         if (
             shots.real_fft_size
@@ -346,7 +346,7 @@ def draw_returns(
         ):
             noise_ratio = noise_pseudo_variance_ratio(shots.window, shots.fft_size)
             n_near_bins = 1 + int(
-                np.flatnonzero(np.abs(noise_ratio) > _CIRCULAR_PSEUDO_VARIANCE_MAX)[-1]
+                np.flatnonzero(np.abs(noise_ratio) > _CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX)[-1]
             )
             n_filter_bins = 2 * (n_near_bins + window_bins + int(spectra.n_bins.max(initial=0)))
             end_filter = NoiseFilter(
@@ -354,12 +354,12 @@ def draw_returns(
                 shots.real_fft_size,
             )
             part_config = part_config._replace(
-                end_noise_filter=end_filter,
+                spectrum_end_noise_filter=end_filter,
                 noise_pseudo_variance_ratio=np.ascontiguousarray(noise_ratio[:n_near_bins]),
             )
         n_filter_bins = max(
             window_bins,
-            len(part_config.end_noise_filter.weights),
+            len(part_config.spectrum_end_noise_filter.weights),
             int(spectra.n_bins.max(initial=0)),
         )
         workspace = DrawWorkspace.allocate(n_filter_bins, groups_max)
@@ -379,7 +379,7 @@ def draw_returns(
     return measure_returns(shots, inputs, drawn_peaks, motion)
 
 
-_CIRCULAR_PSEUDO_VARIANCE_MAX = 1e-3
+_CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX = 1e-3
 """Largest ratio of |E[X^2]|, the pseudo-variance of a bin's complex noise X, to its power E[|X|^2],
 for which the noise counts as circular."""
 
@@ -387,11 +387,11 @@ for which the noise counts as circular."""
 def _iter_spectra(
     shots: Shots,
     bin_groups: BinGroups,
-    in_noise: bool,
+    adds_noise: bool,
     known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None,
 ) -> Iterator[tuple[np.ndarray, NoiselessSpectra, LeakageBins]]:
     """Yield indices of points in parts, with their noiseless spectra and bins of leaked signal."""
-    if in_noise:
+    if adds_noise:
         for indices, spectra in iter_noiseless_spectra(shots):
             yield indices, spectra, bins_without_noise_peaks(shots, bin_groups, indices, spectra)
         return
@@ -430,7 +430,7 @@ class DrawConfig(NamedTuple):
 
     first_draw: int
     """Number of the first draw that is made."""
-    in_noise: bool
+    adds_noise: bool
     """True if noise is added to the bins of an echo; False if random numbers are compared with
     probabilities of detection."""
     adds_powers: bool
@@ -453,10 +453,10 @@ class DrawConfig(NamedTuple):
     its strongest bin may."""
     noise_filter: NoiseFilter
     """Filter that makes the correlated noise of an echo's bins from independent numbers."""
-    noise_root: np.ndarray
+    noise_covariance_root: np.ndarray
     """Matrix that makes the noise of adjacent bins from as many independent numbers
     (:func:`sweep.model.sampling.draws.noise_covariance_root`)."""
-    end_noise_filter: NoiseFilter
+    spectrum_end_noise_filter: NoiseFilter
     """Filter, like ``noise_filter``, for bins next to frequency 0 (DC) or Nyquist. It has no bins
     if no echo in developed speckle is near either."""
     noise_pseudo_variance_ratio: np.ndarray
@@ -475,7 +475,7 @@ class DrawConfig(NamedTuple):
     one amplitude is then compared with the probability of detection."""
 
     @classmethod
-    def from_shots(cls, shots: Shots, first_draw: int, in_noise: bool) -> "DrawConfig":
+    def from_shots(cls, shots: Shots, first_draw: int, adds_noise: bool) -> "DrawConfig":
         """Return the settings for draws of prepared shots.
 
         Parameters
@@ -484,7 +484,7 @@ class DrawConfig(NamedTuple):
             Prepared shots.
         first_draw : int
             Number of the first draw that is made.
-        in_noise : bool
+        adds_noise : bool
             True to add noise to the bins of an echo; False to compare random numbers with
             probabilities of detection.
         """
@@ -506,7 +506,7 @@ class DrawConfig(NamedTuple):
             votes = -1
         return cls(
             int(first_draw),
-            in_noise,
+            adds_noise,
             shots.footprint.adds_powers,
             bool(has_doppler),
             shots.fft_size // 2,
@@ -589,13 +589,9 @@ class DrawInputs(NamedTuple):
     echo_fraction: np.ndarray
     """(n, 3, groups): fraction, 0..1, of the echo in the mean power (echo plus noise) of the
     amplitude that detects a group in speckle."""
-    wander_deviation: np.ndarray
-    """(n, 3, groups): standard deviation of a group's position by speckle [bins], if the peak's |X|
-    is sigma, the noise of a bin per quadrature. It is inversely proportional to |X|, and 0 without
-    speckle."""
     n_independent_bins: np.ndarray
-    """(n, 3, groups): equivalent number of independent bins by which a group in developed speckle
-    may be detected."""
+    """(n, 3, groups): equivalent number of independent bins, any of which may detect a group in
+    developed speckle."""
     speckle_mixing: SpeckleMixing
     """(n,) in each field: coefficients of the amplitudes by speckle in the three segments; 0
     without speckle."""
@@ -621,7 +617,7 @@ class DrawWorkspace(NamedTuple):
 
     noise: NoiseScratch
     """Noise of an echo's bins over sigma, the standard deviation per quadrature."""
-    bin_ratio: np.ndarray
+    bin_magnitude_ratio: np.ndarray
     """(bins,): |X| of an echo's bins over sigma, the noise of a bin per quadrature."""
     bin_power: np.ndarray
     """(bins,): |X|^2 of an echo's bins over sigma^2, the noise power of a bin per quadrature."""
@@ -746,9 +742,9 @@ def make_draw_inputs(
         shots.footprint.relative_amplitude[shots.footprint.row_of_point],
     )
     if shots.complex_record:
-        apart = (line_positions - bin_groups.strongest_bin[:, :, :1]) / shots.fft_size
-        line_positions = line_positions - shots.fft_size * np.floor(apart + 0.5)
-    apart = line_positions[:, :, None] - bin_groups.strongest_bin[..., None]
+        offset_cycles = (line_positions - bin_groups.strongest_bin[:, :, :1]) / shots.fft_size
+        line_positions = line_positions - shots.fft_size * np.floor(offset_cycles + 0.5)
+    line_offset = line_positions[:, :, None] - bin_groups.strongest_bin[..., None]
     is_in_group = (line_positions[:, :, None] >= bin_groups.first_bin[..., None] - 1) & (
         line_positions[:, :, None] <= bin_groups.last_bin[..., None] + 1
     )
@@ -764,10 +760,10 @@ def make_draw_inputs(
         np.moveaxis(bin_groups.neighbour_magnitudes, -1, 0)
     )
     first_searched_bin, last_searched_bin = _searched_bins(shots)
-    echo_fraction, wander_deviation, n_independent_bins = _speckle_draw_inputs(shots, bin_groups)
+    echo_fraction, n_independent_bins = _speckle_draw_inputs(shots, bin_groups)
     threshold_ratio, line_noise_ratio = threshold_and_line_noise_ratios(shots)
-    mean_offset = (weight * apart).sum(axis=-1) / total
-    mean_square = (weight * apart**2).sum(axis=-1) / total
+    mean_offset = (weight * line_offset).sum(axis=-1) / total
+    mean_square = (weight * line_offset**2).sum(axis=-1) / total
     line_deviation = np.sqrt(np.maximum(mean_square - mean_offset**2, 0.0))
     if shots.speckle.segment_correlations is not None:  # drawn lines include their spread
         line_deviation *= 0.0
@@ -799,7 +795,6 @@ def make_draw_inputs(
             bin_groups.strongest_bin < 0, np.nan, bin_groups.strongest_bin + mean_offset
         ),
         echo_fraction=echo_fraction,
-        wander_deviation=wander_deviation,
         n_independent_bins=n_independent_bins,
         speckle_mixing=_speckle_mixing(shots),
         look_covariance_root=_look_covariance_roots(shots),
@@ -847,20 +842,14 @@ def _n_independent_bins(
     )
 
 
-def _speckle_draw_inputs(
-    shots: Shots, bin_groups: BinGroups
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ``echo_fraction``, ``wander_deviation`` and ``n_independent_bins`` of DrawInputs."""
-    noise_sigma, line_sigma, threshold = (
+def _speckle_draw_inputs(shots: Shots, bin_groups: BinGroups) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fields ``echo_fraction`` and ``n_independent_bins`` of :class:`DrawInputs`."""
+    line_sigma, threshold = (
         np.broadcast_to(v, shots.size)[:, None, None]
-        for v in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
+        for v in (shots.line_noise_sigma, shots.threshold)
     )
     if shots.speckle.line_gradients is None:
-        return (
-            np.zeros(bin_groups.pd.shape),
-            np.zeros(bin_groups.pd.shape),
-            np.ones(bin_groups.pd.shape),
-        )
+        return np.zeros(bin_groups.pd.shape), np.ones(bin_groups.pd.shape)
     has_noncircular_bins = (shots.speckle_table.pseudo_variance_row.T > 0)[:, :, None] & (
         shots.real_fft_size > 0
     )
@@ -878,26 +867,14 @@ def _speckle_draw_inputs(
         echo_fraction = np.where(
             has_noncircular_bins, signal_power / (2 + signal_power), echo_fraction
         )
-    line_deviation = np.sqrt((shots.speckle.line_gradients.line_shift**2).sum(axis=-1))
-    n_looks = (
-        shots.looks.number
-        if shots.looks.is_noncoherent and shots.looks.has_independent_speckle
-        else 1
-    )
-    wander_deviation = (
-        line_deviation[..., None] * bin_groups.magnitude / noise_sigma / math.sqrt(2 * n_looks)
-    )
-    return (
-        np.clip(np.nan_to_num(echo_fraction), 0.0, 1.0),
-        np.nan_to_num(wander_deviation),
-        n_independent,
-    )
+    return np.clip(np.nan_to_num(echo_fraction), 0.0, 1.0), n_independent
 
 
 def _doppler_prediction(shots: Shots, motion: EgoMotion | None = None) -> DopplerPrediction:
     """Return the coefficients that predict the Doppler beat from the up and the down beat.
 
-    The mismatch of the prediction is that by the instrument's known motion.
+    The known ``motion`` sets the shift that is added to the tolerance of the prediction. The shift
+    is 0 if ``motion`` is None.
     """
     _, doppler, down = shots.waveform.chirp_slopes
     up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.waveform.carriers)
@@ -951,9 +928,9 @@ class MeasuredValues(NamedTuple):
     """(m,): range of each return [m]."""
     radial_velocity: np.ndarray
     """(m,): radial velocity of each return [m/s]."""
-    range_error: np.ndarray
+    range_standard_error: np.ndarray
     """(m,): standard error by noise of ``range`` [m]."""
-    velocity_error: np.ndarray
+    radial_velocity_standard_error: np.ndarray
     """(m,): standard error by noise of ``radial_velocity`` [m/s]."""
 
 
@@ -1091,12 +1068,15 @@ def _measure_listed_returns(
         radial_velocity=by_bin.radial_velocity,
         radial_velocity_interpolated=interpolated.radial_velocity,
         # Values by whole bins stay uncorrected; the correction is added to their errors.
-        range_standard_error=np.hypot(by_bin.range_error, interpolated.range - uncorrected.range),
-        range_interpolated_standard_error=interpolated.range_error,
-        radial_velocity_standard_error=np.hypot(
-            by_bin.velocity_error, interpolated.radial_velocity - uncorrected.radial_velocity
+        range_standard_error=np.hypot(
+            by_bin.range_standard_error, interpolated.range - uncorrected.range
         ),
-        radial_velocity_interpolated_standard_error=interpolated.velocity_error,
+        range_interpolated_standard_error=interpolated.range_standard_error,
+        radial_velocity_standard_error=np.hypot(
+            by_bin.radial_velocity_standard_error,
+            interpolated.radial_velocity - uncorrected.radial_velocity,
+        ),
+        radial_velocity_interpolated_standard_error=interpolated.radial_velocity_standard_error,
         snr=np.minimum(up_ratio, down_ratio) ** 2 / 2,
         pd=np.where(is_signal, pd, np.nan),
         flags=np.where(
@@ -1110,7 +1090,7 @@ def _measure_listed_returns(
 
 
 def _values_of_points(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> np.ndarray:
-    """Return the elements of values (n,), or of one common value, at the indices ``point`` (m,)."""
+    """Return the values (m,) at the indices ``point``, of values (n,) or one value for all."""
     return np.broadcast_to(values, shots.size)[point]
 
 
@@ -1170,7 +1150,7 @@ def _wander_covariance(
 def _add_drift_errors(
     shots: Shots, listed_returns: ListedReturns, motion: EgoMotion | None
 ) -> ListedReturns:
-    """Add to the peaks' standard errors those by the drift of lines within the record.
+    """Add the errors by the drift of lines within the record to the peaks' standard errors.
 
     Lines drift because range and velocity change within the record. The drift follows from the
     known motion, if given, else from the true motion of the shots.
@@ -1205,8 +1185,7 @@ def _add_drift_errors(
 
 
 _POSITION_ERROR_MAX_BINS = 0.5
-"""Largest standard error of a peak's position between bins, after the correction for late echoes
-[bins]."""
+"""Limit on the standard error of a peak's position [bins] after the correction for late echoes."""
 
 
 def _correct_late_echoes(
@@ -1214,8 +1193,8 @@ def _correct_late_echoes(
 ) -> ListedReturns:
     """Correct peak positions for the samples that lack the echo because it arrives late.
 
-    The instrument knows the number of these samples from the range by whole bins. No standard error
-    exceeds half a bin, because a position is always within one.
+    The instrument knows the number of these samples from the range by whole bins. Standard errors
+    are limited to half a bin.
     """
     at_returns = partial(_values_of_points, shots, listed_returns.point)
     delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_bin.range)
@@ -1243,7 +1222,7 @@ def _correct_late_echoes(
 
 
 class ShiftsByMotion(NamedTuple):
-    """Shifts of measured range and velocity by motion that the beats hide."""
+    """Shifts of measured range and velocity by motion that the beats do not show."""
 
     range: np.ndarray
     """(m,): shift of the range [m] by one unit of the motion."""
@@ -1294,8 +1273,10 @@ def _correct_for_motion(
     )
     by_bin, interpolated = (
         values._replace(
-            range_error=np.hypot(values.range_error, unknown_range),
-            velocity_error=np.hypot(values.velocity_error, unknown_velocity),
+            range_standard_error=np.hypot(values.range_standard_error, unknown_range),
+            radial_velocity_standard_error=np.hypot(
+                values.radial_velocity_standard_error, unknown_velocity
+            ),
         )
         for values in (by_bin, interpolated)
     )
@@ -1305,7 +1286,7 @@ def _correct_for_motion(
 def _response_to_motion(
     shots: Shots, listed_returns: ListedReturns
 ) -> tuple[ShiftsByMotion, ShiftsByMotion]:
-    """Return the shifts of measured range and velocity by motion that the beats hide.
+    """Return the shifts of measured range and velocity by motion that the beats do not show.
 
     The first shifts are by an acceleration of 1 m/s^2, the second by a slip of 1 m/s. The slip is
     the radial velocity minus the speed at which the range falls.
@@ -1410,8 +1391,9 @@ def _measure_by_reading(
     by_bin, interpolated = (
         MeasuredValues(
             *convert_peaks(peak_positions),
-            range_error=range_per_half_bin * np.sqrt(range_variance + rounding_variance),
-            velocity_error=velocity_per_half_bin * np.sqrt(velocity_variance + rounding_variance),
+            range_standard_error=range_per_half_bin * np.sqrt(range_variance + rounding_variance),
+            radial_velocity_standard_error=velocity_per_half_bin
+            * np.sqrt(velocity_variance + rounding_variance),
         )
         for peak_positions, rounding_variance in (
             (listed_returns.peaks.bin, 2 * ROUNDING_VARIANCE),
@@ -1484,7 +1466,7 @@ def _add_wander_covariance(
     weights: np.ndarray,
     point_index: np.ndarray,
 ) -> RangeVelocityDeviation:
-    """Add the effect of speckle on the beats to the deviations of range and velocity.
+    """Add the covariance of the beats by speckle to the deviations of range and velocity.
 
     ``beat_covariance`` (m, 3, 3) [Hz^2] is the covariance of the beats by speckle.
     """
@@ -1546,7 +1528,7 @@ def _draw_returns_of_points(
     """
     _, draws, returns_max = drawn_peaks.flags.shape
     is_up_detected, speckle_factors = np.zeros(returns_max, np.bool_), np.ones((returns_max, 3))
-    in_speckle = len(inputs.line_grid.line_shift) > 0
+    in_speckle = len(inputs.line_grid.line_shift_gradient) > 0
     speckle = empty_group_speckle(returns_max)
     for i in range(rows.size):
         if in_speckle:
@@ -1599,16 +1581,16 @@ class GroupSpeckle(NamedTuple):
     amplitudes: np.ndarray
     """(groups, looks, 3, bins): complex factors by speckle, of mean power 1, on the echo's bins in
     each look (record); one look if all looks have the same speckle."""
-    factor_rank: np.ndarray
-    """(groups,) int64: number of rows of ``factor`` in use; 0 if the speckle is summed over the
-    lines of the footprint."""
-    factor: np.ndarray
+    covariance_factor_rank: np.ndarray
+    """(groups,) int64: number of rows of ``covariance_factor`` in use; 0 if the speckle is summed
+    over the lines of the footprint."""
+    covariance_factor: np.ndarray
     """(groups, rows, 3, bins): factor of the covariance of the bins' speckle, by which the speckle
     is drawn from few random numbers."""
     independent_amplitudes: np.ndarray
     """(sets, 3, bins): complex factors by speckle, by draw, segment and bin. The draws (sets) are
     independent, and are mixed into the partly correlated speckle of the looks."""
-    pd_amplitude_bin_weights: np.ndarray
+    detection_amplitude_weights: np.ndarray
     """(groups, 3, bins): weights of the bins in one amplitude of mean power 1, which is compared
     with the probability of detection."""
 
@@ -1620,7 +1602,7 @@ def empty_group_speckle(groups_max):
     no_amplitudes = np.zeros((groups_max, 1, 3, 0), np.complex128)
     powers = np.zeros((groups_max, 3, 0))
     no_independent = np.zeros((0, 3, 0), np.complex128)
-    factor_rank = np.zeros(groups_max, np.int64)
+    covariance_factor_rank = np.zeros(groups_max, np.int64)
     return GroupSpeckle(
         first_bin=bins,
         n_bins=bins,
@@ -1628,10 +1610,10 @@ def empty_group_speckle(groups_max):
         pseudo_variance_ratio=powers,
         rms_magnitude_ratio=powers,
         amplitudes=no_amplitudes,
-        factor_rank=factor_rank,
-        factor=no_amplitudes,
+        covariance_factor_rank=covariance_factor_rank,
+        covariance_factor=no_amplitudes,
         independent_amplitudes=no_independent,
-        pd_amplitude_bin_weights=powers,
+        detection_amplitude_weights=powers,
     )
 
 
@@ -1663,12 +1645,14 @@ def prepare_group_speckle(point, config, inputs, spectra):
             strongest_bin = inputs.strongest_bin[point, s, g]
             if strongest_bin < 0:
                 continue
-            if config.in_noise and config.lobe_half_width > 0:
+            if config.adds_noise and config.lobe_half_width > 0:
                 span_first_bin, span_start = (
                     spectra.first_bin[point, s],
                     spectra.bins_start[point, s],
                 )
-                span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[point, s]]
+                span_ratios = spectra.bin_magnitude_ratios[
+                    span_start : span_start + spectra.n_bins[point, s]
+                ]
                 lobe_half_width = max(
                     config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[point])
                 )
@@ -1690,14 +1674,14 @@ def prepare_group_speckle(point, config, inputs, spectra):
     )
     n_looks = config.n_looks if config.has_independent_speckle else 1
     rows_max = 3 * n_bins_max if 3 * n_bins_max <= FACTORED_BINS_MAX else 0
-    factor_rank, factor = (
+    covariance_factor_rank, covariance_factor = (
         np.zeros(groups_max, np.int64),
         np.empty((groups_max, rows_max, 3, n_bins_max), np.complex128),
     )
     for g in range(groups_max):
         if n_bins[g].max() == 0:
             continue
-        has_images = mean_bin_powers(
+        has_images = fill_mean_bin_powers(
             inputs.line_grid,
             point,
             inputs.line_centre[point, :, g],
@@ -1706,26 +1690,26 @@ def prepare_group_speckle(point, config, inputs, spectra):
             pseudo_variance_ratio[g],
         )
         if rows_max > 0 and not has_images:
-            factor_rank[g] = factor_bin_covariance(
+            covariance_factor_rank[g] = factor_bin_covariance(
                 inputs.line_grid,
                 point,
                 inputs.line_centre[point, :, g],
                 first_bin[g],
                 mean_power[g],
-                factor[g],
+                covariance_factor[g],
             )
     amplitudes = np.zeros((groups_max, n_looks, 3, n_bins_max), np.complex128)
     _, _, _, n_independent_sets = inputs.look_covariance_root.shape
     independent_amplitudes = np.zeros((n_independent_sets, 3, n_bins_max), np.complex128)
-    rms_magnitude_ratio, pd_amplitude_bin_weights = (
+    rms_magnitude_ratio, detection_amplitude_weights = (
         np.zeros((groups_max, 3, n_bins_max)),
         np.zeros((groups_max, 3, n_bins_max)),
     )
     for g in range(groups_max):
         for s in range(3):
-            if n_bins[g, s] == 0 or config.in_noise:
+            if n_bins[g, s] == 0 or config.adds_noise:
                 continue
-            fill_pd_amplitude_bin_weights(
+            fill_detection_amplitude_weights(
                 point,
                 s,
                 g,
@@ -1733,9 +1717,9 @@ def prepare_group_speckle(point, config, inputs, spectra):
                 inputs,
                 first_bin,
                 mean_power,
-                factor_rank,
-                factor,
-                pd_amplitude_bin_weights[g, s],
+                covariance_factor_rank,
+                covariance_factor,
+                detection_amplitude_weights[g, s],
             )
             strongest_index, noise_sigma = (
                 inputs.strongest_bin[point, s, g] - first_bin[g, s],
@@ -1758,16 +1742,25 @@ def prepare_group_speckle(point, config, inputs, spectra):
         pseudo_variance_ratio=pseudo_variance_ratio,
         rms_magnitude_ratio=rms_magnitude_ratio,
         amplitudes=amplitudes,
-        factor_rank=factor_rank,
-        factor=factor,
+        covariance_factor_rank=covariance_factor_rank,
+        covariance_factor=covariance_factor,
         independent_amplitudes=independent_amplitudes,
-        pd_amplitude_bin_weights=pd_amplitude_bin_weights,
+        detection_amplitude_weights=detection_amplitude_weights,
     )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def fill_pd_amplitude_bin_weights(
-    point, segment, group, config, inputs, first_bin, mean_power, factor_rank, factor, weights
+def fill_detection_amplitude_weights(
+    point,
+    segment,
+    group,
+    config,
+    inputs,
+    first_bin,
+    mean_power,
+    covariance_factor_rank,
+    covariance_factor,
+    weights,
 ):
     """Compute the weights of an echo's bins in the amplitude that decides on its detection.
 
@@ -1788,16 +1781,16 @@ def fill_pd_amplitude_bin_weights(
         Number of each echo's first bin, by segment.
     mean_power : ndarray (groups, 3, bins)
         Mean power of each bin over speckle, for lines of the total power 1.
-    factor_rank : ndarray (groups,) int64
-        Number of rows of ``factor`` in use; 0 if the speckle is summed over lines.
-    factor : ndarray (groups, rows, 3, bins) complex
+    covariance_factor_rank : ndarray (groups,) int64
+        Number of rows of ``covariance_factor`` in use; 0 if the speckle is summed over lines.
+    covariance_factor : ndarray (groups, rows, 3, bins) complex
         Factor of the covariance of the bins' speckle.
     weights : ndarray (bins,)
         Result: weight of each bin's speckle, such that the amplitude has the mean power 1.
     """
     weights[:] = 0.0
     weights[inputs.strongest_bin[point, segment, group] - first_bin[group, segment]] = 1.0
-    if config.lobe_half_width == 0 or factor_rank[group] == 0:
+    if config.lobe_half_width == 0 or covariance_factor_rank[group] == 0:
         return
     weighted_power = 0.0
     for k in range(weights.size):
@@ -1805,10 +1798,10 @@ def fill_pd_amplitude_bin_weights(
         weights[k] = interpolate_transform(distance, inputs.line_grid) * math.sqrt(
             mean_power[group, segment, k]
         )
-    for factor_row in range(factor_rank[group]):
+    for factor_row in range(covariance_factor_rank[group]):
         mode_amplitude = complex(0.0, 0.0)
         for k in range(weights.size):
-            mode_amplitude += weights[k] * factor[group, factor_row, segment, k]
+            mode_amplitude += weights[k] * covariance_factor[group, factor_row, segment, k]
         weighted_power += 2.0 * abs(mode_amplitude) ** 2
     weights /= math.sqrt(weighted_power)
 
@@ -1845,9 +1838,13 @@ def draw_group_speckle(address, point, inputs, speckle, speckle_factors):
                 if n_independent_sets > 0
                 else speckle.amplitudes[g, look]
             )
-            if speckle.factor_rank[g] > 0:
+            if speckle.covariance_factor_rank[g] > 0:
                 draw_factored_amplitudes(
-                    look_address, g, speckle.factor[g], speckle.factor_rank[g], amplitudes
+                    look_address,
+                    g,
+                    speckle.covariance_factor[g],
+                    speckle.covariance_factor_rank[g],
+                    amplitudes,
                 )
             else:
                 draw_bin_amplitudes(
@@ -1948,13 +1945,13 @@ def pair_into_returns(point, row, draw, config, inputs, peak_lists, pairs, works
     else:
         n_confirmed = n_pairs = min(n_up, n_down)
         for r in range(n_pairs):
-            pairs.up[r], pairs.doppler[r], pairs.down[r] = r, -1, r
+            pairs.up_index[r], pairs.doppler_index[r], pairs.down_index[r] = r, -1, r
             pairs.reading[r] = config.two_beat_reading
     _, _, returns_max = drawn_peaks.flags.shape
     for r in range(min(n_pairs, returns_max)):
         drawn_peaks.reading[row, draw, r] = pairs.reading[r]
         group, positions = drawn_peaks.group[row, draw, r], workspace.peak_positions
-        peak_of_segment = pairs.up[r], pairs.doppler[r], pairs.down[r]
+        peak_of_segment = pairs.up_index[r], pairs.doppler_index[r], pairs.down_index[r]
         for s in range(3):
             k = peak_of_segment[s]
             if k < 0:  # no Doppler peak
@@ -1967,7 +1964,8 @@ def pair_into_returns(point, row, draw, config, inputs, peak_lists, pairs, works
             drawn_peaks.peaks.magnitude_ratio[row, draw, r, s] = peaks.magnitude_ratio[s, k]
             if group[s] < 0:
                 continue
-            if len(inputs.line_grid.line_shift) > 0:  # without the echo's wander by speckle
+            # Without the echo's wander by speckle.
+            if len(inputs.line_grid.line_shift_gradient) > 0:
                 positions[s] = inputs.line_centre[point, s, group[s]]
             if config.down_beat_sign != 0.0:  # groups may be multiples of N from their peaks
                 bin_distance = inputs.strongest_bin[point, s, group[s]] - positions[s]
@@ -2037,7 +2035,7 @@ def draw_segment_peaks(
     for g in range(strongest_bins.size):
         if strongest_bins[g] < 0:
             break
-        if config.in_noise and config.lobe_half_width > 0:
+        if config.adds_noise and config.lobe_half_width > 0:
             is_detected, peak = draw_all_bins(
                 address,
                 point,
@@ -2050,7 +2048,7 @@ def draw_segment_peaks(
                 interpolation,
                 workspace,
             )
-        elif config.in_noise:
+        elif config.adds_noise:
             is_detected, peak = draw_peak_bin(
                 address,
                 point,
@@ -2113,7 +2111,7 @@ def draw_segment_peaks(
         0,
     )
     false_peak_magnitude_ratios[:] = 0.0
-    if config.in_noise:
+    if config.adds_noise:
         n_false = list_noisy_leaked_peaks(
             address,
             point,
@@ -2141,7 +2139,7 @@ def draw_segment_peaks(
         )
     stream = (
         philox.STREAM_NOISE_MAXIMUM[segment]
-        if config.in_noise
+        if config.adds_noise
         else philox.STREAM_FALSE_ALARM[segment]
     )
     alarm_word, bin_word, _, _ = philox.four_words(
@@ -2242,7 +2240,7 @@ def list_noisy_leaked_peaks(
             key_0, key_1, draw, philox.STREAM_NOISE[segment], spectra.leaked_index[n]
         )
         speckle_factor = speckle_factors[leakage_bins.group[n]]
-        ratio = math.hypot(spectra.leaked_ratio[n] * speckle_factor + re, im)
+        ratio = math.hypot(spectra.leaked_magnitude_ratio[n] * speckle_factor + re, im)
         if ratio < threshold_ratio:
             continue
         bin_number = spectra.first_bin[point, segment] + spectra.leaked_index[n]
@@ -2252,13 +2250,13 @@ def list_noisy_leaked_peaks(
         previous_bin = bin_number
         if ratio > largest:
             peak, largest = bin_number, ratio
-        if spectra.exempt_neighbour_ratio[n] > 0.0:
+        if spectra.exempt_neighbour_magnitude_ratio[n] > 0.0:
             neighbour_index = spectra.leaked_index[n] + spectra.side_of_adjacent_echo_bin[n]
             re_own, im_own = philox.normal_pair(
                 key_0, key_1, draw, philox.STREAM_NOISE[segment], neighbour_index
             )
             in_phase = (
-                spectra.exempt_neighbour_ratio[n] * speckle_factor
+                spectra.exempt_neighbour_magnitude_ratio[n] * speckle_factor
                 + correlation * re
                 + independent_part * re_own
             )
@@ -2273,7 +2271,7 @@ def list_noisy_leaked_peaks(
 def draw_peak_bin(
     address, point, segment, group, config, inputs, spectra, speckle, interpolation, workspace
 ):
-    """Add noise to an echo's strongest bin, and detect the echo if that reaches the threshold.
+    """Add noise to an echo's strongest bin, and detect the echo if the sum reaches the threshold.
 
     Parameters
     ----------
@@ -2316,15 +2314,15 @@ def draw_peak_bin(
     if is_real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * line_noise_ratio, im * line_noise_ratio
-    near_end = speckle.n_bins[group, segment] > 0 and is_near_end(
+    near_end = speckle.n_bins[group, segment] > 0 and is_near_spectrum_end(
         strongest_bin - 1, THREE_BINS, config
     )
     noise = workspace.noise
     if near_end:
-        draw_noise_near_end(
+        draw_noise_near_spectrum_end(
             address,
             stream,
-            ECHO_NOISE_FIRST_INDEX * (1 + group),
+            ECHO_NOISE_FIRST_RANDOM_INDEX * (1 + group),
             strongest_bin - 1,
             THREE_BINS,
             config,
@@ -2409,7 +2407,7 @@ def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
 def detect_in_speckle(
     address, point, segment, group, config, inputs, speckle, interpolation, workspace
 ):
-    """Draw an echo in developed speckle, detected with its probability of detection.
+    """Draw an echo in developed speckle; it is detected with its probability of detection.
 
     Parameters
     ----------
@@ -2464,7 +2462,7 @@ def detect_in_speckle(
         pd = independent_bin_pd_kernel(pd, n_independent_bins)
     echo_fraction, is_noncircular = (
         inputs.echo_fraction[point, segment, group],
-        is_near_end(first_bin, n_bins, config),
+        is_near_spectrum_end(first_bin, n_bins, config),
     )
     if not pd > 0.0:
         return False, UNDETECTED_PEAK
@@ -2482,10 +2480,10 @@ def detect_in_speckle(
                 look_address, philox.STREAM_NOISE[segment], 3 * group, interpolation, noise
             )
         else:
-            draw_adjacent_noise(
+            draw_adjacent_bin_noise(
                 look_address,
                 philox.STREAM_NOISE[segment],
-                ECHO_NOISE_FIRST_INDEX * (1 + group),
+                ECHO_NOISE_FIRST_RANDOM_INDEX * (1 + group),
                 first_bin,
                 n_bins,
                 config,
@@ -2495,7 +2493,7 @@ def detect_in_speckle(
         for k in range(n_bins):
             magnitude_ratio, bin_weight = (
                 speckle.rms_magnitude_ratio[group, segment, k],
-                echo_weight * speckle.pd_amplitude_bin_weights[group, segment, k],
+                echo_weight * speckle.detection_amplitude_weights[group, segment, k],
             )
             re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * noise.in_phase[k]
             im = (
@@ -2563,9 +2561,9 @@ def detect_in_speckle(
     )
 
 
-_OTHER_BINS_RANDOM_OFFSET = 1 << 22
-"""Index of the first random number used for the independent bins of echoes other than the
-strongest. Each echo has a range of indices."""
+_OTHER_BINS_FIRST_RANDOM_INDEX = 1 << 22
+"""Index of the first random number used for an echo's independent bins other than its strongest.
+Each echo has its own range of indices."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -2590,7 +2588,7 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
         inputs.n_independent_bins[point, segment, group] - 1.0,
         inputs.echo_fraction[point, segment, group],
     )
-    random_index = _OTHER_BINS_RANDOM_OFFSET + group * int(DRAWN_INDEPENDENT_BINS_MAX)
+    random_index = _OTHER_BINS_FIRST_RANDOM_INDEX + group * int(DRAWN_INDEPENDENT_BINS_MAX)
     while n_bins_left > 1e-6:
         speckle_amplitude = speckle_amplitudes(
             address, random_index, speckle_mixing_at(inputs.speckle_mixing, point)
@@ -2611,7 +2609,7 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_adjacent_noise(address, stream, first_index, first_bin, n_bins, config, noise):
+def draw_adjacent_bin_noise(address, stream, first_index, first_bin, n_bins, config, noise):
     """Draw the noise of adjacent bins over sigma, the standard deviation per quadrature.
 
     Parameters
@@ -2626,21 +2624,23 @@ def draw_adjacent_noise(address, stream, first_index, first_bin, n_bins, config,
         Settings with the filters.
     noise
         :class:`sweep.model.sampling.draws.NoiseScratch`, the result. It has at least as many bins;
-        for bins near DC or Nyquist as many as ``config.end_noise_filter``.
+        for bins near DC or Nyquist as many as ``config.spectrum_end_noise_filter``.
     """
     touches_end = config.real_fft_size > 0 and (
         first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_fft_size
     )
-    if is_near_end(first_bin, n_bins, config):
-        draw_noise_near_end(address, stream, first_index, first_bin, n_bins, config, noise)
-    elif n_bins <= len(config.noise_root) and not touches_end:
-        draw_bin_noise_by_root(address, stream, first_index, n_bins, config.noise_root, noise)
+    if is_near_spectrum_end(first_bin, n_bins, config):
+        draw_noise_near_spectrum_end(address, stream, first_index, first_bin, n_bins, config, noise)
+    elif n_bins <= len(config.noise_covariance_root) and not touches_end:
+        draw_bin_noise_by_root(
+            address, stream, first_index, n_bins, config.noise_covariance_root, noise
+        )
     else:
         draw_bin_noise(address, stream, first_index, first_bin, n_bins, config.noise_filter, noise)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def is_near_end(first_bin, n_bins, config):
+def is_near_spectrum_end(first_bin, n_bins, config):
     """Return True if any of adjacent bins has non-circular noise, near DC or Nyquist.
 
     Parameters
@@ -2657,7 +2657,7 @@ def is_near_end(first_bin, n_bins, config):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_noise_near_end(address, stream, first_index, first_bin, n_bins, config, noise):
+def draw_noise_near_spectrum_end(address, stream, first_index, first_bin, n_bins, config, noise):
     """Draw the noise of adjacent bins near frequency 0 (DC) or Nyquist.
 
     Bins beyond either end are complex conjugates of their mirror images.
@@ -2675,10 +2675,10 @@ def draw_noise_near_end(address, stream, first_index, first_bin, n_bins, config,
     n_bins : int
         Number of bins.
     config : DrawConfig
-        Settings; ``end_noise_filter`` is the filter for these bins.
+        Settings; ``spectrum_end_noise_filter`` is the filter for these bins.
     noise : NoiseScratch
         Result: noise of each bin in both quadratures, over its standard deviation per quadrature.
-        It has at least as many bins as ``end_noise_filter``.
+        It has at least as many bins as ``spectrum_end_noise_filter``.
     """
     last_bin = first_bin + n_bins - 1
     drawn_first, drawn_last = 0, max(last_bin, -first_bin)
@@ -2693,10 +2693,11 @@ def draw_noise_near_end(address, stream, first_index, first_bin, n_bins, config,
         first_index,
         drawn_first,
         drawn_last - drawn_first + 1,
-        config.end_noise_filter,
+        config.spectrum_end_noise_filter,
         noise,
     )
-    drawn_re, drawn_im = noise.number_in_phase, noise.number_in_quadrature  # no longer needed
+    # The independent numbers are no longer needed.
+    drawn_re, drawn_im = noise.independent_in_phase, noise.independent_in_quadrature
     for k in range(drawn_last - drawn_first + 1):
         drawn_re[k], drawn_im[k] = noise.in_phase[k], noise.in_quadrature[k]
     for k in range(n_bins):
@@ -2791,7 +2792,9 @@ def draw_all_bins(
         spectra.first_bin[point, segment],
         spectra.bins_start[point, segment],
     )
-    span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[point, segment]]
+    span_ratios = spectra.bin_magnitude_ratios[
+        span_start : span_start + spectra.n_bins[point, segment]
+    ]
     first_index, last_index = (
         inputs.first_bin[point, segment, group] - span_first_bin,
         inputs.last_bin[point, segment, group] - span_first_bin,
@@ -2805,7 +2808,7 @@ def draw_all_bins(
     )
     n_bins, peak_index = last_index - first_index + 1, 0
     pedestal_power, noise = workspace.pedestal_power[:n_bins], workspace.noise
-    ratios = workspace.bin_ratio
+    ratios = workspace.bin_magnitude_ratio
     pedestal_power[:] = 0.0
     if line_noise_ratio > 1.0:
         magnitudes = workspace.bin_power[:n_bins]
@@ -2815,9 +2818,9 @@ def draw_all_bins(
         fill_pedestal_ratios(
             magnitudes, workspace.all_bins_are_echo[:n_bins], bin_threshold, pedestal_power
         )
-    stream, first_number = philox.STREAM_NOISE[segment], ECHO_NOISE_FIRST_INDEX * (1 + group)
+    stream, first_number = philox.STREAM_NOISE[segment], ECHO_NOISE_FIRST_RANDOM_INDEX * (1 + group)
     if speckle.n_bins[group, segment] > 0:
-        draw_adjacent_noise(
+        draw_adjacent_bin_noise(
             address, stream, first_number, span_first_bin + first_index, n_bins, config, noise
         )
     else:
@@ -2950,7 +2953,7 @@ def draw_free_bin(
     fft_size,
     down_beat_sign,
 ):
-    """Draw the bin of a false peak of noise, uniformly from those outside of all echoes.
+    """Draw the bin of a false peak of noise, uniformly from the searched bins outside all echoes.
 
     Parameters
     ----------

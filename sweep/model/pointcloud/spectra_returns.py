@@ -7,9 +7,9 @@ with the echoes of all surfaces in its footprint. Adjacent flagged bins make a p
 estimator gives its position. The strongest peaks are paired, compared with the truth and measured
 as all peaks of flights are (:mod:`sweep.model.pointcloud.returns`).
 
-A peak belongs to an echo if it shares a bin with the echo. The bins of an echo begin with the first
-of half its largest magnitude and end with the last, plus half a main lobe on either side. With
-``peak_bin`` only the strongest bin counts. An echo has one peak, the strongest. All other peaks are
+A peak belongs to an echo if it shares a bin with the echo. An echo extends from the first to the
+last bin with half its largest magnitude, plus half a main lobe on either side. With ``peak_bin``
+only the strongest bin counts. An echo has one peak, the strongest. All other peaks are
 false, however many there are. A false peak is omitted if it contains a bin in which the signal
 alone reaches a fixed threshold, or a neighbour of such a bin. Closed forms exempt such bins from
 false alarms, too.
@@ -58,12 +58,12 @@ from sweep.model.sampling.noisy_spectra import (
     PointSpectra,
     SegmentSignal,
     SpectrumMethods,
-    centre_bins,
     centring_shift,
     estimate_positions,
     flag_detected_bins,
     iter_look_spectra,
     prepare_point_spectra,
+    rotate_to_centre,
     zero_frequency_index,
 )
 from sweep.model.waveform import STRONGEST_PEAK
@@ -189,7 +189,7 @@ def draw_spectra_returns(
 class EchoBounds(NamedTuple):
     """First and last bin of each of k echoes in a segment.
 
-    Bins have the indices that :func:`centre_bins` gives them.
+    Bins have the indices that :func:`rotate_to_centre` gives them.
     """
 
     first_bin: np.ndarray
@@ -204,7 +204,7 @@ class FlaggedPeaks(NamedTuple):
     A peak is a run of adjacent bins that the detector flags.
     """
 
-    power: np.ndarray
+    spectrum_power: np.ndarray
     """(bins,): |X|^2 of all bins of the segment's spectrum in the draw [V^2]."""
     strongest_bin: np.ndarray
     """(peaks,) int64: index of the strongest bin of each peak."""
@@ -228,7 +228,7 @@ def _echo_bin_bounds(
         return EchoBounds(echo_indices, echo_indices)
     if echo_indices.size == 1:
         return EchoBounds(np.array([signal.first_bin + shift]), np.array([signal.last_bin + shift]))
-    magnitude = centre_bins(shots, np.abs(signal.spectrum), signal.strongest_bin)
+    magnitude = rotate_to_centre(shots, np.abs(signal.spectrum), signal.strongest_bin)
     lobe_half_width = math.ceil(
         main_lobe_half_width(settings.window) * settings.fft_size / settings.window.length
     )
@@ -270,7 +270,7 @@ def list_flagged_peaks(
     (all_power,), (flags,) = flag_detected_bins(spectra, point_spectra, signal.segment)
     shots, shift = point_spectra.shots, centring_shift(point_spectra.shots, signal.strongest_bin)
     power, flags = (
-        centre_bins(shots, values, signal.strongest_bin) for values in (all_power, flags)
+        rotate_to_centre(shots, values, signal.strongest_bin) for values in (all_power, flags)
     )
     end_index = power.size - 1
     if shots.real_fft_size and signal.last_bin >= signal.first_bin:
@@ -283,7 +283,7 @@ def list_flagged_peaks(
                 )
     flags[[0, -1]] = False
     assert signal.is_exempt is not None
-    is_exempt = centre_bins(shots, signal.is_exempt, signal.strongest_bin)
+    is_exempt = rotate_to_centre(shots, signal.is_exempt, signal.strongest_bin)
     edges = np.diff(flags.astype(np.int8))
     starts, ends = np.flatnonzero(edges > 0) + 1, np.flatnonzero(edges < 0) + 1
     strongest_bins: list[int] = []

@@ -9,9 +9,10 @@ points is a scrambled net [1]_. Different pairs visit their cells in independent
 
 The mean of a group is therefore unbiased. If a probability is a smooth function of one pair, the
 variance of the mean is far below that of independent draws. For any function it is at most twice
-that of independent draws, which only functions as fine as the cells come near. Of a pair of radius
-and angle, half the angle's circle is spread evenly, and the sign is random. An interval of a mean
-over many groups follows from the variance of the groups' means
+that of independent draws, and comes near to twice only for functions that vary from cell to cell.
+Of a pair of radius and angle, the angle is spread evenly over half the circle, and its sign is
+random. The confidence interval of a mean over many groups follows from the variance of the groups'
+means
 (:func:`sweep.model.error_budget.grouped_mean_half_width`).
 
 Cells and orders are addressed by point, group, cause and index, as all random numbers are
@@ -40,16 +41,17 @@ from sweep.model.sampling.philox import (
 
 _INDEX_BITS = 6
 GROUP_SIZE = 1 << _INDEX_BITS
-"""Number of draws in a group. Larger groups vary less. There have to be several of them, because an
-interval follows from their variance. A tolerance of 0.01 takes at least 384 draws."""
+"""Number of draws in a group. The means of larger groups vary less, but there must be several
+groups, because a confidence interval follows from their variance. A tolerance of 0.01 takes at
+least 384 draws."""
 
 GROUPED_NUMBERS_MAX = 32
 """Number of random numbers of a draw, for each cause, that are spread evenly over a group. Further
-numbers are independent. Of many numbers no single one matters much."""
+numbers are independent, as none of so many matters much."""
 
 _WORDS_PER_PAIR = 4 + GROUP_SIZE
-"""Number of random words of a group for each pair of numbers: two that scramble the two numbers'
-cells, two unused, and those that shuffle the order of the cells."""
+"""Number of random words of a group for each pair of numbers: two to scramble the cells of the two
+numbers, two unused, and GROUP_SIZE to shuffle the order of the cells."""
 
 _CELL_SHIFT, _OFFSET_SHIFT = np.uint64(64 - _INDEX_BITS), np.uint64(_INDEX_BITS)
 _ONE = np.uint64(1)
@@ -119,7 +121,7 @@ def _fill_grouped_uniforms(keys, draw_numbers, stream, are_polar, cells, uniform
 
 @njit(cache=True)
 def _fill_cells(group_address, stream, cells):
-    """Draw the cells of a group's random numbers: for each number those of its draws, in order.
+    """Draw the cell of each random number in each draw of a group.
 
     Parameters
     ----------
@@ -128,8 +130,8 @@ def _fill_cells(group_address, stream, cells):
     stream
         Number of the stream of the random numbers.
     cells
-        (numbers, GROUP_SIZE) uint64: output array, cells 0 to GROUP_SIZE - 1. The two numbers of a
-        pair are in rows 2 i and 2 i + 1.
+        (numbers, GROUP_SIZE) uint64: output array of cells, 0 to GROUP_SIZE - 1, by number and
+        draw. The two numbers of pair i are in rows 2 i and 2 i + 1.
 
     Notes
     -----
@@ -174,12 +176,13 @@ def _scramble_cell(cell, word):
 
 
 class GroupStatistics(NamedTuple):
-    """Statistics of the means of whole groups of draws, (names, points) each."""
+    """Number and variance of the means of whole groups of draws, (names, points) each."""
 
     n_groups: np.ndarray
     """(names, points) int64: number of whole groups."""
     group_variance: np.ndarray
-    """(names, points): unbiased variance of the mean of a group; nan with fewer than two."""
+    """(names, points): unbiased estimate of the variance of a group's mean; nan with fewer than two
+    groups."""
 
 
 class GroupMeans:
@@ -227,7 +230,7 @@ class GroupMeans:
     def statistics(self, point_indices: np.ndarray, n_values: np.ndarray) -> GroupStatistics:
         """Return the statistics of selected points.
 
-        ``n_values`` (names, points) are the numbers of values that were added, nan not counted.
+        ``n_values`` (names, points) are the numbers of values that were added, without nan.
         """
         n_groups = n_values // GROUP_SIZE
         with np.errstate(divide="ignore", invalid="ignore"):

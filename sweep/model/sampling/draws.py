@@ -53,7 +53,7 @@ from sweep.model.sampling.speckle_lines import (
     draw_bin_amplitudes,
     draw_factored_amplitudes,
     factor_bin_covariance,
-    mean_bin_powers,
+    fill_mean_bin_powers,
     speckle_line_grid,
 )
 from sweep.model.spectrum.search_restriction import mean_line_positions
@@ -83,7 +83,7 @@ class DrawRanges(NamedTuple):
 class DrawCountConfig(NamedTuple):
     """Settings and tables for counting detections and false alarms, common to all points."""
 
-    in_noise: bool
+    adds_noise: bool
     """True if noise is added to the bins of an echo; False if random numbers are compared with
     probabilities of detection."""
     noise_filter: "NoiseFilter"
@@ -162,10 +162,10 @@ class DrawCounts(NamedTuple):
 class EventProbabilities(NamedTuple):
     """Probabilities of events in each segment, with which random numbers are compared.
 
-    Each is (3, n), by segment: up, Doppler, down. A detection in the down segment has the condition
-    that the up segment detects. One in the Doppler segment has the condition that exactly one of
-    the other two detects, so that the Doppler segment decides whether any two do. The up segment
-    has no condition.
+    Each is (3, n), by segment: up, Doppler, down. The condition for the down segment is that the up
+    segment detects. The condition for the Doppler segment is that exactly one of the other two
+    detects, so that the Doppler segment decides whether any two do. The up segment has no
+    condition.
     """
 
     alarm: np.ndarray
@@ -195,15 +195,15 @@ class BinInNoise(NamedTuple):
 
     magnitude_ratio: float
     """|X| of the bin without noise and speckle, over sigma."""
-    deviation_in_phase: float
+    noise_deviation_in_phase: float
     """Standard deviation, over sigma, of the noise in phase with the signal."""
-    deviation_in_quadrature: float
+    noise_deviation_in_quadrature: float
     """Standard deviation, over sigma, of the noise in quadrature with the signal."""
     squared_threshold_ratio: float
     """Square of the threshold over sigma."""
-    factor_in_phase: np.ndarray
+    speckle_factor_in_phase: np.ndarray
     """(draws,): real part of the factor by speckle on the signal."""
-    factor_in_quadrature: np.ndarray
+    speckle_factor_in_quadrature: np.ndarray
     """(draws,): imaginary part of the complex speckle factor, of mean power 1, by which the
     signal is multiplied."""
 
@@ -338,11 +338,10 @@ class NoiseScratch(NamedTuple):
     """(k,): component, over sigma, of each bin's noise in phase with the signal."""
     in_quadrature: np.ndarray
     """(k,): component, over sigma, of each bin's noise in quadrature with the signal."""
-    number_in_phase: np.ndarray
+    independent_in_phase: np.ndarray
     """(k,): independent normal numbers from which the filter makes ``in_phase``."""
-    number_in_quadrature: np.ndarray
-    """(k,): independent normal numbers from which the filter of NOISE_FILTER_TAPS makes
-    ``in_quadrature``."""
+    independent_in_quadrature: np.ndarray
+    """(k,): independent normal numbers from which the filter makes ``in_quadrature``."""
 
     @classmethod
     def allocate(cls, n_bins: int) -> "NoiseScratch":
@@ -411,14 +410,14 @@ def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
             ).sum()
             if j < k:
                 root[k, j] = covariance / root[j, j] if root[j, j] > 0 else 0.0
-            elif covariance > _REMAINDER_MIN:
+            elif covariance > _UNEXPLAINED_VARIANCE_FRACTION_MIN:
                 root[k, k] = math.sqrt(covariance)
     return root
 
 
-_REMAINDER_MIN = 1e-9
-"""Smallest fraction of a bin's noise variance, not explained by the bins before it, that is not
-neglected."""
+_UNEXPLAINED_VARIANCE_FRACTION_MIN = 1e-9
+"""Smallest fraction of a bin's noise variance left unexplained by the bins before it, for which the
+bin gets an independent random number."""
 
 
 def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilities:
@@ -460,7 +459,7 @@ def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarra
     return threshold_ratio, line_noise_ratio
 
 
-ECHO_NOISE_FIRST_INDEX = np.int64(1 << 24)
+ECHO_NOISE_FIRST_RANDOM_INDEX = np.int64(1 << 24)
 """Index in the noise stream of the first random number for the noise of all bins of an echo. Lower
 indices are used for bins that are drawn one by one."""
 
@@ -468,46 +467,47 @@ indices are used for bins that are drawn one by one."""
 class NoiselessSpectra(NamedTuple):
     """Spectra without noise by point and segment, (m, 3), to which noise is added.
 
-    Bins of a segment are numbered from its ``first_bin``. sigma is the noise of a bin per
+    Indices of bins are counted from the segment's ``first_bin``. sigma is the noise of a bin per
     quadrature.
     """
 
     first_bin: np.ndarray
     """(m, 3) int64: number of the first bin that holds signal."""
     peak_index: np.ndarray
-    """(m, 3) int64: number of the bin with the largest magnitude, counted from ``first_bin``."""
-    peak_ratio: np.ndarray
+    """(m, 3) int64: index of the bin with the largest magnitude, counted from ``first_bin``."""
+    peak_magnitude_ratio: np.ndarray
     """(m, 3): largest |X| / sigma in the segment's bins; nan for a segment that does not exist.
     sigma is the noise of a bin per quadrature."""
-    has_real_noise: np.ndarray
+    peak_has_real_noise: np.ndarray
     """(m, 3) bool: True if the noise in the bin with the largest magnitude is real, as at frequency
     0 (DC) and Nyquist."""
     bins_start: np.ndarray
-    """(m, 3) int64: index of the segment's first bin in ``bin_ratios`` and ``is_echo``."""
+    """(m, 3) int64: index of the segment's first bin in ``bin_magnitude_ratios`` and ``is_echo``.
+    """
     n_bins: np.ndarray
-    """(m, 3) int64: number of the segment's bins in ``bin_ratios`` and ``is_echo``."""
-    bin_ratios: np.ndarray
+    """(m, 3) int64: number of the segment's bins in ``bin_magnitude_ratios`` and ``is_echo``."""
+    bin_magnitude_ratios: np.ndarray
     """(bins,): |X| / sigma in the bins of all points and segments. sigma is the noise of a bin per
     quadrature."""
     is_echo: np.ndarray
-    """(bins,) bool: True for bins that belong to an echo, of the bins of all points and segments.
-    """
+    """(bins,) bool: True for those of the bins of all points and segments that belong to an
+    echo."""
     n_noise_bins: np.ndarray
     """(m, 3): equivalent number of independent bins that hold noise alone and may raise a false
     alarm."""
     leaked_begin: np.ndarray
-    """(m, 3) int64: index of each segment's first bin in ``leaked_index``, ``leaked_ratio`` and the
-    arrays ``exempt_neighbour_*``."""
+    """(m, 3) int64: index of each segment's first bin in the arrays from ``leaked_index`` to
+    ``side_of_adjacent_echo_bin``."""
     leaked_end: np.ndarray
     """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1; equal to
     ``leaked_begin`` without leaked signal."""
     leaked_index: np.ndarray
-    """(leaked,) int64: numbers, from ``first_bin``, of the bins with signal leaked from an echo.
-    With noise they may raise a false alarm."""
-    leaked_ratio: np.ndarray
+    """(leaked,) int64: indices, counted from ``first_bin``, of the bins with signal leaked from an
+    echo. With noise they may raise a false alarm."""
+    leaked_magnitude_ratio: np.ndarray
     """(leaked,): |X| / sigma in the bins that hold leaked signal. sigma is the noise of a bin per
     quadrature."""
-    exempt_neighbour_ratio: np.ndarray
+    exempt_neighbour_magnitude_ratio: np.ndarray
     """(leaked,): |X| over sigma of the adjacent bin that belongs to an echo, and so cannot raise a
     false alarm; 0 if no adjacent bin does."""
     side_of_adjacent_echo_bin: np.ndarray
@@ -525,18 +525,18 @@ class NoiselessSpectra(NamedTuple):
         return cls(
             first_bin=zeros,
             peak_index=zeros,
-            peak_ratio=np.full((n_points, 3), np.nan),
-            has_real_noise=np.zeros((n_points, 3), np.bool_),
+            peak_magnitude_ratio=np.full((n_points, 3), np.nan),
+            peak_has_real_noise=np.zeros((n_points, 3), np.bool_),
             bins_start=zeros,
             n_bins=zeros,
-            bin_ratios=no_values,
+            bin_magnitude_ratios=no_values,
             is_echo=np.empty(0, np.bool_),
             n_noise_bins=np.zeros((n_points, 3)),
             leaked_begin=zeros,
             leaked_end=zeros,
             leaked_index=no_numbers,
-            leaked_ratio=no_values,
-            exempt_neighbour_ratio=no_values,
+            leaked_magnitude_ratio=no_values,
+            exempt_neighbour_magnitude_ratio=no_values,
             side_of_adjacent_echo_bin=no_numbers,
         )
 
@@ -590,26 +590,26 @@ def iter_noiseless_spectra(
         spectra = NoiselessSpectra(
             first_bin=np.where(exists, spans.first_bin.T, 0),
             peak_index=np.where(exists, spans.peak_index.T, 0),
-            has_real_noise=np.isin(
+            peak_has_real_noise=np.isin(
                 (spans.first_bin + spans.peak_index).T, (0, shots.real_fft_size / 2)
             )
             & exists
             & has_real_ends,
-            peak_ratio=np.where(
+            peak_magnitude_ratio=np.where(
                 exists & spans.peak_is_searched.T,
                 spans.peak_magnitude.T / noise_sigma[spans.point_numbers, None],
                 np.nan,
             ),
             bins_start=(np.cumsum(n_bins) - n_bins).reshape(-1, 3),
             n_bins=spans.n_bins.T,
-            bin_ratios=ratio,
+            bin_magnitude_ratios=ratio,
             is_echo=spans.is_exempt[flat_index],
             n_noise_bins=np.maximum(n_noise_bins, 0.0),
             leaked_begin=leaked_end - n_leaked,
             leaked_end=leaked_end,
             leaked_index=index_in_span[is_leaked],
-            leaked_ratio=ratio[is_leaked],
-            exempt_neighbour_ratio=np.maximum(below, above)[is_leaked],
+            leaked_magnitude_ratio=ratio[is_leaked],
+            exempt_neighbour_magnitude_ratio=np.maximum(below, above)[is_leaked],
             side_of_adjacent_echo_bin=np.where(above >= below, 1, -1)[is_leaked],
         )
         # In C order as in `NoiselessSpectra.empty`: numba compiles anew for each order.
@@ -645,11 +645,14 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
     )
     random_words = np.empty((4, _DRAWS_PER_STEP), np.uint64)
     segment_factors = np.ones((3, _DRAWS_PER_STEP))
-    factors_in_phase, factors_in_quadrature = (
+    speckle_factors_in_phase, speckle_factors_in_quadrature = (
         np.zeros((3, _DRAWS_PER_STEP)),
         np.zeros((3, _DRAWS_PER_STEP)),
     )
-    factor_in_phase, factor_in_quadrature = np.ones(_DRAWS_PER_STEP), np.zeros(_DRAWS_PER_STEP)
+    speckle_factor_in_phase, speckle_factor_in_quadrature = (
+        np.ones(_DRAWS_PER_STEP),
+        np.zeros(_DRAWS_PER_STEP),
+    )
     no_amplitudes = np.zeros((3, 0, 0), np.complex128)
     is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
     for j in range(draw_ranges.point_index.size):
@@ -667,10 +670,10 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     speckle_mixing_at(inputs.speckle_mixing, j),
                 )
                 for s in range(3):
-                    factors_in_phase[s, d] = amplitudes[s].real
-                    factors_in_quadrature[s, d] = amplitudes[s].imag
+                    speckle_factors_in_phase[s, d] = amplitudes[s].real
+                    speckle_factors_in_quadrature[s, d] = amplitudes[s].imag
                     segment_factors[s, d] = math.hypot(
-                        factors_in_phase[s, d], factors_in_quadrature[s, d]
+                        speckle_factors_in_phase[s, d], speckle_factors_in_quadrature[s, d]
                     )
             echo_amplitudes = no_amplitudes
             if in_speckle and n_filter_bins > 0:
@@ -684,9 +687,9 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     segment_factors,
                 )
             for s in (0, 2, 1):
-                stream, peak_ratio, peak_index = (
+                stream, peak_magnitude_ratio, peak_index = (
                     STREAM_NOISE[s],
-                    spectra.peak_ratio[j, s],
+                    spectra.peak_magnitude_ratio[j, s],
                     spectra.peak_index[j, s],
                 )
                 pseudo_variance_row = inputs.pseudo_variance_row[s, j]
@@ -694,7 +697,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     pseudo_variance_row,
                     : (config.pseudo_variance_ratio.shape[1] if pseudo_variance_row > 0 else 0),
                 ]
-                if config.in_noise and n_filter_bins > 0:
+                if config.adds_noise and n_filter_bins > 0:
                     _mark_any_bin_crossings(
                         address,
                         n_draws,
@@ -707,32 +710,35 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                         noise,
                         is_detected[s],
                     )
-                elif config.in_noise:
-                    deviation_in_phase = deviation_in_quadrature = line_noise_ratio
-                    if spectra.has_real_noise[j, s]:
-                        deviation_in_phase = math.sqrt(2.0) * line_noise_ratio
-                        deviation_in_quadrature = 0.0
-                    factor_in_phase[:], factor_in_quadrature[:] = segment_factors[s], 0.0
+                elif config.adds_noise:
+                    noise_deviation_in_phase = noise_deviation_in_quadrature = line_noise_ratio
+                    if spectra.peak_has_real_noise[j, s]:
+                        noise_deviation_in_phase = math.sqrt(2.0) * line_noise_ratio
+                        noise_deviation_in_quadrature = 0.0
+                    speckle_factor_in_phase[:], speckle_factor_in_quadrature[:] = (
+                        segment_factors[s],
+                        0.0,
+                    )
                     if pseudo_variance_row > 0:
                         bin_pseudo_variance = pseudo_variance_ratio_at(
                             spectra.first_bin[j, s] + peak_index,
                             config.nyquist_bin,
                             pseudo_variance_ratios,
                         )
-                        factor_in_phase[:] = (
-                            math.sqrt(1.0 + bin_pseudo_variance) * factors_in_phase[s]
+                        speckle_factor_in_phase[:] = (
+                            math.sqrt(1.0 + bin_pseudo_variance) * speckle_factors_in_phase[s]
                         )
-                        factor_in_quadrature[:] = (
+                        speckle_factor_in_quadrature[:] = (
                             math.sqrt(max(1.0 - bin_pseudo_variance, 0.0))
-                            * factors_in_quadrature[s]
+                            * speckle_factors_in_quadrature[s]
                         )
                     peak_bin = BinInNoise(
-                        peak_ratio,
-                        deviation_in_phase,
-                        deviation_in_quadrature,
+                        peak_magnitude_ratio,
+                        noise_deviation_in_phase,
+                        noise_deviation_in_quadrature,
                         threshold_ratio * threshold_ratio,
-                        factor_in_phase,
-                        factor_in_quadrature,
+                        speckle_factor_in_phase,
+                        speckle_factor_in_quadrature,
                     )
                     _mark_crossings(
                         address,
@@ -757,7 +763,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
                     )
                 if inputs.pfa[s, j] > 0.0:
                     alarm_stream = (
-                        STREAM_NOISE_MAXIMUM[s] if config.in_noise else STREAM_FALSE_ALARM[s]
+                        STREAM_NOISE_MAXIMUM[s] if config.adds_noise else STREAM_FALSE_ALARM[s]
                     )
                     _mark_random_events(
                         address,
@@ -861,7 +867,7 @@ def _mark_leakage_alarms(
                 is_pending[d] = joins_echo[d] = False
         is_crossing[:] = False
         bin_in_noise = BinInNoise(
-            spectra.leaked_ratio[leaked_bin],
+            spectra.leaked_magnitude_ratio[leaked_bin],
             1.0,
             1.0,
             threshold_ratio * threshold_ratio,
@@ -882,7 +888,7 @@ def _mark_leakage_alarms(
                 has_alarm[d] |= is_pending[d]
                 is_pending[d] = joins_echo[d] = False
                 continue
-            if spectra.exempt_neighbour_ratio[leaked_bin] > 0.0:
+            if spectra.exempt_neighbour_magnitude_ratio[leaked_bin] > 0.0:
                 re, im = philox.normal_pair(
                     key_0, key_1, first_draw + d, stream, spectra.leaked_index[leaked_bin]
                 )
@@ -893,7 +899,7 @@ def _mark_leakage_alarms(
                     key_0, key_1, first_draw + d, stream, edge_index
                 )
                 in_phase = (
-                    spectra.exempt_neighbour_ratio[leaked_bin] * magnitude_factors[d]
+                    spectra.exempt_neighbour_magnitude_ratio[leaked_bin] * magnitude_factors[d]
                     + sidelobe_neighbour_noise_correlation * re
                     + independent_part * re_edge
                 )
@@ -1007,8 +1013,8 @@ def _mark_random_events(
 
 
 @njit(cache=True, error_model="numpy")
-def _echo_end_indices(point, segment, spectra):
-    """Return the numbers of the first and last bin of an echo; the last is -1 without an echo."""
+def _first_and_last_echo_index(point, segment, spectra):
+    """Return the indices of an echo's first and last bin in its span; -1 for the last if none."""
     bins_start, n_bins = spectra.bins_start[point, segment], spectra.n_bins[point, segment]
     first_index, last_index = 0, n_bins - 1
     while first_index < n_bins and not spectra.is_echo[bins_start + first_index]:
@@ -1032,13 +1038,13 @@ def _draw_echo_amplitudes(address, n_draws, row, spectra, line_grid, line_centre
     first_bin, n_bins_max = np.zeros(3, np.int64), 0
     first_index = np.zeros(3, np.int64)
     for s in range(3):
-        begin_index, end_index = _echo_end_indices(row, s, spectra)
+        begin_index, end_index = _first_and_last_echo_index(row, s, spectra)
         first_bin[s], first_index[s] = spectra.first_bin[row, s] + begin_index, begin_index
         n_bins_max = max(n_bins_max, end_index - begin_index + 1)
         if end_index < begin_index:
             line_centre[s] = np.nan
     mean_power, pseudo_variance = np.zeros((3, n_bins_max)), np.zeros((3, n_bins_max))
-    has_images = mean_bin_powers(
+    has_images = fill_mean_bin_powers(
         line_grid, row, line_centre, first_bin, mean_power, pseudo_variance
     )
     n_rows_max, factor_rank = 3 * n_bins_max, 0
@@ -1105,11 +1111,11 @@ def _mark_any_bin_crossings(
     fade. The phase-noise pedestal fades with the echo's bins.
     """
     begin, n_bins = spectra.bins_start[point, segment], spectra.n_bins[point, segment]
-    bin_ratios, is_echo = (
-        spectra.bin_ratios[begin : begin + n_bins],
+    bin_magnitude_ratios, is_echo = (
+        spectra.bin_magnitude_ratios[begin : begin + n_bins],
         spectra.is_echo[begin : begin + n_bins],
     )
-    first_index, last_index = _echo_end_indices(point, segment, spectra)
+    first_index, last_index = _first_and_last_echo_index(point, segment, spectra)
     if last_index < 0:
         return
     threshold_ratio = bin_threshold.threshold / bin_threshold.noise_without_pedestal
@@ -1118,12 +1124,12 @@ def _mark_any_bin_crossings(
         bin_threshold.side_noise > bin_threshold.noise_without_pedestal
         or bin_threshold.line_noise > bin_threshold.noise_without_pedestal
     ):
-        fill_pedestal_ratios(bin_ratios, is_echo, bin_threshold, pedestal_power)
+        fill_pedestal_ratios(bin_magnitude_ratios, is_echo, bin_threshold, pedestal_power)
     for d in range(n_draws):
         draw_bin_noise(
             DrawAddress(address.key_0, address.key_1, address.draw + d),
             STREAM_NOISE[segment],
-            ECHO_NOISE_FIRST_INDEX,
+            ECHO_NOISE_FIRST_RANDOM_INDEX,
             spectra.first_bin[point, segment] + first_index,
             last_index - first_index + 1,
             filter_rule,
@@ -1136,10 +1142,13 @@ def _mark_any_bin_crossings(
                 else complex(1.0, 0.0)
             )
             noise_deviation = math.sqrt(1.0 + pedestal_power[i] * abs(amplitude) ** 2)
-            re = noise_deviation * noise.in_phase[i - first_index] + bin_ratios[i] * amplitude.real
+            re = (
+                noise_deviation * noise.in_phase[i - first_index]
+                + bin_magnitude_ratios[i] * amplitude.real
+            )
             im = (
                 noise_deviation * noise.in_quadrature[i - first_index]
-                + bin_ratios[i] * amplitude.imag
+                + bin_magnitude_ratios[i] * amplitude.imag
             )
             is_marked[d] |= is_echo[i] and re * re + im * im >= threshold_ratio * threshold_ratio
 
@@ -1179,14 +1188,14 @@ def draw_bin_noise(address, stream, first_index, first_bin, n_bins, filter_rule,
         re, im = philox.normal_pair(key_0, key_1, draw, stream, first_index + j)
         if is_symmetric and j == 0:
             re, im = math.sqrt(2.0) * re, 0.0
-        noise.number_in_phase[j], noise.number_in_quadrature[j] = re, im
+        noise.independent_in_phase[j], noise.independent_in_quadrature[j] = re, im
     for k in range(n_bins):
         re, im = 0.0, 0.0
         for m in range(n_taps):
             j = start[k] + m - first_number
             sign = -1.0 if is_symmetric and j < 0 else 1.0  # conjugate in a real record
-            re += weights[k, m] * noise.number_in_phase[abs(j)]
-            im += weights[k, m] * sign * noise.number_in_quadrature[abs(j)]
+            re += weights[k, m] * noise.independent_in_phase[abs(j)]
+            im += weights[k, m] * sign * noise.independent_in_quadrature[abs(j)]
         i = n_bins - 1 - k if is_from_nyquist else k
         noise.in_phase[i], noise.in_quadrature[i] = re, im
 
@@ -1213,7 +1222,7 @@ def draw_bin_noise_by_root(address, stream, first_index, n_bins, root, noise):
     sigma is the standard deviation of a bin's noise per quadrature.
     """
     key_0, key_1, draw = address
-    re_numbers, im_numbers = noise.number_in_phase, noise.number_in_quadrature
+    re_numbers, im_numbers = noise.independent_in_phase, noise.independent_in_quadrature
     for k in range(0, n_bins, 2):
         radius_word, angle_word, next_radius_word, next_angle_word = philox.four_words(
             key_0, key_1, draw, stream, (first_index + k) >> 1
@@ -1245,12 +1254,12 @@ def _mark_crossings(address, n_draws, stream, pair_index, bin_in_noise, random_w
     for d in range(n_draws):
         re, im = philox.to_normals(random_words[lane, d], random_words[lane + 1, d])
         re = (
-            bin_in_noise.magnitude_ratio * bin_in_noise.factor_in_phase[d]
-            + re * bin_in_noise.deviation_in_phase
+            bin_in_noise.magnitude_ratio * bin_in_noise.speckle_factor_in_phase[d]
+            + re * bin_in_noise.noise_deviation_in_phase
         )
         im = (
-            bin_in_noise.magnitude_ratio * bin_in_noise.factor_in_quadrature[d]
-            + im * bin_in_noise.deviation_in_quadrature
+            bin_in_noise.magnitude_ratio * bin_in_noise.speckle_factor_in_quadrature[d]
+            + im * bin_in_noise.noise_deviation_in_quadrature
         )
         is_marked[d] |= re**2 + im**2 >= bin_in_noise.squared_threshold_ratio
 

@@ -27,9 +27,9 @@ flagged by the mean of |X|^2, by votes of the records, or by the mean record. Th
 mean of the looks' estimates.
 
 A detector and an estimator of frequency process each segment's spectrum. The detector flags bins of
-|X|^2. A segment is detected if any bin that the signal occupies is flagged. With ``peak_bin`` only
-the bin counts that is strongest without noise and speckle. Adjacent flagged bins form a group. A
-group outside the bins that the signal occupies is a false alarm. The estimator receives the
+|X|^2. A segment is detected if any bin that the signal occupies is flagged; with ``peak_bin``, if
+the bin is flagged that is strongest without noise and speckle. Adjacent flagged bins form a group.
+A group outside the bins that the signal occupies is a false alarm. The estimator receives the
 spectrum and the largest bin of the detected group. If all segments are detected, their frequencies
 are resolved into range and radial velocity.
 """
@@ -92,7 +92,7 @@ from sweep.model.sampling.speckle_lines import (
     folding_signs,
     speckle_line_grid,
 )
-from sweep.model.sampling.speckle_wander import MeanSquareErrors, wander_variance
+from sweep.model.sampling.speckle_wander import MeanSquareErrors, range_velocity_wander_variance
 from sweep.model.spectrum.search_band import is_searched
 from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import full_segment_spectrum
@@ -136,8 +136,8 @@ class SegmentSignal(NamedTuple):
     """Index of the bin with the largest magnitude. DC and Nyquist are excluded if the noise of a
     real record counts as circular in all bins."""
     first_bin: int
-    """Index of the first bin that the signal occupies. The occupied bins begin with the first bin
-    of half the largest magnitude and end with the last, plus half a main lobe on either side."""
+    """Index of the first bin that the signal occupies. The signal extends from the first to the
+    last bin with half the largest magnitude, plus half a main lobe on either side."""
     last_bin: int
     """Index of the last bin that the signal occupies. It is below ``first_bin`` if there is no
     echo, or if the strongest bin is outside the search band."""
@@ -181,15 +181,15 @@ class EchoPeaks(NamedTuple):
     echo about its strongest bin."""
 
 
-class EchoWindow(NamedTuple):
-    """First, last, strongest and middle bin of an echo whose speckle is drawn.
+class EchoBinRange(NamedTuple):
+    """Bins of an echo whose speckle is drawn.
 
     Bins are stated by their index in the spectrum.
     """
 
     strongest_bin: int
     """Index of the strongest bin of the echo."""
-    position: float
+    middle_position: float
     """Middle of the echo, as a fractional index in the spectrum."""
     first_bin: int
     """Index of the first bin whose speckle is drawn."""
@@ -212,7 +212,7 @@ def noiseless_signal(
     segment
         The segment: 0 up, 1 Doppler, 2 down.
     echo_bins
-        Indices of the strongest bins of the echoes, if several surfaces return one.
+        Indices of the strongest bins of the echoes, if several surfaces return an echo.
     fixed_threshold
         Threshold [V] of the detector, if it is fixed; bins that reach it raise no false alarm.
     """
@@ -249,7 +249,7 @@ def noiseless_signal(
     shift = centring_shift(shots, strongest_bin)
     bins_above_half = (
         np.flatnonzero(
-            centre_bins(shots, magnitude, strongest_bin) >= 0.5 * magnitude[strongest_bin]
+            rotate_to_centre(shots, magnitude, strongest_bin) >= 0.5 * magnitude[strongest_bin]
         )
         - shift
     )
@@ -334,8 +334,7 @@ def _exempt_bin_mask(
 ) -> np.ndarray:
     """Return a mask (bins,) of the bins of a segment that cannot raise a false alarm.
 
-    These bins are the bins of the echo, and bins of signal at or above the threshold with their
-    neighbours.
+    These are the bins of the echo, bins of signal at or above the threshold, and their neighbours.
 
     Parameters
     ----------
@@ -352,7 +351,7 @@ def _exempt_bin_mask(
     is_exempt = np.zeros(magnitude.size, bool)
     if last_bin < first_bin:
         return is_exempt
-    centred_magnitude = centre_bins(shots, magnitude, strongest_bin)
+    centred_magnitude = rotate_to_centre(shots, magnitude, strongest_bin)
     is_marked = np.zeros(centred_magnitude.size, bool)
     mark_exempt_bins(
         centred_magnitude,
@@ -373,11 +372,11 @@ def zero_frequency_index(shots: Shots) -> int:
 
 
 def centring_shift(shots: Shots, middle_index: int) -> int:
-    """Return the number of bins by which :func:`centre_bins` moves a given bin upwards."""
+    """Return the number of bins by which :func:`rotate_to_centre` moves a given bin upwards."""
     return 1 + shots.fft_size // 2 - middle_index if shots.complex_record else 0
 
 
-def centre_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarray:
+def rotate_to_centre(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarray:
     """Rotate the bins of a complex record's spectrum until a given bin is in the middle.
 
     Bins about it are then adjacent, although the first bin of the spectrum follows its last. A 0 is
@@ -429,12 +428,12 @@ def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray
         -cycles, shots.window.length
     )
     record[:first_sample] = 0.0
-    tone = record_spectrum(shots, record if shots.complex_record else record.real)
+    tone = transform_record(shots, record if shots.complex_record else record.real)
     magnitude = np.abs(tone)
     return np.where(magnitude > 0, tone / np.where(magnitude > 0, magnitude, 1.0), 1.0)
 
 
-def record_spectrum(shots: Shots, record: np.ndarray) -> np.ndarray:
+def transform_record(shots: Shots, record: np.ndarray) -> np.ndarray:
     """Transform a windowed record (L,), padded to the FFT size, to a complex spectrum (bins,)."""
     if shots.complex_record:
         return np.asarray(fft.fftshift(fft.fft(record, shots.fft_size)))
@@ -513,7 +512,7 @@ def draw_signal_spectra(
         )
         rotated_record = record * np.exp(1j * phase)
         spectra.append(
-            record_spectrum(shots, rotated_record if shots.complex_record else rotated_record.real)
+            transform_record(shots, rotated_record if shots.complex_record else rotated_record.real)
         )
     return np.array(spectra)
 
@@ -544,7 +543,7 @@ def draw_noise_spectra(
         * cached_window_samples(shots.window)
     )
     # One transform at a time, so that bits do not depend on the number of draws.
-    return np.array([record_spectrum(shots, noise_record) for noise_record in record])
+    return np.array([transform_record(shots, noise_record) for noise_record in record])
 
 
 def draw_bin_speckle(
@@ -586,24 +585,24 @@ def draw_bin_speckle(
     factors = np.empty((draws.size, n_bins), complex)
     is_real_bin = np.zeros(n_bins, bool)  # the real part alone has all of the power
     is_real_bin[[0, -1]] = shots.real_fft_size > 0
-    echo_windows = [
-        EchoWindow(
+    echo_bin_ranges = [
+        EchoBinRange(
             signal.strongest_bin, signal.frequency + zero_index, signal.first_bin, signal.last_bin
         )
     ]
     if signal.nearest_echo is not None and signal.multiple_echo_peaks is not None:
-        echo_windows = [
-            EchoWindow(
+        echo_bin_ranges = [
+            EchoBinRange(
                 int(echo_bin),
                 position,
                 int(echo_bin) - signal.echo_half_width,
                 int(echo_bin) + signal.echo_half_width,
             )
             if (echo_bin - signal.first_bin) % n_bins > signal.last_bin - signal.first_bin
-            else EchoWindow(int(echo_bin), position, signal.first_bin, signal.last_bin)
+            else EchoBinRange(int(echo_bin), position, signal.first_bin, signal.last_bin)
             for echo_bin, position in zip(*signal.multiple_echo_peaks, strict=True)
         ]
-    for echo_number, (strongest_bin, position, first_bin, last_bin) in enumerate(echo_windows):
+    for echo_number, (strongest_bin, position, first_bin, last_bin) in enumerate(echo_bin_ranges):
         first_bin, last_bin = min(first_bin, strongest_bin - 1), max(last_bin, strongest_bin + 1)
         positions = np.full(3, np.nan)
         positions[segment] = position
@@ -652,7 +651,7 @@ def draw_bin_speckle(
 def add_footprint_records(
     shots: Shots, point: int, signal: SegmentSignal, line_grid: SpeckleLineGrid
 ) -> SegmentSignal:
-    """Return a segment's signal with the records that draws of its speckle need.
+    """Return a segment's signal together with the records from which its speckle is drawn.
 
     Parameters
     ----------
@@ -676,7 +675,9 @@ def add_footprint_records(
         return signal
     segment, zero_index = signal.segment, zero_frequency_index(shots)
     line_deviation = (
-        np.hypot(*line_grid.line_shift[point, segment]) * shots.window.length / shots.fft_size
+        np.hypot(*line_grid.line_shift_gradient[point, segment])
+        * shots.window.length
+        / shots.fft_size
     )
     if line_deviation > RECORD_LINE_DEVIATION_MAX_BINS:
         return signal._replace(footprint_records=())
@@ -729,7 +730,7 @@ def _draw_speckle_from_records(
             drawn_record = record.draw_speckled_record(key, int(draw), echo_number)
             drawn_record = drawn_record if shots.complex_record else drawn_record.real
             scaling = signal.record_scalings[echo_number]
-            factors[row, echo_bins] = (record_spectrum(shots, drawn_record) * scaling)[echo_bins]
+            factors[row, echo_bins] = (transform_record(shots, drawn_record) * scaling)[echo_bins]
     return factors
 
 
@@ -789,7 +790,7 @@ def _draw_look_speckle(
     A look is one record of the segment.
 
     The speckle of successive looks is equal, independent or correlated. Correlated speckle is a sum
-    of independent realisations, with other coefficients in each look.
+    of independent realisations, with different coefficients in each look.
     """
     draw_arguments: dict[str, Any] = {
         "key": point_spectra.random_key,
@@ -831,7 +832,8 @@ class PointSpectra(NamedTuple):
     random_key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[SegmentSignal | None, ...]
-    """Noiseless signal of each segment, as in ``shots``; None for a segment that does not exist."""
+    """Noiseless signal of each segment at the time of ``shots``; None for a segment that does not
+    exist."""
     look_shots: list[Shots]
     """Prepared shots at the time of each look (record of each segment), while the target moves."""
     settings: SpectrumSettings
@@ -843,8 +845,8 @@ class PointSpectra(NamedTuple):
     """Estimator of frequency: a function of complex spectra (m, bins), indices of peak bins (m,)
     and the settings, which returns positions (m,) as fractional indices."""
     signal_cache: dict[tuple[int, int], SegmentSignal]
-    """Noiseless signals computed so far for later looks (records), by segment and look. The target
-    has moved between looks."""
+    """Noiseless signals computed so far for looks (records of a segment) after the first, by
+    segment and look. The target moves between looks."""
     echo_bins: np.ndarray | None = None
     """(3, k) int64: indices of the strongest bins of the shot's k echoes in each segment, -1 for
     none; None for a single echo."""
@@ -897,9 +899,9 @@ class SegmentDetections(NamedTuple):
     """(m,): estimated position minus the largest bin of the detected group of adjacent flagged bins
     [bins]."""
     peak_power: np.ndarray
-    """(m,): |X|^2 [V^2] from which errors due to speckle are computed. It belongs to the bin that
-    is strongest without noise. It is at least the smaller of two values: the power of the peak, and
-    the squared threshold."""
+    """(m,): |X|^2 [V^2] from which errors due to speckle are computed. It is the larger of two
+    values: that of the bin that is strongest without noise, and that of the peak, limited to the
+    squared threshold."""
 
 
 def prepare_point_spectra(
@@ -1038,7 +1040,7 @@ def estimate_positions(
     return positions[0] if len(positions) == 1 else np.asarray(np.mean(positions, axis=0))
 
 
-def detect_and_estimate(
+def detect_and_estimate_frequency(
     spectra: Sequence[np.ndarray], signal: SegmentSignal, point_spectra: PointSpectra
 ) -> SegmentDetections:
     """Detect an echo and estimate its frequency in each draw of a segment.
@@ -1054,7 +1056,9 @@ def detect_and_estimate(
     """
     power, flags = flag_detected_bins(spectra, point_spectra, signal.segment)
     shots, shift = point_spectra.shots, centring_shift(point_spectra.shots, signal.strongest_bin)
-    power, flags = (centre_bins(shots, values, signal.strongest_bin) for values in (power, flags))
+    power, flags = (
+        rotate_to_centre(shots, values, signal.strongest_bin) for values in (power, flags)
+    )
     strongest_index, first_index, last_index = (
         k + shift for k in (signal.strongest_bin, signal.first_bin, signal.last_bin)
     )
@@ -1079,7 +1083,7 @@ def detect_and_estimate(
     start, end = start + 1, np.nonzero(flag_edges < 0)[1] + 1
     assert signal.is_exempt is not None
     n_exempt_below = np.cumsum(
-        np.pad(centre_bins(shots, signal.is_exempt, signal.strongest_bin), (1, 0))
+        np.pad(rotate_to_centre(shots, signal.is_exempt, signal.strongest_bin), (1, 0))
     )
     is_false = n_exempt_below[start] == n_exempt_below[end]  # groups without exempt bins
     is_false &= (start <= end_index - shots.first_searched_bin) & (end > shots.first_searched_bin)
@@ -1102,10 +1106,10 @@ def detect_and_estimate(
     )
     peak_power = np.maximum(power[:, strongest_index], capped_power)
     peak_bin = (peak_index - shift) % shots.fft_size if shots.complex_record else peak_index
-    peak_place = estimate_positions(spectra, peak_bin, point_spectra)
-    frequency = peak_place - zero_frequency_index(shots)
+    peak_position = estimate_positions(spectra, peak_bin, point_spectra)
+    frequency = peak_position - zero_frequency_index(shots)
     return SegmentDetections(
-        is_detected, n_false_groups, n_false_bins, frequency, peak_place - peak_bin, peak_power
+        is_detected, n_false_groups, n_false_bins, frequency, peak_position - peak_bin, peak_power
     )
 
 
@@ -1134,7 +1138,7 @@ def count_detections(
     n_searched = 0
     for s, signal in enumerate(point_spectra.signals):
         if signal is not None:
-            detections[s] = detect_and_estimate(
+            detections[s] = detect_and_estimate_frequency(
                 list(iter_look_spectra(point_spectra, s, draws)), signal, point_spectra
             )
             bins = np.arange(point_spectra.shots.n_bins)
@@ -1192,8 +1196,8 @@ def _error_bounds_by_draw(
 ) -> RangeVelocityDeviation:
     """Return the smallest standard deviations of range and radial velocity by draw, (m,) each.
 
-    The standard deviations are bounds for the segments that are detected in a draw, ``is_detected``
-    (3, m).
+    They are the bounds (:func:`measurement_bound`) for the segments that are detected in each draw:
+    ``is_detected`` (3, m).
     """
     bounds = RangeVelocityDeviation(
         *(
@@ -1215,7 +1219,8 @@ def _wander_variances(
 ) -> MeanSquareErrors:
     """Return the mean square errors of range and radial velocity due to speckle, (m,) each.
 
-    `detections` are those of each segment, and `is_detected` (3, m) says which count.
+    `detections` has one element for each segment. Those of a draw count where `is_detected` (3, m)
+    is True.
     """
     shots, point, n_draws = point_spectra.shots, point_spectra.point, is_detected.shape[1]
     if shots.speckle.line_gradients is None:
@@ -1240,7 +1245,7 @@ def _wander_variances(
     ).T
     echo_fraction = np.broadcast_to(signal / mean_power, power.shape)
     peaks = SpecklePeaks(offsets, folding_signs(shots)[point_indices], power, echo_fraction)
-    return wander_variance(shots, point_indices, peaks, is_detected)
+    return range_velocity_wander_variance(shots, point_indices, peaks, is_detected)
 
 
 def measurement_bound(
@@ -1303,7 +1308,8 @@ def _measurement_errors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return measured minus true range [m] and radial velocity [m/s] in each draw, (m,) each.
 
-    `detections` are those of each segment, and `is_detected` (3, m) says which count.
+    `detections` has one element for each segment. Those of a draw count where `is_detected` (3, m)
+    is True.
     """
     shots, point = point_spectra.shots, point_spectra.point
     bin_width = point_spectra.settings.sample_rate / point_spectra.settings.fft_size
@@ -1351,6 +1357,6 @@ def _carriers_at(shots: Shots, point: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Return the element of an array (n,) for a point; a single number is common to all points."""
+    """Return the value of a point from an array (n,), or from one number common to all points."""
     column = np.asarray(column)
     return np.asarray(column[point] if column.ndim else column)

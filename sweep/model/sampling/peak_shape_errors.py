@@ -23,10 +23,12 @@ from sweep.model.window import Window, window_samples
 if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
-_SPREAD_GRID_CELLS = np.array([0.01, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0])
-"""Tabulated spreads of a footprint's lines, as standard deviations in units of fs/L, the sample
-rate over the number of samples in the record."""
-_QUADRATURE_SHIFT_VARIANCES = np.concatenate([[1e-4], np.geomspace(3e-3, 30.0, 13)])
+_SPREADS_UNPADDED_BINS = np.array(
+    [0.01, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0]
+)
+"""Tabulated spreads (standard deviations) of a footprint's lines, in bins of a record without
+padding: units of fs/L, the sample rate over the number of samples in the record."""
+_IMAGINARY_SHIFT_VARIANCES = np.concatenate([[1e-4], np.geomspace(3e-3, 30.0, 13)])
 """Tabulated variances of Im s [(fs/L)^2], with the complex shift s by which speckle deforms a peak
 (:class:`PeakShapeErrors`), the sample rate fs and the number L of samples in the record."""
 _SHAPE_OFFSETS_BINS = np.linspace(0.0, 1.0, 33)
@@ -66,10 +68,10 @@ class PeakShapeErrors(NamedTuple):
 
     spread_error: np.ndarray
     """(m, 3): error of the peak position [bins] by the broadening of the line, equation (1)."""
-    quadrature_error: np.ndarray
+    imaginary_shift_error: np.ndarray
     """(m, 3): mean error of the peak position [bins] by the imaginary part of the complex shift,
     equation (2)."""
-    quadrature_deviation: np.ndarray
+    imaginary_shift_deviation: np.ndarray
     """(m, 3): standard deviation of the error by the imaginary part [bins], with the sign of the
     mean error at small shifts."""
 
@@ -93,24 +95,28 @@ class PeakShapeErrors(NamedTuple):
         tables = _peak_shape_error_tables(shots.window, shots.fft_size)
         squared_cell = (shots.fft_size / shots.window.length) ** 2
         spread = np.clip(
-            np.sqrt(squared_shift / squared_cell), _SPREAD_GRID_CELLS[0], _SPREAD_GRID_CELLS[-1]
+            np.sqrt(squared_shift / squared_cell),
+            _SPREADS_UNPADDED_BINS[0],
+            _SPREADS_UNPADDED_BINS[-1],
         )
-        limited_square = np.minimum(squared_shift / squared_cell, _SPREAD_GRID_CELLS[-1] ** 2)
-        limited_variance = np.minimum(variance / squared_cell, _QUADRATURE_SHIFT_VARIANCES[-1])
-        log_variance = np.log(np.maximum(limited_variance, _QUADRATURE_SHIFT_VARIANCES[0]))
+        limited_square = np.minimum(squared_shift / squared_cell, _SPREADS_UNPADDED_BINS[-1] ** 2)
+        limited_variance = np.minimum(variance / squared_cell, _IMAGINARY_SHIFT_VARIANCES[-1])
+        log_variance = np.log(np.maximum(limited_variance, _IMAGINARY_SHIFT_VARIANCES[0]))
         sign, distance = np.sign(offset), np.abs(offset)
         (spread_error,) = interpolate_tables(
-            (_SPREAD_GRID_CELLS, _SHAPE_OFFSETS_BINS), (tables.spread_error,), (spread, distance)
+            (_SPREADS_UNPADDED_BINS, _SHAPE_OFFSETS_BINS),
+            (tables.spread_error,),
+            (spread, distance),
         )
-        quadrature_error, quadrature_deviation = interpolate_tables(
-            (_SPREAD_GRID_CELLS, np.log(_QUADRATURE_SHIFT_VARIANCES), _SHAPE_OFFSETS_BINS),
-            (tables.quadrature_error, tables.quadrature_deviation),
+        imaginary_shift_error, imaginary_shift_deviation = interpolate_tables(
+            (_SPREADS_UNPADDED_BINS, np.log(_IMAGINARY_SHIFT_VARIANCES), _SHAPE_OFFSETS_BINS),
+            (tables.imaginary_shift_error, tables.imaginary_shift_deviation),
             (spread, log_variance, distance),
         )
         return cls(
             sign * limited_square * spread_error,
-            sign * limited_variance * quadrature_error,
-            sign * limited_variance * quadrature_deviation,
+            sign * limited_variance * imaginary_shift_error,
+            sign * limited_variance * imaginary_shift_deviation,
         )
 
 
@@ -123,16 +129,16 @@ class PeakShapeErrorTables(NamedTuple):
 
     spread_error: np.ndarray
     """Error by the broadening of the line [bins], over b^2 [(fs/L)^2]; by spread and offset."""
-    quadrature_error: np.ndarray
+    imaginary_shift_error: np.ndarray
     """Mean error by the imaginary shift [bins], over its variance; by spread, log variance and
     offset."""
-    quadrature_deviation: np.ndarray
+    imaginary_shift_deviation: np.ndarray
     """Standard deviation of that error [bins], over the variance; by the same coordinates."""
 
 
 @lru_cache(maxsize=16)
 def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTables:
-    """Tabulate errors of peak positions by deformed peaks."""
+    """Tabulate the errors of the positions of deformed peaks."""
     interpolation, padding = interpolator(window, fft_size), fft_size / window.length
     n_samples = min(window.length, _SHAPE_SAMPLES_MAX)
     window_values = window_samples(window.name, n_samples)
@@ -140,12 +146,12 @@ def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTab
     sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding
     phase = sample_phase * (np.array([[-1.0], [0.0], [1.0]]) - _SHAPE_OFFSETS_BINS)[..., None]
     cosine, sine = np.cos(phase), np.sin(phase)
-    spread_error = np.empty((len(_SPREAD_GRID_CELLS), _SHAPE_OFFSETS_BINS.size))
-    mean, deviation = np.empty((2, len(_SPREAD_GRID_CELLS), *_quadrature_table_shape()))
+    spread_error = np.empty((len(_SPREADS_UNPADDED_BINS), _SHAPE_OFFSETS_BINS.size))
+    mean, deviation = np.empty((2, len(_SPREADS_UNPADDED_BINS), *_imaginary_shift_table_shape()))
     unbroadened = _offsets_of_magnitudes(np.abs(cosine @ window_values), interpolation)
-    imaginary_shift = padding * np.sqrt(_QUADRATURE_SHIFT_VARIANCES)[:, None] * _SHAPE_NODES
+    imaginary_shift = padding * np.sqrt(_IMAGINARY_SHIFT_VARIANCES)[:, None] * _SHAPE_NODES
     node_weights = _SHAPE_WEIGHTS / _SHAPE_WEIGHTS.sum()
-    for i, spread in enumerate(_SPREAD_GRID_CELLS):
+    for i, spread in enumerate(_SPREADS_UNPADDED_BINS):
         taper = window_values * np.exp(-0.5 * (spread * padding * sample_phase) ** 2)
         line, slope = cosine @ taper, -(sine @ (taper * sample_phase))
         offset = _offsets_of_magnitudes(np.abs(line), interpolation)
@@ -157,19 +163,19 @@ def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTab
         mean[i] = np.einsum("n,vno->vo", node_weights, errors)
         mean_square = np.einsum("n,vno->vo", node_weights, errors**2)
         deviation[i] = np.sqrt(np.maximum(mean_square - mean[i] ** 2, 0.0))
-    mean /= _QUADRATURE_SHIFT_VARIANCES[:, None]
-    deviation /= _QUADRATURE_SHIFT_VARIANCES[:, None]
+    mean /= _IMAGINARY_SHIFT_VARIANCES[:, None]
+    deviation /= _IMAGINARY_SHIFT_VARIANCES[:, None]
     return PeakShapeErrorTables(spread_error, mean, deviation)
 
 
-def _quadrature_table_shape() -> tuple[int, int]:
+def _imaginary_shift_table_shape() -> tuple[int, int]:
     """Return the numbers of tabulated variances and offsets."""
-    return _QUADRATURE_SHIFT_VARIANCES.size, _SHAPE_OFFSETS_BINS.size
+    return _IMAGINARY_SHIFT_VARIANCES.size, _SHAPE_OFFSETS_BINS.size
 
 
 @njit(cache=True, error_model="numpy")
 def _estimate_sub_bin_offsets(magnitudes, interpolation, offset):
-    """Set ``offset`` (m,) to the estimates from magnitudes (3, m) below, at and above a bin."""
+    """Fill ``offset`` (m,) with estimates from the magnitudes (3, m) below, at and above a bin."""
     for i in range(offset.size):
         offset[i] = estimate_sub_bin_offset(
             magnitudes[0, i], magnitudes[1, i], magnitudes[2, i], interpolation
@@ -185,24 +191,27 @@ def _offsets_of_magnitudes(magnitudes: np.ndarray, interpolation: Interpolator) 
     return offset
 
 
-_TWO_BIN_SPREADS_CELLS = np.array([0.005, 0.03, 0.1, 0.2, 0.35, 0.6, 1.0, 2.0])
+_TWO_BIN_SPREADS_UNPADDED_BINS = np.array([0.005, 0.03, 0.1, 0.2, 0.35, 0.6, 1.0, 2.0])
 _TWO_BIN_SHIFT_RATIOS = np.geomspace(0.05, 200.0, 8)
 _TWO_BIN_NOISE_RATIOS = np.concatenate([[1e-4], np.geomspace(2e-3, 0.3, 6)])
 _TWO_BIN_OFFSETS_BINS = np.array(
     [0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0]
 )
-"""Coordinates of the tables of :func:`_two_bin_error_tables`: spread of the lines [fs/L], echo
-fraction over relative power, noise per quadrature over the peak's |X|, and estimated offset."""
-_TWO_BIN_DRAWS = 4096
+"""Coordinates of the tables of :func:`_two_bin_error_tables`: spread of the lines [fs/L, bins of a
+record without padding], echo fraction over relative power, noise per quadrature over the peak's
+|X|, and estimated offset [bins]."""
+_TWO_BIN_DRAWS_PER_ENTRY = 4096
 """Number of drawn peaks from which each entry of these tables is averaged."""
 _TWO_BIN_LINES, _TWO_BIN_LINE_POWERS = np.polynomial.hermite_e.hermegauss(24)
-"""Places y_j of the lines of a drawn footprint, in units of the spread, and their powers a_j^2."""
+"""Positions y_j of the lines of a drawn footprint, in units of the spread, and their powers a_j^2.
+"""
 _TWO_BIN_SEARCH_BINS = 5
 """Largest distance [bins] from bin 0 at which the mean echo of a drawn footprint may be largest."""
-_LEAST_TABLE_VARIANCE = 1e-10
+_TABULATED_VARIANCE_MIN = 1e-10
 """Smallest tabulated variance [bins^2]."""
-_EMPTY_TABLE_ENTRY_DRAWS = 2.0
-"""Number of draws below which the value of a neighbouring offset is taken."""
+_TABLE_ENTRY_DRAWS_MIN = 2.0
+"""Smallest effective number of draws of a table's entry. With fewer, the entry is interpolated from
+other offsets."""
 
 
 def estimates_by_two_bins(shots: "Shots") -> bool:
@@ -215,13 +224,14 @@ class TwoBinErrors(NamedTuple):
 
     Notes
     -----
-    In windows whose neighbours of a tone on a bin vanish, noise and speckle decide on the side of a
-    peak near a bin, and the error on the wrong side is twice the offset. A dim peak is the slope of
-    its neighbours' light, and wanders by less than the linear law says. None of these errors is
-    small against the offset. So they are averages over drawn lines, given the power of the peak
-    bin and the estimated offset. Line j has the place b y_j about the tone, the spread b, the
-    weight a_j and a complex Gaussian amplitude z_j. Tones are anywhere between bins with equal
-    density. Noise is independent from bin to bin, as it is in the rectangular window.
+    With some windows a tone in the middle of a bin leaves no signal in the neighbouring bins. Noise
+    and speckle then decide on which side of the bin a peak near its middle seems to be. On the
+    wrong side the error is twice the offset. A dim peak is the slope of its neighbours' light, and
+    wanders by less than the linear law says. None of these errors is small against the offset. So
+    they are averages over drawn lines, given the power of the peak bin and the estimated offset.
+    Line j is at b y_j from the tone, with the spread b, and has the weight a_j and a complex
+    Gaussian amplitude z_j. Tones are at any position between bins with equal density. Noise is
+    independent from bin to bin, as it is in the rectangular window.
 
     Two segments share speckle, so their errors are correlated. The common part is the linear
     wander w = b Re(sum a z y / X) of the peak X, times a gain: the regression of the error on w.
@@ -232,9 +242,9 @@ class TwoBinErrors(NamedTuple):
     wander_gain: np.ndarray
     """(m, 3): slope of the regression of the position error on the linear wander w."""
     excess_variance: np.ndarray
-    """(m, 3): variance about the mean [bins^2], beyond that of the wander times its gain, and
-    beyond that of the standard error by noise that
-    :func:`sweep.model.detection.sub_bin_interpolation.sub_bin_standard_error` states."""
+    """(m, 3): variance of the error [bins^2] minus two parts: the variance of the wander times its
+    gain, and the square of the standard error by noise
+    (:func:`sweep.model.detection.sub_bin_interpolation.sub_bin_standard_error`)."""
 
     @classmethod
     def from_offset(
@@ -267,7 +277,7 @@ class TwoBinErrors(NamedTuple):
         log_coordinates = (
             np.log(np.clip(values, grid[0], grid[-1]))
             for values, grid in (
-                (spread_cells, _TWO_BIN_SPREADS_CELLS),
+                (spread_cells, _TWO_BIN_SPREADS_UNPADDED_BINS),
                 (shift_ratio, _TWO_BIN_SHIFT_RATIOS),
                 (noise_ratio, _TWO_BIN_NOISE_RATIOS),
             )
@@ -292,19 +302,19 @@ class TwoBinErrorTables(NamedTuple):
     """
 
     relative_mean: np.ndarray
-    """Mean error, over the root of the variance beyond wander."""
+    """Mean error, over the square root of the variance in ``log_variance``."""
     log_variance: np.ndarray
-    """Logarithm of the variance about the mean, beyond that of the wander times its gain [bins^2].
-    It includes noise."""
+    """Logarithm of the variance of the error minus the variance of the wander times its gain
+    [bins^2]. It includes noise."""
     wander_gain: np.ndarray
-    """Error over linear wander, by regression."""
+    """Slope of the regression of the error on the linear wander."""
 
 
 @lru_cache(maxsize=8)
 def _two_bin_error_tables(
     window: Window, fft_size: int, keeps_strongest_bin: bool
 ) -> TwoBinErrorTables:
-    """Tabulate moments of the errors of drawn peaks.
+    """Tabulate mean, variance and wander gain of the errors of drawn peaks.
 
     ``keeps_strongest_bin`` is True if peaks are estimated about the bin that is strongest without
     noise and speckle; else they are estimated about the largest bin.
@@ -317,9 +327,11 @@ def _two_bin_error_tables(
     rng = np.random.default_rng(0)
     shape = tuple(grid.size for grid in _two_bin_error_grids())
     mean, log_variance, gain = np.empty((3, *shape))
-    for i, spread in enumerate(_TWO_BIN_SPREADS_CELLS * padding):
-        place_max = 0.5 if keeps_strongest_bin else 1.5 + spread
-        footprints = _DrawnFootprints.from_random(rng, window, padding, spread, place_max, bins)
+    for i, spread in enumerate(_TWO_BIN_SPREADS_UNPADDED_BINS * padding):
+        tone_position_max = 0.5 if keeps_strongest_bin else 1.5 + spread
+        footprints = _DrawnFootprints.from_random(
+            rng, window, padding, spread, tone_position_max, bins
+        )
         for k, noise_ratio in enumerate(_TWO_BIN_NOISE_RATIOS):
             known_moments = None
             for j, shift_ratio in enumerate(_TWO_BIN_SHIFT_RATIOS):
@@ -336,26 +348,27 @@ def _two_bin_error_tables(
 
 
 class _DrawnFootprints(NamedTuple):
-    """Random lines about tones at random places, and their echo and noise in bins about 0.
+    """Random lines about tones at random positions, and their echo and noise in bins about 0.
 
-    There are m draws. All numbers are of unit mean power; |X| is relative to the peak bin's.
+    There are m draws. Echo amplitudes and noise have mean power 1.
     """
 
     bins: np.ndarray
     """(bins,): numbers of the bins."""
-    place: np.ndarray
-    """(m,): place of the tone [bins]."""
+    tone_position: np.ndarray
+    """(m,): position of the tone [bins]."""
     echo: np.ndarray
     """(bins, m) complex: echo of the lines."""
     echo_covariance: np.ndarray
     """(bins, bins, m): covariance of the echo over draws of the amplitudes."""
     noise: np.ndarray
     """(bins, m) complex: noise."""
-    shift: np.ndarray
-    """(m,): spread times the real part of the sum of a_j y_j z_j [bins]."""
-    shift_covariance: np.ndarray
-    """(bins, m): covariance of that sum, as a complex number, with the echo [bins]."""
-    strongest_mean: np.ndarray
+    weighted_offset: np.ndarray
+    """(m,): real part of the sum over lines of offset [bins] times amplitude: b Re(sum a_j y_j
+    z_j)."""
+    weighted_offset_covariance: np.ndarray
+    """(bins, m): covariance of the complex sum b sum a_j y_j z_j with the echo [bins]."""
+    strongest_mean_power: np.ndarray
     """(m,): mean power of the echo in the bin where it is largest."""
 
     @classmethod
@@ -365,38 +378,43 @@ class _DrawnFootprints(NamedTuple):
         window: Window,
         padding: float,
         spread: float,
-        place_max: float,
+        tone_position_max: float,
         bins: np.ndarray,
     ) -> "_DrawnFootprints":
-        """Draw footprints of a given spread [bins], with tones at most ``place_max`` from 0."""
+        """Draw footprints of a spread [bins], with tones at most ``tone_position_max`` from 0."""
         n_samples = min(window.length, _SHAPE_SAMPLES_MAX)
         window_values = window_samples(window.name, n_samples)
         sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding
         powers = _TWO_BIN_LINE_POWERS / _TWO_BIN_LINE_POWERS.sum()
-        place = rng.uniform(-place_max, place_max, _TWO_BIN_DRAWS)
-        line_places = place + spread * _TWO_BIN_LINES[:, None]
-        reach = np.abs(line_places).max() + _TWO_BIN_SEARCH_BINS
+        tone_position = rng.uniform(-tone_position_max, tone_position_max, _TWO_BIN_DRAWS_PER_ENTRY)
+        line_positions = tone_position + spread * _TWO_BIN_LINES[:, None]
+        reach = np.abs(line_positions).max() + _TWO_BIN_SEARCH_BINS
         distance = np.linspace(-reach, reach, int(128 * reach))
         transform = np.cos(np.outer(distance, sample_phase)) @ window_values / window_values.sum()
         mean_powers = [
-            powers @ np.interp(bin_ - line_places, distance, transform) ** 2
+            powers @ np.interp(bin_ - line_positions, distance, transform) ** 2
             for bin_ in range(-_TWO_BIN_SEARCH_BINS, _TWO_BIN_SEARCH_BINS + 1)
         ]
-        shapes = np.interp(bins[:, None, None] - line_places, distance, transform)
+        shapes = np.interp(bins[:, None, None] - line_positions, distance, transform)
         amplitudes, noise = (
             (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
-            for shape in ((powers.size, _TWO_BIN_DRAWS), (bins.size, _TWO_BIN_DRAWS))
+            for shape in (
+                (powers.size, _TWO_BIN_DRAWS_PER_ENTRY),
+                (bins.size, _TWO_BIN_DRAWS_PER_ENTRY),
+            )
         )
-        weighted_places = spread * np.sqrt(powers) * _TWO_BIN_LINES
+        weighted_offsets = spread * np.sqrt(powers) * _TWO_BIN_LINES
         return cls(
             bins=bins,
-            place=place,
+            tone_position=tone_position,
             echo=np.einsum("l,klm,lm->km", np.sqrt(powers), shapes, amplitudes),
             echo_covariance=np.einsum("l,jlm,klm->jkm", powers, shapes, shapes),
             noise=noise,
-            shift=weighted_places @ amplitudes.real,
-            shift_covariance=np.einsum("l,klm->km", weighted_places * np.sqrt(powers), shapes),
-            strongest_mean=np.max(mean_powers, axis=0),
+            weighted_offset=weighted_offsets @ amplitudes.real,
+            weighted_offset_covariance=np.einsum(
+                "l,klm->km", weighted_offsets * np.sqrt(powers), shapes
+            ),
+            strongest_mean_power=np.max(mean_powers, axis=0),
         )
 
     def weighted_errors(
@@ -406,14 +424,14 @@ class _DrawnFootprints(NamedTuple):
         largest_index: int,
         interpolation: Interpolator,
     ) -> np.ndarray:
-        """Return the errors of peaks whose largest bin is X = 1, and the weights of the draws.
+        """Return errors of peaks, scaled to X = 1 in the largest bin, and weights of the draws.
 
         Parameters
         ----------
         shift_ratio
-            Mean power of the echo in the bin where it is largest, v / q^2.
+            Mean power of the echo in the bin where it is largest, over the peak's power: v / q^2.
         noise_ratio
-            Noise per quadrature.
+            Noise per quadrature, over the peak's |X|.
         largest_index
             Index of the largest bin.
         interpolation
@@ -427,28 +445,32 @@ class _DrawnFootprints(NamedTuple):
 
         Notes
         -----
-        Echo and noise were drawn without regard to X, and are moved to X = 1: a Gaussian number Y
-        becomes Y + cov(Y, X) (1 - X) / var(X). The weight is the density exp(-1 / var(X)) / var(X)
-        of X at 1, and 0 if another bin is larger. Without regard to X, the wander has the variance
-        b^2 v / (2 q^2), as where it is used. Given X, bright peaks have up to 1.6 times this, and
-        dim ones a third of it: their standard errors are up to 1.25 times too large.
+        Echo and noise were drawn for any X, and are moved to X = 1: a Gaussian number Y becomes
+        Y + cov(Y, X) (1 - X) / var(X). The weight is the density exp(-1 / var(X)) / var(X) of X at
+        1, and 0 if another bin is larger. For any X the wander has the variance b^2 v / (2 q^2),
+        which :func:`sweep.model.sampling.speckle_lines.position_error_moments` uses. Given X,
+        bright peaks have up to 1.6 times this, and dim ones a third of it: their standard errors
+        are up to 1.25 times too large.
         """
-        ratio, noise_power = shift_ratio / self.strongest_mean, 2 * noise_ratio**2
+        ratio, noise_power = shift_ratio / self.strongest_mean_power, 2 * noise_ratio**2
         drawn = np.sqrt(ratio) * self.echo + np.sqrt(noise_power) * self.noise
         variance = ratio * self.echo_covariance[largest_index, largest_index] + noise_power
         correction = ratio * (1 - drawn[largest_index]) / variance
         spectrum = drawn + self.echo_covariance[largest_index] * correction
         spectrum[largest_index] = 1.0
         magnitude, middle = np.abs(spectrum), self.bins.size // 2
-        shift = np.sqrt(ratio) * self.shift + self.shift_covariance[largest_index] * correction.real
+        shift = (
+            np.sqrt(ratio) * self.weighted_offset
+            + self.weighted_offset_covariance[largest_index] * correction.real
+        )
         estimate = _offsets_of_magnitudes(magnitude[middle - 1 : middle + 2], interpolation)
         density = np.exp(1 / variance.max() - 1 / variance) / variance
         side = np.where(estimate < 0, -1.0, 1.0)
         return np.stack(
             [
                 np.abs(estimate),
-                side * (estimate - self.place),
-                side * shift * np.sqrt(self.strongest_mean),
+                side * (estimate - self.tone_position),
+                side * shift * np.sqrt(self.strongest_mean_power),
                 np.where(magnitude.max(axis=0) <= 1, density, 0.0),
             ]
         )
@@ -457,7 +479,7 @@ class _DrawnFootprints(NamedTuple):
 def _two_bin_error_grids() -> tuple[np.ndarray, ...]:
     """Return the coordinates of :func:`_two_bin_error_tables`, in the order of their axes."""
     return (
-        np.log(_TWO_BIN_SPREADS_CELLS),
+        np.log(_TWO_BIN_SPREADS_UNPADDED_BINS),
         np.log(_TWO_BIN_SHIFT_RATIOS),
         np.log(_TWO_BIN_NOISE_RATIOS),
         _TWO_BIN_OFFSETS_BINS,
@@ -467,11 +489,12 @@ def _two_bin_error_grids() -> tuple[np.ndarray, ...]:
 def _moments_by_offset(
     offset: np.ndarray, error: np.ndarray, shift: np.ndarray, draw_weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return mean error, logarithm of the variance beyond the shift's, and gain, at the offsets.
+    """Return mean error, logarithm of the residual variance, and gain, at the tabulated offsets.
 
-    The gain is the regression of the error on the shift. Arguments are (m,), by draw: estimated
-    offset, error, shift and weight. Draws near a tabulated offset count there. None if no offset
-    has _EMPTY_TABLE_ENTRY_DRAWS.
+    The gain is the slope of the regression of the error on the shift (linear wander), and the
+    residual variance is that about the regression [bins^2]. Arguments are (m,), by draw: estimated
+    offset, error, shift and weight. A draw counts at the two tabulated offsets next to its own. The
+    result is None if no offset has _TABLE_ENTRY_DRAWS_MIN draws.
     """
     n_offsets = _TWO_BIN_OFFSETS_BINS.size
     position = np.interp(offset, _TWO_BIN_OFFSETS_BINS, np.arange(n_offsets))
@@ -485,7 +508,7 @@ def _moments_by_offset(
         )
 
     weight = sums(draw_weight)
-    is_known = weight**2 > _EMPTY_TABLE_ENTRY_DRAWS * sums(draw_weight**2)
+    is_known = weight**2 > _TABLE_ENTRY_DRAWS_MIN * sums(draw_weight**2)
     if not is_known.any():
         return None
     mean_error, mean_shift, squared_error, squared_shift, product = (
@@ -494,7 +517,7 @@ def _moments_by_offset(
     )
     gain = (product - mean_error * mean_shift) / (squared_shift - mean_shift**2)
     variance = squared_error - mean_error**2 - gain * (product - mean_error * mean_shift)
-    log_variance = np.log(np.maximum(variance, 0.0) + _LEAST_TABLE_VARIANCE)
+    log_variance = np.log(np.maximum(variance, 0.0) + _TABULATED_VARIANCE_MIN)
     known_offsets = _TWO_BIN_OFFSETS_BINS[is_known]
     mean_error, log_variance, gain = (
         np.interp(_TWO_BIN_OFFSETS_BINS, known_offsets, values)

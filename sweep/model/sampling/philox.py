@@ -158,7 +158,7 @@ def four_words(key0, key1, draw, stream, block):
 
 @njit(cache=True)
 def fill_words(address, stream, block, increments, count, words):
-    """Fill columns of an array with random words: those of one block (:func:`four_words`) each.
+    """Fill the columns of an array with random words, one block (:func:`four_words`) a column.
 
     Parameters
     ----------
@@ -289,9 +289,10 @@ def _fill_uniforms(keys, draws, stream, out):
 
 
 def to_normals_by_row(uniform_numbers: np.ndarray) -> np.ndarray:
-    """Convert uniform numbers (m, k), with even k, to as many independent standard normal numbers.
+    """Convert uniform numbers (m, k), with even k, to standard normal numbers (m, k).
 
-    Columns 2 i and 2 i + 1 give pair i, which is that of :func:`normal_pair` up to the last bit.
+    Columns 2 i and 2 i + 1 hold pair i, which equals that of :func:`normal_pair` up to the last
+    bit.
     """
     # Contiguous copies, so that bits do not depend on the number of rows.
     first, second = (np.ascontiguousarray(uniform_numbers[:, lane::2]) for lane in range(2))

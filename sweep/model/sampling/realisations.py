@@ -54,7 +54,7 @@ class RealisedShots(NamedTuple):
 
 
 def random_effects(effects: Collection[str]) -> tuple[Effect, ...]:
-    """Return those of the named effects that are simulated by random draws."""
+    """Return the effects that are simulated by random draws, among the named ones."""
     return tuple(effect for effect in select_effects(effects) if effect.is_random)
 
 
@@ -116,10 +116,11 @@ def iter_realisations(
 def _realise_batch(
     parameters: dict[str, np.ndarray], effects: Collection[str], draw_keys: DrawAddresses
 ) -> Shots:
-    """Return prepared shots, with all effects, for m draws of points that share text parameters.
+    """Return prepared shots, with all effects, for m draws of points that share all settings.
 
-    ``draw_keys`` holds the random key of each point and the number of each draw. Points of one
-    category share all settings that are words or sizes.
+    Settings are parameters that are words or sizes.
+
+    ``draw_keys`` holds the random key of the point and the number of each draw.
     """
     n_points, random = draw_keys.draw_numbers.size, random_effects(effects)
     for effect in random:
@@ -136,7 +137,7 @@ def _realise_batch(
 
 
 def zero_standard_errors(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return standard errors by name if nothing is random: 0, or nan where the output is nan."""
+    """Return standard errors by name where nothing is random: 0, or nan if the output is nan."""
     return {name: 0.0 * outputs[name.removesuffix("_error")] for name in STANDARD_ERROR_OUTPUTS}
 
 
@@ -211,7 +212,7 @@ class RunningMeans:
             )
 
     def running_sums(self) -> np.ndarray:
-        """Return what further draws need in addition to the stored means, (n, columns).
+        """Return the sums that further draws need in addition to the stored means, (n, columns).
 
         A row holds a point's numbers of values of all outputs, the sums of squared deviations of
         those in OUTPUT_HAS_SQUARED_DEVIATIONS, and the largest logarithms of those in
@@ -224,7 +225,7 @@ class RunningMeans:
         )
         return np.concatenate(arrays).T
 
-    def resume(self, results: Mapping[str, np.ndarray]) -> None:
+    def restore_from_results(self, results: Mapping[str, np.ndarray]) -> None:
         """Restore means and sums from the results of earlier draws, so that draws can be added.
 
         `results` are those of :meth:`results` by name, with the array of :meth:`running_sums` as

@@ -12,7 +12,7 @@ compared with known probabilities, pd is exact, and the counts sample it.
 
 Drawing until the tolerance is met goes in rounds over all points that do not meet it yet. A
 sequential test stops sooner, on average, if the draws happen to vary little. This reduces coverage
-and adds bias. :func:`stopping_checks` tests seldom enough to keep both small;
+and adds bias. Tests at the numbers of :func:`stopping_checks` are rare enough to keep both small;
 ``benchmarks/stopping_rule.py`` measures them. Tests come at the same numbers of draws for every
 point. With random effects these are whole groups of draws, over which random numbers are spread
 evenly (:mod:`sweep.model.sampling.draw_groups`). The half-width then follows from the variance of
@@ -90,13 +90,13 @@ PD_COUNT_ROWS = [
 rows of such an array are in the order of ``DRAW_COUNT_OUTPUTS``."""
 
 
-GROUPS_OF_STANDARD_ERROR_MIN = 4
-"""Smallest number of groups of draws whose means are used for a standard error. Fewer groups do not
-tell their variance: with two, one error in fifty would exceed five standard errors. With four it is
-one in 250."""
+STANDARD_ERROR_GROUPS_MIN = 4
+"""Smallest number of groups of draws whose means are used for a standard error. The variance of
+fewer groups is too uncertain: with two, one error in fifty would exceed five standard errors. With
+four it is one in 250."""
 
 STANDARD_ERROR_CONFIDENCE = 0.95
-"""Confidence at which standard errors by the means of groups count Student's quantile."""
+"""Confidence at which Student's quantile widens a standard error by the means of groups."""
 
 
 class PriorDraws(NamedTuple):
@@ -116,7 +116,7 @@ class PriorDraws(NamedTuple):
 
 
 class Sampler(ABC):
-    """Counts and sums of the draws of n points made so far, to which further draws are added.
+    """Counts and sums over the draws of n points made so far, to which further draws are added.
 
     Parameters
     ----------
@@ -223,10 +223,9 @@ class Sampler(ABC):
     def half_width_over_tolerance(
         self, point_indices: np.ndarray, error_budget: ErrorBudget
     ) -> np.ndarray:
-        """Return the excess of each point's largest half-width over the tolerance, (points,).
+        """Return each point's largest half-width minus the tolerance, but at least 0, (points,).
 
-        The half-widths are those of the confidence intervals of detection probabilities. The result
-        is at least 0.
+        The half-widths are those of the confidence intervals of detection probabilities.
         """
         widths = self.half_widths(point_indices, error_budget)
         excess = widths - error_budget.select(point_indices, self.n_draws.size).tolerance
@@ -247,28 +246,24 @@ class Sampler(ABC):
 
 
 def never_stop() -> bool:
-    """Return False, so that drawing goes on until all draws are made.
-
-    This function is the default of ``should_stop``.
-    """
+    """Return False: the default of ``should_stop``, with which all draws are made."""
     return False
 
 
 def stopping_checks(batch_size: int, draws_max: int, group_size: int = 1) -> Iterator[int]:
     """Yield, in rising order, the numbers of draws after which sampling may stop.
 
-    At each of them the half-widths of the confidence intervals of the detection probabilities are
+    After as many draws, half-widths of the confidence intervals of detection probabilities are
     compared with the tolerance.
 
     Parameters
     ----------
     batch_size
-        Number of draws in a batch. Numbers below two groups are whole batches.
+        Number of draws in a batch. Yielded numbers below two groups are whole batches.
     draws_max
-        Largest number of draws, the last that is yielded.
+        Largest number of draws, which is yielded last.
     group_size
-        Number of draws that are made together. Numbers of two groups or more are rounded up to
-        whole groups.
+        Number of draws in a group. Numbers of at least two groups are rounded up to whole groups.
 
     Notes
     -----
@@ -316,8 +311,9 @@ def simulate_draws(
     first_draw
         Number of the first draw.
     batch_sizes
-        Numbers of draws to count separately; each point then has their sum. Without them a point
-        has as many draws as `error_budget` needs, in one count.
+        Numbers of draws in batches that are counted separately; a point then has their sum of
+        draws. Without batch sizes a point has as many draws as `error_budget` needs, counted
+        together.
     batch
         Number of draws in a batch. Whole batches are made between tests against `error_budget`,
         with random effects rounded up to whole groups of draws.
@@ -330,8 +326,8 @@ def simulate_draws(
     prior_draws
         Earlier draws from `first_draw` on, for the same tolerance or a looser one.
     should_stop
-        Function that is called between steps. If it returns True, no more draws are made. The
-        result then holds at least those of one step, and can be the `prior_draws` of another call.
+        Function that is called between steps. If it returns True, no more draws are made. At least
+        one step is made, and the results can be the `prior_draws` of another call.
 
     Returns
     -------
@@ -384,8 +380,8 @@ def draw_until_accurate(
     point_indices
         Points to draw.
     check_draws
-        Rising numbers of draws at which half-widths are tested. A point that already has more draws
-        is not tested at that number.
+        Rising numbers of draws after which half-widths are compared with the tolerance. A point
+        that already has more draws is skipped at that number.
     error_budget
         Tolerance and confidence; None to draw up to the last of `check_draws` without a test.
     should_stop
@@ -416,8 +412,8 @@ def draw_until_accurate(
 def _can_be_accurate(n_draws: int, error_budget: ErrorBudget) -> bool:
     """Return False if no point with random effects can meet its tolerance with ``n_draws`` draws.
 
-    Half-widths are z^2 / n at least, if there are two whole groups, else half of that
-    (:mod:`sweep.model.error_budget`).
+    With n draws in at least two whole groups, half-widths are at least z^2 / n, with the normal
+    quantile z; with fewer draws they are at least half of that (:mod:`sweep.model.error_budget`).
     """
     least_width = two_sided_normal_quantile(error_budget.confidence) ** 2 / n_draws
     if n_draws < 2 * GROUP_SIZE:
@@ -444,7 +440,7 @@ class DetectionSampler(Sampler):
             values = evaluate(parameters, effects)
             self._outputs = {name: np.broadcast_to(v, (n_points,)) for name, v in values.items()}
         elif prior_draws is not None:
-            self._running_means.resume(prior_draws.means)
+            self._running_means.restore_from_results(prior_draws.means)
             self._group_means.restore_state(prior_draws.means[RUNNING_SUMS][:, -N_GROUP_SUMS:].T)
 
     def draws_per_step(self, n_points: int) -> int:
@@ -540,8 +536,8 @@ class DetectionSampler(Sampler):
     def _standard_errors(self) -> dict[str, np.ndarray]:
         """Return the standard errors of mean probabilities of detection, (n,) by name.
 
-        Draws in whole groups count with the variance of the groups' means, as in half-widths, if
-        there are at least :data:`GROUPS_OF_STANDARD_ERROR_MIN` groups. All others count with that
+        The variance of draws in whole groups follows from the groups' means, as in half-widths, if
+        there are at least :data:`STANDARD_ERROR_GROUPS_MIN` groups. Other draws have the variance
         of independent draws.
         """
         assert self._running_means is not None
@@ -555,7 +551,7 @@ class DetectionSampler(Sampler):
             group_size=GROUP_SIZE,
             confidence=STANDARD_ERROR_CONFIDENCE,
         )
-        n_grouped = GROUP_SIZE * np.where(n_groups >= GROUPS_OF_STANDARD_ERROR_MIN, n_groups, 0)
+        n_grouped = GROUP_SIZE * np.where(n_groups >= STANDARD_ERROR_GROUPS_MIN, n_groups, 0)
         squared_sum_error = n_grouped * grouped_variance + (n - n_grouped) * variance
         errors = np.sqrt(squared_sum_error) / np.where(n > 0, n, np.nan)
         return {f"{name}_error": row for name, row in zip(PD_OUTPUTS, errors, strict=True)}
@@ -597,8 +593,8 @@ class SpectraSampler(Sampler):
     def draws_per_step(self, n_points: int) -> int:
         """Return the number of draws of each point that are made in one step.
 
-        The result is a multiple of the number of draws that a detector processes together. So a
-        detector gets the same draws together, however draws are divided into steps.
+        The result is a multiple of the number of draws that a detector processes together. So the
+        division into steps does not change which draws a detector processes together.
         """
         fft_sizes = np.unique(self.parameters[FFT_SIZE_PATH])
         return max(1, 4 // n_points) * math.lcm(

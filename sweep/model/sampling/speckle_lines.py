@@ -69,18 +69,18 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
 QUADRATURE_NODE_COUNTS = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
-"""Possible numbers of nodes of a Gaussian quadrature. A footprint is represented by as many lines
+"""Possible numbers of nodes of a Gaussian quadrature: numbers of lines that represent a footprint
 along one coordinate of the beam."""
 
-_QUADRATURE_PHASE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
+_QUADRATURE_PHASE_SLOPE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
 """Largest slope of a phase [rad per standard deviation of the beam] for which a Gaussian quadrature
 errs by at most 1e-3. There is one value for each number of nodes in QUADRATURE_NODE_COUNTS."""
 
 _LINE_WEIGHT_MIN = 1e-6
 """Smallest fraction of the beam's power for which a line of the footprint is included."""
 
-ECHO_NUMBER_STRIDE = 1 << 24
-"""Number of indices of random numbers that are reserved for each echo. Those of echo g (0, 1, ..)
+ECHO_RANDOM_INDEX_STRIDE = 1 << 24
+"""Number of indices of random numbers reserved for each echo. The indices of echo g (0, 1, ..)
 begin at (1 + g) times this number."""
 
 LOOK_DRAW_STRIDE = np.int64(1 << 48)
@@ -98,11 +98,11 @@ class SpeckleLineGrid(NamedTuple):
     and x of the beam.
     """
 
-    line_shift: np.ndarray
+    line_shift_gradient: np.ndarray
     """(n, 3, 2): derivative of a line's frequency [bins] with respect to its distance from the
     beam's axis [standard deviations of the beam]. Axes are point, segment and coordinate of the
     beam; positive values are towards higher bins."""
-    phase: np.ndarray
+    phase_gradient: np.ndarray
     """(n, 3, 2): derivative of the phase of a line's amplitude [rad] with respect to its distance
     from the beam's axis [standard deviations of the beam]. Axes are point, segment and coordinate
     of the beam. Phases are relative to the up segment."""
@@ -153,11 +153,11 @@ class SpeckleLineGrid(NamedTuple):
 
     def select(self, points: np.ndarray) -> "SpeckleLineGrid":
         """Return the lines of the points with the given indices."""
-        if not len(self.line_shift):
+        if not len(self.line_shift_gradient):
             return self
         return self._replace(
-            line_shift=self.line_shift[points],
-            phase=self.phase[points],
+            line_shift_gradient=self.line_shift_gradient[points],
+            phase_gradient=self.phase_gradient[points],
             quadrature_index=self.quadrature_index[points],
             peak_search_half_width=self.peak_search_half_width[points],
         )
@@ -190,7 +190,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     # The product of two bins' transforms turns by at most 2 pi for each bin of fs/L.
     phase_max = np.abs(phase[:, :, None] - phase[:, None]).max(axis=(1, 2))
     phase_max = phase_max + np.pi * np.abs(line_shift).max(axis=1) / padding_factor
-    quadrature_index = np.searchsorted(_QUADRATURE_PHASE_MAX, phase_max)
+    quadrature_index = np.searchsorted(_QUADRATURE_PHASE_SLOPE_MAX, phase_max)
     line_shift_max = np.sqrt((line_shift**2).sum(axis=-1)).max(axis=1)
     peak_search_half_width = np.ones(n_points, np.int64)
     if shots.detection_settings.echo_bins == "any_bin":
@@ -216,7 +216,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
 def _rotate_to_steepest(
     line_shift: np.ndarray, phase: np.ndarray, padding_factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate the beam's coordinates so that shifts and phases grow most along the first.
+    """Rotate the beam's coordinates so that shifts and phases change most along the first.
 
     The beam is round, so the joint distribution of the amplitudes is unchanged. Few lines are then
     needed along the second coordinate.
@@ -249,9 +249,9 @@ def _rotate_to_steepest(
 
 
 def folding_signs(shots: "Shots") -> np.ndarray:
-    """Return -1 for segments whose bin falls as the beat frequency rises, else 1, (n, 3).
+    """Return -1 for segments whose peak moves to lower bins as the beat rises, else 1, (n, 3).
 
-    A bin falls if the beat is folded at Nyquist or at frequency 0.
+    It moves to lower bins if the beat is folded at Nyquist or at frequency 0.
     """
     signs = np.ones((shots.size, 3))
     if shots.complex_record:
@@ -291,7 +291,7 @@ def nearest_image_position(position, nyquist_bin):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_variance):
+def fill_mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_variance):
     """Compute the mean powers over speckle of an echo's bins.
 
     The lines of the echo have the total power 1.
@@ -329,10 +329,10 @@ def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_vari
                     continue
                 position = (
                     echo_centre[s]
-                    + grid.line_shift[point, s, _FIRST] * grid.node[first_quadrature, a]
+                    + grid.line_shift_gradient[point, s, _FIRST] * grid.node[first_quadrature, a]
                 )
                 position += (
-                    grid.line_shift[point, s, _SECOND] * grid.node[second_quadrature, c]
+                    grid.line_shift_gradient[point, s, _SECOND] * grid.node[second_quadrature, c]
                     - first_bin[s]
                 )
                 begin = max(0, math.ceil(position - grid.transform_reach_bins))
@@ -383,9 +383,9 @@ def draw_bin_amplitudes(
     grid, point
         Speckle lines (:class:`SpeckleLineGrid`), and the index of the point.
     echo_centre, first_bin
-        Middle of the echo and first bin, as in :func:`mean_bin_powers`.
+        Middle of the echo and first bin, as in :func:`fill_mean_bin_powers`.
     mean_power
-        (3, bins): result of :func:`mean_bin_powers` for the same bins.
+        (3, bins): result of :func:`fill_mean_bin_powers` for the same bins.
     amplitudes
         (3, bins) complex: output array.
 
@@ -398,7 +398,10 @@ def draw_bin_amplitudes(
     amplitudes[:] = 0.0
     key_0, key_1, draw = address
     first_quadrature, second_quadrature = grid.quadrature_index[point]
-    quadrature_deviation, random_number = math.sqrt(0.5), ECHO_NUMBER_STRIDE * (1 + echo_number)
+    amplitude_deviation, random_number = (
+        math.sqrt(0.5),
+        ECHO_RANDOM_INDEX_STRIDE * (1 + echo_number),
+    )
     for a in range(grid.n_nodes[first_quadrature]):
         for c in range(grid.n_nodes[second_quadrature]):
             weight = grid.weight[first_quadrature, a] * grid.weight[second_quadrature, c]
@@ -406,19 +409,22 @@ def draw_bin_amplitudes(
                 continue
             re, im = philox.normal_pair(key_0, key_1, draw, philox.STREAM_SPECKLE, random_number)
             random_number += 1
-            line_amplitude = complex(re, im) * (quadrature_deviation * math.sqrt(weight))
+            line_amplitude = complex(re, im) * (amplitude_deviation * math.sqrt(weight))
             y, x = grid.node[first_quadrature, a], grid.node[second_quadrature, c]
             for s in range(3):
                 if np.isnan(echo_centre[s]):
                     continue
-                phase = grid.phase[point, s, _FIRST] * y + grid.phase[point, s, _SECOND] * x
+                phase = (
+                    grid.phase_gradient[point, s, _FIRST] * y
+                    + grid.phase_gradient[point, s, _SECOND] * x
+                )
                 phased_amplitude = line_amplitude
                 if phase != 0.0:
                     phased_amplitude = line_amplitude * complex(math.cos(phase), math.sin(phase))
                 position = (
                     echo_centre[s]
-                    + grid.line_shift[point, s, _FIRST] * y
-                    + grid.line_shift[point, s, _SECOND] * x
+                    + grid.line_shift_gradient[point, s, _FIRST] * y
+                    + grid.line_shift_gradient[point, s, _SECOND] * x
                     - first_bin[s]
                 )
                 begin = max(0, math.ceil(position - grid.transform_reach_bins))
@@ -459,12 +465,10 @@ _RESIDUAL_POWER_MAX = 1e-8
 
 @njit(cache=True, error_model="numpy")
 def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, factor):
-    """Compute a factor of the covariance of an echo's speckle amplitudes; return its rank.
+    """Compute a factor of the covariance of the speckle in an echo's bins; return its rank.
 
-    The amplitudes are those of the echo's bins.
-
-    Draws by the factor (:func:`draw_factored_amplitudes`) have the distribution of those by
-    :func:`draw_bin_amplitudes`, and take fewer random numbers.
+    Amplitudes drawn by the factor (:func:`draw_factored_amplitudes`) have the same distribution as
+    those by :func:`draw_bin_amplitudes`, and take fewer random numbers.
 
     Parameters
     ----------
@@ -506,7 +510,10 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
             for s in range(n_segments):
                 if np.isnan(echo_centre[s]):
                     continue
-                phase = grid.phase[point, s, _FIRST] * y + grid.phase[point, s, _SECOND] * x
+                phase = (
+                    grid.phase_gradient[point, s, _FIRST] * y
+                    + grid.phase_gradient[point, s, _SECOND] * x
+                )
                 phased_amplitude = complex(math.sqrt(line_weight), 0.0)
                 if phase != 0.0:
                     phased_amplitude = phased_amplitude.real * complex(
@@ -514,8 +521,8 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
                     )
                 position = (
                     echo_centre[s]
-                    + grid.line_shift[point, s, _FIRST] * y
-                    + grid.line_shift[point, s, _SECOND] * x
+                    + grid.line_shift_gradient[point, s, _FIRST] * y
+                    + grid.line_shift_gradient[point, s, _SECOND] * x
                     - first_bin[s]
                 )
                 for k in range(n_bins):
@@ -575,7 +582,7 @@ def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
     """
     amplitudes[:] = 0.0
     key_0, key_1, draw = address
-    first_number = ECHO_NUMBER_STRIDE * (1 + echo_number)
+    first_number = ECHO_RANDOM_INDEX_STRIDE * (1 + echo_number)
     for pair in range(0, rank, 2):
         word_0, word_1, word_2, word_3 = philox.four_words(
             key_0, key_1, draw, philox.STREAM_SPECKLE, (first_number + pair) >> 1
@@ -633,7 +640,7 @@ def draw_segment_bin_amplitudes(
     key_0, key_1 = key
     first_bins = np.full(3, first_bin)
     mean_power = np.empty((3, n_bins))
-    mean_bin_powers(grid, point, echo_centre, first_bins, mean_power, np.empty((3, n_bins)))
+    fill_mean_bin_powers(grid, point, echo_centre, first_bins, mean_power, np.empty((3, n_bins)))
     bin_amplitudes = np.zeros((3, n_bins), complex)
     drawn_amplitudes = np.empty((draws.size, n_bins), complex)
     for row, draw in enumerate(draws):
@@ -780,7 +787,7 @@ class FootprintRecord(NamedTuple):
         line_amplitudes = np.empty(len(self.series_coefficients), complex)
         _draw_line_amplitudes(
             philox.DrawAddress(key_0, key_1, np.int64(draw_number)),
-            ECHO_NUMBER_STRIDE * (1 + echo_number),
+            ECHO_RANDOM_INDEX_STRIDE * (1 + echo_number),
             line_amplitudes,
         )
         record = self.windowed_tone.copy()
@@ -793,7 +800,8 @@ class FootprintRecord(NamedTuple):
 
 
 _RELATIVE_POWER_MIN = 1e-14
-"""Smallest mean power of a bin, relative to the largest of all bins, that float64 resolves."""
+"""Smallest mean power of a bin, relative to the largest of all bins. Float64 does not resolve
+smaller ones, which are replaced by it."""
 
 
 class _LineTable(NamedTuple):
@@ -823,7 +831,7 @@ def _line_table(line_grid: SpeckleLineGrid, point: int, segment: int) -> _LineTa
     )
     offsets, phases = (
         gradients[point, segment, _FIRST] * y[:, None] + gradients[point, segment, _SECOND] * x
-        for gradients in (line_grid.line_shift, line_grid.phase)
+        for gradients in (line_grid.line_shift_gradient, line_grid.phase_gradient)
     )
     is_used = line_weights >= _LINE_WEIGHT_MIN
     return _LineTable(offsets[is_used], phases[is_used], line_weights[is_used])
@@ -833,9 +841,8 @@ def _line_table(line_grid: SpeckleLineGrid, point: int, segment: int) -> _LineTa
 def _draw_line_amplitudes(address, first_number, amplitudes):
     """Fill ``amplitudes`` with circular complex Gaussian numbers of mean power 2.
 
-    The numbers follow from the pairs of normal numbers of the stream of speckle, from the pair
-    ``first_number`` on, in the draw of ``address``
-    (:class:`sweep.model.sampling.philox.DrawAddress`).
+    They are pairs of normal numbers of the speckle's stream, from pair ``first_number`` on.
+    ``address`` is that of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
     """
     key_0, key_1, draw = address
     for k in range(amplitudes.size):
@@ -922,7 +929,7 @@ def wander_covariance(
     relative_power: np.ndarray,
     echo_fraction: np.ndarray,
 ) -> np.ndarray:
-    """Return the covariance (m,) of peak positions in two segments as speckle moves them [bins^2].
+    """Return the covariance (m,) [bins^2], due to speckle, of peak positions in two segments.
 
     Parameters
     ----------
@@ -988,8 +995,8 @@ class SpecklePeaks(NamedTuple):
     """(m, 3): interpolated position of the peak, minus the bin about which it was estimated [bins].
     """
     folding_sign: np.ndarray
-    """(m, 3): -1 if the segment's bin falls as its beat frequency rises (:func:`folding_signs`),
-    else 1."""
+    """(m, 3): -1 if the peak moves to lower bins as the beat rises (:func:`folding_signs`), else 1.
+    """
     relative_power: np.ndarray
     """(m, 3): power of the peak bin in this draw, divided by its mean over draws; both include
     noise."""
@@ -1032,14 +1039,14 @@ def position_error_moments(
         Pairs of segments (i, j) that are computed.
     from_three_bins
         True if positions are those of :mod:`sweep.model.detection.sub_bin_interpolation`. Other
-        estimators do not mistake the side of a peak in the rectangular window, and have the errors
-        of :class:`PeakShapeErrors` in any window.
+        estimators have the errors of :class:`PeakShapeErrors` in any window, because they do not
+        mistake the side of a peak in the rectangular window.
 
     Returns
     -------
     numpy.ndarray
-        (m, 3, 3) by segments i and j [bins^2]. Positions have the signs of the beats, before any
-        folding. 0 for pairs without both peaks, or not in `pairs`.
+        (m, 3, 3) by segments i and j [bins^2]; 0 for pairs without both peaks, or not in `pairs`.
+        Positions have the signs of the beats, before any folding.
 
     Notes
     -----
@@ -1051,8 +1058,8 @@ def position_error_moments(
     its mean, and v the echo fraction. In wider footprints the error has the same relative
     deviation. If only the strongest bin is tested, the wander's deviation is divided by sqrt(1 +
     variance / WANDER_MAX_BINS^2). Positions by two bins have the errors of :class:`TwoBinErrors`
-    in the place of all this: the wander times its gain, and the rest, which is independent from
-    segment to segment. The mean over L looks of independent speckle has 1 / L of the variance.
+    instead: the wander times its gain, and an excess that is independent from segment to segment.
+    The mean over L looks of independent speckle has 1 / L of the variance.
     """
     squared_shift = (gradients.line_shift**2).sum(axis=-1)
     has_peak = np.isfinite(peaks.relative_power) & np.isfinite(peaks.offset)
@@ -1061,7 +1068,7 @@ def position_error_moments(
     variance = squared_shift * echo_fraction / (2 * relative_power)
     squared_spread = np.where(echo_fraction > 0, squared_shift, 0.0)
     offset, shift_ratio = np.where(has_peak, peaks.offset, 0.0), echo_fraction / relative_power
-    shape_deviation, quadrature_deviation, own_variance = np.zeros((3, *variance.shape))
+    shape_deviation, imaginary_shift_deviation, own_variance = np.zeros((3, *variance.shape))
     wander_factor = np.ones(variance.shape)
     if from_three_bins and estimates_by_two_bins(shots):
         noise_ratio = np.sqrt((1 - echo_fraction) / (2 * relative_power))
@@ -1074,9 +1081,9 @@ def position_error_moments(
     else:
         shape_errors = PeakShapeErrors.from_offset(offset, squared_spread, variance, shots)
         spread_error = peaks.folding_sign * shape_errors.spread_error
-        mean_error = spread_error + peaks.folding_sign * shape_errors.quadrature_error
+        mean_error = spread_error + peaks.folding_sign * shape_errors.imaginary_shift_error
         shape_deviation = np.sqrt(shift_ratio * (1 + shift_ratio)) * spread_error
-        quadrature_deviation = peaks.folding_sign * shape_errors.quadrature_deviation
+        imaginary_shift_deviation = peaks.folding_sign * shape_errors.imaginary_shift_deviation
         if shots.detection_settings.echo_bins == "peak_bin":
             wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
     n_looks = (
@@ -1104,7 +1111,7 @@ def position_error_moments(
             moment
             + (
                 shape_deviation[:, first] * shape_deviation[:, second]
-                + quadrature_deviation[:, first] * quadrature_deviation[:, second]
+                + imaginary_shift_deviation[:, first] * imaginary_shift_deviation[:, second]
             )
             * amplitude_correlation
         )

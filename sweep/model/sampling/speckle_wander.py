@@ -23,7 +23,7 @@ class MeanSquareErrors(NamedTuple):
     """(m,): mean square error of the radial velocity [m^2/s^2]."""
 
 
-def wander_variance(
+def range_velocity_wander_variance(
     shots: Shots, point_indices: np.ndarray, peaks: SpecklePeaks, is_detected: np.ndarray
 ) -> MeanSquareErrors:
     """Return the mean square errors of m ranges and radial velocities due to speckle.
@@ -118,4 +118,4 @@ def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> MeanS
     peaks = SpecklePeaks(
         np.zeros(relative_power.shape), folding_signs(shots), relative_power, echo_fraction
     )
-    return wander_variance(shots, point_indices, peaks, is_present)
+    return range_velocity_wander_variance(shots, point_indices, peaks, is_present)
