@@ -83,7 +83,7 @@ class EgoMotion(NamedTuple):
     rest approaches."""
     acceleration: np.ndarray
     """Time derivative of ``closing_speed`` [m/s^2]."""
-    slip: np.ndarray
+    slip_at_range_0: np.ndarray
     """Slip [m/s] at range 0: closing speed minus the speed at which the range to level ground
     falls."""
     slip_per_range: np.ndarray
@@ -117,7 +117,7 @@ class EgoMotion(NamedTuple):
         The slip is the closing speed minus the speed at which the range falls.
         """
         slip, per_range = (
-            _align_with_ranges(v, distance) for v in (self.slip, self.slip_per_range)
+            _align_with_ranges(v, distance) for v in (self.slip_at_range_0, self.slip_per_range)
         )
         return np.asarray(slip + per_range * distance)
 
@@ -222,7 +222,7 @@ def assumed_motion_along_beams(
     return EgoMotion(
         closing_speed=closing_speed,
         acceleration=closing_rate,
-        slip=np.where(meets_ground, closing_speed - velocity[:, 2] / direction_z, 0.0),
+        slip_at_range_0=np.where(meets_ground, closing_speed - velocity[:, 2] / direction_z, 0.0),
         slip_per_range=np.where(meets_ground, -direction_rate[:, 2] / direction_z, 0.0),
         slip_per_slope=slip_gradient(velocity),
         slip_per_slope_per_range=slip_gradient(direction_rate),
