@@ -418,9 +418,10 @@ def find_groups_and_leakage_bins(
 ) -> tuple[BinGroups, list[tuple[np.ndarray, LeakageBins]]]:
     """Find groups of bins and bins of leaked signal together, for echoes in developed speckle.
 
-    The field ``leakage`` of the groups is a mean over speckle. Shots with a search band or a line
-    of leaked light need two separate searches instead
+    The field ``leakage`` of the groups is a mean over speckle. Shots with a search
+    band or a line of leaked light need two separate searches instead
     (:func:`sweep.model.pointcloud.bin_groups.list_bin_groups`, :func:`iter_leakage_bins`).
+    The second result is a list of pairs, as :func:`iter_leakage_bins` yields them.
     """
     groups = allocate_bin_groups(shots.size, groups_max)
     leakage_bins_by_part = []
@@ -534,7 +535,9 @@ def _fill_leakage_bins(
         (n, 3, groups): strongest bins of groups, -1 for none.
     circle_bins
         Number of bins of a complex record, else 0.
-    bins_begin, bins_end, bins, log_amplitude, group, exempt_neighbour, side_of_adjacent_echo_bin
+    bins_begin, bins_end, bins, log_amplitude, group
+        Results, as in :class:`LeakageBins`.
+    exempt_neighbour, side_of_adjacent_echo_bin
         Results, as in :class:`LeakageBins`.
     """
     n_listed = 0

@@ -12,11 +12,11 @@ compared with known probabilities, pd is exact, and the counts sample it.
 
 Drawing until the tolerance is met goes in rounds over all points that do not meet it yet. A
 sequential test stops sooner, on average, if the draws happen to vary little. This reduces coverage
-and adds bias. Tests at the numbers of :func:`stopping_checks` are rare enough to keep both small;
-``benchmarks/stopping_rule.py`` measures them. Tests come at the same numbers of draws for every
-point. With random effects these are whole groups of draws, over which random numbers are spread
-evenly (:mod:`sweep.model.sampling.draw_groups`). The half-width then follows from the variance of
-the groups' means.
+and adds bias. Tests at the numbers of :func:`stopping_checks` are rare enough to keep both
+small; ``benchmarks/stopping_rule.py`` measures them. Tests come at the same numbers of draws for
+every point. With random effects these are whole groups of draws, over which random numbers are
+spread evenly (:mod:`sweep.model.sampling.draw_groups`). The half-width then follows from the
+variance of the groups' means.
 
 The draws of a point depend on nothing but the point: other points, blocks and workers change no bit
 of the result. A detector processes the draws of one point and segment together, in parts that
