@@ -77,8 +77,8 @@ class ErrorFloor(NamedTuple):
     def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
         """Return the standard errors of radial velocities [m/s] due to the instrument's errors.
 
-        `radial_velocity` and `speed_across` are the instrument's velocity along and across the beam
-        [m/s].
+        `radial_velocity` is the measured radial velocity, and `speed_across` the instrument's speed
+        across the beam [m/s].
 
         >>> ErrorFloor(pointing=1e-3, vibration=0.03).velocity_error(0.0, 40.0).round(12).item()
         0.05
@@ -185,7 +185,8 @@ def _draw_normal_numbers_by_beam(
 ) -> np.ndarray:
     """Draw two standard normal random numbers for each beam and draw, (beams, draws, 2).
 
-    The numbers are the beam's pointing errors on two axes, in standard deviations.
+    They are errors in standard deviations: of a beam's pointing on two axes, or, with the number
+    INSTRUMENT_KEY_NUMBER in place of a beam's, of clock and wavelength.
     """
     keys = np.repeat(
         point_keys(beam_numbers[:, None], domain=ERROR_FLOOR_KEY_DOMAIN, seed=seed),

@@ -162,7 +162,7 @@ class LeakageBins(NamedTuple):
     log_amplitude: np.ndarray
     """(bins,): ln of the leaked signal |X| over the noise sigma of a bin per quadrature."""
     group: np.ndarray
-    """(bins,) int64: index of the echo (group of bins) with whose speckle each bin fades."""
+    """(bins,) int64: index of the echo (group of bins) whose speckle makes the bin fade."""
     exempt_neighbour: np.ndarray
     """(bins,): |X| / sigma of the adjacent bin that belongs to an echo, and so cannot raise a false
     alarm; 0 if no adjacent bin does."""
@@ -308,7 +308,7 @@ def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
 def fading_group_of_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> np.ndarray:
-    """Return the group (echo) with whose speckle each bin of leaked signal fades.
+    """Return the group (echo) whose speckle makes each bin of leaked signal fade.
 
     It is the group whose strongest bin is nearest. Bins of a complex record are periodic.
 
@@ -1449,7 +1449,7 @@ def _draw_raised_bins(
 ):
     """Draw which bins of leaked signal cross the threshold; list their peaks, and return how many.
 
-    Adjacent raised bins make one peak. Peaks adjacent to a bin of the echo that crosses belong to
+    Adjacent raised bins make one peak. Peaks adjacent to a crossing bin of the echo belong to
     the echo. Bins are skipped by exponential random numbers, as the module describes.
 
     Parameters

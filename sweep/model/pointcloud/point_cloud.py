@@ -168,7 +168,7 @@ def simulate_cloud(
                 bin_groups.strongest_bin[:, :, 0],
                 bin_groups.magnitude[:, :, 0],
             )
-        part_results = _draw_independent_statistics(shots, bin_groups) | _cloud_points(
+        part_results = _closed_form_statistics(shots, bin_groups) | _cloud_points(
             part_eyepoints, part_returns, shots.footprint.n_beamlets
         )
         part_results["beamlets_error"] = np.where(part_eyepoints.has_target, rays_error, np.nan)
@@ -259,7 +259,7 @@ def _prepare_batch(
     return _PreparedBatch(shots, ground.beamlets, bin_groups, known_leakage_bins)
 
 
-def _draw_independent_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
+def _closed_form_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
     """Return the statistics (n,) of shots that do not depend on draws, by name.
 
     The names are those of :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`.

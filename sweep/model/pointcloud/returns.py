@@ -145,7 +145,7 @@ DRAWN_INDEPENDENT_BINS_MAX = 32.0
 """Largest equivalent number of independent bins that are drawn for an echo in developed speckle."""
 
 ROUNDING_VARIANCE = 1 / 12
-"""Variance of the error by which a position is rounded to whole bins [bins^2]."""
+"""Variance of the error that rounding a position to whole bins makes [bins^2]."""
 
 CORRELATED_LOOKS_MAX = 32
 """Largest number of looks (records of a segment) for which partly correlated speckle is drawn look
@@ -255,7 +255,8 @@ class Returns(NamedTuple):
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
     """(n, draws, returns) int32: index of the beamlet that gave the peaks of a true or misread
-    return (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); -1 for other returns, and none."""
+    return (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); -1 for others and without a return.
+    """
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group (adjacent bins above the threshold) of the
     up, Doppler and down peak; -1 for no peak or a false peak."""
@@ -444,8 +445,8 @@ class DrawConfig(NamedTuple):
     rises with the range, else -1. It is 0 for a real record, with bins 1..N/2. N is the FFT size.
     """
     two_beat_reading: int
-    """Number of the reading, the way to interpret an up and a down beat as range and velocity, that
-    is used without a Doppler segment."""
+    """Number of the reading (way to interpret an up and a down beat as range and velocity) that is
+    used without a Doppler peak."""
     real_fft_size: int
     """FFT size N if noise in the bins at frequency 0 (DC) and at Nyquist is real, else 0."""
     lobe_half_width: int
@@ -937,7 +938,7 @@ class MeasuredValues(NamedTuple):
 class Measurements(NamedTuple):
     """Range and radial velocity of m returns, by whole bins and by positions between bins."""
 
-    by_bin: MeasuredValues
+    by_whole_bins: MeasuredValues
     """(m,) in each field: values computed from the whole bins of the peaks."""
     interpolated: MeasuredValues
     """(m,) in each field: values computed from positions of the peaks between bins."""
@@ -1035,7 +1036,7 @@ def _measure_listed_returns(
         at_returns(shots.target.radial_velocity)
         + SPEED_OF_LIGHT / 2 * shots.footprint.doppler_ratio_offset[footprint_row, beamlet]
     )
-    by_bin, interpolated = measurements.by_bin, measurements.interpolated
+    by_whole_bins, interpolated = measurements.by_whole_bins, measurements.interpolated
     range_error = interpolated.range - measurements.range_bias - true_range
     is_right = abs(range_error) <= tolerance_half_bins * measurements.range_per_half_bin
     is_right &= (
@@ -1059,21 +1060,21 @@ def _measure_listed_returns(
         )
     per_slip = ShiftsByMotion(np.zeros(()), np.zeros(()))
     if motion is not None:
-        by_bin, interpolated, per_slip = _correct_for_motion(
-            shots, listed_returns, by_bin, interpolated, motion
+        by_whole_bins, interpolated, per_slip = _correct_for_motion(
+            shots, listed_returns, by_whole_bins, interpolated, motion
         )
     return Returns(
-        range=by_bin.range,
+        range=by_whole_bins.range,
         range_interpolated=interpolated.range,
-        radial_velocity=by_bin.radial_velocity,
+        radial_velocity=by_whole_bins.radial_velocity,
         radial_velocity_interpolated=interpolated.radial_velocity,
         # Values by whole bins stay uncorrected; the correction is added to their errors.
         range_standard_error=np.hypot(
-            by_bin.range_standard_error, interpolated.range - uncorrected.range
+            by_whole_bins.range_standard_error, interpolated.range - uncorrected.range
         ),
         range_interpolated_standard_error=interpolated.range_standard_error,
         radial_velocity_standard_error=np.hypot(
-            by_bin.radial_velocity_standard_error,
+            by_whole_bins.radial_velocity_standard_error,
             interpolated.radial_velocity - uncorrected.radial_velocity,
         ),
         radial_velocity_interpolated_standard_error=interpolated.radial_velocity_standard_error,
@@ -1097,7 +1098,7 @@ def _values_of_points(shots: Shots, point: np.ndarray, values: np.ndarray | floa
 def _wander_covariance(
     shots: Shots, inputs: DrawInputs, listed_returns: ListedReturns, from_three_bins: bool
 ) -> np.ndarray | None:
-    """Return the covariance [bins^2] of the errors of each return's three peaks by speckle.
+    """Return the covariance [bins^2], by speckle, of the position errors of a return's three peaks.
 
     It is (m, 3, 3) by segment, with the signs of the beats; None for shots without speckle.
     """
@@ -1197,8 +1198,8 @@ def _correct_late_echoes(
     are limited to half a bin.
     """
     at_returns = partial(_values_of_points, shots, listed_returns.point)
-    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_bin.range)
-    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_bin.radial_velocity)
+    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_whole_bins.range)
+    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_whole_bins.radial_velocity)
     n_missing = waveform.count_samples_before_echo(
         delay=delay, doppler_ratio=beta, record_start=at_returns(shots.record.acquisition_delay),
         sample_rate=at_returns(shots.sample_rate), length=shots.window.length,
@@ -1233,11 +1234,11 @@ class ShiftsByMotion(NamedTuple):
 class MotionCorrection(NamedTuple):
     """Measured values of m returns after the correction for the instrument's known motion."""
 
-    by_bin: MeasuredValues
+    by_whole_bins: MeasuredValues
     """(m,) in each field: values computed from whole bins. Their errors alone are changed."""
     interpolated: MeasuredValues
     """(m,) in each field: values computed from positions between bins."""
-    per_slip: ShiftsByMotion
+    shifts_per_slip: ShiftsByMotion
     """(m,) in each field: shifts by a slip of 1 m/s. The slip is the closing speed minus the speed
     at which the range falls."""
 
@@ -1245,7 +1246,7 @@ class MotionCorrection(NamedTuple):
 def _correct_for_motion(
     shots: Shots,
     listed_returns: ListedReturns,
-    by_bin: MeasuredValues,
+    by_whole_bins: MeasuredValues,
     interpolated: MeasuredValues,
     motion: EgoMotion,
 ) -> MotionCorrection:
@@ -1271,16 +1272,16 @@ def _correct_for_motion(
         np.hypot(by_slip * slip_error, by_acceleration * motion.acceleration_standard_error)
         for by_slip, by_acceleration in zip(per_slip, per_acceleration, strict=True)
     )
-    by_bin, interpolated = (
+    by_whole_bins, interpolated = (
         values._replace(
             range_standard_error=np.hypot(values.range_standard_error, unknown_range),
             radial_velocity_standard_error=np.hypot(
                 values.radial_velocity_standard_error, unknown_velocity
             ),
         )
-        for values in (by_bin, interpolated)
+        for values in (by_whole_bins, interpolated)
     )
-    return MotionCorrection(by_bin, interpolated, per_slip)
+    return MotionCorrection(by_whole_bins, interpolated, per_slip)
 
 
 def _response_to_motion(
@@ -1388,7 +1389,7 @@ def _measure_by_reading(
     range_variance, velocity_variance = (
         np.maximum(variance + v, 0.0) for v in (-covariance, covariance)
     )
-    by_bin, interpolated = (
+    by_whole_bins, interpolated = (
         MeasuredValues(
             *convert_peaks(peak_positions),
             range_standard_error=range_per_half_bin * np.sqrt(range_variance + rounding_variance),
@@ -1405,7 +1406,9 @@ def _measure_by_reading(
     range_bias = carrier / chirp_rate * at_returns(shots.target.acceleration)
     range_bias = 0.5 * (down_start - up_start) * range_bias
     range_bias -= 0.5 * (down_start + up_start) * at_returns(shots.target.approach_speed)
-    return Measurements(by_bin, interpolated, range_per_half_bin, velocity_per_half_bin, range_bias)
+    return Measurements(
+        by_whole_bins, interpolated, range_per_half_bin, velocity_per_half_bin, range_bias
+    )
 
 
 def _measure_by_fit(
@@ -1451,7 +1454,7 @@ def _measure_by_fit(
         np.where(segments, np.sqrt(0.5), np.inf) + 0 * bin_width, np.arange(shots.size)
     )
     return Measurements(
-        by_bin=fit_peak_positions(listed_returns.peaks.bin, ROUNDING_VARIANCE),
+        by_whole_bins=fit_peak_positions(listed_returns.peaks.bin, ROUNDING_VARIANCE),
         interpolated=fit_peak_positions(listed_returns.peaks.position, 0.0),
         range_per_half_bin=half_bin_deviation.range[point],
         velocity_per_half_bin=half_bin_deviation.radial_velocity[point],
@@ -2036,7 +2039,7 @@ def draw_segment_peaks(
         if strongest_bins[g] < 0:
             break
         if config.adds_noise and config.lobe_half_width > 0:
-            is_detected, peak = draw_all_bins(
+            is_detected, peak = detect_by_any_bin(
                 address,
                 point,
                 segment,
@@ -2049,7 +2052,7 @@ def draw_segment_peaks(
                 workspace,
             )
         elif config.adds_noise:
-            is_detected, peak = draw_peak_bin(
+            is_detected, peak = detect_by_peak_bin(
                 address,
                 point,
                 segment,
@@ -2216,7 +2219,7 @@ def list_noisy_leaked_peaks(
         Bins of leaked signal of all points, with |X| / sigma. sigma is the noise of a bin per
         quadrature.
     leakage_bins : LeakageBins
-        Bins of leaked signal; ``group`` is the echo with whose speckle each bin fades.
+        Bins of leaked signal; ``group`` is the echo whose speckle makes each bin fade.
     speckle_factors : ndarray (groups,)
         Factors by speckle on the magnitudes of the point's echoes in this segment.
     threshold_ratio : float
@@ -2268,7 +2271,7 @@ def list_noisy_leaked_peaks(
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def draw_peak_bin(
+def detect_by_peak_bin(
     address, point, segment, group, config, inputs, spectra, speckle, interpolation, workspace
 ):
     """Add noise to an echo's strongest bin, and detect the echo if the sum reaches the threshold.
@@ -2751,7 +2754,7 @@ def draw_three_bin_noise(address, stream, first_index, interpolation, noise):
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def draw_all_bins(
+def detect_by_any_bin(
     address, point, segment, group, config, inputs, spectra, speckle, interpolation, workspace
 ):
     """Add noise to all bins of an echo, and detect the echo if any reaches the threshold.

@@ -1014,7 +1014,7 @@ def _mark_random_events(
 
 @njit(cache=True, error_model="numpy")
 def _first_and_last_echo_index(point, segment, spectra):
-    """Return the indices of an echo's first and last bin in its span; -1 for the last if none."""
+    """Return an echo's first and last bin, as indices in its span; the last is -1 for no echo."""
     bins_start, n_bins = spectra.bins_start[point, segment], spectra.n_bins[point, segment]
     first_index, last_index = 0, n_bins - 1
     while first_index < n_bins and not spectra.is_echo[bins_start + first_index]:

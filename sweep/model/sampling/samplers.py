@@ -253,8 +253,8 @@ def never_stop() -> bool:
 def stopping_checks(batch_size: int, draws_max: int, group_size: int = 1) -> Iterator[int]:
     """Yield, in rising order, the numbers of draws after which sampling may stop.
 
-    After as many draws, half-widths of the confidence intervals of detection probabilities are
-    compared with the tolerance.
+    After each of these numbers of draws, the half-widths of the confidence intervals of detection
+    probabilities are compared with the tolerance.
 
     Parameters
     ----------
