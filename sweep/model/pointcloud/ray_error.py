@@ -47,12 +47,12 @@ from sweep.model.window import window_samples
 _CHIRP_SIGNS = 1.0, 0.0, -1.0
 """Signs of the chirp rates (frequency slopes) of the up, Doppler and down segment."""
 
-_LOBE_REACH_BINS = 4
-"""Distance from a line [bins of fs/L] at which the table of its power ends. fs is the sampling rate
-and L the number of samples of the record."""
-_LOBE_STEPS_PER_BIN = 1024
-"""Number of entries per bin of fs/L in the table of a line's power by distance. fs is the sampling
-rate and L the number of samples of the record."""
+_LOBE_REACH_CELLS = 4
+"""Distance from a line [resolution cells] at which the table of its power ends. A cell is the
+sample rate over the number of samples in the record."""
+_LOBE_STEPS_PER_CELL = 1024
+"""Number of entries per resolution cell in the table of a line's power by distance. A cell is the
+sample rate over the number of samples in the record."""
 _LINE_TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the window from which the table of a line's power by distance is computed.
 """
@@ -251,8 +251,8 @@ class BinPowers(NamedTuple):
     """(m, b): power that each beamlet's line has in the bin, up to a factor that is common to the
     beamlets of a shot."""
     echo_width: np.ndarray
-    """(m,): width of a uniform echo with the spread of the lines, plus 1 [bins of fs/L]. fs is the
-    sampling rate and L the number of samples of the record."""
+    """(m,): width of a uniform echo with the spread of the lines, plus 1 [resolution cells]. A cell
+    is the sample rate over the number of samples in the record."""
 
 
 def _bin_powers(
@@ -331,7 +331,7 @@ def _bin_powers(
     echo_width = 1.0 + np.sqrt(12.0 * variance) * (shots.window.length / fft_size)
     bin_position = np.abs(bin_position)
     lobe = _main_lobe_table(shots.window.name)
-    bin_position *= shots.window.length / fft_size * _LOBE_STEPS_PER_BIN
+    bin_position *= shots.window.length / fft_size * _LOBE_STEPS_PER_CELL
     table_index = np.minimum(bin_position, lobe.size - 2.0).astype(np.int64)
     table_fraction = np.minimum(bin_position - table_index, 1.0)
     power = echo * (
@@ -448,13 +448,13 @@ def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> 
 def _main_lobe_table(window_name: str) -> np.ndarray:
     """Return the power |W(y) / W(0)|^2 of a line at distances y = 0, 1, 2 .. steps from its centre.
 
-    W is the transform of the window. A bin of fs/L has ``_LOBE_STEPS_PER_BIN`` steps, for windows
-    of any length L and any sampling rate fs.
+    W is the transform of the window. A resolution cell has ``_LOBE_STEPS_PER_CELL`` steps, for
+    windows of any length and any sample rate.
     """
     w = window_samples(window_name, _LINE_TABLE_WINDOW_SAMPLES)
     transform = np.abs(
-        np.fft.rfft(w, _LINE_TABLE_WINDOW_SAMPLES * _LOBE_STEPS_PER_BIN)[
-            : _LOBE_REACH_BINS * _LOBE_STEPS_PER_BIN + 1
+        np.fft.rfft(w, _LINE_TABLE_WINDOW_SAMPLES * _LOBE_STEPS_PER_CELL)[
+            : _LOBE_REACH_CELLS * _LOBE_STEPS_PER_CELL + 1
         ]
     )
     transform[-1] = 0.0  # zero beyond the table

@@ -84,7 +84,7 @@ from sweep.model.sampling.philox import (
 )
 from sweep.model.sampling.speckle_lines import (
     LOOK_DRAW_STRIDE,
-    RECORD_LINE_DEVIATION_MAX_BINS,
+    RECORD_LINE_DEVIATION_MAX_CELLS,
     FootprintRecord,
     SpeckleLineGrid,
     SpecklePeaks,
@@ -161,7 +161,7 @@ class SegmentSignal(NamedTuple):
     """One :class:`FootprintRecord` for each echo, from which the echo's speckle is drawn; None
     until :func:`add_footprint_records` sets the field. An empty tuple means that the speckle of
     this segment is drawn in another way: its lines spread over more than
-    RECORD_LINE_DEVIATION_MAX_BINS, or an echo has no samples in the segment."""
+    RECORD_LINE_DEVIATION_MAX_CELLS, or an echo has no samples in the segment."""
     record_scalings: tuple[np.ndarray, ...] = ()
     """(bins,) complex for each echo: factors from the transform of a drawn record to the speckle by
     which the bins of ``spectrum`` are multiplied."""
@@ -679,7 +679,7 @@ def add_footprint_records(
         * shots.window.length
         / shots.fft_size
     )
-    if line_deviation > RECORD_LINE_DEVIATION_MAX_BINS:
+    if line_deviation > RECORD_LINE_DEVIATION_MAX_CELLS:
         return signal._replace(footprint_records=())
     first_sample = (
         0

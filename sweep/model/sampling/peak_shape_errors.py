@@ -23,14 +23,14 @@ from sweep.model.window import Window, window_samples
 if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
-_SPREADS_UNPADDED_BINS = np.array(
+_TABULATED_SPREADS_CELLS = np.array(
     [0.01, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0]
 )
-"""Tabulated spreads (standard deviations) of a footprint's lines, in bins of a record without
-padding: units of fs/L, the sample rate over the number of samples in the record."""
+"""Tabulated spreads (standard deviations) of a footprint's lines, in resolution cells. A cell is
+fs/L, the sample rate over the number of samples in the record."""
 _IMAGINARY_SHIFT_VARIANCES = np.concatenate([[1e-4], np.geomspace(3e-3, 30.0, 13)])
-"""Tabulated variances of Im s [(fs/L)^2], with the complex shift s by which speckle deforms a peak
-(:class:`PeakShapeErrors`), the sample rate fs and the number L of samples in the record."""
+"""Tabulated variances of Im s [squared resolution cells], with the complex shift s by which speckle
+deforms a peak (:class:`PeakShapeErrors`)."""
 _SHAPE_OFFSETS_BINS = np.linspace(0.0, 1.0, 33)
 """Tabulated offsets of a peak from the bin about which it is estimated [bins]."""
 _SHAPE_SAMPLES_MAX = 2048
@@ -96,20 +96,20 @@ class PeakShapeErrors(NamedTuple):
         squared_cell = (shots.fft_size / shots.window.length) ** 2
         spread = np.clip(
             np.sqrt(squared_shift / squared_cell),
-            _SPREADS_UNPADDED_BINS[0],
-            _SPREADS_UNPADDED_BINS[-1],
+            _TABULATED_SPREADS_CELLS[0],
+            _TABULATED_SPREADS_CELLS[-1],
         )
-        limited_square = np.minimum(squared_shift / squared_cell, _SPREADS_UNPADDED_BINS[-1] ** 2)
+        limited_square = np.minimum(squared_shift / squared_cell, _TABULATED_SPREADS_CELLS[-1] ** 2)
         limited_variance = np.minimum(variance / squared_cell, _IMAGINARY_SHIFT_VARIANCES[-1])
         log_variance = np.log(np.maximum(limited_variance, _IMAGINARY_SHIFT_VARIANCES[0]))
         sign, distance = np.sign(offset), np.abs(offset)
         (spread_error,) = interpolate_tables(
-            (_SPREADS_UNPADDED_BINS, _SHAPE_OFFSETS_BINS),
+            (_TABULATED_SPREADS_CELLS, _SHAPE_OFFSETS_BINS),
             (tables.spread_error,),
             (spread, distance),
         )
         imaginary_shift_error, imaginary_shift_deviation = interpolate_tables(
-            (_SPREADS_UNPADDED_BINS, np.log(_IMAGINARY_SHIFT_VARIANCES), _SHAPE_OFFSETS_BINS),
+            (_TABULATED_SPREADS_CELLS, np.log(_IMAGINARY_SHIFT_VARIANCES), _SHAPE_OFFSETS_BINS),
             (tables.imaginary_shift_error, tables.imaginary_shift_deviation),
             (spread, log_variance, distance),
         )
@@ -121,14 +121,14 @@ class PeakShapeErrors(NamedTuple):
 
 
 class PeakShapeErrorTables(NamedTuple):
-    """Tables of :class:`PeakShapeErrors` by spread [fs/L], log variance, and offset [bins].
+    """Tables of :class:`PeakShapeErrors` by spread, log variance, and offset [bins].
 
-    fs/L is the sample rate over the number of samples in the record. The variance is that of the
-    imaginary part of the complex shift [(fs/L)^2].
+    The spread is in resolution cells: sample rate over number of samples in the record. The
+    variance is that of the imaginary part of the complex shift [squared cells].
     """
 
     spread_error: np.ndarray
-    """Error by the broadening of the line [bins], over b^2 [(fs/L)^2]; by spread and offset."""
+    """Error by the broadening of the line [bins], over b^2 [cells^2], by spread and offset."""
     imaginary_shift_error: np.ndarray
     """Mean error by the imaginary shift [bins], over its variance; by spread, log variance and
     offset."""
@@ -146,12 +146,12 @@ def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTab
     sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding
     phase = sample_phase * (np.array([[-1.0], [0.0], [1.0]]) - _SHAPE_OFFSETS_BINS)[..., None]
     cosine, sine = np.cos(phase), np.sin(phase)
-    spread_error = np.empty((len(_SPREADS_UNPADDED_BINS), _SHAPE_OFFSETS_BINS.size))
-    mean, deviation = np.empty((2, len(_SPREADS_UNPADDED_BINS), *_imaginary_shift_table_shape()))
+    spread_error = np.empty((len(_TABULATED_SPREADS_CELLS), _SHAPE_OFFSETS_BINS.size))
+    mean, deviation = np.empty((2, len(_TABULATED_SPREADS_CELLS), *_imaginary_shift_table_shape()))
     unbroadened = _offsets_of_magnitudes(np.abs(cosine @ window_values), interpolation)
     imaginary_shift = padding * np.sqrt(_IMAGINARY_SHIFT_VARIANCES)[:, None] * _SHAPE_NODES
     node_weights = _SHAPE_WEIGHTS / _SHAPE_WEIGHTS.sum()
-    for i, spread in enumerate(_SPREADS_UNPADDED_BINS):
+    for i, spread in enumerate(_TABULATED_SPREADS_CELLS):
         taper = window_values * np.exp(-0.5 * (spread * padding * sample_phase) ** 2)
         line, slope = cosine @ taper, -(sine @ (taper * sample_phase))
         offset = _offsets_of_magnitudes(np.abs(line), interpolation)
@@ -191,15 +191,15 @@ def _offsets_of_magnitudes(magnitudes: np.ndarray, interpolation: Interpolator) 
     return offset
 
 
-_TWO_BIN_SPREADS_UNPADDED_BINS = np.array([0.005, 0.03, 0.1, 0.2, 0.35, 0.6, 1.0, 2.0])
+_TWO_BIN_SPREADS_CELLS = np.array([0.005, 0.03, 0.1, 0.2, 0.35, 0.6, 1.0, 2.0])
 _TWO_BIN_SHIFT_RATIOS = np.geomspace(0.05, 200.0, 8)
 _TWO_BIN_NOISE_RATIOS = np.concatenate([[1e-4], np.geomspace(2e-3, 0.3, 6)])
 _TWO_BIN_OFFSETS_BINS = np.array(
     [0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0]
 )
-"""Coordinates of the tables of :func:`_two_bin_error_tables`: spread of the lines [fs/L, bins of a
-record without padding], echo fraction over relative power, noise per quadrature over the peak's
-|X|, and estimated offset [bins]."""
+"""Coordinates of the tables of :func:`_two_bin_error_tables`: spread of the lines [resolution
+cells], echo fraction over relative power, noise per quadrature over the peak's |X|, and estimated
+offset [bins]."""
 _TWO_BIN_DRAWS_PER_ENTRY = 4096
 """Number of drawn peaks from which each entry of these tables is averaged."""
 _TWO_BIN_LINES, _TWO_BIN_LINE_POWERS = np.polynomial.hermite_e.hermegauss(24)
@@ -277,7 +277,7 @@ class TwoBinErrors(NamedTuple):
         log_coordinates = (
             np.log(np.clip(values, grid[0], grid[-1]))
             for values, grid in (
-                (spread_cells, _TWO_BIN_SPREADS_UNPADDED_BINS),
+                (spread_cells, _TWO_BIN_SPREADS_CELLS),
                 (shift_ratio, _TWO_BIN_SHIFT_RATIOS),
                 (noise_ratio, _TWO_BIN_NOISE_RATIOS),
             )
@@ -327,7 +327,7 @@ def _two_bin_error_tables(
     rng = np.random.default_rng(0)
     shape = tuple(grid.size for grid in _two_bin_error_grids())
     mean, log_variance, gain = np.empty((3, *shape))
-    for i, spread in enumerate(_TWO_BIN_SPREADS_UNPADDED_BINS * padding):
+    for i, spread in enumerate(_TWO_BIN_SPREADS_CELLS * padding):
         tone_position_max = 0.5 if keeps_strongest_bin else 1.5 + spread
         footprints = _DrawnFootprints.from_random(
             rng, window, padding, spread, tone_position_max, bins
@@ -479,7 +479,7 @@ class _DrawnFootprints(NamedTuple):
 def _two_bin_error_grids() -> tuple[np.ndarray, ...]:
     """Return the coordinates of :func:`_two_bin_error_tables`, in the order of their axes."""
     return (
-        np.log(_TWO_BIN_SPREADS_UNPADDED_BINS),
+        np.log(_TWO_BIN_SPREADS_CELLS),
         np.log(_TWO_BIN_SHIFT_RATIOS),
         np.log(_TWO_BIN_NOISE_RATIOS),
         _TWO_BIN_OFFSETS_BINS,

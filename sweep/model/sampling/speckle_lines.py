@@ -658,10 +658,10 @@ def draw_segment_bin_amplitudes(
     return drawn_amplitudes
 
 
-RECORD_LINE_DEVIATION_MAX_BINS = 1.0
+RECORD_LINE_DEVIATION_MAX_CELLS = 1.0
 """Largest standard deviation of the positions of a footprint's lines for which draws use a
-:class:`FootprintRecord` [bins of fs/L]. fs is the sampling rate and L the number of samples of the
-record."""
+:class:`FootprintRecord` [resolution cells]. A cell is the sample rate over the number of samples in
+the record."""
 
 
 class FootprintRecord(NamedTuple):
