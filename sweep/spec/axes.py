@@ -22,10 +22,10 @@ from sweep.spec.rules import (
     Finding,
     Findings,
     FrequencyErrorTableRule,
-    Location,
     NumericRule,
     Rule,
-    findings_error,
+    SpecLocation,
+    single_finding_error,
     suggest_similar_name,
 )
 from sweep.spec.sections import (
@@ -38,23 +38,22 @@ from sweep.spec.sections import (
 )
 from sweep.units import ExactQuantity, QuantityError, Unit
 
-RESERVED_DIMENSIONS = (DRAW_BATCH_DIM, "draw", "point", "spec", "study_id")
+RESERVED_DIMENSION_NAMES = (DRAW_BATCH_DIM, "draw", "point", "spec", "study_id")
 """Names of dimensions that a store may have in addition to the axes.
 
 No axis may have such a name.
 """
 
-_STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
-"""Pattern of coordinate names that no axis may have.
+STUDY_MARKER_NAME_PATTERN = re.compile("study_[0-9a-f]{16}")
+"""Pattern of the name of a coordinate that marks the study from which a dataset's points come.
 
-A coordinate with such a name marks the study from which a dataset's points come.
+No zipped axis may have a name of this pattern.
 """
 
 _AXIS_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 """Pattern of the name of a zipped axis."""
 _VALUES_LISTED_IN_IDENTITY_MAX = 64
-"""Maximum number of values that the identity of an axis lists; longer axes are given by a
-digest."""
+"""Maximum number of values that the identity of an axis lists; a longer axis has a digest."""
 _AXIS_NAME_REMEDY = "take a word such as 'cut'"
 
 
@@ -80,7 +79,7 @@ class Axis:
     """One dimension of a study's grid, along which one parameter or several vary."""
 
     name: str
-    """Name of the dimension in the store; the paths of parameters are in ``parameters``."""
+    """Name of the dimension in the store."""
     parameters: tuple[AxisParameter, ...]
     """Parameters along the axis: one, or several that vary together."""
 
@@ -96,10 +95,11 @@ class Axis:
 
 
 def axis_identity(axis: Axis) -> dict[str, Any]:
-    """Return the content of an axis that counts for the study's identity (equality of two studies).
+    """Return the part of a study's identity that describes an axis.
 
-    An axis of at most 64 values is listed value by value. A longer axis is given by the number of
-    its values, the first and last value, and a digest of all values.
+    Two studies are the same if their identities are equal. An axis of at most 64 values is listed
+    value by value. A longer axis is given by the number of its values, the first and last value,
+    and a digest of all values.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
     return {"number": n_values, "first": first, "last": last, "digest": digest}
 
 
-def parameter_location(path: str, axes: tuple[Axis, ...]) -> Location:
+def parameter_location(path: str, axes: tuple[Axis, ...]) -> SpecLocation:
     """Return the location of a parameter's values in a spec: its axis, if any, else its field."""
     for axis in axes:
         if any(parameter.path == path for parameter in axis.parameters):
@@ -167,10 +167,10 @@ def read_axes(raw_axes: object) -> tuple[tuple[Axis, ...], list[Finding]]:
     axes: list[Axis] = []
     findings = Findings()
     for key, value in raw_axes.items():
-        with findings.collect():
+        with findings.collect_errors():
             axes.append(_read_axis(str(key), value, ("axes", str(key))))
     findings += _duplicate_path_findings(raw_axes)
-    return (tuple(_name_coordinates(axes)), findings + _name_clash_findings(axes))
+    return (tuple(_assign_coordinate_names(axes)), findings + _name_clash_findings(axes))
 
 
 def first_values_on_axes(raw_axes: object) -> dict[str, object]:
@@ -180,7 +180,7 @@ def first_values_on_axes(raw_axes: object) -> dict[str, object]:
     """
     first_values: dict[str, object] = {}
     for key, value in raw_axes.items() if isinstance(raw_axes, dict) else ():
-        for path, values in _paths_and_values(str(key), value):
+        for path, values in _paths_with_raw_values(str(key), value):
             first_values.setdefault(path, _first_raw_value(values))
     return {path: value for path, value in first_values.items() if path in parameter_rules()}
 
@@ -218,10 +218,10 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
+def _paths_with_raw_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
     """Return the dotted path and the written values of each parameter of an axis.
 
-    A zipped axis is written in pieces, one after the other. Its result has one pair for each
+    A zipped axis is written in pieces, one after the other. The result then has one pair for each
     parameter of each piece.
     """
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
@@ -238,43 +238,43 @@ def _first_raw_value(values: object) -> object:
     return None if isinstance(values, dict | list) else values
 
 
-def _read_axis(key: str, raw_axis: object, location: Location) -> Axis:
+def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
     """Read one axis, plain or zipped; raise `FindingsError` if it can't be read."""
     if isinstance(raw_axis, dict) and "zip" in raw_axis:
         return _read_zipped_axis(key, raw_axis, location)
     if key in MODEL_BY_SECTION and isinstance(raw_axis, dict):
         path, values_hint = _describe_first_field(key, raw_axis)
         problem = "is a section, and an axis is named by the whole path of a field"
-        raise findings_error(location, problem, f"write '{path}: {values_hint}'")
+        raise single_finding_error(location, problem, f"write '{path}: {values_hint}'")
     parameter = _make_axis_parameter(
-        key, read_axis_pieces(raw_axis, _axis_rule(key, location), location), location
+        key, read_axis_pieces(raw_axis, _axis_parameter_rule(key, location), location), location
     )
-    _check_duplicates(parameter, location)
+    _check_values_distinct(parameter, location)
     return Axis(parameter.coordinate, (parameter,))
 
 
 def _describe_first_field(path: str, raw_section: object) -> tuple[str, str]:
-    """Return the dotted path of the first field in nested sections, and how to write its values.
+    """Return the dotted path of the first field in a section, and how to write its values.
 
-    Both are for the remedy when a user writes a section under ``axes`` in place of a field's path.
+    They are for the remedy if a user writes a whole section under ``axes``, not a field's path.
     """
     while (
         isinstance(raw_section, dict)
         and raw_section
-        and not set(raw_section) & set(_GENERATOR_FORMS)
+        and not set(raw_section) & set(_GENERATOR_EXAMPLES)
     ):
         name = next(iter(raw_section))
         path, raw_section = f"{path}.{name}", raw_section[name]
     return path, "[...]" if isinstance(raw_section, list) else "{linear: [...], number: ...}"
 
 
-def _axis_rule(path: str, location: Location) -> Rule:
+def _axis_parameter_rule(path: str, location: SpecLocation) -> Rule:
     """Return the rule of the parameter at a path; raise `FindingsError` if no axis may set it."""
     rule = parameter_rules().get(path)
     if rule is None:
-        raise findings_error(location, *_axis_path_problem_and_remedy(path))
+        raise single_finding_error(location, *_axis_path_problem_and_remedy(path))
     if isinstance(rule, FrequencyErrorTableRule):
-        raise findings_error(
+        raise single_finding_error(
             location, "is one table for a whole study", "put it into the instrument"
         )
     return rule
@@ -304,27 +304,29 @@ def _axis_path_problem_and_remedy(path: str) -> tuple[str, str]:
     return "is no parameter", suggest_parameter(path)
 
 
-def _make_axis_parameter(path: str, pieces: list[AxisPiece], location: Location) -> AxisParameter:
-    """Join pieces of values, the parts of an axis, into one parameter along the axis."""
+def _make_axis_parameter(
+    path: str, entries: list[AxisEntry], location: SpecLocation
+) -> AxisParameter:
+    """Concatenate the entries of an axis into the values of one parameter along the axis."""
     name = parameter_short_name(path)
-    n_values = _number_of_values(pieces)
+    n_values = _number_of_values(entries)
     if n_values > AXIS_VALUES_MAX:
-        raise findings_error(
+        raise single_finding_error(
             location, f"has {n_values} values, and an axis takes at most {AXIS_VALUES_MAX}"
         )
-    # Use a linear unit if any piece has one: a value of zero can't be shown in decibels.
-    unit = next((piece.unit for piece in pieces if not piece.unit.is_logarithmic), pieces[0].unit)
-    values = np.concatenate([piece.si_values for piece in pieces])
+    # Use a linear unit if any entry has one: a value of zero can't be shown in decibels.
+    unit = next((entry.unit for entry in entries if not entry.unit.is_logarithmic), entries[0].unit)
+    values = np.concatenate([entry.si_values for entry in entries])
     if values.dtype.kind == "U":
         return AxisParameter(path, name, tuple(values.tolist()), values, "")
-    display_values = np.concatenate([piece.to_unit(unit) for piece in pieces])
+    display_values = np.concatenate([entry.values_in_unit(unit) for entry in entries])
     if values.dtype == np.int64 and unit.symbol == "":
         display_values = values.copy()
     values.flags.writeable = display_values.flags.writeable = False
     return AxisParameter(path, name, values, display_values, unit.symbol)
 
 
-def _check_duplicates(parameter: AxisParameter, location: Location) -> None:
+def _check_values_distinct(parameter: AxisParameter, location: SpecLocation) -> None:
     """Raise `FindingsError` if a value occurs more than once along an axis."""
     values = np.asarray(parameter.values)
     if values.dtype.kind != "U" and (
@@ -337,13 +339,13 @@ def _check_duplicates(parameter: AxisParameter, location: Location) -> None:
             np.argmax(values == unique[np.argmax(counts > 1)])
         ]
         value_text = f"{repeated_value} {parameter.units}".strip()
-        raise findings_error(location, f"holds {value_text} more than once", "list it once")
+        raise single_finding_error(location, f"holds {value_text} more than once", "list it once")
 
 
 # Zipped axes: several parameters that vary together, written in pieces that are concatenated
 
 
-def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
+def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: SpecLocation) -> Axis:
     """Read a zipped axis, along which several parameters vary together.
 
     It is written in pieces, one after the other. Every piece must set the same parameters.
@@ -355,11 +357,11 @@ def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: Location) ->
     )
     if (
         _AXIS_NAME_PATTERN.fullmatch(key) is None
-        or key in RESERVED_DIMENSIONS
-        or _STUDY_MARKER_PATTERN.fullmatch(key)
+        or key in RESERVED_DIMENSION_NAMES
+        or STUDY_MARKER_NAME_PATTERN.fullmatch(key)
     ):
         findings.append(Finding(location, "is no name for an axis", _AXIS_NAME_REMEDY))
-    raw_pieces: dict[Location, object] = {(*location, "zip"): raw_axis["zip"]}
+    raw_pieces: dict[SpecLocation, object] = {(*location, "zip"): raw_axis["zip"]}
     if raw_axis["zip"] in ([], {}, None):
         findings.append(Finding((*location, "zip"), "holds no piece", "list at least one"))
         raw_pieces = {}
@@ -367,46 +369,46 @@ def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: Location) ->
         raw_pieces = {
             (*location, "zip", i): raw_piece for i, raw_piece in enumerate(raw_axis["zip"])
         }
-    piece_values: list[dict[str, list[AxisPiece]]] = []
+    pieces: list[dict[str, list[AxisEntry]]] = []
     for piece_location, raw_piece in raw_pieces.items():
-        with findings.collect():
-            piece_values.append(_read_zipped_piece(raw_piece, piece_location))
-            if differing_paths := ", ".join(sorted(set(piece_values[0]) ^ set(piece_values[-1]))):
+        with findings.collect_errors():
+            pieces.append(_read_zipped_piece(raw_piece, piece_location))
+            if differing_paths := ", ".join(sorted(set(pieces[0]) ^ set(pieces[-1]))):
                 problem = "must set the same parameters as the first piece"
-                raise findings_error(piece_location, problem, f"mind {differing_paths}")
+                raise single_finding_error(piece_location, problem, f"mind {differing_paths}")
     findings.raise_if_any()
-    joined_values = {
-        path: [values for raw_piece in piece_values for values in raw_piece[path]]
-        for path in piece_values[0]
+    joined_entries = {
+        path: [entry for piece in pieces for entry in piece[path]] for path in pieces[0]
     }
     return Axis(
         key,
         tuple(
-            _make_axis_parameter(path, values, location) for path, values in joined_values.items()
+            _make_axis_parameter(path, entries, location)
+            for path, entries in joined_entries.items()
         ),
     )
 
 
-def _read_zipped_piece(raw_piece: object, location: Location) -> dict[str, list[AxisPiece]]:
-    """Return the values of one piece of a zipped axis by path, all of equal length.
+def _read_zipped_piece(raw_piece: object, location: SpecLocation) -> dict[str, list[AxisEntry]]:
+    """Return the entries of one piece of a zipped axis by path, with equally many values each.
 
     A single value is repeated to the length of the piece's lists.
     """
     if not isinstance(raw_piece, dict) or not raw_piece:
-        raise findings_error(location, "must be a mapping of paths to values", "", raw_piece)
+        raise single_finding_error(location, "must be a mapping of paths to values", "", raw_piece)
     findings = Findings()
-    values_by_path: dict[str, list[AxisPiece]] = {}
+    entries_by_path: dict[str, list[AxisEntry]] = {}
     for path, raw_value in raw_piece.items():
         value_location = (*location, str(path))
-        with findings.collect():
-            rule = _axis_rule(str(path), value_location)
+        with findings.collect_errors():
+            rule = _axis_parameter_rule(str(path), value_location)
             if isinstance(raw_value, dict | list):
-                values_by_path[path] = read_axis_pieces(raw_value, rule, value_location)
+                entries_by_path[path] = read_axis_pieces(raw_value, rule, value_location)
             else:
-                values_by_path[path] = [read_single_value(raw_value, rule, value_location)]
+                entries_by_path[path] = [read_single_value(raw_value, rule, value_location)]
     lengths = {
-        path: _number_of_values(values_by_path[path])
-        for path in values_by_path
+        path: _number_of_values(entries_by_path[path])
+        for path in entries_by_path
         if isinstance(raw_piece[path], dict | list)
     }
     if len(set(lengths.values())) > 1:
@@ -415,20 +417,20 @@ def _read_zipped_piece(raw_piece: object, location: Location) -> dict[str, list[
     findings.raise_if_any()
     length = max(lengths.values(), default=1)
     return {
-        path: values if path in lengths else [values[0].repeat(length)]
-        for path, values in values_by_path.items()
+        path: entries if path in lengths else [entries[0].repeat(length)]
+        for path, entries in entries_by_path.items()
     }
 
 
-def _number_of_values(pieces: list[AxisPiece]) -> int:
-    """Return the total number of values in a list of pieces, the parts of an axis."""
-    return sum(len(piece.si_values) for piece in pieces)
+def _number_of_values(entries: list[AxisEntry]) -> int:
+    """Return the total number of values in the entries of an axis."""
+    return sum(len(entry.si_values) for entry in entries)
 
 
 # Names of coordinates
 
 
-def _name_coordinates(axes: list[Axis]) -> list[Axis]:
+def _assign_coordinate_names(axes: list[Axis]) -> list[Axis]:
     """Return the axes with a name for each coordinate: the shortest unambiguous end of its path."""
     paths = [parameter.path for axis in axes for parameter in axis.parameters]
     named_axes = []
@@ -463,7 +465,7 @@ def _duplicate_path_findings(raw_axes: dict[Any, Any]) -> list[Finding]:
     """Return a finding for each parameter that two axes set."""
     keys_by_path: dict[str, list[str]] = {}
     for key, value in raw_axes.items():
-        for path in sorted({path for path, _ in _paths_and_values(str(key), value)}):
+        for path in sorted({path for path, _ in _paths_with_raw_values(str(key), value)}):
             keys_by_path.setdefault(path, []).append(str(key))
     return [
         Finding(("axes", keys[1]), f"sets {path}, which the axis '{keys[0]}' sets too")
@@ -503,14 +505,19 @@ def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
 
 AXIS_VALUES_MAX = 20_000_000
 """Maximum number of values along an axis."""
-_GENERATOR_FORMS = {
+_GENERATOR_EXAMPLES = {
     "linear": "{linear: [first, last], number: 10}",
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
-"""Generators of values along an axis, by keyword, with an example of how each is written."""
-_NUMPY_ALIASES = {"linspace": "linear", "geomspace": "log", "logspace": "log", "arange": "step"}
-"""Keyword of the generator that does what a function of NumPy does, by the function's name."""
+"""Example of each generator of values along an axis, by the generator's keyword."""
+_GENERATOR_BY_NUMPY_FUNCTION = {
+    "linspace": "linear",
+    "geomspace": "log",
+    "logspace": "log",
+    "arange": "step",
+}
+"""Keyword of the generator that corresponds to a NumPy function, by the function's name."""
 _NUMBER_OF_VALUES_RULE = NumericRule(
     description="", example="10", at_least="2", at_most=str(AXIS_VALUES_MAX), is_integer=True
 )
@@ -521,24 +528,24 @@ _NUMBER_OF_VALUES_RULE = NumericRule(
 
 @dataclass(frozen=True)
 class Progression:
-    """Arithmetic progression ``start + increment * i``, i = 0 to number - 1, in exact numbers."""
+    """Arithmetic progression ``start + increment * i``, i = 0 to n_values - 1, in exact numbers."""
 
     start: Fraction
     """First value."""
     increment: Fraction = Fraction(0)
     """Difference between a value and the one before it."""
-    number: int = 1
+    n_values: int = 1
     """Number of values."""
 
     def apply_affine_transform(self, factor: Fraction, offset: Fraction) -> Progression:
         """Return the progression whose values are ``factor * value + offset``."""
-        return Progression(self.start * factor + offset, self.increment * factor, self.number)
+        return Progression(self.start * factor + offset, self.increment * factor, self.n_values)
 
     def values(self) -> np.ndarray:
-        """Return the values (number,) as floats, each rounded once from its exact value."""
+        """Return the values (n_values,) as floats, each rounded once from its exact value."""
         denominator = math.lcm(self.start.denominator, self.increment.denominator)
         first, step = int(self.start * denominator), int(self.increment * denominator)
-        return np.array([(first + step * i) / denominator for i in range(self.number)])
+        return np.array([(first + step * i) / denominator for i in range(self.n_values)])
 
 
 def _round_to_15_digits(values: np.ndarray) -> np.ndarray:
@@ -598,19 +605,19 @@ def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
         The value in `unit_name`.
     """
     quantity = rule.read_exact_number(raw_value)
-    single_value = AxisPiece(
+    single_value = AxisEntry(
         np.array([quantity.to_si()]), quantity.unit, Progression(quantity.number)
     )
     target_unit = rule.read_exact_number(f"1 {unit_name}" if unit_name else 1).unit
-    return float(single_value.to_unit(target_unit)[0])
+    return float(single_value.values_in_unit(target_unit)[0])
 
 
 # Written values
 
 
 @dataclass(frozen=True)
-class AxisPiece:
-    """One part of the values along an axis: a single value, or the values of a generator."""
+class AxisEntry:
+    """Entry in the list of values along an axis: a single value, or the values of a generator."""
 
     si_values: np.ndarray
     """Values (n,) in SI units; words for parameters that take words."""
@@ -619,7 +626,7 @@ class AxisPiece:
     progression: Progression | None = None
     """Exact values in `unit`, if they are an arithmetic progression; else None."""
 
-    def to_unit(self, unit: Unit) -> np.ndarray:
+    def values_in_unit(self, unit: Unit) -> np.ndarray:
         """Return the values (n,) in a unit."""
         if self.progression is not None and unit == self.unit:
             return self.progression.values()
@@ -630,13 +637,15 @@ class AxisPiece:
             self.unit.factor / unit.factor, offset
         ).values()
 
-    def repeat(self, number: int) -> AxisPiece:
-        """Return a single value repeated `number` times."""
-        progression = self.progression and replace(self.progression, number=number)
-        return replace(self, si_values=np.repeat(self.si_values, number), progression=progression)
+    def repeat(self, n_repeats: int) -> AxisEntry:
+        """Return a single value repeated `n_repeats` times."""
+        progression = self.progression and replace(self.progression, n_values=n_repeats)
+        return replace(
+            self, si_values=np.repeat(self.si_values, n_repeats), progression=progression
+        )
 
 
-def read_axis_pieces(raw_value: object, rule: Rule, location: Location) -> list[AxisPiece]:
+def read_axis_pieces(raw_value: object, rule: Rule, location: SpecLocation) -> list[AxisEntry]:
     """Read the values of one parameter along an axis.
 
     Parameters
@@ -645,12 +654,12 @@ def read_axis_pieces(raw_value: object, rule: Rule, location: Location) -> list[
         A list of values and generators, or one generator, as parsed from YAML.
     rule : Rule
         Rule of the field.
-    location : Location
+    location : SpecLocation
         Location of the values in the spec, for findings.
 
     Returns
     -------
-    list of AxisPiece
+    list of AxisEntry
         One entry for each element of the list.
 
     Raises
@@ -659,24 +668,24 @@ def read_axis_pieces(raw_value: object, rule: Rule, location: Location) -> list[
         The error holds every mistake in the values.
     """
     if isinstance(raw_value, dict):
-        return [_read_generator(raw_value, rule, location)]
+        return [_read_value_generator(raw_value, rule, location)]
     if not isinstance(raw_value, list):
         example = getattr(rule, "example", "") if raw_value is None else raw_value
-        remedy = f"write e.g. [{example}] or {_GENERATOR_FORMS['linear']}"
-        raise findings_error(location, "must be a list or a generator", remedy, raw_value)
+        remedy = f"write e.g. [{example}] or {_GENERATOR_EXAMPLES['linear']}"
+        raise single_finding_error(location, "must be a list or a generator", remedy, raw_value)
     if not raw_value:
-        raise findings_error(location, "holds no value", "list at least one")
-    pieces: list[AxisPiece] = []
+        raise single_finding_error(location, "holds no value", "list at least one")
+    entries: list[AxisEntry] = []
     findings = Findings()
-    for i, piece in enumerate(raw_value):
-        read_piece = _read_generator if isinstance(piece, dict) else read_single_value
-        with findings.collect():
-            pieces.append(read_piece(piece, rule, (*location, i)))
+    for i, raw_entry in enumerate(raw_value):
+        read_entry = _read_value_generator if isinstance(raw_entry, dict) else read_single_value
+        with findings.collect_errors():
+            entries.append(read_entry(raw_entry, rule, (*location, i)))
     findings.raise_if_any()
-    return pieces
+    return entries
 
 
-def read_single_value(raw_value: object, rule: Rule, location: Location) -> AxisPiece:
+def read_single_value(raw_value: object, rule: Rule, location: SpecLocation) -> AxisEntry:
     """Read one value: a number with its unit for numeric fields, else a word.
 
     Raises
@@ -687,32 +696,42 @@ def read_single_value(raw_value: object, rule: Rule, location: Location) -> Axis
     try:
         value = rule.read(raw_value)
         if not isinstance(rule, NumericRule):
-            return AxisPiece(np.array([str(value)]), Unit(""))
+            return AxisEntry(np.array([str(value)]), Unit(""))
         quantity = rule.read_exact_number(raw_value)
     except QuantityError as error:
-        raise findings_error(location, error.rule, error.suggestion, raw_value) from None
+        raise single_finding_error(location, error.rule, error.suggestion, raw_value) from None
     dtype = np.int64 if rule.is_integer else np.float64
-    return AxisPiece(np.array([value], dtype=dtype), quantity.unit, Progression(quantity.number))
+    return AxisEntry(np.array([value], dtype=dtype), quantity.unit, Progression(quantity.number))
 
 
-def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Location) -> AxisPiece:
-    """Return the values of ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``.
+def _read_value_generator(
+    raw_generator: dict[Any, Any], rule: Rule, location: SpecLocation
+) -> AxisEntry:
+    """Read a generator ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``; return its values.
 
     Raise `FindingsError` if the generator is invalid or a value is outside the field's bounds.
     """
-    given_forms = [key for key in raw_generator if key in _GENERATOR_FORMS]
+    given_forms = [key for key in raw_generator if key in _GENERATOR_EXAMPLES]
     if len(given_forms) != 1:
         name, value = next(iter(raw_generator.items()), ("", None))
-        remedy = suggest_similar_name(_NUMPY_ALIASES.get(str(name), str(name)), _GENERATOR_FORMS)
-        if isinstance(value, list) and name not in _NUMPY_ALIASES and len(raw_generator) == 1:
+        remedy = suggest_similar_name(
+            _GENERATOR_BY_NUMPY_FUNCTION.get(str(name), str(name)), _GENERATOR_EXAMPLES
+        )
+        if (
+            isinstance(value, list)
+            and name not in _GENERATOR_BY_NUMPY_FUNCTION
+            and len(raw_generator) == 1
+        ):
             remedy = remedy or f"write the list alone, without '{name}:'"
-        remedy = remedy or f"write e.g. {_GENERATOR_FORMS['linear']}"
-        raise findings_error(location, "must have exactly one of linear, log and step", remedy)
+        remedy = remedy or f"write e.g. {_GENERATOR_EXAMPLES['linear']}"
+        raise single_finding_error(
+            location, "must have exactly one of linear, log and step", remedy
+        )
     if not isinstance(rule, NumericRule):
-        raise findings_error(location, "takes words, which have no steps", "list them")
+        raise single_finding_error(location, "takes words, which have no steps", "list them")
     form, findings = given_forms[0], Findings()
     allowed_keys = {form} if form == "step" else {form, "number"}
-    remedy = f"write {_GENERATOR_FORMS[form]}"
+    remedy = f"write {_GENERATOR_EXAMPLES[form]}"
     for key, value in raw_generator.items():
         if key not in allowed_keys:
             key_location = (*location, str(key))
@@ -721,39 +740,39 @@ def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Locatio
     if form != "step" and "number" not in raw_generator:
         findings.append(Finding(location, "lacks the number of values", remedy))
     elif form != "step":
-        with findings.collect((*location, "number"), raw_generator["number"]):
+        with findings.collect_errors((*location, "number"), raw_generator["number"]):
             number = int(_NUMBER_OF_VALUES_RULE.read(raw_generator["number"]))
-    values: AxisPiece | None = None
-    with findings.collect():
+    values: AxisEntry | None = None
+    with findings.collect_errors():
         # Read the bounds even if the number of values can't be read, to report all mistakes at
         # once.
         values = _generate_values(form, raw_generator[form], number or 2, rule, (*location, form))
         if number or form == "step":
-            _check_bounds(values, rule, location)
+            _check_within_field_bounds(values, rule, location)
     findings.raise_if_any()
     assert values is not None
     return values
 
 
 def _generate_values(
-    form: str, raw_bounds: object, number: int, rule: NumericRule, location: Location
-) -> AxisPiece:
+    form: str, raw_bounds: object, number: int, rule: NumericRule, location: SpecLocation
+) -> AxisEntry:
     """Return the values of a generator from its written bounds."""
-    bounds, unit = _read_bounds(form, raw_bounds, rule, location)
+    bounds, unit = _read_generator_bounds(form, raw_bounds, rule, location)
     if form == "step":
-        return _progression_values(_step_progression(bounds, location), unit, rule, location)
+        return _arithmetic_values(_progression_from_bounds(bounds, location), unit, rule, location)
     if bounds[0] == bounds[1]:
-        raise findings_error(
+        raise single_finding_error(
             location, "begins and ends with the same value", "write it as a list of one"
         )
     if form == "log":
         return _geometric_values(bounds, unit, number, rule, location)
     progression = Progression(bounds[0], (bounds[1] - bounds[0]) / (number - 1), number)
-    return _progression_values(progression, unit, rule, location)
+    return _arithmetic_values(progression, unit, rule, location)
 
 
-def _read_bounds(
-    form: str, raw_bounds: object, rule: NumericRule, location: Location
+def _read_generator_bounds(
+    form: str, raw_bounds: object, rule: NumericRule, location: SpecLocation
 ) -> tuple[list[Fraction], Unit]:
     """Return the first value, last value and (for a step) increment, and their common unit.
 
@@ -761,27 +780,27 @@ def _read_bounds(
     """
     count = 3 if form == "step" else 2
     if not isinstance(raw_bounds, list) or len(raw_bounds) != count:
-        raise findings_error(
+        raise single_finding_error(
             location,
             f"must be a list of {count} values",
-            f"write {_GENERATOR_FORMS[form]}",
+            f"write {_GENERATOR_EXAMPLES[form]}",
             raw_bounds,
         )
     exact_values: list[ExactQuantity] = []
     findings = Findings()
     for i, raw_bound in enumerate(raw_bounds):
-        with findings.collect((*location, i), raw_bound):
+        with findings.collect_errors((*location, i), raw_bound):
             exact_values.append(rule.read_exact_number(raw_bound))
             if i < 2:
                 rule.read(raw_bound)
     findings.raise_if_any()
     first_unit = exact_values[0].unit
     if any(value.unit.is_logarithmic != first_unit.is_logarithmic for value in exact_values):
-        raise findings_error(location, "mixes decibels with a plain unit", "take one of them")
+        raise single_finding_error(location, "mixes decibels with a plain unit", "take one of them")
     if first_unit.is_logarithmic and any(
         value.unit.factor != first_unit.factor for value in exact_values
     ):
-        raise findings_error(
+        raise single_finding_error(
             location, "mixes units of decibels", f"take {first_unit.symbol} for all"
         )
     # An increment is a difference of values, so that the unit's offset cancels.
@@ -792,77 +811,81 @@ def _read_bounds(
     ], first_unit
 
 
-def _step_progression(bounds: list[Fraction], location: Location) -> Progression:
-    """Return the values of a step generator, whose bounds are first value, last value and step.
+def _progression_from_bounds(bounds: list[Fraction], location: SpecLocation) -> Progression:
+    """Return the progression of a step generator from its first value, last value and step.
 
     The last value is included if a whole number of steps leads to it.
     """
     first, last, step = bounds
     if step == 0:
-        raise findings_error(location, "has a step of zero", "list the values")
+        raise single_finding_error(location, "has a step of zero", "list the values")
     if (last - first) / step < 0:
         remedy = "turn its sign, or swap first and last"
-        raise findings_error(location, "has a step that leads away from its end", remedy)
+        raise single_finding_error(location, "has a step that leads away from its end", remedy)
     number = math.floor((last - first) / step) + 1
     if number > AXIS_VALUES_MAX:
         problem = f"gives {number} values, and an axis has at most {AXIS_VALUES_MAX}"
-        raise findings_error(location, problem, "take a larger step")
+        raise single_finding_error(location, problem, "take a larger step")
     return Progression(first, step, number)
 
 
-def _progression_values(
-    progression: Progression, unit: Unit, rule: NumericRule, location: Location
-) -> AxisPiece:
-    """Return an arithmetic progression in `unit` as values of an axis.
+def _arithmetic_values(
+    progression: Progression, unit: Unit, rule: NumericRule, location: SpecLocation
+) -> AxisEntry:
+    """Return the values of an arithmetic progression in `unit` as an entry of an axis.
 
     The values are integers if the field takes integers.
     """
     if unit.is_logarithmic:
         si_values = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
-        return AxisPiece(si_values, unit, progression)
+        return AxisEntry(si_values, unit, progression)
     si_progression = progression.apply_affine_transform(unit.factor, unit.offset)
     if not rule.is_integer:
-        return AxisPiece(si_progression.values(), unit, progression)
+        return AxisEntry(si_progression.values(), unit, progression)
     if si_progression.start.denominator != 1 or si_progression.increment.denominator != 1:
-        raise findings_error(location, "gives values that are not whole", "list them")
-    steps = np.arange(progression.number, dtype=np.int64)
-    return AxisPiece(
+        raise single_finding_error(location, "gives values that are not whole", "list them")
+    steps = np.arange(progression.n_values, dtype=np.int64)
+    return AxisEntry(
         int(si_progression.start) + int(si_progression.increment) * steps, unit, progression
     )
 
 
 def _geometric_values(
-    bounds: list[Fraction], unit: Unit, number: int, rule: NumericRule, location: Location
-) -> AxisPiece:
+    bounds: list[Fraction], unit: Unit, number: int, rule: NumericRule, location: SpecLocation
+) -> AxisEntry:
     """Return `number` values with a constant ratio, from the first to the second bound.
 
     The ratio is constant in SI units, so that the unit in which the bounds are written does not
     matter.
     """
     if unit.is_logarithmic:
-        remedy = f"write {_GENERATOR_FORMS['linear']}"
-        raise findings_error(location, "steps in decibels, which are logarithms already", remedy)
+        remedy = f"write {_GENERATOR_EXAMPLES['linear']}"
+        raise single_finding_error(
+            location, "steps in decibels, which are logarithms already", remedy
+        )
     first, last = (unit.to_si(bound) for bound in bounds)
     if first <= 0 or last <= 0:
-        raise findings_error(location, "must begin and end above zero")
+        raise single_finding_error(location, "must begin and end above zero")
     si_values = _round_to_15_digits(np.geomspace(first, last, number))
     si_values[0], si_values[-1] = first, last
     if not rule.is_integer:
-        return AxisPiece(si_values, unit)
+        return AxisEntry(si_values, unit)
     rounded = np.rint(si_values)
     if np.any(np.abs(si_values - rounded) > 1e-9 * rounded):
-        raise findings_error(location, "gives values that are not whole", "list them")
-    return AxisPiece(rounded.astype(np.int64), unit)
+        raise single_finding_error(location, "gives values that are not whole", "list them")
+    return AxisEntry(rounded.astype(np.int64), unit)
 
 
-def _check_bounds(values: AxisPiece, rule: NumericRule, location: Location) -> None:
+def _check_within_field_bounds(
+    values: AxisEntry, rule: NumericRule, location: SpecLocation
+) -> None:
     """Raise `FindingsError` if a value of a generator is outside the bounds of the field."""
     violation = rule.first_out_of_bounds(values.si_values)
     if violation is not None:
-        value = values.to_unit(values.unit)[violation.value_index]
+        value = values.values_in_unit(values.unit)[violation.value_index]
         value_text = f"{value:.12g} {values.unit.symbol}".rstrip()
-        raise findings_error(
+        raise single_finding_error(
             location,
-            f"{violation.broken_bound}, and value {violation.value_index + 1} of the generator is "
-            f"{value_text}",
+            f"{violation.broken_bound_text}, and value {violation.value_index + 1} of the "
+            f"generator is {value_text}",
         )

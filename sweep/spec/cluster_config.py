@@ -78,7 +78,7 @@ def _read_worker_bounds(raw_value: object) -> WorkerBounds:
     return WorkerBounds(**bounds)
 
 
-def _read_environment(raw_value: object) -> dict[str, str]:
+def _read_environment_mapping(raw_value: object) -> dict[str, str]:
     """Read environment variables: a mapping of names to values of one line each, without quotes."""
     remedy = "write e.g. {TMPDIR: /scratch}"
     if not isinstance(raw_value, Mapping):
@@ -99,7 +99,7 @@ _SINGLE_LINE_RULE_ARGUMENTS = {
     "remedy": "write one line",
 }
 """Keyword arguments of `TextRule` for a text that must be a single line."""
-_LIST_TEXTS_MAX = 100_000
+_TEXTS_PER_LIST_MAX = 100_000
 """Maximum number of texts in a list of a cluster's configuration."""
 _MEMORY_FIELD_ARGUMENTS = ("byte", "4 GB", "64 MB", "100 TB")
 """Arguments of `declare.quantity_field` for an amount of memory: unit, example, and bounds."""
@@ -170,12 +170,12 @@ class BatchJobConfig(SpecSection):
     queue: str = declare.command_word_field("Queue or partition", "normal", "")
     account: str = declare.command_word_field("Account that is charged", "lidar", "")
     directives: tuple[str, ...] = declare.list_field(
-        TextRule(**_SINGLE_LINE_RULE_ARGUMENTS, example="--exclusive"), 0, _LIST_TEXTS_MAX, (),
+        TextRule(**_SINGLE_LINE_RULE_ARGUMENTS, example="--exclusive"), 0, _TEXTS_PER_LIST_MAX, (),
         description="Further options of the job", element_noun="texts",
     )  # fmt: skip
     prologue: tuple[str, ...] = declare.list_field(
         TextRule(**_SINGLE_LINE_RULE_ARGUMENTS, example="module load python/3.12"),
-        0, _LIST_TEXTS_MAX, (),
+        0, _TEXTS_PER_LIST_MAX, (),
         description="Shell lines before the worker starts", element_noun="texts",
     )  # fmt: skip
     logs: str = declare.command_word_field("Directory for the output of jobs", "logs", "logs")
@@ -209,7 +209,10 @@ class SessionStartedClusterConfig(ClusterConfig):
     """Base of the configurations of clusters whose workers the session starts."""
 
     environment: dict[str, str] = declare.field_with_rule(
-        CustomRule(description="Environment variables of workers", reader=_read_environment), {}
+        CustomRule(
+            description="Environment variables of workers", reader=_read_environment_mapping
+        ),
+        {},
     )
 
 
@@ -246,7 +249,7 @@ class SSHClusterConfig(SessionStartedClusterConfig):
     hosts: tuple[str, ...] = declare.list_field(
         declare.command_word_rule("A host", "node1"),
         1,
-        _LIST_TEXTS_MAX,
+        _TEXTS_PER_LIST_MAX,
         description="Machines",
         element_noun="texts",
     )
@@ -343,7 +346,7 @@ AnyClusterConfig = Annotated[
     | KubernetesClusterConfig,
     Field(discriminator="kind"),
 ]
-_CLUSTER_ADAPTER: TypeAdapter[AnyClusterConfig] = TypeAdapter(AnyClusterConfig)
+_CLUSTER_CONFIG_ADAPTER: TypeAdapter[AnyClusterConfig] = TypeAdapter(AnyClusterConfig)
 
 
 def load_cluster_config(path: str | Path) -> AnyClusterConfig:
@@ -398,19 +401,19 @@ def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
     """Validate the configuration in a document; raise `SpecError` with every mistake."""
     findings = document.findings
     try:
-        cluster = _CLUSTER_ADAPTER.validate_python(document.content)
+        cluster = _CLUSTER_CONFIG_ADAPTER.validate_python(document.content)
     except ValidationError as error:
         findings += validation_findings(error, AnyClusterConfig)
     else:
         cluster._base_folder = base
         findings += _cluster_findings(cluster)
     if findings:
-        raise SpecError(document.to_mistakes(findings))
+        raise SpecError(document.mistakes_from_findings(findings))
     return cluster
 
 
 def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
-    """Yield mistakes in a cluster's configuration that involve several fields, or missing files."""
+    """Yield findings about missing files, and about fields that contradict each other."""
     for name, path in zip(Security.model_fields, cluster.certificate_paths() or (), strict=False):
         if not Path(path).is_file():
             remedy = "make certificates with 'sweep certificates DIRECTORY'"

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import sweep.spec.fields as spec_fields
-from sweep.spec.flight_sections import AnyScanner, Platform, beam_rule
+from sweep.spec.flight_sections import AnyScanner, Platform, beam_direction_rule
 from sweep.spec.rules import Rule
 from sweep.spec.scene_sections import ErrorFloorSection, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.sections import MODEL_BY_SECTION
@@ -20,7 +20,7 @@ LISTED_VALUES_MAX = 8
 """Largest number of values of a field that a line of differences lists in full."""
 SHOWN_CHARACTERS_MAX = 200
 """Largest number of characters of a text that a line of differences shows."""
-_EXACT_TEXT_CONTEXT = Context(prec=20)
+_DECIMAL_CONTEXT = Context(prec=20)
 """Decimal arithmetic with more digits than a float has."""
 SCENE_SECTION_MODELS: spec_fields.ModelClasses = (
     Scene,
@@ -65,13 +65,14 @@ def describe_differences(a: Any, b: Any) -> list[str]:
         identity if isinstance(identity, Mapping) else identity.identity() for identity in (a, b)
     )
     identity_a, identity_b = (
-        _flatten_identity(spec_fields.to_canonical(identity)) for identity in identities
+        _flatten_identity(spec_fields.to_canonical_data(identity)) for identity in identities
     )
     lines = []
     for path in [*identity_a, *(path for path in identity_b if path not in identity_a)]:
         if identity_a.get(path) != identity_b.get(path):
             old_text, new_text = (
-                _format_entry(path, identity.get(path)) for identity in (identity_a, identity_b)
+                _format_identity_entry(path, identity.get(path))
+                for identity in (identity_a, identity_b)
             )
             lines.append(f"{path}: {old_text} -> {new_text}")
     return lines
@@ -98,8 +99,11 @@ def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
     return leaves
 
 
-def _format_entry(path: str, value: Any) -> str:
-    """Return an entry of an identity, given by its dotted path, as text with its unit."""
+def _format_identity_entry(path: str, value: Any) -> str:
+    """Return the value of an identity's entry as text with its unit.
+
+    `path` is the dotted path of the entry.
+    """
     rule = rules_by_field_name().get(path.rsplit(".", 1)[-1])
     if value is None:
         return "(none)"
@@ -110,7 +114,9 @@ def _format_entry(path: str, value: Any) -> str:
     if path in ("axes", "objects"):
         return ", ".join(value) or "(none)"
     if isinstance(value, list) and path.endswith(".beams"):
-        return "[" + ", ".join(_format_list(beam_rule(beam), beam) for beam in value) + "]"
+        return (
+            "[" + ", ".join(_format_list(beam_direction_rule(beam), beam) for beam in value) + "]"
+        )
     if isinstance(value, Mapping) and "values" in value:
         return _format_list(rule, value["values"])
     if isinstance(value, Mapping):
@@ -144,9 +150,9 @@ def _unit_suffix(rule: Rule | None) -> str:
 
 
 def _format_number(rule: Rule | None, value: Any) -> str:
-    """Return the text of an SI value in the unit in which its field is shown, without the unit.
+    """Return an SI value as a number in the unit in which its field is shown, without the unit.
 
-    A value whose unit differs from the SI unit (an angle) reads back as exactly the same value.
+    Angles, which are not shown in SI units, read back as exactly the same value.
     """
     unit_name = _unit_suffix(rule).strip()
     if rule is None or unit_name == rule.value_unit or isinstance(value, str):
@@ -156,5 +162,5 @@ def _format_number(rule: Rule | None, value: Any) -> str:
     if unit.to_si(Fraction(text)) != value:
         exact_number = Fraction(value) / unit.factor
         numerator, denominator = map(Decimal, exact_number.as_integer_ratio())
-        text = str(_EXACT_TEXT_CONTEXT.divide(numerator, denominator))
+        text = str(_DECIMAL_CONTEXT.divide(numerator, denominator))
     return text

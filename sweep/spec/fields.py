@@ -26,9 +26,9 @@ from sweep.spec.rules import (
     FlagRule,
     FrequencyErrorTableRule,
     ListRule,
-    Location,
     NumericRule,
     Rule,
+    SpecLocation,
     TextRule,
 )
 
@@ -38,6 +38,8 @@ ModelClasses = tuple[type[BaseModel], ...]
 """Pydantic models, each a kind of section. A value is validated as one of them."""
 KeyPath = tuple[str, ...]
 """Keys that lead to a value in a spec: the names of the sections around it and of its field."""
+Vector = tuple[float, ...]
+"""Numbers of one kind in SI units, such as the components of a vector along x, y and z."""
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
 KIND_RULE = TextRule(description="Which of several a part is")
@@ -54,7 +56,7 @@ class SpecSection(BaseModel):
 # without a default is required, except that a choice has its first option as the default.
 
 # Above any value of a real study, and small enough that squares and products do not overflow.
-_SIGNED_QUANTITY_MAX = {
+_DEFAULT_MAGNITUDE_MAX_BY_UNIT = {
     "m": "1e9 m",
     "rad": "1e6 deg",
     "m/s": "1000 km/s",
@@ -62,7 +64,7 @@ _SIGNED_QUANTITY_MAX = {
     "rad/s": "1e6 deg/s",
     "": "1e12",
 }
-"""Largest magnitude of a quantity of either sign, unless its field has bounds, by SI unit."""
+"""Largest magnitude of a quantity whose field states no bound, by SI unit."""
 
 
 def field_with_rule(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
@@ -101,18 +103,20 @@ def quantity_rule(
     example : str
         A valid value.
     at_least, at_most : str
-        Inclusive bounds with units; wide ones by default (`_SIGNED_QUANTITY_MAX`).
+        Inclusive bounds with units; wide ones by default (`_DEFAULT_MAGNITUDE_MAX_BY_UNIT`).
     **rule_options
         Further fields of `NumericRule`. `at_least` is ignored if `above` is given, and `at_most` if
         `below` is given.
     """
     bounds = (
-        {"at_least": at_least or f"-{_SIGNED_QUANTITY_MAX[unit]}"}
+        {"at_least": at_least or f"-{_DEFAULT_MAGNITUDE_MAX_BY_UNIT[unit]}"}
         if "above" not in rule_options
         else {}
     )
     bounds |= (
-        {"at_most": at_most or _SIGNED_QUANTITY_MAX[unit]} if "below" not in rule_options else {}
+        {"at_most": at_most or _DEFAULT_MAGNITUDE_MAX_BY_UNIT[unit]}
+        if "below" not in rule_options
+        else {}
     )
     return NumericRule(
         description=description,
@@ -322,7 +326,7 @@ def add_effect_parameter_fields(section_path: str) -> Callable[[type[SectionT]],
         parameter.path.removeprefix(f"{section_path}."): (
             Annotated[
                 str if parameter.options or parameter.is_table else float,
-                _parameter_rule(parameter),
+                _effect_parameter_rule(parameter),
             ],
             parameter.default,
         )
@@ -348,7 +352,7 @@ def add_effect_mode_fields(section: type[SectionT]) -> type[SectionT]:
     )
 
 
-def _parameter_rule(parameter: Parameter) -> Rule:
+def _effect_parameter_rule(parameter: Parameter) -> Rule:
     """Return the rule of an effect's parameter."""
     if parameter.is_table:
         return FrequencyErrorTableRule(description=parameter.description)
@@ -461,23 +465,23 @@ def reachable_models(*roots: type[BaseModel]) -> list[type[BaseModel]]:
     return list(visited)
 
 
-class SpecLocation(NamedTuple):
+class ModelLocation(NamedTuple):
     """Location of a value in a spec, with the models of the value and of the section around it."""
 
-    keys: Location
+    keys: SpecLocation
     """Keys and indices that lead to the value in the file."""
     value_models: ModelClasses
-    """Pydantic models of the value, one for each kind of it; empty for a scalar or list."""
+    """Pydantic models that the value may have, one for each ``kind``; empty if it is no section."""
     enclosing_section_models: ModelClasses
-    """Pydantic models of the section that contains the value, one for each kind of section."""
+    """Pydantic models that the section around the value may have, one for each ``kind``."""
 
 
-def translate_error_location(pydantic_location: Location, root: Any) -> SpecLocation:
+def translate_pydantic_location(pydantic_location: SpecLocation, root: Any) -> ModelLocation:
     """Translate a location of a pydantic error to a location in a spec.
 
     Parameters
     ----------
-    pydantic_location : Location
+    pydantic_location : SpecLocation
         Location from pydantic, which contains the kind of a section after the section's key.
     root : type
         Model, or union of models, that was validated.
@@ -497,7 +501,7 @@ def translate_error_location(pydantic_location: Location, root: Any) -> SpecLoca
             annotation = None if field is None else field.annotation
         else:
             annotation = _element_annotation(annotation)
-    return SpecLocation(tuple(keys), models_of_annotation(annotation), enclosing_section_models)
+    return ModelLocation(tuple(keys), models_of_annotation(annotation), enclosing_section_models)
 
 
 # Traversal of the values of sections
@@ -599,15 +603,15 @@ def set_if_absent(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
 # Identities
 
 
-def to_canonical(value: Any) -> Any:
+def to_canonical_data(value: Any) -> Any:
     """Return data in a form in which equal data has equal JSON text.
 
     Floats without a fraction below 2**53 become integers, keys are sorted, and tuples become lists.
     """
     if isinstance(value, Mapping):
-        return {str(key): to_canonical(value[key]) for key in sorted(value)}
+        return {str(key): to_canonical_data(value[key]) for key in sorted(value)}
     if isinstance(value, list | tuple):
-        return [to_canonical(item) for item in value]
+        return [to_canonical_data(item) for item in value]
     if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
         return int(value)
     return value
@@ -619,7 +623,7 @@ def identity_digest(identity: Mapping[str, Any]) -> str:
     It is BLAKE2b of the canonical JSON text, 32 hexadecimal digits.
     """
     text = json.dumps(
-        to_canonical(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
+        to_canonical_data(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
     )
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -667,7 +671,7 @@ class SpecFiles:
         return path
 
 
-def iter_file_paths(section: BaseModel) -> Iterator[FileField]:
+def iter_file_fields(section: BaseModel) -> Iterator[FileField]:
     """Yield all fields of a section that name a file."""
     for key_path, rule, value in iter_section_values(section):
         if isinstance(rule, FilePathRule):

@@ -16,7 +16,7 @@ from sweep.model import outputs
 from sweep.spec.axes import Axis
 from sweep.spec.fields import SpecSection, validate_or_none
 from sweep.spec.flight_sections import AnyScanner, shots_per_cycle
-from sweep.spec.rules import ChoiceRule, CustomRule, Finding, Location, suggest_similar_name
+from sweep.spec.rules import ChoiceRule, CustomRule, Finding, SpecLocation, suggest_similar_name
 from sweep.spec.scene_sections import SceneDraws
 from sweep.spec.sections import SPECTRA_METHOD, parameter_rules
 from sweep.units import QuantityError, read_number
@@ -69,29 +69,34 @@ def _read_published_number(raw_value: object) -> float:
     return read_number(raw_value).to_si()
 
 
-_VALUE_SCHEMA = {"type": ["string", "number"]}
-_VALUES_SCHEMA = {"type": "array", "items": _VALUE_SCHEMA, "minItems": 1}
+_COORDINATE_VALUE_SCHEMA = {"type": ["string", "number"]}
+_COORDINATE_VALUES_SCHEMA = {"type": "array", "items": _COORDINATE_VALUE_SCHEMA, "minItems": 1}
 _COORDINATE_SELECTION_RULE = CustomRule(
     description="Values of coordinates that the figure is confined to",
     reader=_read_coordinate_selection,
     value_schema={
         "type": "object",
-        "additionalProperties": {"anyOf": [_VALUE_SCHEMA, _VALUES_SCHEMA]},
+        "additionalProperties": {"anyOf": [_COORDINATE_VALUE_SCHEMA, _COORDINATE_VALUES_SCHEMA]},
         "examples": [{"grazing_angle": "15 deg"}],
     },
 )
-_NUMBER_SCHEMA = {"type": ["number", "string"]}
+_PUBLISHED_NUMBER_SCHEMA = {"type": ["number", "string"]}
 _PUBLISHED_NUMBERS_RULE = CustomRule(
     description="Published numbers, row by row, for comparison",
     reader=_read_published_numbers,
     value_schema={
         "type": "array",
-        "items": {"anyOf": [_NUMBER_SCHEMA, {"type": "array", "items": _NUMBER_SCHEMA}]},
+        "items": {
+            "anyOf": [
+                _PUBLISHED_NUMBER_SCHEMA,
+                {"type": "array", "items": _PUBLISHED_NUMBER_SCHEMA},
+            ]
+        },
     },
 )
 
 
-def _store_name_field(description: str, example: str, default: Any = ...) -> Any:
+def _name_in_store_field(description: str, example: str, default: Any = ...) -> Any:
     """Declare a field that holds the name of a coordinate or variable of a store."""
     pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
     return declare.text_field(
@@ -102,10 +107,10 @@ def _store_name_field(description: str, example: str, default: Any = ...) -> Any
 def _coordinate_name_field(default: Any = ...) -> Any:
     """Declare a field that holds the name of a coordinate."""
     example = "the last part of an axis's path, such as 'range'"
-    return _store_name_field("a coordinate: the last part of an axis's path", example, default)
+    return _name_in_store_field("a coordinate: the last part of an axis's path", example, default)
 
 
-_VARIABLE_NAME_FIELD = _store_name_field(
+_VARIABLE_NAME_FIELD = _name_in_store_field(
     "a stored quantity, such as pd_shot", "a stored quantity, such as 'pd_shot'"
 )
 
@@ -163,7 +168,7 @@ class SurfaceFigure(GridFigureBase):
         10,
         (),
         description="Levels at which contours are drawn",
-        increasing=True,
+        is_increasing=True,
     )
 
 
@@ -182,7 +187,7 @@ class SlicesFigure(GridFigureBase):
         10,
         (),
         description="Levels at which lines are drawn across",
-        increasing=True,
+        is_increasing=True,
     )
 
 
@@ -228,11 +233,11 @@ GridFigure = Annotated[
 
 # Figures of scenes
 
-_FIGURE_OUTPUTS = (
+_PLOTTABLE_OUTPUTS = (
     outputs.SHOT_VARIABLES | outputs.SHOT_STATISTIC_VARIABLES | outputs.POINT_VARIABLES
 )
 FIGURE_QUANTITIES = (
-    *(name for name, output in _FIGURE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
+    *(name for name, output in _PLOTTABLE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
 """Names of the quantities of shots and of points that a scene's figure can show."""
@@ -296,18 +301,20 @@ def _plotted_quantity_field(description: str, default: Any = ...) -> Any:
 def _crop_field(axis: str) -> Any:
     """Declare a field that holds the lower and upper limit of a scene's coordinate [m]."""
     rule = declare.quantity_rule("Coordinate", "m", "100 m")
-    return declare.list_field(rule, 2, 2, None, description=f"Part along {axis}", increasing=True)
+    return declare.list_field(
+        rule, 2, 2, None, description=f"Part along {axis}", is_increasing=True
+    )
 
 
 _SCANNER_FIELD = declare.object_name_field("Scanner; the first by default", None)
-_RANGES_FIELD = declare.choice_field(
+_RANGE_INTERPOLATION_FIELD = declare.choice_field(
     "Range shown for each point: quantised to FFT bins, or interpolated between bins",
     ("quantised", "interpolated"),
 )
 _DRAW_FIELD = declare.integer_field("Number of the draw, from 0", "0", "0", "1e9", default=0)
 _TIME_FIELD = declare.list_field(
     declare.quantity_rule("Time", "s", "10 s", "0 s", "1e8 s"), 2, 2, None,
-    description="Part of the flight's time", increasing=True,
+    description="Part of the flight's time", is_increasing=True,
 )  # fmt: skip
 
 
@@ -324,7 +331,7 @@ class CloudFigure(SceneFigureBase):
     kind: Literal["cloud"]
     scanner: str | None = _SCANNER_FIELD
     colour: str = _plotted_quantity_field("Quantity that colours the points", "range")
-    ranges: str = _RANGES_FIELD
+    ranges: str = _RANGE_INTERPOLATION_FIELD
     view: str | dict[str, float] = declare.field_with_rule(_VIEW_RULE, "oblique")
     x: CropLimits | None = _crop_field("x")
     y: CropLimits | None = _crop_field("y")
@@ -345,7 +352,7 @@ class ScatterFigure(SceneFigureBase):
     x: str = _plotted_quantity_field("Quantity along x", "time")
     y: str = _plotted_quantity_field("Quantity along y")
     colour: str = _plotted_quantity_field("Quantity that colours the points", "beam")
-    ranges: str = _RANGES_FIELD
+    ranges: str = _RANGE_INTERPOLATION_FIELD
     time: CropLimits | None = _TIME_FIELD
     draw: int = _DRAW_FIELD
 
@@ -370,7 +377,7 @@ class _NavigationFigureBase(SceneFigureBase):
     FILE_NAME_PARTS = ("quantity", "show")
     scanners: tuple[str, ...] | None = declare.list_field(
         declare.object_name_rule("Scanner", "three"), 1, 10_000, None,
-        description="Scanners; all by default", element_noun="names", distinct=True,
+        description="Scanners; all by default", element_noun="names", is_distinct=True,
     )  # fmt: skip
     quantity: str = declare.choice_field("Velocity vector or altitude", ("velocity", "altitude"))
     show: str = declare.choice_field("Statistics to show", ("all", "availability", "bias", "rmse"))
@@ -396,10 +403,10 @@ SceneFigure = Annotated[
 
 # Checks of figures
 
-_COORDINATE_FIELDS = ("x", "y", "by", "rows", "columns")
+_COORDINATE_FIELD_NAMES = ("x", "y", "by", "rows", "columns")
 """Fields of a grid's figure whose value is the name of a coordinate."""
 
-NAVIGATION_SHOTS_MIN = 3
+NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
 """Minimum number of shots in a measurement cycle from which a velocity can be computed."""
 
 
@@ -464,7 +471,7 @@ def scene_figure_findings(
 
 def _iter_readable_figures(
     raw_spec: Mapping[str, Any], annotation: Any
-) -> Iterator[tuple[Location, Any]]:
+) -> Iterator[tuple[SpecLocation, Any]]:
     """Yield location and model of each figure that can be read."""
     figures = raw_spec.get("figures")
     for i, raw_figure in enumerate(figures if isinstance(figures, list | tuple) else ()):
@@ -484,7 +491,7 @@ def _duplicate_file_name_findings(
 
 
 def _figure_coordinate_findings(
-    figure: Any, axes: tuple[Axis, ...], figure_location: Location
+    figure: Any, axes: tuple[Axis, ...], figure_location: SpecLocation
 ) -> Iterator[Finding]:
     """Yield mistakes in the coordinates that a figure names, and in values that it selects.
 
@@ -492,7 +499,7 @@ def _figure_coordinate_findings(
     """
     is_grid_figure = isinstance(figure, GridFigureBase)
     coordinate_names = (
-        {field: getattr(figure, field, "") for field in _COORDINATE_FIELDS}
+        {field: getattr(figure, field, "") for field in _COORDINATE_FIELD_NAMES}
         if is_grid_figure
         else {}
     )
@@ -500,7 +507,7 @@ def _figure_coordinate_findings(
     paths = {parameter.coordinate: parameter.path for axis in axes for parameter in axis.parameters}
     known_names = list(dict.fromkeys([*paths, *(axis.name for axis in axes if is_grid_figure)]))
     for field, name in (coordinate_names | {f"where.{name}": name for name in selection}).items():
-        location: Location = (*figure_location, *field.split("."))
+        location: SpecLocation = (*figure_location, *field.split("."))
         values = selection[name] if field.startswith("where.") else ()
         if name and name not in known_names:
             remedy = (
@@ -523,7 +530,7 @@ def _figure_coordinate_findings(
 
 
 def _figure_variable_findings(
-    figure: Any, draws: object, extra_variables: Collection[str], location: Location
+    figure: Any, draws: object, extra_variables: Collection[str], location: SpecLocation
 ) -> Iterator[Finding]:
     """Yield a finding if a figure shows a variable that the study does not store."""
     variable = getattr(figure, "variable", None)
@@ -552,11 +559,8 @@ def _figure_variable_findings(
     yield Finding((*location, "variable"), problem, remedy, variable)
 
 
-def _spectra_variable_findings(figure: Any, location: Location) -> Iterator[Finding]:
-    """Yield a finding if a figure shows a closed-form result that the study does not store.
-
-    Studies that draw whole spectra store no such results.
-    """
+def _spectra_variable_findings(figure: Any, location: SpecLocation) -> Iterator[Finding]:
+    """Yield a finding if a figure shows a result that a study of whole spectra does not store."""
     stored_variables = (
         outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
     )
@@ -575,14 +579,14 @@ def _spectra_variable_findings(figure: Any, location: Location) -> Iterator[Find
 
 
 def _figure_scanner_findings(
-    figure: Any, scanners: Mapping[str, Any], location: Location
+    figure: Any, scanners: Mapping[str, Any], location: SpecLocation
 ) -> Iterator[Finding]:
-    """Yield a finding for each scanner that is missing or has too few beams for navigation."""
+    """Yield a finding for each missing scanner, and for too few shots per cycle for navigation."""
     single_scanner, listed_scanners = (
         getattr(figure, "scanner", None),
         getattr(figure, "scanners", None) or (),
     )
-    names_by_location: dict[Location, str] = (
+    names_by_location: dict[SpecLocation, str] = (
         {("scanner",): single_scanner} if single_scanner else {}
     )
     for relative_location, name in (
@@ -597,10 +601,13 @@ def _figure_scanner_findings(
         has_navigation = {name: _allows_navigation(scanner) for name, scanner in scanners.items()}
         for i, name in enumerate(figure.scanners or ()):
             if has_navigation.get(name, True) is False:
-                problem = f"has fewer than {NAVIGATION_SHOTS_MIN} shots a cycle, and no navigation"
+                problem = (
+                    f"has fewer than {NAVIGATION_SHOTS_PER_CYCLE_MIN} shots a cycle, and no "
+                    "navigation"
+                )
                 yield Finding((*location, "scanners", i), problem, "leave it out", name)
         if not figure.scanners and has_navigation and not any(has_navigation.values()):
-            problem = f"needs a scanner of {NAVIGATION_SHOTS_MIN} shots a cycle or more"
+            problem = f"needs a scanner of {NAVIGATION_SHOTS_PER_CYCLE_MIN} shots a cycle or more"
             yield Finding(location, problem, "leave it out")
 
 
@@ -611,12 +618,17 @@ def _allows_navigation(raw_scanner: object) -> bool:
     """
     scanner = validate_or_none(AnyScanner, raw_scanner)
     try:
-        return scanner is None or shots_per_cycle(scanner.build_pattern()) >= NAVIGATION_SHOTS_MIN
+        return (
+            scanner is None
+            or shots_per_cycle(scanner.build_pattern()) >= NAVIGATION_SHOTS_PER_CYCLE_MIN
+        )
     except ValueError:
         return True
 
 
-def _draw_number_findings(figure: Any, raw_draws: object, location: Location) -> Iterator[Finding]:
+def _draw_number_findings(
+    figure: Any, raw_draws: object, location: SpecLocation
+) -> Iterator[Finding]:
     """Yield a finding if a figure shows a draw that the study does not make.
 
     Studies whose draws can't be read are skipped.

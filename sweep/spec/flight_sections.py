@@ -16,12 +16,10 @@ from sweep.model.geometry import body_motion as motion_laws
 from sweep.model.geometry import quaternion
 from sweep.model.geometry import scanner as scan_patterns
 from sweep.model.geometry.scanner import ScanPattern
-from sweep.spec.fields import SpecFiles, SpecSection
+from sweep.spec.fields import SpecFiles, SpecSection, Vector
 from sweep.spec.rules import JsonObject, ListRule, Rule, read_list_element
 from sweep.units import QuantityError
 
-Vector = tuple[float, ...]
-"""Components of a vector along x, y and z, in SI units."""
 TimeSpan = tuple[float, float]
 """Start and stop of a time interval [s]."""
 
@@ -350,13 +348,13 @@ class BeamDirectionsRule(Rule):
         if not isinstance(raw_value, list | tuple) or not 0 < len(raw_value) <= BEAMS_MAX:
             raise QuantityError(f"must be a list of 1 to {BEAMS_MAX} beams", remedy)
         return tuple(
-            read_list_element(beam_rule(raw_beam), i, raw_beam)
+            read_list_element(beam_direction_rule(raw_beam), i, raw_beam)
             for i, raw_beam in enumerate(raw_value)
         )
 
     def format(self, value: Any) -> Any:
         """Return the beams as a spec would hold them; `read` converts them back exactly."""
-        return [beam_rule(beam).format(beam) for beam in value]
+        return [beam_direction_rule(beam).format(beam) for beam in value]
 
     def _value_schema(self) -> JsonObject:
         beam_schema = {"anyOf": [STEERING_ANGLES_RULE.schema(), _DIRECTION_VECTOR_RULE.schema()]}
@@ -364,7 +362,7 @@ class BeamDirectionsRule(Rule):
         return {"type": "array", "items": beam_schema} | length_keywords
 
 
-def beam_rule(beam: object) -> ListRule:
+def beam_direction_rule(beam: object) -> ListRule:
     """Return the rule of one beam: a direction vector for three numbers, else two angles."""
     return (
         _DIRECTION_VECTOR_RULE
@@ -376,10 +374,10 @@ def beam_rule(beam: object) -> ListRule:
 _NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
 """Smallest and largest angle between a beam and the downward vertical (nadir), with units."""
 _CYCLE_RATE_FIELD = declare.frequency_field("Number of measurement cycles per second")
-_INTERVAL_FIELD_ZERO_BY_DEFAULT = declare.duration_field(
+_BEAM_INTERVAL_FIELD_DEFAULT_ZERO = declare.duration_field(
     "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
 )
-_INTERVAL_FIELD_EVEN_BY_DEFAULT = declare.duration_field(
+_BEAM_INTERVAL_FIELD_DEFAULT_UNIFORM = declare.duration_field(
     "Time from one beam of a cycle to the next; spread evenly over the cycle by default",
     "10 ms", default=None,
 )  # fmt: skip
@@ -397,7 +395,7 @@ class ConeScanner(SpecSection):
         "Azimuth of the first beam, from forward towards the left", default=0.0
     )
     rate: float = _CYCLE_RATE_FIELD
-    interval: float = _INTERVAL_FIELD_ZERO_BY_DEFAULT
+    interval: float = _BEAM_INTERVAL_FIELD_DEFAULT_ZERO
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of beams on a cone around nadir."""
@@ -418,7 +416,7 @@ class FixedBeamsScanner(SpecSection):
         )
     )
     rate: float = _CYCLE_RATE_FIELD
-    interval: float = _INTERVAL_FIELD_ZERO_BY_DEFAULT
+    interval: float = _BEAM_INTERVAL_FIELD_DEFAULT_ZERO
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of beams at the given directions."""
@@ -439,7 +437,7 @@ class CornersScanner(SpecSection):
         "Angle of both axes from nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS
     )
     rate: float = _CYCLE_RATE_FIELD
-    interval: float | None = _INTERVAL_FIELD_EVEN_BY_DEFAULT
+    interval: float | None = _BEAM_INTERVAL_FIELD_DEFAULT_UNIFORM
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of a beam steered to the four corners of a square."""
@@ -457,7 +455,7 @@ class SquaresScanner(SpecSection):
         description="Angle by which each element of an axis throws the beam to either side",
     )  # fmt: skip
     rate: float = _CYCLE_RATE_FIELD
-    interval: float | None = _INTERVAL_FIELD_EVEN_BY_DEFAULT
+    interval: float | None = _BEAM_INTERVAL_FIELD_DEFAULT_UNIFORM
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of a beam steered along squares, one square per cycle."""
@@ -497,7 +495,7 @@ class LineScanner(SpecSection):
         description="Angle of each beam from nadir towards forward",
     )  # fmt: skip
     wave: str = declare.choice_field("Constant rate or resonant mirror", ("triangle", "sine"))
-    interval: float = _INTERVAL_FIELD_ZERO_BY_DEFAULT
+    interval: float = _BEAM_INTERVAL_FIELD_DEFAULT_ZERO
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of beams swept from side to side."""

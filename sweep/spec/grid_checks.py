@@ -1,8 +1,8 @@
 """Checks of combinations of fields over the whole grid of a study.
 
-Each check evaluates the extremes of the grid, not each point. It may find a chirp shorter than the
-delay of its echo, or a responsivity above one electron per photon. It may find a beam that its
-aperture can't make, or an effect without a parameter that it needs.
+Each check evaluates the extremes of the grid, not each point. Examples of mistakes are a chirp
+shorter than the delay of its echo, a responsivity above one electron per photon, a beam that its
+aperture can't make, and an effect without a parameter that it needs.
 """
 
 from __future__ import annotations
@@ -72,10 +72,10 @@ Such a detector compares a bin with the noise in neighbouring bins, its training
 """
 
 _WINDOW_TRIAL_SAMPLES_MAX = 16
-"""Maximum number of samples at which a window function is tried.
+"""Maximum number of samples with which a window function is tried.
 
-`WindowFunctionRule` tests names with as many samples. A window that exists with so many samples
-exists with more.
+`WindowFunctionRule` tries windows with this number too. A window that exists with this number of
+samples exists with any larger number.
 """
 _SPECTRUM_BINS_MIN = 8
 """Minimum number of bins of a spectrum for detectors that examine the whole spectrum."""
@@ -88,10 +88,10 @@ class GridValues:
     Axes vary independently of each other; the parameters of one axis vary together.
     """
 
-    values: Mapping[str, Any]
-    """SI values of the parameters by dotted path.
+    field_values: Mapping[str, Any]
+    """SI values of the parameters' fields, or their defaults, by dotted path.
 
-    For a parameter on an axis it is the value of its field, which `axes` overrides.
+    `axes` overrides the value of a parameter on an axis.
     """
     axes: tuple[Axis, ...] = ()
     """Axes of the study."""
@@ -124,7 +124,7 @@ class GridValues:
             for parameter in axis.parameters:
                 if parameter.path == path:
                     return np.asarray(parameter.values)
-        return np.asarray([self.values[path]] if path in self.values else [])
+        return np.asarray([self.field_values[path]] if path in self.field_values else [])
 
     def make_finding(self, path: str, problem: str, remedy: str) -> Finding:
         """Return a finding about a parameter, located at its axis, if any, else at its field."""
@@ -140,9 +140,11 @@ class GridValues:
         """
         paths_on_axes = {parameter.path for axis in self.axes for parameter in axis.parameters}
         for path in set(conditions) - paths_on_axes:
-            if path not in self.values or not conditions[path](np.asarray(self.values[path])):
+            if path not in self.field_values or not conditions[path](
+                np.asarray(self.field_values[path])
+            ):
                 return False
-        return all(_meets_conditions(axis, conditions).any() for axis in self.axes)
+        return all(_condition_mask(axis, conditions).any() for axis in self.axes)
 
     def argmin_of_sum(
         self,
@@ -168,7 +170,7 @@ class GridValues:
         """
         if not self.has_values(*terms) or not self.any_point_meets(conditions):
             return {}
-        minimum = {path: self.values[path] for path in terms if path in self.values}
+        minimum = {path: self.field_values[path] for path in terms if path in self.field_values}
         for axis in self.axes:
             axis_values = {
                 parameter.path: np.asarray(parameter.values) for parameter in axis.parameters
@@ -177,7 +179,7 @@ class GridValues:
                 (term(axis_values[path]) for path, term in terms.items() if path in axis_values),
                 np.zeros(axis.size),
             )
-            index = np.where(_meets_conditions(axis, conditions), axis_sum, np.inf).argmin()
+            index = np.where(_condition_mask(axis, conditions), axis_sum, np.inf).argmin()
             minimum |= {path: axis_values[path][index] for path in terms if path in axis_values}
         return {path: float(value) for path, value in minimum.items()}
 
@@ -190,7 +192,7 @@ def raw_value_at(raw_spec: Mapping[str, Any], path: str, default: object = MISSI
     return default if raw_value is MISSING else raw_value
 
 
-def _meets_conditions(axis: Axis, conditions: Mapping[str, ValueCondition]) -> np.ndarray:
+def _condition_mask(axis: Axis, conditions: Mapping[str, ValueCondition]) -> np.ndarray:
     """Return a mask (n,) of the points along an axis that meet the conditions on its parameters."""
     is_met = np.ones(axis.size, bool)
     for parameter in axis.parameters:
@@ -295,9 +297,9 @@ def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
     if not grid.has_values(*ECHO_TIME_PATHS):
         return None
     values: dict[str, np.ndarray] = {
-        path: np.asarray(grid.values[path], float)
+        path: np.asarray(grid.field_values[path], float)
         for path in ECHO_TIME_PATHS
-        if path in grid.values
+        if path in grid.field_values
     }
     n_points = 1
     for axis_number, axis in enumerate(grid.axes):
@@ -401,7 +403,7 @@ def _responsivity_findings(grid: GridValues) -> Iterator[Finding]:
 
 def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if the table of the frequency error does not cover the longest chirp."""
-    table_text = grid.values.get(ERROR_TABLE_PATH, NO_TABLE)
+    table_text = grid.field_values.get(ERROR_TABLE_PATH, NO_TABLE)
     if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
         return
     table, duration_max = (
@@ -444,9 +446,11 @@ def _beam_findings(grid: GridValues) -> Iterator[Finding]:
 def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding for beams that are narrower or wider than possible.
 
-    Notes ----- The narrowest full divergence of an aperture of diameter D is 4 M^2 lambda / (pi D),
-    with the beam quality M^2 and the wavelength lambda. A waist may be at most the radius of the
-    aperture, and must be so wide that the beam spreads by at most 90 deg.
+    Notes
+    -----
+    The narrowest full divergence of an aperture of diameter D is 4 M^2 lambda / (pi D), with the
+    beam quality M^2 and the wavelength lambda. A waist may be at most the radius of the aperture,
+    and must be so wide that the beam spreads by at most 90 deg.
     """
     remedy = "or set instrument.telescope.coupling: aperture, where all light mixes"
     if narrowest := _narrowest_impossible_beam(grid, _SINGLE_MODE_CONDITIONS):
@@ -589,7 +593,7 @@ A look is one record of each segment (chirp).
 def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in the settings of several looks, the repeated records of each segment.
 
-    The settings contradict each other, or their detection probability is unknown.
+    Mistakes are settings that contradict each other, or whose detection probability is unknown.
     """
     several_looks: dict[str, ValueCondition] = {looks.LOOKS_NUMBER_PATH: exceeds_one}
     combined_by_bin: dict[str, ValueCondition] = {
@@ -799,10 +803,9 @@ def undrawn_effect_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Finding]:
-    """Yield mistakes in random effects and methods that flights can't draw.
+    """Yield findings about random effects and draw methods that a flight does not support.
 
-    All other random effects are drawn in flights. Mistakes in the parameters of a target are
-    located in the target's own section.
+    Parameters of the section ``target`` are not checked here: a scene's spec has no such section.
 
     Parameters
     ----------
@@ -875,10 +878,10 @@ def is_detector_or_estimator_parameter(path: str) -> bool:
 
 
 def spectrum_method_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in methods that examine whole spectra.
+    """Yield mistakes in detectors and estimators, which examine whole spectra.
 
-    Such a method needs ``draws.method: spectra`` and a number of draws, and CFAR windows must fit
-    the spectrum.
+    They need ``draws.method: spectra`` and a number of draws, and the cells of a CFAR detector must
+    fit into the spectrum.
 
     Parameters
     ----------
@@ -897,13 +900,13 @@ def spectrum_method_findings(draws: Draws | SceneDraws, grid: GridValues) -> Ite
         problem, remedy = "draws whole spectra, and draws none", "set draws.number or draws.limit"
         yield Finding(("draws", "method"), problem, remedy, draws.method)
     else:
-        yield from _cfar_window_findings(grid)
+        yield from _cfar_cell_findings(grid)
 
 
 def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
-    """Return the paths of those detector and estimator parameters that the spec sets.
+    """Return the paths of the detector and estimator parameters that the spec changes.
 
-    They are on axes, or their values differ from the defaults.
+    A changed parameter is on an axis, or its value differs from the default.
     """
     paths_on_axes = [
         parameter.path
@@ -911,7 +914,7 @@ def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
         for parameter in axis.parameters
         if is_detector_or_estimator_parameter(parameter.path)
     ]
-    values = grid.values
+    values = grid.field_values
     changed_paths = [
         path
         for path in SPECTRUM_METHOD_DEFAULTS
@@ -920,11 +923,11 @@ def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
     return [*paths_on_axes, *(path for path in changed_paths if path not in paths_on_axes)]
 
 
-def _cfar_window_findings(grid: GridValues) -> Iterator[Finding]:
+def _cfar_cell_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in the cells of CFAR detectors, which compare a bin with neighbouring bins.
 
-    The number of training cells is odd, the cells exceed the spectrum, or the rank exceeds the
-    cells.
+    Mistakes are an odd number of training cells, more cells than the spectrum has bins, and a rank
+    above the number of training cells.
     """
     training, guard, rank = (
         grid.parameter_values(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)

@@ -18,7 +18,7 @@ from sweep.scenes.rasters import (
     read_raster_terrain,
 )
 from sweep.scenes.scene_files import require_memory
-from sweep.spec.fields import SpecFiles, SpecSection
+from sweep.spec.fields import SpecFiles, SpecSection, Vector
 from sweep.spec.sections import REFLECTANCE_FIELD
 
 if TYPE_CHECKING:
@@ -28,9 +28,6 @@ GRID_STEPS_PER_SIDE_MAX = 7000
 """Maximum number of grid steps along one side of a square."""
 _RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
 """Uses of random numbers. The index of a use selects its stream of random numbers."""
-
-Vector = tuple[float, ...]
-"""Components of a vector along x, y and z, in SI units."""
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:
@@ -134,7 +131,7 @@ class Craters(SpecSection):
         return carve_craters(terrain, craters)
 
 
-def _check_memory(n_nodes: int) -> None:
+def _require_grid_memory(n_nodes: int) -> None:
     """Raise `SceneError` if the triangles of a grid would need more memory than is free."""
     remedy = "take a coarser grid, or a smaller part of it"
     require_memory(
@@ -191,7 +188,7 @@ class Ground(Material, ABC):
             raise ValueError(
                 f"refined {self.factor} times it has more than {GRID_CELLS_MAX:.0e} nodes"
             )
-        _check_memory(terrain.heights.size * self.factor**2)
+        _require_grid_memory(terrain.heights.size * self.factor**2)
         if self.smoothing:
             terrain = smooth_terrain(terrain, standard_deviation=self.smoothing)
         if self.factor > 1:
@@ -374,7 +371,7 @@ class ImageGround(PlacedGround):
 
 
 def _nodes_per_side(side: float, step: float) -> int:
-    """Return the number of nodes, `step` [m] apart, of a grid side that is at least `side` [m]."""
+    """Return the number of nodes at spacing `step` [m] along a side of at least `side` [m]."""
     return math.ceil(side / step * (1 - 1e-12)) + 1
 
 
@@ -394,7 +391,7 @@ class SquareGround(PlacedGround):
 
         self.check_grid()
         step, n_nodes = self.unrefined_step(), _nodes_per_side(self.size, self.unrefined_step())
-        _check_memory(n_nodes * n_nodes)
+        _require_grid_memory(n_nodes * n_nodes)
         return Terrain(np.zeros((n_nodes, n_nodes)), (step, step), np.zeros(3))
 
     def check_grid(self) -> None:

@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 PFA_SHOT_WARNING_ABOVE = 0.01
 """Probability that noise raises a false alarm in a shot, above which the user is warned."""
 
-SAMPLED_SETTINGS_MAX = 400
-"""Approximate largest number of settings for which false alarms are computed.
+SAMPLED_COMBINATIONS_MAX = 400
+"""Approximate maximum number of combinations for which false alarms are computed.
 
-A setting is a combination of threshold, FFT size and detector.
+A combination has one value from each axis over ``instrument.processing``.
 """
 
 
-class ShotFalseAlarm(NamedTuple):
+class ShotFalseAlarmProbabilities(NamedTuple):
     """Probabilities of false alarms of a shot, due to noise alone."""
 
     either_chirp: float
@@ -36,8 +36,8 @@ class ShotFalseAlarm(NamedTuple):
     """Probability of a false alarm in both chirps."""
 
 
-def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm]:
-    """Compute the false-alarm probabilities of a shot, due to noise alone, over a study's settings.
+def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarmProbabilities]:
+    """Compute the false-alarm probabilities of a shot, due to noise alone, over a study's axes.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
 
     Returns
     -------
-    list of ShotFalseAlarm
+    list of ShotFalseAlarmProbabilities
         Probabilities for each sampled combination. Combinations with a user-defined detector are
         left out.
 
@@ -55,13 +55,13 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
     -----
     Noise in the up- and down-chirp is independent, so that the probability of a false alarm in both
     chirps is the product of the two. A chirp's probability follows from that of a bin and the
-    number of independent bins that have as many alarms (`alarm_equivalent_bins`).
+    number of independent bins that raise as many alarms (`alarm_equivalent_bins`).
     """
     axes = [
         axis for axis in spec.axes
         if any(member.path.startswith("instrument.processing.") for member in axis.parameters)
     ]  # fmt: skip
-    samples_per_axis = max(2, int(SAMPLED_SETTINGS_MAX ** (1 / max(len(axes), 1))))
+    samples_per_axis = max(2, int(SAMPLED_COMBINATIONS_MAX ** (1 / max(len(axes), 1))))
     probabilities = []
     sampled_indices = (
         np.linspace(0, axis.size - 1, min(axis.size, samples_per_axis)).astype(int) for axis in axes
@@ -86,14 +86,14 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
             float(segment_pfa(np.asarray(pfa_bin), bins))
             for bins in (n_bins_up, n_bins_down, n_bins_up + n_bins_down)
         )
-        probabilities.append(ShotFalseAlarm(pfa_any, pfa_up * pfa_down))
+        probabilities.append(ShotFalseAlarmProbabilities(pfa_any, pfa_up * pfa_down))
     return probabilities
 
 
 def iter_false_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
     """Yield one sentence if noise alone raises a false alarm in more than 1 % of the shots.
 
-    The sentence states the largest probability over the study's settings and the fields to change.
+    The sentence states the largest probability over the study's axes, and the fields to change.
     """
     pfa_max = max((pfa.either_chirp for pfa in false_alarm_probabilities(spec)), default=0.0)
     if pfa_max > PFA_SHOT_WARNING_ABOVE:

@@ -33,7 +33,7 @@ from sweep.units import DECIBEL, ExactQuantity, QuantityError, Unit, read_number
 
 # Mistakes in specs
 
-Location = tuple[str | int, ...]
+SpecLocation = tuple[str | int, ...]
 """Keys and list indices that lead to a value in a spec."""
 
 MISSING = object()
@@ -41,10 +41,10 @@ MISSING = object()
 _SHOWN_VALUE_CHARACTERS_MAX = 60
 """Maximum number of characters of a wrong value that an error message shows."""
 _PARTIAL_NAME_CHARACTERS_MIN, _SUGGESTIONS_MAX = 4, 3
-"""Limits of suggestions for a misspelt name.
+"""Limits of the suggestion of known names that contain a misspelt name.
 
-The first is the least length of a text that suggests longer names which contain it [characters].
-The second is the largest number of such names.
+The first is the minimum number of characters of the misspelt name. The second is the maximum number
+of names to suggest.
 """
 _OFF_WORDS = {"no", "n", "false", "none", "never", "null", "disable", "disabled", "0", "off"}
 """Words that users write in place of ``off``, such as no."""
@@ -98,7 +98,7 @@ class SpecError(Exception):
 class Finding:
     """A mistake at a location of a spec, before its file and line are known."""
 
-    location: Location
+    location: SpecLocation
     """Keys and list indices that lead to the value."""
     problem: str
     """The broken rule, as the end of a sentence about the location."""
@@ -116,18 +116,20 @@ class FindingsError(Exception):
         self.findings = list(findings)
 
 
-def findings_error(
-    location: Location, problem: str, suggestion: str = "", raw_value: object = MISSING
+def single_finding_error(
+    location: SpecLocation, problem: str, suggestion: str = "", raw_value: object = MISSING
 ) -> FindingsError:
     """Return a `FindingsError` with a single finding, to be raised."""
     return FindingsError(Finding(location, problem, suggestion, raw_value))
 
 
 class Findings(list[Finding]):
-    """List of findings that collects the errors of several parts, so that all parts are read."""
+    """List of findings; an error in one part of a spec is added, and the next part is read."""
 
     @contextmanager
-    def collect(self, location: Location = (), raw_value: object = MISSING) -> Iterator[None]:
+    def collect_errors(
+        self, location: SpecLocation = (), raw_value: object = MISSING
+    ) -> Iterator[None]:
         """Context manager that appends the reading errors of its body to this list.
 
         A `QuantityError` becomes a finding at `location` that shows `raw_value`; a `FindingsError`
@@ -146,7 +148,7 @@ class Findings(list[Finding]):
             raise FindingsError(*self)
 
 
-def dotted_path(location: Location) -> str:
+def dotted_path(location: SpecLocation) -> str:
     """Return a location as text, such as ``axes.target.range[2]``."""
     path = ""
     for key in location:
@@ -292,8 +294,8 @@ _BOUND_KINDS = {
 }
 """Kinds of bounds of a number, by the names of `NumericRule`'s fields.
 
-Each has its words in messages, a comparison that is True for values outside the bound, and its
-keyword in a JSON Schema.
+Each entry has the words for messages, a comparison that is True for values outside the bound, and
+the keyword of JSON Schema.
 """
 
 
@@ -302,7 +304,7 @@ class BoundViolation(NamedTuple):
 
     value_index: int
     """Index of the value among those that were checked."""
-    broken_bound: str
+    broken_bound_text: str
     """The broken bound in words, such as ``must be at least 1 m``."""
 
 
@@ -414,7 +416,7 @@ class NumericRule(Rule):
         value = quantity.to_si()
         violation = self.first_out_of_bounds(np.array([value]))
         if violation is not None:
-            raise QuantityError(violation.broken_bound)
+            raise QuantityError(violation.broken_bound_text)
         return int(quantity.number) if self.is_integer else value
 
     def first_out_of_bounds(self, values: np.ndarray) -> BoundViolation | None:
@@ -628,9 +630,9 @@ class ListRule(Rule):
     """Maximum number of values."""
     element_noun: str = "values"
     """Noun for the values in messages."""
-    increasing: bool = False
+    is_increasing: bool = False
     """True if each value must be larger than the one before it."""
-    distinct: bool = False
+    is_distinct: bool = False
     """True if no value may occur twice."""
 
     @property
@@ -658,9 +660,9 @@ class ListRule(Rule):
         values = tuple(
             read_list_element(self.element_rule, i, value) for i, value in enumerate(raw_value)
         )
-        if self.increasing and any(b <= a for a, b in pairwise(values)):
+        if self.is_increasing and any(b <= a for a, b in pairwise(values)):
             raise QuantityError("must begin below its end", "put the lower value first")
-        if self.distinct and len(set(values)) < len(values):
+        if self.is_distinct and len(set(values)) < len(values):
             raise QuantityError("holds a name more than once", "list it once")
         return values
 
@@ -670,7 +672,7 @@ class ListRule(Rule):
 
     def _value_schema(self) -> JsonObject:
         length_keywords = {"minItems": self.length_min, "maxItems": self.length_max}
-        distinct_keyword = {"uniqueItems": True} if self.distinct else {}
+        distinct_keyword = {"uniqueItems": True} if self.is_distinct else {}
         return (
             {"type": "array", "items": self.element_rule.schema()}
             | length_keywords
@@ -706,7 +708,7 @@ _FREQUENCY_ERROR_RULE = NumericRule(
     at_most="1e15 Hz",
 )
 """Rule of a frequency error [Hz] in a table of the chirp's frequency error over time."""
-ERROR_TABLE_ROWS_MAX = 4096
+FREQUENCY_ERROR_TABLE_ROWS_MAX = 4096
 """Maximum number of rows of a table of the chirp's frequency error over time."""
 
 
@@ -720,10 +722,12 @@ class FrequencyErrorTableRule(Rule):
         remedy = "write e.g. [[0 us, 0 Hz], [10 us, 2 kHz], [20 us, 1 kHz]], or a CSV file's path"
         if (
             not isinstance(raw_value, list | tuple)
-            or not 3 <= len(raw_value) <= ERROR_TABLE_ROWS_MAX
+            or not 3 <= len(raw_value) <= FREQUENCY_ERROR_TABLE_ROWS_MAX
         ):
             raise QuantityError(
-                f"must be a list of 3 to {ERROR_TABLE_ROWS_MAX} rows, a time and an error", remedy
+                f"must be a list of 3 to {FREQUENCY_ERROR_TABLE_ROWS_MAX} rows, "
+                "a time and an error",
+                remedy,
             )
         rows = []
         for i, row in enumerate(raw_value):
@@ -767,7 +771,9 @@ SCIPY_WINDOWS = (
     "tukey",
 )  # fmt: skip
 """Names of scipy's windows that are suggested to users."""
-_WINDOW_PATTERN = re.compile(r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]*)\))?")
+_WINDOW_NAME_PATTERN = re.compile(
+    r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]*)\))?"
+)
 """Pattern of a window's name with its parameters."""
 _KAISER_REMEDY = "write e.g. 'kaiser(8.6)'"
 
@@ -778,7 +784,7 @@ class WindowFunctionRule(Rule):
     def read(self, raw_value: object) -> str:
         """Return the window as its name, with parameters in parentheses if it has any."""
         match = (
-            _WINDOW_PATTERN.fullmatch(raw_value.strip().lower())
+            _WINDOW_NAME_PATTERN.fullmatch(raw_value.strip().lower())
             if isinstance(raw_value, str)
             else None
         )

@@ -30,10 +30,10 @@ from sweep.model.outputs import (
 from sweep.scenes.map_frames import metres_per_height_unit
 from sweep.scenes.scene_files import SceneError
 from sweep.spec.axes import parameter_location
-from sweep.spec.fields import SpecFiles, iter_file_paths, validate_or_none
+from sweep.spec.fields import SpecFiles, iter_file_fields, validate_or_none
 from sweep.spec.grid_checks import GridValues, raw_value_at
 from sweep.spec.ground_sections import Craters, Ground, JacksboroGround, RasterGround
-from sweep.spec.rules import Finding, Location, suggest_similar_name
+from sweep.spec.rules import Finding, SpecLocation, suggest_similar_name
 from sweep.spec.sections import default_value
 from sweep.units import QuantityError, read_unit
 
@@ -41,10 +41,10 @@ SHOTS_PER_SCANNER_MAX = 10**9
 """Maximum number of shots of a scanner in a flight. Arrays of this length must fit into memory."""
 
 RESERVED_SCANNER_NAMES = ("scene_map",)
-"""Names of groups in a store that are not scanners."""
+"""Names that no scanner may have, because other groups in a store have them."""
 _SOLIDS_WITH_REQUIRED_POSITION = (scene_sections.Sphere, scene_sections.Box)
 """Models of solids that need a position or a motion."""
-OBJECTS_LOCATION: Location = ("scene", "objects")
+OBJECTS_SECTION_LOCATION: SpecLocation = ("scene", "objects")
 """Location of the section of objects in a spec."""
 _N_ATTITUDE_TRIAL_TIMES = 257
 """Number of instants of a path at which its attitude is evaluated as a trial."""
@@ -73,13 +73,16 @@ def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Findi
         Folder that paths in the spec are relative to; None skips all checks that read files.
     """
     objects = _read_sections(
-        _raw_section(raw_spec, *OBJECTS_LOCATION), scene_sections.AnySceneObject
+        _raw_section(raw_spec, *OBJECTS_SECTION_LOCATION), scene_sections.AnySceneObject
     )
     scanners = _read_sections(_raw_section(raw_spec, "scanners"), flight_sections.AnyScanner)
     platform = validate_or_none(flight_sections.Platform, raw_spec.get("platform"))
     findings = [
         *_name_findings(
-            raw_spec, OBJECTS_LOCATION, lambda name: name == scene_sections.WORLD_ORIGIN, "scene"
+            raw_spec,
+            OBJECTS_SECTION_LOCATION,
+            lambda name: name == scene_sections.WORLD_ORIGIN_KEYWORD,
+            "scene",
         ),
         *_name_findings(
             raw_spec, ("scanners",), lambda name: name in RESERVED_SCANNER_NAMES, "store"
@@ -87,7 +90,7 @@ def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Findi
         *_reference_findings(raw_spec, objects),
     ]
     for name, scene_object in objects.items():
-        findings += _object_findings(scene_object, (*OBJECTS_LOCATION, name))
+        findings += _object_findings(scene_object, (*OBJECTS_SECTION_LOCATION, name))
     file_findings = [] if base is None else list(_file_findings(objects, platform, base))
     known_locations = {finding.location for finding in file_findings}
     flight_findings = _flight_findings(platform, scanners, objects, base)
@@ -103,7 +106,7 @@ def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Findi
 
 def _name_findings(
     raw_spec: Mapping[str, Any],
-    section_location: Location,
+    section_location: SpecLocation,
     is_taken: Callable[[str], bool],
     owner: str,
 ) -> Iterator[Finding]:
@@ -129,30 +132,32 @@ def _reference_findings(
 
     The ground that is the scene's origin may state no position.
     """
-    raw_objects = _raw_section(raw_spec, *OBJECTS_LOCATION)
+    raw_objects = _raw_section(raw_spec, *OBJECTS_SECTION_LOCATION)
     if not raw_objects:
         return
-    origin = _raw_section(raw_spec, "scene").get("origin", scene_sections.WORLD_ORIGIN)
-    if isinstance(origin, str) and origin != scene_sections.WORLD_ORIGIN:
+    origin = _raw_section(raw_spec, "scene").get("origin", scene_sections.WORLD_ORIGIN_KEYWORD)
+    if isinstance(origin, str) and origin != scene_sections.WORLD_ORIGIN_KEYWORD:
         yield from _ground_reference_findings(
             origin, ("scene", "origin"), raw_objects, objects, ", or 'world'"
         )
         if any(getattr(objects.get(origin), "position", None) or ()):
             problem, remedy = "places the scene's origin, which lies at zero", "leave it out, or "
             yield Finding(
-                (*OBJECTS_LOCATION, origin, "position"), problem, f"{remedy}take another origin"
+                (*OBJECTS_SECTION_LOCATION, origin, "position"),
+                problem,
+                f"{remedy}take another origin",
             )
     for name, raw_object in raw_objects.items():
         ground_name = raw_object.get("on") if isinstance(raw_object, Mapping) else None
         if isinstance(ground_name, str):
             yield from _ground_reference_findings(
-                ground_name, (*OBJECTS_LOCATION, name, "on"), raw_objects, objects, ""
+                ground_name, (*OBJECTS_SECTION_LOCATION, name, "on"), raw_objects, objects, ""
             )
 
 
 def _ground_reference_findings(
     name: str,
-    location: Location,
+    location: SpecLocation,
     raw_objects: Mapping[str, Any],
     objects: Mapping[str, Any],
     extra_remedy: str,
@@ -174,12 +179,12 @@ def _file_findings(
     objects: Mapping[str, Any], platform: flight_sections.Platform | None, base: Path
 ) -> Iterator[Finding]:
     """Yield a finding for each file of objects and platform that is missing or can't be read."""
-    located_sections: list[tuple[Location, Any]] = [
-        ((*OBJECTS_LOCATION, name), section) for name, section in objects.items()
+    located_sections: list[tuple[SpecLocation, Any]] = [
+        ((*OBJECTS_SECTION_LOCATION, name), section) for name, section in objects.items()
     ]
     located_sections += [] if platform is None else [(("platform",), platform)]
     for location, section in located_sections:
-        for key_path, rule, file in iter_file_paths(section):
+        for key_path, rule, file in iter_file_fields(section):
             path = SpecFiles(base).resolve(file)
             try:
                 rule.compute_digest(path)
@@ -193,7 +198,9 @@ def _file_findings(
 # Objects
 
 
-def _construction_findings(construct: Callable[[], object], location: Location) -> list[Finding]:
+def _construction_findings(
+    construct: Callable[[], object], location: SpecLocation
+) -> list[Finding]:
     """Return a finding if calling `construct` raises an error, else nothing."""
     try:
         construct()
@@ -202,7 +209,7 @@ def _construction_findings(construct: Callable[[], object], location: Location) 
     return []
 
 
-def _object_findings(scene_object: Any, location: Location) -> Iterator[Finding]:
+def _object_findings(scene_object: Any, location: SpecLocation) -> Iterator[Finding]:
     """Yield mistakes in an object, except those in its references and files."""
     if isinstance(scene_object, Ground):
         yield from _ground_findings(scene_object, location)
@@ -237,7 +244,7 @@ def _object_findings(scene_object: Any, location: Location) -> Iterator[Finding]
 
 
 def _diameter_findings(
-    section: scene_sections.Boulders | Craters, location: Location
+    section: scene_sections.Boulders | Craters, location: SpecLocation
 ) -> Iterator[Finding]:
     """Yield a finding if the largest diameter is not above the smallest."""
     if not section.smallest < section.largest:
@@ -245,7 +252,7 @@ def _diameter_findings(
         yield Finding((*location, "largest"), problem, "", f"{section.largest:g} m")
 
 
-def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
+def _ground_findings(ground: Ground, location: SpecLocation) -> Iterator[Finding]:
     """Yield a finding for an invalid grid, or for craters smaller than three grid steps."""
     field_name = "middle" if isinstance(ground, JacksboroGround) else "spacing"
     construction_findings = _construction_findings(ground.check_grid, (*location, field_name))
@@ -264,7 +271,7 @@ def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
 
 
 def _solid_findings(
-    scene_object: scene_sections.SolidObject, location: Location
+    scene_object: scene_sections.SolidObject, location: SpecLocation
 ) -> Iterator[Finding]:
     """Yield mistakes in a solid: two positions or none, an invalid rotation, an unknown unit."""
     position_location = (*location, "position")
@@ -313,7 +320,9 @@ def _flight_findings(
     for name, scene_object in objects.items():
         motion = getattr(scene_object, "motion", None)
         if motion is not None and span is not None and (base or not _reads_tables(motion)):
-            findings += _motion_findings(motion, (*OBJECTS_LOCATION, name, "motion"), files, span)
+            findings += _motion_findings(
+                motion, (*OBJECTS_SECTION_LOCATION, name, "motion"), files, span
+            )
     return findings
 
 
@@ -324,7 +333,7 @@ def _reads_tables(motion: flight_sections.RigidMotion) -> bool:
 
 def _motion_findings(
     motion: flight_sections.RigidMotion,
-    location: Location,
+    location: SpecLocation,
     files: SpecFiles,
     span: flight_sections.TimeSpan | None,
 ) -> Iterator[Finding]:
@@ -358,7 +367,7 @@ def _motion_findings(
 
 
 def _scan_pattern_findings(
-    scanner: Any, location: Location, span: flight_sections.TimeSpan | None
+    scanner: Any, location: SpecLocation, span: flight_sections.TimeSpan | None
 ) -> Iterator[Finding]:
     """Yield a finding for an invalid scan pattern, less than a full cycle, or too many shots."""
     construction_findings = _construction_findings(scanner.build_pattern, location)
@@ -474,7 +483,7 @@ def axis_refusal(path: str) -> AxisRefusal:
 
 
 def variation_findings(
-    parameters: Mapping[str, Any], path: str, values: Iterable[Any], location: Location
+    parameters: Mapping[str, Any], path: str, values: Iterable[Any], location: SpecLocation
 ) -> list[Finding]:
     """Return the reasons why one parameter of a scene may not take several values.
 
@@ -486,7 +495,7 @@ def variation_findings(
         Dotted path of the parameter that varies.
     values : Iterable
         SI values that it takes.
-    location : Location
+    location : SpecLocation
         Location of the values in the spec, for findings.
     """
     problem, remedy = axis_refusal(path)
@@ -514,7 +523,9 @@ def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
     Also yield one for a pattern of beamlets that only suits a plane, and for an axis whose name the
     store uses.
     """
-    parameters = {path: default_value(path) for path in _BEAMLET_POSITION_PATHS} | dict(grid.values)
+    parameters = {path: default_value(path) for path in _BEAMLET_POSITION_PATHS} | dict(
+        grid.field_values
+    )
     if parameters[PATTERN_PATH] in ("line", "square"):
         problem = "is only for a plane, and the ground of a scene is none"
         yield Finding(("footprint", "pattern"), problem, "take hexagonal", parameters[PATTERN_PATH])

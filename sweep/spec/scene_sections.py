@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 import sweep.spec.fields as declare
 from sweep.scenes.scene_files import SceneError
-from sweep.spec.fields import SpecFiles, SpecSection
+from sweep.spec.fields import SpecFiles, SpecSection, Vector
 from sweep.spec.flight_sections import Orientation, RigidMotion, TimeSpan
 from sweep.spec.ground_sections import (
     ArrayGround,
@@ -42,11 +42,8 @@ if TYPE_CHECKING:
     from sweep.scenes.terrain import Terrain
 
 
-Vector = tuple[float, ...]
-"""Components of a vector along x, y and z, in SI units."""
-
-WORLD_ORIGIN = "world"
-"""Word for a scene's origin that leaves the coordinates of objects as they are."""
+WORLD_ORIGIN_KEYWORD = "world"
+"""Value of ``scene.origin`` that leaves the coordinates of objects as they are."""
 
 
 class SolidObject(Material, ABC):
@@ -329,7 +326,7 @@ class Scene(SpecSection):
     """Objects below the instrument, and the sunlight on them."""
 
     origin: str = declare.object_name_field(
-        "Ground whose middle is the zero of all positions, or 'world'", WORLD_ORIGIN
+        "Ground whose middle is the zero of all positions, or 'world'", WORLD_ORIGIN_KEYWORD
     )
     objects: dict[str, AnySceneObject] = Field(description="Objects of the scene, by name")
     solar_irradiance: float = sunlight_field("scene")
@@ -419,13 +416,13 @@ class ErrorFloorSection(SpecSection):
     )
 
 
-_LIMIT_NOTE = "what lies beyond is clipped and reported as invalid"
+_CLIPPING_NOTE = "what lies beyond is clipped and reported as invalid"
 
 
 class Interface(SpecSection):
     """Reports of the unit according to its interface control document.
 
-    No part of the study's identity.
+    The section is no part of the study's identity.
 
     ``sweep export --as reports`` makes reports from stored points, without a new simulation.
     """
@@ -438,17 +435,17 @@ class Interface(SpecSection):
         "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
     )  # fmt: skip
     min_range: float | None = declare.length_field(
-        f"Smallest range that a report can hold; {_LIMIT_NOTE}", "10 m", "0 m", default=None
+        f"Smallest range that a report can hold; {_CLIPPING_NOTE}", "10 m", "0 m", default=None
     )
     max_range: float | None = declare.length_field(
-        f"Largest range that a report can hold; {_LIMIT_NOTE}", "5 km", "0 m", default=None
+        f"Largest range that a report can hold; {_CLIPPING_NOTE}", "5 km", "0 m", default=None
     )
     min_radial_velocity: float | None = declare.quantity_field(
-        f"Smallest radial velocity that a report can hold, positive when closing; {_LIMIT_NOTE}",
+        f"Smallest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
         "m/s", "-60 m/s", default=None,
     )  # fmt: skip
     max_radial_velocity: float | None = declare.quantity_field(
-        f"Largest radial velocity that a report can hold, positive when closing; {_LIMIT_NOTE}",
+        f"Largest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
         "m/s", "220 m/s", default=None,
     )  # fmt: skip
     rate: float | None = declare.quantity_field(
@@ -631,7 +628,7 @@ def _build_mesh(facets: Facets, first_surface: int) -> CleanedMesh:
 
 
 def _object_error(name: str, error: Exception) -> SceneError:
-    """Return the error that names an object and why it can't be built."""
+    """Return an error that states which object can't be built, and why."""
     return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
 
 

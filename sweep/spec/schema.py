@@ -30,7 +30,7 @@ def json_schema() -> JsonObject:
     _, schema = models_json_schema([(GridSpec, "validation"), (SceneSpec, "validation")])
     definitions: JsonObject = schema["$defs"]
     for model in reachable_models(GridSpec, SceneSpec):
-        _format_defaults(definitions[model.__name__]["properties"], model)
+        _format_schema_defaults(definitions[model.__name__]["properties"], model)
     for name in (*_INSTRUMENT_MODEL_NAMES, "Instrument", "Target"):
         definitions[name].pop("required", None)
     instrument, file_description = (
@@ -54,8 +54,8 @@ def json_schema() -> JsonObject:
         definitions[f"{path}.value"] = rule.schema()
         definitions[f"{path}.values"] = _values_schema(path, rule)
     scene_rules = {path: rule for path, rule in rules.items() if SceneSpec.may_be_on_axis(path)}
-    _complete_study_schema(definitions["GridSpec"], rules, ())
-    _complete_study_schema(definitions["SceneSpec"], scene_rules, ("scene", "platform", "scanners"))
+    _add_study_sections(definitions["GridSpec"], rules, ())
+    _add_study_sections(definitions["SceneSpec"], scene_rules, ("scene", "platform", "scanners"))
     return {
         "$schema": JSON_SCHEMA_DIALECT,
         "title": "sweep study",
@@ -66,7 +66,7 @@ def json_schema() -> JsonObject:
     }
 
 
-def _complete_study_schema(
+def _add_study_sections(
     study_schema: JsonObject, rules: Mapping[str, Rule], required: tuple[str, ...]
 ) -> None:
     """Add instrument, axes and required sections to the schema of a study."""
@@ -85,7 +85,7 @@ def _complete_study_schema(
     study_schema["required"] = ["title", "instrument", *required]
 
 
-def _format_defaults(properties: JsonObject, model: type[BaseModel]) -> None:
+def _format_schema_defaults(properties: JsonObject, model: type[BaseModel]) -> None:
     """Replace the defaults of a model's fields, in SI units, by values as users write them.
 
     `properties` is the JSON Schema of the fields, which is changed in place.

@@ -501,7 +501,7 @@ class Accuracy(SpecSection):
 
 
 SPECTRA_METHOD = "spectra"
-"""Method of draws in which whole spectra are drawn, including noise in every bin."""
+"""Value of ``draws.method`` for drawing whole spectra, including noise in every bin."""
 
 
 class Draws(SpecSection):
@@ -630,14 +630,14 @@ def parameter_short_name(path: str) -> str:
     return parent_names[-1] if last_name == "kind" and parent_names else last_name
 
 
-def suggest_parameter(path: str, known: Iterable[str] | None = None) -> str:
+def suggest_parameter(path: str, known_paths: Iterable[str] | None = None) -> str:
     """Suggest the parameter that a wrong path probably means.
 
     Parameters
     ----------
     path : str
         Path that names no parameter.
-    known : Iterable of str, optional
+    known_paths : Iterable of str, optional
         Paths to choose from; all parameters by default.
 
     Returns
@@ -645,13 +645,13 @@ def suggest_parameter(path: str, known: Iterable[str] | None = None) -> str:
     str
         Suggestion, or advice on the sections that axes take.
     """
-    paths = list(parameter_rules() if known is None else known)
+    paths = list(parameter_rules() if known_paths is None else known_paths)
     tail = parameter_short_name(path)
-    same_tail = [known for known in paths if parameter_short_name(known) == tail]
+    same_tail = [known_path for known_path in paths if parameter_short_name(known_path) == tail]
     if len(same_tail) == 1:
         return f"did you mean '{same_tail[0]}'?"
-    path_by_tail = {parameter_short_name(known): known for known in paths}
+    path_by_tail = {parameter_short_name(known_path): known_path for known_path in paths}
     suggestion = suggest_similar_name(path, paths) or suggest_similar_name(tail, path_by_tail)
-    for tail_of_path, known in path_by_tail.items():
-        suggestion = suggestion.replace(f"'{tail_of_path}'", f"'{known}'")
+    for tail_of_path, known_path in path_by_tail.items():
+        suggestion = suggestion.replace(f"'{tail_of_path}'", f"'{known_path}'")
     return suggestion or AXES_REMEDY

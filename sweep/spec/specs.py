@@ -43,14 +43,14 @@ from sweep.spec.fields import (
     SpecFiles,
     SpecSection,
     identity_digest,
-    iter_file_paths,
+    iter_file_fields,
     iter_section_values,
     set_if_absent,
     validate_or_none,
     values_by_path,
 )
 from sweep.spec.figure_sections import (
-    NAVIGATION_SHOTS_MIN,
+    NAVIGATION_SHOTS_PER_CYCLE_MIN,
     GridFigure,
     SceneFigure,
     grid_figure_findings,
@@ -71,11 +71,11 @@ from sweep.spec.ground_sections import OPTICAL_FIELDS
 from sweep.spec.rules import (
     CustomRule,
     Finding,
-    Location,
     Mistake,
     NumericRule,
     Rule,
     SpecError,
+    SpecLocation,
     dotted_path,
     format_raw_value,
 )
@@ -106,10 +106,10 @@ if TYPE_CHECKING:
 
 GRID_POINTS_MAX = 10**15
 """Maximum number of points of a grid."""
-WARNED_LINE_DRIFT_BINS_MIN = 2.0
-"""Smallest drift of a line within a record, due to acceleration, that gives a warning [bins].
+LINE_DRIFT_WARNING_BINS = 2.0
+"""Drift of a line within a record, due to acceleration, above which users are warned [bins].
 
-The line is in developed speckle. From this drift on the stated standard errors are too small.
+It applies to echoes in developed speckle. Above it the stated standard errors are too small.
 """
 
 _N_ACCELERATION_SAMPLES = 1000
@@ -148,7 +148,7 @@ class BaseSpec(SpecSection):
     """Folder that paths in the spec are relative to."""
     _file_digests: dict[str, str] = PrivateAttr(default_factory=dict)
     """Digest of each file's content, by the file's path as written in the spec."""
-    _instrument_floor: InstrumentErrorFloor | None = PrivateAttr(default=None)
+    _instrument_error_floor: InstrumentErrorFloor | None = PrivateAttr(default=None)
     """Fields of the section error_floor that come from the instrument.
 
     None if the spec states all of them.
@@ -217,7 +217,7 @@ class BaseSpec(SpecSection):
             Spec as read from YAML or plain data; changed by this method.
         base : Path or None
             Folder that paths in the spec are relative to. None for the document of a store: its
-            files are not read, and the value of a field may differ from those of its axis.
+            files are not read, and a field's value need not be among the values of its axis.
 
         Raises
         ------
@@ -265,9 +265,9 @@ class BaseSpec(SpecSection):
             findings.insert(0, Finding(("instrument",), "is missing", missing_instrument_remedy()))
         findings = document.findings + findings
         if findings or spec is None:
-            raise SpecError(document.to_mistakes(findings))
+            raise SpecError(document.mistakes_from_findings(findings))
         spec._yaml_mapping = spec._fill_defaults(raw_spec)
-        spec._instrument_floor = document.instrument_floor
+        spec._instrument_error_floor = document.instrument_error_floor
         return spec
 
     @classmethod
@@ -356,10 +356,10 @@ class BaseSpec(SpecSection):
             grid = GridValues(parameters, effect_modes=self.effect_modes())
             findings = [*grid_findings(grid), *_strongest_peak_findings(grid)]
         if findings:
-            raise SpecError(Document({}).to_mistake(finding) for finding in findings)
+            raise SpecError(Document({}).mistake_from_finding(finding) for finding in findings)
         return parameters
 
-    def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
+    def value_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
         """Return the reasons why a parameter may not take an SI value; none for grids.
 
         `location` is the location of the value in the spec, for findings.
@@ -409,9 +409,9 @@ class BaseSpec(SpecSection):
         return read_in_unit(rule, raw_value, parameter.units)
 
     def unstated_error_sentences(self) -> list[str]:
-        """Return sentences about sources of error of unstated size; [] for a grid.
+        """Return sentences for the user about sources of error whose size the spec leaves open.
 
-        A flight overrides this method.
+        The list is empty for a grid; `SceneSpec` overrides this method.
         """
         return []
 
@@ -485,9 +485,10 @@ class BaseSpec(SpecSection):
 
 
 def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, Rule | None]:
-    """Return dotted path and rule of a parameter, found by its path or the last part of its path.
+    """Return dotted path and rule of the parameter that `name` denotes.
 
-    If none or several match, return the name itself and None.
+    The name is a dotted path or the last part of one. If none or several paths match, return the
+    name itself and None.
     """
     rules = sections.parameter_rules()
     paths = [path for path in known_paths if name in (path, sections.parameter_short_name(path))]
@@ -526,7 +527,7 @@ STRONGEST_PEAK_CONDITION: dict[str, ValueCondition] = {
 
 
 def _strongest_peak_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if the strongest peak is reported in a case without a known probability."""
+    """Yield a finding if only strongest peaks are reported where their probability is unknown."""
     several_looks: dict[str, ValueCondition] = {
         looks.LOOKS_NUMBER_PATH: lambda number: number > 1,
         looks.LOOKS_COMBINE_PATH: lambda combination: combination != looks.COMBINE_COHERENT,
@@ -603,14 +604,14 @@ class GridSpec(BaseSpec):
 
     @cached_property
     def has_random_effects(self) -> bool:
-        """True if any effect beyond noise may be random at any point."""
+        """True if an effect other than noise may be random at some point of the grid."""
         return any(
             undrawn_effect_findings(GridValues(self.parameters(), self.axes, self.effect_modes()))
         )
 
     @property
     def reports_strongest_peak(self) -> bool:
-        """True if, at any point, segments report only their strongest peak."""
+        """True if segments report only their strongest peak at some point of the grid."""
         return GridValues(self.parameters(), self.axes).any_point_meets(STRONGEST_PEAK_CONDITION)
 
     def identity(self) -> dict[str, Any]:
@@ -670,7 +671,7 @@ class SceneSpec(BaseSpec):
             spec._base_folder = base
             spec._file_digests = {
                 field.raw_path: field.rule.compute_digest(files.resolve(field.raw_path))
-                for field in iter_file_paths(spec)
+                for field in iter_file_fields(spec)
             }
         return spec
 
@@ -695,7 +696,7 @@ class SceneSpec(BaseSpec):
         """Return True if an axis may set the parameter at a dotted path: it moves no beamlet."""
         return not axis_refusal(path).problem
 
-    def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
+    def value_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
         """Return the reasons why a parameter may not take an SI value with fixed rays."""
         return variation_findings(self.parameters(), path, [value], location)
 
@@ -771,7 +772,9 @@ class SceneSpec(BaseSpec):
     @property
     def has_navigation_solution(self) -> bool:
         """True if at least one scanner has enough shots per cycle for a navigation solution."""
-        return any(self.shots_per_cycle(name) >= NAVIGATION_SHOTS_MIN for name in self.scanners)
+        return any(
+            self.shots_per_cycle(name) >= NAVIGATION_SHOTS_PER_CYCLE_MIN for name in self.scanners
+        )
 
     def unstated_error_sentences(self) -> list[str]:
         """Return sentences for the user about sources of error whose size the spec leaves open.
@@ -785,7 +788,7 @@ class SceneSpec(BaseSpec):
             dict(self.error_floor),
             declare.rules_by_path(scene_sections.ErrorFloorSection, ""),
         )
-        instrument_floor = self._instrument_floor
+        instrument_floor = self._instrument_error_floor
         if instrument_floor and any(floor_values[name] for name in instrument_floor.fields):
             fields = {
                 name: raw_value
@@ -834,8 +837,8 @@ class SceneSpec(BaseSpec):
         -----
         At the radial velocity v and wavelength lambda the Doppler frequency is 2 v / lambda. An
         acceleration a changes it by 2 a T / lambda within a record of duration T. A bin is 1 / T
-        wide, so that the drift is 2 a T^2 / lambda bins. The result
-        is 0 below `WARNED_LINE_DRIFT_BINS_MIN`, and for ground without developed speckle.
+        wide, so that the drift is 2 a T^2 / lambda bins. The result is 0 up to
+        `LINE_DRIFT_WARNING_BINS`, and for ground without developed speckle.
         """
         p = self.parameters()
         if p["footprint.speckle"] != "developed":
@@ -849,7 +852,7 @@ class SceneSpec(BaseSpec):
         state = flight.state(np.linspace(flight.start, flight.stop, _N_ACCELERATION_SAMPLES))
         acceleration_max = float(np.sqrt((state.acceleration**2).sum(axis=1)).max())
         drift = 2 * acceleration_max * record_duration**2 / wavelength
-        return drift if drift > WARNED_LINE_DRIFT_BINS_MIN else 0.0
+        return drift if drift > LINE_DRIFT_WARNING_BINS else 0.0
 
     def number_of_cycles(self, name: str) -> int:
         """Return the number of complete measurement cycles of the scanner `name` in the flight."""
@@ -892,7 +895,7 @@ class SceneSpec(BaseSpec):
         located_findings = [
             replace(finding, location=("interface", *finding.location)) for finding in findings
         ]
-        raise SpecError(map(Document({}).to_mistake, located_findings))
+        raise SpecError(map(Document({}).mistake_from_finding, located_findings))
 
     def pointing_jitter(self) -> PointingJitter | None:
         """Return the random pointing errors of the beams; None without jitter."""
@@ -1092,7 +1095,7 @@ def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
     yaml_text = "".join(f"{json.dumps(path)}: {value}\n" for path, value in text_by_path.items())
     document = parse_document(yaml_text, Path("--set"))
     if document.findings:
-        raise SpecError(map(document.to_mistake, document.findings))
+        raise SpecError(map(document.mistake_from_finding, document.findings))
     return document.content
 
 

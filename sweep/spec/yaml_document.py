@@ -28,27 +28,27 @@ from sweep.spec.rules import (
     RULE_ERROR_TYPE,
     Finding,
     FindingsError,
-    Location,
     Mistake,
     NumericRule,
     SpecError,
+    SpecLocation,
     dotted_path,
-    findings_error,
     format_raw_value,
+    single_finding_error,
     suggest_similar_name,
 )
 from sweep.spec.sections import parameter_rules
 
-FILE_BYTES_MAX = 1_000_000
+YAML_FILE_BYTES_MAX = 1_000_000
 """Maximum size of a YAML file [bytes]."""
-NESTING_MAX = 30
+NESTING_DEPTH_MAX = 30
 """Maximum depth of nested mappings and lists."""
 YAML_NODES_MAX = 200_000
 """Maximum number of YAML nodes in a document; each repetition by an alias counts again."""
 
-_INSTRUMENT_LOCATION: Location = ("instrument",)
+_INSTRUMENT_LOCATION: SpecLocation = ("instrument",)
 _EXAMPLE_INSTRUMENT = "settembrini_2026"
-"""Instrument of the library that remedies use as an example."""
+"""Name of the library's instrument that error messages use as an example."""
 _ERROR_FLOOR_KEY = "error_floor"
 """Name of the section with an instrument's error floor."""
 _INSTRUMENT_FILE_SECTIONS = frozenset(
@@ -70,10 +70,13 @@ _THRESHOLD_FIELDS = {way.removeprefix(PROCESSING_PREFIX) for way in THRESHOLD_PA
 """Fields of ``instrument.processing`` that set the threshold, of which a spec may use one."""
 
 _NUMBER_DIGITS_MAX = 4000
-"""Maximum number of digits of a number; Python refuses longer integers by default."""
+"""Maximum number of characters of a number in YAML, and of bits of an integer in plain data.
+
+Python refuses integers of more than 4300 digits by default.
+"""
 _DECIMAL_PATTERN = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
 """Pattern of a number in decimal notation."""
-_PATH_REMEDY = "check the path, which is relative to the file that names it"
+_FILE_PATH_REMEDY = "check the path, which is relative to the file that names it"
 _SYNTAX_REMEDY = "look at the brackets, quotes, colons and indentation there and above"
 _YAML_REMEDIES = {
     "'\\t'": "indent with blanks, not with tabs",
@@ -112,7 +115,7 @@ class Document:
 
     content: dict[str, Any]
     """Plain data of the spec: dicts with text keys, lists and scalars."""
-    positions: dict[Location, tuple[str, int | None]] = field(default_factory=dict)
+    source_positions: dict[SpecLocation, tuple[str, int | None]] = field(default_factory=dict)
     """File and line of each location; an empty file and None if the value is not from a file."""
     findings: list[Finding] = field(default_factory=list)
     """Mistakes in the YAML text, and in the instrument's file."""
@@ -120,9 +123,9 @@ class Document:
     """Path of the file; empty for plain data."""
     n_nodes: int = 0
     """Number of YAML nodes read; each repetition by an alias counts again."""
-    open_nodes: list[yaml.Node] = field(default_factory=list)
+    enclosing_mappings: list[yaml.Node] = field(default_factory=list)
     """Mappings that are being read, from the outermost to the innermost."""
-    instrument_floor: InstrumentErrorFloor | None = None
+    instrument_error_floor: InstrumentErrorFloor | None = None
     """Fields of the error floor that come from the instrument; None if the study states all of
     them."""
 
@@ -131,14 +134,14 @@ class Document:
         """Make a document of plain data that is not from a file."""
         return cls(content, dict.fromkeys(_iter_locations(content, ()), ("", None)))
 
-    def read_node(self, node: yaml.Node, location: Location) -> Any:
+    def read_node(self, node: yaml.Node, location: SpecLocation) -> Any:
         """Return the value of a YAML node, and record its positions and mistakes.
 
         Parameters
         ----------
         node : yaml.Node
             Scalar, sequence or mapping.
-        location : Location
+        location : SpecLocation
             Keys and indices that lead to the node.
 
         Raises
@@ -148,12 +151,15 @@ class Document:
         """
         self.n_nodes += 1
         line = node.start_mark.line + 1
-        if self.n_nodes > YAML_NODES_MAX or max(len(location), len(self.open_nodes)) > NESTING_MAX:
+        if (
+            self.n_nodes > YAML_NODES_MAX
+            or max(len(location), len(self.enclosing_mappings)) > NESTING_DEPTH_MAX
+        ):
             path, problem = dotted_path(location)[:200], "holds too many values"
             raise SpecError(
                 [Mistake(path, problem, "", "repeat less with aliases", line, self.file)]
             )
-        self.positions.setdefault(location, (self.file, line))
+        self.source_positions.setdefault(location, (self.file, line))
         if node.tag not in _STANDARD_TAGS:
             problem = f"has the tag {node.tag}, and tags are not read"
             self.findings.append(Finding(location, problem, "leave it out"))
@@ -163,7 +169,7 @@ class Document:
             return [self.read_node(child, (*location, i)) for i, child in enumerate(node.value)]
         return _read_scalar(node)
 
-    def _read_mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
+    def _read_mapping(self, node: yaml.MappingNode, location: SpecLocation) -> dict[str, Any]:
         """Read a mapping with text keys; the first value of a repeated key counts.
 
         A merge key, ``<<: *base``, adds the fields of other mappings that this mapping does not
@@ -171,7 +177,7 @@ class Document:
         """
         values: dict[str, Any] = {}
         merged_nodes: list[yaml.Node] = []
-        self.open_nodes.append(node)
+        self.enclosing_mappings.append(node)
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
                 problem = "has a key that is no word"
@@ -180,11 +186,13 @@ class Document:
             key, line = key_node.value, key_node.start_mark.line + 1
             key_location, is_merge = (*location, key), key_node.tag == _MERGE_TAG
             if key in values or (is_merge and merged_nodes):
-                problem = f"is given twice, on lines {self.positions[key_location][1]} and {line}"
+                problem = (
+                    f"is given twice, on lines {self.source_positions[key_location][1]} and {line}"
+                )
                 remedy = "write '<<: [*first, *second]'" if is_merge else "keep one"
                 self.findings.append(Finding(key_location, problem, remedy))
                 continue
-            self.positions[key_location] = (self.file, line)
+            self.source_positions[key_location] = (self.file, line)
             if is_merge:
                 is_list = isinstance(value_node, yaml.SequenceNode)
                 merged_nodes = value_node.value if is_list else [value_node]
@@ -193,11 +201,11 @@ class Document:
         fields: dict[str, Any] = {}
         for merged_node in reversed(merged_nodes):  # earlier mappings override later ones
             fields |= self._read_merged_fields(merged_node, location, values)
-        self.open_nodes.pop()
+        self.enclosing_mappings.pop()
         return fields | values
 
     def _read_merged_fields(
-        self, node: yaml.Node, location: Location, written_fields: Mapping[str, Any]
+        self, node: yaml.Node, location: SpecLocation, written_fields: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Return the fields of a mapping under a merge key, and record their positions.
 
@@ -209,22 +217,22 @@ class Document:
             problem = "must name a mapping by its anchor, or a list of such"
             self.findings.append(Finding(merge_location, problem, "write e.g. '<<: *base'"))
             return {}
-        if node in self.open_nodes:
+        if node in self.enclosing_mappings:
             self.findings.append(
                 Finding(merge_location, "merges a mapping into itself", "leave it out")
             )
             return {}
         base_document = Document(
-            {}, file=self.file, n_nodes=self.n_nodes, open_nodes=self.open_nodes
+            {}, file=self.file, n_nodes=self.n_nodes, enclosing_mappings=self.enclosing_mappings
         )
         fields: dict[str, Any] = base_document.read_node(node, location)
         self.n_nodes, depth = base_document.n_nodes, len(location)
-        for inner_location, position in base_document.positions.items():
+        for inner_location, position in base_document.source_positions.items():
             if len(inner_location) > depth and inner_location[depth] not in written_fields:
-                self.positions[inner_location] = position
+                self.source_positions[inner_location] = position
         return fields
 
-    def to_mistake(self, finding: Finding) -> Mistake:
+    def mistake_from_finding(self, finding: Finding) -> Mistake:
         """Convert a finding to a mistake with the file and line of its location.
 
         If the location is not in a file, the line is that of the section around it.
@@ -233,9 +241,9 @@ class Document:
         therefore located at the user's field that causes it.
         """
         location = finding.location
-        while location and location not in self.positions:
+        while location and location not in self.source_positions:
             location = location[:-1]
-        file, line = self.positions.get(location, (self.file, None))
+        file, line = self.source_positions.get(location, (self.file, None))
         path, value, rule = (
             dotted_path(finding.location),
             format_raw_value(finding.raw_value),
@@ -266,7 +274,7 @@ class Document:
         )
         user_positions = {
             field_location: position
-            for field_location, position in self.positions.items()
+            for field_location, position in self.source_positions.items()
             if position[0] == self.file
         }
         user_fields = [
@@ -301,19 +309,19 @@ class Document:
             (self.file, None),
         )
 
-    def to_mistakes(self, findings: Iterable[Finding]) -> list[Mistake]:
+    def mistakes_from_findings(self, findings: Iterable[Finding]) -> list[Mistake]:
         """Return findings as mistakes without duplicates, sorted by line.
 
         Mistakes in other files come last.
         """
-        mistakes = dict.fromkeys(self.to_mistake(finding) for finding in findings)
+        mistakes = dict.fromkeys(self.mistake_from_finding(finding) for finding in findings)
         return sorted(
             mistakes,
             key=lambda mistake: (mistake.file != self.file, mistake.file, mistake.line or 0),
         )
 
 
-def _iter_locations(value: Any, location: Location) -> Iterator[Location]:
+def _iter_locations(value: Any, location: SpecLocation) -> Iterator[SpecLocation]:
     """Yield the location of a value in plain data and of every value in it."""
     yield location
     if isinstance(value, dict):
@@ -416,13 +424,13 @@ def drop_anchor_sections(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_text(path: Path) -> str:
-    """Return the text of a file of at most `FILE_BYTES_MAX` bytes.
+    """Return the text of a file of at most `YAML_FILE_BYTES_MAX` bytes.
 
     Raise `SpecError` if the file is unreadable.
     """
     try:
         with open(open_regular_file(path), "rb") as file:
-            content = file.read(FILE_BYTES_MAX + 1)
+            content = file.read(YAML_FILE_BYTES_MAX + 1)
     except FileNotFoundError:
         raise _file_error(path, "does not exist", suggest_similar_file(path)) from None
     except IsADirectoryError:
@@ -431,9 +439,9 @@ def _read_text(path: Path) -> str:
         raise _file_error(path, error.strerror or "", "name a YAML file") from None
     except (OSError, ValueError) as error:
         problem = f"cannot be read: {getattr(error, 'strerror', '') or error}"
-        raise _file_error(path, problem, _PATH_REMEDY) from None
-    if len(content) > FILE_BYTES_MAX:
-        problem = f"is larger than {FILE_BYTES_MAX} bytes"
+        raise _file_error(path, problem, _FILE_PATH_REMEDY) from None
+    if len(content) > YAML_FILE_BYTES_MAX:
+        problem = f"is larger than {YAML_FILE_BYTES_MAX} bytes"
         raise _file_error(path, problem, "give long axes as generators")
     try:
         return content.decode("utf-8-sig")
@@ -448,7 +456,7 @@ def _file_error(
     return SpecError([Mistake("", problem, "", suggestion, line, str(path))])
 
 
-def suggest_similar_file(path: Path, *, fallback: str = _PATH_REMEDY) -> str:
+def suggest_similar_file(path: Path, *, fallback: str = _FILE_PATH_REMEDY) -> str:
     """Suggest a YAML file in the same folder whose name resembles that of a missing file.
 
     Parameters
@@ -489,7 +497,7 @@ class _DepthLimitedLoader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Return a node; refuse one that is nested too deeply."""
         self.depth += 1
-        if self.depth > NESTING_MAX:
+        if self.depth > NESTING_DEPTH_MAX:
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
             raise yaml.MarkedYAMLError(problem="it is nested too deeply", problem_mark=mark)
         node = super().compose_node(parent, index)  # type: ignore[no-untyped-call]
@@ -547,16 +555,16 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
         _merge_error_floor(document, instrument_document.content[_ERROR_FLOOR_KEY], str(reference))
     kept_positions = {
         value_location: position
-        for value_location, position in document.positions.items()
+        for value_location, position in document.source_positions.items()
         if _is_leaf(document.content, value_location)
     }
     instrument_positions = {
         value_location: position
-        for value_location, position in instrument_document.positions.items()
+        for value_location, position in instrument_document.source_positions.items()
         if value_location[:1] in (_INSTRUMENT_LOCATION, (_ERROR_FLOOR_KEY,))
         and value_location != _INSTRUMENT_LOCATION
     }
-    document.positions = document.positions | instrument_positions | kept_positions
+    document.source_positions = document.source_positions | instrument_positions | kept_positions
     document.findings += instrument_document.findings
     return True
 
@@ -575,7 +583,7 @@ def _merge_error_floor(document: Document, instrument_floor: object, instrument_
     if added_fields := {
         name: value for name, value in instrument_floor.items() if name not in study_floor
     }:
-        document.instrument_floor = InstrumentErrorFloor(instrument_name, added_fields)
+        document.instrument_error_floor = InstrumentErrorFloor(instrument_name, added_fields)
 
 
 def _load_frequency_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
@@ -601,7 +609,7 @@ def _load_frequency_error_table(document: Document, instrument: dict[str, Any], 
     chirp[name] = [[f"{time!r} s", f"{error!r} Hz"] for time, error in rows]
 
 
-def _read_instrument(reference: object, location: Location, base: Path) -> Document:
+def _read_instrument(reference: object, location: SpecLocation, base: Path) -> Document:
     """Read the file of an instrument, given by its name in the library or by a path.
 
     The document that is returned has the sections of a library file.
@@ -609,9 +617,11 @@ def _read_instrument(reference: object, location: Location, base: Path) -> Docum
     if not isinstance(reference, str):
         if "file" in location:
             remedy = "write it relative to this file"
-            raise findings_error(location, "must be the path of a YAML file", remedy, reference)
+            raise single_finding_error(
+                location, "must be the path of a YAML file", remedy, reference
+            )
         problem = "must be the name of an instrument of the library"
-        raise findings_error(
+        raise single_finding_error(
             location, problem, f"the library has {', '.join(library_instrument_files())}", reference
         )
     file, files_by_name = base / os.path.expanduser(reference), library_instrument_files()
@@ -623,12 +633,14 @@ def _read_instrument(reference: object, location: Location, base: Path) -> Docum
         remedy = suggest_similar_name(
             normalised_name, files_by_name, fallback=f"the library has {', '.join(files_by_name)}"
         )
-        raise findings_error(location, "is no instrument of the library", remedy, reference)
+        raise single_finding_error(location, "is no instrument of the library", remedy, reference)
     try:
         instrument_document = read_document(file)
     except SpecError as error:
         problem = f"names a file that {error.mistakes[0].problem}"
-        raise findings_error(location, problem, error.mistakes[0].suggestion, reference) from None
+        raise single_finding_error(
+            location, problem, error.mistakes[0].suggestion, reference
+        ) from None
     return _normalise_instrument_file(instrument_document)
 
 
@@ -644,42 +656,45 @@ def _normalise_instrument_file(document: Document) -> Document:
             else {}
         )
 
-        def move_below_instrument(location: Location) -> Location:
+        def move_below_instrument(location: SpecLocation) -> SpecLocation:
             return (
                 location
                 if location[:1] == (_ERROR_FLOOR_KEY,)
                 else (*_INSTRUMENT_LOCATION, *location)
             )
 
-        places = {
+        source_positions = {
             move_below_instrument(location): position
-            for location, position in document.positions.items()
+            for location, position in document.source_positions.items()
         }
         findings = [
             replace(finding, location=move_below_instrument(finding.location))
             for finding in document.findings
         ]
         return Document(
-            {"instrument": document.content, **floor_section}, places, findings, document.file
+            {"instrument": document.content, **floor_section},
+            source_positions,
+            findings,
+            document.file,
         )
-    findings, places = list(document.findings), dict(document.positions)
+    findings, source_positions = list(document.findings), dict(document.source_positions)
     for name in sorted(document.content.keys() - _INSTRUMENT_FILE_SECTIONS):
         problem = "is no section of an instrument's file"
         remedy = suggest_similar_name(
             name, _INSTRUMENT_FILE_SECTIONS, fallback="leave it out of that file"
         )
         findings.append(Finding((*_INSTRUMENT_LOCATION, name), problem, remedy))
-        places[(*_INSTRUMENT_LOCATION, name)] = places[(name,)]
+        source_positions[(*_INSTRUMENT_LOCATION, name)] = source_positions[(name,)]
     instrument_fields = document.content["instrument"]
     if not isinstance(instrument_fields, dict):
         problem = "must be a mapping of fields to values in an instrument's file"
-        raise findings_error(
+        raise single_finding_error(
             _INSTRUMENT_LOCATION,
             problem,
             f"write them below 'instrument:' in {document.file}",
             instrument_fields,
         )
-    return Document(document.content, places, findings, document.file)
+    return Document(document.content, source_positions, findings, document.file)
 
 
 def library_instrument_files() -> dict[str, Path]:
@@ -709,14 +724,14 @@ def _drop_overridden_threshold(instrument: Any, overrides: Mapping[str, Any]) ->
     }
 
 
-def to_plain_data(data: Any, location: Location = ()) -> Any:
+def to_plain_data(data: Any, location: SpecLocation = ()) -> Any:
     """Copy data into the types that a YAML parser returns: dicts with text keys, and lists.
 
     Parameters
     ----------
     data : object
         Mappings, sequences and scalars.
-    location : Location
+    location : SpecLocation
         Location of `data` in the spec, for mistakes.
 
     Raises
@@ -724,7 +739,7 @@ def to_plain_data(data: Any, location: Location = ()) -> Any:
     SpecError
         If the data is nested too deeply, or holds an integer with too many digits or invalid text.
     """
-    if len(location) > NESTING_MAX:
+    if len(location) > NESTING_DEPTH_MAX:
         raise SpecError([Mistake(dotted_path(location), "is nested too deeply")])
     if isinstance(data, int) and data.bit_length() > _NUMBER_DIGITS_MAX:
         raise SpecError([Mistake(dotted_path(location), "is a number of too many digits")])
@@ -753,7 +768,7 @@ def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
     return result
 
 
-def _value_at_location(value: Any, location: Location) -> Any:
+def _value_at_location(value: Any, location: SpecLocation) -> Any:
     """Return the value at a location of nested data; empty text if there is none."""
     try:
         for key in location:
@@ -763,7 +778,7 @@ def _value_at_location(value: Any, location: Location) -> Any:
     return value
 
 
-def _is_leaf(value: Any, location: Location) -> bool:
+def _is_leaf(value: Any, location: SpecLocation) -> bool:
     """Return True if the value at a location is not a mapping, or does not exist."""
     for key in location:
         try:
@@ -794,10 +809,10 @@ _OTHER_SPEC_REMEDIES = {
 }
 """Remedies for sections that only the other class of spec has, by the section's name."""
 
-_SPEC_OF_FIGURE_KIND = {
-    spec_fields.kind_of_model(model): target
-    for kind, target in ((GridFigure, "a target"), (SceneFigure, "a scene"))
-    for model in spec_fields.models_of_annotation(kind)
+_REQUIRED_SECTION_BY_FIGURE_KIND = {
+    spec_fields.kind_of_model(model): section_text
+    for annotation, section_text in ((GridFigure, "a target"), (SceneFigure, "a scene"))
+    for model in spec_fields.models_of_annotation(annotation)
 }
 """Section that a study needs for a figure, ``a target`` or ``a scene``, by the figure's kind."""
 
@@ -820,8 +835,8 @@ def validation_findings(error: ValidationError, annotation: Any) -> list[Finding
 def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
     """Convert one entry of `ValidationError.errors` to a finding."""
     error_type, raw_value = detail["type"], detail["input"]
-    spec_location = spec_fields.translate_error_location(detail["loc"], annotation)
-    location = spec_location.keys
+    model_location = spec_fields.translate_pydantic_location(detail["loc"], annotation)
+    location = model_location.keys
     if error_type == RULE_ERROR_TYPE:
         context, path = detail["ctx"], dotted_path(location)
         if (
@@ -835,40 +850,43 @@ def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
         shown_value = MISSING if isinstance(raw_value, dict) else raw_value
         return Finding(location, context["rule"], context["suggestion"], shown_value)
     if error_type == "missing":
-        return Finding(location, "is missing", _missing_field_remedy(spec_location))
+        return Finding(location, "is missing", _missing_field_remedy(model_location))
     if error_type == "extra_forbidden":
         models_by_kind = {
             spec_fields.kind_of_model(model): model
             for model in spec_fields.models_of_annotation(annotation)
         }
         model = models_by_kind.get(detail["loc"][0], annotation)
-        return Finding(location, "is no field", _suggest_field(spec_location, model))
+        return Finding(location, "is no field", _suggest_field(model_location, model))
     if error_type == "union_tag_invalid":
         tag, kind_names = (
             detail["ctx"]["tag"],
-            [spec_fields.kind_of_model(model) for model in spec_location.value_models],
+            [spec_fields.kind_of_model(model) for model in model_location.value_models],
         )
         problem = f"must be one of {', '.join(kind_names)}"
         return Finding((*location, "kind"), problem, _suggest_kind(str(tag), kind_names), tag)
     if error_type == "union_tag_not_found":
         return Finding(
-            location, "lacks its kind", f"write {_kind_hint(spec_location.value_models)}", raw_value
+            location,
+            "lacks its kind",
+            f"write {_kind_hint(model_location.value_models)}",
+            raw_value,
         )
     problem = _PROBLEM_BY_ERROR_TYPE.get(error_type, "has an invalid value")
     remedy = (
-        _missing_field_remedy(spec_location)
-        if spec_location.value_models
-        else _list_remedy(spec_location, error_type)
+        _missing_field_remedy(model_location)
+        if model_location.value_models
+        else _list_remedy(model_location, error_type)
     )
     return Finding(location, problem, remedy, raw_value)
 
 
-def _list_remedy(spec_location: spec_fields.SpecLocation, error_type: str) -> str:
+def _list_remedy(model_location: spec_fields.ModelLocation, error_type: str) -> str:
     """Return the remedy for a value that must be a list, or a mapping of sections."""
     if error_type in ("list_type", "tuple_type"):
         return "put it in brackets, [...], or on lines that begin with '- '"
     return (
-        f"write '{spec_location.keys[-1]}:' with a name and its fields below"
+        f"write '{model_location.keys[-1]}:' with a name and its fields below"
         if error_type == "dict_type"
         else ""
     )
@@ -881,42 +899,45 @@ def _kind_hint(models: spec_fields.ModelClasses) -> str:
 
 def _suggest_kind(tag: str, kind_names: list[str]) -> str:
     """Return a suggestion for an unknown kind."""
-    if tag in _SPEC_OF_FIGURE_KIND and kind_names[0] in _SPEC_OF_FIGURE_KIND:
-        return f"{tag} is for studies of {_SPEC_OF_FIGURE_KIND[tag]}"
+    if (
+        tag in _REQUIRED_SECTION_BY_FIGURE_KIND
+        and kind_names[0] in _REQUIRED_SECTION_BY_FIGURE_KIND
+    ):
+        return f"{tag} is for studies of {_REQUIRED_SECTION_BY_FIGURE_KIND[tag]}"
     return suggest_similar_name(tag, kind_names)
 
 
-def _missing_field_remedy(spec_location: spec_fields.SpecLocation) -> str:
+def _missing_field_remedy(model_location: spec_fields.ModelLocation) -> str:
     """Return the remedy for a missing field or section."""
-    name, section = spec_location.keys[-1], spec_location.keys[:-1]
-    if spec_location.keys == _INSTRUMENT_LOCATION:
+    name, section = model_location.keys[-1], model_location.keys[:-1]
+    if model_location.keys == _INSTRUMENT_LOCATION:
         return missing_instrument_remedy()
     field = (
-        spec_fields.fields_by_name(spec_location.enclosing_section_models[0]).get(str(name))
-        if spec_location.enclosing_section_models
+        spec_fields.fields_by_name(model_location.enclosing_section_models[0]).get(str(name))
+        if model_location.enclosing_section_models
         else None
     )
     rule = spec_fields.rule_of_field(field) if field is not None else None
     example = rule.example if rule is not None else ""
     if example:
         may_vary = (
-            isinstance(rule, NumericRule) and dotted_path(spec_location.keys) in parameter_rules()
+            isinstance(rule, NumericRule) and dotted_path(model_location.keys) in parameter_rules()
         )
         return f"write e.g. '{name}: {example}'" + (", or put it on an axis" if may_vary else "")
-    if isinstance(name, int) and spec_location.value_models:
-        has_kinds = len(spec_location.value_models) > 1
+    if isinstance(name, int) and model_location.value_models:
+        has_kinds = len(model_location.value_models) > 1
         field_names = (
-            _kind_hint(spec_location.value_models)
+            _kind_hint(model_location.value_models)
             if has_kinds
-            else ", ".join(spec_fields.fields_by_name(spec_location.value_models[0]))
+            else ", ".join(spec_fields.fields_by_name(model_location.value_models[0]))
         )
         return f"write a mapping with {field_names}"
-    if len(spec_location.value_models) > 1:
-        return f"write '{name}:' with {_kind_hint(spec_location.value_models)}"
-    if spec_location.value_models:
+    if len(model_location.value_models) > 1:
+        return f"write '{name}:' with {_kind_hint(model_location.value_models)}"
+    if model_location.value_models:
         remedy = (
             f"write '{name}:' with "
-            f"{', '.join(spec_fields.fields_by_name(spec_location.value_models[0]))}"
+            f"{', '.join(spec_fields.fields_by_name(model_location.value_models[0]))}"
         )
         like_remedy = f", or take all that is missing from another: 'like: {_EXAMPLE_INSTRUMENT}'"
         return remedy + (like_remedy if section == _INSTRUMENT_LOCATION else "")
@@ -932,15 +953,15 @@ def missing_instrument_remedy() -> str:
     )
 
 
-def _suggest_field(spec_location: spec_fields.SpecLocation, root_model: type[BaseModel]) -> str:
+def _suggest_field(model_location: spec_fields.ModelLocation, root_model: type[BaseModel]) -> str:
     """Suggest a known field for an unknown one: of the same section, else of the whole spec."""
-    name = str(spec_location.keys[-1])
+    name = str(model_location.keys[-1])
     sibling_names = [
         field
-        for model in spec_location.enclosing_section_models
+        for model in model_location.enclosing_section_models
         for field in spec_fields.fields_by_name(model)
     ]
-    if name in _OTHER_SPEC_REMEDIES and spec_location.enclosing_section_models == (root_model,):
+    if name in _OTHER_SPEC_REMEDIES and model_location.enclosing_section_models == (root_model,):
         return _OTHER_SPEC_REMEDIES[name]
     known_paths = dict.fromkeys((*parameter_rules(), *spec_fields.rules_by_path(root_model, "")))
     if name[:1].isdigit():
