@@ -174,7 +174,7 @@ def read_axes(raw_axes: object) -> tuple[tuple[Axis, ...], list[Finding]]:
 
 
 def first_values_on_axes(raw_axes: object) -> dict[str, object]:
-    """Return the first value, as written, of each parameter that a spec's ``axes`` section sets.
+    """Return the first written value of each parameter that a spec's ``axes`` section sets.
 
     Keys of the result are dotted paths. Paths that name no parameter are left out.
     """
@@ -243,7 +243,7 @@ def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
     if isinstance(raw_axis, dict) and "zip" in raw_axis:
         return _read_zipped_axis(key, raw_axis, location)
     if key in MODEL_BY_SECTION and isinstance(raw_axis, dict):
-        path, values_hint = _describe_first_field(key, raw_axis)
+        path, values_hint = _first_field_path_and_hint(key, raw_axis)
         problem = "is a section, and an axis is named by the whole path of a field"
         raise single_finding_error(location, problem, f"write '{path}: {values_hint}'")
     parameter = _make_axis_parameter(
@@ -253,7 +253,7 @@ def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
     return Axis(parameter.coordinate, (parameter,))
 
 
-def _describe_first_field(path: str, raw_section: object) -> tuple[str, str]:
+def _first_field_path_and_hint(path: str, raw_section: object) -> tuple[str, str]:
     """Return the dotted path of the first field in a section, and how to write its values.
 
     They are for the remedy if a user writes a whole section under ``axes``, not a field's path.
@@ -431,7 +431,10 @@ def _number_of_values(entries: list[AxisEntry]) -> int:
 
 
 def _assign_coordinate_names(axes: list[Axis]) -> list[Axis]:
-    """Return the axes with a name for each coordinate: the shortest unambiguous end of its path."""
+    """Return the axes with names of their coordinates.
+
+    A coordinate's name is the shortest unambiguous end of its parameter's path.
+    """
     paths = [parameter.path for axis in axes for parameter in axis.parameters]
     named_axes = []
     for axis in axes:

@@ -79,9 +79,10 @@ def describe_differences(a: Any, b: Any) -> list[str]:
 
 
 def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a study's identity by dotted path. All values of an axis are one entry.
+    """Return the entries of a study's identity by dotted path.
 
-    The identity is the content by which two studies are the same or not.
+    Two studies are the same if their identities are equal. The values of a parameter along an axis
+    are one entry.
     """
     leaves: dict[str, Any] = dict(identity.get("parameters", {}))
     for key, value in identity.items():

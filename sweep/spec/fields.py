@@ -618,9 +618,10 @@ def to_canonical_data(value: Any) -> Any:
 
 
 def identity_digest(identity: Mapping[str, Any]) -> str:
-    """Return the hash of a study's identity, the content by which studies are the same or not.
+    """Return the hash of a study's identity.
 
-    It is BLAKE2b of the canonical JSON text, 32 hexadecimal digits.
+    Two studies are the same if their identities are equal. The hash is BLAKE2b of the canonical
+    JSON text, 32 hexadecimal digits.
     """
     text = json.dumps(
         to_canonical_data(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False

@@ -209,7 +209,7 @@ def grid_findings(grid: GridValues) -> list[Finding]:
         *_sweep_error_table_findings(grid),
         *_beam_findings(grid),
         *_parent_effect_findings(grid),
-        *_requirement_findings(grid),
+        *_effect_requirement_findings(grid),
         *_record_and_filter_findings(grid),
         *_multiple_looks_findings(grid),
         *_search_band_findings(grid),
@@ -363,7 +363,10 @@ def _segment_samples_min(grid: GridValues) -> float | None:
 
 
 def _window_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if a window function does not exist at the length of the shortest record."""
+    """Yield a finding if a window function does not exist for the number of samples of a record.
+
+    The shortest record of the grid counts.
+    """
     samples = _segment_samples_min(grid)
     if samples is None or not grid.has_values(WINDOW_PATH, FFT_SIZE_PATH):
         return
@@ -725,11 +728,11 @@ def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:
         while outer and grid.effect_modes.get(name) == ON:
             if grid.effect_modes.get(outer) == OFF:
                 problem = f"acts within {outer}, which is off"
-                yield _mode_finding(name, problem, f"turn {outer} on, or leave {name} out")
+                yield _effect_mode_finding(name, problem, f"turn {outer} on, or leave {name} out")
             outer = outer_of_effect[outer]
 
 
-def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
+def _effect_requirement_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding for each broken requirement of an effect that is not off."""
     for effect in EFFECTS:
         mode = grid.effect_modes.get(effect.name, OFF)
@@ -748,7 +751,7 @@ def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
                     and mode == ON
                     and grid.any_point_meets({requirement.other_path: requirement.is_broken_by})
                 ):
-                    yield _mode_finding(effect.name, requirement.problem, remedy)
+                    yield _effect_mode_finding(effect.name, requirement.problem, remedy)
 
 
 def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
@@ -791,7 +794,7 @@ def undrawn_effect_findings(grid: GridValues) -> Iterator[Finding]:
     problem = "is simulated by draws, and the study has none"
     for effect in EFFECTS:
         if effect.is_random and grid.effect_modes.get(effect.name) == ON:
-            yield _mode_finding(
+            yield _effect_mode_finding(
                 effect.name, problem, "set draws.limit or draws.number, or leave it out"
             )
     for effect, parameter in _active_random_parameters(grid):
@@ -825,7 +828,7 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
             instead_text = (
                 ": beams wander by platform.jitter" if effect.perturb_parameters is not None else ""
             )
-            yield _mode_finding(effect.name, problem, f"leave it out{instead_text}")
+            yield _effect_mode_finding(effect.name, problem, f"leave it out{instead_text}")
     yield from spectrum_method_findings(draws, grid)
     if grid.any_point_meets({waveform.SHOT_DETECTION_PATH: condition_equal_to(waveform.ANY_TWO)}):
         problem, remedy = "is not known to flights, which pair peaks", "take both_chirps"
@@ -850,7 +853,7 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
         )
 
 
-def _mode_finding(effect: str, problem: str, remedy: str) -> Finding:
+def _effect_mode_finding(effect: str, problem: str, remedy: str) -> Finding:
     """Return a finding about an effect whose mode is ``on``."""
     return Finding(("effects", effect), problem, remedy, ON)
 

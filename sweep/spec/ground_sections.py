@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 GRID_STEPS_PER_SIDE_MAX = 7000
 """Maximum number of grid steps along one side of a square."""
-_RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
-"""Uses of random numbers. The index of a use selects its stream of random numbers."""
+_RANDOM_STREAM_NAMES = ("relief", "hills", "craters", "boulders", "trees")
+"""Names of the uses of random numbers; the index of a name selects its stream."""
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:
@@ -42,7 +42,7 @@ def random_generator(purpose: str, seed: int) -> np.random.Generator:
     seed : int
         Seed of the section, >= 0.
     """
-    key = (_RANDOM_STREAMS.index(purpose),)
+    key = (_RANDOM_STREAM_NAMES.index(purpose),)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
 
 

@@ -420,7 +420,7 @@ class NumericRule(Rule):
         return int(quantity.number) if self.is_integer else value
 
     def first_out_of_bounds(self, values: np.ndarray) -> BoundViolation | None:
-        """Return the index of the first SI value outside the bounds, and the broken bound in words.
+        """Return the first violation of the bounds: index of the value, and broken bound in words.
 
         Parameters
         ----------

@@ -17,7 +17,7 @@ from sweep.spec.yaml_document import library_instrument_files
 JSON_SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """URI of the JSON Schema dialect that the schema uses."""
 
-_INSTRUMENT_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
+_INSTRUMENT_SECTION_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
 """Names of the pydantic models of the sections of an instrument."""
 
 
@@ -31,7 +31,7 @@ def json_schema() -> JsonObject:
     definitions: JsonObject = schema["$defs"]
     for model in reachable_models(GridSpec, SceneSpec):
         _format_schema_defaults(definitions[model.__name__]["properties"], model)
-    for name in (*_INSTRUMENT_MODEL_NAMES, "Instrument", "Target"):
+    for name in (*_INSTRUMENT_SECTION_MODEL_NAMES, "Instrument", "Target"):
         definitions[name].pop("required", None)
     instrument, file_description = (
         definitions["Instrument"],
@@ -103,7 +103,7 @@ def _definition_reference(path: str, suffix: str) -> JsonObject:
     return {"$ref": f"#/$defs/{path}.{suffix}"}
 
 
-def _object_schema(properties: JsonObject, *required: str, **keywords: Any) -> JsonObject:
+def _mapping_schema(properties: JsonObject, *required: str, **keywords: Any) -> JsonObject:
     """Return the schema of a mapping with the given properties only."""
     required_keyword = {"required": list(required)} if required else {}
     return (
@@ -133,9 +133,9 @@ def _generator_schemas(value_schema: JsonObject) -> Iterator[JsonObject]:
     number_schema = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
     for form in ("linear", "log"):
         bounds_schema = _list_schema(value_schema, 2, maxItems=2)
-        yield _object_schema({form: bounds_schema, "number": number_schema}, form, "number")
+        yield _mapping_schema({form: bounds_schema, "number": number_schema}, form, "number")
     steps_schema = _list_schema({"type": ["string", "number"]}, 3, maxItems=3)
-    yield _object_schema({"step": steps_schema}, "step")
+    yield _mapping_schema({"step": steps_schema}, "step")
 
 
 def _axes_schema(rules: Mapping[str, Rule]) -> JsonObject:
@@ -150,12 +150,12 @@ def _axes_schema(rules: Mapping[str, Rule]) -> JsonObject:
         }
         for path in rules
     }
-    piece_schema = _object_schema(value_schemas, minProperties=1)
+    piece_schema = _mapping_schema(value_schemas, minProperties=1)
     return {
         "type": "object",
         "description": "Parameters that vary: a list, a generator, or a zipped axis by any name",
         "properties": {path: _definition_reference(path, "values") for path in rules},
-        "additionalProperties": _object_schema(
+        "additionalProperties": _mapping_schema(
             {"zip": {"anyOf": [piece_schema, _list_schema(piece_schema)]}}, "zip"
         ),
     }

@@ -1011,7 +1011,7 @@ def load(path: str | Path) -> GridSpec | SceneSpec:
 
 
 def _user_values_on_axes(raw_spec: Any) -> dict[str, object]:
-    """Return the values, as written, of fields that a user sets although an axis sets them too.
+    """Return the written values of fields that a user sets although an axis sets them too.
 
     Fields of the library or of an instrument's file do not count: an axis may override them.
     """

@@ -78,7 +78,7 @@ _DECIMAL_PATTERN = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
 """Pattern of a number in decimal notation."""
 _FILE_PATH_REMEDY = "check the path, which is relative to the file that names it"
 _SYNTAX_REMEDY = "look at the brackets, quotes, colons and indentation there and above"
-_YAML_REMEDIES = {
+_YAML_ERROR_REMEDIES = {
     "'\\t'": "indent with blanks, not with tabs",
     "mapping values are not allowed": "put a blank after each colon, quotes around text that holds "
     "': ', and the same number of blanks before fields of one section",
@@ -397,7 +397,7 @@ def parse_document(text: str, path: Path) -> Document:
         remedy = next(
             (
                 remedy_text
-                for phrase, remedy_text in _YAML_REMEDIES.items()
+                for phrase, remedy_text in _YAML_ERROR_REMEDIES.items()
                 if phrase in yaml_problem
             ),
             _SYNTAX_REMEDY,
@@ -711,7 +711,7 @@ def library_instrument_files() -> dict[str, Path]:
 
 
 def _drop_overridden_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an instrument's fields, without its threshold if the overrides set one in any way."""
+    """Return an instrument's fields, without its threshold if the overrides set a threshold."""
     base_processing, new_processing = instrument.get("processing"), overrides.get("processing")
     if not (
         isinstance(base_processing, Mapping)
