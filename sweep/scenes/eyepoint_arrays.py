@@ -1,4 +1,4 @@
-"""Conversion of eyepoints to the arrays of a store and back.
+"""Conversion of eyepoints (geometry of a flight's shots) to the arrays of a store, and back.
 
 The arrays are named as in :mod:`sweep.model.outputs`.
 """
@@ -56,7 +56,7 @@ def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
 
 
 def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
-    """Return the eyepoints of the arrays of a store.
+    """Return the eyepoints that arrays of a store hold.
 
     Parameters
     ----------

@@ -29,23 +29,23 @@ _CUSTOMARY_NO_DATA_VALUES = (
 """Values by which files customarily mark missing heights."""
 
 _CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN = 0.1
-"""Distance of a customary no-data value from the nearest height, above which a warning is given.
+"""Gap between a customary no-data value and the next height, above which a warning is given.
 
-It is relative to the difference between the largest and the smallest of all other heights.
+The gap is relative to the difference between the largest and the smallest of all other heights.
 """
 
 _REPEATED_EXTREME_RELATIVE_GAP_MIN = 1.0
-"""Distance of the smallest or largest value from the next height, above which a warning is given.
+"""Gap between a repeated extreme height and the next height, above which a warning is given.
 
-Several cells have this value. The distance is relative to the difference between the largest and
-the smallest of all other heights.
+The extreme is the smallest or largest height, and several cells share it. The gap is relative to
+the difference between the largest and the smallest of all other heights.
 """
 
 _REPEATED_EXTREME_CELLS_MIN = 4
-"""Least number of cells that share the smallest or largest value for a warning about it."""
+"""Smallest number of cells with the same extreme height for which a warning is given."""
 
-_SUSPICIOUS_VALUES_MAX = 3
-"""Maximum number of suspicious heights of a file about which warnings are given."""
+_NO_DATA_WARNINGS_PER_FILE_MAX = 3
+"""Maximum number of warnings about suspicious heights of a file."""
 
 _CLIFF_SEARCH_STRIP_ROWS = 256
 """Number of grid rows that the search for cliffs reads at a time."""
@@ -57,7 +57,9 @@ CLIFF_HEIGHT_MIN = 100.0
 """Height difference of neighbouring cells above which a step counts as a cliff [m]."""
 
 
-def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) -> tuple[str, ...]:
+def set_missing_heights_to_nan(
+    path: Path, values: np.ndarray, no_data: float | None
+) -> tuple[str, ...]:
     """Set missing heights to NaN in place, and return warnings about suspicious heights.
 
     Parameters
@@ -115,11 +117,12 @@ def _shortest_decimal_text(value: float) -> str:
 def _undeclared_no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
     """Return warnings about extreme heights that may stand for missing data.
 
-    Such a height is far from all others, or many cells share it.
+    An extreme height is suspicious if it is a customary no-data value and differs clearly from all
+    other heights, or if several cells share it and it differs from all others still more.
     """
     warnings: list[str] = []
     low, high = -np.inf, np.inf
-    for _ in range(_SUSPICIOUS_VALUES_MAX):
+    for _ in range(_NO_DATA_WARNINGS_PER_FILE_MAX):
         is_inside = (values > low) & (values < high)
         if not is_inside.any():
             break

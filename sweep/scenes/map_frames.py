@@ -132,13 +132,14 @@ def metres_per_height_unit(unit: str) -> float:
     return float(read_unit(unit, si_unit="m", example="ft").to_si(Fraction(1)))
 
 
-def resolve_metres_per_height(
+def resolve_metres_per_height_unit(
     path: Path, wkt: str, band_unit: str, stated_unit: str | None, has_height_scale: bool
 ) -> float:
     """Return the factor that converts the heights of a raster to metres.
 
     The unit of heights is stated by the user, by the raster's band, or by the vertical axis of the
-    reference system. Otherwise it is the metre, unless the map's horizontal unit is another one.
+    reference system. If none of them states it, it is the metre. But if the map's horizontal unit
+    is not the metre, the unit of heights must be stated.
 
     Parameters
     ----------
@@ -249,7 +250,7 @@ def make_map_frame(
         raise SceneError(path, problem, "leave one of them out")
     if not wkt:
         return _map_frame_without_crs(path, bounds, cell_size, per_degree or per_unit)
-    crs = _horizontal_crs(_crs_of_raster(path, wkt))
+    crs = _horizontal_crs(_crs_from_raster_wkt(path, wkt))
     if crs.is_geographic:
         if per_unit is not None:
             raise SceneError(path, "is in degrees", "state metres_per_degree in place of unit")
@@ -310,7 +311,7 @@ def _checked_map_frame(
         factors = MetresPerUnit(*stated)
     else:
         factors = None
-    scales, skew = _ground_scales(path, crs, bounds)
+    scales, skew = _measure_scale_and_skew(path, crs, bounds)
     if scales is None:  # a local map of a site without a position on a planet
         assert factors is not None
         return MapFrame(factors, wkt)
@@ -348,7 +349,9 @@ def _largest_scale_error(factors: MetresPerUnit, scales: np.ndarray) -> float:
     return float(np.abs(np.array(factors) / scales - 1).max())
 
 
-def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray | None, float]:
+def _measure_scale_and_skew(
+    path: Path, crs: Any, bounds: MapBounds
+) -> tuple[np.ndarray | None, float]:
     """Measure the scale of a map on the ground, and the angle between its axes.
 
     Parameters
@@ -435,7 +438,7 @@ def _crs_from_wkt(wkt: str) -> Any:
     return CRS.from_wkt(wkt)
 
 
-def _crs_of_raster(path: Path, wkt: str) -> Any:
+def _crs_from_raster_wkt(path: Path, wkt: str) -> Any:
     """Return the pyproj reference system of a raster; raise `SceneError` if its WKT is invalid."""
     from pyproj.exceptions import CRSError
 
@@ -447,7 +450,7 @@ def _crs_of_raster(path: Path, wkt: str) -> Any:
 
 
 def _horizontal_crs(crs: Any) -> Any:
-    """Return the horizontal part of a pyproj reference system, without transformations of datum."""
+    """Return the horizontal part of a pyproj reference system, without datum transformations."""
     while crs.is_bound or crs.is_compound:
         crs = crs.source_crs if crs.is_bound else crs.sub_crs_list[0]
     return crs

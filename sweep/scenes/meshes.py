@@ -25,10 +25,10 @@ from sweep.units import QuantityError, read_unit
 IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
 """Quaternion (w, x, y, z) of no rotation."""
 
-_RELATIVE_AREA_ROUNDING = 1e-12
-"""Largest length of a triangle's normal that rounding alone can give to a triangle without area.
+_RELATIVE_NORMAL_ROUNDING_ERROR_MAX = 1e-12
+"""Largest rounding error of the normal of a triangle without area.
 
-The normal is the cross product of two edges. The length is relative to the product of the edges'
+The normal is the cross product of two edges. The error is relative to the product of the edges'
 lengths.
 """
 
@@ -39,12 +39,12 @@ All other formats are taken to have a vertical z axis.
 """
 
 _TRIANGLES_ONLY_FORMATS = {".stl", *_Y_UP_FORMATS}
-"""Suffixes of mesh formats that hold no polygons but triangles."""
+"""Suffixes of mesh formats that can only hold triangles."""
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".off", ".gltf", ".glb")
-"""Suffixes of the mesh formats that can be read, without archives.
+"""Suffixes of the mesh formats that can be read.
 
-The content of an archive can be of any size.
+Archives are excluded, because their content can be of any size.
 """
 
 VERTEX_COORDINATE_MAX = 1e9
@@ -56,7 +56,14 @@ _MESH_READER_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
 MESH_FACES_MAX = 100_000_000
 """Maximum number of triangles of a mesh file."""
 
-_MEMORY_PER_FILE_BYTE = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
+_MEMORY_PER_FILE_BYTE_BY_SUFFIX = {
+    ".obj": 40,
+    ".off": 40,
+    ".ply": 20,
+    ".stl": 8,
+    ".gltf": 20,
+    ".glb": 20,
+}
 """Upper bound of the memory needed to read a mesh, in bytes per byte of its file, by suffix."""
 
 
@@ -76,7 +83,7 @@ class Facets:
     """Surface number (m,) int16 of each triangle: an index into the scene's list of surfaces."""
     origin: np.ndarray
     """Origin (3,) of the vertices in world coordinates [m]."""
-    notes: tuple[str, ...] = ()
+    reader_notes: tuple[str, ...] = ()
     """Changes that the reader of the file made, as sentences."""
     is_clean: bool = False
     """True if the triangles need no cleaning.
@@ -148,10 +155,12 @@ class Facets:
             _require_faces(len(self.faces), len(self.faces))
             centre = rounded_centre(self.vertices)
             mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
-            report = MeshCleaningReport(len(self.vertices), len(self.faces), notes=self.notes)
+            report = MeshCleaningReport(
+                len(self.vertices), len(self.faces), reader_notes=self.reader_notes
+            )
             return CleanedMesh(mesh, report)
         mesh, report = clean_mesh(self.vertices, self.faces, self.surface)
-        report = replace(report, notes=self.notes)
+        report = replace(report, reader_notes=self.reader_notes)
         return CleanedMesh(replace(mesh, origin=mesh.origin + self.origin), report)
 
 
@@ -169,7 +178,7 @@ def join_facets(facets_list: Sequence[Facets]) -> Facets:
         ),
         np.concatenate([facets.surface for facets in facets_list]),
         origin,
-        tuple(note for facets in facets_list for note in facets.notes),
+        tuple(note for facets in facets_list for note in facets.reader_notes),
     )
 
 
@@ -180,8 +189,7 @@ _REPAIR_TEXT_BY_REPORT_FIELD = {
     "n_merged_vertices": "{} coincident vertices merged",
     "n_unreferenced_vertices": "{} unused vertices dropped",
 }
-"""Templates of texts about repairs of a mesh, each for one number of `MeshCleaningReport`, by the
-name of its field."""
+"""Templates of texts about repairs, by the field of `MeshCleaningReport` that counts them."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +210,7 @@ class MeshCleaningReport:
     """Number of vertices merged with a coincident vertex."""
     n_unreferenced_vertices: int = 0
     """Number of vertices dropped because no face uses them."""
-    notes: tuple[str, ...] = ()
+    reader_notes: tuple[str, ...] = ()
     """Changes that the reader of the file made, as sentences."""
 
     def summary(self) -> str:
@@ -213,11 +221,11 @@ class MeshCleaningReport:
         ]
         repairs = [template.format(count) for template, count in counts if count]
         input_text = f"{self.n_faces_before:,} faces on {self.n_vertices_before:,} vertices"
-        return "; ".join([input_text, *self.notes, *(repairs or ["nothing to mend"])])
+        return "; ".join([input_text, *self.reader_notes, *(repairs or ["nothing to mend"])])
 
 
 class CleanedMesh(NamedTuple):
-    """Mesh that is fit for ray casting, and how it was made so."""
+    """Mesh that is ready for ray casting, and the report of its cleaning."""
 
     mesh: Mesh
     """Mesh with the faces that are left, in the given order."""
@@ -261,7 +269,7 @@ def clean_mesh(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> Cle
     _require_faces(len(face_corners), len(has_data))
     used = np.unique(face_corners)
     positions = positions[used] + 0.0  # -0.0 and 0.0 are equal positions
-    kept_vertices, index_in_kept = _first_unique_rows(positions)
+    kept_vertices, index_in_kept = _find_unique_rows(positions)
     face_corners, n_merged_vertices = (
         index_in_kept[np.searchsorted(used, face_corners)],
         len(used) - len(kept_vertices),
@@ -269,8 +277,8 @@ def clean_mesh(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> Cle
     positions = positions[kept_vertices]
     origin = rounded_centre(positions)
     positions -= origin
-    has_area = np.flatnonzero(_mask_faces_with_area(positions, face_corners))
-    kept_faces = has_area[_first_unique_rows(np.sort(face_corners[has_area], axis=1))[0]]
+    has_area = np.flatnonzero(_nonzero_area_mask(positions, face_corners))
+    kept_faces = has_area[_find_unique_rows(np.sort(face_corners[has_area], axis=1))[0]]
     _require_faces(len(kept_faces), len(has_data))
     kept_vertices = np.unique(face_corners[kept_faces])
     mesh = Mesh(
@@ -297,7 +305,7 @@ def _require_faces(n_left: int, n_given: int) -> None:
         raise ValueError(f"of {n_given} faces none is left that a ray could hit")
 
 
-def _first_unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the distinct rows of an array.
 
     Returns
@@ -316,12 +324,14 @@ def _first_unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return kept, index_in_kept
 
 
-def _mask_faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _nonzero_area_mask(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return a mask (m,) of the faces with an area above 0; doubtful cases are computed exactly."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     b, c = b - a, c - a
     longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
-    has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _RELATIVE_AREA_ROUNDING * longest)
+    has_area = np.asarray(
+        np.abs(np.cross(b, c)).max(axis=1) > _RELATIVE_NORMAL_ROUNDING_ERROR_MAX * longest
+    )
     doubtful_faces = np.flatnonzero(~has_area)
     exact_normals, _ = facet_normals(vertices[faces[doubtful_faces]].transpose(1, 2, 0))
     has_area[doubtful_faces] = exact_normals.any(axis=0)
@@ -362,7 +372,7 @@ def read_mesh(
     if suffix not in MESH_FORMATS:
         formats = ", ".join(MESH_FORMATS)
         raise SceneError(path, f"is no mesh of a format that is read ({formats})", "export to one")
-    bytes_needed = _MEMORY_PER_FILE_BYTE[suffix] * path.stat().st_size
+    bytes_needed = _MEMORY_PER_FILE_BYTE_BY_SUFFIX[suffix] * path.stat().st_size
     require_memory(path, bytes_needed, "reduce the mesh, or cut a part out of it")
     try:
         reader = _read_polygon_facets if suffix in POLYGON_FORMATS else _read_triangle_facets
@@ -403,7 +413,7 @@ def _read_polygon_facets(path: Path) -> tuple[list[Facets], str | None]:
     return [
         replace(
             Facets.on_one_surface(polygons.vertices, triangulation.faces),
-            notes=triangulation.notes(),
+            reader_notes=triangulation.summary_sentences(),
         )
     ], None
 

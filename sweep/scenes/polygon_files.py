@@ -68,10 +68,10 @@ def _read_off(path: Path) -> Polygons:
         # Normals and colours follow the position; texture coordinates too, in most files.
         vertices = [
             [float(word) for word in line[:3]]
-            for _, line in _take_lines(lines, n_vertices, "vertices")
+            for _, line in _iter_required_lines(lines, n_vertices, "vertices")
         ]
         faces = []
-        for _, line in _take_lines(lines, n_faces, "faces"):
+        for _, line in _iter_required_lines(lines, n_faces, "faces"):
             count = int(line[0])
             corners = [int(word) for word in line[1 : 1 + count]]
             if count < 1 or len(corners) < count:
@@ -84,7 +84,7 @@ def _read_off(path: Path) -> Polygons:
     return _make_polygons(vertices, faces)
 
 
-def _take_lines(
+def _iter_required_lines(
     lines: Iterator[tuple[int, list[str]]], number: int, element_name: str
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the next `number` lines; raise `ValueError` if the file has fewer.
@@ -155,7 +155,7 @@ _INTEGER_PATTERN = re.compile(rb"[-+]?\d{1,4000}")
 def _check_ply_row_counts(path: Path) -> None:
     """Raise `ValueError` if the header of a PLY file declares an impossible number of rows.
 
-    A number is impossible if it is negative, or larger than the file in bytes.
+    A number is impossible if it is negative, or exceeds the size of the file in bytes.
     """
     size = path.stat().st_size
     with path.open("rb") as file:

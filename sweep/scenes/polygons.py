@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 NON_PLANARITY_REPORTED_MIN = 1e-3
-"""Distance of a polygon's corner from its mean plane that is reported.
+"""Distance of a polygon's corner from its mean plane above which the distance is reported.
 
 It is relative to the square root of the polygon's area.
 """
@@ -27,8 +27,8 @@ It is relative to the square root of the polygon's area. The corners of such a p
 determine its surface.
 """
 
-_RELATIVE_AREA_ROUNDING = 1e-12
-"""Largest area that rounding alone can give to a polygon without area.
+_RELATIVE_AREA_ROUNDING_ERROR_MAX = 1e-12
+"""Largest rounding error of the area of a polygon without area.
 
 It is relative to the square of the polygon's extent.
 """
@@ -52,7 +52,7 @@ class Polygons(NamedTuple):
 
     vertices: np.ndarray
     """Vertices (n, 3), float64."""
-    corners: np.ndarray
+    corner_vertices: np.ndarray
     """Vertex indices of the corners of all polygons, one polygon after the other, int64."""
     corner_counts: np.ndarray
     """Number of corners (m,) int64 of each polygon."""
@@ -63,7 +63,7 @@ class Triangulation(NamedTuple):
 
     faces: np.ndarray
     """Vertex indices (k, 3) int64 of the triangles."""
-    n_cut_polygons: int
+    n_triangulated_polygons: int
     """Number of polygons with more than three corners."""
     n_concave_polygons: int
     """Number of polygons with more than three corners that are not convex."""
@@ -75,24 +75,26 @@ class Triangulation(NamedTuple):
     Only the polygons counted by `n_non_planar_polygons` are considered.
     """
 
-    def notes(self) -> tuple[str, ...]:
+    def summary_sentences(self) -> tuple[str, ...]:
         """Return sentences about the polygons that were cut into triangles.
 
         Lengths are in the unit of the file.
         """
-        if not self.n_cut_polygons:
+        if not self.n_triangulated_polygons:
             return ()
         concave_text = (
             f", {self.n_concave_polygons:,} of them not convex" if self.n_concave_polygons else ""
         )
-        notes = [f"{_polygon_count_text(self.n_cut_polygons)} cut into triangles{concave_text}"]
+        sentences = [
+            f"{_polygon_count_text(self.n_triangulated_polygons)} cut into triangles{concave_text}"
+        ]
         if self.n_non_planar_polygons:
             verb = "departs" if self.n_non_planar_polygons == 1 else "depart"
-            notes.append(
+            sentences.append(
                 f"{_polygon_count_text(self.n_non_planar_polygons)} {verb} from a plane by up to "
                 f"{self.largest_plane_departure:.3g} units"
             )
-        return tuple(notes)
+        return tuple(sentences)
 
 
 def _polygon_count_text(polygons: int) -> str:
@@ -122,20 +124,25 @@ def triangulate_polygons(polygons: Polygons) -> Triangulation:
         If a polygon crosses itself, departs from a plane by more than `NON_PLANARITY_MAX`, or has
         an invalid vertex index.
     """
-    vertices, corners, corner_counts = polygons
+    vertices, all_corner_vertices, corner_counts = polygons
     first_corner = np.cumsum(corner_counts) - corner_counts
-    wrong_corners = np.flatnonzero((corners < 0) | (corners >= len(vertices)))
+    wrong_corners = np.flatnonzero(
+        (all_corner_vertices < 0) | (all_corner_vertices >= len(vertices))
+    )
     if wrong_corners.size:
         face = int(np.searchsorted(first_corner, wrong_corners[0], side="right")) - 1
-        problem = f"names the vertex {corners[wrong_corners[0]] + 1} of {len(vertices):,}"
+        wrong_vertex = all_corner_vertices[wrong_corners[0]]
+        problem = f"names the vertex {wrong_vertex + 1} of {len(vertices):,}"
         raise PolygonError(face + 1, problem)
     triangles: list[np.ndarray] = []
     polygon_of_triangle: list[np.ndarray] = []
-    n_cut_polygons = n_concave_polygons = n_non_planar_polygons = 0
+    n_triangulated_polygons = n_concave_polygons = n_non_planar_polygons = 0
     largest_plane_departure = 0.0
     for n_corners in np.unique(corner_counts):
         polygon_numbers = np.flatnonzero(corner_counts == n_corners)
-        corner_vertices = corners[first_corner[polygon_numbers, None] + np.arange(n_corners)]
+        corner_vertices = all_corner_vertices[
+            first_corner[polygon_numbers, None] + np.arange(n_corners)
+        ]
         if n_corners <= 3:  # one or two corners have no area
             triangles.append(
                 np.take(corner_vertices, [0, min(1, n_corners - 1), n_corners - 1], axis=1)
@@ -143,8 +150,8 @@ def triangulate_polygons(polygons: Polygons) -> Triangulation:
             polygon_of_triangle.append(polygon_numbers)
             continue
         flat_polygons = _project_to_mean_planes(vertices[corner_vertices], polygon_numbers)
-        n_cut_polygons += len(polygon_numbers)
-        n_concave_polygons += int((~flat_polygons.is_convex & ~flat_polygons.is_empty).sum())
+        n_triangulated_polygons += len(polygon_numbers)
+        n_concave_polygons += int((~flat_polygons.is_convex & ~flat_polygons.is_degenerate).sum())
         is_bent = flat_polygons.non_planarity > NON_PLANARITY_REPORTED_MIN
         n_non_planar_polygons += int(is_bent.sum())
         largest_plane_departure = max(
@@ -155,15 +162,16 @@ def triangulate_polygons(polygons: Polygons) -> Triangulation:
                 )
             ),
         )
-        # Empty polygons become fans too: clean_mesh drops and counts their triangles without area.
-        fanned = np.flatnonzero(flat_polygons.is_convex | flat_polygons.is_empty)
+        # Degenerate polygons become fans too. Their triangles have no area: clean_mesh drops and
+        # counts them.
+        fanned = np.flatnonzero(flat_polygons.is_convex | flat_polygons.is_degenerate)
         fan = np.stack(
             [np.zeros(n_corners - 2, int), np.arange(1, n_corners - 1), np.arange(2, n_corners)],
             axis=1,
         )
         triangles.append(corner_vertices[fanned][:, fan].reshape(-1, 3))
         polygon_of_triangle.append(np.repeat(polygon_numbers[fanned], n_corners - 2))
-        for k in np.flatnonzero(~(flat_polygons.is_convex | flat_polygons.is_empty)):
+        for k in np.flatnonzero(~(flat_polygons.is_convex | flat_polygons.is_degenerate)):
             part_triangles = _triangulate_by_earcut(
                 flat_polygons.corners[k], vertices[corner_vertices[k]], int(polygon_numbers[k]) + 1
             )
@@ -174,7 +182,7 @@ def triangulate_polygons(polygons: Polygons) -> Triangulation:
     order = np.argsort(np.concatenate(polygon_of_triangle), kind="stable")
     return Triangulation(
         np.concatenate(triangles)[order],
-        n_cut_polygons,
+        n_triangulated_polygons,
         n_concave_polygons,
         n_non_planar_polygons,
         largest_plane_departure,
@@ -192,7 +200,7 @@ class _FlatPolygons(NamedTuple):
     """Largest distance (m,) of a corner from the mean plane, over the square root of the area."""
     is_convex: np.ndarray
     """Mask (m,) of the strictly convex polygons."""
-    is_empty: np.ndarray
+    is_degenerate: np.ndarray
     """Mask (m,) of the polygons without area or with vertices that are not finite."""
 
 
@@ -209,21 +217,23 @@ def _project_to_mean_planes(points: np.ndarray, polygon_numbers: np.ndarray) -> 
     extent = np.sqrt((points * points).sum(axis=2)).max(axis=1)
     area_vector = 0.5 * np.cross(points, next_points).sum(axis=1)
     area = np.sqrt((area_vector * area_vector).sum(axis=1))
-    has_area = area > _RELATIVE_AREA_ROUNDING * extent * extent
+    has_area = area > _RELATIVE_AREA_ROUNDING_ERROR_MAX * extent * extent
     is_collinear = _collinear_polygon_mask(points, extent)
     if (is_folded := ~has_area & ~is_collinear).any():
         raise PolygonError(int(polygon_numbers[is_folded.argmax()]) + 1, "crosses itself")
-    is_empty = ~has_data | is_collinear
+    is_degenerate = ~has_data | is_collinear
     normal = np.where(
-        is_empty[:, None], [0.0, 0.0, 1.0], area_vector / np.where(is_empty, 1.0, area)[:, None]
+        is_degenerate[:, None],
+        [0.0, 0.0, 1.0],
+        area_vector / np.where(is_degenerate, 1.0, area)[:, None],
     )
     in_plane_axis = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     in_plane_axis /= np.sqrt((in_plane_axis * in_plane_axis).sum(axis=1))[:, None]
     axes = np.stack([in_plane_axis, np.cross(normal, in_plane_axis), normal], axis=2)
     flat = points @ axes
     height = flat[..., 2] - flat[..., 2].mean(axis=1)[:, None]
-    non_planarity = np.abs(height).max(axis=1) / np.sqrt(np.where(is_empty, 1.0, area))
-    non_planarity[is_empty] = 0.0
+    non_planarity = np.abs(height).max(axis=1) / np.sqrt(np.where(is_degenerate, 1.0, area))
+    non_planarity[is_degenerate] = 0.0
     if (non_planarity > NON_PLANARITY_MAX).any():
         k = int((non_planarity > NON_PLANARITY_MAX).argmax())
         problem = (
@@ -236,10 +246,10 @@ def _project_to_mean_planes(points: np.ndarray, polygon_numbers: np.ndarray) -> 
     previous_edge = np.roll(edge, 1, axis=1)
     edge_cross = previous_edge[..., 0] * edge[..., 1] - previous_edge[..., 1] * edge[..., 0]
     total_angle = np.arctan2(edge_cross, (previous_edge * edge).sum(axis=2)).sum(axis=1)
-    is_convex = (edge_cross > _RELATIVE_AREA_ROUNDING * (extent * extent)[:, None]).all(axis=1) & (
-        total_angle < 3 * np.pi
-    )
-    return _FlatPolygons(corners, area, non_planarity, is_convex & ~is_empty, is_empty)
+    is_convex = (edge_cross > _RELATIVE_AREA_ROUNDING_ERROR_MAX * (extent * extent)[:, None]).all(
+        axis=1
+    ) & (total_angle < 3 * np.pi)
+    return _FlatPolygons(corners, area, non_planarity, is_convex & ~is_degenerate, is_degenerate)
 
 
 def _collinear_polygon_mask(points: np.ndarray, extent: np.ndarray) -> np.ndarray:
@@ -252,7 +262,7 @@ def _collinear_polygon_mask(points: np.ndarray, extent: np.ndarray) -> np.ndarra
     farthest = points[np.arange(len(points)), squared_distance.argmax(axis=1)]
     cross_product = np.cross(points, farthest[:, None])
     distance = np.sqrt((cross_product * cross_product).sum(axis=2)).max(axis=1)
-    return np.asarray(distance <= _RELATIVE_AREA_ROUNDING * extent * extent)
+    return np.asarray(distance <= _RELATIVE_AREA_ROUNDING_ERROR_MAX * extent * extent)
 
 
 def _triangulate_by_earcut(
@@ -295,14 +305,14 @@ def _triangulate_by_earcut(
             number, f"of {len(plane_corners)} corners crosses itself, seen along its normal"
         )
     if not _polygon_winds_once(
-        corners, triangles[np.abs(area) > _RELATIVE_AREA_ROUNDING * polygon_area]
+        corners, triangles[np.abs(area) > _RELATIVE_AREA_ROUNDING_ERROR_MAX * polygon_area]
     ):
         rule = f"of {len(plane_corners)} corners covers a part of its plane twice"
         raise PolygonError(number, f"{rule}: a hole has to be gone round against its outline")
-    return kept[_insert_collinear_corners(triangles, corners)]
+    return kept[_split_triangles_at_collinear_corners(triangles, corners)]
 
 
-_EDGE_POINT_PAIRS_MAX = 1 << 22
+_EDGE_POINT_PAIRS_PER_BATCH_MAX = 1 << 22
 """Maximum number of pairs of an edge and a point for which winding numbers are computed at once."""
 
 
@@ -313,7 +323,7 @@ def _polygon_winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
     """
     edge_ends = np.roll(corners, -1, axis=0)
     centres = corners[triangles].mean(axis=1)
-    rows = max(_EDGE_POINT_PAIRS_MAX // len(corners), 1)
+    rows = max(_EDGE_POINT_PAIRS_PER_BATCH_MAX // len(corners), 1)
     for begin in range(0, len(centres), rows):
         x, y = centres[begin : begin + rows, None].transpose(2, 0, 1)
         # An upward edge to the right of a point adds one to the winding number.
@@ -335,7 +345,7 @@ def _signed_triangle_areas(corners: np.ndarray, triangles: np.ndarray) -> np.nda
     return np.asarray(0.5 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]))
 
 
-def _insert_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def _split_triangles_at_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Split triangles at the polygon's corners that lie on straight edges.
 
     Earcut leaves such corners out. The polygon would then not share its edges with a neighbour that

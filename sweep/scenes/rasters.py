@@ -17,12 +17,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from sweep.scenes.height_checks import cliff_warnings, mask_missing_heights
+from sweep.scenes.height_checks import cliff_warnings, set_missing_heights_to_nan
 from sweep.scenes.map_frames import (
     UserStatedUnits,
     degree_lengths,
     make_map_frame,
-    resolve_metres_per_height,
+    resolve_metres_per_height_unit,
 )
 from sweep.scenes.scene_files import SceneError, require_file, require_memory
 from sweep.scenes.terrain import AreaBounds, Terrain
@@ -146,11 +146,11 @@ def read_raster_terrain(
         cell_size = math.inf if pixel is not None else min(abs(transform.a), abs(transform.e))
         stated = UserStatedUnits(metres_per_degree, metres_per_unit, height_unit)
         map_frame = make_map_frame(path, wkt, (x[0], y[0], x[1], y[1]), cell_size, stated)
-        metres_per_height = resolve_metres_per_height(
+        metres_per_height = resolve_metres_per_height_unit(
             path, wkt, raster.units[band - 1] or "", height_unit, has_height_scale
         )
-        heights = _read_band(raster, band, pixel_window)
-        no_data_warnings = mask_missing_heights(path, heights, no_data)
+        heights = _read_band_window_in_strips(raster, band, pixel_window)
+        no_data_warnings = set_missing_heights_to_nan(path, heights, no_data)
         heights *= raster.scales[band - 1]
         heights += raster.offsets[band - 1]
         heights *= metres_per_height
@@ -212,7 +212,7 @@ def raster_digest(path: str | Path) -> str:
             band_scaling = raster.scales[band - 1], raster.offsets[band - 1], raster.units[band - 1]
             digest.update(repr(band_scaling).encode())
             for strip in _iter_pixel_windows(raster.width, raster.height):
-                digest.update(_read_window(raster, band, strip).tobytes())
+                digest.update(_read_band_window(raster, band, strip).tobytes())
     return digest.hexdigest()
 
 
@@ -231,7 +231,7 @@ def open_raster(path: Path) -> Iterator[Any]:
         with _gdal_without_network():
             _check_vrt_sources(path, ())
             with _open_raster_file(path) as raster:
-                _require_block_memory(path, raster)
+                _require_raster_block_memory(path, raster)
                 yield raster
     except rasterio.errors.RasterioError as error:
         problem = f"is no raster that can be read ({error.__cause__ or error})"
@@ -239,7 +239,7 @@ def open_raster(path: Path) -> Iterator[Any]:
         raise SceneError(path, problem, remedy) from None
 
 
-def _require_block_memory(path: Path, raster: Any) -> None:
+def _require_raster_block_memory(path: Path, raster: Any) -> None:
     """Raise `SceneError` if a block of a raster file does not fit into the free memory.
 
     A block is the part of a file that is decompressed at once.
@@ -294,12 +294,12 @@ def _check_vrt_sources(path: Path, enclosing_files: tuple[Path, ...]) -> None:
         return
     if len(enclosing_files) > _VRT_NESTING_MAX or path in enclosing_files:
         raise SceneError(path, "is a virtual raster over itself", "name the rasters below it")
-    for source in _read_vrt_sources(path):
+    for source in _read_vrt_source_paths(path):
         _check_vrt_sources(source, (*enclosing_files, path))
         _require_supported_format(source)
 
 
-def _read_vrt_sources(path: Path) -> list[Path]:
+def _read_vrt_source_paths(path: Path) -> list[Path]:
     """Return the source files that a virtual raster names, without duplicates.
 
     Raise `SceneError` if one does not exist.
@@ -382,7 +382,7 @@ def _pixel_window(path: Path, raster: Any, transform: Any, window: AreaBounds | 
             raise SceneError(path, f"has no ground within {window}", coverage_text)
         pixel_window = PixelWindow(left, top, right - left, bottom - top)
     remedy = f"give a window within {tuple(raster.bounds)}"
-    require_grid_size(path, int(pixel_window.height), int(pixel_window.width), remedy)
+    refuse_too_large_grid(path, int(pixel_window.height), int(pixel_window.width), remedy)
     return pixel_window
 
 
@@ -399,13 +399,13 @@ def _iter_pixel_windows(width: int, height: int) -> Iterator[Any]:
             yield PixelWindow(left, top, min(columns, width - left), min(rows, height - top))
 
 
-def _read_window(raster: Any, band: int, window: Any) -> np.ndarray:
+def _read_band_window(raster: Any, band: int, window: Any) -> np.ndarray:
     """Return the stored values (rows, columns) of a band in a pixel window; NaN if missing."""
     values = raster.read(band, window=window, masked=True)
     return np.asarray(np.ma.filled(values.astype(float), np.nan))
 
 
-def _read_band(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
+def _read_band_window_in_strips(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
     """Return the stored values (rows, columns) of a band in a pixel window.
 
     The values are read in strips to save memory.
@@ -422,7 +422,7 @@ def _read_band(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
         )
         rows = slice(strip.row_off, strip.row_off + strip.height)
         columns = slice(strip.col_off, strip.col_off + strip.width)
-        values[rows, columns] = _read_window(raster, band, window)
+        values[rows, columns] = _read_band_window(raster, band, window)
     return values
 
 
@@ -432,7 +432,7 @@ def _require_enough_heights(path: Path, heights: np.ndarray) -> None:
         raise SceneError(path, "has too few heights for a triangle", "check its no-data value")
 
 
-def require_grid_size(path: Path, rows: int, columns: int, remedy: str) -> None:
+def refuse_too_large_grid(path: Path, rows: int, columns: int, remedy: str) -> None:
     """Raise `SceneError` if a grid has too many heights for a scene or for the free memory."""
     if rows * columns > GRID_CELLS_MAX:
         problem = f"has {columns:,} x {rows:,} heights, more than {GRID_CELLS_MAX:.0e}"
@@ -474,7 +474,7 @@ def read_numpy_terrain(
         raise
     except Exception as error:  # archives and headers raise many types of errors
         raise SceneError(path, f"is no NumPy file ({error})", "write it with numpy.save") from None
-    return _terrain_of_heights(path, values, spacing, no_data)
+    return _terrain_from_heights(path, values, spacing, no_data)
 
 
 def _read_npy_or_npz(path: Path, file: Any, size: int, name: str | None) -> np.ndarray:
@@ -528,14 +528,14 @@ def _read_npy_data(path: Path, file: Any, size: int) -> np.ndarray:
     if len(shape) != 2 or dtype.kind not in "iuf":
         problem = f"holds {dtype} of shape {shape}"
         raise SceneError(path, problem, "heights are a two-dimensional array of numbers")
-    require_grid_size(path, *shape, "cut a part out of it")
+    refuse_too_large_grid(path, *shape, "cut a part out of it")
     if file.tell() + math.prod(shape) * dtype.itemsize > size:
         raise ValueError(f"its header tells of shape {shape}, and {size:,} bytes are too few")
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
-def _terrain_of_heights(
+def _terrain_from_heights(
     path: Path, values: np.ndarray, spacing: tuple[float, float], no_data: float | None = None
 ) -> Terrain:
     """Return a terrain with an array of heights, and with its first node at the world's origin."""
@@ -543,7 +543,7 @@ def _terrain_of_heights(
         problem = f"holds {values.dtype} of shape {values.shape}"
         raise SceneError(path, problem, "heights are a two-dimensional array of numbers")
     heights = values.astype(float)
-    no_data_warnings = mask_missing_heights(path, heights, no_data)
+    no_data_warnings = set_missing_heights_to_nan(path, heights, no_data)
     _require_enough_heights(path, heights)
     try:
         terrain = Terrain(heights, spacing, np.zeros(3))
@@ -577,7 +577,7 @@ def read_image_terrain(
     """
     levels = _read_grey_levels(require_file(path))
     heights = black + (white - black) * levels / np.iinfo(levels.dtype).max
-    return _terrain_of_heights(Path(path), heights, (pixel, -pixel))
+    return _terrain_from_heights(Path(path), heights, (pixel, -pixel))
 
 
 def _read_grey_levels(path: Path) -> np.ndarray:
@@ -585,10 +585,10 @@ def _read_grey_levels(path: Path) -> np.ndarray:
     from PIL import Image
 
     try:
-        with warnings.catch_warnings():  # require_grid_size refuses images that are too large
+        with warnings.catch_warnings():  # refuse_too_large_grid refuses images that are too large
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path, formats=_IMAGE_FORMATS) as image:
-                require_grid_size(path, image.height, image.width, "cut a part out of it")
+                refuse_too_large_grid(path, image.height, image.width, "cut a part out of it")
                 mode, levels = image.mode, np.asarray(image)
     except SceneError:
         raise

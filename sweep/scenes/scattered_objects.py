@@ -51,7 +51,7 @@ class MinimumOfPowerLaws:
 LUNAR_CRATER_EQUILIBRIUM_LAW = (10**-1.1, 2.0)
 """Coefficient and exponent of the number of old craters on the Moon per m^2 above a diameter.
 
-In equilibrium new craters destroy as many old ones. Trask gives the number per 10^6 km^2 as
+In equilibrium, new craters destroy as many old craters. Trask gives the number per 10^6 km^2 as
 ``10**10.9 D**-2``, with the diameter D in metres: Ranger VIII and IX, part II, JPL Technical Report
 32-800 (1966).
 """
@@ -112,7 +112,7 @@ class MartianRockLaw:
     def decay_rate(self) -> float:
         """Rate at which the covered fraction falls with the smallest diameter counted [1/m].
 
-        The fraction is proportional to the exponential of minus this rate times the diameter.
+        The fraction under rocks of at least diameter D is proportional to ``exp(-decay_rate * D)``.
         """
         return 1.79 + 0.152 / self.area_fraction
 
@@ -541,8 +541,8 @@ class MeanTreeDimensions:
     -----
     Leaves have random positions and the spherical distribution of leaf angles: every direction of a
     leaf's normal is equally likely. The probability of a gap along a ray is therefore Beer's law
-    ``exp(-G * density * path)``. The density is that of leaf area per volume, and ``G = 1/2`` is
-    the mean area of a leaf across the ray over its own area [1]_ [2]_.
+    ``exp(-G * density * path)``. The density is that of leaf area per volume. ``G = 1/2`` is the
+    mean ratio of a leaf's area, projected along the ray, to its own area [1]_ [2]_.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Terrain as a grid of heights: triangles, sections, refinement, smoothing and random relief.
+"""Terrain as a grid of heights: triangles, cropping, refinement, smoothing and random relief.
 
 Heights are given at the nodes of the grid: row i at y = i dy, column j at x = j dx from the first
 node. A cell of four nodes becomes two triangles. Missing heights (NaN) leave holes; a cell that

@@ -24,8 +24,10 @@ import numpy as np
 from sweep.scenes.terrain import Terrain
 
 _ALIGNMENT_TOLERANCE_CELLS = 1e-3
-"""Two grids count as parts of one if their offset is a whole number of cells within this tolerance
-[cells]."""
+"""Largest deviation of the offset of two grids from a whole number of cells [cells].
+
+Up to this deviation the grids count as parts of one grid.
+"""
 
 _ADJACENT_GAP_MAX_CELLS = 2.0
 """Largest gap between two grids that count as adjacent [cells of the coarser grid]."""

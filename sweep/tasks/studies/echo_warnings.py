@@ -39,7 +39,7 @@ ECHO_LOSS_WARNING_DB = 3.0
 Power is lost if the echo arrives after its record has begun.
 """
 
-PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MAX = 0.125, 0.3
+PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MIN = 0.125, 0.3
 """Limits above which the laser's random walk of phase changes pd by more than 0.02.
 
 The first is the echo's delay over the duration of the record. The second is the variance of the
@@ -55,7 +55,11 @@ Points differ in `ECHO_PARAMETERS`.
 SAMPLED_TILES_PER_SCANNER = 16
 """Number of tiles (runs of consecutive shots) of each scanner whose echoes are checked."""
 
-EDGE_SPREAD_BINS_MIN, EDGE_DISTANCE_BINS, EDGE_DISTANCE_DEVIATIONS = 0.2, 4.0, 3.0
+SPECTRUM_EDGE_SPREAD_BINS_MIN, SPECTRUM_EDGE_DISTANCE_BINS, SPECTRUM_EDGE_DISTANCE_DEVIATIONS = (
+    0.2,
+    4.0,
+    3.0,
+)
 """Limits by which an echo is taken to spread across an edge of the spectrum: DC or Nyquist.
 
 The first is the standard deviation of a footprint's line frequencies [bins] above which an echo is
@@ -97,14 +101,14 @@ ECHO_PARAMETERS = (
 """Dotted paths of the parameters that determine when echoes arrive and how beats are used."""
 
 
-PHASE_ESTIMATOR_LOSS_MAX = 0.03
+PHASE_BASED_WINDOW_FRACTION_LOST_MAX = 0.03
 """Largest part of a record without echo at which frequency estimators that use phases are valid.
 
 It is a fraction of the window's sum. Errors are then below some 0.02 bin. With half a record
 without an echo they reach 0.6 bin.
 """
 
-PHASE_ESTIMATORS = ("jacobsen", "candan")
+PHASE_BASED_FREQUENCY_ESTIMATORS = ("jacobsen", "candan")
 """Frequency estimators that assume the phases of neighbouring bins of a complete record."""
 
 
@@ -117,7 +121,7 @@ class EchoDiagnosis(NamedTuple):
     """Fraction (n,) of the window's sum that precedes the echo, 0..1; 1 if no echo arrives."""
     is_misread: np.ndarray
     """True (n,) where the measured beats would be interpreted as another range or velocity."""
-    has_phase_walk: np.ndarray
+    has_large_phase_walk: np.ndarray
     """True (n,) where the laser's phase noise exceeds the limits of the model of detection."""
     is_range_velocity_exchanged: np.ndarray
     """True (n,) where up and down beat give range and velocity exchanged, as the spec reads them.
@@ -145,7 +149,7 @@ class FootprintSpreads(NamedTuple):
     """Standard deviation of the radial velocity (n,) [m/s]."""
 
     @classmethod
-    def of_plane_footprint(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintSpreads:
+    def from_plane_footprint(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintSpreads:
         """Return the deviations of footprints on a plane at ranges `range_` (n,) [m].
 
         Text parameters in `p` are the same at all points.
@@ -157,7 +161,7 @@ class FootprintSpreads(NamedTuple):
         return cls(*(np.nan_to_num(v + 0 * range_) for v in (range_deviation, velocity_deviation)))
 
     @classmethod
-    def on_ground(cls, eyepoints: Eyepoints) -> FootprintSpreads:
+    def from_eyepoints(cls, eyepoints: Eyepoints) -> FootprintSpreads:
         """Return the deviations of ray-traced footprints; 0 for footprints on several surfaces.
 
         Surfaces at different ranges are separate echoes.
@@ -233,9 +237,9 @@ def diagnose_echoes(
         if str(p[LASER_PREFIX + "line_shape"]) == "lorentzian":
             delay, duration = 2 / SPEED_OF_LIGHT * range_, record.duration
             variance = 2 * np.pi * p[LASER_PREFIX + "line_width"] * np.minimum(delay, duration)
-            diagnosis.has_phase_walk[index] = (delay > PHASE_WALK_DELAY_RATIO_MIN * duration) & (
-                variance > PHASE_WALK_VARIANCE_MAX
-            )
+            diagnosis.has_large_phase_walk[index] = (
+                delay > PHASE_WALK_DELAY_RATIO_MIN * duration
+            ) & (variance > PHASE_WALK_VARIANCE_MIN)
     return diagnosis
 
 
@@ -257,7 +261,7 @@ def _crosses_spectrum_edge(
         or not is_speckled
     ):
         return np.zeros(range_.shape, bool)
-    footprint = FootprintSpreads.of_plane_footprint(p, range_) if footprint is None else footprint
+    footprint = FootprintSpreads.from_plane_footprint(p, range_) if footprint is None else footprint
     budget = LinkBudget(p)
     settings, record = budget.waveform, budget.record
     chirp_rate, record_length = settings.chirp_rate, record.window.length
@@ -276,8 +280,9 @@ def _crosses_spectrum_edge(
         spread_bins = (
             spread_bins + 2 / SPEED_OF_LIGHT * np.abs(slope) * chirp_rate * footprint.range
         ) / bin_width
-        crosses |= (spread_bins > EDGE_SPREAD_BINS_MIN) & (
-            distance_bins < EDGE_DISTANCE_BINS + EDGE_DISTANCE_DEVIATIONS * spread_bins
+        crosses |= (spread_bins > SPECTRUM_EDGE_SPREAD_BINS_MIN) & (
+            distance_bins
+            < SPECTRUM_EDGE_DISTANCE_BINS + SPECTRUM_EDGE_DISTANCE_DEVIATIONS * spread_bins
         )
     return crosses
 
@@ -385,9 +390,11 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
             "processing.acquisition_delay to the largest 2R/c, and chirp.duration with it"
         )
     is_shifted = (
-        has_overlap & ~is_absent & (diagnosis.window_fraction_lost > PHASE_ESTIMATOR_LOSS_MAX)
+        has_overlap
+        & ~is_absent
+        & (diagnosis.window_fraction_lost > PHASE_BASED_WINDOW_FRACTION_LOST_MAX)
     )
-    if (kinds := _used_phase_estimators(study)) and is_shifted.any():
+    if (kinds := _used_phase_based_estimators(study)) and is_shifted.any():
         yield (
             f"instrument.processing.estimator.kind {' and '.join(kinds)} takes echoes for whole "
             f"records, and echoes begin within theirs at {_fraction_text(is_shifted)} of the "
@@ -411,14 +418,19 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
             "wrong range or velocity: raise processing.sample_rate, or lower chirp.bandwidth over "
             "chirp.duration"
         )
-    has_phase_walk = (
-        diagnosis.has_phase_walk & ~is_absent & (study.spec.effect_modes()["line_width"] != "off")
+    has_large_phase_walk = (
+        diagnosis.has_large_phase_walk
+        & ~is_absent
+        & (study.spec.effect_modes()["line_width"] != "off")
     )
-    if has_phase_walk.any() and (study.spec.draws is None or study.spec.draws.method != "spectra"):
+    if has_large_phase_walk.any() and (
+        study.spec.draws is None or study.spec.draws.method != "spectra"
+    ):
         yield (
             "the laser's phase walks so far within the delay of the echo at "
-            f"{_fraction_text(has_phase_walk)} of "
-            f"the {points_noun}, {_range_text(has_phase_walk, diagnosis.range, is_absent)}, that "
+            f"{_fraction_text(has_large_phase_walk)} of "
+            f"the {points_noun}, "
+            f"{_range_text(has_large_phase_walk, diagnosis.range, is_absent)}, that "
             "probabilities of detection "
             "may be off by up to 0.1: take draws.method: spectra, which draws the walk, or lower "
             "instrument.laser.line_width"
@@ -441,7 +453,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
         )
 
 
-def _used_phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
+def _used_phase_based_estimators(study: GridStudy | FlightStudy) -> list[str]:
     """Return the frequency estimators of a study that use the phases of neighbouring bins."""
     path = f"{ESTIMATOR_PREFIX}kind"
     values = [
@@ -451,7 +463,9 @@ def _used_phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
         if member.path == path
     ]
     kinds = values[0] if values else [study.spec.parameters().get(path)]
-    return [kind for kind in PHASE_ESTIMATORS if kind in {str(name) for name in kinds}]
+    return [
+        kind for kind in PHASE_BASED_FREQUENCY_ESTIMATORS if kind in {str(name) for name in kinds}
+    ]
 
 
 def _reads_two_beats(study: GridStudy | FlightStudy) -> bool:
@@ -596,7 +610,7 @@ def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
                 hitting_eyepoints, parameters, study.surfaces
             )
             diagnoses.append(
-                diagnose_echoes(shot_parameters, FootprintSpreads.on_ground(hitting_eyepoints))
+                diagnose_echoes(shot_parameters, FootprintSpreads.from_eyepoints(hitting_eyepoints))
             )
     return (
         EchoDiagnosis(*map(np.concatenate, zip(*diagnoses, strict=True)))

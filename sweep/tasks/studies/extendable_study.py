@@ -39,13 +39,13 @@ class ExtendableStudy(BlockStudy):
         return str(self.spec.id)
 
     @abstractmethod
-    def depends_on_tolerance_beyond_effects(self, block: int) -> np.ndarray | bool:
+    def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
         """Return which points of a block are computed more accurately if the tolerance is smaller.
 
         The result is a mask (points,), or one bool for all points.
         """
 
-    def first_draw_block(self, block: int) -> int:
+    def block_of_first_draws(self, block: int) -> int:
         """Return the block that holds the results shared by all draws of a block's points."""
         return block
 

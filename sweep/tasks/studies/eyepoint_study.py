@@ -51,11 +51,11 @@ SAMPLED_RAYS_MAX = 1 << 19
 
 #: Number of nodes of a scene's map along the longer side, and least number along the shorter side.
 TERRAIN_MAP_NODES_MAX = 256
-TERRAIN_MAP_NODES_MIN = 16
+TERRAIN_MAP_SHORT_SIDE_NODES_MIN = 16
 
 #: Number of shots of each scanner, or of times, that sample the extent of a flight; and the margin
 #: of the map around it, as a fraction of the extent.
-SAMPLED_FLIGHT_TIMES = 512
+N_SAMPLED_FLIGHT_TIMES = 512
 TERRAIN_MAP_MARGIN_FRACTION = 0.08
 
 #: Height above scene and flight from which rays are cast down to map the ground [m].
@@ -220,7 +220,7 @@ class EyepointStudy(BlockStudy):
         """
         return self._shot_numbers_of_cycles(_middles_of_equal_parts(self.n_cycles, n_cycles))
 
-    def spread_shot_numbers(self, n_shots: int) -> np.ndarray:
+    def evenly_spaced_shot_numbers(self, n_shots: int) -> np.ndarray:
         """Return the numbers of `n_shots` shots spread evenly over the flight."""
         return _middles_of_equal_parts(self.n_points, n_shots)
 
@@ -245,7 +245,7 @@ class EyepointStudy(BlockStudy):
             shot_numbers,
             caster=built_scene.caster,
             body_motions=built_scene.body_motions,
-            **self._observation_arguments,
+            **self._compute_eyepoints_keywords,
         )
 
     def _cycle_arrays(self, shot_arrays: Results) -> Results:
@@ -268,7 +268,7 @@ class EyepointStudy(BlockStudy):
         return self._built_scene or get_built_scene(self.spec)
 
     @cached_property
-    def _observation_arguments(self) -> dict[str, Any]:
+    def _compute_eyepoints_keywords(self) -> dict[str, Any]:
         """Arguments of :func:`compute_eyepoints` for the instrument and its flight."""
         return {
             "flight": self.spec.build_flight(),
@@ -311,7 +311,7 @@ def height_above_surface(
 def below_surface_warning(spec: SceneSpec) -> str:
     """Return a warning if the flight is below its scene at times; '' if it is not."""
     built_scene, flight = get_built_scene(spec), spec.build_flight()
-    time = np.linspace(flight.start, flight.stop, SAMPLED_FLIGHT_TIMES)
+    time = np.linspace(flight.start, flight.stop, N_SAMPLED_FLIGHT_TIMES)
     position = flight.state(time).position
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
     hits_above = built_scene.caster.cast_bundles(position, up, poses=_body_poses(built_scene, time))
@@ -422,7 +422,7 @@ def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -
 
     n_shots = spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)
     scan = spec.scan_pattern(scanner).shots(
-        np.unique(np.linspace(0, n_shots - 1, SAMPLED_FLIGHT_TIMES).astype(int))
+        np.unique(np.linspace(0, n_shots - 1, N_SAMPLED_FLIGHT_TIMES).astype(int))
     )
     flight = spec.build_flight()
     state = flight.state(flight.start + scan.time)
@@ -438,7 +438,9 @@ def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -
 def _terrain_map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the x and y coordinates of the nodes of square cells that cover a rectangle [m]."""
     step = float((high - low).max()) / (TERRAIN_MAP_NODES_MAX - 1)
-    count = np.maximum(np.ceil((high - low) / step).astype(int) + 1, TERRAIN_MAP_NODES_MIN)
+    count = np.maximum(
+        np.ceil((high - low) / step).astype(int) + 1, TERRAIN_MAP_SHORT_SIDE_NODES_MIN
+    )
     centre = (low + high) / 2
     x, y = (
         axis_centre + step * (np.arange(n_nodes) - (n_nodes - 1) / 2)

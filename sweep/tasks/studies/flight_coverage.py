@@ -88,7 +88,7 @@ def sample_coverage(spec: SceneSpec) -> FlightCoverage:
     built_scene, flight = get_built_scene(spec), spec.build_flight()
     times = np.linspace(flight.start, flight.stop, _N_SAMPLED_TIMES)
     positions = flight.state(times).position
-    scanners = tuple(_sample_scanner(spec, scanner) for scanner in spec.scanners)
+    scanners = tuple(_sample_scanner_hits(spec, scanner) for scanner in spec.scanners)
     return FlightCoverage(
         scanners, _bounding_box(positions), _bounding_box(_body_corners(built_scene, times))
     )
@@ -111,7 +111,7 @@ def refuse_flight_without_hits(spec: SceneSpec) -> None:
     raise SceneError("platform.path", rule, remedy)
 
 
-def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
+def _sample_scanner_hits(spec: SceneSpec, name: str) -> ScannerHits:
     """Cast a sample of the shots of one scanner. Return its hits."""
     study = EyepointStudy(spec, name)
     n_shots_max, shots_per_cycle = (

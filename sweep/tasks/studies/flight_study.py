@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 
 #: Text from which, with the seed, the random numbers of a flight's draws follow. The key of a shot
 #: is its number, so the draws are the same at every point of the axes and for every instrument.
-FLIGHT_KEY_DOMAIN = "sweep.flight"
+FLIGHT_RANDOM_KEY_DOMAIN = "sweep.flight"
 
 #: Smallest number of shots in a measurement cycle from which a velocity vector is computed.
 NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
@@ -207,7 +207,7 @@ def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
         raise SpecError([Mistake("draws.number", rule, f"{n_draws}", "take fewer draws")])
 
 
-class ScannerBlock(NamedTuple):
+class LocatedFlightBlock(NamedTuple):
     """Block of a flight, with the grid of its scanner."""
 
     grid: ScannerBlockGrid
@@ -251,7 +251,7 @@ class FlightStudy(ExtendableStudy):
         """Grids of blocks, one for each scanner."""
         return list(self.scanner_grids.values())
 
-    def depends_on_tolerance_beyond_effects(self, block: int) -> np.ndarray | bool:
+    def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
         """Return True if a smaller tolerance changes shots by more than the choice of effects.
 
         The number of rays, or of the steps of computation, may depend on it too.
@@ -261,16 +261,16 @@ class FlightStudy(ExtendableStudy):
             or has_numerics_set_by_tolerance(self.spec.parameters())
         )
 
-    def locate_flight_block(self, block: int) -> ScannerBlock:
+    def locate_flight_block(self, block: int) -> LocatedFlightBlock:
         """Return the grid of a block's scanner, and the block within this grid.
 
         IndexError is raised if there is no such block.
         """
         grid, block_in_grid = self.locate_in_grid(block)
         scanner_grid = self.scanner_grids[grid.group]
-        return ScannerBlock(scanner_grid, scanner_grid.flight_block(block_in_grid))
+        return LocatedFlightBlock(scanner_grid, scanner_grid.flight_block(block_in_grid))
 
-    def first_draw_block(self, block: int) -> int:
+    def block_of_first_draws(self, block: int) -> int:
         """Return the block of the first draws of the same shots.
 
         It also holds the results that do not depend on draws.
@@ -536,7 +536,9 @@ class FlightStudy(ExtendableStudy):
             {"methods": spectrum_methods(self.parameters_at(flight_block))} if draws_spectra else {}
         )
         seed, first_draw = int(self.spec.seed), flight_block.draws.start + draw_slice.start
-        keys = point_keys(shot_numbers[:, None].astype(float), domain=FLIGHT_KEY_DOMAIN, seed=seed)
+        keys = point_keys(
+            shot_numbers[:, None].astype(float), domain=FLIGHT_RANDOM_KEY_DOMAIN, seed=seed
+        )
         results = simulate_cloud(
             eyepoints,
             parameters=self.parameters_at(flight_block),
@@ -626,7 +628,7 @@ class FlightStudy(ExtendableStudy):
             first_draw_results, block_results = (
                 reuse_source.read_block(source_block)
                 for source_block in (
-                    reuse_source.source_study.first_draw_block(shared_points.source_block),
+                    reuse_source.source_study.block_of_first_draws(shared_points.source_block),
                     shared_points.source_block,
                 )
             )

@@ -126,7 +126,7 @@ PARAMETERS_CONSTANT_IN_TILE = (
 )
 
 
-class EffectGroup(NamedTuple):
+class PointsWithSameEffects(NamedTuple):
     """Points at which the same effects are simulated."""
 
     point_indices: np.ndarray
@@ -135,7 +135,7 @@ class EffectGroup(NamedTuple):
     """Names of the effects."""
 
 
-class EffectBatch(NamedTuple):
+class PointsComputedTogether(NamedTuple):
     """Points that are computed together though their effects may differ."""
 
     point_indices: np.ndarray
@@ -156,24 +156,24 @@ class SelectedEffects(NamedTuple):
         """Return the effects of some of the points."""
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
-    def iter_groups_by_effects(self) -> Iterator[EffectGroup]:
+    def iter_groups_by_effects(self) -> Iterator[PointsWithSameEffects]:
         """Yield the groups of points with the same simulated effects."""
         for group_flags in np.unique(self.effect_flags):
-            yield EffectGroup(
+            yield PointsWithSameEffects(
                 np.flatnonzero(self.effect_flags == group_flags),
                 unpack_effect_flags(int(group_flags)),
             )
 
     def iter_groups_computed_together(
         self,
-    ) -> Iterator[EffectBatch]:
+    ) -> Iterator[PointsComputedTogether]:
         """Yield groups of points that are computed together though their effects may differ."""
         separating_flags = self.effect_flags & SEPARATE_BATCHES_MASK
         for shared_flags in np.unique(separating_flags):
             index = np.flatnonzero(separating_flags == shared_flags)
             group_flags = self.effect_flags[index]
             effect_names = unpack_effect_flags(int(np.bitwise_or.reduce(group_flags)))
-            yield EffectBatch(index, effect_names, group_flags)
+            yield PointsComputedTogether(index, effect_names, group_flags)
 
 
 class TileGroup(NamedTuple):
@@ -479,7 +479,7 @@ class GridStudy(ExtendableStudy):
         """Grid of the study's points, in a tuple of one."""
         return (self.grid,)
 
-    def depends_on_tolerance_beyond_effects(self, block: int) -> np.ndarray | bool:
+    def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
         """Return which points of a block are computed more accurately if the tolerance is smaller.
 
         The result is a mask (points,), or one bool for all points.
@@ -618,7 +618,7 @@ class GridStudy(ExtendableStudy):
             parts.append(PartialResults(shared_points.local_indices[has_same_effects], results))
         local_indices, results = concatenate_results(parts)
         reused_results = PartialResults(
-            local_indices, zero_running_sums(self.spec, local_indices.size) | results
+            local_indices, initial_running_sums(self.spec, local_indices.size) | results
         )
         reuse_source.reused_points_by_block[block] = (
             local_indices.size if reuse_source.has_final_results else 0
@@ -683,7 +683,7 @@ def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
 POINTS_PER_CALL_MAX = 1 << 16
 
 #: Largest number of counts of draws per call; a point has one per batch.
-COUNTS_PER_CALL_MAX = 1 << 19
+DRAW_COUNTS_PER_CALL_MAX = 1 << 19
 
 #: Prefixes of parameters that change how draws are evaluated, and not the draws.
 NON_PHYSICAL_PARAMETER_PREFIXES = (
@@ -692,7 +692,7 @@ NON_PHYSICAL_PARAMETER_PREFIXES = (
 
 #: Text from which, with the seed, the random numbers of a grid's draws follow. They differ from all
 #: other random numbers of the same seed.
-GRID_KEY_DOMAIN = "sweep.draws"
+GRID_RANDOM_KEY_DOMAIN = "sweep.draws"
 
 
 def iter_block_results(
@@ -802,7 +802,9 @@ def select_parameters(
 
 def _points_per_call(spec: GridSpec) -> int:
     """Return how many points one call of the model computes at once."""
-    return max(1, min(POINTS_PER_CALL_MAX, COUNTS_PER_CALL_MAX // max(1, len(batch_sizes(spec)))))
+    return max(
+        1, min(POINTS_PER_CALL_MAX, DRAW_COUNTS_PER_CALL_MAX // max(1, len(batch_sizes(spec))))
+    )
 
 
 def batch_sizes(spec: GridSpec) -> list[int]:
@@ -823,7 +825,7 @@ def random_keys_of_points(
         if not path.startswith(NON_PHYSICAL_PARAMETER_PREFIXES)
     }
     return point_keys(
-        canonical_point_rows(physical, n_points), domain=GRID_KEY_DOMAIN, seed=spec.seed
+        canonical_point_rows(physical, n_points), domain=GRID_RANDOM_KEY_DOMAIN, seed=spec.seed
     )
 
 
@@ -884,10 +886,10 @@ def _simulate_draws(
         keywords |= {"batch_sizes": batch_sizes(spec)}
     if draws.draws_whole_spectra:
         return simulate_draws(parameters, effects, methods=spectrum_methods(parameters), **keywords)
-    return zero_running_sums(spec, n_points) | simulate_draws(parameters, effects, **keywords)
+    return initial_running_sums(spec, n_points) | simulate_draws(parameters, effects, **keywords)
 
 
-def zero_running_sums(spec: GridSpec, n_points: int) -> Results:
+def initial_running_sums(spec: GridSpec, n_points: int) -> Results:
     """Return sums of zero (n_points, sums) to which draws are added, if the study stores sums."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
     return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}

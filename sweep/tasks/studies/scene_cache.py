@@ -43,14 +43,14 @@ CACHE_BYTES_MAX = 2 << 30
 DRAFT_AGE_MAX = 86400.0
 """Age at which an unfinished file is deleted, since its writer must have died [s]."""
 
-LIBRARIES_OF_SCENES = (
+SCENE_BUILDING_LIBRARIES = (
     "numpy", "scipy", "trimesh", "rasterio", "pyproj", "pillow", "matplotlib", "pint",
 )  # fmt: skip
 """Libraries whose version may change the arrays of a scene."""
 
 _DRAFT_PREFIX = "draft-"
 _HEADER_BYTES = 8  # CRC-32 of the rest of the file, as hexadecimal digits
-_READ_BYTES = 1 << 20
+_READ_BUFFER_BYTES = 1 << 20
 
 _log = logging.getLogger("sweep")
 
@@ -132,7 +132,7 @@ def _source_digest() -> str | None:
 def _library_versions() -> tuple[str, ...]:
     """Return the versions of the libraries that read and build scenes, "" for an absent one."""
     versions = []
-    for name in LIBRARIES_OF_SCENES:
+    for name in SCENE_BUILDING_LIBRARIES:
         try:
             versions.append(version(name))
         except PackageNotFoundError:
@@ -157,7 +157,7 @@ def _read_scene(path: Path) -> BuiltScene | None:
     try:
         with path.open("rb") as file:
             expected_checksum, checksum = int(file.read(_HEADER_BYTES), 16), 0
-            while data := file.read(_READ_BYTES):
+            while data := file.read(_READ_BUFFER_BYTES):
                 checksum = zlib.crc32(data, checksum)
             if checksum != expected_checksum:
                 return None

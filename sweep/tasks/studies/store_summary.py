@@ -94,7 +94,7 @@ class DetectionSummary(NamedTuple):
 def detection_summary(store: str | Location) -> DetectionSummary:
     """Summarise detection in the stored blocks of a grid, or in a sample of them."""
     store_path = parse_location(store)
-    study = study_loading.read_study_of_blocks(store_path).study
+    study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, GridStudy):
         raise StoreError(f"{store_path} holds no study over a grid")
     sample = _sample_blocks(store_path, study, None)
@@ -141,7 +141,7 @@ def count_unsupported_points(
 ) -> UnsupportedPoints:
     """Count unsupported points in a sample. Return the count, and the reason for the first."""
     store_path = parse_location(store)
-    study = study_loading.read_study_of_blocks(store_path).study
+    study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, GridStudy):
         return UnsupportedPoints(0, "")
     blocks = _sample_blocks(store_path, study, done_block_numbers).blocks
@@ -248,12 +248,12 @@ class ScannerRow:
     false_points: int = 0  # number of points that are no true return
     n_cycles: int = 0  # number of cycles times draws; 0 if a cycle has too few shots
     solved_cycles: int = 0  # number of cycles, times draws, with a velocity vector
-    pd_of_shots: list[np.ndarray] = field(default_factory=list, repr=False)
+    pd_of_shots_by_block: list[np.ndarray] = field(default_factory=list, repr=False)
 
     @property
     def mean_pd(self) -> float:
         """Mean probability of detection of the shots that hit something; nan if no shot does."""
-        all_pd = np.concatenate([*self.pd_of_shots, np.empty(0)])
+        all_pd = np.concatenate([*self.pd_of_shots_by_block, np.empty(0)])
         return float(all_pd.mean()) if all_pd.size else float("nan")
 
     def add_block(self, block_arrays: Mapping[str, np.ndarray]) -> None:
@@ -266,7 +266,9 @@ class ScannerRow:
         self.shots_with_true_return += int(((point_flags & TRUE_FLAG) > 0).any(axis=-1).sum())
         self.false_points += int(((point_flags > 0) & ((point_flags & TRUE_FLAG) == 0)).sum())
         if "pd_shot" in block_arrays:  # only blocks of the first draws have it
-            self.pd_of_shots.append(block_arrays["pd_shot"][np.isfinite(block_arrays["pd_shot"])])
+            self.pd_of_shots_by_block.append(
+                block_arrays["pd_shot"][np.isfinite(block_arrays["pd_shot"])]
+            )
         if "velocity_status" in block_arrays:
             status = block_arrays["velocity_status"]
             self.n_cycles += status.size
@@ -276,7 +278,7 @@ class ScannerRow:
 def flight_summary(store: str | Location) -> list[ScannerRow]:
     """Return a row for each scanner and point of the axes; one per scanner if points are many."""
     store_path = parse_location(store)
-    study = study_loading.read_study_of_blocks(store_path).study
+    study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, FlightStudy):
         raise StoreError(f"{store_path} holds no study of a scene")
     axis_points = list(np.ndindex(tuple(int(axis.size) for axis in study.spec.axes)))
@@ -404,7 +406,7 @@ def accuracy_rows_of_draws(
     The result is empty without draws or results.
     """
     store_path = parse_location(store)
-    study = study_loading.read_study_of_blocks(store_path).study
+    study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, GridStudy) or not study.spec.draws.has_draws:
         return []
     error_arrays = {name: f"{name}_half_width" for name in PD_OUTPUTS}
@@ -430,7 +432,7 @@ def accuracy_rows_of_rays(
     A grid has one row, and only if the largest number of beamlets does not suffice.
     """
     store_path = parse_location(store)
-    study = study_loading.read_study_of_blocks(store_path).study
+    study = study_loading.read_study_and_check_blocks(store_path).study
     if isinstance(study, GridStudy):
         tolerance_limit = np.maximum(
             ErrorBudget(_tolerance_over_grid(study)).allowed_beamlets_error,
@@ -576,7 +578,7 @@ def status(store: str | Location) -> Status:
     (4, 4)
     """
     store_path = parse_location(store)
-    attributes, study = study_loading.read_study_of_blocks(store_path)
+    attributes, study = study_loading.read_study_and_check_blocks(store_path)
     last_run = journal.read_last_run(store_path)
     receipts = read_receipt_totals(store_path, study.n_blocks, since=last_run.start_time)
     packed_bytes = (

@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 
 #: Number of blocks that are read for checking at once, and number of threads that read them.
 BLOCKS_PER_READ_BATCH = 256
-READER_THREADS = 4
+N_READER_THREADS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +295,7 @@ def _iter_block_damages(
     )  # a short verification shows no progress
     progress.begin(points=len(blocks), done=0, unit="blocks")
     try:
-        with ThreadPoolExecutor(READER_THREADS) as pool:
+        with ThreadPoolExecutor(N_READER_THREADS) as pool:
             for start in range(0, len(blocks), BLOCKS_PER_READ_BATCH):
                 batch = [int(block) for block in blocks[start : start + BLOCKS_PER_READ_BATCH]]
                 for damages in pool.map(
@@ -420,7 +420,7 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
         study_store.build_template(
             template_path, study, attributes or study_store.template_attributes(study)
         )
-        _refuse_unreproducible(store_path, template_path)
+        _refuse_unreproducible_template(store_path, template_path)
         template_digests = {
             name: stored_objects_digest(template_path, [name])
             for name in sorted(iter_names_below(template_path))
@@ -437,7 +437,7 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
     return altered_names
 
 
-def _refuse_unreproducible(store_path: Location, template_path: Path) -> None:
+def _refuse_unreproducible_template(store_path: Location, template_path: Path) -> None:
     """Raise a StoreError if newly made objects differ from the digests in the manifest.
 
     Only undamaged lines of the manifest count.
@@ -504,7 +504,7 @@ def pack_store(
         the copy can't be written and read back.
     """
     store_path, output = parse_location(store_path).absolute(), parse_location(output).absolute()
-    attributes, study = study_loading.read_study_of_blocks(store_path)
+    attributes, study = study_loading.read_study_and_check_blocks(store_path)
     n_missing = study.n_blocks - int(np.count_nonzero(committed_blocks(store_path, study)))
     if attributes.get(PACKED_ATTRIBUTE) or n_missing:
         reason = (
@@ -574,7 +574,7 @@ def _pack_array(source: Any, output: Location) -> None:
     target = target.with_config({"write_empty_chunks": True})  # else chunks of fill values are lost
     dims = tuple(map(str, range(target.ndim)))
     shard_grid = BlockGrid(dims, target.shape, target.shards or target.chunks)
-    with ThreadPoolExecutor(READER_THREADS) as pool:
+    with ThreadPoolExecutor(N_READER_THREADS) as pool:
         for _ in pool.map(
             lambda shard: _copy_region(source, target, shard_grid.block_slices(shard)),
             range(shard_grid.n_blocks),

@@ -106,7 +106,7 @@ def read_study(store_path: Location) -> StoredStudy[AnyStudy]:
     return StoredStudy(attributes, load_study(store_path, attributes))
 
 
-def read_study_of_blocks(store_path: Location) -> StoredStudy[AnyStudy]:
+def read_study_and_check_blocks(store_path: Location) -> StoredStudy[AnyStudy]:
     """Compute :func:`read_study` for a reader of receipts, which count the study's blocks.
 
     StoreError is also raised if the store's blocks have another shape than the study has here: its
@@ -233,7 +233,7 @@ class ReuseSource:
         is_reusable = source_grid_indices >= 0
         if self._has_other_tolerance:
             is_reusable = is_reusable & ~np.asarray(
-                self._target_study.depends_on_tolerance_beyond_effects(block)
+                self._target_study.has_numerics_set_by_tolerance(block)
             )
         local_indices = np.flatnonzero(is_reusable)
         source_blocks, source_local_indices = source_grid.locate_points(
@@ -243,7 +243,7 @@ class ReuseSource:
             if (
                 self._committed_digests[first_source_block + source_block]
                 and self._committed_digests[
-                    self.source_study.first_draw_block(first_source_block + source_block)
+                    self.source_study.block_of_first_draws(first_source_block + source_block)
                 ]
             ):
                 is_in_block = source_blocks == source_block
@@ -302,7 +302,7 @@ class ReuseSource:
         remarks = ["points that are there are drawn further"] if self.has_first_draws else []
         spec = self._target_study.spec
         has_closer_points = self._has_other_tolerance and np.any(
-            self._target_study.depends_on_tolerance_beyond_effects(0)
+            self._target_study.has_numerics_set_by_tolerance(0)
         )
         if self._has_other_tolerance and isinstance(spec, SceneSpec) and not has_closer_points:
             remarks.append("shots that call for more effects with the tolerance are computed anew")
@@ -630,11 +630,11 @@ def _make_axis_lookup(
         }
     n_values = len(next(iter(other_values.values()))) if other_values else 1
     rows = canonical_point_rows(other_values, n_values)
-    row_indices = _find_rows(rows, canonical_point_rows(parameters, math.prod(shape)))
+    row_indices = _find_row_indices(rows, canonical_point_rows(parameters, math.prod(shape)))
     return AxisLookup(tuple(other_values), axis, row_indices.reshape(shape))
 
 
-def _find_rows(known_rows: np.ndarray, wanted_rows: np.ndarray) -> np.ndarray:
+def _find_row_indices(known_rows: np.ndarray, wanted_rows: np.ndarray) -> np.ndarray:
     """Return the index (m,) of each wanted row in `known_rows` (n, columns); -1 if missing."""
     if not known_rows.shape[1]:
         return np.zeros(len(wanted_rows), np.int64)

@@ -56,7 +56,7 @@ TIMED_RAYS_MAX = 1 << 17
 TIMED_SHOT_DRAWS_MAX = 1 << 14
 
 #: Number of shots, spread over the flight, that load kernels and tables before any is timed.
-UNTIMED_FIRST_SHOTS_MAX = 32
+WARM_UP_SHOTS_MAX = 32
 
 #: Largest number of shots of a cycle of which whole cycles are timed, with their navigation.
 TIMED_CYCLE_SHOTS_MAX = 128
@@ -504,7 +504,7 @@ class _ScannerTimer:
                 max(n_shots // self.grid.shots_per_cycle, 1)
             )
         else:
-            shot_numbers = self._eyepoints.spread_shot_numbers(n_shots)
+            shot_numbers = self._eyepoints.evenly_spaced_shot_numbers(n_shots)
         shot_arrays = self._eyepoints.cast_shots(shot_numbers)
         cast_at = time.process_time()
         shot_eyepoints = eyepoints_from_arrays(shot_arrays, self._eyepoints.beamlet_weights)
@@ -529,7 +529,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     timer = _ScannerTimer(study, eyepoints)
     seconds_max = FLIGHT_TIMING_SECONDS / len(study.spec.scanners)
     # The first shots load kernels and tables, which other places in the flight may need too.
-    first_sample = timer.time_shots(min(UNTIMED_FIRST_SHOTS_MAX, timer.n_shots_max))
+    first_sample = timer.time_shots(min(WARM_UP_SHOTS_MAX, timer.n_shots_max))
     start = time.process_time()
     n_timed, samples = 1, [timer.time_shots(1)]
     while n_timed < timer.n_shots_max and (

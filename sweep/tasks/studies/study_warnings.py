@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.flight_study import FlightStudy
     from sweep.tasks.studies.grid_study import GridStudy
 
-_PACKAGE_FOLDER = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+_TASKS_PACKAGE_FOLDER = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 
 
 class StudyWarning(UserWarning):
@@ -66,7 +66,7 @@ def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], No
     Errors that are not stated are messages of `say`.
     """
     stack_level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE_FOLDER):
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_TASKS_PACKAGE_FOLDER):
         stack_level, frame = stack_level + 1, frame.f_back
     for sentences in (iter_spec_warnings(study.spec), iter_result_warnings(study)):
         for sentence in sentences:
