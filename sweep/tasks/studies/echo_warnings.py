@@ -2,8 +2,8 @@
 
 A record begins at the acquisition delay and ends `fft_size` samples later, or with the chirp. An
 echo arrives at 2 R / c. Beats above half the sample rate are aliased, so that three peaks, or two
-with an assumption, give a wrong range. Both follow from a few parameters. They are therefore
-checked for a whole grid, and for shots spread over a flight, before anything runs.
+with an assumption, give a wrong range. Few parameters decide whether an echo is late or misread.
+All points of a grid, and shots spread over a flight, are therefore checked before anything runs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Power is lost if the echo arrives after its record has begun.
 """
 
 PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MIN = 0.125, 0.3
-"""Limits above which the laser's random walk of phase changes pd by more than 0.02.
+"""Limits that are both exceeded if the laser's random walk of phase changes pd by more than 0.02.
 
 The first is the echo's delay over the duration of the record. The second is the variance of the
 laser's phase over the delay, or over the record if that is shorter [rad^2].
@@ -49,7 +49,7 @@ laser's phase over the delay, or over the record if that is shorter [rad^2].
 ECHO_POINTS_SAMPLED_MAX = 200_000
 """Largest number of points of a grid whose echoes are checked.
 
-Points differ in `ECHO_PARAMETERS`.
+Of points with equal `ECHO_PARAMETERS` only one is checked.
 """
 
 SAMPLED_TILES_PER_SCANNER = 16
@@ -63,8 +63,8 @@ SPECTRUM_EDGE_SPREAD_BINS_MIN, SPECTRUM_EDGE_DISTANCE_BINS, SPECTRUM_EDGE_DISTAN
 """Limits by which an echo is taken to spread across an edge of the spectrum: DC or Nyquist.
 
 The first is the standard deviation of a footprint's line frequencies [bins] above which an echo is
-not a single line, if any bin may detect it. The others are distances from the edge, in bins and in
-standard deviations, below which such an echo spreads across it.
+not a single line. Such an echo spreads across an edge that is nearer than a number of bins (the
+second limit) plus a number of these standard deviations (the third).
 """
 
 ECHO_PARAMETERS = (
@@ -102,14 +102,14 @@ ECHO_PARAMETERS = (
 
 
 PHASE_BASED_WINDOW_FRACTION_LOST_MAX = 0.03
-"""Largest part of a record without echo at which frequency estimators that use phases are valid.
+"""Largest fraction of the window's sum before the echo at which phase-based estimators are valid.
 
-It is a fraction of the window's sum. Errors are then below some 0.02 bin. With half a record
-without an echo they reach 0.6 bin.
+Their errors are then below some 0.02 bin. They reach 0.6 bin if the echo begins in the middle of
+the record.
 """
 
 PHASE_BASED_FREQUENCY_ESTIMATORS = ("jacobsen", "candan")
-"""Frequency estimators that assume the phases of neighbouring bins of a complete record."""
+"""Frequency estimators that rely on the phases that a complete record gives to adjacent bins."""
 
 
 class EchoDiagnosis(NamedTuple):
@@ -122,7 +122,7 @@ class EchoDiagnosis(NamedTuple):
     is_misread: np.ndarray
     """True (n,) where the measured beats would be interpreted as another range or velocity."""
     has_large_phase_walk: np.ndarray
-    """True (n,) where the laser's phase noise exceeds the limits of the model of detection."""
+    """True (n,) where the laser's phase walks too far for the model of detection."""
     is_range_velocity_exchanged: np.ndarray
     """True (n,) where up and down beat give range and velocity exchanged, as the spec reads them.
 
@@ -150,9 +150,9 @@ class FootprintSpreads(NamedTuple):
 
     @classmethod
     def from_plane_footprint(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintSpreads:
-        """Return the deviations of footprints on a plane at ranges `range_` (n,) [m].
+        """Return the standard deviations over footprints on a plane at ranges `range_` (n,) [m].
 
-        Text parameters in `p` are the same at all points.
+        `p` are parameters by dotted path. Its text parameters are the same at all points.
         """
         with np.errstate(all="ignore"):
             places, directions = beam.footprint_full_angles(p, range_)
@@ -162,9 +162,10 @@ class FootprintSpreads(NamedTuple):
 
     @classmethod
     def from_eyepoints(cls, eyepoints: Eyepoints) -> FootprintSpreads:
-        """Return the deviations of ray-traced footprints; 0 for footprints on several surfaces.
+        """Return the standard deviations over ray-traced footprints.
 
-        Surfaces at different ranges are separate echoes.
+        They are 0 for a footprint on several surfaces: surfaces at different ranges are separate
+        echoes.
         """
         weight = eyepoints.weight / eyepoints.weight.sum()
         deviations = []
@@ -176,17 +177,17 @@ class FootprintSpreads(NamedTuple):
         return cls(*(np.where(has_one_surface, v, 0.0) for v in deviations))
 
     def select(self, points: np.ndarray) -> FootprintSpreads:
-        """Return the deviations of the footprints with given indices."""
+        """Return the standard deviations at points with given indices."""
         return FootprintSpreads(self.range[points], self.radial_velocity[points])
 
 
 def diagnose_echoes(
     parameters: Mapping[str, Any], footprint: FootprintSpreads | None = None
 ) -> EchoDiagnosis:
-    """Find out when the echoes of points arrive, and which range and velocity their beats give.
+    """Check when the echoes of n points arrive, and which range and velocity their beats give.
 
-    ``footprint`` has the deviations of range and velocity over the footprints; by default those of
-    footprints on a plane.
+    ``parameters`` are by dotted path: one value, or an array (n,). ``footprint`` has the standard
+    deviations of range and velocity over the footprints; by default those of footprints on a plane.
     """
     relevant = {
         path: parameter for path, parameter in parameters.items() if path in ECHO_PARAMETERS
@@ -249,7 +250,7 @@ def _crosses_spectrum_edge(
     velocity: np.ndarray,
     footprint: FootprintSpreads | None,
 ) -> np.ndarray:
-    """Return where echoes in developed speckle spread across DC or Nyquist, (n,) of bool.
+    """Return a mask (n,) of the echoes in developed speckle that spread across DC or Nyquist.
 
     The result is :attr:`EchoDiagnosis.crosses_spectrum_edge`.
     """
@@ -292,8 +293,8 @@ def _is_misread(
 ) -> np.ndarray:
     """Return True (n,) where the beats, folded as in spectra, give another range or velocity.
 
-    All three beats are used. With an ``assumption`` about the target, ``far`` or ``fast``, only up
-    and down beat are.
+    All three beats are used. If ``assumption`` is given, only up and down beat are used, and the
+    target is assumed to be ``far`` or ``fast``.
     """
     budget = LinkBudget(p)
     settings, record, slopes = budget.waveform, budget.record, waveform.chirp_slopes(p)
@@ -583,7 +584,7 @@ def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
 
 
 def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
-    """Diagnose late and folded echoes of sampled shots of a flight, at the ends of its axes."""
+    """Diagnose the echoes of sampled shots, at the first and the last point of a flight's axes."""
     from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
     from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 

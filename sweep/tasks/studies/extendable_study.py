@@ -12,8 +12,8 @@ import numpy as np
 from sweep.model import VERSION
 from sweep.tasks.engine.block_study import BlockStudy
 
-#: Errors of Zarr at a chunk that is missing or damaged.
 CHUNK_READ_ERRORS = (OSError, ValueError, RuntimeError)
+"""Exceptions that Zarr raises for a chunk that is missing or damaged."""
 
 
 class ExtendableStudy(BlockStudy):
@@ -40,13 +40,17 @@ class ExtendableStudy(BlockStudy):
 
     @abstractmethod
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return which points of a block are computed more accurately if the tolerance is smaller.
+        """Return True for the points of a block whose numerical accuracy follows the tolerance.
 
-        The result is a mask (points,), or one bool for all points.
+        The result is a mask (points,), or one bool for all points. The choice of effects, which
+        always follows the tolerance, does not count.
         """
 
     def block_of_first_draws(self, block: int) -> int:
-        """Return the block that holds the results shared by all draws of a block's points."""
+        """Return the block with the first draws of a block's points.
+
+        It also holds the results that do not depend on draws.
+        """
         return block
 
     def pop_reused_point_count(self, block: int) -> int:

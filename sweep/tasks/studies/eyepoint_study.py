@@ -35,37 +35,41 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec
     from sweep.spec.scene_sections import BuiltScene
 
-#: Largest numbers of shots and of beamlets (rays) in a block of complete measurement cycles.
 SHOTS_PER_BLOCK_MAX = 4096
+"""Largest number of shots in a block, unless a single measurement cycle has more."""
 BEAMLETS_PER_BLOCK_MAX = 1 << 20
+"""Largest number of beamlets (rays) in a block, unless a single measurement cycle has more."""
 
-#: Number of beamlets (rays) above which they are cut into several blocks, so that all cores have
-#: work. So many take some half a second.
 DEFAULT_BLOCK_BEAMLETS_MIN = 1 << 17
+"""Number of beamlets (rays) above which a study is divided into several blocks.
 
-#: Largest number of beamlets (rays) that are cast at once. It limits memory if cycles are long.
+All cores then have work. Casting this number takes about half a second.
+"""
+
 RAYS_PER_CAST_MAX = 1 << 18
+"""Largest number of beamlets (rays) that are cast at once. It limits memory if cycles are long."""
 
-#: Largest number of beamlets (rays) of the shots that sample a flight before it runs.
 SAMPLED_RAYS_MAX = 1 << 19
+"""Largest number of beamlets (rays) of the shots that sample a flight before it runs."""
 
-#: Number of nodes of a scene's map along the longer side, and least number along the shorter side.
 TERRAIN_MAP_NODES_MAX = 256
+"""Number of nodes along the longer side of a scene's map."""
 TERRAIN_MAP_SHORT_SIDE_NODES_MIN = 16
+"""Smallest number of nodes along the shorter side of a scene's map."""
 
-#: Number of shots of each scanner, or of times, that sample the extent of a flight; and the margin
-#: of the map around it, as a fraction of the extent.
 N_SAMPLED_FLIGHT_TIMES = 512
+"""Number of times, or of shots of each scanner, that sample where a flight and its beams go."""
 TERRAIN_MAP_MARGIN_FRACTION = 0.08
+"""Margin of a scene's map around the sampled positions, as a fraction of their extent."""
 
-#: Height above scene and flight from which rays are cast down to map the ground [m].
 TERRAIN_MAP_VIEWPOINT_CLEARANCE = 1.0
+"""Height above scene and flight from which rays are cast down to map the ground [m]."""
 
-#: Largest height above ground at which a platform counts as standing on it [m].
 GROUND_CONTACT_DISTANCE_MAX = 1e-6
+"""Largest height of ground above a platform at which the platform counts as standing on it [m]."""
 
-#: Sizes of the model's dimensions of vectors and matrices.
 VECTOR_DIM_SIZES = {"xyz": 3, "xyz_again": 3}
+"""Sizes of the dimensions of vectors and matrices in stores, by the dimension's name."""
 
 
 class EyepointStudy(BlockStudy):
@@ -216,7 +220,7 @@ class EyepointStudy(BlockStudy):
     def shot_numbers_of_spread_cycles(self, n_cycles: int) -> np.ndarray:
         """Return the numbers of all shots in `n_cycles` cycles spread evenly over the flight.
 
-        A single cycle is that in the middle.
+        If `n_cycles` is 1, the cycle in the middle is taken.
         """
         return self._shot_numbers_of_cycles(_middles_of_equal_parts(self.n_cycles, n_cycles))
 

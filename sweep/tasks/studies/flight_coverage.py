@@ -20,7 +20,7 @@ SAMPLED_RAYS_PER_SCANNER = 1 << 17
 """Number of rays per scanner, spread over the flight, that sample what the scanner hits."""
 
 MISSED_SHOTS_FRACTION_MAX = 0.01
-"""Fraction of a scanner's shots without a hit above which a warning is given."""
+"""Largest fraction of a scanner's shots that may hit nothing without a warning."""
 
 _N_SAMPLED_TIMES = 65
 """Number of times in a flight at which platform and moving objects are located."""
@@ -30,6 +30,7 @@ class ScannerHits(NamedTuple):
     """Numbers of hits and misses among sampled shots of one scanner."""
 
     name: str
+    """Name of the scanner."""
     n_shots: int
     """Number of shots in the sample."""
     hit_fraction: float
@@ -37,7 +38,7 @@ class ScannerHits(NamedTuple):
     partial_hit_fraction: float
     """Fraction of the shots with some beamlets that hit something, and others that do not."""
     beams_without_hits: tuple[int, ...]
-    """Numbers of those beams of which no sampled shot hits anything."""
+    """Numbers of the beams whose sampled shots all hit nothing."""
 
     def hits_text(self) -> str:
         """Return the hits as a sentence."""
@@ -56,6 +57,7 @@ class FlightCoverage(NamedTuple):
     """Sampled hits of each scanner of a flight, and the bounding boxes of path and scene."""
 
     scanner_hits: tuple[ScannerHits, ...]
+    """Sampled hits of each scanner."""
     path_bounding_box: np.ndarray
     """Smallest and largest coordinates of the platform along its path, (2, 3) [m]."""
     scene_bounding_box: np.ndarray
@@ -69,7 +71,7 @@ class FlightCoverage(NamedTuple):
         )
 
     def warnings(self) -> Iterator[str]:
-        """Yield a warning for each scanner of which too many shots hit nothing.
+        """Yield a warning for each scanner with too many shots that hit nothing.
 
         The limit is `MISSED_SHOTS_FRACTION_MAX`.
         """
@@ -84,7 +86,10 @@ class FlightCoverage(NamedTuple):
 
 @lru_cache(maxsize=1)
 def sample_coverage(spec: SceneSpec) -> FlightCoverage:
-    """Cast the rays of sampled shots of each scanner, and return where they hit (cached)."""
+    """Cast sampled shots of each scanner. Return their hits, and the extents of path and scene.
+
+    The result is cached.
+    """
     built_scene, flight = get_built_scene(spec), spec.build_flight()
     times = np.linspace(flight.start, flight.stop, _N_SAMPLED_TIMES)
     positions = flight.state(times).position

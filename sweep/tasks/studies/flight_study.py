@@ -74,15 +74,17 @@ if TYPE_CHECKING:
     flags.
     """
 
-#: Text from which, with the seed, the random numbers of a flight's draws follow. The key of a shot
-#: is its number, so the draws are the same at every point of the axes and for every instrument.
 FLIGHT_RANDOM_KEY_DOMAIN = "sweep.flight"
+"""Text that, with the seed and a shot's number, determines the random numbers of the shot's draws.
 
-#: Smallest number of shots in a measurement cycle from which a velocity vector is computed.
+The draws are the same at every point of the axes and for every instrument.
+"""
+
 NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
+"""Smallest number of shots in a measurement cycle from which a velocity vector is computed."""
 
-#: Outputs of the geometry of shots and cycles, which do not depend on the axes.
 GEOMETRY_OUTPUTS = SHOT_VARIABLES | CYCLE_VARIABLES
+"""Output variables of the geometry of shots and cycles, which do not depend on the axes."""
 
 
 @cache
@@ -114,9 +116,13 @@ class FlightBlock(NamedTuple):
     """Block of a flight: measurement cycles and draws of one scanner at one point of the axes."""
 
     scanner: str
+    """Name of the scanner."""
     axis_indices: tuple[int, ...]
+    """Index along each axis of the point of the axes."""
     draws: range
+    """Numbers of the draws."""
     cycles: range
+    """Numbers of the measurement cycles."""
 
 
 class ScannerBlockGrid(ParameterGrid, BlockGrid):
@@ -140,14 +146,14 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
             self.n_cycles * self.shots_per_cycle,
             self.n_draws,
         )
-        cycles_per_block = max(1, block_size_max.shots // self.shots_per_cycle)
+        cycles_per_block = max(1, block_size_max.n_shots // self.shots_per_cycle)
         BlockGrid.__init__(
             self,
             (*(axis.name for axis in spec.axes), "draw", "cycle"),
             (*self.axes_shape, self.n_draws, self.n_cycles),
             (
                 *(1 for _ in self.axes_shape),
-                min(self.n_draws, block_size_max.draws),
+                min(self.n_draws, block_size_max.n_draws),
                 min(self.n_cycles, cycles_per_block),
             ),
             group=scanner,
@@ -159,14 +165,14 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
                 f"cuts {self.n_draws:,} draws of {self.n_cycles:,} cycles of {scanner} into "
                 f"{self.n_blocks:.3g} blocks, and a study has at most {BLOCKS_PER_STUDY_MAX:.0e}"
             )
-            size = f"{block_size_max.draws}"
+            size = f"{block_size_max.n_draws}"
             remedy = "raise it or storage.block_shots, or take fewer draws"
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
         """Return the values along each dimension of the grid.
 
-        They are given by parameter path along axes, and by the names `draw` and `cycle`.
+        The keys are parameter paths for axes, and `draw` and `cycle` for the other dimensions.
         """
         draw_values = {"draw": np.arange(self.n_draws)}
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
@@ -191,8 +197,8 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
         return self.flight_block(self.block_at((*axis_indices, 0, 0)))
 
 
-#: Largest product of a scanner's shots, draws and points of the axes.
 DRAWN_SHOTS_MAX = 10**10
+"""Largest product of a scanner's shots, draws and points of the axes."""
 
 
 def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
@@ -219,7 +225,7 @@ class LocatedFlightBlock(NamedTuple):
 class SimulatedGroup(NamedTuple):
     """Results of shots that were simulated together."""
 
-    rows: np.ndarray
+    shot_rows: np.ndarray
     """Indices (m,) of the shots among all shots that are to be simulated."""
     results: Results
     """Arrays (m, ...) of results by the name of the output variable."""
@@ -228,8 +234,10 @@ class SimulatedGroup(NamedTuple):
 class ReusedCloud(NamedTuple):
     """Results of a flight's block that are taken from the store of a smaller study."""
 
-    is_reused: np.ndarray  # (shots, draws) bool
-    results: Results  # (shots or cycles, draws, ...) by name; (shots, ...) without draws
+    is_reused: np.ndarray
+    """True (shots, draws) where the results are taken from the smaller study."""
+    results: Results
+    """Arrays of results by name: (shots or cycles, draws, ...), or (shots, ...) without draws."""
 
 
 class FlightStudy(ExtendableStudy):
@@ -252,10 +260,7 @@ class FlightStudy(ExtendableStudy):
         return list(self.scanner_grids.values())
 
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True if a smaller tolerance changes shots by more than the choice of effects.
-
-        The number of rays, or of the steps of computation, may depend on it too.
-        """
+        """Return True if the numerical accuracy of shots, or their rays, follow the tolerance."""
         return bool(
             self.spec.is_ray_number_set_by_tolerance
             or has_numerics_set_by_tolerance(self.spec.parameters())
@@ -271,7 +276,7 @@ class FlightStudy(ExtendableStudy):
         return LocatedFlightBlock(scanner_grid, scanner_grid.flight_block(block_in_grid))
 
     def block_of_first_draws(self, block: int) -> int:
-        """Return the block of the first draws of the same shots.
+        """Return the block with the first draws of a block's shots.
 
         It also holds the results that do not depend on draws.
         """
@@ -444,8 +449,8 @@ class FlightStudy(ExtendableStudy):
     ) -> Results:
         """Simulate radiometry, draws and navigation of shots that make complete measurement cycles.
 
-        Results that are ``reused_cloud`` holds are not simulated again. Shots may be any if
-        ``solves_navigation`` is False.
+        Results that ``reused_cloud`` holds are not simulated again. If ``solves_navigation`` is
+        False, the shots need not make complete cycles.
         """
         scanner_grid = self.scanner_grids[flight_block.scanner]
         n_draws, shots_per_cycle = len(flight_block.draws), scanner_grid.shots_per_cycle
@@ -476,7 +481,7 @@ class FlightStudy(ExtendableStudy):
     def _empty_cloud(
         self, scanner_grid: ScannerBlockGrid, n_shots: int, n_draws: int
     ) -> ReusedCloud:
-        """Return the arrays of results of shots, filled with their fill values."""
+        """Return a cloud without reused results: arrays that contain their fill values."""
         outputs = (
             SHOT_STATISTIC_VARIABLES
             | POINT_VARIABLES
@@ -689,7 +694,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
-        """Standard deviations of those instrument errors that a stronger echo does not reduce."""
+        """Standard deviations of the instrument errors that a stronger echo does not reduce."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
         floor_section = self.spec.error_floor
@@ -787,9 +792,12 @@ def _insert_results(
 class ShotEffectPlan(NamedTuple):
     """Effects chosen for each shot of a flight."""
 
-    hitting_shots: np.ndarray  # (m,) indices of the shots that hit something
-    tile_index: np.ndarray  # (m,) index of the tile of each such shot in the plan
-    tile_plan: EffectPlan  # plan of the tiles
+    hitting_shots: np.ndarray
+    """Indices (m,) of the shots that hit something."""
+    tile_index: np.ndarray
+    """Index (m,) in `tile_plan` of the tile of each shot that hits something."""
+    tile_plan: EffectPlan
+    """Plan of the tiles (runs of shots with common effects)."""
 
     def selected_effects(self, n_shots: int) -> SelectedEffects:
         """Return the effects simulated at each of `n_shots` shots.

@@ -76,8 +76,8 @@ if TYPE_CHECKING:
 def canonical_point_rows(parameters: Mapping[str, ParameterValue], n_points: int) -> np.ndarray:
     """Return rows of float64 (n_points, parameters) that identify points by their parameters alone.
 
-    A row holds every parameter, in the order of the sorted paths. Strings are represented by 62
-    bits of their hash.
+    A row contains all parameters of a point, sorted by path. Strings are represented by 62 bits of
+    their hash.
     """
     rows = np.empty((n_points, len(parameters)), dtype=np.uint64)
     for column, path in enumerate(sorted(parameters)):
@@ -103,17 +103,19 @@ def _text_hash(word: str) -> int:
     return int.from_bytes(digest, "little") >> 2
 
 
-#: Names of the arrays with the simulated effects, and with the error bound of the omitted ones.
 EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY = "effects", "effects_error"
+"""Names of the arrays with the simulated effects, and with the error bound of the omitted ones."""
 
-#: Largest number of points of a tile, a box of points whose effects are chosen together. It is
-#: small enough for similar points, and large enough for cheap planning.
 POINTS_PER_TILE_MAX = 1024
+"""Largest number of points of a tile, a box of points whose effects are chosen together.
 
-#: Number of points whose effects are planned at once, and number per tile in a first, rough plan.
+It is small enough for similar points, and large enough for cheap planning.
+"""
+
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
+"""Number of points whose effects are planned at once, and number per tile in a rough first plan.
+"""
 
-#: Numeric parameters whose values must be equal in a tile: sizes of records, and the tolerance.
 PARAMETERS_CONSTANT_IN_TILE = (
     "instrument.processing.fft_size",
     "instrument.processing.sample_rate",
@@ -124,6 +126,7 @@ PARAMETERS_CONSTANT_IN_TILE = (
     LOOKS_VOTES_PATH,
     TOLERANCE_PARAMETER,
 )
+"""Numeric parameters whose values must be equal in a tile: sizes of records, and the tolerance."""
 
 
 class PointsWithSameEffects(NamedTuple):
@@ -149,8 +152,10 @@ class PointsComputedTogether(NamedTuple):
 class SelectedEffects(NamedTuple):
     """Effects that are simulated at each of n points, one bit per effect."""
 
-    effect_flags: np.ndarray  # (n,) uint32: bit k for the k-th effect of the catalogue
-    error_bound: np.ndarray  # (n,): bound of the change by all omitted effects together
+    effect_flags: np.ndarray
+    """Effects of each point, (n,) of uint32: bit k for the k-th effect of the catalogue."""
+    error_bound: np.ndarray
+    """Upper bound (n,) of the change that all omitted effects together would cause."""
 
     def subset(self, index: slice | np.ndarray) -> SelectedEffects:
         """Return the effects of some of the points."""
@@ -182,8 +187,10 @@ class TileGroup(NamedTuple):
     Record sizes are the :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the FFT size.
     """
 
-    group_number: int  # number of the group in the grid
-    requested_indices: np.ndarray  # (m,): indices of the tiles in the request
+    group_number: int
+    """Number of the group in the grid."""
+    requested_indices: np.ndarray
+    """Indices (m,) of the tiles among those that were requested from `TileGrid.group_tiles`."""
     parameters: dict[str, ParameterValue]
     """Parameters by dotted path: strings, numbers, and arrays that broadcast over (m, *tile).
 
@@ -194,17 +201,17 @@ class TileGroup(NamedTuple):
 class BlockTiles(NamedTuple):
     """Tiles that overlap a block."""
 
-    tiles: np.ndarray
+    tile_numbers: np.ndarray
     """Numbers (m,) of the tiles in the grid."""
     tile_index: np.ndarray
-    """Index (n,) in `tiles` of the tile of each point of the block, in C order."""
+    """Index (n,) in `tile_numbers` for each point of the block, in C order."""
 
 
 class TilePlans(NamedTuple):
     """Effects that were chosen for a batch of tiles."""
 
-    members: np.ndarray
-    """Indices (m,) of the batch's tiles among the requested tiles."""
+    requested_indices: np.ndarray
+    """Indices (m,) of the tiles among those that were requested from the planner."""
     effect_plan: EffectPlan
     """Plan of the m tiles."""
 
@@ -243,8 +250,8 @@ class TileGrid(BlockGrid):
     def group_tiles(self, tiles: np.ndarray, stride: int = 1) -> Iterator[TileGroup]:
         """Yield the groups of tiles that can be planned together, with their points' parameters.
 
-        With a ``stride`` n the parameters are those of every n-th point along each axis, and of the
-        point with the largest value of each parameter.
+        ``tiles`` are the numbers of the tiles. With a ``stride`` n only some points are sampled:
+        every n-th along each axis, and the point with the largest value of each parameter.
         """
         positions = np.unravel_index(tiles, self.blocks_per_dim) if self.blocks_per_dim else ()
         group_codes = np.zeros(len(tiles), np.int64)
@@ -276,9 +283,11 @@ class TileGrid(BlockGrid):
     def _values_along_axis(
         self, axis: int, tile_index_along: np.ndarray, stride: int
     ) -> dict[str, ParameterValue]:
-        """Return the values along an axis, cut into tiles, by parameter path.
+        """Return the values along an axis at the points of m tiles, by parameter path.
 
-        Their shape broadcasts with that of the values along other axes.
+        ``tile_index_along`` (m,) are the positions of the tiles along the axis. The values
+        broadcast with those along other axes: their first dimension has length m, that of the axis
+        the number of points, and all others 1. An axis that is constant in a tile has scalars.
         """
         members = self.grid.values_by_axis[axis]
         if self._is_constant_axis[axis]:
@@ -353,10 +362,10 @@ class EffectPlanner:
             ],
             np.int64,
         )
-        for members, plan in self.iter_tile_plans(unplanned_tiles):
+        for plan_indices, plan in self.iter_tile_plans(unplanned_tiles):
             flags_of_tiles = pack_effect_flags(plan.is_kept)
             for tile, flag, error in zip(
-                unplanned_tiles[members], flags_of_tiles, plan.total_error, strict=True
+                unplanned_tiles[plan_indices], flags_of_tiles, plan.total_error, strict=True
             ):
                 self._plan_by_tile[int(tile)] = int(flag), float(error)
         planned = [self._plan_by_tile[tile_number] for tile_number in tiles.tolist()]
@@ -480,7 +489,7 @@ class GridStudy(ExtendableStudy):
         return (self.grid,)
 
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return which points of a block are computed more accurately if the tolerance is smaller.
+        """Return True for the points of a block whose numerical accuracy follows the tolerance.
 
         The result is a mask (points,), or one bool for all points.
         """
@@ -646,7 +655,7 @@ class GridStudy(ExtendableStudy):
         return n_reusable
 
     def compile_kernels(self) -> None:
-        """Compile the model's kernels with a point of all possible effects, and a point of none."""
+        """Compile the kernels: compute a point with all possible effects, and one without any."""
         effect_modes, single_draw_spec = self.spec.effect_modes(), limit_draws(self.spec, 1)
         possible_effects = [
             effect.name
@@ -678,21 +687,26 @@ def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
     ]
 
 
-#: Number of points per call of the model: large enough for negligible overhead, small enough that
-#: memory does not grow with the block. The model divides their draws further.
 POINTS_PER_CALL_MAX = 1 << 16
+"""Largest number of points per call of the model.
 
-#: Largest number of counts of draws per call; a point has one per batch.
+It is large enough for negligible overhead, and small enough that memory does not grow with the
+block. The model divides the draws of the points further.
+"""
+
 DRAW_COUNTS_PER_CALL_MAX = 1 << 19
+"""Largest number of stored counts of draws per call of the model: one per point and batch."""
 
-#: Prefixes of parameters that change how draws are evaluated, and not the draws.
 NON_PHYSICAL_PARAMETER_PREFIXES = (
     "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS_PATH
 )  # fmt: skip
+"""Prefixes of parameters that change how draws are evaluated, but not what is drawn."""
 
-#: Text from which, with the seed, the random numbers of a grid's draws follow. They differ from all
-#: other random numbers of the same seed.
 GRID_RANDOM_KEY_DOMAIN = "sweep.draws"
+"""Text that, with the seed and a point's parameters, determines the random numbers of its draws.
+
+They differ from all other random numbers of the same seed.
+"""
 
 
 def iter_block_results(
@@ -772,7 +786,9 @@ def evaluate_points(
     prior_draws: PriorDraws | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Results:
-    """Return the results of points, (n_points,) each; counts of draws (n_points, batches).
+    """Return the results of points as arrays by name: (n_points,), or with further dimensions.
+
+    Counts of draws have the shape (n_points, batches).
 
     Parameters are scalars, strings or arrays (n_points,). Draws continue from ``prior_draws`` until
     all are made or ``should_stop`` returns True.
@@ -816,7 +832,10 @@ def batch_sizes(spec: GridSpec) -> list[int]:
 def random_keys_of_points(
     spec: GridSpec, parameters: Mapping[str, ParameterValue], n_points: int
 ) -> np.ndarray:
-    """Return the random keys (n_points, 2) uint64 of points, which no accuracy setting changes."""
+    """Return the random keys (n_points, 2) uint64 of points.
+
+    They do not depend on the `NON_PHYSICAL_PARAMETER_PREFIXES`, such as settings of accuracy.
+    """
     from sweep.model.sampling.philox import point_keys
 
     physical = {
@@ -890,7 +909,7 @@ def _simulate_draws(
 
 
 def initial_running_sums(spec: GridSpec, n_points: int) -> Results:
-    """Return sums of zero (n_points, sums) to which draws are added, if the study stores sums."""
+    """Return the sums (n_points, sums) before any draw: 0; empty if the study stores no sums."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
     return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
 

@@ -18,13 +18,17 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.grid_study import GridStudy
 
 FFT_SIZE_PARAMETER = "instrument.processing.fft_size"
+"""Dotted path of the FFT size (number of samples)."""
 
 PEAK_BYTES_PER_FFT_POINT = 250
-PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA = 300
-"""Peak memory of one grid point, per sample of its FFT [bytes], if whole spectra are drawn.
+"""Peak memory of computing one grid point without whole spectra, per sample of its FFT [bytes].
 
-`PEAK_BYTES_PER_FFT_POINT` is the same for closed-form results. Both were measured with FFTs of 2^20
-and 2^22 samples.
+It was measured with FFTs of 2^20 and 2^22 samples.
+"""
+PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA = 300
+"""Peak memory of drawing whole spectra of one grid point, per sample of its FFT [bytes].
+
+It was measured with FFTs of 2^20 and 2^22 samples.
 """
 
 
@@ -106,7 +110,7 @@ def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> N
 
 
 def _available_memory_phrase(worker_memory: WorkerMemory) -> str:
-    """Return the available memory as part of a sentence."""
+    """Return the available memory as a phrase, such as 'and a worker has 8.0 GB'."""
     return f"and {worker_memory.process_name} has {_gigabytes_text(worker_memory.bytes_max)}"
 
 

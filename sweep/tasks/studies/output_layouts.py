@@ -28,7 +28,7 @@ They are from version 90 of the table of standard names.
 
 
 def cf_attributes(units: str, long_name: str, comment: str = "", name: str = "") -> dict[str, Any]:
-    """Return the attributes of an array or coordinate by the CF conventions, without empty ones."""
+    """Return the non-empty attributes of an array or coordinate by the CF conventions."""
     attributes = {"units": units, "long_name": long_name}
     optional = {"comment": comment, "standard_name": CF_STANDARD_NAMES.get(name, "")}
     return attributes | {key: value for key, value in optional.items() if value}

@@ -12,9 +12,8 @@ from sweep.spec.specs import GridSpec, SceneSpec
 from sweep.tasks.engine.blocks import BLOCKS_PER_STUDY_MAX, BlockGrid
 
 ParameterValue = float | int | str | np.ndarray
+"""Value of a parameter: one for all points, or an array with the value of each point."""
 
-#: Parameters that change the frequencies of spectral lines. Any other parameter only scales lines
-#: or changes how they are evaluated, which is cheap once their frequencies are known.
 GEOMETRIC_PARAMETERS = (
     "target.range",
     "target.grazing_angle",
@@ -22,41 +21,58 @@ GEOMETRIC_PARAMETERS = (
     "target.transverse_velocity",
     "target.pointing_jitter",
 )
+"""Parameters that change the frequencies of spectral lines.
+
+Any other parameter, except those of `GEOMETRIC_PARAMETER_PREFIXES`, only scales lines or changes
+how they are evaluated, which is cheap once their frequencies are known.
+"""
 GEOMETRIC_PARAMETER_PREFIXES = (
     "instrument.laser.beam_", "instrument.laser.focus", "instrument.telescope.coupling",
     "instrument.receiver.local_oscillator_waist", "footprint.",
 )  # fmt: skip
+"""Prefixes of further parameters that change the frequencies of spectral lines."""
 
 TOLERANCE_PARAMETER = "accuracy.tolerance"
+"""Dotted path of the tolerance."""
 
-#: Number of consecutive shots of a flight whose effects are planned together.
 SHOTS_PER_TILE = 256
+"""Number of consecutive shots of a flight whose effects are planned together."""
 
-#: Largest time of a block by :func:`worst_cpu_seconds_per_point` [s], which is lost if a worker
-#: dies. It also limits the counts of draws, one per point and batch, to some 100 MB.
 BLOCK_CPU_SECONDS_MAX = 60.0
+"""Largest time of a block on one core, estimated by `worst_cpu_seconds_per_point` [s].
 
-#: Default size of a block [points], and number of blocks above which blocks grow instead. A block
-#: is some 25 files, which are listed, copied and removed one by one.
+This time is lost if a worker dies. The limit also keeps the counts of draws in a block, one per
+point and batch, below some 100 MB.
+"""
+
 DEFAULT_BLOCK_POINTS = 1 << 16
+"""Largest default number of points of a block, up to `BLOCKS_OF_DEFAULT_SIZE_MAX` blocks."""
 BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
+"""Largest number of blocks of the default size; larger studies have larger blocks instead.
 
-#: Time on one core of a point of a grid without draws, or of one of its draws, and what a point in
-#: developed speckle takes longer [s].
+A block is some 25 files, which are listed, copied and removed one by one.
+"""
+
 POINT_DRAW_CPU_SECONDS = 4e-5
+"""Time of a grid point without draws, or of one draw of a point, on one core [s]."""
 SPECKLE_CPU_SECONDS = 1.6e-4
+"""Additional time of a point in developed speckle, on one core [s]."""
 
-#: Time on one core of a flight's shot, and of each of its draws [s].
 SHOT_CPU_SECONDS = 7e-5
+"""Time of a flight's shot without its draws, on one core [s]."""
 SHOT_DRAW_CPU_SECONDS = 2e-5
+"""Time of one draw of a flight's shot, on one core [s]."""
 
-#: Number of blocks into which studies are cut by default, so that all cores of a machine have work
-#: from the first second on; and least estimated time of such a block on one core [s].
 DEFAULT_BLOCKS_MIN = 32
-DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
+"""Number of blocks into which studies are divided by default, if these are not too small.
 
-#: Largest number of draws in a block of a flight, if the spec does not state one.
+All cores of a machine then have work from the first second on.
+"""
+DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
+"""Smallest estimated time of a default block on one core [s]."""
+
 DEFAULT_BLOCK_DRAWS_MAX = 128
+"""Largest number of draws in a block of a flight, if the spec does not state one."""
 
 
 def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
@@ -104,9 +120,9 @@ def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
 class FlightBlockSize(NamedTuple):
     """Numbers of shots and of draws of a flight's block."""
 
-    shots: int
+    n_shots: int
     """Number of shots of one scanner."""
-    draws: int
+    n_draws: int
     """Number of draws of each shot."""
 
 
@@ -115,12 +131,15 @@ def flight_block_size_max(
 ) -> FlightBlockSize:
     """Return upper limits on the shots and on the draws of any block of a flight.
 
-    A section `storage` that differs from its defaults states both. By default a study is cut into
-    DEFAULT_BLOCKS_MIN blocks or more, or into fewer that take DEFAULT_BLOCK_CPU_SECONDS_MIN or
-    more. The shots of a block are whole tiles, because the effects of a tile's shots are chosen
-    together. A block has only a part of the draws of its shots if a tile with all draws takes
-    longer than such a block, and than twice DEFAULT_BLOCK_CPU_SECONDS_MIN: each part computes the
-    spectra of its shots anew. It never has more than DEFAULT_BLOCK_DRAWS_MAX.
+    If the spec's section `storage` differs from its defaults, it states both limits. Otherwise:
+
+    * A study is divided into DEFAULT_BLOCKS_MIN blocks or more, or into fewer blocks if they would
+      take less than DEFAULT_BLOCK_CPU_SECONDS_MIN.
+    * A block contains complete tiles, because the effects of a tile's shots are chosen together.
+    * Blocks share the draws of a shot only if a tile with all draws takes longer than such a block,
+      and longer than twice DEFAULT_BLOCK_CPU_SECONDS_MIN. The reason is that each of these blocks
+      computes the spectra of the shot again.
+    * A block has at most DEFAULT_BLOCK_DRAWS_MAX draws of a shot.
 
     Parameters
     ----------
@@ -160,9 +179,9 @@ def fit_block_shape(
 ) -> tuple[int, ...]:
     """Return the number of points of a block along each axis.
 
-    `is_geometric` tells whether an axis changes the geometry of beam and target; other axes are
-    radiometric. A block first takes whole radiometric axes, then geometric ones, beginning with the
-    last axis. It thus holds every radiometric variation of its geometries.
+    `is_geometric` is True for axes that change the geometry of beam and target; the other axes are
+    radiometric. Radiometric axes are filled first, then geometric axes, each time beginning with
+    the last axis. A block thus contains all radiometric variations of its geometries.
     """
     order = sorted(range(len(sizes)), key=lambda k: (is_geometric[k], -k))
     shape, points_left = [1] * len(sizes), block_points
@@ -182,7 +201,7 @@ def default_block_points(n_points: int, cpu_seconds_per_point: float) -> int:
 def block_points_limit(spec: GridSpec, n_points: int) -> int:
     """Return the largest number of points of a block.
 
-    It is as specified, or less if points take long.
+    It is the number that the spec states, or a smaller one if points take long.
     """
     cpu_seconds_per_point = worst_cpu_seconds_per_point(spec)
     requested_points = spec.storage.block_points or default_block_points(
@@ -252,7 +271,7 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
         return parameters
 
     def point_order_by_geometry(self, block: int) -> np.ndarray:
-        """Return an order (n,) of a block's points that puts points with equal geometry together.
+        """Return the indices (n,) of a block's points, with points of equal geometry adjacent.
 
         Radiometric axes vary fastest, and velocities slowest, as the change of a spectral line
         within a record depends on velocity.

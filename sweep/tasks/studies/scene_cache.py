@@ -1,8 +1,8 @@
 """Cache of built scenes: a large elevation model takes longer to build than to read.
 
 A file holds the bodies of a scene with their box trees. Its name is a digest of everything that
-they follow from: the spec's scene and platform, and the content of the files that these name. The
-sources of this package, and the versions of the libraries that build scenes, count too.
+determines them: the spec's scene and platform, the content of the files that these name, the
+sources of this package, and the versions of the libraries that build scenes.
 
     BASE/sweep-scenes-UID/DIGEST
 
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
 CACHED_BUILD_SECONDS_MIN = 1.0
-"""Processor time of building a scene from which on the scene is cached [s]."""
+"""Smallest processor time of building a scene for which the scene is cached [s]."""
 
 CACHE_BYTES_MAX = 2 << 30
 """Largest size of all cached scenes together [bytes]. The least recently used ones are deleted."""
 
 DRAFT_AGE_MAX = 86400.0
-"""Age at which an unfinished file is deleted, since its writer must have died [s]."""
+"""Largest age of an unfinished file [s]. An older file is deleted: its writer must have died."""
 
 SCENE_BUILDING_LIBRARIES = (
     "numpy", "scipy", "trimesh", "rasterio", "pyproj", "pillow", "matplotlib", "pint",
@@ -49,8 +49,11 @@ SCENE_BUILDING_LIBRARIES = (
 """Libraries whose version may change the arrays of a scene."""
 
 _DRAFT_PREFIX = "draft-"
-_HEADER_BYTES = 8  # CRC-32 of the rest of the file, as hexadecimal digits
+"""Beginning of the names of unfinished files."""
+_HEADER_BYTES = 8
+"""Size of the header of a file: the CRC-32 of the rest of the file, as hexadecimal digits."""
 _READ_BUFFER_BYTES = 1 << 20
+"""Number of bytes of a file that are read at once."""
 
 _log = logging.getLogger("sweep")
 
@@ -99,9 +102,9 @@ def _cache_root() -> Path | None:
 
 
 def _scene_digest(spec: SceneSpec) -> str | None:
-    """Return a digest of everything from which the arrays and reports of a scene follow.
+    """Return a digest of everything that determines the arrays and reports of a scene.
 
-    None if the sources can't be read.
+    The result is None if the sources can't be read.
     """
     source_digest = _source_digest()
     if source_digest is None:
@@ -130,7 +133,7 @@ def _source_digest() -> str | None:
 
 @cache
 def _library_versions() -> tuple[str, ...]:
-    """Return the versions of the libraries that read and build scenes, "" for an absent one."""
+    """Return the versions of the libraries that read and build scenes; "" for a missing library."""
     versions = []
     for name in SCENE_BUILDING_LIBRARIES:
         try:
@@ -147,7 +150,7 @@ class _ChecksumWriter:
         self._file, self.checksum = file, 0
 
     def write(self, data: Any) -> int:
-        """Write bytes, or an object with a buffer of bytes."""
+        """Write bytes, or an object with a buffer of bytes. Return the number of bytes."""
         self.checksum = zlib.crc32(data, self.checksum)
         return self._file.write(data)
 
@@ -171,7 +174,7 @@ def _read_scene(path: Path) -> BuiltScene | None:
 
 
 def _write_scene(path: Path, scene: BuiltScene) -> None:
-    """Write a scene to a draft, and rename it into place; what fails leaves no file behind.
+    """Write a scene to an unfinished file, and rename it. A failure leaves no file behind.
 
     A scene larger than CACHE_BYTES_MAX is not written.
     """

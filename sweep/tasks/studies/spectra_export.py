@@ -1,4 +1,4 @@
-"""Export of drawn spectra of a shot, with noise, noise level, and the true quantities."""
+"""Export of drawn spectra of one point, with the noise level and the true quantities."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec
 
 FILE_SUFFIXES = (".zarr", ".npz")
+"""Suffixes of the formats to which spectra are exported."""
 
 
 def draw_point_spectra(
@@ -41,7 +42,7 @@ def draw_point_spectra(
     Parameters
     ----------
     spec
-        Study of whole spectra or not, for its effects and seed.
+        Study whose effects and seed are used. It need not draw whole spectra itself.
     parameters
         SI values of all parameters of the point, by path.
     n_draws, first_draw

@@ -36,36 +36,42 @@ from sweep.tasks.studies.parameter_grid import TOLERANCE_PARAMETER
 if TYPE_CHECKING:
     from sweep.spec import Axis
 
-#: Probability of detection above which a point counts as detected.
 DETECTED_PD_MIN = 0.9
+"""Probability of detection above which a point counts as detected."""
 
-#: Largest number of rows of the table of detection, without the row for the whole grid.
 SUMMARY_ROWS_MAX = 10
+"""Largest number of rows of the table of detection, without the row for the whole grid."""
 
-#: Largest numbers of points and of blocks that are read; of larger studies a random sample.
 SAMPLED_POINTS_MAX = 1 << 23
+"""Largest number of points that are read. Larger studies are sampled at random."""
 SAMPLED_BLOCKS_MAX = 1000
+"""Largest number of blocks that are read. Larger studies are sampled at random."""
 
-#: Largest number of points of a flight's axes that have separate rows.
 AXIS_POINTS_LISTED_MAX = 12
+"""Largest number of points of a flight's axes with a row for each point."""
 
 
 @dataclass(frozen=True)
 class DetectionRow:
-    """Mean detection results in one part of a grid.
+    """Detection in one part of a grid.
 
     Points that are not computed (NaN) do not count.
     """
 
     label: str
+    """Values of the axis in this part, as text."""
     n_points: int
-    detected_fraction: float  # fraction of points with pd_shot above `DETECTED_PD_MIN`
-    median_pd_shot: float  # median of pd_shot
+    """Number of computed points."""
+    detected_fraction: float
+    """Fraction of the points with pd_shot above `DETECTED_PD_MIN`."""
+    median_pd_shot: float
+    """Median of pd_shot."""
     median_pd_doppler: float
+    """Median of pd_doppler; nan without a Doppler segment."""
 
     @classmethod
     def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
-        """Return the row for n points; ``pd_doppler`` may be nan, as without a Doppler segment."""
+        """Return the row for n points. ``pd_doppler`` (n,) is nan without a Doppler segment."""
         is_computed = ~np.isnan(pd_shot)
         pd_shot, pd_doppler = (
             pd_shot[is_computed],
@@ -86,7 +92,7 @@ class DetectionSummary(NamedTuple):
     axis_heading: str
     """Name and units of the slowest axis; '' for a grid without axes."""
     rows: list[DetectionRow]
-    """Rows of the parts of this axis, and last one of the whole grid."""
+    """A row for each part of this axis, and a last row for the whole grid."""
     block_fraction: float
     """Fraction of the stored blocks that were read."""
 
@@ -105,7 +111,7 @@ def detection_summary(store: str | Location) -> DetectionSummary:
     part_edges = np.linspace(0, n_values, min(n_values, SUMMARY_ROWS_MAX) + 1).astype(int)
     values_by_part: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in part_edges[1:]]
     for region, values in iter_block_values(
-        store_path, study, ("pd_shot", "pd_doppler"), sample.blocks
+        store_path, study, ("pd_shot", "pd_doppler"), sample.block_numbers
     ):
         pd_pair = np.stack(values).reshape(2, -1, *values[0].shape[1:])
         axis_indices = np.arange(pd_pair.shape[1]) + (region[0].start if region else 0)
@@ -116,7 +122,7 @@ def detection_summary(store: str | Location) -> DetectionSummary:
     pd_by_part = [np.concatenate(values_of_part, axis=1) for values_of_part in values_by_part]
     total_row = DetectionRow.from_points("all", *np.concatenate(pd_by_part, axis=1))
     if axis is None:
-        return DetectionSummary("", [total_row], sample.fraction)
+        return DetectionSummary("", [total_row], sample.block_fraction)
     labels = [_axis_range_label(axis, first, stop) for first, stop in pairwise(part_edges)]
     rows = [
         DetectionRow.from_points(label, *values)
@@ -124,7 +130,7 @@ def detection_summary(store: str | Location) -> DetectionSummary:
     ]
     units = axis.parameters[0].units if len(axis.parameters) == 1 else ""
     heading = f"{axis.name} [{units}]" if units else axis.name
-    return DetectionSummary(heading, [*rows, total_row], sample.fraction)
+    return DetectionSummary(heading, [*rows, total_row], sample.block_fraction)
 
 
 class UnsupportedPoints(NamedTuple):
@@ -139,12 +145,15 @@ class UnsupportedPoints(NamedTuple):
 def count_unsupported_points(
     store: str | Location, done_block_numbers: np.ndarray | None = None
 ) -> UnsupportedPoints:
-    """Count unsupported points in a sample. Return the count, and the reason for the first."""
+    """Count the points in a sample of a store's blocks that the model does not support.
+
+    Return the number, and why the first of them is not supported.
+    """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, GridStudy):
         return UnsupportedPoints(0, "")
-    blocks = _sample_blocks(store_path, study, done_block_numbers).blocks
+    blocks = _sample_blocks(store_path, study, done_block_numbers).block_numbers
     n_unsupported, first_reason = 0, ""
     for block, (_, (pd_shot,)) in zip(
         blocks, iter_block_values(store_path, study, ("pd_shot",), blocks), strict=True
@@ -172,9 +181,9 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
 class _BlockSample(NamedTuple):
     """Random sample of the stored blocks."""
 
-    blocks: np.ndarray
+    block_numbers: np.ndarray
     """Numbers (m,) of the sampled blocks, in rising order."""
-    fraction: float
+    block_fraction: float
     """Fraction of the stored blocks that are in the sample."""
 
 
@@ -237,18 +246,25 @@ def iter_block_values(
 
 @dataclass
 class ScannerRow:
-    """Numbers of true and false points of one scanner at one point of the axes.
+    """Numbers of true and false points of one scanner, at one point of the axes or at all of them.
 
     Only stored blocks count.
     """
 
     label: str
-    n_shots: int = 0  # number of shots times draws
-    shots_with_true_return: int = 0  # number of shots, times draws, with at least one true return
-    false_points: int = 0  # number of points that are no true return
-    n_cycles: int = 0  # number of cycles times draws; 0 if a cycle has too few shots
-    solved_cycles: int = 0  # number of cycles, times draws, with a velocity vector
+    """Name of the scanner, and values at the point of the axes, as text."""
+    n_shots: int = 0
+    """Number of shots times draws."""
+    shots_with_true_return: int = 0
+    """Number of shots (times draws) with at least one true return."""
+    false_points: int = 0
+    """Number of points of the clouds that are not true returns."""
+    n_cycles: int = 0
+    """Number of cycles times draws; 0 if a cycle has too few shots for navigation."""
+    solved_cycles: int = 0
+    """Number of cycles (times draws) with a velocity vector."""
     pd_of_shots_by_block: list[np.ndarray] = field(default_factory=list, repr=False)
+    """Probabilities of detection of the shots that hit something, by block."""
 
     @property
     def mean_pd(self) -> float:
@@ -276,7 +292,10 @@ class ScannerRow:
 
 
 def flight_summary(store: str | Location) -> list[ScannerRow]:
-    """Return a row for each scanner and point of the axes; one per scanner if points are many."""
+    """Return a row for each scanner and point of the axes.
+
+    If there are more than `AXIS_POINTS_LISTED_MAX` points, each scanner has one row.
+    """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, FlightStudy):
@@ -309,7 +328,10 @@ def flight_summary(store: str | Location) -> list[ScannerRow]:
 
 
 def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list[str]:
-    """Return the values at a point of the axes as text; of the first axes if there are many."""
+    """Return the values at a point of the axes as texts.
+
+    `axis_point` may have fewer indices than there are axes: the last axes are then left out.
+    """
     return [
         f"{member.coordinate} "
         f"{_format_value(member.display_values[index])}{' ' * bool(member.units)}{member.units}"
@@ -320,27 +342,34 @@ def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list
 
 @dataclass
 class AccuracyRow:
-    """Statistical error of a probability of detection, or error by the finite number of rays.
+    """Summary of the errors at many points, compared with the tolerance at each point.
 
-    It is compared with the tolerance at each point.
+    They are statistical errors of a probability of detection, or errors by the finite number of
+    rays.
     """
 
     name: str
     """Name of the probability or of the scanner; empty for the beamlets of a grid."""
-    n_points: int = (
-        0  # points computed with a known error; for a flight shots times points of the axes
-    )
-    n_points_within_tolerance: int = 0  # number of points within the tolerance
-    worst_error: float = (
-        math.nan
-    )  # error, as a half-width, of the point with the largest excess over its tolerance
-    tolerance_at_worst_point: float = math.nan  # tolerance at this point
+    n_points: int = 0
+    """Number of points with a known error; for a flight, shots times points of the axes."""
+    n_points_within_tolerance: int = 0
+    """Number of points whose error is within the tolerance."""
+    worst_error: float = math.nan
+    """Error, as a half-width, at the worst point: that of the largest excess over the tolerance."""
+    tolerance_at_worst_point: float = math.nan
+    """Tolerance at the worst point."""
     worst_point_label: str = ""
-    samples_at_worst_point: int = 0  # number of draws, or of rays, at this point
-    total_samples: int = 0  # number of draws, or of rays, at all points
+    """Values of the axes at the worst point, as text."""
+    samples_at_worst_point: int = 0
+    """Number of draws, or of rays, at the worst point."""
+    total_samples: int = 0
+    """Number of draws, or of rays, at all points together."""
     samples_max: int = 0
-    worst_point_index: tuple[int, ...] = ()  # index of this point in the array
-    block_fraction: float = 1.0  # fraction of the blocks that were read
+    """Largest number of draws, or of rays, at a point."""
+    worst_point_index: tuple[int, ...] = ()
+    """Index of the worst point in the stored array."""
+    block_fraction: float = 1.0
+    """Fraction of the stored blocks that were read."""
     _worst_excess: float = -math.inf
 
     @property
@@ -429,7 +458,8 @@ def accuracy_rows_of_rays(
 ) -> list[AccuracyRow]:
     """Return a row of errors by the finite number of rays for each scanner.
 
-    A grid has one row, and only if the largest number of beamlets does not suffice.
+    For a grid, the result is one row if the largest number of beamlets does not suffice, and empty
+    otherwise.
     """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
@@ -485,10 +515,10 @@ def _accuracy_rows(
     ``samples_array`` holds the numbers of draws or rays.
     """
     sample, axes = _sample_blocks(store_path, study, done_block_numbers), study.spec.axes
-    rows = [AccuracyRow(name, block_fraction=sample.fraction) for name in error_arrays]
+    rows = [AccuracyRow(name, block_fraction=sample.block_fraction) for name in error_arrays]
     tolerance = np.broadcast_to(tolerance, study.output_layout_by_name[samples_array].shape)
     for region, (samples, *error_values) in iter_block_values(
-        store_path, study, [samples_array, *error_arrays.values()], sample.blocks
+        store_path, study, [samples_array, *error_arrays.values()], sample.block_numbers
     ):
         for row, errors in zip(rows, error_values, strict=True):
             row.add_points(errors, tolerance[region], samples, tuple(part.start for part in region))
@@ -552,7 +582,7 @@ class Status:
 
 
 def status(store: str | Location) -> Status:
-    """Return the state of a store by its logs, without checking that its chunks exist.
+    """Return the state of a store from its logs, without checking that its chunks exist.
 
     Parameters
     ----------

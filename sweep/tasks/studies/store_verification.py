@@ -1,7 +1,7 @@
 """Verification of every byte of a store by digests, repair, and packing into few large files.
 
-Everything that a store contains before results follows from the study, so it can be made again to
-the same bytes. A packed copy is checked value by value when it is made.
+What a store contains before the first result follows from the study alone, and can be restored byte
+for byte. A packed copy is checked value by value when it is made.
 """
 
 from __future__ import annotations
@@ -70,9 +70,10 @@ from sweep.tasks.studies.study_loading import AnyStudy
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
-#: Number of blocks that are read for checking at once, and number of threads that read them.
 BLOCKS_PER_READ_BATCH = 256
+"""Number of blocks that are read for checking at once."""
 N_READER_THREADS = 4
+"""Number of threads that read blocks or shards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +158,11 @@ def verify(
 
 
 def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> AnyStudy | None:
-    """Return the study in a store; None if it holds none, or if it can't be read."""
+    """Return the study in a store, or that of ``spec``; raise StoreError if it can't be read.
+
+    The result is None for a store whose blocks can't be checked: one without a study, a packed one,
+    or one of eyepoints that does not name their study.
+    """
     try:
         attributes = _undamaged_attributes(store_path)
     except StoreError:
@@ -340,7 +345,7 @@ def _find_block_damages(
 
 
 def _read_chunk_damage(store_path: Location, chunk_path: str, bytes_max: int) -> str:
-    """Return the damage of a chunk; '' if it has none.
+    """Read a chunk. Return a description of its damage; '' if it has none.
 
     In an object store a damaged chunk is read twice, as a response may be incomplete.
     """
@@ -475,9 +480,11 @@ def _refuse_unproven_study(
             )
 
 
-#: Largest size of a shard (file of several chunks) before compression [bytes]. Each thread holds
-#: one.
 SHARD_BYTES_MAX = 64 << 20
+"""Largest size of a shard (file of several chunks) before compression [bytes].
+
+Each thread holds one in memory.
+"""
 
 
 def pack_store(
@@ -597,7 +604,7 @@ def _copy_region(
 
 
 def shard_shape_of_array(layout: ArrayLayout) -> tuple[int, ...] | None:
-    """Return the shape of a shard, a file of whole chunks; None if the array gets none.
+    """Return the shape of an array's shards (files of several chunks); None if it gets no shards.
 
     A shard is filled along the last axis first.
     """

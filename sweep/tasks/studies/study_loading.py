@@ -2,7 +2,7 @@
 
 A larger study takes results from the store of a smaller one, bit for bit. A result depends on the
 parameters of its point, its draws and the simulated effects. Points are matched axis by axis. The
-older store is only read. A block of it that does not match the digest in its receipt counts as
+older store is only read. Its blocks that do not match the digests in their receipts count as
 missing.
 """
 
@@ -107,10 +107,11 @@ def read_study(store_path: Location) -> StoredStudy[AnyStudy]:
 
 
 def read_study_and_check_blocks(store_path: Location) -> StoredStudy[AnyStudy]:
-    """Compute :func:`read_study` for a reader of receipts, which count the study's blocks.
+    """Return the same as :func:`read_study`, after a check of the shape of the store's blocks.
 
-    StoreError is also raised if the store's blocks have another shape than the study has here: its
-    receipts would be taken for those of other points.
+    It is for readers of receipts, which are numbered by blocks: with blocks of another shape than
+    the study has here, receipts would be taken for those of other points. StoreError is then
+    raised.
     """
     stored_study = read_study(store_path)
     if PACKED_ATTRIBUTE not in stored_study.attributes:  # a packed copy joins blocks in its chunks
@@ -165,24 +166,29 @@ def refuse_other_study(
     )
 
 
-#: Fields that an extension may increase, decrease, or change at will.
 FIELDS_THAT_MAY_GROW = ("draws.number", "draws.limit")
+"""Fields of a spec that an extension may increase."""
 FIELDS_THAT_MAY_SHRINK = (TOLERANCE_PARAMETER,)
+"""Fields of a spec that an extension may decrease."""
 FIELDS_THAT_MAY_CHANGE = ("storage.block_points", "storage.block_shots", "storage.block_draws")
+"""Fields of a spec that an extension may change at will."""
 
-#: Largest number of lost values of an axis that an error message lists.
 LOST_VALUES_LISTED_MAX = 5
+"""Largest number of lost values of an axis that an error message lists."""
 
-#: Number of blocks of the smaller study that a process keeps in memory.
 CACHED_BLOCKS_MAX = 2
+"""Largest number of blocks of the smaller study that a process keeps in memory."""
 
 
 class SharedPoints(NamedTuple):
     """Points that a block of the larger study and a block of the smaller one have in common."""
 
-    source_block: int  # block of the smaller study
-    local_indices: np.ndarray  # (m,) int64: indices in C order over the larger study's block
-    source_local_indices: np.ndarray  # (m,) int64: indices in C order over `source_block`
+    source_block: int
+    """Block of the smaller study."""
+    local_indices: np.ndarray
+    """Indices (m,) int64 of the points in the larger study's block, in C order."""
+    source_local_indices: np.ndarray
+    """Indices (m,) int64 of the same points in `source_block`, in C order."""
 
 
 class ReuseSource:
@@ -215,7 +221,7 @@ class ReuseSource:
         self._matching_of_group = cache(self._match_points_of_group)
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
-        """Yield those points of a block that committed blocks of the smaller study contain."""
+        """Yield the points of a block that committed blocks of the smaller study contain, too."""
         target_grid, block_in_grid = self._target_study.locate_in_grid(block)
         source_grids = {grid.group: grid for grid in self.source_study.grids}
         if (
@@ -268,7 +274,7 @@ class ReuseSource:
     def _read_block(self, source_block: int) -> Results | None:
         """Return the results of a block of the smaller study, by the name of the array.
 
-        None if a chunk is damaged or missing.
+        The result is None if a chunk is damaged or missing.
         """
         try:
             chunk_paths = study_store.chunk_names_of_block(self.source_study, source_block)
@@ -376,9 +382,9 @@ def have_equal_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
 
 
 def continues_draws(source_spec: GridSpec, target_spec: GridSpec) -> bool:
-    """Return True if the draws of one study are the first draws of the other.
+    """Return True if the draws of the source are the first draws of the target.
 
-    Studies that draw whole spectra are excluded.
+    The result is False for studies that draw whole spectra.
     """
     draw_counts = {"number": target_spec.draws.number, "limit": target_spec.draws.limit}
     is_looser = (_fixed_tolerance(source_spec) or 1.0) < (_fixed_tolerance(target_spec) or 0.0)
@@ -455,7 +461,7 @@ def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]
 
 
 def _iter_disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
-    """Yield the changes of fields that an extension does not allow."""
+    """Yield a text for each change of a field that an extension does not allow."""
     on_axes = {
         member.path
         for any_spec in (source_spec, target_spec)
@@ -496,7 +502,7 @@ def _field_value(spec: AnySpec, path: str) -> float:
 
 
 def _iter_lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
-    """Yield the values of the store's axes that the study lacks."""
+    """Yield a text for each axis of the source with values that the target lacks."""
     source_grid, target_grid = ParameterGrid(source_spec), ParameterGrid(target_spec)
     varying_paths = {
         path
@@ -536,7 +542,9 @@ class AxisLookup(NamedTuple):
     """
 
     paths: tuple[str, ...]
-    axis: int | None  # axis of the other study; None if the parameters are fixed there
+    """Dotted paths of the parameters."""
+    axis: int | None
+    """Axis of the other study; None if the parameters are fixed there."""
     index_along_axis: np.ndarray
     """Index of each value along the other study's axis, int64; -1 if that axis lacks the value.
 
@@ -590,7 +598,11 @@ class PointMatching:
 def _iter_parameter_groups(
     other_grid: ParameterGrid, grid: ParameterGrid
 ) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
-    """Yield parameters that are matched together: those of each axis, and the fixed ones."""
+    """Yield groups of the other grid's parameters that are matched together, by dotted path.
+
+    A group has the parameters of one axis of the other grid, or fixed ones. It comes with the
+    number of the axis; None for fixed parameters.
+    """
     yield from enumerate(other_grid.values_by_dim())
     on_axes = {path for values in other_grid.values_by_dim() for path in values}
     fixed_values = {
@@ -606,7 +618,10 @@ def _iter_parameter_groups(
 def _make_axis_lookup(
     grid: ParameterGrid, axis: int | None, other_values: dict[str, np.ndarray]
 ) -> AxisLookup:
-    """Match the values of a group of parameters in a grid with those of the other grid."""
+    """Find the values of a group of parameters of a grid among those of the other grid.
+
+    ``other_values`` are the values in the other grid, by path, along its axis ``axis``.
+    """
     varying_axes = [
         axis_number
         for axis_number, axis_values in enumerate(grid.values_by_dim())

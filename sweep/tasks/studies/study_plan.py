@@ -44,49 +44,60 @@ from sweep.tasks.studies.workload import SpecWorkload
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
-#: Limits of measuring the time per point: duration of the measurement [s], and number of blocks.
 POINT_TIMING_SECONDS = 1.0
+"""Approximate time for which the points of a grid are timed [s]."""
 TIMED_BLOCKS_MAX = 16
+"""Largest number of blocks whose points are timed."""
 
-#: Approximate time limit of measuring all scanners of a flight [s].
 FLIGHT_TIMING_SECONDS = 1.0
+"""Approximate time for which the shots of all scanners of a flight are timed [s]."""
 
-#: Limits of the shots of a scanner that are timed: of their rays, and of products with draws.
 TIMED_RAYS_MAX = 1 << 17
+"""Largest number of rays of a scanner's timed shots."""
 TIMED_SHOT_DRAWS_MAX = 1 << 14
+"""Largest product of the numbers of a scanner's timed shots and of their draws."""
 
-#: Number of shots, spread over the flight, that load kernels and tables before any is timed.
 WARM_UP_SHOTS_MAX = 32
+"""Largest number of shots, spread over the flight, by which kernels and tables are loaded first.
 
-#: Largest number of shots of a cycle of which whole cycles are timed, with their navigation.
+The time per shot is measured afterwards.
+"""
+
 TIMED_CYCLE_SHOTS_MAX = 128
+"""Largest number of shots per cycle for which complete cycles and their navigation are timed."""
 
-#: Number of points along a flight's axes at which shots are timed.
 TIMED_AXIS_POINTS_MAX = 3
+"""Largest number of points of a flight's axes at which shots are timed."""
 
-#: Largest number of draws of a point whose time is measured.
 TIMED_DRAWS_MAX = 1000
+"""Largest number of draws of a point or shot that are timed, without whole spectra."""
 
-#: Largest number of draws of whole spectra whose time is measured.
 TIMED_SPECTRA_MAX = 10
+"""Largest number of draws of a point or shot that are timed, of whole spectra."""
 
-#: Estimated times for a plan [s]: of starting worker processes, of writing one chunk, of starting
-#: the command, of creating a flight's stores and summing up its results, and of compiling a flight.
 WORKER_START_SECONDS = 3.0
+"""Estimated time of starting worker processes [s]."""
 CHUNK_WRITE_SECONDS = 2e-3
+"""Estimated time of writing a chunk [s]."""
 COMMAND_START_CPU_SECONDS = 1.5
+"""Estimated time of starting the command [s]."""
 FLIGHT_STORE_CPU_SECONDS = 1.0
+"""Estimated time of creating a flight's stores and of summing up its results [s]."""
 FLIGHT_COMPILE_CPU_SECONDS = 100.0
+"""Estimated time of compiling the kernels of a flight [s]."""
 
-#: Assumed times of a flight whose kernels are not compiled yet [s]: of loading the model, and of a
-#: ray, of a shot, and of each of its draws.
 MODEL_LOADING_CPU_SECONDS = 3.0
+"""Assumed time of loading the model of a flight whose kernels are not compiled yet [s]."""
 UNMEASURED_RAY_CPU_SECONDS = 1e-6
+"""Assumed time of a ray if kernels are not compiled yet [s]."""
 UNMEASURED_SHOT_CPU_SECONDS, UNMEASURED_DRAW_CPU_SECONDS = 5e-4, 3e-5
+"""Assumed times of a shot, and of each of its draws, if kernels are not compiled yet [s]."""
 
-#: Limits of the ratio of wall time to processor time of this process. It is above 1 if other
-#: programs keep the processors busy.
 BUSY_RATIO_MAX = 10.0
+"""Largest ratio of wall time to processor time that a plan assumes.
+
+The measured ratio is above 1 if other programs keep the processors busy.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +105,11 @@ class TimePart:
     """Part of the time that a run takes."""
 
     name: str
-    cpu_seconds: float  # processor time [s]
-    n_parallel: int = 1  # number of threads or workers that share it
+    """Name of the work, such as 'rays' or 'writing'."""
+    cpu_seconds: float
+    """Processor time [s]."""
+    n_parallel: int = 1
+    """Number of threads or workers that share the work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,14 +117,23 @@ class ScannerPlan:
     """Plan of one scanner of a flight: numbers of shots and rays, and computing times."""
 
     name: str
+    """Name of the scanner."""
     n_cycles: int
+    """Number of measurement cycles."""
     n_shots: int
+    """Number of shots."""
     n_rays: int
-    has_eyepoints: bool  # whether the eyepoints exist already
-    seconds_per_ray: float  # measured time of a ray on one worker [s]
-    seconds_per_draw: float  # measured time of one draw of a shot, with navigation [s]
-    n_timed_shots: int  # number of different shots that were timed; 0 if none was
-    loading_seconds: float = 0.0  # time of loading kernels and tables before the first shot [s]
+    """Number of rays of all shots."""
+    has_eyepoints: bool
+    """True if the geometry of the shots (eyepoints) is already stored."""
+    seconds_per_ray: float
+    """Measured time of a ray on one worker [s]."""
+    seconds_per_draw: float
+    """Measured time of one draw of a shot, with navigation [s]."""
+    n_timed_shots: int
+    """Number of different shots that were timed; 0 if times are assumed."""
+    loading_seconds: float = 0.0
+    """Time of loading kernels and tables before the first shot [s]."""
 
     @property
     def casting_seconds(self) -> float:
@@ -128,7 +151,7 @@ class StudyPlan:
     n_chunks: int
     nbytes: int  # size of all results before compression [bytes]
     n_workers: int  # number of worker processes, or of threads of the command
-    has_workers: bool  # whether worker processes compute, in the place of threads
+    has_workers: bool  # True if worker processes compute, False if threads do
     seconds_per_point: float  # measured time of a point on one core [s]
     time_parts: tuple[TimePart, ...]  # parts of the time of the run
     busy_ratio: float  # wall time over processor time of this process as it planned, at least 1
@@ -169,8 +192,8 @@ def plan_study(
     store_path
         Path of its store; eyepoints that exist there need not be cast.
     n_workers
-        Number of worker processes; by default that of the spec's `execution`, else threads on all
-        cores compute, where the study allows it.
+        Number of worker processes; by default the number in the spec's section `execution`. If both
+        are missing, threads on all cores compute, provided the study allows it.
 
     Returns
     -------
@@ -299,8 +322,8 @@ def are_flight_kernels_compiled(spec: SceneSpec) -> bool:
 def measure_seconds_per_point(study: GridStudy) -> float:
     """Return the processor time of a point [s], measured at points spread over the grid.
 
-    Complete sets of points that share a geometry are computed, as in a run. Points that miss the
-    accuracy after few draws count with the limit of draws.
+    Complete sets of points that share a geometry are computed, as in a run. If a point misses the
+    accuracy after the timed draws, the time of the largest number of draws is assumed for it.
     """
     study.compile_kernels()
     blocks = _choose_timed_blocks(study)
@@ -321,9 +344,10 @@ def measure_seconds_per_point(study: GridStudy) -> float:
 
 
 def _choose_timed_blocks(study: GridStudy) -> list[int]:
-    """Return blocks spread over the grid, fewer if points take long; each is computed once.
+    """Return the numbers of blocks spread over the grid; fewer if points take long.
 
-    This loads compiled kernels, which takes longer than many points.
+    Some points of each block are computed first: this loads compiled kernels, which takes longer
+    than many points.
     """
     blocks: list[int] = []
     last_block, start = study.grid.n_blocks - 1, time.process_time()
@@ -343,13 +367,15 @@ class TimedRound(NamedTuple):
     """Number of points in one round of time measurement, and the time that they took."""
 
     n_points: int
-    seconds_by_part: tuple[float, ...]  # time of each part of the work [s]
+    """Number of points."""
+    seconds_by_part: tuple[float, ...]
+    """Time of each part of the work [s]."""
 
 
 def _time_growing_rounds(
     time_round: Callable[[int], TimedRound], n_points_max: int, seconds_max: float
 ) -> TimedRound:
-    """Time rounds of increasing size. Return the first that is long enough or covers the study."""
+    """Time rounds of increasing size. Return the first that is long enough, or covers the study."""
     from numba.core.event import install_recorder
 
     n_samples, start = 1, time.perf_counter()
@@ -401,9 +427,13 @@ def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tu
 class PointTimes(NamedTuple):
     """Processor time that some points took, and an estimate for draws that were left out."""
 
-    measured_seconds: float  # measured time [s]
+    measured_seconds: float
+    """Measured time [s]."""
     extrapolated_seconds: float
-    """Estimated time of omitted draws [s]: up to the limit, at points that miss their accuracy."""
+    """Estimated time of the draws that were left out [s].
+
+    If the number of draws is adaptive, only points that miss their accuracy have such draws.
+    """
 
 
 def time_points(
@@ -462,7 +492,7 @@ class TimedShots(NamedTuple):
 
 
 class _ScannerTimer:
-    """Stopwatch of a scanner's shots, spread over the flight and over the points of the axes."""
+    """Timer of a scanner's shots, spread over the flight and over the points of the axes."""
 
     def __init__(self, study: FlightStudy, eyepoints: EyepointStudy) -> None:
         self._study, self._eyepoints = study, eyepoints
@@ -524,7 +554,8 @@ class _ScannerTimer:
 def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     """Return the plan of a scanner, with times measured on shots spread over its flight.
 
-    A call takes a time of its own, and a time for each shot. Both follow from two numbers of shots.
+    A call takes a fixed time, and a time for each shot. Both follow from the measured times of two
+    calls with different numbers of shots.
     """
     timer = _ScannerTimer(study, eyepoints)
     seconds_max = FLIGHT_TIMING_SECONDS / len(study.spec.scanners)
@@ -581,28 +612,29 @@ def _plan_scanner_unmeasured(study: FlightStudy, eyepoints: EyepointStudy) -> Sc
     )
 
 
-#: Largest number of tiles of a grid that are planned; in larger grids they are spread evenly.
 GRID_TILES_SAMPLED_MAX = 1024
+"""Largest number of tiles of a grid that are planned; in larger grids they are spread evenly."""
 
-#: Number of tiles of each scanner of a flight that are planned, and of points along the axes.
 SCANNER_TILES_SAMPLED, AXIS_POINTS_SAMPLED = 16, 12
+"""Number of tiles of each scanner of a flight that are planned, and of points of the axes."""
 
-#: Sample for measuring the cost of an effect: tiles of a grid, points of each, and draws of each
-#: point.
 (
     EFFECT_COST_TILES_MAX,
     EFFECT_COST_POINTS_MAX,
     EFFECT_COST_DRAWS_MAX,
 ) = 4, 24, 20
-#: Number of rounds of measuring the cost of an effect, at most, and at least if they take long.
+"""Largest sample for measuring the cost of an effect: tiles, points per tile, draws per point."""
 EFFECT_COST_ROUNDS_MAX, EFFECT_COST_ROUNDS_MIN = 5, 3
+"""Largest number of rounds of measuring the cost of an effect, and smallest if they take long."""
 
-#: Largest relative spread of an effect's cost over the rounds for which the cost is reported. It is
-#: about twice the error of the median.
 EFFECT_COST_SPREAD_MAX = 0.1
+"""Largest relative spread of an effect's cost over the rounds for which the cost is reported.
 
-#: Duration of a round of measuring an effect's cost after which no more work is added [s].
+It is about twice the error of the median.
+"""
+
 EFFECT_COST_ROUND_SECONDS = 0.1
+"""Duration of a round of measuring an effect's cost above which no more work is added [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -610,12 +642,19 @@ class EffectRow:
     """Row of a table of effects: where one effect is simulated, what it changes, and its cost."""
 
     name: str
+    """Name of the effect."""
     mode: str
-    simulated_fraction: float  # fraction of the points at which the effect is simulated
-    simulated_region: str  # region of the study that contains these points
-    change_bound: float  # largest bound of its change of pd, log10 pfa or relative |X|
-    largest_change_region: str  # region of the largest bound
-    time_fraction: float  # fraction of the time of the points where it is simulated; nan if unknown
+    """Mode in the spec: 'auto', 'on' or 'off'."""
+    simulated_fraction: float
+    """Fraction of the points at which the effect is simulated."""
+    simulated_region: str
+    """Region of the study that contains these points, as text."""
+    change_bound: float
+    """Upper bound of the change of pd, log10 pfa or relative |X| by the effect at any point."""
+    largest_change_region: str
+    """Region of the study with the largest bound, as text."""
+    time_fraction: float
+    """Effect's share of the computing time of points where it is simulated; nan if unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -623,9 +662,13 @@ class EffectsTable:
     """Table of all effects of a study: where each is simulated, what it changes, and its cost."""
 
     rows: tuple[EffectRow, ...]
+    """A row for each effect."""
     tolerance: float
-    error_bound: float  # largest bound of the change by all omitted effects together
-    tile_fraction: float  # fraction of the tiles that were planned
+    """Tolerance of the study."""
+    error_bound: float
+    """Upper bound of the change by all omitted effects together, at any point."""
+    tile_fraction: float
+    """Fraction of the tiles that were planned."""
 
     def warnings(self) -> Iterator[str]:
         """Yield a warning for each disabled effect that changes results beyond the tolerance."""
@@ -647,8 +690,8 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
     study
         Study over a grid, or flight.
     costs
-        Whether to measure the fraction of time that each effect of a grid takes. It is not measured
-        for a flight: the time of a shot varies too much for the share of one effect.
+        Whether to measure each effect's share of the computing time of a grid. It is not measured
+        for a flight, as the times of shots vary by more than such a share.
 
     Returns
     -------
@@ -761,9 +804,12 @@ def _flight_effects_table(study: FlightStudy) -> EffectsTable:
 class _TileEffects(NamedTuple):
     """Simulated and omitted effects of m tiles (boxes of points, or runs of shots)."""
 
-    n_simulated: np.ndarray  # (effects, m): number of points at which an effect is simulated
-    change_bounds: np.ndarray  # (effects, m): bound of the change by an effect
-    error_bounds: np.ndarray  # (m,): bound of the change by all omitted effects together
+    n_simulated: np.ndarray
+    """Number (effects, m) of points at which an effect is simulated."""
+    change_bounds: np.ndarray
+    """Upper bound (effects, m) of the change by an effect."""
+    error_bounds: np.ndarray
+    """Upper bound (m,) of the change by all omitted effects together."""
 
 
 def _make_effects_table(
@@ -806,7 +852,7 @@ def _time_range_text(times: np.ndarray) -> str:
 
 
 def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarray) -> str:
-    """Return the smallest box of the grid that contains given tiles, in the user's units.
+    """Return the smallest box of the grid that contains given tiles, as text in the user's units.
 
     A tile is a box of neighbouring points whose effects are chosen together.
     """
@@ -897,7 +943,7 @@ def _grid_effect_cost(
 
 
 def reproducible_time_fraction(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> float:
-    """Return an effect's share of the computing time; nan if it is not reproducible.
+    """Measure an effect's share of the computing time; return nan if it is not reproducible.
 
     Parameters
     ----------

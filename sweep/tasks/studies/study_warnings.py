@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.grid_study import GridStudy
 
 _TASKS_PACKAGE_FOLDER = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+"""Folder of the package `sweep.tasks`, whose frames warnings skip to reach the user's program."""
 
 
 class StudyWarning(UserWarning):
@@ -37,7 +38,7 @@ def iter_spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
     Raises
     ------
     SceneError
-        The flight sees nothing.
+        If none of the flight's sampled beams hits anything.
     """
     if beam_warning := describe_narrow_beam(spec.parameters_off_axes(), spec.axes):
         yield beam_warning
@@ -60,10 +61,10 @@ def iter_result_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
 
 
 def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], None]) -> None:
-    """Issue the warnings about a study, and notes on errors that it does not state.
+    """Issue the warnings about a study, and notes on sources of error of unstated size.
 
-    Each warning is a `StudyWarning` at the line of the caller's program; the command prints it.
-    Errors that are not stated are messages of `say`.
+    Each warning is a `StudyWarning` at the line of the caller's program; the command passes it to
+    `say` instead. Notes are passed to `say`, too.
     """
     stack_level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_TASKS_PACKAGE_FOLDER):
@@ -79,9 +80,10 @@ def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], No
 
 
 def issue_study_warning(sentence: str, stack_level: int) -> None:
-    """Issue a `StudyWarning` at the line of a frame; only a warning filter of the user's raises it.
+    """Issue a `StudyWarning` at the line of the frame with a given level of the call stack.
 
-    A closed or broken standard error does not end the computation.
+    It is raised as an exception only if a warning filter of the user's asks for it. A closed or
+    broken standard error does not end the computation.
     """
     try:
         warnings.warn(sentence, StudyWarning, stacklevel=stack_level)

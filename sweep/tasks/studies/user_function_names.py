@@ -9,15 +9,12 @@ SPECTRUM_METHOD_PARAMETERS = {
 }
 """Dotted paths of the parameters that name the detector and the estimator for whole spectra.
 
-Each names a built-in method or a function of the user's.
+The value of each is a built-in method or a function of the user's.
 """
 
 
 def iter_user_functions(spec: Any) -> Iterator[tuple[str, str]]:
-    """Yield, for each function of the user's that a spec names, its role and its name.
-
-    The role is detector or estimator.
-    """
+    """Yield the role (detector or estimator) and the name of each user function in a spec."""
     draws = getattr(spec, "draws", None)
     if not getattr(draws, "draws_whole_spectra", False):
         return

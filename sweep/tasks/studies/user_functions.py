@@ -1,4 +1,4 @@
-"""Detectors and estimators that are functions of the user's: imported and checked.
+"""Import and checks of the user's functions that serve as detectors and estimators.
 
 A spec names them as ``module:function``; reading a spec imports nothing. Processes that compute
 import only modules that are allowed (:mod:`sweep.tasks.engine.user_code`).
@@ -59,7 +59,7 @@ def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
 
 @lru_cache(maxsize=64)
 def load_checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
-    """Return a user's function with a wrapper that checks results. Its arguments are read-only."""
+    """Return a user's function in a wrapper that passes read-only arrays and checks the results."""
     function = _import_user_function(name)
     definition = f"{name}{_definition_text(function)}"
 
