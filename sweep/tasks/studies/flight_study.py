@@ -772,7 +772,7 @@ class FlightStudy(ExtendableStudy):
 
 
 def _iter_shots_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
-    """Yield groups of shots that lack the same draws, by index, and a slice of these draws."""
+    """Yield the indices of shots that lack the same run of draws, and the slice of these draws."""
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):
         rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)

@@ -476,7 +476,7 @@ def block_output_variables(spec: GridSpec) -> dict[str, OutputVariable]:
 
 
 class GridStudy(ExtendableStudy):
-    """Study over a grid of parameters, of which each point is computed on its own."""
+    """Study over a grid of parameters. Its points are computed independently of each other."""
 
     def __init__(self, spec: GridSpec) -> None:
         super().__init__(spec)
@@ -500,7 +500,7 @@ class GridStudy(ExtendableStudy):
         coordinate_names = [
             member.coordinate for axis in self.spec.axes for member in axis.parameters
         ]
-        coordinate_names += ["batch_draws"] if batch_sizes(self.spec) else []
+        coordinate_names += ["batch_draws"] if draw_batch_sizes(self.spec) else []
         return {
             "kind": "grid",
             "title": self.spec.title,
@@ -514,7 +514,7 @@ class GridStudy(ExtendableStudy):
     def constant_arrays(self) -> list[ArrayLayout]:
         """Return the arrays known in advance: axis coordinates, and sizes of batches of draws."""
         arrays = axis_coordinate_layouts(self.spec.axes)
-        if draws_per_batch := batch_sizes(self.spec):
+        if draws_per_batch := draw_batch_sizes(self.spec):
             batch_attributes = cf_attributes("1", "draws in the batch")
             arrays.append(
                 ArrayLayout.from_values(
@@ -528,7 +528,7 @@ class GridStudy(ExtendableStudy):
 
     def output_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of the model's outputs, and of the arrays of effects."""
-        sizes = {DRAW_BATCH_DIM: len(batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
+        sizes = {DRAW_BATCH_DIM: len(draw_batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
         off_axes = self.spec.parameters_off_axes()
         promised_accuracy = {  # accuracy that the half-widths of intervals are compared with
             name: float(off_axes[f"accuracy.{name}"])
@@ -819,11 +819,11 @@ def select_parameters(
 def _points_per_call(spec: GridSpec) -> int:
     """Return how many points one call of the model computes at once."""
     return max(
-        1, min(POINTS_PER_CALL_MAX, DRAW_COUNTS_PER_CALL_MAX // max(1, len(batch_sizes(spec))))
+        1, min(POINTS_PER_CALL_MAX, DRAW_COUNTS_PER_CALL_MAX // max(1, len(draw_batch_sizes(spec))))
     )
 
 
-def batch_sizes(spec: GridSpec) -> list[int]:
+def draw_batch_sizes(spec: GridSpec) -> list[int]:
     """Return the size of each batch of a point's `draws.number` draws; the last may be smaller."""
     n_draws, draws_per_batch = spec.draws.number, spec.draws.batch
     return [min(draws_per_batch, n_draws - first) for first in range(0, n_draws, draws_per_batch)]
@@ -869,7 +869,7 @@ def extract_prior_draws(
     counts = np.stack(
         [spread_over_points(name).reshape(len(local_indices), -1) for name in DRAW_COUNT_OUTPUTS]
     )
-    n_missing_batches = max(1, len(batch_sizes(spec))) - counts.shape[-1]
+    n_missing_batches = max(1, len(draw_batch_sizes(spec))) - counts.shape[-1]
     counts = np.pad(counts, ((0, 0), (0, 0), (0, n_missing_batches)))
     means = {
         name: spread_over_points(name)
@@ -902,7 +902,7 @@ def _simulate_draws(
     if draws.is_adaptive:
         keywords |= {"batch": draws.batch, "limit": draws.limit}
     else:
-        keywords |= {"batch_sizes": batch_sizes(spec)}
+        keywords |= {"batch_sizes": draw_batch_sizes(spec)}
     if draws.draws_whole_spectra:
         return simulate_draws(parameters, effects, methods=spectrum_methods(parameters), **keywords)
     return initial_running_sums(spec, n_points) | simulate_draws(parameters, effects, **keywords)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
     from sweep.spec import GridSpec
 
-FILE_SUFFIXES = (".zarr", ".npz")
+SPECTRA_FILE_SUFFIXES = (".zarr", ".npz")
 """Suffixes of the formats to which spectra are exported."""
 
 
@@ -212,8 +212,8 @@ def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -
     StoreError
         For another suffix, or if something exists at the path.
     """
-    if path.suffix not in FILE_SUFFIXES:
-        raise StoreError(f"{path} ends in neither {' nor '.join(FILE_SUFFIXES)}")
+    if path.suffix not in SPECTRA_FILE_SUFFIXES:
+        raise StoreError(f"{path} ends in neither {' nor '.join(SPECTRA_FILE_SUFFIXES)}")
     if not can_create_store(path):
         if not overwrite:
             raise StoreError(

@@ -362,7 +362,7 @@ class AccuracyRow:
     """Values of the axes at the worst point, as text."""
     samples_at_worst_point: int = 0
     """Number of draws, or of rays, at the worst point."""
-    total_samples: int = 0
+    n_total_samples: int = 0
     """Number of draws, or of rays, at all points together."""
     samples_max: int = 0
     """Largest number of draws, or of rays, at a point."""
@@ -380,7 +380,7 @@ class AccuracyRow:
     @property
     def mean_samples(self) -> float:
         """Mean number of draws or rays per point."""
-        return self.total_samples / max(self.n_points, 1)
+        return self.n_total_samples / max(self.n_points, 1)
 
     @property
     def draws_needed(self) -> float:
@@ -413,7 +413,7 @@ class AccuracyRow:
         excess = np.where(is_known, errors - tolerances, -np.inf)
         self.n_points += int(is_known.sum())
         self.n_points_within_tolerance += int((excess <= 0).sum() - (~is_known).sum())
-        self.total_samples += int(samples.sum())
+        self.n_total_samples += int(samples.sum())
         self.samples_max = max(self.samples_max, int(samples.max(initial=0)))
         worst = np.unravel_index(np.argmax(excess), excess.shape)
         if excess[worst] > self._worst_excess:

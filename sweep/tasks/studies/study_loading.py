@@ -176,7 +176,7 @@ FIELDS_THAT_MAY_CHANGE = ("storage.block_points", "storage.block_shots", "storag
 LOST_VALUES_LISTED_MAX = 5
 """Largest number of lost values of an axis that an error message lists."""
 
-CACHED_BLOCKS_MAX = 2
+CACHED_SOURCE_BLOCKS_MAX = 2
 """Largest number of blocks of the smaller study that a process keeps in memory."""
 
 
@@ -217,7 +217,7 @@ class ReuseSource:
         )
         self._has_other_tolerance = have_different_tolerances(source_study.spec, target_study.spec)
         self._committed_digests = read_committed_digests(source_path, source_study.n_blocks)
-        self.read_block = lru_cache(maxsize=CACHED_BLOCKS_MAX)(self._read_block)
+        self.read_block = lru_cache(maxsize=CACHED_SOURCE_BLOCKS_MAX)(self._read_block)
         self._matching_of_group = cache(self._match_points_of_group)
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:

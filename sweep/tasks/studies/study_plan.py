@@ -93,7 +93,7 @@ UNMEASURED_RAY_CPU_SECONDS = 1e-6
 UNMEASURED_SHOT_CPU_SECONDS, UNMEASURED_DRAW_CPU_SECONDS = 5e-4, 3e-5
 """Assumed times of a shot, and of each of its draws, if kernels are not compiled yet [s]."""
 
-BUSY_RATIO_MAX = 10.0
+WALL_TO_CPU_TIME_RATIO_MAX = 10.0
 """Largest ratio of wall time to processor time that a plan assumes.
 
 The measured ratio is above 1 if other programs keep the processors busy.
@@ -249,7 +249,7 @@ def plan_study(
         has_workers=has_workers,
         seconds_per_point=seconds_per_point,
         time_parts=(start_part, *parts, writing_part),
-        busy_ratio=min(max(wall_seconds / cpu_seconds, 1.0), BUSY_RATIO_MAX),
+        busy_ratio=min(max(wall_seconds / cpu_seconds, 1.0), WALL_TO_CPU_TIME_RATIO_MAX),
         # with the model loaded, and for each block at work its results and their encoded copy
         memory_bytes=psutil.Process().memory_info().rss
         + (1 if has_workers else n_parallel) * block_peak_bytes(study),
