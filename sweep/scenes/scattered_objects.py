@@ -112,7 +112,8 @@ class MartianRockLaw:
     def decay_rate(self) -> float:
         """Rate at which the covered fraction falls with the smallest diameter counted [1/m].
 
-        The fraction under rocks of at least diameter D is proportional to ``exp(-decay_rate * D)``.
+        The fraction under rocks of at least diameter D is proportional to ``exp(-q D)``, with this
+        rate q.
         """
         return 1.79 + 0.152 / self.area_fraction
 
