@@ -342,9 +342,10 @@ def _checked_map_frame(
 
 
 def _largest_scale_error(factors: MetresPerUnit, scales: np.ndarray) -> float:
-    """Return the largest relative difference between a map's scale and its scale on the ground.
+    """Return the largest relative error of the metres per unit that are assumed for a map.
 
-    `scales` (n, 2) are metres on the ground per unit eastwards and northwards at n points.
+    `factors` are assumed. `scales` (n, 2) are metres on the ground per unit eastwards and
+    northwards, measured at n points.
     """
     return float(np.abs(np.array(factors) / scales - 1).max())
 

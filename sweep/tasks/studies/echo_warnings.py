@@ -124,9 +124,10 @@ class EchoDiagnosis(NamedTuple):
     has_large_phase_walk: np.ndarray
     """True (n,) where the laser's phase walks too far for the model of detection."""
     is_range_velocity_exchanged: np.ndarray
-    """True (n,) where up and down beat give range and velocity exchanged, as the spec reads them.
+    """True (n,) where up and down beat, under the spec's assumption, give exchanged values.
 
-    The spec assumes a far or a fast target. The opposite assumption would give both correctly.
+    The spec assumes a far or a fast target. With the wrong assumption, range and velocity are
+    exchanged; the opposite one would give both correctly.
     """
     is_exchanged_by_other_assumption: np.ndarray
     """True (n,) where the opposite of the spec's assumption would exchange range and velocity.

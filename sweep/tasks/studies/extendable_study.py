@@ -40,10 +40,10 @@ class ExtendableStudy(BlockStudy):
 
     @abstractmethod
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True for the points of a block whose numerical accuracy follows the tolerance.
+        """Return True for the points of a block whose numerical accuracy is set by the tolerance.
 
         The result is a mask (points,), or one bool for all points. The choice of effects, which
-        always follows the tolerance, does not count.
+        always depends on the tolerance, does not count.
         """
 
     def block_of_first_draws(self, block: int) -> int:

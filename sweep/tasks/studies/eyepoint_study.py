@@ -363,10 +363,10 @@ def refine_rays(
     ray_errors
         Errors (n,) that remain with these rays.
     accuracy
-        Accuracy that sets the number of rays.
+        Error budget from which the number of rays follows.
     cast_more_rays
-        Function of the indices (m,) of shots and of a number of rays. It casts the shots with these
-        rays, and returns the errors (m,) that remain.
+        Function of the indices (m,) of shots and of a number of rays. It casts each of the shots
+        with this number of rays, and returns the errors (m,) that remain.
     """
     rays_needed = next_ray_counts(n_rays, ray_errors, accuracy)
     for n_rays_now in accuracy.ray_counts:  # the numbers rise, as do those that a shot needs

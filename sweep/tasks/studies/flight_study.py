@@ -260,7 +260,7 @@ class FlightStudy(ExtendableStudy):
         return list(self.scanner_grids.values())
 
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True if the numerical accuracy of shots, or their rays, follow the tolerance."""
+        """Return True if the tolerance sets the number of rays, or other numerics of shots."""
         return bool(
             self.spec.is_ray_number_set_by_tolerance
             or has_numerics_set_by_tolerance(self.spec.parameters())
@@ -319,7 +319,7 @@ class FlightStudy(ExtendableStudy):
         } | {TERRAIN_MAP_GROUP: {}}
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the map of the scene, and the coordinates of every scanner."""
+        """Return the map of the scene, and the axis coordinates in the group of each scanner."""
         return terrain_map_layouts(self.spec) + [
             replace(layout, name=f"{scanner}/{layout.name}")
             for scanner in self.scanner_grids

@@ -285,9 +285,9 @@ class TileGrid(BlockGrid):
     ) -> dict[str, ParameterValue]:
         """Return the values along an axis at the points of m tiles, by parameter path.
 
-        ``tile_index_along`` (m,) are the positions of the tiles along the axis. The values
-        broadcast with those along other axes: their first dimension has length m, that of the axis
-        the number of points, and all others 1. An axis that is constant in a tile has scalars.
+        ``tile_index_along`` (m,) are the positions of the tiles along the axis. The arrays have the
+        shape (m, 1, ..., k, ..., 1), with k points of a tile along the axis. If the axis is
+        constant in a tile, the values are scalars.
         """
         members = self.grid.values_by_axis[axis]
         if self._is_constant_axis[axis]:
@@ -489,7 +489,7 @@ class GridStudy(ExtendableStudy):
         return (self.grid,)
 
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True for the points of a block whose numerical accuracy follows the tolerance.
+        """Return True for the points of a block whose numerical accuracy is set by the tolerance.
 
         The result is a mask (points,), or one bool for all points.
         """
@@ -909,7 +909,7 @@ def _simulate_draws(
 
 
 def initial_running_sums(spec: GridSpec, n_points: int) -> Results:
-    """Return the sums (n_points, sums) before any draw: 0; empty if the study stores no sums."""
+    """Return running sums of 0 (n_points, sums); an empty dict if the study stores no sums."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
     return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
 

@@ -46,9 +46,12 @@ point and batch, below some 100 MB.
 """
 
 DEFAULT_BLOCK_POINTS = 1 << 16
-"""Largest default number of points of a block, up to `BLOCKS_OF_DEFAULT_SIZE_MAX` blocks."""
+"""Largest default number of points of a block.
+
+Studies with more than `BLOCKS_OF_DEFAULT_SIZE_MAX` such blocks have larger blocks instead.
+"""
 BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
-"""Largest number of blocks of the default size; larger studies have larger blocks instead.
+"""Largest number of blocks of `DEFAULT_BLOCK_POINTS` points.
 
 A block is some 25 files, which are listed, copied and removed one by one.
 """
@@ -64,9 +67,10 @@ SHOT_DRAW_CPU_SECONDS = 2e-5
 """Time of one draw of a flight's shot, on one core [s]."""
 
 DEFAULT_BLOCKS_MIN = 32
-"""Number of blocks into which studies are divided by default, if these are not too small.
+"""Smallest default number of blocks of a study.
 
-All cores of a machine then have work from the first second on.
+It gives all cores of a machine work from the first second on. It does not hold if blocks would take
+less than `DEFAULT_BLOCK_CPU_SECONDS_MIN`.
 """
 DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
 """Smallest estimated time of a default block on one core [s]."""
@@ -100,7 +104,7 @@ def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
 def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
     """Return an upper estimate of the time of any point of a study on one core [s].
 
-    If draws continue until a tolerance is met, their limit counts.
+    If draws continue until a tolerance is met, their largest permitted number is assumed.
     """
     n_draws = max(spec.draws.number, spec.draws.limit, 1)
     speckle_modes = {spec.parameters()["footprint.speckle"]}
@@ -113,7 +117,7 @@ def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
 
 
 def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
-    """Return the default computing time of a block on one core [s], given that of the study."""
+    """Return the default time of a block on one core [s], given the time of the whole study."""
     return max(study_cpu_seconds / DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_CPU_SECONDS_MIN)
 
 
@@ -136,9 +140,9 @@ def flight_block_size_max(
     * A study is divided into DEFAULT_BLOCKS_MIN blocks or more, or into fewer blocks if they would
       take less than DEFAULT_BLOCK_CPU_SECONDS_MIN.
     * A block contains complete tiles, because the effects of a tile's shots are chosen together.
-    * Blocks share the draws of a shot only if a tile with all draws takes longer than such a block,
-      and longer than twice DEFAULT_BLOCK_CPU_SECONDS_MIN. The reason is that each of these blocks
-      computes the spectra of the shot again.
+    * The draws of a shot are divided among blocks only if a tile with all draws takes longer than
+      such a block, and longer than twice DEFAULT_BLOCK_CPU_SECONDS_MIN. The reason is that each of
+      these blocks computes the spectra of the shot again.
     * A block has at most DEFAULT_BLOCK_DRAWS_MAX draws of a shot.
 
     Parameters

@@ -86,7 +86,7 @@ def load_or_build_scene(spec: SceneSpec, build: Callable[[], BuiltScene]) -> Bui
 
 @cache
 def _cache_root() -> Path | None:
-    """Return the folder of cached scenes, next to that of the kernels; None if there is none."""
+    """Return the folder of cached scenes, beside the cache of kernels; None if there is none."""
     from sweep.kernel_cache import cache_folder, create_private_folder  # imports the compiler
 
     kernel_folder = cache_folder().path
@@ -117,7 +117,7 @@ def _scene_digest(spec: SceneSpec) -> str | None:
 
 @cache
 def _source_digest() -> str | None:
-    """Return a digest of the package's sources; None if one can't be read."""
+    """Return a digest of the package's source files; None if a file can't be read."""
     package_dir = Path(__file__).parents[2]
     digest = hashlib.sha256()
     try:

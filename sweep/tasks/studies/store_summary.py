@@ -48,7 +48,7 @@ SAMPLED_BLOCKS_MAX = 1000
 """Largest number of blocks that are read. Larger studies are sampled at random."""
 
 AXIS_POINTS_LISTED_MAX = 12
-"""Largest number of points of a flight's axes with a row for each point."""
+"""Largest number of points of a flight's axes for which the summary has a row per point."""
 
 
 @dataclass(frozen=True)
@@ -344,8 +344,8 @@ def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list
 class AccuracyRow:
     """Summary of the errors at many points, compared with the tolerance at each point.
 
-    They are statistical errors of a probability of detection, or errors by the finite number of
-    rays.
+    The errors are statistical errors of a probability of detection, or errors by the finite number
+    of rays.
     """
 
     name: str
@@ -430,7 +430,7 @@ class AccuracyRow:
 def accuracy_rows_of_draws(
     store: str | Location, done_block_numbers: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row of errors for each probability whose error the tolerance bounds.
+    """Return a row of statistical errors for each probability of detection.
 
     The result is empty without draws or results.
     """

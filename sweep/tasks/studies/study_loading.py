@@ -221,7 +221,7 @@ class ReuseSource:
         self._matching_of_group = cache(self._match_points_of_group)
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
-        """Yield the points of a block that committed blocks of the smaller study contain, too."""
+        """Yield the points of a block that are also in committed blocks of the smaller study."""
         target_grid, block_in_grid = self._target_study.locate_in_grid(block)
         source_grids = {grid.group: grid for grid in self.source_study.grids}
         if (

@@ -346,8 +346,8 @@ def measure_seconds_per_point(study: GridStudy) -> float:
 def _choose_timed_blocks(study: GridStudy) -> list[int]:
     """Return the numbers of blocks spread over the grid; fewer if points take long.
 
-    Some points of each block are computed first: this loads compiled kernels, which takes longer
-    than many points.
+    Points of one geometry are computed in each block. This loads compiled kernels, which takes
+    longer than many points.
     """
     blocks: list[int] = []
     last_block, start = study.grid.n_blocks - 1, time.process_time()

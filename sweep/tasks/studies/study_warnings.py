@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.grid_study import GridStudy
 
 _TASKS_PACKAGE_FOLDER = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
-"""Folder of the package `sweep.tasks`, whose frames warnings skip to reach the user's program."""
+"""Folder of `sweep.tasks`. Call frames in it are skipped to find the line of the user's program."""
 
 
 class StudyWarning(UserWarning):

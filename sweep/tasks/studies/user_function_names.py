@@ -27,5 +27,5 @@ def iter_user_functions(spec: Any) -> Iterator[tuple[str, str]]:
 
 
 def user_module_names(spec: Any) -> tuple[str, ...]:
-    """Return the names of the modules whose functions a spec names, each once."""
+    """Return the names of the modules of a spec's user functions, without duplicates."""
     return tuple(dict.fromkeys(name.partition(":")[0] for _, name in iter_user_functions(spec)))
