@@ -42,12 +42,12 @@ from sweep.storage.store_format import ACCURACY_STORE_KIND, OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
 
 TABULATED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-"""Errors for which a table shows the fastest setting whose error is no larger."""
+"""Tolerances for which a table names the fastest setting whose error does not exceed them."""
 
 NEGLIGIBLE_ERROR = 1e-9
 """Error below which two settings count as equally accurate.
 
-The reference, to which they are compared, has errors of this size itself.
+The reference setting, from which errors are measured, has errors of this size itself.
 """
 
 FIXED_SETTING_KINDS = (
@@ -63,21 +63,22 @@ FIXED_SETTING_KINDS = (
 """Kinds of settings with the same effects, beamlets and draws at every point of a study."""
 
 REQUIRED_SPEEDUP_OVER_FIXED, REQUIRED_SPEEDUP_OVER_THESIS = 1 / 1.1, 5.0
-"""Least ratio of computing times that adaptive settings must reach at equal accuracy.
+"""Least speed-ups of adaptive settings that are required at equal accuracy.
 
-The ratios are those of the best fixed setting, and of the thesis's method, to the adaptive setting.
+The first is over the best fixed setting, the second over the thesis's method. A speed-up is the
+time of the other setting over the time of the adaptive one.
 """
 
-MEDIAN_ROUNDS_MIN = 3
-"""Least number of rounds of measurement for speed-ups to be medians over the rounds.
+ROUNDS_FOR_MEDIAN_MIN = 3
+"""Least number of measurement rounds for which a speed-up is the median over the rounds.
 
-With fewer rounds they are ratios of the fastest rounds.
+With fewer rounds it is the ratio of the times of the fastest rounds.
 """
 
-RANDOM_ERROR_QUANTILE = 0.95
-"""Quantile over the points, 0..1, that is taken as the error of a setting with random draws.
+RANDOM_ERROR_QUANTILE_LEVEL = 0.95
+"""Level, 0..1, of the quantile over the points that is the error of a setting with random draws.
 
-Without draws the error of a setting is the largest one.
+Without draws the error of a setting is the largest over the points.
 """
 
 
@@ -111,9 +112,9 @@ class MeasuredSetting:
     reaches the threshold.
     """
     error_quantile: float
-    """Quantile of the errors of pd over the points that is taken as `largest_error`, 0..1.
+    """Level, 0..1, of the quantile of pd's errors over the points that is the `largest_error`.
 
-    It is 1, the largest error, without draws.
+    Without draws it is 1, which stands for the largest error.
     """
 
     @property
@@ -134,9 +135,10 @@ class MeasuredSetting:
 
     @property
     def covers_leakage_error(self) -> bool:
-        """True unless the setting is a closed form whose missing leakage exceeds its other errors.
+        """False if the setting is a closed form whose leakage error exceeds its other errors.
 
-        Leakage is the probability of false peaks due to window sidelobes.
+        Closed forms omit leakage, the probability of false peaks due to window sidelobes. Other
+        settings include it, and for them the result is True.
         """
         return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
             self.largest_error, NEGLIGIBLE_ERROR
@@ -149,10 +151,10 @@ class MeasuredSetting:
     def speedup_over(self, other: MeasuredSetting, extra_seconds: float = 0.0) -> float:
         """Return the time of another setting over the time of this one.
 
-        The ratio is the median of the rounds of measurement, or the ratio of the fastest rounds if
-        there are few. ``extra_seconds`` is a time per point that is added to both [s].
+        The ratio is the median over the rounds of measurement, or that of the fastest rounds if
+        there are few rounds. ``extra_seconds`` is a time per point that is added to both [s].
         """
-        if self.seconds_by_round.size < MEDIAN_ROUNDS_MIN:
+        if self.seconds_by_round.size < ROUNDS_FOR_MEDIAN_MIN:
             return (other.fastest_round_seconds + extra_seconds) / (
                 self.fastest_round_seconds + extra_seconds
             )
@@ -172,7 +174,7 @@ def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
         dataset = dataset.rename(rung="setting")
     array_by_name = {name: array.values for name, array in dataset.variables.items()}
     error_quantile = (
-        RANDOM_ERROR_QUANTILE if np.isfinite(array_by_name["standard_error"]).any() else 1.0
+        RANDOM_ERROR_QUANTILE_LEVEL if np.isfinite(array_by_name["standard_error"]).any() else 1.0
     )
     return [
         MeasuredSetting(
@@ -246,9 +248,10 @@ class SettingComparison(NamedTuple):
 
 
 def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
-    """Compare the fastest adaptive with the fastest fixed setting, for each adaptive setting.
+    """Compare the fastest adaptive with the fastest fixed setting, at several limits of the error.
 
-    Neither of the two compared has a larger error than that setting.
+    The limits are the errors of the adaptive settings. Neither of two compared settings exceeds the
+    limit.
     """
     adaptive_settings = select_settings_of_kinds(settings, ADAPTIVE_KIND)
     fixed_settings = [
@@ -361,7 +364,7 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
     ) + _closed_form_sentences(settings)
-    conclusions.append(_reference_sentences(attributes))
+    conclusions.append(_reference_setting_sentences(attributes))
     notes = attributes["notes"]  # a list in stores of earlier versions
     notes = notes.splitlines() if isinstance(notes, str) else notes
     conclusions += [note[0].upper() + note[1:] + "." for note in notes]
@@ -450,9 +453,9 @@ def _slowdown_text(
 ) -> str:
     """Return a text that says by how much adaptive settings miss the speed of fixed settings.
 
-    It gives the extra time for the whole study, the time of planning, and the smallest speed-up if
-    the time to store results counts too. `worst_comparison` is the comparison of smallest speed-up
-    among `comparisons`.
+    The text gives the extra time for the whole study, the time of planning, and the smallest
+    speed-up with the time to store results included. `worst_comparison` is the comparison with the
+    smallest speed-up among `comparisons`.
     """
     n_points = attributes["study_points"]
     extra_seconds = worst_comparison.adaptive.fastest_round_seconds * (
@@ -539,7 +542,7 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
     return [text + (f" Speed-up over improved versions: {improved_text}." if improved_text else "")]
 
 
-def _reference_sentences(attributes: dict) -> str:
+def _reference_setting_sentences(attributes: dict) -> str:
     """Return sentences that name the reference setting and its error against the time domain."""
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
@@ -581,7 +584,7 @@ def format_error(value: float) -> str:
     )
 
 
-NUMBERED_SETTING_KINDS = (
+SETTING_KINDS_NAMED_BY_NUMBER = (
     BEAMLETS_KIND,
     BEAMLET_ROW_KIND,
     MEAN_OF_DRAWS_KIND,
@@ -590,13 +593,13 @@ NUMBERED_SETTING_KINDS = (
 )
 """Kinds of accuracy settings whose names begin with a number of beamlets or draws."""
 
-CONNECTED_SETTING_KINDS = (ADAPTIVE_KIND, *NUMBERED_SETTING_KINDS)
+SETTING_KINDS_JOINED_BY_LINE = (ADAPTIVE_KIND, *SETTING_KINDS_NAMED_BY_NUMBER)
 """Kinds of accuracy settings that differ only in tolerance or number.
 
 A line connects their marks.
 """
 
-MARK_BY_KIND = {
+MARK_BY_SETTING_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
     FIXED_EFFECTS_KIND: ("s", canvas.LINE_COLOURS[2], "the same effects everywhere"),
     BEAMLETS_KIND: ("^", canvas.LINE_COLOURS[1], "number of beamlets in a lattice"),
@@ -610,7 +613,7 @@ MARK_BY_KIND = {
     IMPROVED_THESIS_KIND: ("p", canvas.LINE_COLOURS[4], "the thesis's way, improved"),
     AS_WRITTEN_KIND: ("*", canvas.LINE_COLOURS[6], "as written"),
 }
-"""Marker, colour and legend text of each kind of accuracy setting in the figure."""
+"""Plot marker, colour and legend text of each kind of accuracy setting."""
 
 
 def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> Sheet:
@@ -626,11 +629,11 @@ def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]
         zorder=1,
         label="Pareto front of time and error",
     )
-    for kind, (marker, colour, label) in MARK_BY_KIND.items():
+    for kind, (marker, colour, label) in MARK_BY_SETTING_KIND.items():
         kind_settings = select_settings_of_kinds(plotted_settings, kind)
         for i, setting in enumerate(kind_settings):
             _draw_setting_mark(axes, setting, marker, colour, label if i == 0 else "")
-        if kind in CONNECTED_SETTING_KINDS and kind_settings:
+        if kind in SETTING_KINDS_JOINED_BY_LINE and kind_settings:
             polyline = zip(*map(_setting_plot_position, kind_settings), strict=True)
             axes.plot(*polyline, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
             kind_settings = kind_settings[:1] + kind_settings[1:][-1:]
@@ -694,7 +697,7 @@ def _short_setting_name(setting: MeasuredSetting) -> str:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
     if setting.kind == THESIS_KIND:
         return setting.name.removeprefix("thesis ")
-    if setting.kind in NUMBERED_SETTING_KINDS:
+    if setting.kind in SETTING_KINDS_NAMED_BY_NUMBER:
         return setting.name.split()[0]
     return ""
 

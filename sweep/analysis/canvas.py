@@ -164,7 +164,7 @@ LINES_PER_SHARED_PANEL_MAX = 4
 """Largest number of lines that share a panel. If there are more, each line has its own panel."""
 
 MARKED_POINTS_MAX = 40
-"""Largest number of points of a line for every point to have a marker."""
+"""Largest number of points of a line whose points are drawn with markers."""
 
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Markers of the points of lines, by style index."""
@@ -175,7 +175,7 @@ MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INC
     (10.0, 1.75),
     (4.3, 3.0),
 )
-"""Widths and heights of panels [inches]: of heat maps, of lines, of a single line, and in rows."""
+"""Widths and heights of panels [inches]: heat map, several lines, single line, and one of a row."""
 
 
 def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:

@@ -172,9 +172,9 @@ class ChartSizeLimits:
     parts_max: int
     """Largest number of parts of the study that are shown. Each part has a panel."""
     columns_max: int
-    """Largest number of columns of a row of heat maps."""
+    """Largest number of columns of cells in a row of heat maps."""
     rows_max: int
-    """Largest number of rows of a heat map."""
+    """Largest number of rows of cells in a heat map."""
     cells_max: float
     """Largest number of cells of all heat maps together."""
     maps_per_row: int
@@ -266,9 +266,9 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
     Returns
     -------
     ColourScale
-        The extent of the finite values. It is logarithmic if all are at least 0, and the largest
-        exceeds 1000 times the median of the positive ones. It then starts at the first percentile
-        of the positive values, but not below 1e-12 of the largest.
+        Scale from the lowest to the highest finite value. It is logarithmic if all values are at
+        least 0, and the largest exceeds 1000 times the median of the positive ones. It then starts
+        at the first percentile of the positive values, but not below 1e-12 of the largest.
     """
     values = np.concatenate([layer.ravel() for layer in layers])
     finite_values = values[np.isfinite(values)]
@@ -288,10 +288,10 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
 
 
 def worst_statistic(variable: str) -> str:
-    """Return which statistic of a cell is the worst value of a variable.
+    """Return the name of the statistic that gives the worst value of a variable in a cell.
 
-    The worst value is the lowest one for detection, the highest one for false alarms, and '' for
-    other variables.
+    It is the lowest value for detection and SNR, and the highest one for misses and false alarms.
+    For other variables the name is ''.
     """
     if variable.startswith(("pd_", "snr_")):
         return CELL_LOWEST
@@ -452,7 +452,7 @@ def _arrange_on_plane(
     x_values, column_index = np.unique(points.coordinate_values(x), return_inverse=True)
     y_values, row_index = np.unique(points.coordinate_values(y), return_inverse=True)
     shared_dim = points.dim_of_coordinate(x)
-    point_indices = np.asarray(points.dim_tables[shared_dim].index)
+    point_indices = np.asarray(points.table_by_dim[shared_dim].index)
     flat_coordinate = SortedCoordinate(shared_dim, point_indices, point_indices)
     values = np.full((y_values.size, x_values.size), np.nan)
     values[row_index.ravel(), column_index.ravel()] = points.coarsen(
@@ -513,15 +513,15 @@ def slice_chart(
     """
     line_coordinates = [by] if by else []
     parts, n_omitted_parts = split_into_parts(points, [x, *line_coordinates], parts_max)
-    named_points, n_omitted_lines = split_into_lines(parts, line_coordinates)
+    labelled_lines, n_omitted_lines = split_into_lines(parts, line_coordinates)
     drawn_lines, remarks = read_lines_along(
-        [(named_line.points, variable) for named_line in named_points], x
+        [(labelled_line.points, variable) for labelled_line in labelled_lines], x
     )
     x_axis = CoordinateAxis.from_points(points, x)
     value_scale = fit_colour_scale(variable, label, [line.y for line in drawn_lines])
     limits = PROBABILITY_AXIS_LIMITS if variable.startswith("pd_") else None
     y_axis = ChartAxis(label, LOG_SCALE if value_scale.is_log else LINEAR_SCALE, limits)
-    panels = make_line_panels(named_points, drawn_lines, x_axis, y_axis)
+    panels = make_line_panels(labelled_lines, drawn_lines, x_axis, y_axis)
     alt_text = lines_alt_text(
         label, x_axis.describe_span(np.unique(points.coordinate_values(x))), panels[0]
     )
@@ -545,10 +545,10 @@ def _horizontal_level_lines(panel: Panel, levels: Sequence[float]) -> list[Chart
 
 
 class LabelledLinePoints(NamedTuple):
-    """Points of a line of a chart."""
+    """Points of a line of a chart, with the names of the line and of its panel."""
 
     part: str
-    """Name of the part (panel) to which the line belongs."""
+    """Name of the part of the study; the line belongs to the panel of this part."""
     name: str
     """Name of the line."""
     points: PointSelection
@@ -558,7 +558,7 @@ class LabelledLinePoints(NamedTuple):
 class ShownLines(NamedTuple):
     """Lines that the panels of a chart have room for."""
 
-    named_points: list[LabelledLinePoints]
+    labelled_lines: list[LabelledLinePoints]
     """Part, name and points of each line."""
     n_omitted: int
     """Number of omitted lines."""
@@ -575,22 +575,22 @@ class LinesWithRemarks(NamedTuple):
 
 def split_into_lines(parts: Sequence[NamedPart], line_coordinates: Sequence[str]) -> ShownLines:
     """Split every part of a chart into lines by the values of coordinates."""
-    named_points: list[LabelledLinePoints] = []
+    labelled_lines: list[LabelledLinePoints] = []
     n_omitted = 0
     for part_label, part_points in parts:
         part_lines, n_omitted_lines = split_by_coordinates(
             part_points, line_coordinates, LINES_PER_PANEL_MAX
         )
         n_omitted += n_omitted_lines
-        named_points += [
+        labelled_lines += [
             LabelledLinePoints(part_label, line_name, line_points)
             for line_name, line_points in part_lines
         ]
-    return ShownLines(named_points, n_omitted)
+    return ShownLines(labelled_lines, n_omitted)
 
 
 def make_line_panels(
-    named_points: Sequence[LabelledLinePoints],
+    labelled_lines: Sequence[LabelledLinePoints],
     drawn_lines: Sequence[ChartLine],
     x_axis: CoordinateAxis,
     y_axis: ChartAxis,
@@ -600,7 +600,7 @@ def make_line_panels(
 
     Parameters
     ----------
-    named_points
+    labelled_lines
         Part, name and points of each line.
     drawn_lines
         The lines in the same order, with x in the units of the dataset. Lines of the same name get
@@ -612,10 +612,12 @@ def make_line_panels(
     """
     style_by_name = {
         name: k
-        for k, name in enumerate(dict.fromkeys(named_line.name for named_line in named_points))
+        for k, name in enumerate(
+            dict.fromkeys(labelled_line.name for labelled_line in labelled_lines)
+        )
     }
     lines_by_part: dict[str, list[ChartLine]] = {}
-    for (part, name, _), line in zip(named_points, drawn_lines, strict=True):
+    for (part, name, _), line in zip(labelled_lines, drawn_lines, strict=True):
         styled_line = replace(
             line, x=x_axis.to_axis_units(line.x), name=name, style_index=style_by_name[name]
         )

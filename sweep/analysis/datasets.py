@@ -50,10 +50,10 @@ about 7 kB per chunk.
 READ_SHOTS_MAX = 8192
 """Largest number of shots that are read at once, unless a stored chunk has more."""
 
-MISSING_COUNT = -1
-"""Value that stands in a store for a count that is not computed yet."""
+COUNT_FILL_VALUE = -1
+"""Value in a store of counts that are not computed yet."""
 
-_DESCRIPTION_BY_KIND = {
+_DESCRIPTION_BY_STORE_KIND = {
     GRID_STORE_KIND: "a grid of points: sweep.open() opens it",
     SCENE_STORE_KIND: "a scene's point clouds: sweep.open_scene() opens it",
     ACCURACY_STORE_KIND: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
@@ -131,7 +131,7 @@ def open(
 
 
 def _datasets_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
-    """Return datasets by the titles of their studies. Titles that are equal get the study id."""
+    """Return datasets by the titles of their studies; the study id distinguishes equal titles."""
     titles = [str(dataset.attrs["title"]) for dataset in datasets]
     dataset_by_name = {
         comparison.study_title_with_id(dataset) if titles.count(title) > 1 else title: dataset
@@ -254,8 +254,8 @@ def chunk_aligned_slices(
 ) -> list[slice]:
     """Return consecutive slices that cover a dimension of an array.
 
-    Each slice has whole stored chunks, and at most `slice_length_max` elements if a chunk is not
-    longer.
+    Each slice consists of complete stored chunks. It has at most `slice_length_max` elements, or
+    one chunk if chunks are longer.
     """
     length, stored_chunk = array.sizes[dim], stored_chunk_length(array, dim)
     step = stored_chunk * max(1, slice_length_max // stored_chunk)
@@ -296,7 +296,7 @@ def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, A
     """
     attributes = store_format.read_attributes(store_path)
     if kind and attributes["kind"] != kind:
-        raise NotAStoreError(f"{store_path} holds {_DESCRIPTION_BY_KIND[attributes['kind']]}")
+        raise NotAStoreError(f"{store_path} holds {_DESCRIPTION_BY_STORE_KIND[attributes['kind']]}")
     return attributes
 
 
@@ -321,7 +321,7 @@ def sum_draw_batches(dataset: xr.Dataset) -> xr.Dataset:
     }
     sums = {
         name: array.sum(DRAW_BATCH_DIM, keep_attrs=True).where(
-            (array != MISSING_COUNT).all(DRAW_BATCH_DIM), MISSING_COUNT
+            (array != COUNT_FILL_VALUE).all(DRAW_BATCH_DIM), COUNT_FILL_VALUE
         )
         for name, array in batched_counts.items()
     }
@@ -421,7 +421,10 @@ class SweepAccessor:
 
 @xr.register_datatree_accessor("sweep")
 class FlightAccessor:
-    """Answers from a tree of `sweep.open_scene`. They are lazy, except that shots are matched."""
+    """Answers from a tree of `sweep.open_scene`.
+
+    They are lazy, but the shots of two flights are matched at once.
+    """
 
     def __init__(self, tree: xr.DataTree) -> None:
         self._tree = tree

@@ -72,8 +72,8 @@ class PointSelection:
 
     dataset: xr.Dataset
     """Dataset whose points are selected."""
-    dim_tables: Mapping[str, pandas.DataFrame]
-    """Table for each dimension: rows are the selected indices, columns the coordinates along it."""
+    table_by_dim: Mapping[str, pandas.DataFrame]
+    """Table of each dimension; rows are selected indices, columns are coordinates along it."""
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> PointSelection:
@@ -94,15 +94,15 @@ class PointSelection:
     @property
     def size(self) -> int:
         """Number of selected points."""
-        return math.prod(map(len, self.dim_tables.values()))
+        return math.prod(map(len, self.table_by_dim.values()))
 
     def dim_of_coordinate(self, name: str) -> str:
         """Return the dimension of the named coordinate, or the name if it is a dimension."""
-        return next((dim for dim, table in self.dim_tables.items() if name in table), name)
+        return next((dim for dim, table in self.table_by_dim.items() if name in table), name)
 
     def coordinate_values(self, name: str) -> np.ndarray:
         """Return a coordinate's values at the selected indices; the indices if it has no values."""
-        table = self.dim_tables[self.dim_of_coordinate(name)]
+        table = self.table_by_dim[self.dim_of_coordinate(name)]
         return np.asarray(table.get(name, table.index))
 
     def coordinate_units(self, name: str) -> str:
@@ -111,9 +111,9 @@ class PointSelection:
         return "" if coordinate is None else str(coordinate.attrs.get("units", ""))
 
     def isel(self, dim: str, indices: np.ndarray) -> PointSelection:
-        """Return the selection restricted to row numbers, or a mask, of a dimension's table."""
+        """Restrict the selection along a dimension to row numbers, or to a mask of rows."""
         return replace(
-            self, dim_tables={**self.dim_tables, dim: self.dim_tables[dim].iloc[indices]}
+            self, table_by_dim={**self.table_by_dim, dim: self.table_by_dim[dim].iloc[indices]}
         )
 
     def sel(self, name: str, values: list[object]) -> PointSelection:
@@ -125,8 +125,8 @@ class PointSelection:
     def drop_duplicates(self) -> PointSelection:
         """Return the selection without points that repeat all coordinates along a dimension."""
         tables = {dim: table.drop_duplicates() if len(table.columns) else table
-                  for dim, table in self.dim_tables.items()}  # fmt: skip
-        return replace(self, dim_tables=tables)
+                  for dim, table in self.table_by_dim.items()}  # fmt: skip
+        return replace(self, table_by_dim=tables)
 
     def unique_values(self, name: str) -> list[object]:
         """Return the values of a coordinate, in the order in which they first appear."""
@@ -136,7 +136,7 @@ class PointSelection:
         """Return the names of coordinates with more than one value."""
         return [
             n
-            for table in self.dim_tables.values()
+            for table in self.table_by_dim.values()
             for n in table
             if table[n].nunique(dropna=False) > 1
         ]
@@ -148,13 +148,13 @@ class PointSelection:
         """
         return [
             name
-            for dim in self.dim_tables
+            for dim in self.table_by_dim
             for name in self.distinguishing_coordinates_along(dim, names)
         ]
 
     def distinguishing_coordinates_along(self, dim: str, names: Sequence[str]) -> list[str]:
         """Return the `distinguishing_coordinates` that lie along one dimension."""
-        table = self.dim_tables[dim]
+        table = self.table_by_dim[dim]
         given_names = [name for name in names if name in table]
         distinguishing: list[str] = []
         n_distinct = len(table[given_names].drop_duplicates()) if given_names else 1
@@ -171,11 +171,11 @@ class PointSelection:
         Values are in the order of their first appearance.
         """
         dim = self.dim_of_coordinate(name)
-        groups = self.dim_tables[dim].groupby(
+        groups = self.table_by_dim[dim].groupby(
             self.coordinate_values(name), sort=False, dropna=False
         )
         return [
-            (value, replace(self, dim_tables={**self.dim_tables, dim: table}))
+            (value, replace(self, table_by_dim={**self.table_by_dim, dim: table}))
             for value, table in groups
         ]
 
@@ -189,14 +189,14 @@ class PointSelection:
             order = np.argsort(first_rows)
             values, first_rows = values[order], first_rows[order]
         dim = self.dim_of_coordinate(name)
-        return SortedCoordinate(dim, np.asarray(self.dim_tables[dim].index)[first_rows], values)
+        return SortedCoordinate(dim, np.asarray(self.table_by_dim[dim].index)[first_rows], values)
 
     def first_indices(self, *coordinates: SortedCoordinate) -> dict[str, int]:
         """Return the first selected index of each dimension that no coordinate runs along."""
         shown_dims = {coordinate.dim for coordinate in coordinates}
         return {
             dim: int(table.index[0])
-            for dim, table in self.dim_tables.items()
+            for dim, table in self.table_by_dim.items()
             if dim not in shown_dims
         }
 
@@ -336,8 +336,8 @@ PUBLISHED_CUTS = (
 Each has the dotted path and the value of the parameter that is fixed.
 """
 
-AVERAGED_RANGE_MIN = "5 m"
-"""Smallest range of points over which false alarms are averaged [m].
+FALSE_ALARM_AVERAGING_RANGE_MIN = "5 m"
+"""Smallest range of the points over which false alarms are averaged, with its unit.
 
 At shorter ranges the shot noise of the echo matters ([T] 4.2).
 """
@@ -349,7 +349,7 @@ class StudyCut:
 
     name: str
     """Name of the cut: the value of the fixed coordinate, or 'all' for the complete study."""
-    fixed_name: str
+    fixed_coordinate: str
     """Name of the fixed coordinate; empty for the complete study."""
     fixed_value: object
     """Value of the fixed coordinate; None for the complete study."""
@@ -359,8 +359,8 @@ class StudyCut:
     def select_from(self, points: PointSelection) -> PointSelection:
         """Return the points of a selection that are on the cut, without duplicates."""
         return (
-            points.sel(self.fixed_name, [self.fixed_value]).drop_duplicates()
-            if self.fixed_name
+            points.sel(self.fixed_coordinate, [self.fixed_value]).drop_duplicates()
+            if self.fixed_coordinate
             else points
         )
 
@@ -497,7 +497,7 @@ class Statistics:
 def compute_statistics(groups: Sequence[PointSelection], variable: str) -> list[Statistics]:
     """Return the statistics of a variable over each group of points. The data are read once."""
     indices_by_group = [
-        {dim: np.asarray(table.index) for dim, table in g.dim_tables.items()} for g in groups
+        {dim: np.asarray(table.index) for dim, table in g.table_by_dim.items()} for g in groups
     ]
     arrays = [
         to_float_with_nan(g.dataset[variable].isel(group_indices))

@@ -216,7 +216,7 @@ def _segment_spectrum(
     if seed is not None:
         noise = np.array(
             [
-                draw_noise_spectrum(
+                simulate_noise_spectrum(
                     prepared_shot, seed=seed, segment=segment_index, look=look
                 ).take(signed_bins, mode="wrap")
                 for look in range(looks.number)
@@ -253,10 +253,10 @@ def _segment_spectrum(
     )
 
 
-def draw_noise_spectrum(
+def simulate_noise_spectrum(
     prepared_shot: shot_model.Shots, *, seed: int, segment: int, look: int = 0
 ) -> np.ndarray:
-    """Draw the noise spectrum of one look's windowed record.
+    """Simulate the noise spectrum of the windowed record of one look, with random numbers.
 
     Parameters
     ----------
@@ -349,6 +349,7 @@ SPECTRUM_COLOUR, THRESHOLD_COLOUR, NOISE_COLOUR, DETECTION_COLOUR = (
     canvas.LINE_COLOURS[1],
     "black",
 )
+"""Colours of the spectrum, the threshold, the noise level and detections."""
 LEVEL_AXIS_MARGIN_BELOW_DB, LEVEL_AXIS_MARGIN_ABOVE_DB = 25.0, 12.0
 """Margins of the vertical axis of a spectrum [dB].
 
@@ -371,9 +372,10 @@ It is a fraction of the width of the spectrum.
 def draw_spectra_sheet(
     shots: Sequence[SimulatedShot], *, title: str, footnote: str, shows_detections: bool = False
 ) -> Sheet:
-    """Return a sheet with a row for each segment, and for each shot its full band and a close-up.
+    """Return a sheet of spectra, with a row for each segment and two columns for each shot.
 
-    With ``shows_detections`` the close-up includes all detections near the peak.
+    The columns show the full band, and a close-up of the peak. With ``shows_detections`` the
+    close-up includes all detections near the peak.
     """
     n_rows, n_columns = len(shots[0].segments), 2 * len(shots)
     width = 5.4 if len(shots) == 1 else 4.2
@@ -651,7 +653,7 @@ def _false_alarm_table(shot: SimulatedShot) -> PageTable:
     return PageTable("False alarms", ("", "probability"), rows)
 
 
-DRAWN_AXIS_VALUES_MAX = 3
+REPORTED_AXIS_VALUES_MAX = 3
 """Largest number of values of a study's only axis for which a report shows one shot per value."""
 
 _REPORTED_PARAMETER_PATHS = (
@@ -763,7 +765,9 @@ def select_shot_parameters(
             raise SpecError([Mistake(path, problem, suggestion="keep one of them")])
         names_by_path[path] = name
     draws_all_values = (
-        not coordinate_values and len(spec.axes) == 1 and spec.axes[0].size <= DRAWN_AXIS_VALUES_MAX
+        not coordinate_values
+        and len(spec.axes) == 1
+        and spec.axes[0].size <= REPORTED_AXIS_VALUES_MAX
     )
     labelled_parameters: list[LabelledParameters] = []
     for i in range(spec.axes[0].size if draws_all_values else 1):

@@ -285,7 +285,7 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
     ]
 
 
-DEFAULT_CLOUD_QUANTITIES = ("range", "radial_velocity")
+DEFAULT_CLOUD_COLOUR_QUANTITIES = ("range", "radial_velocity")
 """Quantities by which the default figures colour a point cloud."""
 
 
@@ -299,7 +299,7 @@ def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
     figure_specs: list[SceneFigure] = [
         CloudFigure(kind="cloud", scanner=scanner, colour=colour, path=colour == "range")
         for scanner in scanners
-        for colour in DEFAULT_CLOUD_QUANTITIES
+        for colour in DEFAULT_CLOUD_COLOUR_QUANTITIES
     ]
     if any("velocity_status" in tree[scanner] for scanner in scanners):
         figure_specs += [

@@ -18,7 +18,7 @@ import xarray as xr
 from sweep.analysis import labels
 from sweep.analysis.answers.probability import false_alarms_per_shot
 from sweep.analysis.selection import (
-    AVERAGED_RANGE_MIN,
+    FALSE_ALARM_AVERAGING_RANGE_MIN,
     PointSelection,
     compute_statistics,
     parameters_at,
@@ -337,7 +337,9 @@ def split_by_setting(points: PointSelection, spec: GridSpec, by: str) -> list[Po
     list of PointsOfSetting
         Name, parameters and points of each setting.
     """
-    cut_names = {name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_name)}
+    cut_names = {
+        name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_coordinate)
+    }
     names = [by, *(n for n in points.varying_coordinates() if n != by and n not in cut_names)]
     paths = [spec.axis_parameter(name).path for name in names]
     parts = split_by_coordinates(points, names, TABLE_ROWS_MAX).parts
@@ -373,7 +375,9 @@ def false_alarm_records(
             i,
             j,
             cut.name,
-            select_beyond_range(cut.select_from(setting_points), spec, AVERAGED_RANGE_MIN),
+            select_beyond_range(
+                cut.select_from(setting_points), spec, FALSE_ALARM_AVERAGING_RANGE_MIN
+            ),
         )
         for i, (_, _, setting_points) in enumerate(setting_parts)
         for j, cut in enumerate(study_cuts(spec))
@@ -416,7 +420,7 @@ _FALSE_ALARM_COLUMNS = {
     "study's mean": ("study_mean", ".6e"), "excess of mean": ("study_variance_excess", ".1e%"),
 }  # fmt: skip
 """Record key and number format of each column of the table of false alarms, by column name."""
-_PRINTED_COLUMNS = {
+_PUBLISHED_VALUE_COLUMNS = {
     "printed": ("printed", ".3e"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".4f%"),
 }  # fmt: skip
@@ -454,7 +458,7 @@ def false_alarm_page(
     page_tables = [
         _record_table(
             "Probability of a false alarm in both chirp segments, from noise",
-            _FALSE_ALARM_COLUMNS | (_PRINTED_COLUMNS if has_printed else {}), records,
+            _FALSE_ALARM_COLUMNS | (_PUBLISHED_VALUE_COLUMNS if has_printed else {}), records,
         ),
         _record_table(
             "Leakage: extra groups raised by the signal's own sidelobes", _LEAKAGE_COLUMNS, records
@@ -483,7 +487,10 @@ def threshold_page(
     records: list[dict[str, TableCell]] = []
     setting_parts = split_by_setting(points, spec, by)
     pfa_statistics = compute_statistics(
-        [select_beyond_range(part.points, spec, AVERAGED_RANGE_MIN) for part in setting_parts],
+        [
+            select_beyond_range(part.points, spec, FALSE_ALARM_AVERAGING_RANGE_MIN)
+            for part in setting_parts
+        ],
         "pfa_bin",
     )
     for i, (name, setting, _) in enumerate(setting_parts):
@@ -512,8 +519,8 @@ def threshold_page(
 
 _FALSE_ALARM_NOTES = (
     "noise only: the model with a reflectance of 0.",
-    f"study's mean: over points beyond {AVERAGED_RANGE_MIN} of range, the echo's own shot noise "
-    "included.",
+    f"study's mean: over points beyond {FALSE_ALARM_AVERAGING_RANGE_MIN} of range, the echo's own "
+    "shot noise included.",
     "excess: noise variance above the one that sets the threshold, as a figure implies.",
     "  Nothing is tuned to the printed figures.",
 )

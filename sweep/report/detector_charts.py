@@ -50,19 +50,19 @@ from sweep.units import percent
 CHART_PARTS_MAX = 6
 """Largest number of parts of a study among which the reader of a chart can choose."""
 
-NOISE_BUDGET_POINTS = 24
+NOISE_BUDGET_POINTS_MAX = 24
 """Number of points at which a chart of noise sources is computed.
 
 They are points along a coordinate of a grid, or shots along a flight.
 """
 
-ROC_POINT_PDS = (0.999, 0.9, 0.5, 0.1, 0.01)
-"""Probabilities of detection pd. For each, the ROC curve of the point of closest pd is drawn."""
+ROC_POINT_SELECTION_PDS = (0.999, 0.9, 0.5, 0.1, 0.01)
+"""Values of pd. For each of them, the ROC curve of the point with the closest pd is drawn."""
 
 ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
 """Probabilities of a false alarm in a bin at which ROC curves are computed."""
 
-ROC_DRAWS = 400
+N_ROC_DRAWS = 400
 """Number of draws with which the ROC curve of a point with random effects is simulated."""
 
 PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
@@ -71,7 +71,7 @@ PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
 Leakage is signal in the window's sidelobes.
 """
 
-_LABEL_BY_ALARM = {
+_LABEL_BY_ALARM_VARIABLE = {
     "pfa_bin": "noise, one bin",
     "pfa_segment": "noise, a segment",
     "pfa_both_chirps": "noise, both",
@@ -178,11 +178,11 @@ def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: 
             "From the stored signal-to-noise ratio; where that alone does not give the stored "
             "probability of detection, simulated for this page with the effects that the study "
             "simulates at the point"
-            + (f", in {ROC_DRAWS} draws" if results.spec.draws.has_draws else ""),
+            + (f", in {N_ROC_DRAWS} draws" if results.spec.draws.has_draws else ""),
             "False alarms of noise alone, in all bins that are counted",
             "Dots: the study's own threshold",
             "Points: those whose probability of detection comes nearest to "
-            + ", ".join(f"{pd_value:g}" for pd_value in ROC_POINT_PDS),
+            + ", ".join(f"{pd_value:g}" for pd_value in ROC_POINT_SELECTION_PDS),
             charts.omission_remark(n_omitted),
         ],
         panels=panels,
@@ -190,7 +190,7 @@ def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: 
     )
 
 
-_PFA_FUNCTION_BY_ALARM = {
+_PFA_FUNCTION_BY_ALARM_KIND = {
     "in a segment": noise_false_alarms.segment_pfa,
     "in a bin": lambda bin_probability, bins: bin_probability,
     "in both chirps": lambda p, bins: noise_false_alarms.segment_pfa(p, bins) ** 2,
@@ -206,10 +206,12 @@ def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
 
     Dots mark the threshold of the study.
     """
-    lines_by_alarm: dict[str, list[ChartLine]] = {alarm: [] for alarm in _PFA_FUNCTION_BY_ALARM}
+    lines_by_alarm: dict[str, list[ChartLine]] = {
+        alarm: [] for alarm in _PFA_FUNCTION_BY_ALARM_KIND
+    }
     for style_index, index in enumerate(_roc_indices(profile)):
         point = results.dataset.isel(profile.axis_indices(index)).compute()
-        curve = point.sweep.roc(ROC_PFA_BIN_VALUES, draws=ROC_DRAWS)
+        curve = point.sweep.roc(ROC_PFA_BIN_VALUES, draws=N_ROC_DRAWS)
         parameters = parameters_at(results.spec, profile.axis_indices(index))
         study_pfa, study_pd = 10.0 ** point["log10_pfa_bin"].values, point["pd_shot"].values
         n_bins, study_n_bins = (
@@ -217,7 +219,7 @@ def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
             for p in (ROC_PFA_BIN_VALUES, study_pfa)
         )
         tnr_texts = [f"TNR {t:.3g}" for t in curve["curve_tnr"].values]
-        for alarm, pfa_from_bin in _PFA_FUNCTION_BY_ALARM.items():
+        for alarm, pfa_from_bin in _PFA_FUNCTION_BY_ALARM_KIND.items():
             x = np.asarray(pfa_from_bin(ROC_PFA_BIN_VALUES, n_bins))
             line = ChartLine(
                 x,
@@ -250,18 +252,18 @@ def _point_label(profile: GridProfile, index: int) -> str:
 
 
 def _roc_indices(profile: GridProfile) -> np.ndarray:
-    """Return the indices along a profile whose pd is closest to the `ROC_POINT_PDS`."""
+    """Return the indices along a profile whose pd is closest to the `ROC_POINT_SELECTION_PDS`."""
     indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_CELLS)
     pd = profile.variable_values("pd_shot", indices)
     if not np.isfinite(pd).any():
         return np.zeros(0, int)
     nearest_indices = [
-        int(indices[np.nanargmin(np.abs(pd - pd_value))]) for pd_value in ROC_POINT_PDS
+        int(indices[np.nanargmin(np.abs(pd - pd_value))]) for pd_value in ROC_POINT_SELECTION_PDS
     ]
     return np.unique(nearest_indices)
 
 
-def noise_budget_of_grid(
+def grid_noise_budget_chart(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart:
     """Return the chart of the noise at the ADC, along each part (profile) of a grid.
@@ -270,7 +272,7 @@ def noise_budget_of_grid(
     """
     panels = []
     for profile in profiles:
-        indices = profile.evenly_spread_indices(NOISE_BUDGET_POINTS)
+        indices = profile.evenly_spread_indices(NOISE_BUDGET_POINTS_MAX)
         budgets = []
         for index, flags in zip(indices, profile.variable_values("effects", indices), strict=True):
             parameters = parameters_at(results.spec, profile.axis_indices(index))
@@ -361,12 +363,12 @@ def false_alarm_chart(
     coordinate_name = profiles[0].coordinate_name
     pfa_with_leakage = probability.false_alarms_per_shot(results.dataset, leakage=True)
     alarm_dataset = results.dataset[
-        [v for v in _LABEL_BY_ALARM if v != PFA_WITH_LEAKAGE_NAME]
+        [v for v in _LABEL_BY_ALARM_VARIABLE if v != PFA_WITH_LEAKAGE_NAME]
     ].assign({PFA_WITH_LEAKAGE_NAME: pfa_with_leakage})
-    named_points: list[charts.LabelledLinePoints] = []
+    labelled_lines: list[charts.LabelledLinePoints] = []
     drawn_lines: list[ChartLine] = []
     remarks: list[str] = []
-    for variable, alarm_label in _LABEL_BY_ALARM.items():
+    for variable, alarm_label in _LABEL_BY_ALARM_VARIABLE.items():
         variable_points = [
             charts.LabelledLinePoints(
                 profile.label, alarm_label, replace(profile.points, dataset=alarm_dataset)
@@ -375,13 +377,13 @@ def false_alarm_chart(
         ]
         # One reading pass per variable: in a joint pass chunks would accumulate in memory.
         lines, remarks = charts.read_lines_along(
-            [(named_line.points, variable) for named_line in variable_points], coordinate_name
+            [(labelled_line.points, variable) for labelled_line in variable_points], coordinate_name
         )
         drawn_lines += lines
-        named_points += variable_points
+        labelled_lines += variable_points
     x_axis = CoordinateAxis.from_points(results.points, coordinate_name)
     panels = charts.make_line_panels(
-        named_points, drawn_lines, x_axis, ChartAxis("probability", LOG_SCALE)
+        labelled_lines, drawn_lines, x_axis, ChartAxis("probability", LOG_SCALE)
     )
     # All points share one threshold if no axis changes it or the looks.
     off_axes = results.spec.parameters_off_axes()
@@ -464,7 +466,7 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
     max_ranges = [
         NamedPart(
             words,
-            _points_with_maximum_range(shown_points, range_parameter.coordinate, range_axis.factor),
+            _compute_maximum_range(shown_points, range_parameter.coordinate, range_axis.factor),
         )
         for words, shown_points in shown_parts
     ]
@@ -528,12 +530,11 @@ def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
     return sentences
 
 
-def _points_with_maximum_range(
-    points: PointSelection, name: str, unit_factor: float
-) -> PointSelection:
-    """Return points without a range coordinate, and their maximum range as a lazy variable.
+def _compute_maximum_range(points: PointSelection, name: str, unit_factor: float) -> PointSelection:
+    """Compute the maximum range over all coordinates except range, as lazy variables of points.
 
-    `name` is the coordinate of range, `unit_factor` converts it to display units.
+    `name` is the name of the range coordinate. The result is in display units, to which
+    `unit_factor` converts the units of that coordinate.
     """
     dim = points.dim_of_coordinate(name)
     indices = np.sort(points.sorted_coordinate(name).indices)
@@ -599,11 +600,13 @@ def _maximum_range_chart(
         ]
         n_omitted += n_omitted_parts
     n_omitted += max(0, len(parts) - CHART_PARTS_MAX)
-    named_points = charts.split_into_lines(parts[:CHART_PARTS_MAX], line_coordinates).named_points
+    labelled_lines = charts.split_into_lines(
+        parts[:CHART_PARTS_MAX], line_coordinates
+    ).labelled_lines
     pairs = [
-        (named_line.points, answer)
+        (labelled_line.points, answer)
         for answer in LIMIT_VARIABLE_BY_LABEL.values()
-        for named_line in named_points
+        for labelled_line in labelled_lines
     ]
     drawn_lines, remarks = charts.read_lines_along(pairs, x)
     x_axis = CoordinateAxis.from_points(first_points, x)
@@ -612,11 +615,11 @@ def _maximum_range_chart(
         panel
         for answer_label, answer_lines in zip(
             LIMIT_VARIABLE_BY_LABEL,
-            (drawn_lines[: len(named_points)], drawn_lines[len(named_points) :]),
+            (drawn_lines[: len(labelled_lines)], drawn_lines[len(labelled_lines) :]),
             strict=True,
         )
         for panel in charts.make_line_panels(
-            named_points, answer_lines, x_axis, y_axis, answer=answer_label
+            labelled_lines, answer_lines, x_axis, y_axis, answer=answer_label
         )
     ]
     span_text = x_axis.describe_span(np.unique(first_points.coordinate_values(x)))

@@ -48,7 +48,11 @@ from sweep.model.effects.catalogue import unpack_effect_flags
 from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
 from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
 from sweep.model.pointcloud.pairing import TRUE_FLAG
-from sweep.report.detector_charts import NOISE_BUDGET_POINTS, noise_budget_chart, noise_budget_panel
+from sweep.report.detector_charts import (
+    NOISE_BUDGET_POINTS_MAX,
+    noise_budget_chart,
+    noise_budget_panel,
+)
 from sweep.report.html_page import (
     COLOUR_BAR_LAYOUT,
     HtmlTable,
@@ -226,8 +230,8 @@ def cloud_plot(
                 "Frame",
                 ["whole flight", "ground"],
                 {
-                    "whole flight": _frame_layout(list(shown_clouds.values()), with_path=True),
-                    "ground": _frame_layout(list(shown_clouds.values())),
+                    "whole flight": _framing_layout(list(shown_clouds.values()), with_path=True),
+                    "ground": _framing_layout(list(shown_clouds.values())),
                 },
             ),
             PlotControl("ground", "Terrain", ["shown", "hidden"] if height_map else ["none"]),
@@ -262,7 +266,7 @@ def _cloud_traces(
         meta=trace_meta(0, cloud=cloud_label),
         hoverinfo="name",
     )
-    is_true = cloud.is_true
+    is_true = cloud.true_point_mask
     for quantity in CLOUD_COLOUR_QUANTITIES:
         values = to_displayed_values(quantity, cloud.points[quantity])
         scale_values = values[is_true] if is_true.any() else values
@@ -371,7 +375,7 @@ def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
     return bool((offset <= VIEW_FILL_FRACTION * math.tan(CAMERA_FIELD_OF_VIEW / 2) * depth).all())
 
 
-def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> dict[str, Any]:
+def _framing_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> dict[str, Any]:
     """Return the changes of plotly's layout that make the true points of all clouds fill the view.
 
     With ``with_path`` the flight paths are in the view too. All axes have the same scale.
@@ -380,7 +384,8 @@ def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> d
     lengths = {}
     for axis in WORLD_AXES:
         true_values = [
-            c.points[axis][c.is_true if c.is_true.any() else slice(None)] for c in clouds
+            c.points[axis][c.true_point_mask if c.true_point_mask.any() else slice(None)]
+            for c in clouds
         ]
         values = np.concatenate(
             [*true_values, *(cloud.path[axis] for cloud in clouds if with_path)]
@@ -411,23 +416,23 @@ def _scene_layout() -> dict[str, Any]:
     )
 
 
-SHOT_QUANTITIES = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
+SHOT_CHART_QUANTITIES = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
 """Quantities of shots that a report draws over time."""
 
-MEASURED_QUANTITIES = ("range", "radial_velocity")
+ERROR_CHART_QUANTITIES = ("range", "radial_velocity")
 """Quantities of a point whose errors a report draws over time."""
 
 PAGE_SHOTS_MAX = 12_000
 """Largest number of shots of all charts over time on a page."""
 
-NAVIGATION_ALTITUDE_BINS = 20
+N_NAVIGATION_ALTITUDE_BINS = 20
 """Number of altitude bins in the charts of navigation errors."""
 
 
 def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
-    """Return the chart of the `SHOT_QUANTITIES` over time, or None if no shot is computed."""
+    """Return the chart of the `SHOT_CHART_QUANTITIES` over time, or None if no shot is computed."""
     quantities = [
-        name for name in SHOT_QUANTITIES if name in labelled_recordings[0].recording.dataset
+        name for name in SHOT_CHART_QUANTITIES if name in labelled_recordings[0].recording.dataset
     ]
 
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
@@ -454,7 +459,7 @@ def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) ->
 
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
         is_true = (column_arrays["flags"].astype(int) & TRUE_FLAG) > 0
-        for name in MEASURED_QUANTITIES if is_true.any() else ():
+        for name in ERROR_CHART_QUANTITIES if is_true.any() else ():
             error_column = {"error": column_arrays[name] - column_arrays[f"true_{name}"]}
             true_columns = {
                 key: values[is_true] for key, values in (column_arrays | error_column).items()
@@ -473,12 +478,12 @@ def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) ->
         "time",
         "beam",
         "flags",
-        *MEASURED_QUANTITIES,
-        *(f"true_{name}" for name in MEASURED_QUANTITIES),
+        *ERROR_CHART_QUANTITIES,
+        *(f"true_{name}" for name in ERROR_CHART_QUANTITIES),
     ]
     panels, reduction_remark = _time_panels(labelled_recordings, "point", names, quantity_lines)
     error_texts = "; ".join(
-        panel.facet_choices["quantity"] for panel in panels[: len(MEASURED_QUANTITIES)]
+        panel.facet_choices["quantity"] for panel in panels[: len(ERROR_CHART_QUANTITIES)]
     )
     alt = f"Marks of the error of each true point over time. {error_texts}."
     method_remark = "Measured less true, of true points, interpolated between bins"
@@ -532,9 +537,9 @@ def _time_chart(heading: str, alt: str, caption: list[str], panels: list[Panel])
 
 
 def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[ChartLine]:
-    """Return dots of a quantity over time for each beam.
+    """Return a line of dots for each beam: a quantity over time.
 
-    If there are more beams than colours, all beams make one line of dots.
+    If there are more beams than colours, all beams share one line.
     """
     values = to_displayed_values(name, column_arrays[name])
     beams = np.unique(column_arrays["beam"])
@@ -553,7 +558,7 @@ def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[Char
     ]
 
 
-def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable:
+def point_count_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable:
     """Return a table with the numbers of shots and of points by kind, for each recording.
 
     Shots and points are counted over all draws.
@@ -585,7 +590,7 @@ def returns_sentences(
     Parameters
     ----------
     returns_frame
-        Frame of :func:`returns_table`.
+        Frame of :func:`point_count_table`.
     groups
         Datasets of the scanners.
     n_omitted
@@ -629,7 +634,7 @@ def flight_navigation_error_chart(
         curve
         for quantity in ("velocity", "altitude")
         for curve in navigation_error_curves(
-            named_recordings, quantity=quantity, n_bins=NAVIGATION_ALTITUDE_BINS
+            named_recordings, quantity=quantity, n_bins=N_NAVIGATION_ALTITUDE_BINS
         )
     ]
     if not error_curves:
@@ -650,7 +655,7 @@ def _error_floor_remarks(spec: SceneSpec) -> list[str]:
     return floor_remark + spec.unstated_error_sentences()
 
 
-def noise_budget_of_flight(
+def flight_noise_budget_chart(
     results: SceneResults, labelled_recordings: Sequence[LabelledRecording]
 ) -> Chart | None:
     """Return the chart of the shares of noise sources along a flight.
@@ -683,7 +688,7 @@ def _flight_noise_panel(results: SceneResults, labelled_recording: LabelledRecor
     recording = labelled_recording.recording
     n_shots = recording.n_shots
     shot_indices = np.unique(
-        np.linspace(0, n_shots - 1, min(NOISE_BUDGET_POINTS, n_shots)).round().astype(int)
+        np.linspace(0, n_shots - 1, min(NOISE_BUDGET_POINTS_MAX, n_shots)).round().astype(int)
     )
     eyepoints = read_eyepoints(results.store_path, recording.dataset, shot_indices)
     seen_indices = np.flatnonzero(eyepoints.has_target)

@@ -61,13 +61,13 @@ class PlotControl:
     """Control of a plot by which the reader selects one of several options."""
 
     name: str
-    """Name of the choice in the `meta` of traces (see :func:`trace_meta`)."""
+    """Name of the control in the `meta` of traces (see :func:`trace_meta`)."""
     label: str
     """Label on the page."""
     options: Sequence[str]
     """Options in order."""
-    relayout: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Changes of plotly's layout that the choice of an option makes, by option."""
+    relayout_by_option: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Changes of plotly's layout that are made when an option is chosen, by option."""
 
     @property
     def initial_option_index(self) -> int:
@@ -92,7 +92,7 @@ class InteractivePlot:
     """Plotly's figure. The `meta` of its traces say when they are shown (:func:`trace_meta`)."""
     controls: Sequence[PlotControl] = ()
     """Controls of the plot; those with one option are hidden."""
-    has_cut: bool = False
+    offers_cuts: bool = False
     """True if the page offers cuts through the first heat map."""
     is_tall: bool = False
     """True if the plot needs more height, for views in three dimensions."""
@@ -144,7 +144,7 @@ def make_interactive_plot(chart: Chart) -> InteractivePlot:
             ),
         ),
         [_make_control(chart.panels, name, label) for name, label in chart.facet_labels.items()],
-        has_cut=chart.colour_scale is not None,
+        offers_cuts=chart.colour_scale is not None,
     )
 
 
@@ -157,7 +157,7 @@ def _make_control(panels: Sequence[Panel], name: str, label: str) -> PlotControl
     axes_by_option: dict[str, set[ChartAxis]] = {}
     for panel in panels:
         axes_by_option.setdefault(panel.facet_choices[name], set()).add(panel.y_axis)
-    relayout: dict[str, dict[str, Any]] = {}
+    relayout_by_option: dict[str, dict[str, Any]] = {}
     if (
         all(len(option_axes) == 1 for option_axes in axes_by_option.values())
         and len(set().union(*axes_by_option.values())) > 1
@@ -166,9 +166,11 @@ def _make_control(panels: Sequence[Panel], name: str, label: str) -> PlotControl
             axis_options = {
                 k: v for k, v in _axis_layout(axis).items() if k in ("type", "range", "rangemode")
             }
-            relayout[option] = {f"yaxis.{key}": value for key, value in axis_options.items()}
-            relayout[option]["yaxis.title.text"] = wrap_with_html_breaks(axis.label, 36)
-    return PlotControl(name, label, list(axes_by_option), relayout)
+            relayout_by_option[option] = {
+                f"yaxis.{key}": value for key, value in axis_options.items()
+            }
+            relayout_by_option[option]["yaxis.title.text"] = wrap_with_html_breaks(axis.label, 36)
+    return PlotControl(name, label, list(axes_by_option), relayout_by_option)
 
 
 def _panel_traces(panel: Panel, colour_scale: ColourScale | None) -> Iterator[Any]:
@@ -366,8 +368,8 @@ class HtmlTable:
     """Sentences of the caption."""
     frame: pandas.DataFrame
     """Cells of the table, with its column names."""
-    file: str
-    """Name of the CSV file to download, without suffix."""
+    csv_stem: str
+    """Name of the CSV file to download, without its suffix."""
 
 
 @dataclass(frozen=True)
@@ -380,7 +382,7 @@ class TextItem:
     """Sentences of the caption."""
     text: str
     """Text."""
-    file: str = ""
+    download_name: str = ""
     """Name of the file to download; empty for no download."""
 
 
@@ -418,12 +420,12 @@ class ReportPage:
     """Sections in order."""
 
 
-TABLE_ROWS_SHOWN = 10
+N_TABLE_ROWS_SHOWN = 10
 """Number of rows of a table that a page shows at once."""
 
 
-LONG_CELL_CHARACTERS = 40
-"""Length of a cell's text above which the text is wrapped like a sentence [characters]."""
+UNWRAPPED_CELL_CHARACTERS_MAX = 40
+"""Largest number of characters of a cell whose text is not wrapped like a sentence."""
 
 
 def render_html(page: ReportPage) -> str:
@@ -458,14 +460,16 @@ def _compress_base64(text: str) -> str:
 
 def _chart_json(plot: InteractivePlot) -> str:
     """Return a plot as JSON for the page's script."""
-    relayouts: dict[str, Any] = {c.name: dict(c.relayout) for c in plot.controls if c.relayout}
-    content = {"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.has_cut}
+    relayouts: dict[str, Any] = {
+        c.name: dict(c.relayout_by_option) for c in plot.controls if c.relayout_by_option
+    }
+    content = {"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.offers_cuts}
     return str(to_json_plotly(content))
 
 
 def _table_json(table: HtmlTable) -> str:
     """Return a table as JSON for the page's script, with the options of sorting and download."""
-    csv_button = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
+    csv_button = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.csv_stem}
     widths = table.frame.map(lambda cell: len(str(cell))).max()
     with pandas.option_context("display.float_format", "{:.6g}".format):
         arguments = get_itable_arguments(
@@ -473,10 +477,10 @@ def _table_json(table: HtmlTable) -> str:
             showIndex=False,
             maxBytes=0,
             maxColumns=0,
-            pageLength=TABLE_ROWS_SHOWN,
+            pageLength=N_TABLE_ROWS_SHOWN,
             columnDefs=[
                 {
-                    "targets": np.flatnonzero(widths > LONG_CELL_CHARACTERS).tolist(),
+                    "targets": np.flatnonzero(widths > UNWRAPPED_CELL_CHARACTERS_MAX).tolist(),
                     "className": "long",
                 }
             ],

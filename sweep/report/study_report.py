@@ -52,7 +52,7 @@ from sweep.storage.store_format import (
     parse_software_versions,
 )
 
-PAGE_SIZE_LIMITS = ChartSizeLimits(
+PAGE_CHART_SIZE_LIMITS = ChartSizeLimits(
     parts_max=detector_charts.CHART_PARTS_MAX,
     columns_max=500,
     rows_max=180,
@@ -137,7 +137,7 @@ def _grid_report(store: Location) -> ReportPage:
     )
     profiles_and_omitted = detector_charts.grid_profiles(results)
     detector_items: list[SectionItem] = [
-        detector_charts.noise_budget_of_grid(results, *profiles_and_omitted)
+        detector_charts.grid_noise_budget_chart(results, *profiles_and_omitted)
     ]
     if not spec.draws.draws_whole_spectra:  # detectors of whole spectra have no closed forms
         detector_items = [
@@ -279,7 +279,9 @@ def _iter_figure_charts(results: GridResults) -> Iterator[SectionItem]:
     for figure_spec in figure_specs:
         chart = results.make_chart(
             figure_spec,
-            replace(PAGE_SIZE_LIMITS, cells_max=PAGE_SIZE_LIMITS.cells_max / max(1, n_maps)),
+            replace(
+                PAGE_CHART_SIZE_LIMITS, cells_max=PAGE_CHART_SIZE_LIMITS.cells_max / max(1, n_maps)
+            ),
         )
         if chart is None:
             yield TextItem(figure_spec.title, ["No point of the study is within its limits."], "")
@@ -333,7 +335,7 @@ def _scene_report(store: Location) -> ReportPage:
         flight_charts.shots_over_time_chart(labelled_recordings),
         flight_charts.measurement_error_chart(labelled_recordings),
         flight_charts.flight_navigation_error_chart(spec, labelled_recordings),
-        flight_charts.noise_budget_of_flight(results, labelled_recordings),
+        flight_charts.flight_noise_budget_chart(results, labelled_recordings),
     ]
     scanner_datasets = [results.tree[name].to_dataset() for name in results.scanners]
     request_section = _spec_and_effects_section(
@@ -341,14 +343,16 @@ def _scene_report(store: Location) -> ReportPage:
     )
     key_facts = [("shots times draws", f"{attributes['points']:,}"),
              ("scanners", ", ".join(map(labels.coordinate_label, results.scanners)))]  # fmt: skip
-    returns_table = flight_charts.returns_table(labelled_recordings)
+    point_count_table = flight_charts.point_count_table(labelled_recordings)
     sections = [
         _main_results_section(
             spec,
             scanner_datasets,
             "shots",
             [
-                *flight_charts.returns_sentences(returns_table.frame, scanner_datasets, n_omitted),
+                *flight_charts.returns_sentences(
+                    point_count_table.frame, scanner_datasets, n_omitted
+                ),
                 *consistency_sentences(results.tree),
             ],
         ),
@@ -360,7 +364,9 @@ def _scene_report(store: Location) -> ReportPage:
         ),
         _page_section("flight", "Along the flight", flight_items),
         request_section,
-        _page_section("tables", "Tables", [returns_table, _cloud_point_table(labelled_recordings)]),
+        _page_section(
+            "tables", "Tables", [point_count_table, _cloud_point_table(labelled_recordings)]
+        ),
     ]
     return _report_page(spec, attributes, "blocks", key_facts, sections, store)
 

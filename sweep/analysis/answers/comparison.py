@@ -25,13 +25,13 @@ from sweep.model.error_budget import interval_half_width as interval_half_width
 from sweep.model.outputs import GRID_OUTPUTS, PD_OUTPUTS, SHOT_STATISTIC_VARIABLES, SPECTRA_OUTPUTS
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 
-PD_ROUNDING_MAX = 1e-12
+PD_ROUNDING_ERROR_MAX = 1e-12
 """Largest difference of a probability of detection that rounding on another processor explains."""
 
 _MATCHED_SIGNIFICANT_DIGITS = 12
 """Number of significant digits to which coordinates must agree if two points are to match."""
 
-GRID_WITH_FLIGHT_MESSAGE = (
+GRID_FLIGHT_COMPARISON_MESSAGE = (
     "a grid of points and a flight have nothing to match: compare two of a kind"
 )
 """Error message for a comparison of a grid with a flight."""
@@ -62,7 +62,7 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
         The studies have no common point, or `other` is a flight.
     """
     if not isinstance(other, xr.Dataset):
-        raise ValueError(GRID_WITH_FLIGHT_MESSAGE)
+        raise ValueError(GRID_FLIGHT_COMPARISON_MESSAGE)
     ours, other = (
         provenance.check_single_study(dataset, require_axes=True) for dataset in (ours, other)
     )
@@ -95,7 +95,7 @@ def compute_differences(
         allowed_difference = (
             _pd_error_bound(matched_ours, name)
             + _pd_error_bound(matched_other, name)
-            + PD_ROUNDING_MAX
+            + PD_ROUNDING_ERROR_MAX
         )
         result[f"{name}_allowed"] = allowed_difference.assign_attrs(
             units="1", long_name=f"largest difference of {name} within what is known of both"
@@ -129,13 +129,13 @@ def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
 def _restrict_to_common_points(
     ours: xr.Dataset, other: xr.Dataset
 ) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return both datasets with nothing but their common points, and with equal coordinates."""
-    other = _select_fixed_parameters(other, ours)
-    ours = _select_fixed_parameters(ours, other)
+    """Reduce two datasets to their common points; return them with equal coordinates."""
+    other = _select_points_at_fixed_values(other, ours)
+    ours = _select_points_at_fixed_values(ours, other)
     for dim in [d for d in ours.dims if d in other.dims]:
         our_index, other_index = (
-            _index_of_dimension_values(ours, str(dim)),
-            _index_of_dimension_values(other, str(dim)),
+            _pandas_index_of_dimension(ours, str(dim)),
+            _pandas_index_of_dimension(other, str(dim)),
         )
         common_index = our_index.intersection(other_index, sort=False)
         if not common_index.size:
@@ -150,10 +150,10 @@ def _restrict_to_common_points(
     return ours, other.drop_vars(scalar_names)
 
 
-def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
-    """Select points with the values of all parameters that the reference dataset does not vary.
+def _select_points_at_fixed_values(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
+    """Select the points at which parameters have the values that are fixed in a reference dataset.
 
-    An axis without that value stays.
+    An axis on which the fixed value of its parameter does not occur is kept.
     """
     varying_paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
     spec = spec_of_dataset(reference)
@@ -173,7 +173,7 @@ def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.D
     return dataset
 
 
-def _index_of_dimension_values(dataset: xr.Dataset, dim: str) -> pandas.Index:
+def _pandas_index_of_dimension(dataset: xr.Dataset, dim: str) -> pandas.Index:
     """Return a pandas index of the coordinate values along a dimension, for matching.
 
     Values are in SI, rounded to 12 significant digits. Several coordinates make a multi-index.
@@ -258,7 +258,7 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
         The flights have no common scanner, or no common shot of a scanner; or `other` is a grid.
     """
     if not isinstance(other, xr.DataTree):
-        raise ValueError(GRID_WITH_FLIGHT_MESSAGE)
+        raise ValueError(GRID_FLIGHT_COMPARISON_MESSAGE)
     scanners = [name for name in scanner_names(ours) if name in scanner_names(other)]
     if not scanners:
         scanner_lists = (", ".join(scanner_names(tree)) for tree in (ours, other))
@@ -505,13 +505,13 @@ def describe_common_shots(differences: xr.Dataset) -> str:
 
 
 class AgreementVerdict(NamedTuple):
-    """True if two stores agree."""
+    """Verdict on whether the probabilities of detection of two stores agree."""
 
     verdict: Literal["same", "different", "nothing"]
-    """``same`` if all probabilities of detection agree, ``different`` if one does not, and
+    """``same`` if they agree at all common points, ``different`` if they differ at one, and
     ``nothing`` if no common point is computed."""
     sentence: str
-    """Sentence about it for the user."""
+    """The verdict as a sentence for the user."""
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> AgreementVerdict:
@@ -544,9 +544,10 @@ PLOTTED_DIFFERENCE_MIN = 1e-16
 def save_difference_figure(
     differences_by_scanner: Mapping[str, xr.Dataset], file_path: Path
 ) -> Path:
-    """Draw the share of points whose pd differs by more than an amount; return the picture's path.
+    """Save a figure of the differences of pd; return the path of the picture.
 
-    Each scanner has its own colour.
+    It shows the share of points whose pd differs by more than an amount, over that amount. Each
+    scanner has its own colour.
     """
     from sweep.analysis import canvas
 
@@ -591,10 +592,10 @@ def pd_difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Cha
 def _exceedance_lines(
     differences: xr.Dataset, name: str, scanner: str, style_index: int
 ) -> list[ChartLine]:
-    """Return two lines over the difference of pd.
+    """Return two lines of shares of points [%] over a difference d of pd; none without values.
 
-    The lines are the shares of points whose difference is larger, and whose allowed difference is
-    larger.
+    The first is the share of points whose difference exceeds d, the second the share of points
+    whose allowed difference exceeds d.
     """
     is_finite = np.isfinite(differences[name].values)
     lines = []

@@ -33,18 +33,18 @@ _STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
 """Pattern of the name of a coordinate that marks the study from which a dataset comes."""
 
 JOINED_SPECS_ATTRIBUTE = "specs"
-"""Name of the attribute of a join of studies with their specs and variable names.
+"""Name of the attribute in which a join of studies keeps their specs and variable names.
 
-The value of the attribute is JSON text, by study id.
+Its value is the JSON text of a mapping by study id.
 """
 
 
 def study_marker_name(study_ids: Iterable[str]) -> str:
     """Return the name of the coordinate that marks the data of a study, or of joined studies.
 
-    xarray drops conflicting coordinates, or keeps that of the first dataset. It always keeps a
-    coordinate that only one dataset has. The study id is therefore part of the marker's name: a
-    merge of two studies has two markers.
+    When xarray merges datasets, it drops conflicting coordinates, or keeps that of the first dataset.
+    It always keeps a coordinate that only one dataset has. The study id is therefore part of the
+    marker's name: a merge of two studies has two markers.
     """
     study_ids = list(study_ids)
     if len(study_ids) == 1:

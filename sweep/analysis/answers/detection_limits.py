@@ -30,10 +30,10 @@ _PD_PLUS_MISS_ERROR_MAX = 1e-6
 """Largest deviation of pd plus the probability of a miss from 1, due to rounding and averaging."""
 
 _NORMAL_DEVIATE_MAX = 38.0
-"""Largest magnitude of a normal deviate, which stands for a pd of 0 or 1.
+"""Largest magnitude of a normal deviate z; it stands for a pd of 0 or 1.
 
-The normal deviate of pd is the argument at which the normal distribution function equals pd. This
-one corresponds to a probability near the smallest positive float.
+The normal deviate z of pd is defined by pd = Phi(z), with the normal distribution function Phi.
+Phi(-38) is near the smallest positive float.
 """
 
 
@@ -222,12 +222,12 @@ def _limits_along_dimension(
     is_falling = (z >= 0) & (next_z < 0)
     crossings = steps + z / (z - next_z).where(is_falling, 1.0)
     first_break, first_unknown = (
-        _smallest_chosen_step(crossings, is_falling, dim),
-        _smallest_chosen_step(steps, z.isnull(), dim),
+        _smallest_step_where(crossings, is_falling, dim),
+        _smallest_step_where(steps, z.isnull(), dim),
     )
     last_break, last_unknown = (
-        -_smallest_chosen_step(-crossings, is_falling, dim),
-        -_smallest_chosen_step(-steps, z.isnull(), dim),
+        -_smallest_step_where(-crossings, is_falling, dim),
+        -_smallest_step_where(-steps, z.isnull(), dim),
     )
     starts_above, ends_above = (z.isel({dim: end}, drop=True) >= 0 for end in (0, -1))
     unbroken_reason = xr.where(
@@ -256,8 +256,8 @@ def _limits_along_dimension(
     }
 
 
-def _smallest_chosen_step(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
-    """Return the smallest of the chosen steps along a dimension; infinity if none is chosen.
+def _smallest_step_where(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
+    """Return the smallest step along a dimension where a mask is true; infinity if it never is.
 
     A step is an index along the dimension, which may lie between two integers.
     """

@@ -341,7 +341,7 @@ def _cramer_rao_bounds_of_group(
         remaining_samples = record_length - np.where(
             parameters["late"], missing_samples, 0
         )  # samples of the record that contain the echo
-        remaining_sum, relative_width = sums_and_widths_of_window_ends(taper)
+        remaining_sum, relative_width = window_tail_sums_and_widths(taper)
         bin_offset = (
             (beat_bin - np.rint(beat_bin))
             * relative_width[remaining_samples]
@@ -384,7 +384,7 @@ def _cramer_rao_bounds_of_group(
 
 
 @lru_cache(maxsize=8)
-def sums_and_widths_of_window_ends(taper: Window) -> tuple[np.ndarray, np.ndarray]:
+def window_tail_sums_and_widths(taper: Window) -> tuple[np.ndarray, np.ndarray]:
     """Return the sum and the width of the last n samples of a window, for every n.
 
     Parameters

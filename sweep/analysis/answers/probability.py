@@ -32,7 +32,7 @@ from sweep.model.threshold import THRESHOLD_PATHS, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec
 
 SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
-"""Names of what has a probability of detection: each segment (chirp), and the whole shot."""
+"""Names of the segments (chirps) and of the shot, each of which has a probability of detection."""
 
 
 def segment_variable_name(quantity: str, segment: str) -> str:
@@ -112,8 +112,8 @@ def false_alarms_per_second(
         Shots per second, ``"20 Hz"`` or a number. By default it is the highest rate possible, 1 /
         (looks * segments * (duration + gap)).
     leakage
-        If true, extra groups raised by leaked signal count in addition to noise. A study that draws
-        whole spectra always counts every false alarm of a shot, from both causes.
+        If true, false alarms due to leaked signal count in addition to those due to noise. A study
+        that draws whole spectra always counts every false alarm of a shot, from both causes.
 
     Returns
     -------

@@ -71,7 +71,7 @@ def compute_answer_per_study(
     }
     if not require_axes and not names_from_sweep & {*dataset.coords, *dataset.attrs}:
         return answer(dataset)  # not from a store: the answer needs nothing but the arrays
-    dim = _join_dimension(dataset)
+    dim = _joined_dimension(dataset)
     if not dim:
         return answer(check_single_study(dataset, require_axes=require_axes))
     answers = [
@@ -102,7 +102,7 @@ def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset
         The dataset comes from no study or from several, its coordinates were changed, a dimension
         is not an axis, or (with ``require_axes``) the coordinate of an axis is missing.
     """
-    _join_dimension(dataset, refuse_join=True)
+    _joined_dimension(dataset, refuse_join=True)
     spec = spec_of_dataset(dataset)
     dataset = _restore_coordinate_attributes(dataset, spec)
     if JOINED_SPECS_ATTRIBUTE in dataset.attrs:
@@ -131,7 +131,7 @@ def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> N
             )
 
 
-def _join_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
+def _joined_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
     """Return the dimension along which a dataset joins several studies, or '' for a single study.
 
     Raise ValueError if the dataset proves neither. With ``refuse_join`` a join is an error too.
@@ -185,7 +185,7 @@ def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSp
 
 
 def _study_value_mask(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
-    """Return a mask of those values of a coordinate that the study has for its parameter."""
+    """Return a mask of the values of a coordinate that occur in the study's spec."""
     path = coord.attrs["path"]
     axis_values = [
         np.asarray(axis_parameter.values)

@@ -135,13 +135,13 @@ class ObliqueView:
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {"depthshade": False}
-    """Options of matplotlib\'s `scatter` for this kind of view."""
+    """Options of matplotlib's `scatter` for this kind of view."""
 
     def __init__(
         self, cloud: PointCloud, azimuth: float, elevation: float, *, title: str, caption: str
     ) -> None:
         self.cloud = cloud
-        self.draw_order = np.arange(cloud.is_true.size)
+        self.draw_order = np.arange(cloud.true_point_mask.size)
         low, high = self._projected_box(azimuth, elevation)
         inches_per_unit = min(
             OBLIQUE_WIDTH_MAX_INCHES / (high[0] - low[0]),
@@ -224,8 +224,8 @@ class ObliqueView:
             [(x - view_limits.x0) / view_limits.width, (y - view_limits.y0) / view_limits.height]
         )
 
-    def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """Return the coordinates of world positions (3, n) that the axes plot: x, y and z."""
+    def to_axes_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
+        """Convert world positions (3, n) to the coordinates that axes plot: x, y and z, (n,)."""
         return list(positions)
 
     def to_picture_inches(self, positions: np.ndarray) -> np.ndarray:
@@ -274,7 +274,7 @@ class AxisAlignedView:
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {}
-    """Options of matplotlib\'s `scatter` for this kind of view."""
+    """Options of matplotlib's `scatter` for this kind of view."""
 
     def __init__(
         self,
@@ -322,13 +322,13 @@ class AxisAlignedView:
             xlim=self.cloud.box[self.axis_names[0]], ylim=self.cloud.box[self.axis_names[1]]
         )
 
-    def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """Return two of the coordinates of world positions (3, n): those that the axes plot."""
+    def to_axes_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
+        """Convert world positions (3, n) to the two coordinates that the axes plot, (n,) each."""
         return [positions[WORLD_AXES.index(axis)] for axis in self.axis_names[:2]]
 
     def to_picture_inches(self, positions: np.ndarray) -> np.ndarray:
         """Return world positions (3, n) as positions on the picture, (2, n) [inches]."""
-        return self.inches_per_unit * np.array(self.plot_coordinates(positions))
+        return self.inches_per_unit * np.array(self.to_axes_coordinates(positions))
 
     def draw_ground(self, height_map: HeightMap) -> bool:
         """Draw the ground: from above as relief with contours, from the side as an area.
@@ -396,10 +396,10 @@ class AxisAlignedView:
 def _draw_cloud_marks(picture: AxisAlignedView | ObliqueView, point_colours: np.ndarray) -> None:
     """Draw the true points, the false points, the shots without a point, and the flight path."""
     axes: Any = picture.axes
-    cloud, to_columns = picture.cloud, picture.plot_coordinates
+    cloud, to_columns = picture.cloud, picture.to_axes_coordinates
     positions = np.array([cloud.points[axis] for axis in WORLD_AXES])
     area = point_styles.marker_area(picture.to_picture_inches(positions), *picture.size_inches)
-    is_true = cloud.is_true[picture.draw_order]
+    is_true = cloud.true_point_mask[picture.draw_order]
     true_indices, false_indices = picture.draw_order[is_true], picture.draw_order[~is_true]
     axes.scatter(
         *to_columns(positions[:, true_indices]),
@@ -490,7 +490,7 @@ def draw_cloud_sheet(
     """
     values = to_displayed_values(quantity, cloud.points[quantity])
     colouring = point_styles.choose_colours(
-        quantity, values, is_trusted=cloud.is_true, surfaces=surfaces
+        quantity, values, is_trusted=cloud.true_point_mask, surfaces=surfaces
     )
     caption = labels.join_sentences([*cloud.remarks, *remarks])
     picture: AxisAlignedView | ObliqueView
@@ -510,7 +510,7 @@ def draw_cloud_sheet(
 def _legend_handles(cloud: PointCloud, *, shows_ground: bool) -> list[Any]:
     """Return the legend entries for everything in a picture except the colours of points."""
     handles: list[Any] = []
-    if not cloud.is_true.all():
+    if not cloud.true_point_mask.all():
         handles.append(point_styles.false_point_legend_marker())
     if cloud.dropouts and cloud.dropouts["x"].size:
         style = {"markerfacecolor": "none", "markeredgecolor": DROPOUT_COLOUR, "markersize": 5}
@@ -524,7 +524,7 @@ def _legend_handles(cloud: PointCloud, *, shows_ground: bool) -> list[Any]:
     return handles
 
 
-SCATTER_SIZE_INCHES = 7.6, 4.6
+SCATTER_PLOT_SIZE_INCHES = 7.6, 4.6
 """Width and height of a scatter plot [inches]."""
 
 
@@ -556,17 +556,18 @@ def draw_scatter_sheet(
             f"{labels.number_with_noun(n_outside, 'false point')} outside of the picture"
         )
     picture_sheet = SheetWithLegends(
-        SCATTER_SIZE_INCHES[0] + AXIS_MARGINS_INCHES[0],
-        SCATTER_SIZE_INCHES[1] + AXIS_MARGINS_INCHES[1],
+        SCATTER_PLOT_SIZE_INCHES[0] + AXIS_MARGINS_INCHES[0],
+        SCATTER_PLOT_SIZE_INCHES[1] + AXIS_MARGINS_INCHES[1],
         title=title,
         caption=labels.join_sentences([*count_texts, *remarks]),
     )
-    axes = picture_sheet.add_axes(*AXIS_MARGINS_INCHES, *SCATTER_SIZE_INCHES)
+    axes = picture_sheet.add_axes(*AXIS_MARGINS_INCHES, *SCATTER_PLOT_SIZE_INCHES)
     _set_scatter_axes(axes, limits, (x, y))
     rgba = colouring.to_rgba_colours(values)
     positions = np.array([columns[x], columns[y]])
     area = point_styles.marker_area(
-        axes.transData.transform(positions[:, is_inside].T).T / canvas.PNG_DPI, *SCATTER_SIZE_INCHES
+        axes.transData.transform(positions[:, is_inside].T).T / canvas.PNG_DPI,
+        *SCATTER_PLOT_SIZE_INCHES,
     )
     is_true_inside, is_false_inside = is_inside & is_true, is_inside & ~is_true
     x_values, y_values = positions

@@ -1,9 +1,9 @@
 """Comparison of a flight's actual errors with the standard errors that it states.
 
 A flight's store contains the truth. Errors of true points divided by their standard errors should
-have a size of about 1. So should errors of velocity and altitude relative to their covariances. Far
-larger ratios come from effects that the standard errors do not include, such as unstated relief or
-speckle.
+have a size of about 1. The same holds for errors of velocity and altitude relative to their
+covariances. Far larger ratios come from effects that the standard errors do not include, such as
+unstated relief or speckle.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.storage.locations import Location
 
-ERROR_RATIO_MAX = 2.0
+CONSISTENT_ERROR_RATIO_MAX = 2.0
 """Largest ratio of actual errors to stated standard errors that counts as consistent."""
 
 _JUDGED_ERRORS_MIN = 20
-"""Least number of errors from which their size is judged."""
+"""Least number of errors that suffices to judge whether they are consistent."""
 
 _SAMPLED_SHOTS_MAX, _SAMPLED_DRAWS_MAX, _SAMPLED_VALUES_PER_AXIS_MAX = 1 << 15, 16, 6
 """Largest numbers of shots, of draws, and of values per axis whose errors are read."""
 
-_SAMPLED_FLIGHT_INTERVALS = 16
+_N_SAMPLED_FLIGHT_INTERVALS = 16
 """Number of evenly spaced parts of a long flight whose errors are read."""
 
-_COMPARED_QUANTILES = 0.6827, 0.9545
-"""Fractions (probabilities) at which quantiles of actual errors are compared with normal ones."""
+_COMPARED_QUANTILE_LEVELS = 0.6827, 0.9545
+"""Levels (0..1) at which quantiles of actual errors are compared with those of normal errors."""
 
 _SCALAR_NORMAL_QUANTILES, _VECTOR_NORMAL_QUANTILES = (1.0, 2.0), (1.8780, 2.8328)
 """Quantiles at 68.27 % and 95.45 % of the length of a normal error, in standard errors.
@@ -65,7 +65,9 @@ class ConsistencyResult(NamedTuple):
     @property
     def is_consistent(self) -> bool:
         """True if errors are about as large as stated, or too few for a judgement."""
-        return self.n_errors < _JUDGED_ERRORS_MIN or not self.error_ratio > ERROR_RATIO_MAX
+        return (
+            self.n_errors < _JUDGED_ERRORS_MIN or not self.error_ratio > CONSISTENT_ERROR_RATIO_MAX
+        )
 
     @property
     def message(self) -> str:
@@ -115,7 +117,7 @@ def check_error_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
                     else _SCALAR_NORMAL_QUANTILES
                 )
                 error_ratio = np.max(
-                    np.quantile(normalised_errors, _COMPARED_QUANTILES) / reference_quantiles
+                    np.quantile(normalised_errors, _COMPARED_QUANTILE_LEVELS) / reference_quantiles
                 )
             results.append(
                 ConsistencyResult(scanner, quantity, float(error_ratio), normalised_errors.size)
@@ -126,8 +128,8 @@ def check_error_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
 def understated_error_messages(store: str | Location, scanner: str | None = None) -> list[str]:
     """Return a sentence for each quantity of a store whose errors are far larger than stated.
 
-    ``scanner`` is the only scanner to check; None stands for all. The store of a grid has no such
-    errors, and gives an empty list.
+    ``scanner`` is the only scanner to check; None stands for all. Raise NotAStoreError if the store
+    is not that of a flight.
     """
     from sweep.analysis.datasets import open_scene_tree
     from sweep.storage.locations import parse_location
@@ -158,7 +160,7 @@ def _iter_flight_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
     group = group.isel({"draw": slice(_SAMPLED_DRAWS_MAX), **axis_indices})
     n_cycles = n_shots // shots_per_cycle
     n_sampled_cycles = min(n_cycles, max(1, _SAMPLED_SHOTS_MAX // shots_per_cycle))
-    n_intervals = 1 if n_sampled_cycles == n_cycles else _SAMPLED_FLIGHT_INTERVALS
+    n_intervals = 1 if n_sampled_cycles == n_cycles else _N_SAMPLED_FLIGHT_INTERVALS
     cycles_per_interval = max(1, n_sampled_cycles // n_intervals)
     for first_cycle in np.unique(
         np.linspace(0, n_cycles - cycles_per_interval, n_intervals).astype(int)

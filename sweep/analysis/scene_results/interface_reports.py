@@ -19,6 +19,7 @@ from sweep.analysis import labels
 from sweep.analysis.scene_results.point_export import resolve_recording
 from sweep.analysis.scene_results.recordings import (
     INTERPOLATED_RANGES,
+    ColumnArrays,
     Recording,
     quantity_array_name,
 )
@@ -65,9 +66,6 @@ It allows for rounding errors of times.
 """
 _REPORTS_PER_SHOT_MAX = 10
 """Largest number of reports per shot. A higher rate of reports is refused: most would be empty."""
-
-ColumnArrays = dict[str, np.ndarray]
-"""Columns of a table by name, all of equal length."""
 
 
 def reports(

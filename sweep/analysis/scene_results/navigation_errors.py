@@ -43,7 +43,7 @@ class ErrorTally:
     The second dimension is the component of the solution.
     """
     mean_stated_variance: np.ndarray
-    """Mean variance that solutions state for themselves, by altitude bin (bins, m).
+    """Mean of the error variances that solutions state, by altitude bin (bins, m).
 
     The second dimension is the component of the solution.
     """
@@ -135,7 +135,7 @@ class ErrorCurve:
 
     @property
     def stated_deviation(self) -> np.ndarray:
-        """Standard deviation that the solutions state, as a root mean square, like `rmse`."""
+        """Root of the mean variance that the solutions state, in the shape of `rmse`."""
         return _append_vector_length(np.sqrt(self.tally.stated_variance))
 
 

@@ -73,9 +73,9 @@ class PointTable:
 
     recording: Recording
     """Recording of a scanner."""
-    draw: int
+    draw_number: int
     """Number of the draw."""
-    ranges: str
+    range_kind: str
     """Kind of ranges: ``interpolated`` or ``quantised``."""
     origin: np.ndarray
     """Offset that is added to the stored coordinates (3,) [m]."""
@@ -91,7 +91,7 @@ class PointTable:
         ]
         for shot_slice in self.recording.iter_shot_slices():
             column_arrays = self.recording.point_columns(
-                [*stored_columns, "returns"], shot_slice, self.draw, self.ranges
+                [*stored_columns, "returns"], shot_slice, self.draw_number, self.range_kind
             )
             rows = np.zeros(column_arrays["x"].size, POINT_DTYPE)
             for name in stored_columns:
@@ -127,7 +127,7 @@ class PointTable:
     def count_points(self) -> int:
         """Return the number of points of the table."""
         return sum(
-            int((self.recording.read_array("flags", shot_slice, self.draw) > 0).sum())
+            int((self.recording.read_array("flags", shot_slice, self.draw_number) > 0).sum())
             for shot_slice in self.recording.iter_shot_slices()
         )
 
@@ -138,7 +138,9 @@ class PointTable:
         """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for shot_slice in self.recording.iter_shot_slices():
-            column_arrays = self.recording.point_columns("xyz", shot_slice, self.draw, self.ranges)
+            column_arrays = self.recording.point_columns(
+                "xyz", shot_slice, self.draw_number, self.range_kind
+            )
             coordinates = np.array([*column_arrays.values()]) + self.origin[:, None]
             low = np.minimum(low, coordinates.min(axis=1, initial=np.inf))
             high = np.maximum(high, coordinates.max(axis=1, initial=-np.inf))
@@ -287,7 +289,7 @@ def _to_las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # t
         points[axis] = rows[axis]
     points["gps_time"] = rows["time"]
     for name, return_numbers in zip(
-        ("return_number", "number_of_returns"), _number_returns_by_range(rows), strict=True
+        ("return_number", "number_of_returns"), _assign_return_numbers(rows), strict=True
     ):
         points[name] = np.minimum(return_numbers, LAS_RETURN_NUMBER_MAX)
     points[_STORED_RETURN_NUMBER_FIELD] = rows["return_number"]
@@ -303,7 +305,7 @@ def _to_las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # t
     return points
 
 
-def _number_returns_by_range(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _assign_return_numbers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Assign return numbers to the points of each shot, from 1 by rising range.
 
     True and false points are numbered separately. ``rows`` are points of `POINT_DTYPE`, and contain
@@ -347,9 +349,9 @@ def export(
 ) -> int:
     """Write the points of one scanner and draw to a file.
 
-    Coordinates are those of the scene's files in metres: the scene's origin is added to the stored
-    ones. For a raster in feet they are its coordinates times the length of a foot. Times are those
-    of the platform's table of waypoints; without a table they begin with the flight. Radial
+    Coordinates are those of the scene's files, in metres: the scene's origin is added to stored
+    coordinates. A raster's coordinates in feet are converted to metres. Times are those of the
+    platform's table of waypoints; without a table they begin with the flight. Radial
     velocities are positive when closing. Points are written in the order of shots and returns, part
     by part. Points that are not computed yet are left out. The file appears only once it is
     complete.
@@ -509,7 +511,7 @@ def _file_remarks(
         f"flag {bit}: {labels.coordinate_label(name)}" for name, bit in FLAG_BITS.items()
     ]
     selection_remark = (
-        f"scanner {table.recording.scanner}, draw {table.draw}, {table.ranges} ranges"
+        f"scanner {table.recording.scanner}, draw {table.draw_number}, {table.range_kind} ranges"
     )
     consistency_messages = [
         result.message

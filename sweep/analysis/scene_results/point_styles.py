@@ -41,7 +41,7 @@ MISSING_POINT_COLOUR = "0.6"
 """Colour of points whose value is not known, or whose category has no colour of its own."""
 
 OUTLIER_MARGIN_FRACTION = 0.25
-"""Distance beyond the 0.5 % or 99.5 % quantile above which a value does not extend a colour scale.
+"""Distance from the 0.5 % or 99.5 % quantile beyond which colour scales leave out values.
 
 It is a fraction of the difference between both quantiles.
 """
@@ -244,7 +244,7 @@ MARKER_AREA_MAX = 24.0
 """Largest area of the marker of a point of the cloud [(1/72 inch)^2]."""
 
 MARKER_AREA_MIN_BY_POINT_COUNT = ((2000, 9.0), (8000, 5.0), (30_000, 2.0), (math.inf, 0.7))
-"""Least areas of markers [(1/72 inch)^2], each with the largest number of points that it is for."""
+"""Pairs of a number of points, and the least area of markers [(1/72 inch)^2] up to this number."""
 
 TICK_SPACING_MIN_X_INCHES, TICK_SPACING_MIN_Y_INCHES = 0.42, 0.25
 """Least spacing of legible ticks on horizontal and vertical axes [inches]."""

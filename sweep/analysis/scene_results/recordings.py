@@ -199,9 +199,10 @@ class Recording:
         return int(self.dataset.sizes["shot"])
 
     def iter_shot_slices(self, time_limits: ValueLimits = UNLIMITED_VALUES) -> Iterator[slice]:
-        """Yield the slices in which shots are read: those with a computed shot within time limits.
+        """Yield slices of shots that are read together, in the order of shots.
 
-        `time_limits` are the earliest and the latest time [s].
+        Slices without a computed shot within `time_limits`, the earliest and the latest time [s],
+        are skipped.
         """
         for shot_slice in chunk_aligned_slices(self.dataset["flags"], "shot"):
             if within_limits_mask(
@@ -212,9 +213,9 @@ class Recording:
     def computed_shot_mask(self, shot_slice: slice, draw: int = 0) -> np.ndarray:
         """Return a mask (k,) of the k shots of a slice whose points are computed for a draw.
 
-        The geometry of a shot is stored as soon as one draw at one axis position is computed. A
-        shot that is not computed has no points, like one that detects nothing. Only the existence
-        of the stored chunk shows which is the case.
+        A shot that is not computed has no points, like one that detects nothing; only the existence
+        of its stored chunk tells them apart. Its geometry proves nothing, as it is stored with the
+        first draw at any axis position.
         """
         has_geometry = np.isfinite(self.read_array("time", shot_slice))
         if self.flags_chunk_folder is None:
@@ -570,9 +571,9 @@ class PointCloud:
     path: ColumnArrays
     """Columns x, y and z of the flight path [m]; empty if it was not requested."""
     thinned_points: ThinnedRows
-    """Points before those outside the box were left out, with the number of all points."""
+    """Points including those outside the box, with the number of points before thinning."""
     thinned_dropouts: ThinnedRows
-    """Positions of the dropouts, with the number of all dropouts."""
+    """Positions of the dropouts, with their number before thinning."""
     n_outside: int
     """Number of false points that are left out because they lie outside the box."""
     box: CoordinateBox
@@ -587,7 +588,7 @@ class PointCloud:
         return self.thinned_dropouts.to_columns()
 
     @property
-    def is_true(self) -> np.ndarray:
+    def true_point_mask(self) -> np.ndarray:
         """Mask of the true points among the points."""
         return np.asarray((self.points["flags"] & TRUE_FLAG) > 0)
 
@@ -630,7 +631,7 @@ def gather_point_cloud(
     crops
         Lowest and highest value of quantities, by name. Points outside are left out.
     with_dropouts, with_path
-        If true, shots without a point are read too, and the flight path.
+        If true, the shots without a point, or the flight path, are read too.
     points_max
         Largest number of points; a larger number is thinned.
 
