@@ -42,9 +42,9 @@ Its value is the JSON text of a mapping by study id.
 def study_marker_name(study_ids: Iterable[str]) -> str:
     """Return the name of the coordinate that marks the data of a study, or of joined studies.
 
-    When xarray merges datasets, it drops conflicting coordinates, or keeps that of the first dataset.
-    It always keeps a coordinate that only one dataset has. The study id is therefore part of the
-    marker's name: a merge of two studies has two markers.
+    When xarray merges datasets, it drops a coordinate that differs between them, or keeps that of
+    the first dataset. It always keeps a coordinate that only one dataset has. The study id is
+    therefore part of the marker's name: a merge of two studies has two markers.
     """
     study_ids = list(study_ids)
     if len(study_ids) == 1:
