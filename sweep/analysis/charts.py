@@ -119,7 +119,7 @@ class Panel:
     """
 
     facet_choices: Mapping[str, str]
-    """Choice of each facet at which a page shows the panel, by the facet's name.
+    """Choices at which a page shows the panel, by the name of the facet.
 
     A facet is a property by which panels differ, such as the part of the study.
     """
@@ -209,9 +209,9 @@ _LARGEST_IS_WORST_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
 class CoordinateAxis:
     """Axis along which a coordinate of a study is shown, in display units."""
 
-    axis: ChartAxis
+    chart_axis: ChartAxis
     """Label, scale and limits."""
-    factor: float
+    unit_factor: float
     """Factor from the units of the coordinate to those of the axis."""
     units: str
     """Units of the axis; empty for categories."""
@@ -230,9 +230,9 @@ class CoordinateAxis:
 
     def to_axis_units(self, values: np.ndarray) -> np.ndarray:
         """Convert values of the coordinate to the units of the axis; categories become text."""
-        if self.axis.kind == CATEGORY_SCALE:
+        if self.chart_axis.kind == CATEGORY_SCALE:
             return np.array([str(value) for value in values])
-        return values * self.factor
+        return values * self.unit_factor
 
     def describe_span(self, values: np.ndarray) -> str:
         """Return a text with the label of the axis, and the first and last value."""
@@ -240,7 +240,7 @@ class CoordinateAxis:
         end_texts = [
             labels.format_quantity(v, self.units) for v in (axis_values[0], axis_values[-1])
         ]
-        return f"{self.axis.label} from {end_texts[0]} to {end_texts[1]}"
+        return f"{self.chart_axis.label} from {end_texts[0]} to {end_texts[1]}"
 
 
 def is_log_spaced(values: np.ndarray) -> bool:
@@ -386,14 +386,16 @@ def surface_chart(
             x_coordinate.cell_means(cells_max[0]),
             y_coordinate.cell_means(cells_max[1]),
         )
-        contour_levels = () if CATEGORY_SCALE in (x_axis.axis.kind, y_axis.axis.kind) else levels
+        contour_levels = (
+            () if CATEGORY_SCALE in (x_axis.chart_axis.kind, y_axis.chart_axis.kind) else levels
+        )
         layer = HeatMap(
             x_axis.to_axis_units(x_values),
             y_axis.to_axis_units(y_values),
             layers[len(panels)],
             contour_levels,
         )
-        panels.append(Panel(facet_choices, x_axis.axis, y_axis.axis, heat_map=layer))
+        panels.append(Panel(facet_choices, x_axis.chart_axis, y_axis.chart_axis, heat_map=layer))
     span_texts = [
         coordinate_axis.describe_span(np.unique(points.coordinate_values(n)))
         for coordinate_axis, n in ((x_axis, x), (y_axis, y))
@@ -623,7 +625,7 @@ def make_line_panels(
         )
         lines_by_part.setdefault(part, []).append(styled_line)
     return [
-        Panel({"part": p} | further_choices, x_axis.axis, y_axis, lines)
+        Panel({"part": p} | further_choices, x_axis.chart_axis, y_axis, lines)
         for p, lines in lines_by_part.items()
     ]
 

@@ -192,7 +192,7 @@ class PointSelection:
         return SortedCoordinate(dim, np.asarray(self.table_by_dim[dim].index)[first_rows], values)
 
     def first_indices(self, *coordinates: SortedCoordinate) -> dict[str, int]:
-        """Return the first selected index of each dimension that no coordinate runs along."""
+        """Return the first selected index of each dimension, except those of given coordinates."""
         shown_dims = {coordinate.dim for coordinate in coordinates}
         return {
             dim: int(table.index[0])

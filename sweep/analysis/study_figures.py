@@ -387,7 +387,7 @@ def _picture_remarks(
 ) -> list[str]:
     """Return caption sentences with the picture's scanner, ranges, draw, axis values and source.
 
-    What has only one possible value is not stated.
+    The scanner and the draw are stated only if there are several.
     """
     choice_texts = []
     if len(results.scanners) > 1:

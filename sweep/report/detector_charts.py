@@ -65,7 +65,7 @@ ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
 N_ROC_DRAWS = 400
 """Number of draws with which the ROC curve of a point with random effects is simulated."""
 
-PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
+PFA_WITH_LEAKAGE_VARIABLE = "pfa_both_chirps_with_leakage"
 """Name of the variable for false alarms in both chirps, by noise or by leakage.
 
 Leakage is signal in the window's sidelobes.
@@ -78,7 +78,7 @@ _LABEL_BY_ALARM_VARIABLE = {
     "pfa_shot": "noise, any",
     "p_leakage_up": "leakage, up",
     "p_leakage_down": "leakage, down",
-    PFA_WITH_LEAKAGE_NAME: "either, both",
+    PFA_WITH_LEAKAGE_VARIABLE: "either, both",
 }
 """Short legend labels of the false-alarm variables."""
 
@@ -252,7 +252,10 @@ def _point_label(profile: GridProfile, index: int) -> str:
 
 
 def _roc_indices(profile: GridProfile) -> np.ndarray:
-    """Return the indices along a profile whose pd is closest to the `ROC_POINT_SELECTION_PDS`."""
+    """Return the indices of those points of a profile for which ROC curves are drawn.
+
+    Their pd is closest to a value of `ROC_POINT_SELECTION_PDS`.
+    """
     indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_CELLS)
     pd = profile.variable_values("pd_shot", indices)
     if not np.isfinite(pd).any():
@@ -285,7 +288,7 @@ def grid_noise_budget_chart(
             x_axis, x = ChartAxis(), indices
         else:
             x_axis, x = (
-                profile.coordinate_axis.axis,
+                profile.coordinate_axis.chart_axis,
                 profile.coordinate_axis.to_axis_units(profile.coordinate.values[indices]),
             )
         panels.append(noise_budget_panel({"part": profile.label}, x_axis, x, budgets))
@@ -363,8 +366,8 @@ def false_alarm_chart(
     coordinate_name = profiles[0].coordinate_name
     pfa_with_leakage = probability.false_alarms_per_shot(results.dataset, leakage=True)
     alarm_dataset = results.dataset[
-        [v for v in _LABEL_BY_ALARM_VARIABLE if v != PFA_WITH_LEAKAGE_NAME]
-    ].assign({PFA_WITH_LEAKAGE_NAME: pfa_with_leakage})
+        [v for v in _LABEL_BY_ALARM_VARIABLE if v != PFA_WITH_LEAKAGE_VARIABLE]
+    ].assign({PFA_WITH_LEAKAGE_VARIABLE: pfa_with_leakage})
     labelled_lines: list[charts.LabelledLinePoints] = []
     drawn_lines: list[ChartLine] = []
     remarks: list[str] = []
@@ -398,7 +401,7 @@ def false_alarm_chart(
     return Chart(
         "False alarms",
         charts.lines_alt_text(
-            "probabilities of false alarms and leakage", x_axis.axis.label, panels[0]
+            "probabilities of false alarms and leakage", x_axis.chart_axis.label, panels[0]
         ),
         [f"A bin of noise alone crosses with probability {closed_form:.3g} in closed form"
          if has_one_threshold else "",
@@ -466,7 +469,9 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
     max_ranges = [
         NamedPart(
             words,
-            _compute_maximum_range(shown_points, range_parameter.coordinate, range_axis.factor),
+            _compute_maximum_range(
+                shown_points, range_parameter.coordinate, range_axis.unit_factor
+            ),
         )
         for words, shown_points in shown_parts
     ]

@@ -60,7 +60,7 @@ _TRUTH_VARIABLE_BY_COLUMN = {
 """Stored variables with the true values along the beam, by column of the reports."""
 
 _PERIOD_END_TOLERANCE_FRACTION = 1e-6
-"""Time before the end of a report's period from which a shot counts to the next period [periods].
+"""Fraction of a report's period before its end in which shots count to the next period.
 
 It allows for rounding errors of times.
 """
