@@ -1,6 +1,7 @@
 """Kinds of accuracy settings, as the stores of `sweep accuracy` hold them.
 
-An accuracy setting is a choice of tolerance, effects, beamlets or draws.
+An accuracy setting is a choice of tolerance, effects, beamlets or draws. The thesis is D. B.
+Chester, *A Parameterized Simulation of Doppler Lidar*, Utah State University, 2017.
 """
 
 AS_WRITTEN_KIND = "as written"
@@ -19,16 +20,16 @@ Beamlets are the rays that sample the cross-section of a beam.
 BEAMLET_ROW_KIND = "in a line"
 """Kind of settings with a fixed number of beamlets in a line."""
 CLOSED_FORM_KIND = "closed form"
-"""Kind of settings that compute the thesis's effects in closed form."""
+"""Kind of settings that compute only the thesis's effects, in closed form."""
 THESIS_KIND = "thesis"
 """Kind of settings that compute by the thesis's method."""
 IMPROVED_THESIS_KIND = "thesis improved"
 """Kind of settings that compute by an improved form of the thesis's method."""
 REFERENCE_KIND = "reference"
-"""Kind of the reference, the most accurate setting, to which all are compared."""
+"""Kind of the reference: the most accurate setting, with which all others are compared."""
 MEAN_OF_DRAWS_KIND = "means of draws"
-"""Kind of settings with a fixed number of draws, over which pd is averaged."""
+"""Kind of settings that average pd over a fixed number of draws."""
 COUNTED_DRAWS_KIND = "draws counted"
-"""Kind of settings with a fixed number of draws, in which detections are counted."""
+"""Kind of settings that count detections in a fixed number of draws."""
 DRAWS_IN_NOISE_KIND = "draws in noise"
 """Kind of settings that count detections in a fixed number of draws with noise in every bin."""

@@ -54,7 +54,7 @@ def is_draft_file(name: str) -> bool:
 
 
 def list_foreign_files(store: Path) -> list[str]:
-    """List foreign files and folders of a store, by relative path; folders end in a slash."""
+    """Return the relative paths of a store's foreign files and folders; folders end in a slash."""
     node_names = _read_node_names(store)
     return sorted(
         _iter_foreign_files(store, "", node_names, {*node_names, *_iter_parent_groups(node_names)})
@@ -129,7 +129,7 @@ def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
 def move_foreign_files(old_store: Path, new_store: Path) -> None:
     """Move the foreign files of a store to its replacement; raise OSError if one can't be moved.
 
-    If the name of a file exists there already, a number is appended to its name.
+    If the replacement already has a file of the same path, a number is appended to the name.
     """
     if not old_store.is_dir() or old_store.is_symlink():
         return

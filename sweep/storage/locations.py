@@ -41,7 +41,7 @@ from sweep.messages import escape_unprintable
 from sweep.regular_files import check_file_size, open_file_below_root, read_file_below_root
 
 #: URL schemes of object stores; `memory` is for tests, and exists only within its process.
-URL_SCHEMES = ("s3", "gs", "az", "memory")
+OBJECT_STORE_URL_SCHEMES = ("s3", "gs", "az", "memory")
 
 #: Directory of the journal inside a store.
 JOURNAL_DIR = ".sweep"
@@ -52,10 +52,10 @@ DRAFT_SUFFIX = ".partial"
 #: Attribute that marks a packed copy of a store: its files are shards of many chunks.
 PACKED_ATTRIBUTE = "packed"
 
-#: Number of requests to an object store at a time. A request takes milliseconds, mostly waiting.
+#: Largest number of simultaneous requests to an object store. A request is mostly waiting.
 CONCURRENT_REQUESTS_MAX = 16
 
-#: How often a request is repeated after HTTP status 500 and above, timeouts and lost connections.
+#: Settings for repeating a request after HTTP status 500 and above, timeouts and lost connections.
 RETRY_CONFIG = {
     "max_retries": 8,
     "retry_timeout": timedelta(seconds=90),
@@ -66,14 +66,16 @@ RETRY_CONFIG = {
     },
 }
 
-#: How often the first request is repeated. A wrong address is then likelier than a transient fault.
+#: Settings for repeating the first request to a bucket. It is repeated less often, as a wrong
+#: address is likelier than a transient fault.
 FIRST_CONTACT_RETRY_CONFIG = {
     **RETRY_CONFIG,
     "max_retries": 3,
     "retry_timeout": timedelta(seconds=10),
 }
 
-CLIENT_OPTIONS = {"timeout": "30s", "connect_timeout": "5s"}
+#: Timeouts of requests to an object store, and of connecting to it.
+OBJECT_STORE_TIMEOUTS = {"timeout": "30s", "connect_timeout": "5s"}
 
 ObjectVersion = Any
 """Tag (ETag or version) by which an object store distinguishes the versions of an object."""
@@ -85,16 +87,20 @@ class VersionedContent(NamedTuple):
     content: bytes
     """Content of the object."""
     version: ObjectVersion
-    """Version by which a later write tells whether the object has changed since."""
+    """Version of the object, by which a later write detects changes by other processes."""
 
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+ItemT = TypeVar("ItemT")
+"""Type of the items to which `map_concurrently` applies a function."""
+ResultT = TypeVar("ResultT")
+"""Type that a function called by this module returns."""
 
-#: Error texts of the library for a truncated response body and a truncated listing.
+#: Error texts of obstore for a truncated response body and a truncated listing.
 _TRUNCATED_RESPONSE_TEXTS = ("body error", "invalid list response")
 
 _clients: dict[str, Any] = {}
+"""Clients of the buckets that this process has connected to, by URL of the bucket."""
+
 _clients_lock = threading.RLock()
 
 
@@ -107,7 +113,7 @@ class ObjectStoreError(OSError):
 
 @dataclass(frozen=True, order=True)
 class ObjectPath:
-    """Key in an object store, with the part of the interface of `pathlib.Path` that sweep needs."""
+    """Key in an object store, with those methods of `pathlib.Path` that sweep needs."""
 
     bucket_url: str  # scheme and bucket, such as s3://bucket
     key: str  # without a slash at either end
@@ -121,7 +127,7 @@ class ObjectPath:
         )
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """Return the path whose key is this key with further parts appended."""
+        """Return a path below this one: its key with further parts appended."""
         return self / "/".join(others)
 
     @property
@@ -161,24 +167,24 @@ class ObjectPath:
                     _clients[self.bucket_url] = _connect_to_bucket(self.bucket_url, RETRY_CONFIG)
             return _clients[self.bucket_url]
 
-    def _head_object(self) -> Any:
+    def _read_object_metadata(self) -> Any:
         """Return the metadata of the object, or None if it does not exist."""
         with translate_errors(self), suppress(FileNotFoundError):
             return self.client.head(self.key)
 
     def exists(self) -> bool:
-        """Tell whether an object has this key, or a Zarr group or array lies under it."""
+        """Return True if an object has this key, or if the key is that of a Zarr group or array."""
         return self.size() >= 0 or (self / "zarr.json").size() >= 0
 
     def size(self) -> int:
         """Return the size of the object [bytes], or -1 if it does not exist."""
-        head = self._head_object()
-        return -1 if head is None else int(head["size"])
+        metadata = self._read_object_metadata()
+        return -1 if metadata is None else int(metadata["size"])
 
     def last_modified(self) -> float | None:
         """Return the time of the last write [s since the epoch], or None if no object exists."""
-        head = self._head_object()
-        return None if head is None else float(head["last_modified"].timestamp())
+        metadata = self._read_object_metadata()
+        return None if metadata is None else float(metadata["last_modified"].timestamp())
 
     def read_bytes(self, bytes_max: int | None = None) -> bytes:
         """Read the whole object, and once more if the response body is truncated.
@@ -223,7 +229,7 @@ class ObjectPath:
                             last, is_repeated = entry["path"], False
                     return
                 except BaseError as error:
-                    if is_repeated or not _is_truncated_response(error):
+                    if is_repeated or not _is_truncation_error(error):
                         raise
                     is_repeated = True  # list again, from the last key that was received
 
@@ -234,7 +240,7 @@ class ObjectPath:
         return sorted(path.rpartition("/")[2] for path in paths)
 
     def is_dir(self) -> bool:
-        """Tell whether any keys lie under this one."""
+        """Return True if any object lies below this key."""
         return bool(self._list_child_names())
 
     def glob(self, pattern: str) -> list[ObjectPath]:
@@ -255,8 +261,8 @@ class ObjectPath:
     def refuse_truncated_content(self, content: bytes) -> None:
         """Raise ObjectStoreError if a response's content is shorter than the object.
 
-        A proxy may send a truncated body with a matching content length, so the client can't
-        notice.
+        The client can't notice this if a proxy sends a truncated body with a matching content
+        length.
         """
         if len(content) < self.size():
             raise ObjectStoreError(errno.EIO, _truncation_message(self.bucket_url), str(self))
@@ -266,8 +272,8 @@ class ObjectPath:
     ) -> ObjectVersion | None:
         """Write an object only if its version is still the expected one.
 
-        Return the new version, or None if another process has written the object meanwhile. An
-        ``expected_version`` of None means that no object may exist.
+        Return the new version, or None if another process has written the object meanwhile. If
+        ``expected_version`` is None, the object must not exist yet.
         """
         from obstore.exceptions import AlreadyExistsError, PreconditionError
 
@@ -278,20 +284,20 @@ class ObjectPath:
         return None
 
 
-def _retry_if_truncated(ask: Callable[[], Result]) -> Result:
-    """Return the response of a request, which is repeated once if the response is truncated."""
+def _retry_if_truncated(ask: Callable[[], ResultT]) -> ResultT:
+    """Send a request, once more if the response is truncated, and return the response."""
     from obstore.exceptions import BaseError
 
     try:
         return ask()
     except BaseError as error:
-        if not _is_truncated_response(error):
+        if not _is_truncation_error(error):
             raise
         return ask()
 
 
-def _is_truncated_response(error: Exception) -> bool:
-    """Tell whether an error means that the body or the listing of a response was truncated."""
+def _is_truncation_error(error: Exception) -> bool:
+    """Return True if an error means that the body or the listing of a response was truncated."""
     return any(words in str(error) for words in _TRUNCATED_RESPONSE_TEXTS)
 
 
@@ -307,7 +313,7 @@ def _connect_to_bucket(bucket_url: str, retry_config: Any) -> Any:
         return MemoryStore()
     allow_http = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
     options: Any = {
-        **CLIENT_OPTIONS,
+        **OBJECT_STORE_TIMEOUTS,
         "allow_http": allow_http or _s3_endpoint_url().startswith("http:"),
     }
     return from_url(bucket_url, client_options=options, retry_config=retry_config)
@@ -354,7 +360,7 @@ def to_readable_error(error: Exception) -> Exception:
 
 
 def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
-    """Translate an error text of the object-store library to an errno and a message with remedy.
+    """Return errno, and message with remedy, for an error text of the object-store library.
 
     ``bucket_url``: scheme and bucket that the message names.
     """
@@ -413,9 +419,11 @@ def parse_location(address: str | Location) -> Location:
             f"a store is named by its path, such as 'study.zarr', and not by a {type_name}"
         )
     address_text = str(address)
-    if not re.match(rf"({'|'.join(URL_SCHEMES)}):/", address_text):
+    if not re.match(rf"({'|'.join(OBJECT_STORE_URL_SCHEMES)}):/", address_text):
         if re.match(r"(?!file:)[A-Za-z][A-Za-z0-9+.-]+:/", address_text):
-            schemes_text = ", ".join(f"{scheme}://" for scheme in URL_SCHEMES if scheme != "memory")
+            schemes_text = ", ".join(
+                f"{scheme}://" for scheme in OBJECT_STORE_URL_SCHEMES if scheme != "memory"
+            )
             raise ObjectStoreError(
                 22, f"is no place for a store: write a path, or {schemes_text}", address_text
             )
@@ -430,7 +438,7 @@ def parse_location(address: str | Location) -> Location:
 
 
 def to_zarr_store(location: Location) -> Any:
-    """Return a location in the form in which Zarr and xarray open it."""
+    """Return a location as the path or Zarr store that Zarr and xarray can open."""
     if isinstance(location, Path):
         return location
     from zarr.storage import ObjectStore, StorePath
@@ -439,8 +447,8 @@ def to_zarr_store(location: Location) -> Any:
 
 
 def map_concurrently(
-    location: Location, function: Callable[[Item], Result], items: Iterable[Item]
-) -> list[Result]:
+    location: Location, function: Callable[[ItemT], ResultT], items: Iterable[ItemT]
+) -> list[ResultT]:
     """Apply a function to all items, in order; use threads if the location is an object store."""
     if isinstance(location, Path):
         return [function(item) for item in items]
@@ -468,15 +476,15 @@ def iter_names_below(location: Location) -> Iterator[str]:
         yield from (name for name, _ in location.iter_objects_below())
         return
     prefix_length = len(str(location)) + 1
-    yield from (entry.path[prefix_length:] for entry in iter_entries_below(str(location)))
+    yield from (entry.path[prefix_length:] for entry in iter_file_entries_below(str(location)))
 
 
-def iter_entries_below(folder: str) -> Iterator[os.DirEntry[str]]:
+def iter_file_entries_below(folder: str) -> Iterator[os.DirEntry[str]]:
     """Yield the directory entries of all files and links below a folder; no link is followed."""
     with os.scandir(folder) as entries:
         for entry in entries:  # no stat of a file: there may be millions
             if entry.is_dir(follow_symlinks=False):
-                yield from iter_entries_below(entry.path)
+                yield from iter_file_entries_below(entry.path)
             else:
                 yield entry
 
@@ -497,7 +505,7 @@ def derived_files_dir(location: Location) -> Path:
 
 
 def atomic_write(location: Location, content: bytes) -> None:
-    """Write a small file atomically: readers, and a power cut, see the old or the new content."""
+    """Write a small file atomically: it has its old or its new content, even after a power cut."""
     if isinstance(location, ObjectPath):
         location.write_bytes(content)
     else:
@@ -556,10 +564,10 @@ _LEFTOVER_NAME_PATTERN = re.compile(
 )
 """Pattern of the hidden names of files that interrupted processes leave.
 
-Earlier versions of sweep wrote no host, or no start time of the process, into such names.
+Earlier versions of sweep wrote no host, or no start time of the process, into these names.
 """
 
-#: Start time that stands for a process that exists, but is hidden from other users.
+#: Result of `process_start_id` for a process that exists, but is hidden from this user.
 HIDDEN_PROCESS_START_ID = -1
 
 
@@ -635,7 +643,7 @@ def final_path_for(path: Path) -> Path:
 
 
 def can_create_store(location: Location) -> bool:
-    """Tell whether a store can be created at a location: it is missing, or an empty folder."""
+    """Return True if a store can be created at a location: nothing or an empty folder is there."""
     if isinstance(location, ObjectPath):
         return not location.exists()
     try:
@@ -726,10 +734,10 @@ def recover_interrupted_replace(location: Location) -> None:
                     _recover_leftover(path.parent / name, leftover_match)
 
 
-def store_fingerprint(location: Location) -> tuple[int, ...] | None:
-    """Return numbers that identify the store at a location; no other store ever has the same.
+def store_stat_fingerprint(location: Location) -> tuple[int, ...] | None:
+    """Return device, inode, size and times of the root document of a store on disk.
 
-    They are device, inode, size and times of the store's root document. Return None in an object
+    Together they identify the store: no other store ever has the same. Return None for an object
     store, or if the document can't be opened.
     """
     if not isinstance(location, Path):
@@ -758,7 +766,7 @@ def _recover_leftover(leftover: Path, leftover_match: re.Match[str]) -> None:
 
 
 def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
-    """Tell whether the process that writes a draft may still be running."""
+    """Return True if the process that writes a draft may still be running."""
     import psutil
 
     modified_time = draft_path.stat().st_mtime
@@ -826,7 +834,7 @@ def os_error_reason(error: OSError, path: object) -> str:
 
 
 def remedy_for_write_error(error: OSError, place: object, otherwise: str) -> str:
-    """Return the remedy for a path that can't be written; ``otherwise`` if the error has none."""
+    """Return the remedy for an error of writing, as text; ``otherwise`` if none is known."""
     if NO_FREE_INODES_MESSAGE in (error.strerror, os_error_reason(error, place)):
         return "remove files from its disk, or have one with more inodes"
     return WRITE_REMEDY_BY_ERRNO.get(error.errno or 0, otherwise)

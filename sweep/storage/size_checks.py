@@ -1,9 +1,8 @@
 """Size checks of array files before Zarr decodes them.
 
-A few kilobytes of zstd can declare a decoded size, and decode to one, that exceeds any memory. The
-metadata of an array, which are checked before, define the size of its chunks. A file is therefore
-refused unread if it is larger than possible. So is a chunk whose zstd frame declares another size,
-or none.
+A few kilobytes of zstd can decode to more bytes than any memory holds. The metadata of an array,
+which are checked first, define the size of its chunks. A file that is larger than its chunks can be
+is therefore refused unread. A chunk is refused if its zstd frame declares another size, or none.
 """
 
 from __future__ import annotations
@@ -73,8 +72,8 @@ class ArrayFileLayout(NamedTuple):
         return cls(math.prod(chunk_shape), bytes_per_value, chunks_per_shard)
 
     @property
-    def chunk_bytes_max(self) -> int:
-        """Size of an uncompressed chunk [bytes]; for strings the largest possible size."""
+    def uncompressed_chunk_bytes_max(self) -> int:
+        """Size of an uncompressed chunk [bytes]; the largest valid size if it holds strings."""
         if self.bytes_per_value:
             return self.values_per_chunk * self.bytes_per_value
         return 4 + self.values_per_chunk * (4 + STRING_BYTES_MAX)
@@ -83,8 +82,8 @@ class ArrayFileLayout(NamedTuple):
     def file_bytes_max(self) -> int:
         """Largest size of a file [bytes]."""
         if not self.chunks_per_shard:
-            return compressed_bytes_max(self.chunk_bytes_max)
-        compressed_chunk_bytes = compressed_bytes_max(self.chunk_bytes_max)
+            return compressed_bytes_max(self.uncompressed_chunk_bytes_max)
+        compressed_chunk_bytes = compressed_bytes_max(self.uncompressed_chunk_bytes_max)
         return (
             self.chunks_per_shard * (compressed_chunk_bytes + _SHARD_INDEX_ENTRY_BYTES)
             + _CHECKSUM_BYTES
@@ -96,9 +95,10 @@ class ArrayFileLayout(NamedTuple):
             self.check_chunk_decoded_size(chunk, path_in_messages)
 
     def _iter_chunks(self, content: bytes) -> Iterator[bytes]:
-        """Yield each chunk in a file of an array.
+        """Yield the chunks in a file of an array.
 
-        Of a numeric chunk in a shard (a file of many chunks) only the header is read.
+        In a shard (a file of many chunks), only the start of a numeric chunk is yielded, which
+        contains its zstd header.
         """
         if not self.chunks_per_shard:
             yield content
@@ -125,13 +125,13 @@ class ArrayFileLayout(NamedTuple):
             raise RefusedFileError(
                 errno.EINVAL, "has a chunk that does not declare its size", path_in_messages
             )
-        if content_bytes > self.chunk_bytes_max or (
-            self.bytes_per_value and content_bytes < self.chunk_bytes_max
+        if content_bytes > self.uncompressed_chunk_bytes_max or (
+            self.bytes_per_value and content_bytes < self.uncompressed_chunk_bytes_max
         ):
             raise RefusedFileError(
                 errno.EINVAL,
                 f"has a chunk that declares {content_bytes:,} bytes, where "
-                f"{self.chunk_bytes_max:,} "
+                f"{self.uncompressed_chunk_bytes_max:,} "
                 f"are {'right' if self.bytes_per_value else 'the most'}",
                 path_in_messages,
             )
@@ -187,18 +187,18 @@ class StoreFileSizeLimits:
         }
 
     def array_layout(self, file_name: str) -> ArrayFileLayout | None:
-        """Return the layout of the array whose chunk a file is; None for a metadata document."""
+        """Return the layout of the array that a file belongs to; None for a metadata document."""
         return self._layouts.get(file_name.rpartition("/c/")[0] or file_name.removesuffix("/c"))
 
     def file_bytes_max(self, file_name: str) -> int:
-        """Return the largest size of a file of the store [bytes], by its name."""
+        """Return the largest valid size of the file of that name [bytes]."""
         layout = self.array_layout(file_name)
         return METADATA_BYTES_MAX if layout is None else layout.file_bytes_max
 
     def check_decoded_size(
         self, file_name: str, content: bytes, path_in_messages: str, *, is_single_chunk: bool
     ) -> None:
-        """Raise RefusedFileError if content would not decode to its expected size.
+        """Raise RefusedFileError if the content of a file would not decode to its expected size.
 
         ``is_single_chunk``: the content is one chunk of a shard, not a whole file.
         """
@@ -211,10 +211,10 @@ class StoreFileSizeLimits:
 
 
 class SingleWriterLocalStore(LocalStore):
-    """Local store that only this process uses, also on a disk without hard links."""
+    """Local Zarr store that only this process writes. Its disk need not have hard links."""
 
     async def set_if_not_exists(self, key: str, value: Any) -> None:
-        """Write a file unless it exists. Zarr's own method uses hard links, for several writers."""
+        """Write a file unless it exists. Zarr's own method needs hard links."""
         if not await self.exists(key):
             await self.set(key, value)
 
@@ -236,7 +236,9 @@ class SizeCheckedLocalStore(LocalStore):
         """Return the bytes of a file, or of a part of it; None if the file does not exist."""
         bytes_max = self._limits.file_bytes_max(key)
         try:
-            content = read_file_below_root(self.root, key, bytes_max, _to_slice(byte_range))
+            content = read_file_below_root(
+                self.root, key, bytes_max, _byte_range_to_slice(byte_range)
+            )
             if byte_range is None or isinstance(byte_range, RangeByteRequest):
                 path_in_messages = f"{self.root}/{key}"
                 self._limits.check_decoded_size(
@@ -271,7 +273,7 @@ def _to_zarr_buffer(content: bytes | None, prototype: Any) -> Any:
     return (prototype or default_buffer_prototype()).buffer.from_bytes(content)
 
 
-def _to_slice(byte_range: Any) -> slice:
+def _byte_range_to_slice(byte_range: Any) -> slice:
     """Return a byte range of Zarr as a slice."""
     match byte_range:
         case RangeByteRequest():

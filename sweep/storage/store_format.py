@@ -1,12 +1,12 @@
-"""Format of stores and of their journal logs; only data that this program writes is read.
+"""Format of stores and of their journal logs. Data that this program would not write is refused.
 
 Zarr decodes whatever the metadata of arrays declare, including pickled objects and codecs of
 plug-ins. The root document of a store contains the metadata of all its arrays. It is checked first,
 and arrays are opened only through it.
 
 A log consists of lines of JSON, each with its own digest at the end. On disk a log is a file to
-which lines are appended. In an object store a log is a sequence of numbered objects. Each is
-written whole, with the lines of about a second.
+which lines are appended. In an object store a log is a sequence of numbered objects. Each object is
+written once, with the lines of about a second.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from sweep.storage.locations import (
     map_concurrently,
     read_object,
     recover_interrupted_replace,
-    store_fingerprint,
+    store_stat_fingerprint,
 )
 from sweep.storage.size_checks import (
     ARRAY_FILE_BYTES_MAX,
@@ -84,7 +84,7 @@ GRID_STORE_KIND, SCENE_STORE_KIND, EYEPOINTS_STORE_KIND, ACCURACY_STORE_KIND = (
 )  # fmt: skip
 """Kinds of stores: results of grids, of flights over scenes, of rays, and of `sweep accuracy`."""
 
-_ATTRIBUTES_BY_STORE_KIND = {
+_REQUIRED_ATTRIBUTES_BY_STORE_KIND = {
     GRID_STORE_KIND: ("title", "spec", "coordinates"),
     SCENE_STORE_KIND: ("title", "spec", "scanners", "surfaces"),
     EYEPOINTS_STORE_KIND: ("geometry", "shots_a_cycle"),
@@ -92,7 +92,7 @@ _ATTRIBUTES_BY_STORE_KIND = {
 }
 """Names of the attributes that each kind of store must have, in addition to the common ones."""
 
-_COMMON_ATTRIBUTES = ("study_id", "model_version", "software")
+_COMMON_REQUIRED_ATTRIBUTES = ("study_id", "model_version", "software")
 """Names of the attributes that every store must have."""
 
 _STUDY_ID_PATTERN = re.compile(r"[0-9a-f]{32}")
@@ -139,7 +139,7 @@ class StoreError(EscapedTextError):
 
 
 class NotAStoreError(StoreError, ValueError):
-    """Error of a path without a store of a study, or with one that this program can't read."""
+    """Error of a path that has no store of a study, or a store that this program can't read."""
 
 
 def read_attributes(path: Location) -> dict[str, Any]:
@@ -192,8 +192,10 @@ def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
             f"{path} is laid out as version {layout!r:.20}; this sweep writes {LAYOUT_VERSION}"
         )
     required = (
-        *_COMMON_ATTRIBUTES,
-        *_ATTRIBUTES_BY_STORE_KIND.get(str(checked_attributes.get("kind")), ("no known kind",)),
+        *_COMMON_REQUIRED_ATTRIBUTES,
+        *_REQUIRED_ATTRIBUTES_BY_STORE_KIND.get(
+            str(checked_attributes.get("kind")), ("no known kind",)
+        ),
     )
     attributes_as_text = checked_attributes | {
         "software": format_software_versions(checked_attributes.get("software"))
@@ -315,7 +317,7 @@ def objects_match_digest(
     expected_digest: str,
     bytes_max: Callable[[str], int] = lambda name: ARRAY_FILE_BYTES_MAX,
 ) -> bool:
-    """Tell whether stored objects have the expected digest.
+    """Return True if stored objects have the expected digest.
 
     A mismatch in an object store is confirmed by a second read. ``bytes_max``, and the errors that
     are raised, are those of :func:`stored_objects_digest`.
@@ -346,7 +348,7 @@ def read_study_id(path: Location) -> str:
 
 
 def repair_hint(path: Location) -> str:
-    """Return advice on how to restore damaged objects in a store's manifest; '' if it has none."""
+    """Return advice on how to restore a store's damaged objects; '' if it has no manifest."""
     if not (path / JOURNAL_DIR / MANIFEST_FILE).exists():
         return ""
     if read_manifest_attributes(path):
@@ -365,7 +367,7 @@ def _nearby_stores_hint(path: Location) -> str:
 
 
 def _check_node_metadata(node_name: str, node: dict[str, Any]) -> None:
-    """Raise ValueError if a group or array is declared otherwise than this program declares it."""
+    """Raise ValueError if metadata of a group or array differ from what this program writes."""
     if not all(map(_VALID_NAME_PATTERN.fullmatch, node_name.split("/"))):
         raise ValueError(f"an array has the name {node_name!r:.60}")
     if node["zarr_format"] != 3:
@@ -481,7 +483,7 @@ def _check_journal_files(path: Location) -> None:
 
 
 def find_irregular_journal_files(path: Location) -> dict[str, str]:
-    """Return links, pipes and devices in a store's journal: their kind in words, by name."""
+    """Return the kind, in words, of each link, pipe and device in a store's journal, by name."""
     if not isinstance(path, Path) or not (path / JOURNAL_DIR).is_dir():
         return {}
     modes = {JOURNAL_DIR: (path / JOURNAL_DIR).lstat().st_mode}
@@ -502,12 +504,12 @@ class StoreReplacedError(EscapedTextError, ValueError):
 
 
 class StudyBoundLocalStore(SizeCheckedLocalStore):
-    """Store on disk that refuses every read once another study's store has its path."""
+    """Zarr store on disk whose reads raise an error once another study's store is at its path."""
 
     def __init__(self, root: Path, limits: StoreFileSizeLimits, study_id: str) -> None:
         super().__init__(root, limits)
         self._study_id = study_id
-        self._last_identity: tuple[int, ...] | None = None
+        self._last_fingerprint: tuple[int, ...] | None = None
 
     def read(self, key: str, byte_range: Any) -> bytes | None:
         """Return the bytes of a file, then check that the store is still that of the study."""
@@ -518,14 +520,14 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
 
     def _check_same_study(self) -> None:
         """Raise StoreReplacedError if the store at the path has another study id."""
-        identity = store_fingerprint(self.root)
-        if identity is None or identity != self._last_identity:  # repaired or replaced
+        fingerprint = store_stat_fingerprint(self.root)
+        if fingerprint is None or fingerprint != self._last_fingerprint:  # repaired or replaced
             if read_study_id(self.root) != self._study_id:
                 raise StoreReplacedError(
                     f"{self.root} was extended, replaced or removed since it was opened: "
                     "open it again"
                 )
-            self._last_identity = identity
+            self._last_fingerprint = fingerprint
 
 
 def open_size_checked_store(location: Location, study_id: str = "") -> Any:
@@ -554,14 +556,16 @@ LOG_LINE_BYTES_MAX = 64 << 20
 #: Time for which lines are collected before they are written as one object [s].
 LOG_OBJECT_INTERVAL_SECONDS = 1.0
 
-#: Number of objects of a log above which they are merged, and size of a merged object [bytes].
+#: Number of objects of a log above which they are merged.
 LOG_OBJECTS_MAX = 64
+
+#: Size from which a merged object gets no further lines [bytes].
 MERGED_LOG_OBJECT_BYTES = 16 << 20
 
 #: Errors of opening a path at which there is no log.
-_NO_LOG_ERRNOS = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
+_MISSING_LOG_ERRNOS = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
 
-_DIGEST_FIELD = b',"sum":"'
+_DIGEST_FIELD_START = b',"sum":"'
 _LOG_RECORD_END = b'"}\n'
 
 _RECEIPT_HEAD_PATTERN = re.compile(
@@ -580,8 +584,8 @@ def encode_record(record: dict[str, Any]) -> bytes:
 
 
 def append_line_digest(line_body: bytes) -> bytes:
-    """Return a log line: the encoded fields without the closing brace, and their digest."""
-    return line_body + _DIGEST_FIELD + _line_digest(line_body) + _LOG_RECORD_END
+    """Return a log line, made of encoded fields without the closing brace, and their digest."""
+    return line_body + _DIGEST_FIELD_START + _line_digest(line_body) + _LOG_RECORD_END
 
 
 def decode_record(line: bytes) -> dict[str, Any] | None:
@@ -601,7 +605,7 @@ def verified_line_body(line: bytes) -> bytes | None:
 
     The fields are not parsed; the digest is checked.
     """
-    line_body, digest_field, line_end = line.rpartition(_DIGEST_FIELD)
+    line_body, digest_field, line_end = line.rpartition(_DIGEST_FIELD_START)
     return (
         line_body
         if digest_field and line_end == _line_digest(line_body) + _LOG_RECORD_END
@@ -614,16 +618,16 @@ def _line_digest(body: bytes) -> bytes:
 
 
 class LogLine(NamedTuple):
-    """Line of a log, and what it says."""
+    """Line of a log, as bytes and decoded."""
 
-    line: bytes
-    """Bytes of the line."""
+    raw_line: bytes
+    """Bytes of the line, with the line end."""
     record: dict[str, Any] | None
     """Record in the line; None if the line is damaged or truncated."""
 
 
 def iter_lines_and_records(path: Location) -> Iterator[LogLine]:
-    """Yield each line of a log with its record; the record is None if damaged or truncated."""
+    """Yield each line of a log with its record; None in place of a damaged or truncated record."""
     for line in iter_raw_lines(path):
         yield LogLine(line, decode_record(line))
 
@@ -701,10 +705,7 @@ class FileLog:
 
 
 class ObjectLog:
-    """Append-only log in an object store: a series of objects under one key.
-
-    They are numbered in the order of writing.
-    """
+    """Append-only log in an object store: objects below one key, numbered in order of writing."""
 
     def __init__(self, path: ObjectPath) -> None:
         self._path = path
@@ -719,9 +720,9 @@ class ObjectLog:
         self._pending_lines.append(lines)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write the pending lines as one object, once `LOG_OBJECT_INTERVAL_SECONDS` have passed.
+        """Write the pending lines as one object, if the last object is old enough or by ``force``.
 
-        With ``force`` write them now. Return True if no lines are pending any more.
+        The least age is `LOG_OBJECT_INTERVAL_SECONDS`. Return True if no lines are pending.
         """
         if not self._pending_lines:
             return True
@@ -758,7 +759,7 @@ class ObjectLog:
     ) -> None:
         """Write the sound lines of objects to one new object, and delete the old objects.
 
-        After an interruption some lines are stored twice.
+        If this is interrupted, some lines are stored twice.
         """
         sound_lines = [line for line in lines if is_sound(line)]
         if len(object_names) == 1 and len(sound_lines) == len(lines):
@@ -799,7 +800,7 @@ def _log_object_number(object_name: str) -> int:
 
 
 def _iter_log_objects(path: ObjectPath, object_names: list[str]) -> Iterator[tuple[str, bytes]]:
-    """Yield the objects of a log with their names; only a batch is in memory at a time."""
+    """Yield the names and contents of objects of a log; only a batch is in memory at a time."""
     for batch_start in range(0, len(object_names), CONCURRENT_REQUESTS_MAX):
         batch = object_names[batch_start : batch_start + CONCURRENT_REQUESTS_MAX]
         yield from zip(
@@ -838,7 +839,7 @@ def iter_raw_lines(path: Location) -> Iterator[bytes]:
         try:
             descriptor = open_regular_file(path, follow_links=False)
         except OSError as error:
-            if error.errno in _NO_LOG_ERRNOS:
+            if error.errno in _MISSING_LOG_ERRNOS:
                 return
             raise
         with open(descriptor, "rb") as log:
@@ -876,7 +877,7 @@ class ReceiptTotals:
 
 
 def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf) -> ReceiptTotals:
-    """Return the totals of the receipts in a store's log; damaged lines are ignored.
+    """Return the totals of the receipts in a store's log, without damaged lines.
 
     ``since`` is the time from which recent points and their workers are counted [s since the
     epoch].
@@ -892,14 +893,14 @@ def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf
             int(head[3] or 0),
         )
         if head[2] and (time_match := _RECEIPT_TIME_PATTERN.search(line_body, len(line_body) - 40)):
-            _add_receipt_time(totals, line_body, int(head[2]), float(time_match[1]), since)
+            _add_receipt_to_totals(totals, line_body, int(head[2]), float(time_match[1]), since)
     return totals
 
 
-def _add_receipt_time(
+def _add_receipt_to_totals(
     totals: ReceiptTotals, line_body: bytes, points: int, receipt_time: float, since: float
 ) -> None:
-    """Add time, recent points and worker of a receipt to the totals, in place."""
+    """Add a receipt's time, and if recent its points and worker, to the totals in place."""
     totals.first_receipt_time, totals.last_receipt_time = (
         min(totals.first_receipt_time, receipt_time),
         max(totals.last_receipt_time, receipt_time),

@@ -1,7 +1,7 @@
 """Stores whose chunks are checked against their checksums and the journal when they are read.
 
 For a missing chunk Zarr returns fill values, and for a damaged chunk it raises errors of its
-codecs. Here both raise `DamagedChunkError`, which names the block, the chunk and the remedy.
+codecs. These stores raise `DamagedChunkError` for both, which names block, chunk and remedy.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CHUNK_NAME_PATTERN = re.compile(r"(.+)/c((?:/\d+)*)")
 #: Dimensions along which the shots of a flight are divided into blocks; they vary fastest.
 CYCLE_DIM, SHOT_DIM = "cycle", "shot"
 
-#: Time in which reads that nobody waits for are cancelled when the program ends [s].
+#: Longest wait for the cancellation of pending reads when the program ends [s].
 PENDING_READS_TIMEOUT_SECONDS = 5.0
 
 _CHECKSUM_BYTES = 4
@@ -82,9 +82,9 @@ def describe_shard_damage(content: bytes, n_chunks: int) -> str:
 class ChunkBlockMap:
     """Map from the chunks of a store's arrays to the blocks that write them.
 
-    It follows from the root document. The chunks of the outputs of a group form a grid, and each
-    block has one position in it. An array that lacks a dimension of this grid is written by the
-    blocks at position 0 along it.
+    The map follows from the root document. In each group of the store the blocks form a grid, as
+    the chunks of its outputs do. If an array lacks a dimension of this grid, the blocks at position
+    0 along that dimension write it.
     """
 
     def __init__(self, location: Location) -> None:
@@ -104,7 +104,7 @@ class ChunkBlockMap:
             self.n_blocks += math.prod(chunks_by_dim.values())
 
     def _block_grid_shape(self, group: str) -> dict[str, int]:
-        """Return the number of chunks of a group's outputs along each dimension cut into blocks."""
+        """Return the number of blocks of a group along each dimension that is cut into blocks."""
         chunks_by_dim: dict[str, int] = {}
         for name, node in self._arrays.items():
             if name.rpartition("/")[0] != group or self._is_in_template(name, node):
@@ -142,7 +142,7 @@ class ChunkBlockMap:
         return first_block + index
 
     def chunks_per_shard(self, chunk_name: str) -> int:
-        """Return how many chunks a chunk's file (shard) may hold; 0 if it is a single chunk."""
+        """Return how many chunks the file of a chunk (a shard) may hold; 0 if it is no shard."""
         name_match = CHUNK_NAME_PATTERN.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         if node is None or node["codecs"][0]["name"] != "sharding_indexed":
@@ -201,7 +201,7 @@ class VerifiedStore(WrapperStore[Any]):
             raise
 
     async def _get_verified(self, key: str, prototype: Any, byte_range: Any) -> Any:
-        """Return the bytes of a file; check a chunk, and read a damaged one a second time."""
+        """Return the bytes of a file. Chunks are checked, and read a second time if damaged."""
         content = await self._fetch(key, prototype, byte_range)
         name = key.removeprefix(self._prefix).lstrip("/")
         if not CHUNK_NAME_PATTERN.fullmatch(name) or not (
@@ -231,7 +231,7 @@ class VerifiedStore(WrapperStore[Any]):
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     def _describe_damage(self, name: str, content: Any, byte_range: Any) -> str:
-        """Return the damage of a chunk in words; '' if it is sound or not yet computed."""
+        """Return the damage of a chunk in words; '' if it is undamaged or not yet computed."""
         if content is None:
             return "is missing" if self._should_chunk_exist(name) else ""
         if byte_range is None and (n_chunks := self._block_map.chunks_per_shard(name)):
@@ -241,7 +241,7 @@ class VerifiedStore(WrapperStore[Any]):
         )  # a chunk, a chunk of a shard, or a shard index
 
     def _should_chunk_exist(self, name: str) -> bool:
-        """Tell whether a chunk must exist: it was made with the store, or its block is done."""
+        """Return True if a chunk must exist: it was made with the store, or its block is done."""
         block_map = self._block_map
         if block_map.is_packed or name in block_map.template_objects:
             return True
@@ -257,7 +257,7 @@ class VerifiedStore(WrapperStore[Any]):
         return frozenset(np.flatnonzero(points).tolist())
 
     def _damage_message(self, name: str, damage: str) -> str:
-        """Return the message on a damaged chunk, with its block and the remedy."""
+        """Return the error message for a damaged chunk, with its block and the remedy."""
         block_map, location = self._block_map, self._location
         block = block_map.block_of_chunk(name)
         chunk_text = f"{location}: block {block}: {name}" if block >= 0 else f"{location}: {name}"

@@ -44,9 +44,9 @@ class EarlierResults(NamedTuple):
 
 
 def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
-    """Join the results of several parts of a block.
+    """Concatenate the results of several parts of a block.
 
-    The first part gives the names of the arrays.
+    Every part has the arrays of the first one.
     """
     if not parts:
         return NO_RESULTS
@@ -59,10 +59,7 @@ def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
 
 @dataclass
 class Deadline:
-    """Time at which a task stops work on a block.
-
-    Calling the object tells whether it has passed.
-    """
+    """Time at which a task stops work on a block. A call returns True once it has passed."""
 
     end_time: float = float("inf")  # time by `time.monotonic` [s]
     has_passed: bool = False  # True if any call so far was after the deadline
@@ -96,9 +93,9 @@ class StoreTemplate(Protocol):
         """Version of the model that computes the results. Stores of other versions are refused."""
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return the root attributes of the store, without software versions.
+        """Return those root attributes of the store that are the same on all machines.
 
-        They are equal on all machines.
+        Software versions are not among them.
         """
 
     def group_attributes(self) -> dict[str, dict[str, Any]]:
@@ -135,7 +132,8 @@ class BlockStudy(StoreTemplate, ABC):
     * `id`, `model_version`, `store_attributes` and `group_attributes`: identity, and attributes of
       its store. Equal ids have equal results, to the bit.
     * `grids`: how its points are cut into blocks, one grid per group of the store.
-    * `constant_arrays` and `output_layouts`: its arrays, with values, and to be written by blocks.
+    * `constant_arrays`: layouts of the arrays whose values are known before any block is computed.
+    * `output_layouts`: layouts of the arrays that blocks write.
     * `evaluate` and `compile_kernels`: computation of one block.
     * `has_checkpoints` and `evaluate_until`, if a block can stop at a deadline and be continued.
     * `pop_reused_point_count`, if results of another store are reused.
@@ -153,7 +151,7 @@ class BlockStudy(StoreTemplate, ABC):
 
     @abstractmethod
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the arrays whose values are known when the store is made, such as coordinates."""
+        """Return layouts, with values, of arrays known when the store is made: coordinates etc."""
 
     @abstractmethod
     def output_layouts(self) -> list[ArrayLayout]:
@@ -180,8 +178,8 @@ class BlockStudy(StoreTemplate, ABC):
     ) -> Results:
         """Compute a block from a checkpoint on, with the same results as `evaluate`.
 
-        Raise `UnfinishedBlock` at the deadline. It is called in place of `evaluate` if
-        `has_checkpoints`.
+        Raise `UnfinishedBlock` at the deadline. If `has_checkpoints`, this method is called in
+        place of `evaluate`.
         """
         raise NotImplementedError
 
@@ -193,7 +191,7 @@ class BlockStudy(StoreTemplate, ABC):
         return 0
 
     def array_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of all arrays of the store: constant ones, and those of results."""
+        """Return the layouts of all arrays of the store: constant arrays, then results."""
         return [*self.constant_arrays(), *self.output_layout_by_name.values()]
 
     @cached_property
@@ -262,7 +260,7 @@ class BlockStudy(StoreTemplate, ABC):
         return grid.count_block_points(block_in_grid)
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Return the total number of points in the blocks that a mask (blocks,) of bool marks."""
+        """Return the total number of points in the blocks where a mask (blocks,) is True."""
         parts = np.split(is_included, np.cumsum([grid.n_blocks for grid in self.grids])[:-1])
         return sum(
             grid.count_points_in_blocks(part) for grid, part in zip(self.grids, parts, strict=True)
@@ -270,9 +268,9 @@ class BlockStudy(StoreTemplate, ABC):
 
     @cached_property
     def _grid_dim_indices_by_array(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
-        """Index of the grid dimension that each dimension of an array is cut along.
+        """Grid dimensions along which the dimensions of each array are cut, by group and array.
 
-        The outer keys are groups of the store, the inner keys names of arrays.
+        An entry is the index of a grid dimension, or None for a dimension that is not cut.
         """
         grid_dims: dict[str, dict[str, tuple[int | None, ...]]] = {
             group: {} for group in self._grid_by_group
@@ -283,11 +281,11 @@ class BlockStudy(StoreTemplate, ABC):
         return grid_dims
 
     def chunk_positions(self, block: int) -> dict[str, tuple[int, ...]]:
-        """Return the position, in an array's grid of chunks, of the chunk that a block writes.
+        """Return the position of the chunk that a block writes in each array, by array name.
 
-        The result has one entry per array, by name. An array that lacks a dimension of the block
-        grid is written by the first block along that dimension. The result of the other blocks
-        lacks this array.
+        A position is the index of the chunk along each dimension of the array. If an array lacks a
+        dimension of the block grid, only the first block along that dimension writes it, and the
+        result for other blocks has no entry for this array.
         """
         grid, block_in_grid = self.locate_in_grid(block)
         position = grid.block_position(block_in_grid)
@@ -320,24 +318,25 @@ class BlockStudy(StoreTemplate, ABC):
 
 
 BlockEvaluator = Callable[[Any, int], Results]
-"""Function of a study and a block's number that computes the block in place of the study."""
+"""Function that computes a block in place of the study: (study, number of the block) -> results."""
 
-Study = TypeVar("Study", bound=BlockStudy, covariant=True)
+StudyT = TypeVar("StudyT", bound=BlockStudy, covariant=True)
+"""Type of the study that a `StoredStudy` holds."""
 
 
-class StoredStudy(NamedTuple, Generic[Study]):
+class StoredStudy(NamedTuple, Generic[StudyT]):
     """Study that was read from its store."""
 
     attributes: dict[str, Any]
     """Root attributes of the store."""
-    study: Study
+    study: StudyT
     """Study whose results the store holds."""
 
 
 StudyReader = Callable[["Location"], StoredStudy[BlockStudy]]
 """Function that returns the study in a store, or raises a StoreError.
 
-It must be defined at the top level of a module, because it is sent to workers by name.
+It must be defined at the top level of a module, as it is sent to workers by name.
 """
 
 

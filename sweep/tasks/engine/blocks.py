@@ -1,7 +1,7 @@
 """Arrays with named dimensions, cut into chunks, and grids of points, cut into blocks.
 
-A :class:`BlockGrid` cuts points into blocks. An array follows it along the dimensions that it has,
-so that which chunks a block owns needs no further rule::
+A :class:`BlockGrid` cuts points into blocks. An array is cut into chunks in the same way along
+each dimension that it shares with the grid. This decides which chunks a block writes (owns)::
 
     blocks of (y, x)       array (y, x)           array (x,)
     +---+---+---+          +---+---+---+
@@ -11,7 +11,7 @@ so that which chunks a block owns needs no further rule::
     +---+---+---+          +---+---+---+
 
 If an array lacks a dimension of the grid, the first block along that dimension owns its chunks.
-:mod:`sweep.tasks.engine.block_study` says what a study of such blocks has to offer.
+:mod:`sweep.tasks.engine.block_study` defines what a study of these blocks must implement.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ import numpy as np
 Results = dict[str, np.ndarray]
 """Arrays of results, by the name of the output variable."""
 
-#: Fill value of arrays by the kind of their data type (NumPy code). Stored integers are not
-#: negative.
+#: Fill value of arrays by the kind of their data type (NumPy code). No stored integer is -1.
 FILL_VALUE_BY_DTYPE_KIND = {"f": float("nan"), "i": -1, "u": 0}
 
 
@@ -48,15 +47,15 @@ def chunk_slices(
 class ArrayLayout:
     """Layout of one array of a store: name, dimensions, shape, chunks and attributes.
 
-    `name` is the path inside the store. `known_values` are the values of an array that is known
-    before any block is computed; None for arrays that blocks write.
+    `known_values` are the values of an array that is known before any block is computed; None for
+    arrays that blocks write.
     """
 
-    name: str
+    name: str  # path inside the store
     shape: tuple[int, ...]
-    chunks: tuple[int, ...]
-    dims: tuple[str, ...]
-    dtype: str
+    chunks: tuple[int, ...]  # shape of a chunk
+    dims: tuple[str, ...]  # names of the dimensions
+    dtype: str  # name of the NumPy data type, or "string"
     fill_value: float | int | str | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
     known_values: np.ndarray | None = None
@@ -108,12 +107,12 @@ class ArrayLayout:
         return chunk_slices(position, self.chunks, self.shape)
 
 
-CF_CONVENTIONS = "CF-1.11"
+CF_CONVENTIONS_VERSION = "CF-1.11"
 """Version of the Climate and Forecast (CF) metadata conventions that all stores follow."""
 
 
 class PointLocations(NamedTuple):
-    """Blocks in which points of a grid are, and where in these blocks."""
+    """Blocks that contain points of a grid, and indices of the points within these blocks."""
 
     blocks: np.ndarray
     """Number (n,) of the block of each point."""
@@ -161,7 +160,7 @@ class BlockGrid:
         return tuple(map(int, np.unravel_index(block, self.blocks_per_dim)))
 
     def block_at(self, block_position: tuple[int, ...]) -> int:
-        """Return the number of the block that has given indices in the grid of blocks."""
+        """Return the number of the block at a position in the grid of blocks."""
         return (
             int(np.ravel_multi_index(block_position, self.blocks_per_dim)) if block_position else 0
         )
@@ -184,16 +183,16 @@ class BlockGrid:
         return math.prod(self.actual_block_shape(block)) * self.fine_steps
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Return the total number of points in the blocks that a mask (blocks,) of bool marks."""
+        """Return the total number of points in the blocks where a mask (blocks,) is True."""
         counts = np.asarray(is_included, bool).reshape(self.blocks_per_dim)
         for size, chunk in zip(self.shape[::-1], self.block_shape[::-1], strict=True):
             counts = counts @ np.minimum(chunk, size - np.arange(0, size, chunk))
         return int(counts) * self.fine_steps
 
     def locate_points(self, grid_indices: np.ndarray) -> PointLocations:
-        """Return the block of each point, and the index of the point in that block, in C order.
+        """Return the number of each point's block, and the index of the point within it.
 
-        `grid_indices` (n,) are indices of the points, in C order over the whole grid.
+        `grid_indices` (n,) are the indices of the points in C order over the whole grid.
         """
         blocks, local_indices = np.zeros((2, grid_indices.size), np.int64)
         index = np.unravel_index(grid_indices, self.shape) if self.shape else ()
@@ -206,9 +205,9 @@ class BlockGrid:
         return PointLocations(blocks, local_indices)
 
     def grid_indices(self, block: int, local_indices: np.ndarray) -> np.ndarray:
-        """Return the indices of some points of a block, in C order over the whole grid.
+        """Convert indices of points within a block to indices within the whole grid.
 
-        `local_indices` (m,) are their indices in C order over the block. Inverse of
+        `local_indices` (m,) and the result (m,) count points in C order. This is the inverse of
         `locate_points`.
         """
         if not self.shape:
@@ -230,7 +229,7 @@ class BlockGrid:
     ) -> ArrayLayout:
         """Return the layout of an array of results, cut into chunks as the grid is cut into blocks.
 
-        `sizes` has the sizes of those dimensions in `dims` that are not dimensions of the grid.
+        `sizes` gives the sizes of the dimensions in `dims` that the grid does not have.
         """
         array_sizes = dict(sizes) | dict(zip(self.dims, self.shape, strict=True))
         chunk_sizes = dict(sizes) | dict(zip(self.dims, self.block_shape, strict=True))

@@ -149,7 +149,7 @@ def _start_workers(
     bounds: WorkerBounds,
     processes: bool,
 ) -> Any:
-    """Start the workers of a cluster that ends with this process.
+    """Start workers that end with this process. Return the Dask cluster object.
 
     ClusterError is raised on failure.
     """
@@ -164,7 +164,7 @@ def _start_workers(
             if isinstance(cluster, BatchClusterConfig):
                 from sweep.tasks.engine.deploy import jobqueue
 
-                return jobqueue.start_jobs(cluster, bounds)
+                return jobqueue.start_batch_cluster(cluster, bounds)
             return local_ssh.start_ssh_cluster(cluster, bounds)
     except (OSError, RuntimeError, ImportError) as error:
         raise ClusterError(
@@ -175,7 +175,7 @@ def _start_workers(
 def _keep_workers_in_bounds(
     dask_cluster: Any, cluster: AnyClusterConfig, bounds: WorkerBounds
 ) -> None:
-    """Adapt the number of workers to the work, between its bounds. Replace batch jobs that end."""
+    """Have Dask adapt the number of workers, within bounds, and replace batch jobs that end."""
     if isinstance(cluster, BatchClusterConfig):
         from sweep.tasks.engine.deploy import jobqueue
 
@@ -210,7 +210,7 @@ def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
 def write_performance_report(
     client: Client, report_path: Path, say: Callable[[str], None]
 ) -> Iterator[None]:
-    """Write Dask's report of the computations in the context. A failure only prints a message."""
+    """Context manager: write Dask's report of the computations; a failure only prints a message."""
     from distributed import performance_report
 
     report = performance_report(filename=str(report_path))

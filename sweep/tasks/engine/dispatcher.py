@@ -1,4 +1,4 @@
-"""Dispatch of blocks to workers as Dask tasks. Only a limited number of tasks is sent at a time.
+"""Dispatch of blocks to workers as Dask tasks. The number of unfinished tasks is limited.
 
 A task writes its blocks itself and returns receipts, which the client fetches and releases at once.
 No result stays on a worker, so none is lost if the worker dies.
@@ -21,7 +21,7 @@ from sweep.messages import number_with_noun, option_name
 from sweep.storage.store_format import NotAStoreError
 from sweep.tasks.engine.journal import Receipt
 from sweep.tasks.engine.progress import SchedulerLostError, StoreError, duration_text
-from sweep.tasks.engine.stalls import COMPILATION_SECONDS_MAX, PrintMessage, StallMonitor
+from sweep.tasks.engine.stalls import COMPILATION_SECONDS_MAX, MessagePrinter, StallMonitor
 from sweep.tasks.engine.worker import (
     IDLE_POLL_SECONDS,
     RESULTS_NOT_VISIBLE_MESSAGE,
@@ -40,21 +40,23 @@ if TYPE_CHECKING:
 #: Intended duration of a task [s]. It is long compared with a task's overhead of 3-9 ms, and short
 #: compared with a study.
 TARGET_TASK_SECONDS = 2.0
+
+#: Largest number of blocks of a task.
 BLOCKS_PER_TASK_MAX = 1000
 
-#: Largest number of tasks per second, a third of what a scheduler can handle [1/s]. With more than
-#: 200 worker threads tasks are made longer to stay below it.
+#: Largest number of tasks per second, a third of what a scheduler can handle [1/s]. If there are
+#: more than 200 worker threads, tasks are made longer to stay below it.
 TASKS_PER_SECOND_MAX = 100.0
 
 #: Interval at which the worker threads of a cluster are counted again [s].
 WORKER_THREADS_REFRESH_SECONDS = 2.0
 
-#: Time without a result after which a worker counts as silent [s]. It is longer if blocks take
-#: long.
+#: Time without a result after which a worker counts as silent [s]. Its tasks are sent to other
+#: workers only later if they are expected to take long.
 WORKER_SILENCE_SECONDS = 30.0
 
-#: Largest time until files that a worker has written are visible to this process [s]. NFS clients
-#: on Linux cache folders for as long.
+#: Largest time until files that a worker has written are visible to this process [s]: the time for
+#: which NFS clients on Linux cache folders.
 FILE_VISIBILITY_SECONDS_MAX = 60.0
 
 #: Largest numbers of tasks and of workers that a summary of the state lists.
@@ -69,8 +71,8 @@ _log = logging.getLogger("sweep.dispatcher")
 class ThroughputEstimator:
     """Estimator of a suitable number of blocks per task, from the times of blocks so far."""
 
-    n_blocks: int = 0
-    work_seconds: float = 0.0
+    n_blocks: int = 0  # number of blocks that tasks have finished
+    work_seconds: float = 0.0  # computing time of these blocks, summed over workers [s]
 
     def add_task_result(self, task_result: TaskResult) -> None:
         """Add the computing times of the blocks that a task has finished."""
@@ -94,19 +96,19 @@ class WorkerThreadCount:
     """Counter of the worker threads of a cluster, updated every few seconds."""
 
     client: Client
-    expected_worker_threads: int = 0
-    n_worker_threads: int = 1
-    threads_by_worker: dict[str, int] = field(default_factory=dict)  # by the worker's address
-    counted_at: float = -1e9
+    expected_worker_threads: int = 0  # number expected once all workers run; 0 if unknown
+    n_worker_threads: int = 1  # larger of the last count and the expected number, at least 1
+    n_threads_by_worker: dict[str, int] = field(default_factory=dict)  # by the worker's address
+    last_counted_at: float = -1e9  # time of the last count, by `time.monotonic` [s]
 
     def current_count(self) -> int:
-        """Return the number of worker threads of the cluster, at least 1."""
-        if time.monotonic() - self.counted_at > WORKER_THREADS_REFRESH_SECONDS:
-            self.threads_by_worker = dict(self.client.nthreads())
+        """Return the number of worker threads, connected or expected, at least 1."""
+        if time.monotonic() - self.last_counted_at > WORKER_THREADS_REFRESH_SECONDS:
+            self.n_threads_by_worker = dict(self.client.nthreads())
             self.n_worker_threads = max(
-                1, self.expected_worker_threads, sum(self.threads_by_worker.values())
+                1, self.expected_worker_threads, sum(self.n_threads_by_worker.values())
             )
-            self.counted_at = time.monotonic()
+            self.last_counted_at = time.monotonic()
         return self.n_worker_threads
 
 
@@ -114,11 +116,11 @@ class WorkerThreadCount:
 class _InFlightTask:
     """Task that was sent to a worker and has not ended.
 
-    It may be sent to others if that one is silent.
+    It is sent to further workers if that one is silent.
     """
 
     blocks: list[int]
-    futures_by_key: dict[Key, Future] = field(default_factory=dict)
+    futures_by_key: dict[Key, Future] = field(default_factory=dict)  # one for each time it was sent
     last_sent_at: float = 0.0  # by `time.monotonic` [s]
 
 
@@ -139,7 +141,7 @@ class TaskDispatcher:
         block_queue: BlockQueue,
         *,
         verify_receipt: ReceiptVerifier,
-        say: PrintMessage,
+        say: MessagePrinter,
     ) -> None:
         self._client, self._settings, self._block_queue = client, settings, block_queue
         self._verify_receipt, self._say = verify_receipt, say
@@ -166,9 +168,10 @@ class TaskDispatcher:
         self._stall_monitor = StallMonitor(say, self.state_summary)
 
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
-        """Yield results of tasks as they arrive; an empty result after each `IDLE_POLL_SECONDS`.
+        """Yield results of tasks as they arrive, or empty ones while none arrives.
 
-        Once `is_stopping` returns True no more tasks are sent. The iteration ends when all sent
+        An empty result is yielded every `IDLE_POLL_SECONDS`. Once `is_stopping` returns True, no
+        more tasks are sent. The iteration ends when all sent
         tasks have ended, or at once if there is no worker. SchedulerLostError is raised if the
         scheduler is gone; StoreError or OSError is raised if no worker can write to the store.
         """
@@ -212,7 +215,7 @@ class TaskDispatcher:
             f"{', '.join(sorted({str(future.status) for future in task.futures_by_key.values()}))}"
             for task in sorted(tasks, key=lambda task: task.last_sent_at)[:TASKS_IN_SUMMARY_MAX]
         ]
-        for worker, threads in sorted(self._slots.threads_by_worker.items())[
+        for worker, threads in sorted(self._slots.n_threads_by_worker.items())[
             :WORKERS_IN_SUMMARY_MAX
         ]:
             answered_at = self._last_response.get(worker)
@@ -226,7 +229,7 @@ class TaskDispatcher:
             )
         return "\n".join(lines)
 
-    def _report_stall(self) -> None:
+    def _report_if_stalled(self) -> None:
         """Print a message and log the state of the run if no result arrives for long."""
         if (
             not self._in_flight or not self._usable_workers()
@@ -242,7 +245,7 @@ class TaskDispatcher:
         """Return the addresses of connected workers that are not excluded."""
         return [
             worker
-            for worker in self._slots.threads_by_worker
+            for worker in self._slots.n_threads_by_worker
             if worker not in self._excluded_workers
         ]
 
@@ -310,7 +313,7 @@ class TaskDispatcher:
         future.add_done_callback(self._finished_futures.put)
 
     def _duplicate_stragglers(self) -> None:
-        """Send tasks of workers that have been silent for long to idle workers as well."""
+        """Send overdue tasks to idle workers as well, if their worker is silent or lost."""
         now = time.monotonic()
         overdue_tasks = [
             task
@@ -333,7 +336,7 @@ class TaskDispatcher:
             worker
             for worker in self._usable_workers()
             if worker not in tasks_by_silent_worker
-            and len(keys_by_worker.get(worker, ())) < self._slots.threads_by_worker[worker]
+            and len(keys_by_worker.get(worker, ())) < self._slots.n_threads_by_worker[worker]
         ]
         if not idle_workers:
             return
@@ -374,13 +377,13 @@ class TaskDispatcher:
         )
 
     def _next_result(self) -> TaskResult:
-        """Return the result of the next task that ends; an empty one after `IDLE_POLL_SECONDS`."""
+        """Return the result of the next task that ends; an empty one if none ends in time."""
         task_result = TaskResult()
         try:
             future = self._finished_futures.get(timeout=IDLE_POLL_SECONDS)
         except queue.Empty:
             self._check_connection()
-            self._report_stall()
+            self._report_if_stalled()
         else:
             if future.key in self._in_flight:
                 task_result = self._finish_task(future)
@@ -389,7 +392,7 @@ class TaskDispatcher:
         return task_result
 
     def _finish_task(self, future: Future) -> TaskResult:
-        """Return the result of a task that has ended, after updating blocks and workers with it."""
+        """Return the result of a task that has ended. Update the queue and the state of workers."""
         task = self._in_flight[future.key]
         for key in task.futures_by_key:
             del self._in_flight[key]
@@ -427,10 +430,10 @@ class TaskDispatcher:
         self._resend_counts.update(blocks)
 
     def _verify_receipts(self, task_result: TaskResult) -> None:
-        """Keep only receipts of blocks that this process sees in the store.
+        """Keep, in a task's result, only receipts of blocks that this process sees in the store.
 
-        The others are checked again later. A block that does not appear in time is sent again, and
-        its worker is excluded.
+        Other receipts are checked again later. A block that does not appear in time is sent again,
+        and its worker is excluded.
         """
         now = time.monotonic()
         receipts_to_verify = [
@@ -459,7 +462,7 @@ class TaskDispatcher:
         """
         if worker in self._excluded_workers:
             return
-        self._excluded_workers[worker] = self._slots.threads_by_worker.get(worker, 1)
+        self._excluded_workers[worker] = self._slots.n_threads_by_worker.get(worker, 1)
         if (
             self._all_workers_excluded
             and sum(self._excluded_workers.values()) >= self._slots.expected_worker_threads

@@ -40,8 +40,8 @@ SIGNAL_POLL_SECONDS = 0.1
 #: Time limit for writing a process's last message, for example to a stopped terminal [s].
 EXIT_MESSAGE_SECONDS_MAX = 1.0
 
-#: Largest number of signals that are read at once, one byte each.
-_SIGNAL_BYTES_MAX = 4096
+#: Largest number of signals that are read at once from the socket, one byte each.
+_SIGNALS_PER_READ_MAX = 4096
 
 #: Byte that wakes the watcher thread and stands for no signal.
 _WAKE_BYTE = b"\0"
@@ -99,7 +99,7 @@ class InterruptHandler:
             self._watcher = None
 
     def announce_stop(self) -> None:
-        """Print once that the run stops when the blocks being computed are written."""
+        """Print, once only, that the run stops when the blocks being computed are written."""
         with self._announce_lock:
             if not self._is_announced:
                 self._is_announced = True
@@ -108,7 +108,7 @@ class InterruptHandler:
     def _handle_signal(self, signal_number: int, frame: FrameType | None) -> None:
         if self._wakeup_receiver is not None:
             with suppress(OSError):
-                self._wakeup_receiver.recv(_SIGNAL_BYTES_MAX)
+                self._wakeup_receiver.recv(_SIGNALS_PER_READ_MAX)
         if self.is_stopping and signal_number != HANGUP_SIGNAL:
             raise KeyboardInterrupt
         self.is_stopping = True
@@ -158,7 +158,7 @@ class InterruptHandler:
             n_reported = 0
             while unhandled := self._unhandled_signals(receiver):
                 if len(unhandled) > n_reported:
-                    if self._is_handled_in_time(receiver, len(unhandled)):
+                    if self._wait_until_handled(receiver, len(unhandled)):
                         continue
                     self._react_to_stalled_signals(unhandled, is_repeated=n_reported > 0)
                     n_reported = len(unhandled)
@@ -173,12 +173,13 @@ class InterruptHandler:
         return None if deadline is None else max(deadline - time.monotonic(), 0.0)
 
     def _unhandled_signals(self, receiver: socket.socket) -> list[int]:
-        """Return signals that have arrived but that the main thread has not handled yet.
+        """Return the numbers of signals that the main thread has not handled yet.
 
-        Bytes by which Python announces signals to the watcher thread are discarded.
+        Python sends one byte per signal to `receiver`, and the main thread removes these bytes when
+        it handles the signal. Other bytes, which only wake this thread, are removed here.
         """
         try:
-            signal_bytes = receiver.recv(_SIGNAL_BYTES_MAX, socket.MSG_PEEK)
+            signal_bytes = receiver.recv(_SIGNALS_PER_READ_MAX, socket.MSG_PEEK)
             unhandled = [
                 signal_number
                 for signal_number in signal_bytes
@@ -190,10 +191,10 @@ class InterruptHandler:
             return []
         return unhandled
 
-    def _is_handled_in_time(self, receiver: socket.socket, n_signals: int) -> bool:
-        """Wait up to `SIGNAL_HANDLING_SECONDS_MAX`.
+    def _wait_until_handled(self, receiver: socket.socket, n_signals: int) -> bool:
+        """Wait until the main thread handles a signal. Return False if it does not in time.
 
-        Return True once the main thread handles a signal.
+        `n_signals` is the number of unhandled signals so far.
         """
         deadline = time.monotonic() + SIGNAL_HANDLING_SECONDS_MAX
         while time.monotonic() < deadline:
@@ -205,9 +206,9 @@ class InterruptHandler:
         return False
 
     def _react_to_stalled_signals(self, unhandled: list[int], *, is_repeated: bool) -> None:
-        """React to signals that can't be handled while compiled code runs.
+        """Print a message or end the process, as compiled code keeps signals from being handled.
 
-        Print a message, or end the process.
+        `is_repeated` means that this method was called before for earlier ones of these signals.
         """
         if set(unhandled) == {HANGUP_SIGNAL}:
             return

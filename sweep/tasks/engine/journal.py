@@ -73,10 +73,15 @@ from sweep.storage.store_format import (
 from sweep.tasks.engine.block_study import BlockStudy, EarlierResults, PartialResults
 from sweep.tasks.engine.progress import BusyError, StoreError, raise_as_store_error
 
+#: Name of the log of blocks that failed permanently.
 FAILURE_LOG_FILE = "failures.jsonl"
+
+#: Name of the log of the beginnings and ends of runs.
 SESSION_LOG_FILE = "sessions.jsonl"
+
 LOG_FILE_NAMES = (RECEIPTS_FILE, FAILURE_LOG_FILE, SESSION_LOG_FILE)
 
+#: Name of the recipe: the facts about how a store is made that its other files do not contain.
 RECIPE_FILE = "recipe.json"
 
 #: Key, in a store's recipe, of the path of the store that this one extends and takes results from.
@@ -88,8 +93,8 @@ USER_MODULE_DIGESTS_KEY = "code"
 #: Key, in a store's recipe, of the id of the study whose store this one will replace; '' if none.
 REPLACED_STUDY_ID_KEY = "replaces"
 
-#: Number of folders on disk that are listed at once; listing on a file server is mostly waiting.
-LISTING_THREADS = 4
+#: Largest number of folders on disk that are listed at once; listing is mostly waiting.
+CONCURRENT_LISTINGS_MAX = 4
 
 _log = logging.getLogger("sweep.journal")
 
@@ -98,15 +103,15 @@ _log = logging.getLogger("sweep.journal")
 class Receipt:
     """Record of a stored block: number, points, size, digest, times, and process that wrote it."""
 
-    block: int
-    points: int
-    bytes: int  # size as stored
+    block: int  # number of the block
+    points: int  # number of its points
+    bytes: int  # size as stored [bytes]
     digest: str  # digest of the stored bytes, by `store_format.contents_digest`
     seconds: float  # time of evaluating and writing [s]
-    write_seconds: float
+    write_seconds: float  # time of writing [s]
     host: str
     pid: int
-    versions: dict[str, str]
+    versions: dict[str, str]  # versions of software, by name
     reused_points: int = 0  # number of points taken from the store of a smaller study
 
 
@@ -114,8 +119,8 @@ class Receipt:
 class Failure:
     """Record of a block that raised an error: the error, and the process in which it occurred."""
 
-    block: int
-    error: str
+    block: int  # number of the block
+    error: str  # type and message of the error
     traceback: str
     host: str
     pid: int
@@ -124,8 +129,8 @@ class Failure:
 class Journal:
     """Writer of a store's logs. Damaged and incomplete lines are removed when it is opened.
 
-    The caller holds the store's lock. If `durable`, a receipt is on the disk once it is committed,
-    and not only in the cache of the operating system.
+    The caller holds the store's lock. If `durable`, a committed receipt is on the disk, and not
+    only in the cache of the operating system.
     """
 
     def __init__(self, store_path: Location, *, durable: bool = False) -> None:
@@ -139,7 +144,7 @@ class Journal:
     def commit(self, *receipts: Receipt) -> None:
         """Append receipts to the log, which marks their blocks as done.
 
-        In an object store they are done after the next `flush`.
+        In an object store the blocks are done after the next `flush` that writes.
         """
         commit_time = round(time.time(), 3)
         self._append(
@@ -161,14 +166,14 @@ class Journal:
         return all(is_flushed)
 
     def record_failure(self, failure: Failure) -> None:
-        """Append the error of a block that failed for good.
+        """Append the error of a block that failed permanently.
 
-        Later runs skip it unless told to retry.
+        Later runs skip this block unless they are asked to retry.
         """
         self._append(FAILURE_LOG_FILE, asdict(failure))
 
     def record_run_event(self, event: str, **details: Any) -> None:
-        """Append an event of the run, such as its begin or end, and write all pending lines."""
+        """Append an event of the run, such as its start or end, and write all pending lines."""
         utc = datetime.now(UTC).isoformat(timespec="seconds")
         self._append(SESSION_LOG_FILE, {"event": event, "time": time.time(), "utc": utc, **details})
         self.flush(force=True)
@@ -217,14 +222,14 @@ def read_permanent_failures(store_path: Location, n_blocks: int) -> dict[int, di
 
 @dataclass(frozen=True, kw_only=True)
 class LastRun:
-    """Begin of the last run of a store, and the threads that computed in it."""
+    """Start time of the last run of a store, and number of threads that computed in it."""
 
-    start_time: float  # time at which it began [s since the epoch]; inf if there was none
-    n_threads: int  # number of threads of the command that computed; 0 if workers did, or unknown
+    start_time: float  # [s since the epoch]; inf if there was no run
+    n_threads: int  # number of threads of the command's process; 0 if workers computed, or unknown
 
 
 def read_last_run(store_path: Location) -> LastRun:
-    """Return when the last run of a store began, and by how many threads it computed."""
+    """Return the start time and the number of threads of the last run of a store."""
     runs = iter_records(store_path / JOURNAL_DIR / SESSION_LOG_FILE)
     starts = [run for run in runs if run.get("event") == "begun"]
     if not starts:
@@ -239,7 +244,7 @@ def read_last_run(store_path: Location) -> LastRun:
 def write_recipe(store_path: Location, **facts: Any) -> None:
     """Replace a store's recipe in one step.
 
-    ``facts`` are its entries: folder of files, extended store.
+    ``facts`` are its entries, such as the folder of the study's files, or the extended store.
     """
     atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_record(facts))
 
@@ -274,7 +279,7 @@ def refuse_damaged_recipe(store_path: Location) -> None:
 
 
 class ChunkScan:
-    """Search, in threads, for missing chunks of blocks. It begins on construction.
+    """Search for missing chunks of blocks, in threads that start on construction.
 
     `candidates` is a mask (blocks,) of bool of the blocks whose chunks are searched.
     """
@@ -282,7 +287,9 @@ class ChunkScan:
     def __init__(self, store_path: Location, study: BlockStudy, candidates: np.ndarray) -> None:
         self._candidates, self._is_stopped = candidates.copy(), False
         n_threads = (
-            CONCURRENT_REQUESTS_MAX if isinstance(store_path, ObjectPath) else LISTING_THREADS
+            CONCURRENT_REQUESTS_MAX
+            if isinstance(store_path, ObjectPath)
+            else CONCURRENT_LISTINGS_MAX
         )
         self._executor = ThreadPoolExecutor(n_threads, thread_name_prefix="chunk-scan")
 
@@ -336,7 +343,7 @@ def find_existing_chunks(folder: Location, shape: tuple[int, ...]) -> np.ndarray
     """Return a mask, in the shape of an array's grid of chunks, of chunks that are not empty."""
     is_present = np.zeros(shape, bool)
     if isinstance(folder, ObjectPath):
-        for position, size in _iter_chunk_keys(folder, shape):
+        for position, size in _iter_chunk_sizes(folder, shape):
             is_present[position] = size > 0
     elif shape:
         _mark_existing_chunks(folder, is_present)
@@ -351,7 +358,7 @@ def _is_nonempty_file(status: os.stat_result) -> bool:
     return stat.S_ISREG(status.st_mode) and status.st_size > 0
 
 
-def _iter_chunk_keys(
+def _iter_chunk_sizes(
     folder: ObjectPath, shape: tuple[int, ...]
 ) -> Iterator[tuple[tuple[int, ...], int]]:
     """Yield the position and the size [bytes] of each chunk of an array in an object store."""
@@ -371,8 +378,8 @@ def _mark_existing_chunks(
 ) -> None:
     """Set `is_present` to True for each chunk that exists below a folder.
 
-    `is_present` has the shape of the array's grid of chunks. `parent_descriptor` is an open folder
-    that contains the folder.
+    `is_present` has the shape of the array's grid of chunks. `parent_descriptor` is the descriptor
+    of the folder's parent if `folder_or_name` is a name.
     """
     try:
         # links are not followed: their targets are no part of the store
@@ -410,7 +417,7 @@ class Checkpoint(NamedTuple):
 def write_checkpoint(
     store_path: Location, study_id: str, block: int, checkpoint: Checkpoint
 ) -> None:
-    """Save a block's checkpoint, unless a saved one has as many points done.
+    """Save a block's checkpoint, unless the saved one has at least as many points done.
 
     OSError is raised if it can't be written.
     """
@@ -516,7 +523,7 @@ def _checkpoint_arrays(results: EarlierResults) -> dict[str, Any]:
 
 
 def _content_digest(content: bytes) -> str:
-    """Return the digest of a checkpoint's content, by which damage is found."""
+    """Return the digest of a checkpoint's content, which reveals damage."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
@@ -525,9 +532,10 @@ LOCK_FILE = "lock"
 #: Largest number of attempts to acquire a lock in an object store against other processes.
 LOCK_ATTEMPTS_MAX = 5
 
-#: Two times of the heartbeats by which a lock's holder shows that it runs [s]. The first is the
-#: time between heartbeats. The second is the age above which a holder on another host may be dead.
+#: Time between the heartbeats by which a lock's holder shows that it runs [s].
 HEARTBEAT_INTERVAL_SECONDS = 10.0
+
+#: Age of the last heartbeat above which a lock's holder on another host may be dead [s].
 HEARTBEAT_AGE_SECONDS_MAX = 120.0
 
 #: Time for which an old heartbeat is watched before its holder counts as dead [s]. A clock that was
@@ -537,9 +545,11 @@ HEARTBEAT_WATCH_SECONDS = 35.0
 #: Largest size of a lock file [bytes].
 LOCK_BYTES_MAX = 1 << 16
 
-#: Errors of file systems without flock (Lustre without it, some NFS), or without hard links (FUSE,
-#: SMB, exFAT; a file system of several disks may say that the link leads to another one).
+#: Error numbers of file systems without flock (some Lustre and NFS).
 FLOCK_UNSUPPORTED_ERRNOS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+
+#: Error numbers of file systems without hard links (FUSE, SMB, exFAT). A file system of several
+#: disks may report that the link leads to another file system.
 HARD_LINK_UNSUPPORTED_ERRNOS = {
     errno.EPERM,
     errno.ENOSYS,
@@ -552,13 +562,13 @@ HARD_LINK_UNSUPPORTED_ERRNOS = {
 _released_tokens: set[str] = set()
 """Tokens (unique texts) of the locks that this process has released.
 
-A store that could not be reached may still hold them.
+Such a lock may still be in its store, if the store could not be reached on release.
 """
 
 _issued_warnings: set[str] = set()
-"""Kinds of lock warnings that this process has given, so that each is given once.
+"""Kinds of lock warnings that this process has issued.
 
-A study may have many locks.
+A study may have many locks, but each kind of warning is issued only once.
 """
 
 
@@ -569,7 +579,7 @@ class LockHolder:
     host: str = "unknown"
     pid: int = 0
     start: int = 0  # `process_start_id` of the process, as process numbers are reused
-    token: str = ""
+    token: str = ""  # unique text of the lock
     machine: str = ""  # boot id and namespace, as several hosts may have the same name
 
     @classmethod
@@ -581,17 +591,17 @@ class LockHolder:
             pid=pid,
             start=process_start_id(pid),
             token=uuid.uuid4().hex,
-            machine=_machine_id(),
+            machine=_boot_and_namespace_id(),
         )
 
     @property
     def is_on_this_machine(self) -> bool:
         """True if the holder is a process of this machine, running or not."""
-        return self.host == socket.gethostname() and self.machine in ("", _machine_id())
+        return self.host == socket.gethostname() and self.machine in ("", _boot_and_namespace_id())
 
 
 @cache
-def _machine_id() -> str:
+def _boot_and_namespace_id() -> str:
     """Return a text that identifies the machine's boot and the process's namespace; '' if unknown.
 
     A process number is unique only among the processes with the same text.
@@ -708,8 +718,9 @@ class _FileLock:
     ) -> None:
         """Acquire the lock for a holder. The lock of a dead holder is removed first.
 
-        `check_holder` raises if the present holder lives. On file systems with flock no other
-        process acquires the lock meanwhile. BusyError is raised if another process was quicker.
+        `check_holder` raises an error if the present holder lives. On file systems with flock no
+        other process acquires the lock meanwhile. BusyError is raised if another process was
+        quicker.
         """
         self._lock_path.parent.mkdir(exist_ok=True)
         with self._acquisition_guard(say):  # one process at a time checks and acquires
@@ -734,7 +745,7 @@ class _FileLock:
 
     @contextmanager
     def _acquisition_guard(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Keep other processes from acquiring the lock meanwhile, if the file system has flock."""
+        """Context manager that keeps other processes from acquiring the lock, if there is flock."""
         guard_path = self._lock_path.with_name("lock.guard")
         open_flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         guard_descriptor = os.open(guard_path, open_flags, 0o666)
@@ -758,7 +769,7 @@ class _FileLock:
             os.close(guard_descriptor)
 
     def _remove_stale_lock(self, stale_json: str | None) -> None:
-        """Remove the lock file of a dead holder; put back a newer one that was removed instead."""
+        """Remove the lock file of a dead holder. Restore it if it is another holder's by now."""
         if stale_json is None:
             return
         _log.debug("%s: taking over from %s", self._lock_path, escape_to_one_line(stale_json))
@@ -805,7 +816,7 @@ class _FileLock:
             raise
 
     def send_heartbeat(self) -> None:
-        """Update the lock file's time, which shows that the holder still runs."""
+        """Update the modification time of the lock file, to show that the holder still runs."""
         os.utime(self._lock_path)
 
     def release(self) -> None:
@@ -830,10 +841,10 @@ def _warn_once(say: Callable[[str], None], kind: str, warning: str) -> None:
         say(f"warning: {warning}")
 
 
-class _ObjectLock:
+class _ObjectStoreLock:
     """Lock of a store in an object store: an object with its holder and a count of heartbeats.
 
-    It is written only if no other process has changed it.
+    This process writes the object only if no other process has changed it.
     """
 
     def __init__(self, lock_path: ObjectPath) -> None:
@@ -853,8 +864,8 @@ class _ObjectLock:
     def _read_lock_object(self) -> VersionedContent | None:
         """Return the content of the lock and its version, read once more if it is incomplete.
 
-        An incomplete content would be taken for the lock of another process. ObjectStoreError is
-        raised if it is incomplete twice.
+        Incomplete content would be mistaken for another process's lock. ObjectStoreError is raised
+        if the content is incomplete twice.
         """
         for _ in range(2):
             lock_object = self._lock_path.read_with_version()
@@ -901,7 +912,7 @@ class _ObjectLock:
         raise ObjectStoreError(11, "others are quicker to lock it: try again", str(self._lock_path))
 
     def send_heartbeat(self) -> None:
-        """Raise the count of heartbeats in the lock, which shows that the holder still runs."""
+        """Increase the count of heartbeats in the lock, to show that the holder still runs."""
         self._replace_content(f"{self._holder_json}\n{self._n_heartbeats + 1}\n")
         self._n_heartbeats += 1
 
@@ -925,17 +936,19 @@ def _holder_json_of_content(content: bytes) -> str:
     return content.decode("utf-8", "replace").partition("\n")[0]
 
 
-def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
+def _lock_of_store(store_path: Location) -> _FileLock | _ObjectStoreLock:
     """Return the lock of a store, on disk or in an object store."""
     lock_path = store_path / JOURNAL_DIR / LOCK_FILE
-    return _ObjectLock(lock_path) if isinstance(lock_path, ObjectPath) else _FileLock(lock_path)
+    return (
+        _ObjectStoreLock(lock_path) if isinstance(lock_path, ObjectPath) else _FileLock(lock_path)
+    )
 
 
 def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
-    """Wait until the last heartbeat of a lock's holder is too old, or a new one arrives.
+    """Wait, if a process on another machine holds a lock, until its last heartbeat is too old.
 
-    The holder is on another machine. A job that was killed and soon restarted on another node is
-    thus not refused.
+    The wait ends early if a new heartbeat arrives. A job that was killed, and soon restarted on
+    another node, is thus not refused.
     """
     other_holder, heartbeat_version = (
         read_lock_holder(store_path),
@@ -949,19 +962,19 @@ def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> Non
         return
     seconds_left = HEARTBEAT_AGE_SECONDS_MAX - heartbeat_age(store_path)
     if 0 < seconds_left <= HEARTBEAT_AGE_SECONDS_MAX:
-        _sends_no_heartbeat(store_path, other_holder, heartbeat_version, seconds_left, say)
+        _confirm_heartbeat_stopped(store_path, other_holder, heartbeat_version, seconds_left, say)
 
 
-def _sends_no_heartbeat(
+def _confirm_heartbeat_stopped(
     store_path: Location,
     other_holder: LockHolder,
     heartbeat_version: object,
     watch_seconds: float,
     say: Callable[[str], None],
 ) -> bool:
-    """Watch a lock for some time by this process's clock.
+    """Watch a lock for `watch_seconds`. Return True if the holder sends no heartbeat in this time.
 
-    Return True if the holder sent no heartbeat in this time.
+    The time is measured by this process's clock.
     """
     holder_text = f"process {other_holder.pid} on {escape_to_one_line(other_holder.host)}"
     _log.debug("%s: watching the heartbeat of %s", store_path, holder_text)
@@ -1005,10 +1018,10 @@ class StoreLock:
         self._heartbeat_thread.start()
 
     def _watch_other_holder(self, say: Callable[[str], None]) -> object:
-        """Watch the heartbeat of a lock's holder on another machine.
+        """Watch the heartbeat of the lock's holder, if it is on another machine.
 
-        Return the state of the lock if no heartbeat arrives, None if there is no such holder.
-        BusyError is raised if the holder lives.
+        Return the holder and the state of its heartbeat if no new one arrives; None if the lock has
+        no holder on another machine. BusyError is raised if the holder lives.
         """
         other_holder, heartbeat_version = (
             read_lock_holder(self._store_path),
@@ -1021,7 +1034,7 @@ class StoreLock:
         ):
             return None
         is_doubtful = not 0 <= heartbeat_age(self._store_path) < HEARTBEAT_AGE_SECONDS_MAX
-        if is_doubtful and _sends_no_heartbeat(
+        if is_doubtful and _confirm_heartbeat_stopped(
             self._store_path, other_holder, heartbeat_version, HEARTBEAT_WATCH_SECONDS, say
         ):
             return other_holder, heartbeat_version
@@ -1055,7 +1068,7 @@ class StoreLock:
         )
 
     def _send_heartbeats(self) -> None:
-        """Update the heartbeat until the lock is released."""
+        """Send heartbeats at intervals until the lock is released."""
         while not self._is_released.wait(HEARTBEAT_INTERVAL_SECONDS):
             try:
                 if self.is_held():

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 #: Time between lines of progress without a terminal [s].
 PROGRESS_LINE_INTERVAL_SECONDS = 30.0
 
-#: Number of times per second that a progress bar is drawn [Hz]. Each time takes some ms.
+#: Number of times per second that a progress bar is drawn [Hz]. Drawing takes some ms.
 BAR_REFRESH_RATE_HZ = 4.0
 
-#: Width of a terminal from which a progress bar shows threads or workers and bytes too [columns].
+#: Smallest width of a terminal [columns] at which a progress bar also shows workers and bytes.
 WIDE_TERMINAL_COLUMNS_MIN = 100
 
 #: Duration of an activity after which a message about it is shown [s]. Most activities are shorter.
@@ -50,12 +50,12 @@ class CodeError(TaskError):
 
 
 class SchedulerLostError(Exception):
-    """Error raised if the Dask scheduler disappears during a run. Committed blocks are safe."""
+    """Error of a Dask scheduler that disappears during a run. Committed blocks are safe."""
 
 
 @contextmanager
 def raise_as_store_error(problem: str) -> Iterator[None]:
-    """Context manager: raise errors of the disk or of an object store as a StoreError.
+    """Context manager that raises errors of the disk or of an object store as a StoreError.
 
     The message of the StoreError begins with `problem`.
     """
@@ -77,7 +77,7 @@ class Progress:
         """
 
     def advance(self, *, points: float, failed: int) -> None:
-        """Add points that were computed and blocks that failed since the last call.
+        """Add the numbers of points computed, and of blocks failed, since the last call.
 
         Both are 0 if only time has passed.
         """
@@ -88,8 +88,8 @@ class Progress:
     def update_threads(self, *, threads: int, stored: int) -> None:
         """Set the number of threads and the size stored so far [bytes]. Called before `advance`.
 
-        The threads of the command's process compute without workers. A listener that does not
-        distinguish them from workers need not define this method.
+        These threads of the command's process compute instead of workers. A listener that does not
+        distinguish threads from workers need not define this method.
         """
         self.update_workers(workers=threads, stored=stored)
 
@@ -110,7 +110,7 @@ def make_progress(progress: bool | Progress) -> Progress:
 
 
 class _GuardedListener(Progress):
-    """Wrapper of a user's progress listener, which is not called again after its first error."""
+    """Wrapper of a user's progress listener, which is not called after its first error."""
 
     def __init__(self, listener: Progress) -> None:
         self._listener, self._has_failed = listener, False
@@ -152,7 +152,7 @@ class _GuardedListener(Progress):
 
 @contextmanager
 def show_activity(activity: str, progress: Progress | None = None) -> Iterator[None]:
-    """Show a text about the work in the context if it takes longer than two seconds.
+    """Context manager that shows a text about the work in it if this takes more than two seconds.
 
     If kernels are being compiled, the text says so.
     """

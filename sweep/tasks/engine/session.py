@@ -86,11 +86,11 @@ if TYPE_CHECKING:
 #: Value of the option `scheduler` that selects serial computation in this process.
 SERIAL_SCHEDULER_OPTION = "none"
 
-#: Number of failed blocks, while no block has succeeded, after which a run stops.
+#: Number of failed blocks at which a run stops if no block has succeeded.
 MAX_INITIAL_FAILURES = 20
 
-#: Time for which a run waits for the search for missing chunks [s]. Afterwards it trusts the log of
-#: receipts, and the search goes on during the run.
+#: Longest wait of a run for the search for missing chunks [s]. The run then relies on the log of
+#: receipts, and the search continues during the run.
 CHUNK_SCAN_TIMEOUT_SECONDS = 2.0
 
 #: Time without any connected worker after which a warning is given [s].
@@ -101,6 +101,7 @@ SUMMED_RECEIPT_FIELDS = ("points", "reused_points", "bytes", "seconds", "write_s
 
 _log = logging.getLogger("sweep.session")
 
+#: Message about a checkpoint that the next worker does not see.
 CHECKPOINT_LOST_MESSAGE = (
     "block {} is computed in pieces, and what one worker saved was not found by the next: "
     "do all of them see the same store?"
@@ -115,8 +116,9 @@ class RunOptions:
     ----------
     client
         Dask client to compute with. Without one, `threads`, `workers`, `scheduler` and `cluster`
-        select the backend. By default threads of this process compute on all cores. Studies that
-        call the user's Python functions, and options that need a scheduler, have worker processes.
+        select the backend. By default threads of this process compute on all cores. Worker
+        processes are used for studies that call the user's Python functions, and for options that
+        need a scheduler.
     threads
         Number of threads of this process that compute blocks; one per core by default.
     workers, processes
@@ -165,7 +167,7 @@ class RunOptions:
             is_integer = isinstance(number, Integral) and not isinstance(number, bool)
             if number is not None and not (is_integer and number > 0):
                 raise ClusterError(f"{name} must be a whole number above 0, not {number!r}")
-        if self.threads is not None and (named := self._first_option_of_workers()):
+        if self.threads is not None and (named := self._first_option_needing_workers()):
             raise ClusterError(
                 f"{option_name('threads')} computes in this process, and {option_name(named)} with "
                 "workers: leave out one"
@@ -201,10 +203,8 @@ class RunOptions:
     def resolve_cluster(self, workload: Workload) -> AnyClusterConfig | None:
         """Return the cluster that the options name, or else that of the spec's section `execution`.
 
-        The result is None if blocks are computed in this process.
-
-        ClusterError is raised if both a scheduler and a cluster are named, or a number of workers
-        for a scheduler that runs already.
+        The result is None if blocks are computed in this process. ClusterError is raised if both a
+        scheduler and a cluster are named, or a number of workers for a scheduler that runs already.
         """
         if self.cluster is not None:
             if self.scheduler is not None:
@@ -266,12 +266,12 @@ class RunOptions:
             return True
         execution = workload.execution
         needs_workers = (
-            self._first_option_of_workers() or self.evaluate or workload.user_module_names
+            self._first_option_needing_workers() or self.evaluate or workload.user_module_names
         )
         return not needs_workers and execution == Execution()
 
-    def _first_option_of_workers(self) -> str:
-        """Return the name of the first set option that only worker processes can serve, or ''."""
+    def _first_option_needing_workers(self) -> str:
+        """Return the name of the first option in use that requires Dask workers; '' if none is."""
         is_set = {
             "workers": self.workers is not None,
             "client": self.client is not None,
@@ -356,7 +356,7 @@ class ComputeBackend(ExitStack):
     def n_threads(self) -> int:
         """Number of threads of this process that compute; 0 if workers do.
 
-        There are as many as memory and blocks suffice for.
+        It is limited by memory, and by the number of blocks.
         """
         if not self.is_in_process:
             return 0
@@ -376,7 +376,7 @@ class ComputeBackend(ExitStack):
         return self.options.client is None and isinstance(self._cluster, ExistingSchedulerConfig)
 
     def connect(self) -> ClusterConnection:
-        """Connect to the workers, and start at most `max_workers` if they do not run yet.
+        """Connect to the workers. If they do not run yet, start at most `max_workers`.
 
         ClusterError is raised if no worker is available.
         """
@@ -478,18 +478,18 @@ class ComputeBackend(ExitStack):
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOutcome:
-    """Result of one session: numbers of blocks and points, size, and why it stopped."""
+    """Result of one session: numbers of blocks and points, times, and why it stopped."""
 
     store: Location
     points_noun: str  # name of the points, in the plural
     points: int  # number of points of the study
-    blocks: int
-    points_done: int  # points of committed blocks, in this run or before
-    blocks_done: int
-    points_computed: int  # in this run, without those taken from a smaller study's store
-    blocks_computed: int
-    failures: tuple[Failure, ...]
-    blocks_skipped: int  # blocks that failed in an earlier run and were not tried again
+    blocks: int  # number of blocks of the study
+    points_done: int  # number of points of committed blocks, in this run or before
+    blocks_done: int  # number of committed blocks, in this run or before
+    points_computed: int  # number in this run, without points taken from a smaller study's store
+    blocks_computed: int  # number in this run
+    failures: tuple[Failure, ...]  # permanent failures of this run
+    blocks_skipped: int  # number of blocks that failed in an earlier run and were not tried again
     stop_reason: str  # reason for stopping early, or ''
     seconds: float  # wall time of this run [s]
     work_seconds: float  # time of evaluating and writing, summed over workers [s]
@@ -524,10 +524,7 @@ def _block_count_text(count: int) -> str:
 
 
 class NoWorkerMonitor:
-    """Monitor that warns if a cluster has no workers for long.
-
-    Intervals between warnings double.
-    """
+    """Monitor that warns if a cluster has no workers for long, at increasing intervals."""
 
     def __init__(self) -> None:
         self._last_seen, self._has_had_workers, self._warn_after = (
@@ -559,7 +556,7 @@ class NoWorkerMonitor:
 
 
 class Session:
-    """Computation of the missing blocks of a store. This process holds the store's lock."""
+    """Computation of the missing blocks of a store, whose lock this process holds."""
 
     def __init__(
         self, store_path: Location, study: BlockStudy, backend: ComputeBackend, lock: StoreLock
@@ -758,14 +755,14 @@ class Session:
                 and len(self._permanent_failures) >= MAX_INITIAL_FAILURES
             ):
                 return f"the first {MAX_INITIAL_FAILURES} blocks all failed"
-        points_before = self._points_so_far()
+        points_before = self._n_points_so_far()
         self._flush_receipts(force=True)
-        self._progress.advance(points=self._points_so_far() - points_before, failed=0)
+        self._progress.advance(points=self._n_points_so_far() - points_before, failed=0)
         return "interrupted" if self._interrupts.is_stopping else ""
 
     def _commit_task_result(self, task_result: TaskResult, block_queue: BlockQueue) -> None:
         """Append a task's receipts and failures to the journal, and report the progress."""
-        points_before, failures_before = self._points_so_far(), len(self._permanent_failures)
+        points_before, failures_before = self._n_points_so_far(), len(self._permanent_failures)
         self._journal.commit(*task_result.receipts)
         self._unflushed_receipts += task_result.receipts
         for failure in task_result.failures:
@@ -784,14 +781,14 @@ class Session:
         else:
             self._progress.update_workers(workers=task_result.n_workers, stored=bytes_stored)
         self._progress.advance(
-            points=self._points_so_far() - points_before,
+            points=self._n_points_so_far() - points_before,
             failed=len(self._permanent_failures) - failures_before,
         )
 
     def _flush_receipts(self, *, force: bool = False) -> None:
-        """Write receipts that are not written yet.
+        """Write pending receipts that are due, or all if `force`.
 
-        Add written ones to the totals of the session.
+        Once all are written, add them to the totals of the session.
         """
         if not self._journal.flush(force=force):
             return
@@ -805,13 +802,13 @@ class Session:
                 journal.delete_checkpoints(self._store_path, receipt.block)
         self._unflushed_receipts.clear()
 
-    def _points_so_far(self) -> float:
-        """Return the number of points done in this run, with those of unfinished blocks."""
+    def _n_points_so_far(self) -> float:
+        """Return the number of points done in this run, and of those in checkpoints."""
         return self._receipt_totals["points"] + sum(self._checkpoint_points.values())
 
 
 def store_write_error_text(store_path: Location, error: OSError) -> str:
-    """Return the reason why a store can't be written, and the remedy, as text of a message."""
+    """Return the reason why a store can't be written, and the remedy, as text for a message."""
     if isinstance(error, ObjectStoreError):
         return f"the store can't be written: {error.strerror}"
     if not _store_exists(store_path):

@@ -1,6 +1,6 @@
-"""Reports of runs that stall: no block comes back for long.
+"""Reports of stalled runs, in which no block is finished for long.
 
-Workers of a cluster, threads of this process and the plain loop are watched with the same patience.
+Workers of a cluster, threads of this process and the plain loop are watched in the same way.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import NamedTuple
 from sweep.messages import number_with_noun
 from sweep.tasks.engine.progress import duration_text
 
-#: Time without any result after which a message says that the run stalls [s]. It is longer if tasks
-#: take long.
+#: Shortest time without any result after which a stall is reported [s].
 STALL_REPORT_SECONDS = 60.0
 
-#: Time without any result after which a stall is reported, as a multiple of a task's expected time.
+#: Time without any result after which a stall is reported, as a multiple of a task's expected time,
+#: if that is longer than `STALL_REPORT_SECONDS`.
 STALL_TASK_DURATION_FACTOR = 5.0
 
 #: Largest number of blocks in progress that a summary lists.
@@ -32,7 +32,8 @@ COMPILATION_SECONDS_MAX = 600.0
 #: Longest wait for the thread that watches the plain loop to end [s]; it may be printing.
 WATCHER_END_SECONDS_MAX = 1.0
 
-PrintMessage = Callable[[str], None]
+MessagePrinter = Callable[[str], None]
+"""Function that shows a message to the user."""
 
 _log = logging.getLogger("sweep.stalls")
 
@@ -40,11 +41,11 @@ _log = logging.getLogger("sweep.stalls")
 class StallMonitor:
     """Monitor that reports the state of a run if no result arrives for long.
 
-    The intervals between reports increase. Only the first report without a result in between prints
-    the state; all of them log it. ``state_summary`` returns the state as text of several lines.
+    The intervals between reports increase. Every report logs the state, but only the first one
+    after a result prints it. ``state_summary`` returns the state as text of several lines.
     """
 
-    def __init__(self, say: PrintMessage, state_summary: Callable[[], str]) -> None:
+    def __init__(self, say: MessagePrinter, state_summary: Callable[[], str]) -> None:
         self._say, self._state_summary = say, state_summary
         self._last_result_at = time.monotonic()
         self._patience = STALL_REPORT_SECONDS  # time after it until the next report [s]
@@ -52,7 +53,10 @@ class StallMonitor:
         self._lock = threading.Lock()  # results and reports may come from different threads
 
     def record_result(self, expected_task_seconds: float) -> None:
-        """Begin to wait for the next result, which is expected to take as long as given [s]."""
+        """Record that a result has arrived, and begin to wait for the next one.
+
+        `expected_task_seconds` is the expected duration of a task [s].
+        """
         with self._lock:
             self._last_result_at = time.monotonic()
             self._patience = max(
@@ -61,15 +65,15 @@ class StallMonitor:
             self._has_printed_state = False
 
     def restart_waiting(self) -> None:
-        """Begin to wait again, as nothing is being computed."""
+        """Measure the time without a result from now on, as nothing is being computed."""
         with self._lock:
             self._last_result_at = time.monotonic()
 
     def report_if_stalled(self, *, explanation: str = "", explained_seconds: float = 0.0) -> None:
         """Print a message and log the state of the run if no result has arrived for long.
 
-        In the first ``explained_seconds`` the message gives the ``explanation`` instead of the
-        state.
+        In the first ``explained_seconds`` after a result the message gives the ``explanation``
+        instead of the state.
         """
         with self._lock:
             seconds_waited = time.monotonic() - self._last_result_at
@@ -108,7 +112,7 @@ class InProcessMonitor:
     ``count_unassigned_blocks`` returns the number of blocks whose computation has not begun.
     """
 
-    def __init__(self, say: PrintMessage, count_unassigned_blocks: Callable[[], int]) -> None:
+    def __init__(self, say: MessagePrinter, count_unassigned_blocks: Callable[[], int]) -> None:
         self._count_unassigned_blocks = count_unassigned_blocks
         self._in_progress: dict[int, BlockInProgress] = {}  # by the identifier of the thread
         self._n_blocks, self._work_seconds = 0, 0.0
@@ -116,7 +120,7 @@ class InProcessMonitor:
 
     @contextmanager
     def list_while_computed(self, block: int) -> Iterator[None]:
-        """List a block as being computed by this thread, inside a `with` statement."""
+        """Context manager that lists a block as being computed by this thread."""
         thread = threading.current_thread()
         self._in_progress[threading.get_ident()] = BlockInProgress(block, time.time(), thread.name)
         try:
@@ -161,9 +165,9 @@ class InProcessMonitor:
 
     @contextmanager
     def watch_in_thread(self, interval_seconds: float) -> Iterator[None]:
-        """Check for a stall at intervals, in a thread of its own, inside a `with` statement.
+        """Context manager that checks for a stall at intervals, in a further thread.
 
-        It serves the plain loop, whose thread is busy with a block. Messages come from that thread.
+        It serves the plain loop, whose own thread is busy with a block.
         """
         is_over = threading.Event()
 

@@ -41,7 +41,7 @@ from sweep.storage.locations import (
     ObjectStoreError,
     atomic_write,
     file_sizes_below,
-    iter_entries_below,
+    iter_file_entries_below,
     iter_names_below,
     map_concurrently,
     os_error_reason,
@@ -70,7 +70,7 @@ from sweep.storage.store_format import (
 )
 from sweep.storage.verified_store import CHUNK_NAME_PATTERN
 from sweep.tasks.engine.block_study import BlockStudy, StoreTemplate
-from sweep.tasks.engine.blocks import CF_CONVENTIONS, ArrayLayout
+from sweep.tasks.engine.blocks import CF_CONVENTIONS_VERSION, ArrayLayout
 from sweep.tasks.engine.journal import (
     LOCK_FILE,
     LOG_FILE_NAMES,
@@ -112,9 +112,9 @@ def create_store(
 ) -> Location:
     """Create a store that holds metadata and arrays with known values, but no results.
 
-    On disk the store is built in the same folder and renamed, so that an interrupted creation
-    leaves nothing that passes for a store. For an object store it is built on this machine and
-    uploaded, its root last. StoreError is raised if something is at the path, or the path is not
+    On disk the store is built under a hidden name and then renamed, so that an interrupted creation
+    leaves no incomplete store. For an object store it is built on this machine and uploaded, its
+    root document last. StoreError is raised if something is at the path, or the path is not
     writable.
     """
     store_path = parse_location(store_path)
@@ -172,7 +172,7 @@ def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
 
 @contextmanager
 def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
-    """Mark a path in an object store as reserved while a store is created there.
+    """Context manager that reserves a path in an object store while a store is created there.
 
     StoreError is raised if something else is at the path.
     """
@@ -197,7 +197,7 @@ def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
 def remove_store(store_path: Location) -> None:
     """Remove a store in one step.
 
-    In an object store its root metadata goes first, which makes it invalid.
+    In an object store, the root document is removed first, without which there is no store.
     """
     if isinstance(store_path, Path):
         remove_atomically(store_path)
@@ -220,8 +220,8 @@ def build_template(
 ) -> None:
     """Create the template on disk: a store without results.
 
-    `shard_shape_of` returns, for an array, the shape of the shard that a file holds. Without it a
-    file holds one chunk.
+    `shard_shape_of` returns the shape of an array's shards, of which a file holds one, or None if a
+    file holds one chunk, which is the default.
     """
     group = zarr.create_group(
         SingleWriterLocalStore(store_path), zarr_format=3, attributes=attributes
@@ -239,9 +239,9 @@ def build_template(
 
 
 def template_attributes(template: StoreTemplate) -> dict[str, Any]:
-    """Return the root attributes of a new store: those of the study, and versions."""
+    """Return the root attributes of a new store: those of the study, versions and processor."""
     return template.store_attributes() | {
-        "Conventions": CF_CONVENTIONS,
+        "Conventions": CF_CONVENTIONS_VERSION,
         "study_id": template.id,
         "model_version": template.model_version,
         "software": format_software_versions(current_software_versions()),
@@ -253,7 +253,7 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
 def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
-    """Write the manifest: root attributes, and digests of all objects without results."""
+    """Write the manifest: root attributes, and digests of all objects that hold no results."""
     records = [encode_record({"attributes": attributes, "objects": len(digests)})]
     records += [
         encode_record({"object": name, "digest": object_digest})
@@ -310,7 +310,7 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
 
     `values` may be smaller than a chunk at the edge of the array; the rest is filled. The bytes are
     compressed little-endian values in C order, and their crc32c. Zarr's own encoder takes ten times
-    as long: for a block of 26 arrays that takes a second to compute, some 2 % of the second.
+    as long: 20 ms for a block of 26 arrays.
     """
     dtype = np.dtype(layout.dtype).newbyteorder("<")
     if values.shape == layout.chunks:
@@ -336,7 +336,7 @@ class BlockWriter:
         self.store_path, self.study = parse_location(store_path), study
 
     def write(self, block: int, results: Mapping[str, np.ndarray]) -> BlockDigest:
-        """Write all chunks of one block; ValueError if the results don't match its arrays."""
+        """Write all chunks of one block. Raise ValueError if the results don't match its arrays."""
         positions = self.study.chunk_positions(block)
         if results.keys() != positions.keys():
             mismatched_names = sorted(results.keys() ^ positions.keys())
@@ -437,7 +437,7 @@ def remove_draft_files(store_path: Location) -> None:
     if isinstance(store_path, Path):
         partial_files = (
             candidate
-            for candidate in iter_entries_below(str(store_path))
+            for candidate in iter_file_entries_below(str(store_path))
             if candidate.name.endswith(locations.DRAFT_SUFFIX)
         )
         for entry in _exclude_foreign_files(store_path, partial_files):
@@ -453,7 +453,7 @@ def refuse_links(store_path: Location) -> None:
     if isinstance(store_path, Path):
         links = (
             entry
-            for entry in iter_entries_below(str(store_path))
+            for entry in iter_file_entries_below(str(store_path))
             if entry.is_symlink() and (entry.is_dir() or not os.path.exists(entry.path))
         )
         for entry in _exclude_foreign_files(store_path, links):
@@ -465,7 +465,7 @@ def refuse_links(store_path: Location) -> None:
 def _exclude_foreign_files(
     store_path: Path, entries: Iterable[os.DirEntry[str]]
 ) -> list[os.DirEntry[str]]:
-    """Return those entries below a store that sweep has made."""
+    """Return the directory entries, of those below a store, that are not foreign."""
     entries = list(entries)
     if not entries:
         return []  # without a search for foreign files, which walks through the store
@@ -480,11 +480,11 @@ def _exclude_foreign_files(
 
 
 class Damage(NamedTuple):
-    """Object of a store that differs from what was written, with a text about the difference."""
+    """Damage of an object in a store: its difference from what was written."""
 
     object_name: str  # path inside the store; with the line number in a log
-    description: str  # description of the damage
-    block: int = -1  # block of the object; -1 without one
+    description: str  # what is wrong, as a predicate such as "is missing"
+    block: int = -1  # number of the block that wrote the object; -1 for other objects
     repaired_by: str = "resume"  # "repair" for objects of the template, "hand" for surplus ones
 
 
@@ -553,7 +553,7 @@ def refuse_damaged_template(store_path: Location) -> None:
 
 
 def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
-    """Raise a StoreError if a store has other blocks, or lacks an array that the study has here."""
+    """Raise a StoreError if a store has blocks of other shapes, or lacks an array of the study."""
     nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
     for name in study.output_layout_by_name:
         if name not in nodes:
@@ -566,9 +566,10 @@ def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
 
 
 def refuse_other_block_shapes(store_path: Location, study: BlockStudy) -> None:
-    """Raise a StoreError if an unpacked store has blocks of another shape than the study here.
+    """Raise a StoreError if an unpacked store has blocks of another shape than the study.
 
-    Receipts and chunks of another version of this program would be taken for those of other points.
+    Another version of this program may have cut the study otherwise. Its receipts and chunks would
+    then be attributed to the wrong points.
     """
     nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
     for layout in study.output_layout_by_name.values():
@@ -610,9 +611,11 @@ def damage_or_read_error(read_damage: Callable[[], str]) -> str:
 def is_block_visible(
     store_path: Location, study: BlockStudy, receipt: Receipt, check_digest: bool
 ) -> bool:
-    """Return True if a block that a worker has written is in the store as this process sees it.
+    """Return True if this process sees the block of a receipt in the store.
 
-    The size of its chunks is compared with the receipt, or their digest if `check_digest`.
+    If `check_digest`, the digest of the block's chunks must be that of the receipt. Otherwise, on
+    disk, their total size must be that of the receipt; in an object store, the last chunk must not
+    be empty.
     """
     chunk_paths = chunk_names_of_block(study, receipt.block)
     try:
@@ -631,21 +634,21 @@ def is_block_visible(
     return (store_path / chunk_paths[-1]).size() > 0
 
 
-#: Python packages whose version can change a result, or the bytes in which it is stored.
-VERSIONED_DISTRIBUTIONS = ("numba", "numpy", "scipy", "sweep", "zarr")
+#: Names of Python packages whose version can change a result, or the bytes in which it is stored.
+RESULT_AFFECTING_PACKAGES = ("numba", "numpy", "scipy", "sweep", "zarr")
 
 
 @cache
 def current_software_versions() -> dict[str, str]:
     """Return the versions of the software that results depend on, by name."""
-    return {name: version(name) for name in VERSIONED_DISTRIBUTIONS}
+    return {name: version(name) for name in RESULT_AFFECTING_PACKAGES}
 
 
 @cache
 def processor_description() -> str:
     """Return machine, processor and vector instructions as text.
 
-    NumPy and LLVM choose machine code by them, so the last bits of results may depend on them.
+    NumPy and LLVM choose machine code by them, so that the last bits of results may differ.
     """
     import llvmlite.binding
     import numpy as np
@@ -657,7 +660,7 @@ def processor_description() -> str:
 
 
 def refuse_foreign_store(store_path: Location) -> None:
-    """Raise a StoreError if what is at a path was not made by sweep; a damaged store passes."""
+    """Raise a StoreError if sweep did not make what is at a path. Damaged stores are accepted."""
     if not any(
         any(iter_records(store_path / JOURNAL_DIR / name))
         for name in (MANIFEST_FILE, *LOG_FILE_NAMES)
@@ -666,7 +669,7 @@ def refuse_foreign_store(store_path: Location) -> None:
 
 
 def refuse_to_replace(store_path: Location) -> None:
-    """Raise a StoreError if what is at a path was not made by sweep, or can't be renamed."""
+    """Raise a StoreError if sweep did not make what is at a path, or if it can't be renamed."""
     if not isinstance(store_path, Path):
         raise StoreError(
             f"{store_path} can't be replaced or extended in its place, as an object store has no "
@@ -692,9 +695,9 @@ def refuse_foreign_files(store_path: Location) -> None:
 def find_pending_replacement(store_path: Location) -> Path | None:
     """Return the path of an unfinished store that will replace the store at ``store_path``.
 
-    The result is None if no replacement is under way. Replacements that dead
-    processes left behind are first completed or undone. StoreError is raised if the unfinished
-    store was begun to replace another study's store than the one now at ``store_path``.
+    The result is None if there is none. Replacements that dead processes have left are first
+    completed or undone. StoreError is raised if the unfinished store was begun to replace the store
+    of another study than the one now at ``store_path``.
     """
     recover_interrupted_replace(store_path)
     if (
@@ -718,9 +721,9 @@ def find_pending_replacement(store_path: Location) -> Path | None:
 def refuse_other_versions(
     store_path: str | Location, attributes: dict[str, Any], model_version: str, *, reader: str
 ) -> None:
-    """Raise a StoreError if a store was begun with another model or other software.
+    """Raise a StoreError if a store was begun with other versions of the model or of software.
 
-    Its bits could differ from those of new results. `reader` names this process in the message.
+    New results could differ from the stored ones. `reader` names this process in the message.
     """
     recorded = {"model": attributes["model_version"], **parse_software_versions(attributes)}
     current = {"model": model_version, **current_software_versions()}

@@ -19,7 +19,7 @@ from typing import Any
 #: Descriptors of standard input, output and error.
 STANDARD_DESCRIPTORS = (0, 1, 2)
 
-#: Time for which a flush waits for a reader that has stopped [s].
+#: Longest time that a flush waits for a reader that has stopped [s].
 READER_PATIENCE_SECONDS = 0.3
 
 #: Time without any text after which the writer thread ends [s].
@@ -96,7 +96,7 @@ class ForgivingStream(io.TextIOBase):
                 self._go_silent(error)
 
     def finish_writing(self) -> None:
-        """Write out all text for the last time, so that no later flush can fail."""
+        """Flush for the last time. After an error the stream is silent: no later flush can fail."""
         self.flush()
         try:
             if self._stream is not None:
@@ -118,10 +118,10 @@ class ForgivingStream(io.TextIOBase):
 class StallTolerantStream(ForgivingStream):
     """Text stream whose reader may stop for a while, as a terminal does after Ctrl-S.
 
-    A thread writes to the descriptor of the inner stream. A flush waits for the thread for at most
-    `READER_PATIENCE_SECONDS`, and not at all from then on until the reader continues. If
-    `WAITING_TEXTS_MAX` texts wait, further ones are dropped. If the inner stream has no descriptor,
-    texts are written to it at once.
+    A thread writes to the descriptor of the inner stream. A flush waits for this thread for at most
+    `READER_PATIENCE_SECONDS`. After such a timeout, flushes do not wait until the reader continues.
+    If `WAITING_TEXTS_MAX` texts wait, further ones are dropped. If the inner stream has no
+    descriptor, texts are written to it at once.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -226,8 +226,8 @@ def is_terminal(stream: Any) -> bool:
 
 @contextmanager
 def silence_failing_output() -> Iterator[None]:
-    """Make standard output and error of this process silent after their first error."""
-    _open_standard_descriptors()
+    """Context manager in which standard output and error become silent after their first error."""
+    _open_closed_descriptors()
     original_streams = sys.stdout, sys.stderr
     output, errors = (ForgivingStream(stream) for stream in original_streams)
     sys.stdout, sys.stderr = output, errors
@@ -241,10 +241,10 @@ def silence_failing_output() -> Iterator[None]:
         sys.stdout, sys.stderr = original_streams
 
 
-def _open_standard_descriptors() -> None:
-    """Open those of the descriptors 0 to 2 that are closed.
+def _open_closed_descriptors() -> None:
+    """Open the null device at each of the descriptors 0 to 2 that is closed.
 
-    New files would otherwise get their numbers, and with them the program's output.
+    Otherwise files that are opened later would get these descriptors, and the program's output.
     """
     for descriptor in STANDARD_DESCRIPTORS:
         try:

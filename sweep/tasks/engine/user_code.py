@@ -2,7 +2,7 @@
 
 Processes that compute import code of the user's only from modules allowed by ``--allow-code
 MODULE``, by ``allow_code=[...]``, or in the environment variable ``SWEEP_ALLOW_CODE``. A run tells
-its workers which modules are allowed. It excludes a worker that has another file of that name.
+its workers which modules are allowed, and excludes a worker whose file of a module differs.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from types import ModuleType
 
 from sweep.tasks.engine.progress import CodeError
 
+#: Environment variable with the names of the modules that may be imported, separated by commas.
 ALLOWED_MODULES_VARIABLE = "SWEEP_ALLOW_CODE"
 
 
@@ -41,10 +42,10 @@ def allow_modules(modules: Iterable[str]) -> None:
     module_names = {*allowed_modules(), *modules}
     if module_names:
         os.environ[ALLOWED_MODULES_VARIABLE] = ",".join(sorted(module_names))
-        _import_from_working_directory()  # spawned workers inherit the search path
+        _append_working_directory_to_path()  # spawned workers inherit the search path
 
 
-def _import_from_working_directory() -> None:
+def _append_working_directory_to_path() -> None:
     """Append the working directory to Python's search path.
 
     It comes last, as any user may have put files there.
@@ -73,8 +74,8 @@ def _module_file_digest(module: ModuleType) -> str:
 def allow_identical_module(module: str, digest: str) -> None:
     """Allow a module in this worker if its file equals that of the process that started the run.
 
-    CodeError is raised if the file differs. It is checked once per process: an imported module does
-    not change with its file.
+    CodeError is raised if the file differs. The file is checked once per process, as an imported
+    module does not change with its file.
     """
     allow_modules([module])
     imported_module = import_user_module(module)
@@ -89,7 +90,7 @@ def allow_identical_module(module: str, digest: str) -> None:
 
 def import_user_module(name: str) -> ModuleType:
     """Import a module of the user's; raise CodeError, with the reason, if that fails."""
-    _import_from_working_directory()
+    _append_working_directory_to_path()
     try:
         return import_module(name)
     except (Exception, SystemExit) as error:

@@ -24,28 +24,29 @@ from typing import TypeVar
 
 import numpy as np
 
-from sweep.storage.locations import parse_location, store_fingerprint
+from sweep.storage.locations import parse_location, store_stat_fingerprint
 from sweep.storage.store_format import read_attributes
 from sweep.tasks.engine import journal, study_store, user_code
 from sweep.tasks.engine.block_study import BlockEvaluator, Deadline, StudyReader, UnfinishedBlock
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import Checkpoint, Failure, Receipt
 from sweep.tasks.engine.progress import CodeError, StoreError
-from sweep.tasks.engine.stalls import InProcessMonitor, PrintMessage
+from sweep.tasks.engine.stalls import InProcessMonitor, MessagePrinter
 
-ReturnValue = TypeVar("ReturnValue")
+ReturnValueT = TypeVar("ReturnValueT")
+"""Type that the function of `run_with_timeout` returns."""
 
-#: Errors of the storage that every further block would raise too, so that a run stops.
-STORAGE_ERRNOS = {
+#: Error numbers of the storage that stop a run, as every further block would raise them too.
+FATAL_STORAGE_ERRNOS = {
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
     errno.ECONNREFUSED, errno.ETIMEDOUT, errno.ENXIO,
 }  # fmt: skip
 
-#: Time after which an unfinished block is saved and left to another task [s]. So much work is lost
-#: if a worker dies, and Ctrl-C waits for as long.
+#: Time after which an unfinished block is saved and left to another task [s]. This is the longest
+#: work that is lost if a worker dies, and the longest wait after Ctrl-C.
 CHECKPOINT_INTERVAL_SECONDS = 10.0
 
-#: Time after a block's time limit in which its thread must return from compiled code [s].
+#: Time in which a block's thread must return from compiled code after the block's time limit [s].
 INTERRUPT_GRACE_SECONDS = 10.0
 
 #: Interval at which scheduler, lock and clock are checked while no result arrives [s].
@@ -55,6 +56,7 @@ IDLE_POLL_SECONDS = 0.5
 OPEN_STUDIES_MAX = 4
 
 
+#: Message about a worker whose results this process does not see in the store.
 RESULTS_NOT_VISIBLE_MESSAGE = (
     "what was written is not in the store here: does the worker see the same file system?"
 )
@@ -99,17 +101,18 @@ class TaskResult:
     n_workers: int = 1  # number of usable workers when the result arrived, or of threads
 
 
-_open_writer_lock = threading.Lock()
+_block_writer_cache_lock = threading.Lock()
+"""Lock under which block writers are looked up and opened, so that none is opened twice."""
 
 
 def get_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
-    """Return the writer of a store's blocks, which is opened once per process.
+    """Return the writer of a store's blocks, which each process opens only once.
 
     StoreError is raised if the store holds another study.
     """
-    with _open_writer_lock:
+    with _block_writer_cache_lock:
         return _cached_block_writer(store_path, study_id, read_study)
 
 
@@ -136,21 +139,21 @@ _cached_block_writer = lru_cache(maxsize=OPEN_STUDIES_MAX)(_open_block_writer)
 
 def _refuse_replaced_store(store_path: str, study_id: str) -> None:
     """Raise a StoreError if the store was replaced since the task was sent."""
-    store_stamp = store_fingerprint(parse_location(store_path))
+    stat_fingerprint = store_stat_fingerprint(parse_location(store_path))
     stored_id = (
-        _stored_study_id(store_path, store_stamp)
-        if store_stamp
-        else _stored_study_id.__wrapped__(store_path, store_stamp)
+        _stored_study_id(store_path, stat_fingerprint)
+        if stat_fingerprint
+        else _stored_study_id.__wrapped__(store_path, stat_fingerprint)
     )
     if stored_id != study_id:
         raise StoreError(f"{store_path} now holds study {stored_id}, not {study_id}")
 
 
 @lru_cache(maxsize=OPEN_STUDIES_MAX)
-def _stored_study_id(store_path: str, store_stamp: tuple[int, ...] | None) -> str:
+def _stored_study_id(store_path: str, stat_fingerprint: tuple[int, ...] | None) -> str:
     """Return the id of the study in a store.
 
-    The result is cached. `store_stamp`, which identifies the store's files, is part of the key.
+    The result is cached; the fingerprint is part of the key of the cache.
     """
     return str(read_attributes(parse_location(store_path))["study_id"])
 
@@ -191,7 +194,7 @@ def _run_blocks(
     blocks: list[int],
     settings: TaskSettings,
 ) -> None:
-    """Compute and write blocks, and add their receipts, failures and points to the result."""
+    """Compute and write blocks. Add receipts, failures and checkpoint points to `task_result`."""
     receipts, checkpoint_time = [], time.monotonic() + CHECKPOINT_INTERVAL_SECONDS
     for block in blocks:
         try:
@@ -203,7 +206,7 @@ def _run_blocks(
         except StoreError:
             raise
         except Exception as error:
-            if isinstance(error, OSError) and error.errno in STORAGE_ERRNOS:
+            if isinstance(error, OSError) and error.errno in FATAL_STORAGE_ERRNOS:
                 raise
             task_result.failures.append(make_failure(block, error))
     if settings.durable and (receipts or task_result.checkpoint_points_by_block):
@@ -271,7 +274,7 @@ def make_failure(block: int, error: BaseException) -> Failure:
 
 
 class BlockTimeoutError(Exception):
-    """Raised if a block exceeds its time limit."""
+    """Error of a block that exceeds its time limit."""
 
 
 class _TimeoutInterruption(SystemExit):
@@ -279,8 +282,8 @@ class _TimeoutInterruption(SystemExit):
 
 
 def run_with_timeout(
-    function: Callable[[], ReturnValue], timeout: float | None, seconds_spent: float = 0.0
-) -> ReturnValue:
+    function: Callable[[], ReturnValueT], timeout: float | None, seconds_spent: float = 0.0
+) -> ReturnValueT:
     """Call a function in a thread and return its result.
 
     BlockTimeoutError is raised if it takes longer than `timeout` less `seconds_spent` [s]. Python
@@ -289,7 +292,7 @@ def run_with_timeout(
     """
     if timeout is None:
         return function()
-    return_values: list[ReturnValue] = []
+    return_values: list[ReturnValueT] = []
     errors: list[BaseException] = []
     is_finished, may_exit = threading.Event(), threading.Event()
 
@@ -343,8 +346,8 @@ def worker_address() -> str:
 class BlockQueue:
     """Queue of the blocks that remain to be computed.
 
-    `is_done` is a mask (blocks,) of bool. A block that failed is tried once more, in a task of its
-    own.
+    `is_done` is a mask (blocks,) of bool. A block that failed is tried once more, in a task with no
+    other blocks.
     """
 
     def __init__(self, is_done: np.ndarray) -> None:
@@ -377,7 +380,7 @@ class BlockQueue:
         return True
 
     def requeue(self, blocks: list[int]) -> None:
-        """Put blocks back into the queue that are unfinished, or whose task was lost.
+        """Put blocks back that are unfinished, or whose task was lost.
 
         A block that failed before is still taken alone.
         """
@@ -396,7 +399,7 @@ def run_serial(
     block_queue: BlockQueue,
     is_stopping: Callable[[], bool],
     verify_receipt: ReceiptVerifier,
-    say: PrintMessage,
+    say: MessagePrinter,
 ) -> Iterator[TaskResult]:
     """Compute blocks in this process one after the other. Yield the result of each.
 
@@ -417,23 +420,23 @@ def run_in_threads(
     block_queue: BlockQueue,
     is_stopping: Callable[[], bool],
     verify_receipt: ReceiptVerifier,
-    say: PrintMessage,
+    say: MessagePrinter,
     n_threads: int,
 ) -> Iterator[TaskResult]:
-    """Yield the results of blocks that threads of this process compute, as they arrive.
+    """Compute blocks in threads of this process. Yield their results as they arrive.
 
     Compiled kernels release Python's global lock, so that the threads keep all cores busy. Each
-    thread takes one block at a time, and an empty result is yielded every `IDLE_POLL_SECONDS` while
-    none arrives.
+    thread takes one block at a time. While no result arrives, an empty one is yielded every
+    `IDLE_POLL_SECONDS`.
 
     Parameters
     ----------
     settings
         Settings of the run.
     block_queue
-        Blocks that are not done.
+        Queue of the blocks that are not done.
     is_stopping
-        Returns True once the run is to stop. Blocks that run are then finished; no other begins.
+        Returns True once the run is to stop. Running blocks are then finished; no other begins.
     verify_receipt
         Tells whether the block of a receipt is in the store.
     say
@@ -493,7 +496,7 @@ def run_in_threads(
 
 
 def _record_result(monitor: InProcessMonitor, task_result: TaskResult) -> None:
-    """Tell the monitor of the blocks that a task has finished, and of the time that they took."""
+    """Report to the monitor the blocks that a task has finished, and their computing time."""
     work_seconds = sum(receipt.seconds for receipt in task_result.receipts)
     monitor.record_result(len(task_result.receipts), work_seconds)
 
@@ -504,10 +507,10 @@ def _accept_result(
     block_queue: BlockQueue,
     verify_receipt: ReceiptVerifier,
 ) -> TaskResult:
-    """Return the result of a task of this process, after a check that its blocks are in the store.
+    """Return the result of a task of this process, after checking that its blocks are in the store.
 
-    Failures replace the receipts of blocks that are missing there. Unfinished blocks go back to the
-    queue. An error that would prevent every block from being computed is raised.
+    If one is missing there, all blocks of the task count as failed. Unfinished blocks go back to
+    the queue. An error that would prevent every block from being computed is raised.
     """
     if task_result.worker_error is not None:
         raise task_result.worker_error

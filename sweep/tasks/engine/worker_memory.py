@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-#: Memory that every machine has which runs this program [bytes]; the program takes as much by
-#: itself. The machine is not asked for so little, as asking it imports Dask, which takes longer
-#: than small studies do.
+#: Amount of memory that is assumed to be available everywhere [bytes]; the program itself takes as
+#: much. For smaller needs the memory limit is not read, as this imports Dask, which takes longer
+#: than a small study.
 ALWAYS_AVAILABLE_BYTES = 6e8
 
 
@@ -39,7 +39,7 @@ class WorkerMemory:
         return self.find_bytes_max()
 
     def suffices_for(self, bytes_needed: float) -> bool:
-        """Return True if the process may use the given amount of memory [bytes]."""
+        """Return True if the process may use `bytes_needed` of memory [bytes]."""
         return bytes_needed < ALWAYS_AVAILABLE_BYTES or bytes_needed <= self.bytes_max
 
 
@@ -55,7 +55,7 @@ def process_memory() -> WorkerMemory:
 
 
 def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
-    """Return the memory of the smallest worker of a cluster that runs, or is to be started."""
+    """Return the memory of the smallest worker of a client, or else of a cluster to be started."""
     if client is not None:
         return WorkerMemory(lambda: _smallest_worker_memory_limit(client), "a worker of the client")
     if isinstance(cluster, LocalClusterConfig):

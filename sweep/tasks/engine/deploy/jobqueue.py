@@ -1,7 +1,7 @@
 """Workers in jobs of SLURM or PBS, by dask-jobqueue.
 
-The scheduler is part of the driver; jobs start and end. A worker leaves its job before the job's
-time limit, each at a different time, after returning its task. Another job replaces it.
+The scheduler runs in the process of the driver. Before a job reaches its time limit, its workers
+finish their tasks and leave, each at a different time. Another job then replaces it.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from sweep.tasks.engine.deploy import local_ssh
 def _keep_signal_handlers() -> Iterator[None]:
     """Keep this thread's signal handlers while dask_jobqueue is imported.
 
-    dask_jobqueue sets a handler on import, by which Ctrl-C ends the program at once. In any thread
-    but the main one that is an error.
+    dask_jobqueue sets a handler on import, so that Ctrl-C would end the program at once. Setting it
+    raises an error in any thread but the main one.
     """
     set_handler, protected_thread = signal.signal, threading.get_ident()
 
@@ -51,7 +51,7 @@ RESUBMIT_PAUSE_SECONDS = 15.0
 
 
 class _JobWithStatus:
-    """Batch job that reports an error if the batch system rejects it."""
+    """Batch job whose status becomes `failed` if the batch system rejects it."""
 
     status: Status
 
@@ -65,12 +65,13 @@ class _JobWithStatus:
 
 
 class _ResubmittingCluster:
-    """Cluster of batch jobs that forgets rejected ones, so that others are submitted later."""
+    """Cluster that forgets rejected batch jobs, so that other jobs are submitted later."""
 
     worker_spec: dict[str, Any]
     workers: dict[str, Any]
 
     async def _correct_state_internal(self) -> None:
+        """Start and end jobs as Dask does. After an error forget rejected jobs, and wait."""
         try:
             await super()._correct_state_internal()  # type: ignore[misc]
         except BaseException:
@@ -99,7 +100,7 @@ class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
     job_cls = _PBSJob
 
 
-def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
+def start_batch_cluster(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
     """Start a cluster, and submit as many jobs as its least number of workers needs.
 
     RuntimeError is raised if the batch system rejects the jobs.
@@ -117,7 +118,7 @@ def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
 def keep_workers_in_bounds(
     dask_cluster: Any, cluster: BatchClusterConfig, bounds: WorkerBounds
 ) -> None:
-    """Replace jobs that end, and adapt the number of jobs to the work within bounds."""
+    """Have Dask replace jobs that end, and adapt the number of jobs to the work within bounds."""
     jobs_min, jobs_max = (count_jobs(cluster, n_workers) for n_workers in bounds)
     dask_cluster.adapt(
         minimum_jobs=jobs_min,
@@ -182,8 +183,8 @@ class WorkerLifetime(NamedTuple):
 def worker_lifetime(walltime: float) -> WorkerLifetime:
     """Return the mean time after which a worker leaves its job, and the largest deviation [s].
 
-    Workers leave at different times. The last one leaves when 5 % of the job's time limit is left,
-    at least a minute, but at most a quarter of a very short limit.
+    `walltime` is the job's time limit [s]. The last worker leaves when 5 % of it is left, at least
+    a minute, but at most a quarter of the time limit.
     """
     reserve = max(0.05 * walltime, min(60.0, walltime / 4))
     return WorkerLifetime(mean=walltime - 1.5 * reserve, deviation_max=reserve / 2)

@@ -13,7 +13,10 @@ from sweep.spec.cluster_config import KubernetesClusterConfig, WorkerBounds
 from sweep.tasks.engine.deploy import local_ssh
 from sweep.tasks.engine.progress import ClusterError
 
+#: API version of the resources of the Dask operator.
 DASK_OPERATOR_API_VERSION = "kubernetes.dask.org/v1"
+
+#: Port at which the scheduler listens in its pod.
 SCHEDULER_PORT = 8786
 
 #: Time in which the scheduler's pod must be ready [s]; an image may have to be fetched first.
@@ -28,7 +31,7 @@ SCHEDULER_HTTP_ROUTES = ["distributed.http.scheduler.api", "distributed.http.hea
 
 @contextmanager
 def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> Iterator[str]:
-    """Create a Dask cluster in Kubernetes for the context. Yield the address of its scheduler.
+    """Context manager: create a Dask cluster in Kubernetes, and yield its scheduler's address.
 
     ClusterError is raised on failure.
     """
@@ -89,7 +92,8 @@ def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> A
 def _open_service_address(service: Any, cluster: KubernetesClusterConfig) -> Iterator[str]:
     """Yield an address at which a service can be reached.
 
-    Inside the cluster it is the service's own, outside it is a port that is forwarded to it.
+    Inside the Kubernetes cluster this is the service's own address. Outside it is the address of a
+    port of this machine that is forwarded to the service.
     """
     if _is_resolvable_host(scheduler_host(cluster)):
         yield f"{connection_protocol(cluster)}://{scheduler_host(cluster)}:{SCHEDULER_PORT}"

@@ -58,15 +58,14 @@ DASK_CONFIG: dict[str, Any] = {
 #: pages; by default it shows workers, tasks and logs to all users of the machine.
 NO_HTTP_PAGES_CONFIG: dict[str, Any] = {"distributed.scheduler.http.routes": []}
 
-#: Time of pending work per worker thread above which an adaptive cluster adds a thread [s].
+#: Time of pending work per worker thread above which an adaptive cluster adds a thread (Dask text).
 ADAPTIVE_TARGET_DURATION = "1s"
 
 
 def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of workers.
+    """Return the environment variables of workers, with those of the user.
 
-    They limit threads, restrict the import path to safe folders, and include the user's own
-    variables.
+    They limit threads, remove the working directory from the import path, and configure Dask.
     """
     dask_variables = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
@@ -76,9 +75,9 @@ def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
 
 
 def make_security(cluster: ClusterConfig) -> Security | None:
-    """Return the TLS security of client, scheduler and workers; None if there are no certificates.
+    """Return the TLS settings of client, scheduler and workers; None if there are no certificates.
 
-    With TLS they refuse connections without a certificate.
+    With TLS all of them refuse connections without a certificate.
     """
     from distributed import Security
 
@@ -87,7 +86,7 @@ def make_security(cluster: ClusterConfig) -> Security | None:
 
 
 def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
-    """Return the settings of `distributed.Security`; empty without certificates."""
+    """Return the keyword arguments of `distributed.Security`; empty without certificates."""
     paths = cluster.certificate_paths()
     if paths is None:
         return {}
@@ -129,9 +128,10 @@ def dashboard_address(scheduler: SchedulerConfig) -> str:
     return f"{LOOPBACK_ADDRESS}:{port}"
 
 
+#: Smallest memory limit of a worker on this machine, unless a limit is configured [bytes].
 WORKER_MEMORY_BYTES_MIN = 1 << 30
 
-#: Time without a sign of life from a worker after which it is ended and restarted.
+#: Time without a sign of life from a worker after which it is ended and restarted (Dask text).
 WORKER_TTL = "2 minutes"
 
 
@@ -201,9 +201,9 @@ def start_local_cluster(
 
 
 def _make_worker_class_without_pages() -> type:
-    """Return a class of workers in threads that serves no web page.
+    """Return a class of Dask workers, for threads of this process, without web pages.
 
-    Dask requires an HTTP server of each worker.
+    Dask starts an HTTP server for each worker, which here serves none.
     """
     from distributed import Worker
 
@@ -243,7 +243,7 @@ def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> in
 def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
     """Start workers on all machines by SSH.
 
-    OSError or RuntimeError is raised if one can't be reached.
+    OSError or RuntimeError is raised if a machine can't be reached.
     """
     import asyncssh
     from distributed import Scheduler, SpecCluster
@@ -267,7 +267,7 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
     """Return one Dask worker specification for each machine, by the machine's name.
 
-    It starts all workers of the machine. The workers are distributed evenly over the machines.
+    A specification starts all workers of its machine. Workers are distributed evenly over machines.
     """
     from distributed.deploy.ssh import Worker
 
@@ -303,7 +303,7 @@ def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
     """Return the arguments of the nannies, the processes that start and watch workers.
 
-    All of them can be written as JSON.
+    They are sent to the machines as JSON.
     """
     security = security_settings(cluster)
     return {
@@ -319,9 +319,9 @@ def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 class Certificates(NamedTuple):
     """Paths of the files of a cluster's self-signed TLS certificate."""
 
-    ca: Path
+    ca: Path  # certificate of the certificate authority
     certificate: Path
-    key: Path
+    key: Path  # private key
 
 
 def make_certificates(directory: Path) -> Certificates:
