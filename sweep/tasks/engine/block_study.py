@@ -135,7 +135,8 @@ class BlockStudy(StoreTemplate, ABC):
     * `constant_arrays`: layouts of the arrays whose values are known before any block is computed.
     * `output_layouts`: layouts of the arrays that blocks write.
     * `evaluate` and `compile_kernels`: computation of one block.
-    * `has_checkpoints` and `evaluate_until`, if a block can stop at a deadline and be continued.
+    * `has_checkpoints` and `evaluate_until`, if blocks can stop at a deadline and be continued
+      later.
     * `pop_reused_point_count`, if results of another store are reused.
 
     Workers read the study of a store by `Workload.read_study`.
@@ -178,8 +179,8 @@ class BlockStudy(StoreTemplate, ABC):
     ) -> Results:
         """Compute a block from a checkpoint on, with the same results as `evaluate`.
 
-        Raise `UnfinishedBlock` at the deadline. If `has_checkpoints`, this method is called in
-        place of `evaluate`.
+        Raise `UnfinishedBlock` at the deadline. This method is called in place of
+        `evaluate` if `has_checkpoints`.
         """
         raise NotImplementedError
 

@@ -410,7 +410,7 @@ class Checkpoint(NamedTuple):
     """Saved results of a block that is not complete, with the time and the points done so far."""
 
     results: EarlierResults = EarlierResults()
-    points: float = 0.0  # number of points done; a point that is computed in part counts in part
+    points: float = 0.0  # number of points done; partly computed ones count in part
     seconds: float = 0.0  # time spent so far [s]
 
 
@@ -998,7 +998,7 @@ def _confirm_heartbeat_stopped(
 class StoreLock:
     """Lock of a store. It is acquired on construction and updated regularly until it is released.
 
-    BusyError is raised if a living process holds the lock. StoreError is raised if the store can't
+    BusyError is raised if a living process holds the lock, and StoreError if the store can't
     be written. ``say`` gets messages for the user; by default they are warnings.
     """
 
