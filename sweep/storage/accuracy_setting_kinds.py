@@ -5,7 +5,7 @@ Chester, *A Parameterized Simulation of Doppler Lidar*, Utah State University, 2
 """
 
 AS_WRITTEN_KIND = "as written"
-"""Kind of the setting that is the spec as written."""
+"""Kind of the setting that computes the spec unchanged."""
 ADAPTIVE_KIND = "adaptive"
 """Kind of settings that simulate an effect only where a tolerance requires it."""
 ALL_EFFECTS_KIND = "all on"

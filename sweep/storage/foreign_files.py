@@ -37,7 +37,7 @@ _DRAFT_FILE_NAME_PATTERN = re.compile(r".+\.[0-9a-f]{32}\.partial")
 
 
 def is_ignorable_file(name: str) -> bool:
-    """Tell from its name whether a file was left by an operating system or a file manager.
+    """Return True if a file's name shows that an operating system or a file manager left it.
 
     >>> is_ignorable_file(".DS_Store"), is_ignorable_file("pd_up/.nfs000000000123")
     (True, True)

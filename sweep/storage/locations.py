@@ -187,7 +187,7 @@ class ObjectPath:
         return None if metadata is None else float(metadata["last_modified"].timestamp())
 
     def read_bytes(self, bytes_max: int | None = None) -> bytes:
-        """Read the whole object, and once more if the response body is truncated.
+        """Return the bytes of the object. Read it once more if the response body is truncated.
 
         Raise RefusedFileError if the object is larger than ``bytes_max``.
         """
@@ -210,7 +210,7 @@ class ObjectPath:
     def unlink(self, missing_ok: bool = False) -> None:
         """Delete the object, or do nothing if it does not exist.
 
-        ``missing_ok`` has no effect; `pathlib.Path` has it too.
+        ``missing_ok`` has no effect; it exists because `pathlib.Path.unlink` has it.
         """
         with translate_errors(self), suppress(FileNotFoundError):
             self.client.delete(self.key)
@@ -449,7 +449,7 @@ def to_zarr_store(location: Location) -> Any:
 def map_concurrently(
     location: Location, function: Callable[[ItemT], ResultT], items: Iterable[ItemT]
 ) -> list[ResultT]:
-    """Apply a function to all items, in order; use threads if the location is an object store."""
+    """Return a function's results for all items, in order; use threads for an object store."""
     if isinstance(location, Path):
         return [function(item) for item in items]
     return list(_request_pool().map(function, items))
@@ -633,10 +633,9 @@ def staging_path_for(path: Path) -> Path:
 
 
 def final_path_for(path: Path) -> Path:
-    """Return the path that a store has once it is complete.
+    """Return the path that the store at ``path`` has once it is complete.
 
-    If ``path`` is a staging path, it is the path of the store that will be replaced, otherwise
-    ``path`` itself.
+    For a staging path this is the path of the store to be replaced, otherwise ``path`` itself.
     """
     staging_match = re.fullmatch(rf"\.(.+){re.escape(STAGING_SUFFIX)}", path.name)
     return path.with_name(staging_match[1]) if staging_match else path
@@ -655,7 +654,7 @@ def can_create_store(location: Location) -> bool:
 
 @contextmanager
 def write_path_atomically(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yield a hidden path for a new file or folder, and rename it to ``path`` at the end.
+    """Context manager that yields a hidden path to write, and renames it to ``path`` at the end.
 
     With ``replace``, whatever is at ``path`` is replaced.
     """
@@ -825,7 +824,7 @@ WRITE_REMEDY_BY_ERRNO = {
 def os_error_reason(error: OSError, path: object) -> str:
     """Return the reason why a path can't be read or written.
 
-    The system reports "no space" also if a disk has space, but no free inode for another file.
+    It names a lack of inodes, which prevents new files, and which the system reports as "no space".
     """
     reason_text = error.strerror or str(error)
     if error.errno == errno.ENOSPC and isinstance(path, Path) and _has_no_free_inodes(path):

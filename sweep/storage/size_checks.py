@@ -139,9 +139,9 @@ class ArrayFileLayout(NamedTuple):
             self._check_string_count(content, path_in_messages)
 
     def _check_string_count(self, content: bytes, path_in_messages: str) -> None:
-        """Refuse a chunk of strings that declares a wrong number of strings.
+        """Raise RefusedFileError if a chunk of strings declares a wrong number of strings.
 
-        The decoder allocates memory for the declared number.
+        The decoder would allocate memory for the declared number.
         """
         try:
             decoded = bytes(_ZSTD_CODEC.decode(content[:-_CHECKSUM_BYTES]))
@@ -191,7 +191,7 @@ class StoreFileSizeLimits:
         return self._layouts.get(file_name.rpartition("/c/")[0] or file_name.removesuffix("/c"))
 
     def file_bytes_max(self, file_name: str) -> int:
-        """Return the largest valid size of the file of that name [bytes]."""
+        """Return the largest valid size of a file of the store [bytes], given its name."""
         layout = self.array_layout(file_name)
         return METADATA_BYTES_MAX if layout is None else layout.file_bytes_max
 
@@ -220,7 +220,7 @@ class SingleWriterLocalStore(LocalStore):
 
 
 class SizeCheckedLocalStore(LocalStore):
-    """Read-only store on disk that raises for files that are not regular or have a wrong size."""
+    """Read-only store on disk whose reads fail for irregular files and files of a wrong size."""
 
     def __init__(self, root: Path, limits: StoreFileSizeLimits) -> None:
         super().__init__(root, read_only=True)
@@ -287,7 +287,7 @@ def _byte_range_to_slice(byte_range: Any) -> slice:
 
 
 class SizeCheckedObjectStore(ObjectStore[Any]):
-    """Read-only store in an object store that raises for objects of a wrong size."""
+    """Read-only store in an object store whose reads fail for objects of a wrong size."""
 
     def __init__(self, client: Any, key_prefix: str, limits: StoreFileSizeLimits) -> None:
         super().__init__(client, read_only=True)

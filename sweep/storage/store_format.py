@@ -98,14 +98,14 @@ _COMMON_REQUIRED_ATTRIBUTES = ("study_id", "model_version", "software")
 _STUDY_ID_PATTERN = re.compile(r"[0-9a-f]{32}")
 
 _NON_STRING_ATTRIBUTE_TYPES = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
-"""Types of those attributes of a store that are not text, by name."""
+"""Types of the store attributes that are not text, by name."""
 
 _ARRAY_ATTRIBUTE_TYPES = {
     "units": str, "long_name": str, "comment": str, "standard_name": str, "path": str,
     "flag_meanings": str, "flag_masks": list, "flag_values": list, "tolerance": float,
     "confidence": float,
 }  # fmt: skip
-"""Permitted attributes of arrays, with types. xarray interprets others, such as `scale_factor`."""
+"""Types of the permitted attributes of arrays. xarray would interpret others (`scale_factor`)."""
 
 _FILL_VALUES_BY_DATA_TYPE: dict[str, tuple[Any, ...]] = {
     "float64": (0.0, "NaN"), "int64": (0, -1), "int32": (0, -1), "int16": (0, -1), "int8": (0, -1),
@@ -117,7 +117,7 @@ TERRAIN_MAP_GROUP = "scene_map"
 """Name of the group with the terrain map of a flight."""
 
 _VALID_NAME_PATTERN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
-"""Valid names of groups, arrays and dimensions."""
+"""Pattern of valid names of groups, arrays and dimensions."""
 
 _CHECKSUM_CODEC = {"name": "crc32c"}
 _COMPRESSION_CODECS = [
@@ -663,7 +663,7 @@ def stored_objects_digest(
 
 
 def contents_digest(contents: Iterable[tuple[str, bytes]]) -> str:
-    """Return the digest of :func:`stored_objects_digest` for names and bytes in memory."""
+    """Return the digest as by :func:`stored_objects_digest`, from names and bytes of objects."""
     hasher = hashlib.blake2b(digest_size=16)
     for name, content in contents:
         hasher.update(f"{name}\0{len(content)}\0".encode())
@@ -720,9 +720,10 @@ class ObjectLog:
         self._pending_lines.append(lines)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write the pending lines as one object, if the last object is old enough or by ``force``.
+        """Write the pending lines as one object. Return True if no lines are pending then.
 
-        The least age is `LOG_OBJECT_INTERVAL_SECONDS`. Return True if no lines are pending.
+        Without ``force``, nothing is written within `LOG_OBJECT_INTERVAL_SECONDS` of the last
+        write.
         """
         if not self._pending_lines:
             return True

@@ -252,7 +252,7 @@ class VerifiedStore(WrapperStore[Any]):
 
     @cached_property
     def _committed_blocks(self) -> frozenset[int]:
-        """Numbers of the blocks that were committed when the first missing chunk was requested."""
+        """Numbers of the committed blocks, as last read from the journal."""
         points = read_receipt_totals(self._location, self._block_map.n_blocks).points_by_block
         return frozenset(np.flatnonzero(points).tolist())
 

@@ -107,7 +107,7 @@ class StoreTemplate(Protocol):
 
 
 class GridBlock(NamedTuple):
-    """Block of a study, as a block of one of the study's grids."""
+    """Block of a study, given by its grid and its number within this grid."""
 
     grid: BlockGrid
     """Grid that contains the block."""
@@ -116,7 +116,7 @@ class GridBlock(NamedTuple):
 
 
 class GroupGrid(NamedTuple):
-    """Grid of a group of the store, and where its blocks begin."""
+    """Grid of the blocks of a group of the store, and the number of the first block."""
 
     first_block: int
     """Number, within the study, of the grid's first block."""
@@ -179,8 +179,8 @@ class BlockStudy(StoreTemplate, ABC):
     ) -> Results:
         """Compute a block from a checkpoint on, with the same results as `evaluate`.
 
-        Raise `UnfinishedBlock` at the deadline. This method is called in place of
-        `evaluate` if `has_checkpoints`.
+        Raise `UnfinishedBlock` at the deadline. If `has_checkpoints`, this is called in
+        place of `evaluate`.
         """
         raise NotImplementedError
 
@@ -309,7 +309,7 @@ class BlockStudy(StoreTemplate, ABC):
     def chunk_owner_blocks(self) -> dict[str, np.ndarray]:
         """Return the number of the block that writes each chunk, by the name of the array.
 
-        Each value has the shape of the array's grid of chunks.
+        Each value is an array in the shape of the grid of chunks.
         """
         owners_by_array = {}
         for array_name, layout in self.output_layout_by_name.items():
@@ -346,7 +346,7 @@ class Workload(Protocol):
 
     @property
     def execution(self) -> Execution:
-        """Number of workers, threads and scheduler that the spec asks for."""
+        """Section `execution` of the spec: number of workers and threads, and scheduler."""
 
     @property
     def user_module_names(self) -> tuple[str, ...]:

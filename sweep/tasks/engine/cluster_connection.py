@@ -51,7 +51,7 @@ def cpu_count() -> int:
 def connect_cluster(
     cluster: AnyClusterConfig, *, max_workers: int, processes: bool, say: Callable[[str], None]
 ) -> Iterator[ClusterConnection]:
-    """Connect a client to a cluster. A cluster that this function starts ends with the context.
+    """Context manager that connects a client to a cluster. A cluster started here ends with it.
 
     At most `max_workers` workers are started, as further ones would be idle. ClusterError is raised
     if no scheduler responds or no worker starts.

@@ -170,10 +170,10 @@ class TaskDispatcher:
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
         """Yield results of tasks as they arrive, or empty ones while none arrives.
 
-        An empty result is yielded every `IDLE_POLL_SECONDS`. Once `is_stopping` returns True, no
-        more tasks are sent. The iteration ends when all sent
-        tasks have ended, or at once if there is no worker. SchedulerLostError is raised if the
-        scheduler is gone; StoreError or OSError is raised if no worker can write to the store.
+        Empty results come every `IDLE_POLL_SECONDS`. Once `is_stopping` returns True, no more tasks
+        are sent. The iteration ends when all sent tasks have ended, or at once if there is no
+        worker. SchedulerLostError is raised if the scheduler is gone; StoreError or OSError is
+        raised if no worker can write to the store.
         """
         try:
             while True:
@@ -279,7 +279,7 @@ class TaskDispatcher:
     def _is_failed_block_in_flight(self) -> bool:
         """Return True if a block that failed before is being computed.
 
-        Two such blocks at once could each be blamed for the error of the other.
+        Only one is computed at a time, so that none is blamed for an error that another causes.
         """
         failed_blocks = self._block_queue.failed_blocks
         return bool(failed_blocks) and any(

@@ -656,7 +656,7 @@ def _is_running_here(holder: LockHolder) -> bool | None:
 
 
 def heartbeat_age(store_path: Location) -> float:
-    """Return the time since a lock was last updated by its holder [s]; inf if it never was.
+    """Return the time since the holder of a lock last updated it [s]; inf if there is no lock.
 
     It is measured by the clock of the file system.
     """

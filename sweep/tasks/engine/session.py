@@ -189,9 +189,9 @@ class RunOptions:
 
     @classmethod
     def from_mapping(cls, options: Mapping[str, Any]) -> RunOptions:
-        """Return the options of a mapping.
+        """Return the options that a mapping of names to values contains.
 
-        TypeError, with the most similar name, is raised for an unknown name.
+        TypeError is raised for an unknown name, with the most similar name.
         """
         names = [field.name for field in fields(cls)]
         for name in options.keys() - set(names):

@@ -220,8 +220,8 @@ def build_template(
 ) -> None:
     """Create the template on disk: a store without results.
 
-    `shard_shape_of` returns the shape of an array's shards, of which a file holds one, or None if a
-    file holds one chunk, which is the default.
+    `shard_shape_of` returns the shape of an array's shards, if each file holds a shard of many
+    chunks. It returns None if each file holds one chunk, which is the default.
     """
     group = zarr.create_group(
         SingleWriterLocalStore(store_path), zarr_format=3, attributes=attributes
@@ -648,7 +648,7 @@ def current_software_versions() -> dict[str, str]:
 def processor_description() -> str:
     """Return machine, processor and vector instructions as text.
 
-    NumPy and LLVM choose machine code by them, so that the last bits of results may differ.
+    The last bits of results may depend on them, as NumPy and LLVM choose machine code by them.
     """
     import llvmlite.binding
     import numpy as np

@@ -360,8 +360,8 @@ class BlockQueue:
     def take_blocks(self, count: int, *, include_failed: bool = True) -> list[int]:
         """Remove up to `count` blocks from the queue, for one task.
 
-        A block that failed before is taken alone. If not `include_failed`, such blocks stay in the
-        queue.
+        A block that failed, or was put back, is taken alone. If not `include_failed`, failed blocks
+        stay in the queue.
         """
         if self._failed_once and include_failed:
             return [self._failed_once.popleft()]
@@ -382,7 +382,7 @@ class BlockQueue:
     def requeue(self, blocks: list[int]) -> None:
         """Put blocks back that are unfinished, or whose task was lost.
 
-        A block that failed before is still taken alone.
+        Blocks that failed before are queued as failed again.
         """
         for block in blocks:
             (self._failed_once if block in self.failed_blocks else self._requeued).append(block)
