@@ -179,8 +179,8 @@ class BlockStudy(StoreTemplate, ABC):
     ) -> Results:
         """Compute a block from a checkpoint on, with the same results as `evaluate`.
 
-        Raise `UnfinishedBlock` at the deadline. If `has_checkpoints`, this is called in
-        place of `evaluate`.
+        Raise `UnfinishedBlock` at the deadline. If `has_checkpoints`, this is called
+        in place of `evaluate`.
         """
         raise NotImplementedError
 
