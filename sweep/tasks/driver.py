@@ -84,8 +84,8 @@ from sweep.tasks.studies.study_loading import (
 from sweep.tasks.studies.user_function_names import iter_user_functions, user_module_names
 from sweep.tasks.studies.workload import SpecWorkload
 
-#: Interval at which a run checks whether another run has cast its rays [s].
 EYEPOINT_LOCK_POLL_SECONDS = 0.5
+"""Interval at which a run checks whether another run has cast the rays that both need [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -551,7 +551,7 @@ def _warn_of_changed_user_code(
 ) -> None:
     """Print a message for each user module whose file has changed since the store was begun.
 
-    If the store extends another one, the file is compared with that at the start of the other one.
+    If the store extends another one, the file is compared with its state at the start of the other.
     """
     modules = user_module_names(spec)
     if not modules:

@@ -28,9 +28,9 @@ from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
 from sweep.model.kernel_integers import INTEGER_ZERO, STEP_DOWN, STEP_UP
 
 BINS_PER_BATCH = 256
-"""Number of spectrum bins in one call of the evaluation of the crossing series."""
+"""Number of bins for which one call evaluates the crossing series."""
 
-SERIES_Y_MAX = 450.0
+SERIES_HALF_SQUARED_THRESHOLD_MAX = 450.0
 """Largest y = b^2/2 for which the crossing series is used; b is the threshold over the noise per
 quadrature. Above it, Marcum's Q is evaluated bin by bin."""
 
@@ -38,16 +38,17 @@ SERIES_TERMS_MAX = 800
 """Size of the array of coefficients of the crossing series, and so the largest number of terms."""
 
 JOINED_PROBABILITY_MIN = 1e-9
-"""Limit for counting the bins next to an echo that may join it by crossing the threshold. The count
-ends where the probability that all bins so far cross falls to this limit."""
+"""Limit on the probability that all bins from an echo up to some bin cross the threshold. Bins
+beyond hardly ever join the echo and are not counted among those that may."""
 
-EDGE_NOISE_DEVIATION_MIN = 0.01
-"""Lower limit of the noise deviation of an echo's outermost bin, given that its neighbour crosses.
-The unit is the noise per quadrature. The limit avoids a division by zero."""
+ECHO_EDGE_NOISE_DEVIATION_MIN = 0.01
+"""Lower limit, in units of the noise per quadrature, of the noise deviation of an echo's outermost
+bin, given that its neighbour crosses. The limit avoids a division by zero."""
 
 _EXPONENTIAL_COEFFICIENTS = tuple((-1) ** n / math.factorial(n) for n in range(12))
 """Taylor coefficients (-1)^n / n! of e^-z, n = 0 .. 11. Their sum errs by 1e-16 for z <= 1/4."""
-_HIGHEST_COEFFICIENT = _EXPONENTIAL_COEFFICIENTS[-1]
+_HIGHEST_ORDER_COEFFICIENT = _EXPONENTIAL_COEFFICIENTS[-1]
+"""Coefficient of z^11, with which the evaluation of e^-z begins."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -55,8 +56,8 @@ def fill_crossing_series(threshold_ratio, series):
     """Fill ``series`` with the coefficients of the crossing series of one threshold b.
 
     Element n is c_n y^n / n! / (1 - e^-y), with c_n = e^-y sum_{j=1..n} y^j / j! and y = b^2/2.
-    All terms are filled that an amplitude below the threshold needs. Nothing is filled for y above
-    :data:`SERIES_Y_MAX`.
+    Terms are filled as far as amplitudes below the threshold need them. Nothing is filled for y
+    above :data:`SERIES_HALF_SQUARED_THRESHOLD_MAX`.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def fill_crossing_series(threshold_ratio, series):
         (terms,): the coefficients; element 0 is left as it is.
     """
     y = 0.5 * threshold_ratio * threshold_ratio
-    if not 0.0 < y <= SERIES_Y_MAX:
+    if not 0.0 < y <= SERIES_HALF_SQUARED_THRESHOLD_MAX:
         return
     term, power, total = math.exp(-y) / -math.expm1(-y), 1.0, 0.0
     for n in range(1, min(_n_series_terms(y, y) + 8, series.size)):
@@ -81,8 +82,8 @@ def fill_crossing_series(threshold_ratio, series):
 def _n_series_terms(x, y):
     """Return the number of terms that the crossing series needs for an error of 1e-16.
 
-    ``x`` is half the square of the largest amplitude, ``y`` half that of the threshold, x <= y.
-    Both are in units of the noise per quadrature.
+    ``x`` is half the squared largest amplitude, ``y`` half the squared threshold; x <= y. Amplitude
+    and threshold are in units of the noise per quadrature.
     """
     root = math.sqrt(x * y)
     return int(8.0 + 1.3 * root + 5.0 * math.sqrt(root) + 4.0 * math.sqrt(x))
@@ -90,10 +91,9 @@ def _n_series_terms(x, y):
 
 @njit(cache=True, error_model="numpy")
 def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabilities):
-    """Fill ``probabilities`` with the crossings that a signal adds to those of noise alone.
+    """Fill ``probabilities`` with those that signal makes a bin cross where noise alone does not.
 
-    The result is (Q_1(a, b) - e^-y) / (1 - e^-y), 0..1, with Marcum's Q_1. It is the probability
-    that the signal makes a bin cross that noise alone would not.
+    The probability of a bin is (Q_1(a, b) - e^-y) / (1 - e^-y), 0..1, with Marcum's Q_1.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabil
         (n_bins + 7,): output array; the last seven elements are scratch.
     """
     y = 0.5 * threshold_ratio * threshold_ratio
-    if y > SERIES_Y_MAX:
+    if y > SERIES_HALF_SQUARED_THRESHOLD_MAX:
         for i in range(n_bins):
             probabilities[i] = marcum_q1_excess(math.sqrt(2.0 * half_squares[i]), threshold_ratio)
         return
@@ -179,7 +179,7 @@ def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, 
             probabilities[i] = u * (u2 * u2 * high + low)
     for i in range(half_squares.size):
         z = scale * half_squares[i]
-        decay = _HIGHEST_COEFFICIENT
+        decay = _HIGHEST_ORDER_COEFFICIENT
         for n in range(10, -1, -1):
             decay = z * decay + _EXPONENTIAL_COEFFICIENTS[n]
         half_squares[i] = decay
@@ -254,7 +254,9 @@ def weighted_crossing_rate(probabilities, weights):
 def edge_crossing_probability(
     edge_ratio, neighbour_ratio, threshold_ratio, sidelobe_neighbour_noise_correlation
 ):
-    """Return the probability that an echo's outermost bin crosses, given that its neighbour does.
+    """Return the probability that an echo's outermost bin crosses, given that the next bin does.
+
+    The next bin is the neighbour outside the echo.
 
     Parameters
     ----------
@@ -272,9 +274,9 @@ def edge_crossing_probability(
     = b - a in phase with its signal. Given this, n has the mean m = phi(d) / (1 - Phi(d)) and the
     variance 1 - m (m - d), with the standard normal density phi and distribution function Phi.
 
-    The noise of the outermost bin then has the mean rho m and the variance s^2 = 1 - rho^2 m
-    (m - d). The bin, of amplitude a_edge, crosses like one of the amplitude b - (b - a_edge -
-    rho m) / s in noise of unit variance.
+    The noise of the outermost bin then has the mean rho m and the variance s^2 = 1 - rho^2 m (m -
+    d). The bin, of amplitude a_edge, crosses as often as a bin of amplitude b - (b - a_edge - rho
+    m) / s in noise of unit variance.
     """
     if sidelobe_neighbour_noise_correlation != 0.0:
         distance_to_threshold = threshold_ratio - neighbour_ratio
@@ -292,7 +294,7 @@ def edge_crossing_probability(
             * (noise_mean - distance_to_threshold)
         )
         noise_deviation = math.sqrt(
-            max(noise_variance, EDGE_NOISE_DEVIATION_MIN * EDGE_NOISE_DEVIATION_MIN)
+            max(noise_variance, ECHO_EDGE_NOISE_DEVIATION_MIN * ECHO_EDGE_NOISE_DEVIATION_MIN)
         )
         edge_ratio = max(
             threshold_ratio
@@ -317,9 +319,9 @@ def exclude_bins_joining_echo(
     """Remove crossings that join an echo from the bins' crossing probabilities, in place.
 
     Adjacent bins above the threshold count as one group. A bin next to an echo may thus join the
-    echo's group, and is no false peak then. The probability of the first bin next to an echo
-    becomes that of a separate group in all bins that may join the echo. The other bins'
-    probabilities become 0.
+    echo's group, and is no false peak then. All bins that may join an echo are replaced by one
+    probability: that they hold a group separate from the echo. It is stored in the bin next to the
+    echo. The probabilities of the others become 0.
 
     Parameters
     ----------
@@ -363,14 +365,14 @@ def exclude_bins_joining_echo(
                 sidelobe_neighbour_noise_correlation,
             )
         if n_joining_below + n_joining_above > n_bins:
-            _fill_further_group_probability(
+            _fill_separate_group_probability(
                 probabilities, gap_begin, STEP_UP, n_bins, p_join_below, p_join_above
             )
         else:
-            _fill_further_group_probability(
+            _fill_separate_group_probability(
                 probabilities, gap_begin, STEP_UP, n_joining_below, p_join_below, 0.0
             )
-            _fill_further_group_probability(
+            _fill_separate_group_probability(
                 probabilities, gap_end - 1, STEP_DOWN, n_joining_above, p_join_above, 0.0
             )
         gap_end += 1
@@ -380,8 +382,7 @@ def exclude_bins_joining_echo(
 def _count_joining_bins(probabilities, first_index, step, n_bins):
     """Return the number of bins next to an echo that may join the echo, 1 .. ``n_bins``.
 
-    They join the echo if they cross the threshold.
-
+    A bin joins the echo if it crosses the threshold together with all bins between it and the echo.
     The bins start at ``first_index`` and go on by ``step``, 1 or -1. The count ends where all of
     them cross with a probability of at most :data:`JOINED_PROBABILITY_MIN`.
     """
@@ -393,10 +394,10 @@ def _count_joining_bins(probabilities, first_index, step, n_bins):
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_further_group_probability(
+def _fill_separate_group_probability(
     probabilities, first_index, step, n_bins, p_join_first, p_join_last
 ):
-    """Set the first bin's probability to that of a group of crossing bins apart from the echo.
+    """Set the first bin's probability to that of a group of crossing bins separate from the echo.
 
     A group is a run of adjacent bins that cross the threshold. The probabilities of the other
     ``n_bins - 1`` bins become 0.

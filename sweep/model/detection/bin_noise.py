@@ -36,10 +36,10 @@ from sweep.model.shot_settings import RecordSettings
 from sweep.model.spectrum.search_band import n_alarm_bins
 from sweep.model.window import Window, centred_transform, window_samples
 
-CIRCULAR_RATIO_MAX = 0.01
-"""Limit below which a bin's noise counts as circular (equal variances in both quadratures). The
-limit is on the difference of a quadrature's variance from the mean of both, relative to the
-mean."""
+CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX = 0.01
+"""Largest pseudo-variance ratio at which a bin's noise counts as circular. The ratio is the
+difference of a quadrature's variance from the mean of both, over that mean. It is 0 if both
+quadratures have equal variances."""
 
 
 @lru_cache(maxsize=64)
@@ -50,19 +50,21 @@ def neighbour_noise_correlation(window: Window, fft_size: int) -> float:
 
 @lru_cache(maxsize=64)
 def first_circular_bin(window: Window, fft_size: int) -> int:
-    """Return the distance [bins] from DC or Nyquist from which on noise counts as circular; >= 1.
+    """Return the least distance [bins] from DC and Nyquist at which noise counts as circular; >= 1.
 
     Notes
     -----
     Circular noise has equal variances in both quadratures. In a real record, the noise k bins from
     DC or Nyquist has the variances sigma^2 (1 +- |W2(2k)| / W2(0)), with their mean sigma^2 and the
     transform W2 of the squared window. The noise counts as circular if the ratio is at most
-    :data:`CIRCULAR_RATIO_MAX` in this bin and in all bins farther away.
+    :data:`CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX` in this bin and in all bins farther away.
     """
     padding_factor = fft_size / window.length
     step = max(int(padding_factor / 16), 1)
     bins = np.arange(1, math.ceil(8 * padding_factor), step)
-    is_circular = _noise_correlations_at(window, fft_size, 2 * bins) <= CIRCULAR_RATIO_MAX
+    is_circular = (
+        _noise_correlations_at(window, fft_size, 2 * bins) <= CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX
+    )
     return int(np.max(bins[~is_circular], initial=0)) + 1
 
 
@@ -104,10 +106,10 @@ def alarm_equivalent_bins(
 def _equivalent_bins_per_bin(
     threshold_ratio: np.ndarray, correlation: float, looks: Looks
 ) -> np.ndarray:
-    """Return the number of independent bins, 0..1, for which each further adjacent bin counts.
+    """Return the number of independent bins, 0..1, that one more adjacent bin is equivalent to.
 
-    The number is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and h that of a
-    bin whose neighbour does not cross.
+    The number is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and the crossing
+    probability h of a bin whose neighbour does not cross.
     """
     from sweep.model.detection.marcum import marcum_q1
 
@@ -139,16 +141,16 @@ def _equivalent_bins_per_bin(
 class SearchedBins(NamedTuple):
     """Bins in which noise may raise false alarms, and the correlation of their noise.
 
-    The threshold (:mod:`sweep.model.threshold`) is set on these bins, and the false alarms of
-    prepared shots are those of the same bins.
+    The threshold (:mod:`sweep.model.threshold`) is set for these bins, and prepared shots count
+    false alarms in the same bins.
     """
 
     n_bins: float | np.ndarray
-    """Number of bins. It is (segments, n), in the order up, Doppler, down, if a search band is set;
-    (n,) of one of its segments; or one number for all segments and points."""
+    """Number of bins: one number for all segments and points. With a search band it is (segments,
+    n), in the order up, Doppler, down, or (n,) after :meth:`select_segment`."""
     first_bin: int
     """Distance of the first searched bin from DC and from Nyquist [bins]. It is above 1 in a real
-    record whose noise is correlated: the noise of the bins that are left out is not circular."""
+    record whose noise is correlated, since the noise of nearer bins is not circular."""
     neighbour_correlation: float
     """Correlation coefficient of the noise of adjacent bins, 0..1; 0 if bins count as
     independent."""

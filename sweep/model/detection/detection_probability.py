@@ -8,9 +8,9 @@ one echo in one record         :func:`sweep.model.detection.echo_detection.pd_an
                                strongest bin or any bin, steady or in developed speckle
 one bin in several looks       :func:`pd_and_miss_in_looks`
 the segments of points         :func:`detect_in_spans`, by one of these two laws. A span is the
-                               range of bins around an echo; it is final then: cut to the search
-                               band, empty in segments that no echo reaches, and with the permanent
-                               line
+                               range of bins around an echo. Spans are complete here: cut to the
+                               search band, empty in segments that no echo reaches, and including
+                               the permanent line
 a group of bins                :func:`pd_of_bin_group` in one record, :func:`final_group_pd` in all
 both chirps of a shot          :func:`joint_detection_probability`
 a shot                         :func:`shot_pd_and_miss`, by both chirps or any two of three segments
@@ -26,8 +26,8 @@ of a real record, lines overlap their images, and the laws are corrected by
 :mod:`sweep.model.detection.pseudo_variance`.
 
 :mod:`sweep.model.spectrum.strongest_peak` applies the first law at higher thresholds, to find how
-often another peak is larger than the echo's. The time-domain truth and the thesis's way apply it to
-whole spectra (:func:`sweep.model.detection.echo_detection.detect_in_spectra`).
+often another peak is larger than the echo's. The time-domain truth and the thesis's method apply it
+to whole spectra (:func:`sweep.model.detection.echo_detection.detect_in_spectra`).
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -39,7 +39,7 @@ from sweep.model.detection import echo_detection
 from sweep.model.detection.echo_detection import (
     EchoBins,
     EchoSpans,
-    at_least_two_of_three,
+    at_least_two_of_three_probability,
     bin_speckle_at,
     bin_threshold_at,
     echo_bounds,
@@ -49,7 +49,7 @@ from sweep.model.detection.echo_detection import (
 from sweep.model.detection.look_speckle import phase_rotated_look_covariances
 from sweep.model.detection.looks import DetectionArrays, pd_and_miss_any_two_in_speckle
 from sweep.model.detection.pseudo_variance import (
-    mean_over_phases,
+    mean_joint_pd_over_phases,
     multilook_pd_and_miss_near_ends,
 )
 
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 def detect_in_spans(shots: "Shots", spans: Any) -> Any:
-    """Set the probabilities of detection of each segment from the bins around its echo.
+    """Compute the probabilities of detection and of a miss of each segment from its echo's bins.
 
     Parameters
     ----------
@@ -70,9 +70,9 @@ def detect_in_spans(shots: "Shots", spans: Any) -> Any:
     Returns
     -------
     BinSpans
-        Spans with the probabilities pd of detection and miss, its complement. An echo whose
-        strongest bin lies outside the search band, or is masked by a permanent line, is not
-        detected. Both are nan in segments that do not exist.
+        The spans with their fields pd and miss set: probability of detection, and its complement.
+        An echo whose strongest bin lies outside the search band, or is masked by a permanent line,
+        is not detected. Both fields are nan in segments that do not exist.
     """
     if shots.looks.is_noncoherent:
         peak_magnitude = spans.peak_magnitude
@@ -153,9 +153,9 @@ def _fill_span_pd_and_miss(spans, point_indices, rule, bin_thresholds, speckle_t
 
 @njit(cache=True, error_model="numpy")
 def pd_of_bin_group(magnitude, strongest, first, last, first_bin, rule, bin_threshold, bin_speckle):
-    """Return the probability that noise and signal detect a group of adjacent bins in one record.
+    """Return the probability that a group of adjacent bins is detected in one record.
 
-    The group counts as an echo of its own, which extends over bins of its lobe below the threshold
+    The group counts as an echo. Bins of its main lobe below the threshold belong to this echo too
     (:func:`sweep.model.detection.echo_detection.echo_bounds`). The law is
     :func:`sweep.model.detection.echo_detection.pd_and_miss`.
 
@@ -166,7 +166,7 @@ def pd_of_bin_group(magnitude, strongest, first, last, first_bin, rule, bin_thre
     strongest, first, last
         Indices in the span of the group's strongest, first and last bin.
     first_bin
-        Number of the span's first bin.
+        Bin number in the spectrum of the span's first bin.
     rule, bin_threshold, bin_speckle
         :class:`~sweep.model.detection.echo_detection.DetectionRule`,
         :class:`~sweep.model.detection.echo_detection.BinThreshold` and
@@ -200,7 +200,9 @@ def final_group_pd(
     is_searched: np.ndarray,
     point_indices: np.ndarray,
 ) -> np.ndarray:
-    """Return the probabilities of detection of groups of bins in all records of a segment.
+    """Return the probabilities of detection of groups of bins, from all looks of a segment.
+
+    A look is one of several records of the same segment.
 
     Parameters
     ----------
@@ -211,7 +213,7 @@ def final_group_pd(
     magnitude : ndarray (m, 3, groups)
         |X| of each group's strongest bin [V].
     strongest_bin : ndarray (m, 3, groups)
-        Numbers of these bins.
+        Bin number of each group's strongest bin.
     is_searched : ndarray (m, 3) bool
         True if the search band contains any bin of the echo, the first group.
     point_indices : ndarray (m,)
@@ -220,8 +222,8 @@ def final_group_pd(
     Returns
     -------
     ndarray (m, 3, groups)
-        That of :func:`pd_and_miss_in_looks` if several looks are combined, else ``pd``; 0 for an
-        echo that is not searched.
+        Probabilities by :func:`pd_and_miss_in_looks` if several looks are combined, else ``pd``.
+        That of an echo outside the search band is 0.
     """
     if shots.looks.is_noncoherent:
         pd = pd_and_miss_in_looks(shots, magnitude.T, strongest_bin.T, point_indices).pd.T
@@ -413,7 +415,7 @@ def _joint_pd_in_one_record(
             np.broadcast_to(values, pd_up.shape)[..., near_ends]
             for values in (threshold_ratio, correlation, n_equivalent)
         )
-        (pd_both[..., near_ends],) = mean_over_phases(
+        (pd_both[..., near_ends],) = mean_joint_pd_over_phases(
             speckle_table.phase_factors[speckle_rows[:, near_ends]],
             (pd_up[..., near_ends], pd_down[..., near_ends]),
             lambda up, down: (
@@ -434,14 +436,15 @@ def _joint_pd_in_looks(
 ) -> np.ndarray:
     """Compute :func:`joint_detection_probability` of several looks in speckle.
 
-    ``correlation`` (n,) is the magnitude of the correlation of the two segments' speckle. It is
-    replaced if the looks are partially correlated.
+    ``correlation`` (n,) is the magnitude of the correlation of the two segments' speckle. If the
+    looks are partially correlated, that of the look speckle is used instead.
 
     Notes
     -----
     Far from DC and Nyquist the law is that of
-    :meth:`sweep.model.detection.looks.Looks.joint_pd_in_speckle`. Near them the excess over the
-    product of both pd is the same fraction of the largest possible excess as far from them.
+    :meth:`sweep.model.detection.looks.Looks.joint_pd_in_speckle`. Near them, the joint probability
+    exceeds the product of both pd by a fraction of the largest possible excess. The fraction is the
+    same as far from DC and Nyquist.
     """
     threshold_ratio = shots.threshold / shots.line_noise_sigma
     signal_up, signal_down = (magnitude / shots.line_noise_sigma for magnitude in magnitudes)
@@ -491,10 +494,10 @@ def _pd_in_looks_far_from_ends(
 def mean_detection_equivalent_bins(
     shots: "Shots", probabilities: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]
 ) -> np.ndarray | float:
-    """Return the number of independent bins that detect as often as an echo's correlated bins.
+    """Return the number of independent bins that are detected as often as an echo's bins.
 
     It is the geometric mean over the given segments of
-    :func:`sweep.model.detection.echo_detection.detection_equivalent_bins`, and 1 if only the
+    :func:`sweep.model.detection.echo_detection.n_detection_equivalent_bins`, and 1 if only the
     strongest bin detects.
 
     Parameters
@@ -512,7 +515,7 @@ def mean_detection_equivalent_bins(
     threshold_ratio = shots.threshold / noise_sigma
     n_equivalent: Any = 1.0
     for pd, magnitude in zip(probabilities, magnitudes, strict=True):
-        n_equivalent = n_equivalent * echo_detection.detection_equivalent_bins(
+        n_equivalent = n_equivalent * echo_detection.n_detection_equivalent_bins(
             pd, magnitude / noise_sigma, threshold_ratio
         )
     return np.asarray(n_equivalent ** (1 / len(probabilities)))
@@ -555,7 +558,9 @@ def _pd_and_miss_any_two(
 ) -> DetectionArrays:
     """Compute :func:`shot_pd_and_miss` where detection in any two of three segments suffices."""
     if shots.speckle.segment_correlations is None:
-        return DetectionArrays(at_least_two_of_three(pd, miss), at_least_two_of_three(miss, pd))
+        return DetectionArrays(
+            at_least_two_of_three_probability(pd, miss), at_least_two_of_three_probability(miss, pd)
+        )
     threshold_ratio = shots.threshold / shots.line_noise_sigma
     if shots.looks.is_noncoherent:
         look_speckle = shots.speckle.look_speckle
@@ -575,7 +580,7 @@ def _pd_and_miss_any_two(
     if near_ends.size:
         threshold_ratio = np.broadcast_to(threshold_ratio, shots.size)[near_ends]
         correlations = correlations[:, near_ends]
-        pd_shot[near_ends], miss_shot[near_ends] = mean_over_phases(
+        pd_shot[near_ends], miss_shot[near_ends] = mean_joint_pd_over_phases(
             speckle_table.phase_factors[speckle_table.pseudo_variance_row[:, near_ends]],
             tuple(pd[:, near_ends]),
             lambda *pd: pd_and_miss_any_two_in_speckle(
@@ -586,25 +591,25 @@ def _pd_and_miss_any_two(
 
 
 class StrongestPeakProbabilities(NamedTuple):
-    """Probabilities of what is reported if a segment reports its strongest peak alone.
+    """Probabilities that a strongest peak is the echo's, or another one, if only it is reported.
 
     Arrays are (3, n) by segment, or (n,) of the shot.
     """
 
     pd: np.ndarray
-    """Probability that the echo's peak is reported; of a shot, that those of both chirps are."""
+    """Probability that the echo's peak is reported; for a shot, that both chirps report it."""
     miss: np.ndarray
-    """1 - pd, with its digits."""
+    """Probability 1 - pd, precise where pd is near 1."""
     p_wrong_range: np.ndarray
     """Probability that another peak is reported. A shot reports a wrong range if both chirps report
-    a peak, but not both report that of the echo, or if both are resolved to another range."""
+    a peak, but not both the echo's, or if the two peaks are resolved to another range."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pd_decrease(at_threshold, at_level):
-    """Return by how much pd falls as the threshold rises to a level, P_b - P_z >= 0.
+    """Return the decrease of pd from the threshold b to a higher level z, P_b - P_z >= 0.
 
-    It is the difference of the smaller ones of pd and miss, which keeps its digits.
+    It is computed from miss instead of pd where that is more precise.
 
     Parameters
     ----------
@@ -651,7 +656,7 @@ def strongest_peak_of_shot(
     speckle_covariance: np.ndarray | None,
     is_range_misread: np.ndarray,
 ) -> StrongestPeakProbabilities:
-    """Return the probabilities that both chirps report the echo's peak, or a shot a wrong range.
+    """Return the probabilities that both chirps report the echo's peak, or the shot a wrong range.
 
     Parameters
     ----------
@@ -663,8 +668,8 @@ def strongest_peak_of_shot(
         Increase of the probability that both are right, due to speckle that both chirps share, in
         cases where bins outside the echo cross the threshold.
     speckle_covariance : ndarray (n,) or None
-        Probability that the echo is detected in both chirps, minus the product of those in each;
-        None without developed speckle.
+        Probability that the echo is detected in both chirps, minus the product of the two chirps'
+        probabilities; None without developed speckle.
     is_range_misread : ndarray (n,) bool
         True where the peaks of the echo itself are resolved to a wrong range.
 
@@ -716,8 +721,8 @@ def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
     Returns
     -------
     ConditionalPd
-        The condition is a detection in the up segment. Without one the probability is
-        (pd_down - pd_both) / (1 - pd_up), with one pd_both / pd_up.
+        The condition is a detection in the up segment. The probability is pd_both / pd_up if the up
+        segment detects, and (pd_down - pd_both) / (1 - pd_up) if it does not.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         without_up = np.where(
@@ -736,8 +741,8 @@ def doppler_pd_given_chirps(
 ) -> ConditionalPd:
     """Return the probability of detection in the Doppler segment, given the results of both chirps.
 
-    The condition is that exactly one of the up and the down segment detects. If any two of three
-    segments detect a shot, the Doppler segment decides then.
+    The condition is that exactly one of the two chirps detects. The Doppler segment then decides on
+    the shot, if detections in any two of three segments suffice.
 
     Parameters
     ----------
@@ -748,8 +753,8 @@ def doppler_pd_given_chirps(
     pd_added_by_doppler
         (...): probability A that the Doppler segment and exactly one chirp detect.
     detects_any_two
-        (...) bool: True where any two of three segments detect a shot. Elsewhere the Doppler
-        segment decides nothing, and both probabilities are D.
+        (...) bool: True where detections in any two of three segments detect a shot. Elsewhere the
+        Doppler segment decides nothing, and both probabilities are D.
 
     Returns
     -------

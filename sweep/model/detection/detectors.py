@@ -52,8 +52,8 @@ def cached_window_samples(window: Window) -> np.ndarray:
 def main_lobe_half_width(window: Window) -> float:
     """Return the distance of the first minimum of |W| from the centre, to 1/8 bin.
 
-    W is the window's transform. Only minima below half its maximum count. A bin is the sample rate
-    over the number of samples in the window.
+    W is the window's transform. Only minima below half its maximum count. The unit, a bin here, is
+    the sample rate over the number of samples in the window.
     """
     magnitude = np.abs(np.fft.rfft(cached_window_samples(window), 8 * window.length))
     is_below_half = magnitude[:-1] < 0.5 * magnitude[0]  # flattop windows have minima above it
@@ -174,7 +174,7 @@ def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
     return math.exp(brentq(log_pfa_excess, -60.0, log_factor_max, xtol=1e-14, rtol=1e-14))
 
 
-def fixed_threshold(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+def exceeds_fixed_threshold(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """Detect bins at or above the fixed threshold; a :data:`Detector`."""
     return power >= settings.threshold**2
 
@@ -184,7 +184,7 @@ def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
     This is a :data:`Detector`.
     """
-    below, above = _training_sums(power, settings)
+    below, above = _training_power_sums(power, settings)
     return _exceeds_cfar_threshold(
         power, (below + above) / (settings.training // 2 * 2), CA_CFAR, settings
     )
@@ -195,17 +195,17 @@ def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
     This is a :data:`Detector`.
     """
-    level = np.maximum(*_training_sums(power, settings)) / (settings.training // 2)
+    level = np.maximum(*_training_power_sums(power, settings)) / (settings.training // 2)
     return _exceeds_cfar_threshold(power, level, GOCA_CFAR, settings)
 
 
 def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Detect bins by one of their training cells, sorted by power; a :data:`Detector`.
+    """Detect bins by the training cell of a given rank in power; a :data:`Detector`.
 
     A bin is detected if at least ``settings.rank`` training cells have at most the bin's power
     divided by the threshold factor.
     """
-    circular_bins = _circular_bins(power, settings)
+    circular_bins = _power_in_circular_bins(power, settings)
     level_max, n_below = (
         circular_bins / _cfar_factor_of_settings(OS_CFAR, settings),
         np.zeros(circular_bins.shape, np.int64),
@@ -217,7 +217,7 @@ def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
 
 DETECTORS: dict[str, Detector] = {
-    FIXED_THRESHOLD: fixed_threshold,
+    FIXED_THRESHOLD: exceeds_fixed_threshold,
     CA_CFAR: ca_cfar,
     OS_CFAR: os_cfar,
     GOCA_CFAR: goca_cfar,
@@ -232,8 +232,8 @@ def _cfar_factor_of_settings(kind: str, settings: SpectrumSettings) -> float:
     return cfar_factor(kind, training=settings.training, rank=settings.rank, pfa=settings.pfa)
 
 
-def _circular_bins(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the power in bins of circular (complex) noise: all but DC and Nyquist if real."""
+def _power_in_circular_bins(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+    """Return the power in bins of circular noise: all, except DC and Nyquist of a real record."""
     return power if settings.complex_record else power[:, 1:-1]
 
 
@@ -247,10 +247,10 @@ def _iter_training_pairs(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield the power of training cells, in pairs: one below and one above each bin.
 
-    Each array has the shape of the spectra without DC and Nyquist of real records. Cells wrap
-    around the ends of the spectrum.
+    Each array has the shape of ``power``, but for DC and Nyquist of real records. Cells wrap around
+    the ends of the spectrum.
     """
-    circular_bins, half_cells = _circular_bins(power, settings), settings.training // 2
+    circular_bins, half_cells = _power_in_circular_bins(power, settings), settings.training // 2
     n_bins, reach_cells = circular_bins.shape[1], half_cells + settings.guard
     circular_bins = circular_bins[:, np.arange(-reach_cells, n_bins + reach_cells) % n_bins]
     for i in range(half_cells):
@@ -258,9 +258,11 @@ def _iter_training_pairs(
         yield circular_bins[:, i : i + n_bins], circular_bins[:, above_begin : above_begin + n_bins]
 
 
-def _training_sums(power: np.ndarray, settings: SpectrumSettings) -> tuple[np.ndarray, np.ndarray]:
+def _training_power_sums(
+    power: np.ndarray, settings: SpectrumSettings
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the summed power of the training cells below each bin, and of those above it."""
-    below, above = np.zeros((2, *_circular_bins(power, settings).shape))
+    below, above = np.zeros((2, *_power_in_circular_bins(power, settings).shape))
     for cells_below, cells_above in _iter_training_pairs(power, settings):
         below += cells_below
         above += cells_above
@@ -272,6 +274,7 @@ def _exceeds_cfar_threshold(
 ) -> np.ndarray:
     """Test if the power of bins is at or above the CFAR factor times their noise level."""
     return _pad_to_all_bins(
-        _circular_bins(power, settings) >= _cfar_factor_of_settings(kind, settings) * level,
+        _power_in_circular_bins(power, settings)
+        >= _cfar_factor_of_settings(kind, settings) * level,
         settings,
     )

@@ -87,7 +87,7 @@ def negligible_signal_ratio(
         x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
 
     to the probability of a false peak due to leaked signal (:mod:`sweep.model.spectrum.leakage`).
-    The last factor is taken at a b = 1, the largest product that is returned.
+    The last factor is taken at a b = 1, the largest product for amplitudes that are returned.
     """
     y = 0.5 * np.square(threshold_ratio)
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
@@ -163,25 +163,24 @@ class EchoSpans(NamedTuple):
 
 
 class BinsGivenMode(NamedTuple):
-    """Parameters of an echo's bins given the complex amplitude z of its strongest speckle mode.
+    """Parameters of an echo's bins, given the amplitude of the echo's strongest speckle mode.
 
-    A speckle mode is a part of the echo that fades with one amplitude in all bins. All fields are
-    relative to the noise of the bin, which is receiver noise plus the other speckle modes.
+    A speckle mode is a part of the echo that fades with one amplitude in all bins. The noise of a
+    bin here is the receiver noise plus all speckle modes but the strongest.
     """
 
-    signal: np.ndarray
-    """(bins,): root mean square magnitude of the strongest speckle mode over the noise per
-    quadrature."""
-    threshold: np.ndarray
+    signal_ratio: np.ndarray
+    """(bins,): root mean square |X| of the strongest speckle mode over the noise per quadrature."""
+    threshold_ratio: np.ndarray
     """(bins,): threshold on |X| over the noise per quadrature."""
-    correlation: np.ndarray
+    neighbour_noise_correlation: np.ndarray
     """(bins,): correlation of the bin's noise with the noise of the bin below it, -1..1."""
-    pedestal: np.ndarray
+    pedestal_power_ratio: np.ndarray
     """(bins,): mean power of the laser's phase-noise pedestal over the noise power. Only the part
     that fades with the strongest speckle mode counts."""
-    other_echo_fraction: np.ndarray
-    """(bins,): fraction, 0..1, of the noise power that is due to other speckle modes than the
-    strongest. Near DC and Nyquist it depends on the phase of the strongest mode's amplitude."""
+    other_modes_noise_fraction: np.ndarray
+    """(bins,): fraction, 0..1, of the noise power that is due to the other speckle modes. Near DC
+    and Nyquist that part of the noise changes with the phase of the strongest mode."""
 
 
 class Detection(NamedTuple):
@@ -214,8 +213,8 @@ class PedestalShape(NamedTuple):
 
     reach_bins: float
     """Distance [bins] from a line up to which bins belong to the echo. In the last of them the
-    pedestal has at least the power of the noise. 0 if it does not exceed the half-width of the main
-    lobe."""
+    pedestal has at least the power of the noise. 0 if this distance does not exceed the half-width
+    of the main lobe."""
     line_width_bins: float
     """Width (FWHM) of the laser's line [FFT bins]."""
     delay: float
@@ -329,7 +328,7 @@ def bin_threshold_at(bin_thresholds, point):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def echo_half_width(rule, pedestal_reach_bins):
-    """Return the half-width [bins] of an echo about its lines.
+    """Return the half-width [bins] by which an echo extends on either side of its lines.
 
     The half-width is the larger of the half-widths of the main lobe and of the phase-noise
     pedestal. ``rule`` is a :class:`DetectionRule`.
@@ -558,7 +557,7 @@ def joint_pd_in_speckle(
     correlation
         (n,): modulus of the correlation of the two segments' echo amplitudes.
     n_independent_bins
-        Number M of independent bins that represent each echo, :func:`detection_equivalent_bins`.
+        Number M of independent bins that represent each echo, :func:`n_detection_equivalent_bins`.
 
     Returns
     -------
@@ -567,19 +566,20 @@ def joint_pd_in_speckle(
 
     Notes
     -----
-    For one bin per segment these are two correlated Rayleigh magnitudes [1]_. A and B are the
-    squared threshold over the mean power of signal plus noise in either segment. The segments are
-    detected with e^-A and e^-B. r is the squared correlation of signal plus noise:
-    ``correlation``^2 times SNR / (1 + SNR) of both segments. Q_1 is Marcum's function. Both
-    segments are detected with the probability
+    With one bin per segment, |X| of the two bins are correlated Rayleigh magnitudes [1]_. Let A be
+    the squared threshold over the mean power of signal plus noise in the first segment, and B that
+    in the second. The segments are detected with the probabilities e^-A and e^-B. The squared
+    correlation of signal plus noise is r = ``correlation``^2 times SNR / (1 + SNR) of both
+    segments. With Marcum's Q_1, both segments are detected with the probability
 
         J = e^-A (1 - Q_1(sqrt(2 B / (1-r)), sqrt(2 r A / (1-r))))
             + e^-B Q_1(sqrt(2 r B / (1-r)), sqrt(2 A / (1-r)))
 
     An echo that any of its bins may detect is represented by M independent bins. Let p be the
-    probability of detection of a segment. Each bin is detected with q = 1 - (1 - p)^(1/M), and is
-    correlated with one bin of the other segment. Both segments are missed with (1 - q_1 - q_2 +
-    J(q_1, q_2))^M. Both segments are thus detected with the probability
+    probability of detection of a segment. Each bin is detected with the probability q = 1 - (1 -
+    p)^(1/M), and is correlated with one bin of the other segment. Both segments are missed with the
+    probability (1 - q_1 - q_2 + J(q_1, q_2))^M. Both segments are thus detected with the
+    probability
 
         p_1 p_2 + (1 - p_1) (1 - p_2) ((1 + (J - q_1 q_2) / ((1 - q_1) (1 - q_2)))^M - 1)
 
@@ -634,12 +634,12 @@ def joint_pd_in_speckle(
     return np.where(is_defined, p_both, np.nan)
 
 
-INDEPENDENT_BINS_MAX = 1e3
+N_INDEPENDENT_BINS_MAX = 1e3
 """Upper limit of the number of independent bins that represent an echo of several bins, as
-:func:`detection_equivalent_bins` returns it."""
+:func:`n_detection_equivalent_bins` returns it."""
 
 
-def detection_equivalent_bins(
+def n_detection_equivalent_bins(
     pd: np.ndarray, peak_ratio: np.ndarray, threshold_ratio: np.ndarray
 ) -> np.ndarray:
     """Return the number M of independent bins that are together detected as often as an echo.
@@ -658,7 +658,7 @@ def detection_equivalent_bins(
     Returns
     -------
     numpy.ndarray
-        M, in general not an integer, from 1 to :data:`INDEPENDENT_BINS_MAX`. It is 1 where pd is
+        M, in general not an integer, from 1 to :data:`N_INDEPENDENT_BINS_MAX`. It is 1 where pd is
         nan, or where pd and q (see below) both round to 1.
 
     Notes
@@ -671,7 +671,7 @@ def detection_equivalent_bins(
         n_bins = np.log1p(-np.minimum(pd, 1 - 1e-15)) / np.log1p(
             -np.minimum(single_bin_pd, 1 - 1e-15)
         )
-    return np.clip(np.nan_to_num(n_bins, nan=1.0), 1.0, INDEPENDENT_BINS_MAX)
+    return np.clip(np.nan_to_num(n_bins, nan=1.0), 1.0, N_INDEPENDENT_BINS_MAX)
 
 
 def independent_bin_pd(
@@ -689,7 +689,7 @@ def independent_bin_pd(
     Returns
     -------
     ndarray or float
-        1 - (1 - pd)^(1/M), with its digits.
+        1 - (1 - pd)^(1/M), precise also where it is small.
 
     Examples
     --------
@@ -700,7 +700,7 @@ def independent_bin_pd(
 
 
 independent_bin_pd_kernel = njit(cache=True, error_model="numpy", borrows=True)(independent_bin_pd)
-"""The same for a kernel and single numbers."""
+""":func:`independent_bin_pd` of single numbers, compiled for calls from kernels."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -713,8 +713,10 @@ def pd_of_independent_bins(bin_pd, n_bins):
     return -math.expm1(n_bins * math.log1p(-bin_pd))
 
 
-def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) -> np.ndarray:
-    """Return the probability that at least two of three independent events happen.
+def at_least_two_of_three_probability(
+    probabilities: np.ndarray, complements: np.ndarray
+) -> np.ndarray:
+    """Return the probability that at least two of three independent events happen, (...).
 
     Parameters
     ----------
@@ -722,14 +724,10 @@ def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) ->
         (3, ...): probability of each event, and one minus it. They are separate arguments to keep
         precision in both tails.
 
-    Returns
-    -------
-    numpy.ndarray
-        (...)
-
     Examples
     --------
-    >>> round(float(at_least_two_of_three(np.array([0.9, 0.8, 0.5]), np.array([0.1, 0.2, 0.5]))), 6)
+    >>> p = np.array([0.9, 0.8, 0.5])
+    >>> round(float(at_least_two_of_three_probability(p, 1 - p)), 6)
     0.85
     """
     (a, b, c), (no_a, no_b, no_c) = probabilities, complements
@@ -767,7 +765,7 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
     each group and the two next to it; the strongest bin and its two neighbours; and bins within
     ``lobe_half_width`` of a bin of at least half the largest magnitude.
     """
-    largest, n_above = _largest_and_count(magnitude[:n_bins], threshold)
+    largest, n_above = _largest_and_n_above(magnitude[:n_bins], threshold)
     peak = 0
     while peak < n_bins - 1 and magnitude[peak] < largest:
         peak += 1
@@ -781,12 +779,12 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
         first -= 1
     while last < n_bins - 1 and magnitude[last + 1] >= threshold:
         last += 1
-    n_exempt = _exempt_group(first, last, n_bins, is_exempt)
+    n_exempt = _mark_group_exempt(first, last, n_bins, is_exempt)
     if n_above > last - first + 1 or lobe_half_width > 0:
         n_exempt = 0
         for i in range(n_bins):
             if magnitude[i] >= threshold:
-                _exempt_group(i, i, n_bins, is_exempt)
+                _mark_group_exempt(i, i, n_bins, is_exempt)
         for i in range(n_bins):
             n_exempt += is_exempt[i]
     return peak, n_exempt
@@ -928,9 +926,9 @@ def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_s
     """
     noise = bin_threshold.noise_without_pedestal
     bins_given_mode = _zero_bins_given_mode(INTEGER_ONE)
-    bins_given_mode.signal[:] = magnitude / noise
-    bins_given_mode.threshold[:] = bin_threshold.threshold / noise
-    bins_given_mode.pedestal[:] = (bin_threshold.line_noise / noise) ** 2 - 1.0
+    bins_given_mode.signal_ratio[:] = magnitude / noise
+    bins_given_mode.threshold_ratio[:] = bin_threshold.threshold / noise
+    bins_given_mode.pedestal_power_ratio[:] = (bin_threshold.line_noise / noise) ** 2 - 1.0
     echo = EchoBins(np.full(1, magnitude), np.ones(1, np.bool_), bin_)
     return _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle)
 
@@ -950,11 +948,11 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
 
     Notes
     -----
-    A single bin crosses with :func:`bin_crossing_tails`. The noise of neighbouring bins is
-    correlated with the coefficient rho, in phase with a signal that keeps its phase from bin to bin
-    as in a main lobe. Two neighbours are taken to cross jointly like two correlated normal numbers
-    that exceed s and t with the same probabilities. The joint probability is the product of the two
-    plus [1]_
+    A single bin crosses with :func:`bin_crossing_tails`. The noise of neighbouring bins has the
+    correlation rho in phase with the signal, if the signal keeps its phase from bin to bin as in a
+    main lobe. Two neighbours are taken to cross jointly like two correlated normal numbers that
+    exceed s and t with the same probabilities. The joint probability is the product of the two plus
+    [1]_
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
@@ -967,7 +965,7 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
        27, 1956.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
-    pd, miss, previous_p_stay, previous_deviate, largest = 0.0, 1.0, -1.0, 0.0, 0.0
+    pd, miss, previous_p_stay, previous_quantile, largest = 0.0, 1.0, -1.0, 0.0, 0.0
     threshold = bin_threshold.threshold
     for i in range(magnitude.size):
         largest = max(largest, magnitude[i] if is_echo[i] else 0.0)
@@ -982,12 +980,12 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
         tails = bin_crossing_tails(magnitude[i] / noise, threshold / noise, is_real)
         if not tails.below > 0.0:
             return Detection(1.0, 0.0)
-        given_neighbour, deviate = _crossing_given_neighbour_below(
-            tails, previous_p_stay, previous_deviate, rule.neighbour_crossing_quadrature
+        given_neighbour, quantile = _crossing_given_neighbour_below(
+            tails, previous_p_stay, previous_quantile, rule.neighbour_crossing_quadrature
         )
         pd += miss * given_neighbour.above
         miss *= given_neighbour.below
-        previous_p_stay, previous_deviate = tails.below, deviate
+        previous_p_stay, previous_quantile = tails.below, quantile
     return Detection(pd if pd < 0.5 else 1.0 - miss, miss)
 
 
@@ -995,17 +993,17 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
 def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
     """Compute :func:`pd_and_miss_any_bin` for a steady echo of a laser with phase noise.
 
-    The laser's phase noise leaves a pedestal around each line, and some bins of the echo hold no
-    more than that. In each bin :func:`fill_pedestal_ratios` tells how much it adds to the noise.
+    The laser's phase noise leaves a pedestal around each line, and some bins of the echo hold only
+    pedestal. :func:`fill_pedestal_ratios` gives the power that it adds to the noise of each bin.
     """
     n_bins = echo.magnitude.size
     pedestal_ratios, bins_given_mode = np.empty(n_bins), _zero_bins_given_mode(n_bins)
     fill_pedestal_ratios(echo.magnitude, echo.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
         noise = bin_threshold.noise_without_pedestal * math.sqrt(1.0 + pedestal_ratios[k])
-        bins_given_mode.signal[k] = echo.magnitude[k] / noise
-        bins_given_mode.threshold[k] = bin_threshold.threshold / noise
-        bins_given_mode.correlation[k] = rule.noise_correlation
+        bins_given_mode.signal_ratio[k] = echo.magnitude[k] / noise
+        bins_given_mode.threshold_ratio[k] = bin_threshold.threshold / noise
+        bins_given_mode.neighbour_noise_correlation[k] = rule.noise_correlation
     return _pd_and_miss_given_mode(
         bins_given_mode, 1.0, echo, rule.real_noise_at_ends, rule.fft_size, np.inf, 0.0
     )
@@ -1016,17 +1014,17 @@ def _zero_bins_given_mode(n_bins):
     """Return a :class:`BinsGivenMode` for ``n_bins`` bins, all of whose fields are zero."""
     rows = np.zeros((5, n_bins))  # one allocation instead of five
     return BinsGivenMode(
-        signal=rows[0],
-        threshold=rows[1],
-        correlation=rows[2],
-        pedestal=rows[3],
-        other_echo_fraction=rows[4],
+        signal_ratio=rows[0],
+        threshold_ratio=rows[1],
+        neighbour_noise_correlation=rows[2],
+        pedestal_power_ratio=rows[3],
+        other_modes_noise_fraction=rows[4],
     )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _crossing_given_neighbour_below(
-    tails, previous_p_stay, previous_deviate, neighbour_crossing_quadrature
+    tails, previous_p_stay, previous_quantile, neighbour_crossing_quadrature
 ):
     """Return a bin's crossing probability given that the bin below does not cross.
 
@@ -1034,7 +1032,7 @@ def _crossing_given_neighbour_below(
     ----------
     tails
         Unconditional :class:`.Tails` of the bin.
-    previous_p_stay, previous_deviate
+    previous_p_stay, previous_quantile
         Probability that the bin below does not cross, and the number that a standard normal
         variable exceeds as often as that bin crosses. The probability is negative if no bin of the
         echo lies below.
@@ -1043,24 +1041,24 @@ def _crossing_given_neighbour_below(
 
     Returns
     -------
-    given_neighbour, deviate
-        Conditional :class:`.Tails`, and the number that a standard normal variable exceeds with
-        ``tails.above``.
+    given_neighbour, quantile
+        Conditional :class:`.Tails`, and the number that a standard normal variable exceeds with the
+        probability ``tails.above``.
     """
-    deviate = _normal_deviate_of_tails(tails)
+    quantile = _upper_normal_quantile_of_tails(tails)
     if not previous_p_stay > 0.0:
-        return tails, deviate
-    p_joint = joint_tail_excess(deviate, previous_deviate, neighbour_crossing_quadrature)
+        return tails, quantile
+    p_joint = joint_tail_excess(quantile, previous_quantile, neighbour_crossing_quadrature)
     p_joint = min(p_joint / previous_p_stay, tails.above)
-    return Tails(tails.above - p_joint, tails.below + p_joint), deviate
+    return Tails(tails.above - p_joint, tails.below + p_joint), quantile
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def any_crossing_of_chain(probabilities, n_bins, neighbour_crossing_quadrature):
-    """Return the probability that any of adjacent bins crosses, from the probability of each bin.
+    """Return the probability that any bin of a run crosses, from the probability of each bin.
 
-    Neighbours are correlated as in :func:`pd_and_miss_any_bin`. Bins that cross with less than 1e-4
-    count as independent.
+    The bins of the run are adjacent, and neighbours are correlated as in
+    :func:`pd_and_miss_any_bin`. Bins that cross with a probability below 1e-4 count as independent.
 
     Parameters
     ----------
@@ -1071,7 +1069,7 @@ def any_crossing_of_chain(probabilities, n_bins, neighbour_crossing_quadrature):
     neighbour_crossing_quadrature
         :class:`sweep.model.detection.joint_tail.JointTailQuadrature` of the noise of neighbours.
     """
-    p_any, p_none, previous_p_stay, previous_deviate = 0.0, 1.0, -1.0, 0.0
+    p_any, p_none, previous_p_stay, previous_quantile = 0.0, 1.0, -1.0, 0.0
     for i in range(n_bins):
         p_cross = min(max(probabilities[i], 0.0), 1.0)
         p_stay = 1.0 - p_cross
@@ -1080,18 +1078,21 @@ def any_crossing_of_chain(probabilities, n_bins, neighbour_crossing_quadrature):
         if p_cross < 1e-4:
             p_any, p_none, previous_p_stay = p_any + p_none * p_cross, p_none * p_stay, -1.0
             continue
-        given_neighbour, deviate = _crossing_given_neighbour_below(
-            Tails(p_cross, p_stay), previous_p_stay, previous_deviate, neighbour_crossing_quadrature
+        given_neighbour, quantile = _crossing_given_neighbour_below(
+            Tails(p_cross, p_stay),
+            previous_p_stay,
+            previous_quantile,
+            neighbour_crossing_quadrature,
         )
         p_any += p_none * given_neighbour.above
         p_none *= given_neighbour.below
-        previous_p_stay, previous_deviate = p_stay, deviate
+        previous_p_stay, previous_quantile = p_stay, quantile
     return p_any
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def clear_image_exemptions(magnitude, is_exempt, first_bin, fft_size, image_gain):
-    """Clear the exemption of bins that an I/Q image dominates; return the number still exempt.
+    """Clear the exemption of bins that an I/Q image dominates; return the number of exempt bins.
 
     Exempt bins belong to an echo and raise no false alarm. An image lies at the opposite frequency
     of its line and has ``image_gain`` times the line's |X|. It dominates a bin if it makes at least
@@ -1175,7 +1176,7 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     return Detection(pd + miss * bin_run.pd, miss * bin_run.miss)
 
 
-_GAUSS_ORDER = 6
+_N_GAUSS_NODES = 6
 """Number of nodes, in each interval, of the Gauss-Legendre quadrature over the magnitude of the
 strongest speckle mode."""
 _IMPOSSIBLE_BELOW_SIGMA, _CERTAIN_ABOVE_SIGMA = 4.5, 2.7
@@ -1186,12 +1187,12 @@ and mostly 1e-4."""
 _SPECKLE_MODE_MAGNITUDE_MAX = 6.0
 """Upper end of the quadrature over the magnitude of the strongest speckle mode, in units of its
 root mean square."""
-_RARE_CROSSING_MAX = 1e-5
+_RARE_CROSSING_PROBABILITY_MAX = 1e-5
 """Crossing probability below which a bin counts as independent of its neighbours."""
 _NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION = 1e-6, 1e-4
 """Largest contribution of a bin to the probability of detection pd that may be neglected. The first
 is absolute, the second relative to the smaller of pd and 1 - pd."""
-_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_N_GAUSS_NODES)
 
 
 @njit(cache=True, error_model="numpy")
@@ -1226,11 +1227,11 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
     # Not by _zero_bins_given_mode: a call and zeros cost 6 % of the time of an echo.
     rows, pedestal_ratios = np.empty((5, n_bins)), np.empty(n_bins)
     bins_given_mode = BinsGivenMode(
-        signal=rows[0],
-        threshold=rows[1],
-        correlation=rows[2],
-        pedestal=rows[3],
-        other_echo_fraction=rows[4],
+        signal_ratio=rows[0],
+        threshold_ratio=rows[1],
+        neighbour_noise_correlation=rows[2],
+        pedestal_power_ratio=rows[3],
+        other_modes_noise_fraction=rows[4],
     )
     previous_fraction, previous_inverse_noise = 0.0, 0.0
     fill_pedestal_ratios(bin_run.magnitude, bin_run.is_echo, bin_threshold, pedestal_ratios)
@@ -1247,10 +1248,10 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
         )
         other_power = (1.0 - mode_fraction) * (signal_power + pedestal_power) + noise_power
         inverse_noise = math.sqrt(2.0 / other_power)
-        bins_given_mode.pedestal[k] = mode_fraction * pedestal_power / other_power
-        bins_given_mode.signal[k] = inverse_noise * math.sqrt(mode_fraction * signal_power)
-        bins_given_mode.threshold[k] = inverse_noise * bin_threshold.threshold
-        bins_given_mode.correlation[k] = 0.0
+        bins_given_mode.pedestal_power_ratio[k] = mode_fraction * pedestal_power / other_power
+        bins_given_mode.signal_ratio[k] = inverse_noise * math.sqrt(mode_fraction * signal_power)
+        bins_given_mode.threshold_ratio[k] = inverse_noise * bin_threshold.threshold
+        bins_given_mode.neighbour_noise_correlation[k] = 0.0
         if k > 0 and is_echo[i] and is_echo[i - 1]:
             neighbour_correlation = interpolate_mode_table(
                 mode_table.neighbour_correlation, cell, i - strongest
@@ -1263,15 +1264,15 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
             noise_covariance += noise_power * math.copysign(
                 rule.noise_correlation, neighbour_correlation
             )
-            bins_given_mode.correlation[k] = min(
+            bins_given_mode.neighbour_noise_correlation[k] = min(
                 max(0.5 * noise_covariance * inverse_noise * previous_inverse_noise, -0.999), 0.999
             )
         previous_fraction, previous_inverse_noise = mode_fraction, inverse_noise
         # The power of the other modes depends on the phase too, except in bins 0 and N/2.
         bin_, other_modes_power = bin_run.first_bin + k, (1.0 - mode_fraction) * magnitude[i] ** 2
-        bins_given_mode.other_echo_fraction[k] = 0.0
+        bins_given_mode.other_modes_noise_fraction[k] = 0.0
         if bin_ != 0 and bin_ != nyquist_bin:
-            bins_given_mode.other_echo_fraction[k] = other_modes_power / (
+            bins_given_mode.other_modes_noise_fraction[k] = other_modes_power / (
                 other_modes_power + noise_power
             )
     return _mean_over_mode_phase(bins_given_mode, bin_run, rule, bin_speckle)
@@ -1299,9 +1300,9 @@ def _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
     given_phase = BinsGivenMode(
         np.empty(n_bins),
         np.empty(n_bins),
-        bins_given_mode.correlation,
+        bins_given_mode.neighbour_noise_correlation,
         np.empty(n_bins),
-        bins_given_mode.other_echo_fraction,
+        bins_given_mode.other_modes_noise_fraction,
     )
     for node in range(N_PHASE_NODES):
         for k in range(n_bins):
@@ -1310,14 +1311,17 @@ def _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
             )
             power_factor = max(1.0 + ratio * PHASE_COSINES[node], 0.0)
             inverse_noise = 1.0 / math.sqrt(
-                1.0 + (power_factor - 1.0) * bins_given_mode.other_echo_fraction[k]
+                1.0 + (power_factor - 1.0) * bins_given_mode.other_modes_noise_fraction[k]
             )
-            given_phase.signal[k] = (
-                bins_given_mode.signal[k] * math.sqrt(power_factor) * inverse_noise
+            given_phase.signal_ratio[k] = (
+                bins_given_mode.signal_ratio[k] * math.sqrt(power_factor) * inverse_noise
             )
-            given_phase.threshold[k] = bins_given_mode.threshold[k] * inverse_noise
-            given_phase.pedestal[k] = (
-                bins_given_mode.pedestal[k] * power_factor * inverse_noise * inverse_noise
+            given_phase.threshold_ratio[k] = bins_given_mode.threshold_ratio[k] * inverse_noise
+            given_phase.pedestal_power_ratio[k] = (
+                bins_given_mode.pedestal_power_ratio[k]
+                * power_factor
+                * inverse_noise
+                * inverse_noise
             )
         at_phase = _mean_over_mode_power(given_phase, echo, rule.real_noise_at_ends, rule.fft_size)
         pd, miss = pd + at_phase.pd / N_PHASE_NODES, miss + at_phase.miss / N_PHASE_NODES
@@ -1329,7 +1333,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
     """Return the mean :class:`Detection` over the power of the strongest speckle mode.
 
     The mode has the amplitude z in all bins. The signal of a bin is |z| times
-    ``bins_given_mode.signal``. The density of |z| at z is 2 z e^(-z^2).
+    ``bins_given_mode.signal_ratio``. The density of |z| at z is 2 z e^(-z^2).
 
     Parameters
     ----------
@@ -1342,26 +1346,27 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
     z_first = z_last = z_middle = _SPECKLE_MODE_MAGNITUDE_MAX
     pedestal_ratio_max, strongest_index = 0.0, NO_INDEX
     for k in range(is_echo.size):
-        pedestal_ratio_max = max(pedestal_ratio_max, bins_given_mode.pedestal[k])
-        if is_echo[k] and bins_given_mode.signal[k] > 0.0:
-            pedestal_deviation = math.sqrt(bins_given_mode.pedestal[k])
-            if bins_given_mode.threshold[k] < z_middle * bins_given_mode.signal[k]:
+        pedestal_ratio_max = max(pedestal_ratio_max, bins_given_mode.pedestal_power_ratio[k])
+        if is_echo[k] and bins_given_mode.signal_ratio[k] > 0.0:
+            pedestal_deviation = math.sqrt(bins_given_mode.pedestal_power_ratio[k])
+            if bins_given_mode.threshold_ratio[k] < z_middle * bins_given_mode.signal_ratio[k]:
                 z_middle, strongest_index = (
-                    bins_given_mode.threshold[k] / bins_given_mode.signal[k],
+                    bins_given_mode.threshold_ratio[k] / bins_given_mode.signal_ratio[k],
                     k,
                 )
             z_first = min(
                 z_first,
-                max(bins_given_mode.threshold[k] - _IMPOSSIBLE_BELOW_SIGMA, 0.0)
-                / (bins_given_mode.signal[k] + _IMPOSSIBLE_BELOW_SIGMA * pedestal_deviation),
+                max(bins_given_mode.threshold_ratio[k] - _IMPOSSIBLE_BELOW_SIGMA, 0.0)
+                / (bins_given_mode.signal_ratio[k] + _IMPOSSIBLE_BELOW_SIGMA * pedestal_deviation),
             )
             signal_over_pedestal = (
-                bins_given_mode.signal[k] - _CERTAIN_ABOVE_SIGMA * pedestal_deviation
+                bins_given_mode.signal_ratio[k] - _CERTAIN_ABOVE_SIGMA * pedestal_deviation
             )
             if signal_over_pedestal > 0.0:
                 z_last = min(
                     z_last,
-                    (bins_given_mode.threshold[k] + _CERTAIN_ABOVE_SIGMA) / signal_over_pedestal,
+                    (bins_given_mode.threshold_ratio[k] + _CERTAIN_ABOVE_SIGMA)
+                    / signal_over_pedestal,
                 )
     z_last = min(z_last, math.sqrt(z_middle * z_middle + 10.0))  # 5e-5 of the mean lies beyond
     interval_ends = (z_first, z_last, z_last)
@@ -1375,17 +1380,17 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
     pd, miss, p_below_first = math.exp(-z_last * z_last), 0.0, -math.expm1(-z_first * z_first)
     for interval in range(1, -1, -1):
         half_width = 0.5 * (interval_ends[interval + 1] - interval_ends[interval])
-        for j in range(_GAUSS_ORDER - 1 if half_width > 0.0 else -1, -1, -1):
+        for j in range(_N_GAUSS_NODES - 1 if half_width > 0.0 else -1, -1, -1):
             z = interval_ends[interval] + half_width * (_GAUSS_NODES[j] + 1.0)
             weight = half_width * _GAUSS_WEIGHTS[j] * 2.0 * z * math.exp(-z * z)
             negligible_probability = (
                 min(_NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION * min(pd, miss + p_below_first))
                 / weight
             )
-            squared_reach = (
+            squared_distance_max = (
                 math.inf
                 if pedestal_ratio_max > 0.0
-                else _squared_reach_given_mode(
+                else _negligible_squared_distance(
                     z, bins_given_mode, strongest_index, is_real, negligible_probability
                 )
             )
@@ -1395,7 +1400,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
                 echo,
                 real_noise_at_ends,
                 fft_size,
-                squared_reach,
+                squared_distance_max,
                 negligible_probability,
             )
             pd, miss = pd + weight * at_z.pd, miss + weight * at_z.miss
@@ -1404,10 +1409,10 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
             min(_NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION * min(pd, p_below_first))
             / p_below_first
         )
-        squared_reach = (
+        squared_distance_max = (
             math.inf
             if pedestal_ratio_max > 0.0
-            else _squared_reach_given_mode(
+            else _negligible_squared_distance(
                 0.6 * z_first, bins_given_mode, strongest_index, is_real, negligible_probability
             )
         )
@@ -1417,7 +1422,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
             echo,
             real_noise_at_ends,
             fft_size,
-            squared_reach,
+            squared_distance_max,
             negligible_probability,
         )
         pd, miss = pd + p_below_first * at_z.pd, miss + p_below_first * at_z.miss
@@ -1426,13 +1431,15 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _squared_reach_given_mode(z, bins_given_mode, strongest_index, is_real, negligible_probability):
-    """Return the squared distance [sigma^2] below the threshold beyond which bins are negligible.
+def _negligible_squared_distance(
+    z, bins_given_mode, strongest_index, is_real, negligible_probability
+):
+    """Return the squared distance below the threshold beyond which bins are negligible [sigma^2].
 
-    The threshold b and signals are in units of sigma, the noise per quadrature. A bin of signal
-    a < b adds at most e^(-(b - a)^2 / 2) times the miss probability of the strongest bin. With the
-    strongest bin's signal A > b, that probability is less than e^(-(A - b)^2 / 2), or the root of
-    this for real noise.
+    The threshold b and signals are in units of sigma, the noise per quadrature. A bin of signal a <
+    b adds at most e^(-(b - a)^2 / 2) times the miss probability of the strongest bin to pd. If the
+    strongest bin's signal A exceeds b, its miss probability is less than e^(-(A - b)^2 / 2), or the
+    root of that for real noise.
 
     Parameters
     ----------
@@ -1450,7 +1457,8 @@ def _squared_reach_given_mode(z, bins_given_mode, strongest_index, is_real, negl
     if not negligible_probability > 0.0 or strongest_index < 0:
         return math.inf
     excess_ratio = max(
-        bins_given_mode.signal[strongest_index] * z - bins_given_mode.threshold[strongest_index],
+        bins_given_mode.signal_ratio[strongest_index] * z
+        - bins_given_mode.threshold_ratio[strongest_index],
         0.0,
     )
     return -2.0 * math.log(negligible_probability) - excess_ratio * excess_ratio * (
@@ -1460,7 +1468,13 @@ def _squared_reach_given_mode(z, bins_given_mode, strongest_index, is_real, negl
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _pd_and_miss_given_mode(
-    bins_given_mode, z, echo, real_noise_at_ends, fft_size, squared_reach, negligible_probability
+    bins_given_mode,
+    z,
+    echo,
+    real_noise_at_ends,
+    fft_size,
+    squared_distance_max,
+    negligible_probability,
 ):
     """Return the :class:`Detection` by any bin given the magnitude z of the strongest speckle mode.
 
@@ -1477,63 +1491,64 @@ def _pd_and_miss_given_mode(
         :class:`BinsGivenMode`, magnitude of the mode, and :class:`EchoBins`.
     real_noise_at_ends, fft_size
         Fields of :class:`DetectionRule`.
-    squared_reach
+    squared_distance_max
         Squared distance [sigma^2] below the threshold beyond which bins are left out.
     negligible_probability
         Contribution to pd below which a bin counts as independent of its neighbours.
     """
     is_echo = echo.is_echo
-    pd, miss, previous_p_stay, previous_deviate, previous_signal = 0.0, 1.0, -1.0, 0.0, 0.0
+    pd, miss, previous_p_stay, previous_quantile, previous_signal = 0.0, 1.0, -1.0, 0.0, 0.0
     for k in range(is_echo.size):
         if not is_echo[k]:
             previous_p_stay = -1.0
             continue
-        scale = 1.0 / math.sqrt(1.0 + bins_given_mode.pedestal[k] * z * z)
-        signal = bins_given_mode.signal[k] * z * scale
-        distance_below = bins_given_mode.threshold[k] * scale - signal
+        scale = 1.0 / math.sqrt(1.0 + bins_given_mode.pedestal_power_ratio[k] * z * z)
+        signal = bins_given_mode.signal_ratio[k] * z * scale
+        distance_below = bins_given_mode.threshold_ratio[k] * scale - signal
         is_real = is_real_bin(echo.first_bin + k, real_noise_at_ends, fft_size)
         if distance_below > 0.0 and distance_below * distance_below > (
-            2.0 * squared_reach if is_real else squared_reach
+            2.0 * squared_distance_max if is_real else squared_distance_max
         ):
             previous_p_stay = -1.0
             continue
-        tails = bin_crossing_tails(signal, bins_given_mode.threshold[k] * scale, is_real)
+        tails = bin_crossing_tails(signal, bins_given_mode.threshold_ratio[k] * scale, is_real)
         p_cross, p_stay = tails.above, tails.below
         if not p_stay > 0.0:
             return Detection(1.0, 0.0)
-        if p_cross < _RARE_CROSSING_MAX or miss * p_cross < negligible_probability:
+        if p_cross < _RARE_CROSSING_PROBABILITY_MAX or miss * p_cross < negligible_probability:
             # That both of a pair cross is at most as likely.
             pd, miss, previous_p_stay = pd + miss * p_cross, miss * p_stay, -1.0
             continue
-        deviate = _rough_normal_deviate_of_tails(tails)
+        quantile = _rough_upper_normal_quantile(tails)
         conditional_cross, conditional_stay = p_cross, p_stay
-        correlation = bins_given_mode.correlation[k]
+        correlation = bins_given_mode.neighbour_noise_correlation[k]
         if previous_p_stay > 0.0 and correlation != 0.0:
             correlation = (
                 correlation * correlation + correlation * signal * previous_signal
             ) / math.sqrt((1.0 + signal * signal) * (1.0 + previous_signal * previous_signal))
-            p_joint = joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation)
+            p_joint = joint_tail_excess_by_four_nodes(quantile, previous_quantile, correlation)
             p_joint = max(min(p_joint / previous_p_stay, p_cross), -p_stay)
             conditional_cross, conditional_stay = p_cross - p_joint, p_stay + p_joint
         pd += miss * conditional_cross
         miss *= conditional_stay
-        previous_p_stay, previous_deviate, previous_signal = p_stay, deviate, signal
+        previous_p_stay, previous_quantile, previous_signal = p_stay, quantile, signal
     return Detection(pd if pd < 0.5 else 1.0 - miss, miss)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _normal_deviate_of_tails(tails):
-    """Return the number that a standard normal variable exceeds with ``tails.above``.
+def _upper_normal_quantile_of_tails(tails):
+    """Return the number that a standard normal variable exceeds with the probability ``above``.
 
-    ``tails`` is a :class:`.Tails`, whose smaller probability is used for precision.
+    ``above`` is a field of ``tails``, a :class:`.Tails`. Its smaller probability is used for
+    precision.
     """
     if tails.above < tails.below:
-        return _normal_deviate(tails.above)
-    return -_normal_deviate(tails.below)
+        return _upper_normal_quantile(tails.above)
+    return -_upper_normal_quantile(tails.below)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _normal_deviate(probability):
+def _upper_normal_quantile(probability):
     """Return the number that a standard normal variable exceeds with a probability <= 1/2.
 
     The error of the returned number is about 1e-4.
@@ -1548,13 +1563,13 @@ def _normal_deviate(probability):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _rough_normal_deviate_of_tails(tails):
-    """Compute :func:`_normal_deviate_of_tails` with an error of at most 4.5e-4.
+def _rough_upper_normal_quantile(tails):
+    """Compute :func:`_upper_normal_quantile_of_tails` with an error of at most 4.5e-4.
 
     Notes
     -----
-    The approximation [1]_ costs a third of :func:`_normal_deviate`, and the quadrature over a
-    speckle mode needs many.
+    The approximation [1]_ costs a third of :func:`_upper_normal_quantile`. The quadrature over a
+    speckle mode makes many calls.
 
     References
     ----------
@@ -1562,13 +1577,13 @@ def _rough_normal_deviate_of_tails(tails):
     """
     probability = min(tails.above, tails.below)
     if probability < 1e-300:
-        deviate = 37.0
+        quantile = 37.0
     else:
         s = math.sqrt(-2.0 * math.log(probability))
-        deviate = s - (2.515517 + s * (0.802853 + s * 0.010328)) / (
+        quantile = s - (2.515517 + s * (0.802853 + s * 0.010328)) / (
             1.0 + s * (1.432788 + s * (0.189269 + s * 0.001308))
         )
-    return deviate if tails.above < tails.below else -deviate
+    return quantile if tails.above < tails.below else -quantile
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1610,7 +1625,7 @@ def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _largest_and_count(magnitude, threshold):
+def _largest_and_n_above(magnitude, threshold):
     """Return the largest |X| of bins, and the number of bins whose |X| reaches the threshold."""
     largest, n_above = magnitude[0], 0
     for i in range(magnitude.size):
@@ -1620,7 +1635,7 @@ def _largest_and_count(magnitude, threshold):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _exempt_group(first, last, n_bins, is_exempt):
+def _mark_group_exempt(first, last, n_bins, is_exempt):
     """Mark the bins first .. last and the two next to them as exempt; return their number.
 
     Exempt bins belong to an echo and raise no false alarm. ``n_bins`` is the number of all bins.
@@ -1644,15 +1659,15 @@ class SpectrumDetections(NamedTuple):
     n_exempt: np.ndarray
     """(m,): number of bins that belong to the echo and so can raise no false alarm."""
     leakage: np.ndarray
-    """(m,): zeros in place of the probability of a false peak due to leaked signal, which is not
-    evaluated here."""
+    """(m,): zeros, as the probability of a false peak due to leaked signal is not evaluated
+    here."""
 
 
 @njit(cache=True, error_model="numpy")
 def detect_in_spectra(
     magnitude, first_bins, last_bin, bin_width, rule, bin_thresholds, speckle_table
 ):
-    """Detect the echo in noiseless spectra, one per point; leakage is not evaluated.
+    """Compute the detection of the echo in noiseless spectra, one per point, without leakage.
 
     Parameters
     ----------

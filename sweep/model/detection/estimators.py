@@ -91,18 +91,18 @@ SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
 
 _TONE_STEPS_PER_BIN = 512
 """Number of steps per bin in tables over the offset, -1..1 bin, of a tone from a bin."""
-_NEIGHBOUR_HEIGHT_MIN = 0.25
-"""Ratio of |X| of a neighbour to |X| of a bin on which a tone lies, below which the neighbours
-count as vanishing."""
+_NEIGHBOUR_MAGNITUDE_RATIO_MIN = 0.25
+"""Limit on |X| of a neighbouring bin, over |X| of the bin on which a tone lies. Below it the
+neighbours count as vanishing."""
 _CENTROID_REACH_CELLS = 2
 """Number of resolution cells on either side of the peak over which the centroid is taken. A cell is
 the sample rate over the number of samples in the record."""
 _ZOOM_POINTS_PER_BIN = 32
 """Number of frequencies per FFT bin at which the chirp-z transform is evaluated."""
-_WINDOW_FRACTION_MIN = 1e-3
+_WINDOW_VALUE_FRACTION_MIN = 1e-3
 """Limit on the window value, over its maximum, of samples that are divided by the window. Samples
 with smaller values are left out."""
-_NEWTON_STEPS = 6
+_NEWTON_STEPS_MAX = 6
 """Largest number of steps of Newton's method in the maximum-likelihood estimate."""
 _NEWTON_REACH_BINS = 0.5
 """Largest distance [FFT bins] by which Newton's method may depart from its starting frequency."""
@@ -183,7 +183,7 @@ def parabolic_log(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSett
 
 
 def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Estimate by Jacobsen's ratio of three complex bins times a factor; an :data:`Estimator`.
+    """Return the peak bin plus Jacobsen's ratio of three bins times a factor; an :data:`Estimator`.
 
     Parameters
     ----------
@@ -202,15 +202,15 @@ def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
 
     Notes
     -----
-    The module's description has both forms of the ratio [Jacobsen and Kootsookos, IEEE Signal
-    Process. Mag. 24(3), 123, 2007].
+    Both forms of the ratio are in the description of this module [Jacobsen and Kootsookos, IEEE
+    Signal Process. Mag. 24(3), 123, 2007].
     """
     sign, factor = jacobsen_coefficients(settings.window, settings.fft_size)
     return peak + factor * _jacobsen_ratio(_three_bins_about_middle(spectrum, peak, settings), sign)
 
 
 def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Estimate by Jacobsen's ratio of three complex bins, without its bias; an :data:`Estimator`.
+    """Return the frequency of a tone with the same Jacobsen ratio; an :data:`Estimator`.
 
     Parameters
     ----------
@@ -229,10 +229,11 @@ def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -
 
     Notes
     -----
-    A table of the ratio for single tones in this window is inverted. The published factor [Candan,
-    IEEE Signal Process. Lett. 18, 351, 2011] is the slope of that curve at the bin.
+    Jacobsen's ratio of three complex bins is tabulated for single tones in this window, and the
+    table is inverted, so that the estimate has no bias. The published factor [Candan, IEEE Signal
+    Process. Lett. 18, 351, 2011] is the slope of that curve at the bin.
     """
-    offset, tone_bins = _tone_bins(settings.window, settings.fft_size)
+    offset, tone_bins = _tone_offsets_and_bins(settings.window, settings.fft_size)
     tone_ratios = np.maximum.accumulate(_jacobsen_ratio(tone_bins, 1))
     return peak + np.interp(
         _jacobsen_ratio(_three_bins_about_middle(spectrum, peak, settings), 1), tone_ratios, offset
@@ -276,7 +277,7 @@ def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
 
 
 def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the positions of the maxima of spectra [bins]; an :data:`Estimator`.
+    """Return the maximum of a finely sampled spectrum around the peak; an :data:`Estimator`.
 
     Parameters
     ----------
@@ -346,7 +347,7 @@ def maximum_likelihood(
     from sweep.model.detection.sub_bin_interpolation import complex_exponentials
 
     w = settings.taper
-    is_used = np.abs(w) > _WINDOW_FRACTION_MIN * np.abs(w).max()
+    is_used = np.abs(w) > _WINDOW_VALUE_FRACTION_MIN * np.abs(w).max()
     weight = np.where(is_used, 1.0 / np.where(is_used, w, 1.0), 0.0)
     start = candan(spectrum, peak, settings)
     fft_size, n_used, frequencies = float(settings.fft_size), float(is_used.sum()), start.copy()
@@ -414,7 +415,7 @@ def _jacobsen_ratio(three_bins: np.ndarray, neighbour_sign: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def _tone_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
+def _tone_offsets_and_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return offsets -1 .. 1 [bins] of tones from a bin, and three bins of each tone, (k, 3).
 
     The values are real, as their phases are relative to the record's middle.
@@ -427,14 +428,14 @@ def _tone_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=16)
 def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
-    """Return sign and factor of Jacobsen's estimate for a window and an FFT size.
+    """Return the sign and the factor of Jacobsen's estimator for a window and an FFT size.
 
     The sign is that of the two neighbours in the denominator of his ratio. The factor turns the
     ratio into an offset [bins].
     """
-    offset, tone_bins = _tone_bins(window, fft_size)
+    offset, tone_bins = _tone_offsets_and_bins(window, fft_size)
     _, centre, above = tone_bins[_TONE_STEPS_PER_BIN]
-    if abs(above) < _NEIGHBOUR_HEIGHT_MIN * centre:
+    if abs(above) < _NEIGHBOUR_MAGNITUDE_RATIO_MIN * centre:
         return 1, 1.0
     is_near = np.abs(offset) <= 0.5
     ratio = _jacobsen_ratio(tone_bins[is_near], -1)
@@ -479,7 +480,7 @@ def _refine_maximum(record: np.ndarray, start: float, fft_size: float) -> float:
 
     n = np.arange(record.size) - 0.5 * (record.size - 1)
     position = start
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(_NEWTON_STEPS_MAX):
         shifted_record = record * complex_exponentials(position / fft_size, record.size)
         s0, s1, s2 = (
             shifted_record.sum(),
@@ -521,9 +522,9 @@ def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
 
     Notes
     -----
-    The tone is assumed on a bin; between bins the true ratio is higher by the scalloping loss. For
-    a tone of amplitude A, window w and noise s per sample, |X| = A sum(w) / 2 on a bin, and the
-    noise power of a bin is sum(w^2) s^2.
+    The tone is assumed to lie on a bin. For a tone between bins the true ratio is higher by the
+    scalloping loss. For a tone of amplitude A, window w and noise s per sample, |X| = A sum(w) / 2
+    on a bin, and the noise power of a bin is sum(w^2) s^2.
     """
     return np.asarray(snr, float) * 2 * window.energy / window.sum**2
 
@@ -622,9 +623,9 @@ def windowed_peak_deviation(
 
 @lru_cache(maxsize=32)
 def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np.ndarray | None:
-    """Return the standard error by noise of an estimator's position of a tone [bins], (m,).
+    """Return the standard error [bins] of an estimator's position of a tone in noise, (m,).
 
-    It holds if the peak bin's |X| equals the noise per quadrature, and falls as 1/|X|.
+    It holds if |X| of the peak bin equals the noise per quadrature, and falls as 1/|X|.
 
     Parameters
     ----------
@@ -636,9 +637,9 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
     Returns
     -------
     numpy.ndarray or None
-        By the tone's distance from the peak bin, 0..1 bin, at as many distances as
-        :attr:`sweep.model.detection.sub_bin_interpolation.Interpolator.error_at_sigma`. None for
-        estimators of which no law is known.
+        The error at m evenly spaced distances, 0..1 bin, of the tone from the peak bin. m is the
+        size of :attr:`sweep.model.detection.sub_bin_interpolation.Interpolator.error_at_sigma`.
+        None for estimators whose error has no known law.
 
     Notes
     -----
@@ -663,7 +664,7 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
     cnr = window.energy / height**2
     if estimator == "maximum_likelihood":
         w = np.abs(cached_window_samples(window))
-        sample = np.flatnonzero(w > _WINDOW_FRACTION_MIN * w.max())
+        sample = np.flatnonzero(w > _WINDOW_VALUE_FRACTION_MIN * w.max())
         squared_length = ((sample - sample.mean()) ** 2).sum()
         return np.asarray(fft_size / (2 * math.pi) / np.sqrt(cnr * squared_length))
     if estimator == "chirp_z":

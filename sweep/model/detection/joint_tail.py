@@ -20,8 +20,8 @@ class JointTailQuadrature(NamedTuple):
 
     Notes
     -----
-    Two numbers of the correlation rho exceed s and t with the product of the two probabilities plus
-    [1]_
+    Two numbers S and T of the correlation rho exceed s and t with the probability P(S > s) P(T > t)
+    plus [1]_
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du.
 
@@ -52,12 +52,12 @@ def joint_tail_quadrature(correlation: float) -> JointTailQuadrature:
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def joint_tail_excess(deviate, previous_deviate, quadrature):
+def joint_tail_excess(quantile, previous_quantile, quadrature):
     """Return P(S > s, T > t) - P(S > s) P(T > t) of correlated standard normal numbers S and T.
 
     Parameters
     ----------
-    deviate, previous_deviate : float
+    quantile, previous_quantile : float
         Limits s and t.
     quadrature : JointTailQuadrature
         Quadrature for the correlation of S and T.
@@ -65,16 +65,16 @@ def joint_tail_excess(deviate, previous_deviate, quadrature):
     excess = 0.0
     for k in range(quadrature.sine.size):
         quadratic_form = (
-            deviate * deviate
-            + previous_deviate * previous_deviate
-            - 2.0 * deviate * previous_deviate * quadrature.sine[k]
+            quantile * quantile
+            + previous_quantile * previous_quantile
+            - 2.0 * quantile * previous_quantile * quadrature.sine[k]
         )
         excess += quadrature.weight[k] * math.exp(-quadratic_form * quadrature.exponent_factor[k])
     return excess
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
+def joint_tail_excess_by_four_nodes(quantile, previous_quantile, correlation):
     """Return P(S > s, T > t) - P(S > s) P(T > t) with 4 quadrature nodes, for any correlation.
 
     The result is less precise than that of :func:`joint_tail_excess`, which has 12 nodes, and needs
@@ -82,7 +82,7 @@ def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
 
     Parameters
     ----------
-    deviate, previous_deviate : float
+    quantile, previous_quantile : float
         Limits s and t.
     correlation : float
         Correlation coefficient of the standard normal numbers S and T.
@@ -91,9 +91,9 @@ def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
     for j in range(_JOINT_TAIL_NODES.size):
         sine = math.sin(half_angle * (_JOINT_TAIL_NODES[j] + 1.0))
         quadratic_form = (
-            deviate * deviate
-            + previous_deviate * previous_deviate
-            - 2.0 * deviate * previous_deviate * sine
+            quantile * quantile
+            + previous_quantile * previous_quantile
+            - 2.0 * quantile * previous_quantile * sine
         )
         excess += _JOINT_TAIL_WEIGHTS[j] * math.exp(-quadratic_form / (2.0 * (1.0 - sine * sine)))
     return excess * (half_angle / (2.0 * math.pi))

@@ -34,7 +34,8 @@ This error times (M - 1) / (N - 1) is subtracted.
 mu_12 is the correlation between looks of the two segments, mu_11 and mu_22 that within a segment.
 With the same speckle in both segments the joint probability is the mean over the speckle of the
 product of both probabilities. For r < 1 the covariance of the two detections is a fraction of that
-mean's: for M = 1 the fraction of two Rayleigh magnitudes with the correlation r, for large M r.
+with the same speckle. For M = 1 the fraction is that of two Rayleigh magnitudes with the
+correlation r, for large M it is r.
 """
 
 import math
@@ -58,7 +59,7 @@ SPECKLE_LATTICE_SIZE = 2048
 """Number of fixed realisations of the speckle of all looks. The probability that enough looks cross
 the threshold is averaged over them."""
 
-_CONTOUR_NODES = 40
+_N_CONTOUR_NODES = 40
 """Number of quadrature nodes on the upper half of the parabola in the complex plane along which
 equation (1) of this module is integrated."""
 _CONTOUR_END = 4.6
@@ -67,7 +68,7 @@ integration variable s and the scale of the integrand's peak."""
 _BISECTION_STEPS = 60
 _CROSSING_TABLE_STEPS = 512
 """Number of steps in the table of a look's crossing probability over the magnitude of speckle."""
-_TABULATED_SPECKLE_MAX = 5.0
+_TABULATED_MAGNITUDE_MAX = 5.0
 """Largest tabulated speckle magnitude, in units of its root mean square."""
 
 
@@ -83,7 +84,7 @@ class LookSpeckle(NamedTuple):
     multiplicity: np.ndarray
     """(3, n, k): multiplicities of the eigenvalues, 0 for unused entries. The sum of eigenvalue
     times multiplicity is the number of looks."""
-    effective_looks: np.ndarray
+    n_effective_looks: np.ndarray
     """(3, n): number of looks of independent speckle that are equivalent to the N looks, 1 .. N."""
     segment_correlation: np.ndarray
     """(3, n): square root of the correlation of two segments' mean powers. The rows are the pairs
@@ -108,22 +109,22 @@ class LookSpeckle(NamedTuple):
         )
         eigenvalue *= n_looks / eigenvalue.sum(axis=-1, keepdims=True)
         multiplicity = np.ones(eigenvalue.shape)
-        effective_looks = n_looks**2 / np.square(eigenvalue).sum(axis=-1)
+        n_effective_looks = n_looks**2 / np.square(eigenvalue).sum(axis=-1)
         if n_looks > MATRIX_LOOKS_MAX:
             lags = np.arange(n_looks)
             n_pairs = np.where(lags > 0, 2.0, 1.0) * (n_looks - lags)
-            is_gamma = effective_looks > GAMMA_SHAPE_MIN
+            is_gamma = n_effective_looks > GAMMA_SHAPE_MIN
             effective_of_all = n_looks**2 / (n_pairs * np.abs(correlation_by_lag) ** 2).sum(axis=-1)
-            effective_looks = np.where(
-                is_gamma, np.maximum(effective_of_all, GAMMA_SHAPE_MIN), effective_looks
+            n_effective_looks = np.where(
+                is_gamma, np.maximum(effective_of_all, GAMMA_SHAPE_MIN), n_effective_looks
             )
             eigenvalue[is_gamma], multiplicity[is_gamma] = 0.0, 0.0
-            eigenvalue[is_gamma, 0] = n_looks / effective_looks[is_gamma]
-            multiplicity[is_gamma, 0] = effective_looks[is_gamma]
+            eigenvalue[is_gamma, 0] = n_looks / n_effective_looks[is_gamma]
+            multiplicity[is_gamma, 0] = n_effective_looks[is_gamma]
         return cls(
             eigenvalue,
             multiplicity,
-            np.clip(effective_looks, 1.0, n_looks),
+            np.clip(n_effective_looks, 1.0, n_looks),
             segment_correlation,
             correlation_by_lag,
             look_power,
@@ -150,18 +151,18 @@ class LookSpeckle(NamedTuple):
         """Return :meth:`covariance_root` of all segments and points, (3, n, N, k).
 
         Only the first k columns are kept. The others have less than the fraction
-        :data:`_POWER_FRACTION_MIN` of the power at all points.
+        :data:`_EIGENVALUE_FRACTION_MIN` of the power at all points.
         """
         n_looks = self.correlation_by_lag.shape[2]
         eigenvalues, eigenvectors = np.linalg.eigh(
             look_covariances(self.correlation_by_lag, self.look_power, n_looks)
         )
         eigenvalues = np.maximum(eigenvalues[..., ::-1], 0.0)
-        n_used = (eigenvalues > _POWER_FRACTION_MIN * n_looks).any(axis=(0, 1)).sum()
+        n_used = (eigenvalues > _EIGENVALUE_FRACTION_MIN * n_looks).any(axis=(0, 1)).sum()
         return (eigenvectors[..., ::-1] * np.sqrt(eigenvalues)[..., None, :])[..., :n_used]
 
 
-_POWER_FRACTION_MIN = 1e-7
+_EIGENVALUE_FRACTION_MIN = 1e-7
 """Smallest fraction of all looks' power for which an eigenvalue of the covariance of their speckle
 is kept."""
 
@@ -199,10 +200,10 @@ def look_covariances(
 
 
 def representative_look_positions(n_looks: int, looks_max: int = MATRIX_LOOKS_MAX) -> np.ndarray:
-    """Return where in the sequence of looks at most ``looks_max`` representative looks lie.
+    """Return the positions, in the sequence of looks, of the looks that represent all, (k,).
 
-    Positions count looks from 0 and need not be integers. They have the variance of the positions
-    of all ``n_looks`` looks.
+    k is at most ``looks_max``. Positions count looks from 0 and need not be integers. They have the
+    variance of the positions of all ``n_looks`` looks.
     """
     n_kept = min(n_looks, looks_max)
     position_step = math.sqrt((n_looks**2 - 1) / (n_kept**2 - 1)) if n_kept < n_looks else 1.0
@@ -233,7 +234,7 @@ def mean_power_tails(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the probabilities that the sum of the looks' powers is above and below a threshold.
 
-    The first is equation (1) of the module's description.
+    The probability above is equation (1) of the module's description.
 
     Parameters
     ----------
@@ -280,8 +281,8 @@ def gamma_sum_tails(
     contour_curvature = np.clip(
         third_derivative / (6 * second_derivative), 0.05 / contour_scale, 2 / contour_scale
     )[..., None]
-    step = _CONTOUR_END / _CONTOUR_NODES
-    node = (np.arange(_CONTOUR_NODES) + 0.5) * step
+    step = _CONTOUR_END / _N_CONTOUR_NODES
+    node = (np.arange(_N_CONTOUR_NODES) + 0.5) * step
     imaginary_part = contour_scale[..., None] * np.sinh(node)
     s = (
         saddle[..., None]
@@ -344,7 +345,7 @@ def _saddle_point(
 
 
 @lru_cache(maxsize=8)
-def speckle_lattice(n_looks: int) -> np.ndarray:
+def speckle_lattice_amplitudes(n_looks: int) -> np.ndarray:
     """Return fixed realisations of the speckle amplitudes of N looks of independent speckle.
 
     The realisations are (SPECKLE_LATTICE_SIZE, N) complex. A Kronecker lattice of the roots of
@@ -412,7 +413,7 @@ def vote_probability_given_speckle(signal, threshold_ratio, votes_needed, magnit
     distribution, which is built up look by look.
     """
     crossing_table = np.empty(_CROSSING_TABLE_STEPS + 1)
-    step = _TABULATED_SPECKLE_MAX / _CROSSING_TABLE_STEPS
+    step = _TABULATED_MAGNITUDE_MAX / _CROSSING_TABLE_STEPS
     for k in range(_CROSSING_TABLE_STEPS + 1):
         faded_signal = signal * k * step
         if is_real:

@@ -71,7 +71,7 @@ _BISECTION_STEPS = 60
 _LOG_POWER_GRID = -5.0, math.log(16.0), 64
 """Grid of the quadrature over the speckle's power (mean 1): ln(power) of the first and of the last
 node, and number of nodes."""
-_GAUSS_NODES = 24
+_N_GAUSS_NODES = 24
 """Number of Gauss-Legendre nodes in each interval of the quadrature over the magnitude of
 speckle."""
 
@@ -146,7 +146,7 @@ class Looks(NamedTuple):
 
     @property
     def amplitude_gain_max(self) -> float:
-        """Upper bound of the gain in signal over noise that combining the looks can bring.
+        """Upper bound of the gain in signal over noise by combining the looks.
 
         The gain is one of amplitude: sqrt(N) for N looks whose powers or crossings are combined,
         else 1.
@@ -252,7 +252,7 @@ class Looks(NamedTuple):
                 special.gammainc(self.number, self.number * y),
             )
         if self.combine == COMBINE_BINARY:
-            magnitude, weight = self.speckle_quadrature(threshold_ratio, signal)
+            magnitude, weight = self.speckle_magnitude_quadrature(threshold_ratio, signal)
             tails_given_speckle = self.pd_and_miss_steady(
                 signal[..., None] * magnitude, threshold_ratio[..., None]
             )
@@ -301,7 +301,7 @@ class Looks(NamedTuple):
             lattice_pd = vote_probability_given_speckle(
                 signal[index], threshold_ratio[index], self.votes, self._lattice_magnitudes()
             ).mean()
-            independence = (look_speckle.effective_looks[index[-2:]] - 1) / (self.number - 1)
+            independence = (look_speckle.n_effective_looks[index[-2:]] - 1) / (self.number - 1)
             pd[index] += independence * (independent_pd[index] - lattice_pd)
         pd = np.clip(pd, 0.0, 1.0)
         return DetectionArrays(pd, 1 - pd)
@@ -311,9 +311,9 @@ class Looks(NamedTuple):
 
         The shape is (realisations, N).
         """
-        from sweep.model.detection.look_speckle import speckle_lattice
+        from sweep.model.detection.look_speckle import speckle_lattice_amplitudes
 
-        return np.abs(speckle_lattice(self.number))
+        return np.abs(speckle_lattice_amplitudes(self.number))
 
     def _correlated_magnitudes(
         self, look_speckle: "LookSpeckle", segment: int, point: int
@@ -324,12 +324,12 @@ class Looks(NamedTuple):
         """
         from sweep.model.detection.look_speckle import (
             correlated_speckle_magnitudes,
-            speckle_lattice,
+            speckle_lattice_amplitudes,
         )
 
         covariance_root = look_speckle.covariance_root(segment, point)
         return correlated_speckle_magnitudes(
-            speckle_lattice(covariance_root.shape[1]), covariance_root
+            speckle_lattice_amplitudes(covariance_root.shape[1]), covariance_root
         )
 
     def pd_given_speckle(
@@ -338,9 +338,9 @@ class Looks(NamedTuple):
         threshold_ratio: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> tuple[list[np.ndarray], np.ndarray]:
-        """Compute probabilities of detection of segments given the speckle of all looks.
+        """Compute the probabilities of detection of segments, given the speckle of all looks.
 
-        Every segment sees the same speckle.
+        All segments have the same speckle.
 
         Parameters
         ----------
@@ -361,11 +361,11 @@ class Looks(NamedTuple):
         if self.combine == COMBINE_POWER or (
             look_speckle is None and not self.has_independent_speckle
         ):
-            effective_looks = np.broadcast_to(
-                self._effective_looks(look_speckle), threshold_ratio.shape
+            n_effective_looks = np.broadcast_to(
+                self._n_effective_looks(look_speckle), threshold_ratio.shape
             )
-            magnitude, weight = self.speckle_quadrature(
-                threshold_ratio, *signals, gamma_shape=effective_looks
+            magnitude, weight = self.speckle_magnitude_quadrature(
+                threshold_ratio, *signals, gamma_shape=n_effective_looks
             )
             pd_by_signal = [
                 self.pd_and_miss_steady(v[..., None] * magnitude, threshold_ratio[..., None]).pd
@@ -418,15 +418,15 @@ class Looks(NamedTuple):
 
         Notes
         -----
-        Independent speckle of the looks: the joint probability is an integral over the power of
-        the first segment's looks. Given it, the power of the second segment's looks is a
+        If looks have independent speckle, the joint probability is an integral over the power of
+        the first segment's looks. Given that power, the power of the second segment's looks is a
         noncentral chi-square variable.
 
-        Common speckle: with a correlation of 1 the joint probability is the mean over the speckle
-        of the product of both probabilities. With a smaller correlation the segments' covariance is
-        a fraction of that at correlation 1. The fraction is that of two Rayleigh magnitudes with
-        the same probabilities. Partially correlated looks are treated likewise
-        (:mod:`sweep.model.detection.look_speckle`).
+        If all looks have common speckle, and the correlation of the segments is 1, the joint
+        probability is the mean over the speckle of the product of both probabilities. With a
+        smaller correlation the segments' covariance is a fraction of that at correlation 1. The
+        fraction is that of two Rayleigh magnitudes with the same probabilities. Partially
+        correlated looks are treated likewise (:mod:`sweep.model.detection.look_speckle`).
         """
         from scipy import stats
 
@@ -488,7 +488,7 @@ class Looks(NamedTuple):
                 n,
                 np.maximum((n * z - n * (1 - squared_correlation)) / squared_correlation, 0.0),
             )
-        node, weight = _gauss_in_intervals(
+        node, weight = _gauss_nodes_in_intervals(
             np.stack([0 * p, np.minimum(step_probability, p), p], axis=-1)
         )
         conditional = (
@@ -542,13 +542,13 @@ class Looks(NamedTuple):
             )
             fraction = fraction / (np.minimum(p, q) - p * q)
         fraction = np.where(correlation > 1 - 1e-9, 1.0, np.clip(np.nan_to_num(fraction), 0.0, 1.0))
-        inverse_looks = 1 / self._effective_looks(look_speckle)
+        inverse_looks = 1 / self._n_effective_looks(look_speckle)
         return np.asarray(inverse_looks * fraction + (1 - inverse_looks) * np.square(correlation))
 
-    def _effective_looks(self, look_speckle: "LookSpeckle | None") -> np.ndarray | float:
-        """Return the effective number of looks: that of independent looks that fade equally."""
+    def _n_effective_looks(self, look_speckle: "LookSpeckle | None") -> np.ndarray | float:
+        """Return the number of looks of independent speckle that fade as much as these looks."""
         if look_speckle is not None:
-            return np.asarray(look_speckle.effective_looks.mean(axis=0))
+            return np.asarray(look_speckle.n_effective_looks.mean(axis=0))
         return float(self.number if self.has_independent_speckle else 1)
 
     def pd_and_miss_any_two(
@@ -589,7 +589,7 @@ class Looks(NamedTuple):
         second law is :func:`pd_and_miss_any_two_in_speckle` of three magnitudes with the same
         probabilities.
         """
-        from sweep.model.detection.echo_detection import at_least_two_of_three
+        from sweep.model.detection.echo_detection import at_least_two_of_three_probability
 
         is_defined = np.isfinite(pd).all(axis=0)
         p = np.where(is_defined, pd, 0.0)
@@ -616,11 +616,13 @@ class Looks(NamedTuple):
             shared_fraction * np.array(pd_by_signal) + (1 - shared_fraction) * p[..., None]
         )
         p_any_two = np.clip(
-            (at_least_two_of_three(pd_by_segment, 1 - pd_by_segment) * weight).sum(axis=-1),
+            (at_least_two_of_three_probability(pd_by_segment, 1 - pd_by_segment) * weight).sum(
+                axis=-1
+            ),
             0.0,
             1.0,
         )
-        inverse_looks = 1 / self._effective_looks(look_speckle)
+        inverse_looks = 1 / self._n_effective_looks(look_speckle)
         pd_in_one_speckle = pd_and_miss_any_two_in_speckle(
             p, 1 - p, np.full(threshold_ratio.shape, 1e100), correlations
         ).pd
@@ -860,7 +862,7 @@ class Looks(NamedTuple):
         """Return nodes and weights of a mean over the speckle power, averaged over all looks.
 
         The power, of mean 1, is treated as a gamma variable. Its shape is the number of looks of
-        independent speckle that equal these looks. Weights have the sum 1.
+        independent speckle that are equivalent to these looks. Weights have the sum 1.
 
         Parameters
         ----------
@@ -871,13 +873,13 @@ class Looks(NamedTuple):
         """
         gamma_shape = float(self.number if self.has_independent_speckle else 1)
         if look_speckle is not None:
-            gamma_shape = float(look_speckle.effective_looks[segment, point])
+            gamma_shape = float(look_speckle.n_effective_looks[segment, point])
         log_power = np.linspace(*_LOG_POWER_GRID)
         log_density = gamma_shape * (log_power - np.exp(log_power))
         weights = np.exp(log_density - log_density.max())
         return np.exp(log_power), weights / weights.sum()
 
-    def speckle_quadrature(
+    def speckle_magnitude_quadrature(
         self,
         threshold_ratio: np.ndarray,
         *signals: np.ndarray,
@@ -916,7 +918,7 @@ class Looks(NamedTuple):
         if np.any(gamma_shape != 1.0):  # a narrow peak about 1
             width = 4 / np.sqrt(gamma_shape)
             interval_ends += [np.clip(1 + d * width, 0.0, magnitude_max) for d in (-1.0, 0.0, 1.0)]
-        node, weight = _gauss_in_intervals(np.sort(np.stack(interval_ends, axis=-1), axis=-1))
+        node, weight = _gauss_nodes_in_intervals(np.sort(np.stack(interval_ends, axis=-1), axis=-1))
         if np.all(gamma_shape == 1.0):
             return node, weight * 2 * node * np.exp(-np.square(node))
         gamma_shape, power = (
@@ -987,7 +989,7 @@ def solve_threshold_ratio(
 def pd_and_miss_any_two_in_speckle(
     pd: np.ndarray, miss: np.ndarray, threshold_ratio: np.ndarray, correlations: np.ndarray
 ) -> DetectionArrays:
-    """Return the probabilities that two or more of three segments in speckle are detected, or not.
+    """Return the probabilities that at least two of three segments in speckle are detected, or not.
 
     Parameters
     ----------
@@ -1023,7 +1025,7 @@ def pd_and_miss_any_two_in_speckle(
     with derivatives by r, the mean given z. This is Mehler's series to its second term, within
     0.002 of drawn amplitudes.
     """
-    from sweep.model.detection.echo_detection import at_least_two_of_three
+    from sweep.model.detection.echo_detection import at_least_two_of_three_probability
     from sweep.model.detection.marcum import marcum_q1
 
     is_defined = np.isfinite(pd).all(axis=0)
@@ -1070,7 +1072,7 @@ def pd_and_miss_any_two_in_speckle(
             magnitude_max,
         ).reshape(9, -1),
     ]
-    node, weight = _gauss_in_intervals(np.sort(np.stack(interval_ends, axis=-1), axis=-1))
+    node, weight = _gauss_nodes_in_intervals(np.sort(np.stack(interval_ends, axis=-1), axis=-1))
     weight = weight * 2 * node * np.exp(-np.square(node))
     signal = np.sqrt(2 * squared_loading / remainder)[..., None] * node
     threshold = np.sqrt(2 * a / remainder)[..., None] + 0 * node
@@ -1091,8 +1093,8 @@ def pd_and_miss_any_two_in_speckle(
         pair_excess = kappa[:, None] * slope_i * slope_j / 2 + square_term
         excess[points] = pair_excess * (p_stay[k, points] - p_cross[k, points])
     probabilities = (
-        at_least_two_of_three(p_cross, p_stay) + excess,
-        at_least_two_of_three(p_stay, p_cross) - excess,
+        at_least_two_of_three_probability(p_cross, p_stay) + excess,
+        at_least_two_of_three_probability(p_stay, p_cross) - excess,
     )
     p_cross, p_stay = (
         np.clip((values * weight).sum(axis=-1), 0.0, 1.0) for values in probabilities
@@ -1125,12 +1127,12 @@ def _marcum_q1_derivatives(
     return scaled_i1, second_derivative + slope_over_signal, second_derivative - slope_over_signal
 
 
-def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_nodes_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss-Legendre nodes and weights of all intervals between successive ends.
 
     ``interval_ends`` are (..., k) in rising order.
     """
-    node, weight = np.polynomial.legendre.leggauss(_GAUSS_NODES)
+    node, weight = np.polynomial.legendre.leggauss(_N_GAUSS_NODES)
     half_width = 0.5 * np.diff(interval_ends, axis=-1)[..., None]
     position = interval_ends[..., :-1, None] + half_width * (node + 1)
     return position.reshape(*interval_ends.shape[:-1], -1), (half_width * weight).reshape(

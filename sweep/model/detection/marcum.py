@@ -31,8 +31,10 @@ _MIDPOINT_STEP = 0.7
 """Step h of the midpoint rule by which the tail integral of Marcum's Q is computed. The relative
 error is exp(-(2 pi / h)^2 / 2) = 3e-18."""
 
-_MIDPOINT_NODES = tuple((_MIDPOINT_STEP * (k + 0.5)) ** 2 for k in range(13))
-_MIDPOINT_WEIGHTS = tuple(_MIDPOINT_STEP / math.pi * math.exp(-0.5 * v) for v in _MIDPOINT_NODES)
+_SQUARED_MIDPOINT_NODES = tuple((_MIDPOINT_STEP * (k + 0.5)) ** 2 for k in range(13))
+_MIDPOINT_WEIGHTS = tuple(
+    _MIDPOINT_STEP / math.pi * math.exp(-0.5 * v) for v in _SQUARED_MIDPOINT_NODES
+)
 _POLE_DECAY_RATE = 2.0 * math.pi / _MIDPOINT_STEP
 """Decay rate c of the midpoint rule's correction for the integrand's pole. At the distance
 d = |a - b| the correction is 1 / (1 + exp(c d)). It is neglected from d = c on."""
@@ -41,19 +43,20 @@ _SQUARED_DISTANCE_MAX = 1500.0
 """Limit of (a - b)^2 above which the smaller tail of Marcum's Q_1(a, b) is 0 in float64. The tail
 is about exp(-(a - b)^2 / 2)."""
 
-# Excess crossings, K terms: 1/(m+1) and 1/m^2 for m = K .. 1, so that no step divides.
 _EXCESS_TERMS_MAX = 24
-_HARMONIC = tuple(1.0 / (m + 1) for m in range(_EXCESS_TERMS_MAX + 1))
-_INVERSE_SQUARE = (0.0, *(1.0 / m**2 for m in range(1, _EXCESS_TERMS_MAX + 1)))
+"""Largest number of terms of the series in :func:`marcum_q1_excess`."""
+# 1/(m+1) and 1/m^2 by m, so that no step of the series divides.
+_INVERSE_NEXT_INTEGERS = tuple(1.0 / (m + 1) for m in range(_EXCESS_TERMS_MAX + 1))
+_INVERSE_SQUARES = (0.0, *(1.0 / m**2 for m in range(1, _EXCESS_TERMS_MAX + 1)))
 
 _LN2 = math.log(2.0)
-_LOG_P_TINY = -600.0
+_LOG_P_LINEAR_MAX = -600.0
 """Limit on ln p of a trial's success probability p. Below it, 1-(1-p)^n and n p are the same double
 for any number of trials n up to 1e240."""
 
 
 class Tails(NamedTuple):
-    """Probabilities that a magnitude |X| is above and below a threshold, of the sum 1.
+    """Probabilities that a magnitude |X| is above and below a threshold; their sum is 1.
 
     Both are precise where they are small.
     """
@@ -158,7 +161,7 @@ def marcum_q1_tails(a, b):
             half_step = -half_step
         quarter, d_square, total = 0.25 / (a * b), d * d, 0.0
         for k in range(12, -1, -1):
-            v = _MIDPOINT_NODES[k]
+            v = _SQUARED_MIDPOINT_NODES[k]
             total += (_MIDPOINT_WEIGHTS[k] * (shift + half_step * v)) / (
                 (d_square + v) * math.sqrt(1.0 - quarter * v)
             )
@@ -205,8 +208,8 @@ def marcum_q1_excess(a, b):
         decay = math.exp(-(high + x))
         kummer, total = 1.0, 0.0
         for m in range(terms, 0, -1):  # backwards, with M by its recurrence
-            kummer = x * _HARMONIC[m] * kummer + 1.0
-            total = (w * _INVERSE_SQUARE[m]) * (kummer + total)
+            kummer = x * _INVERSE_NEXT_INTEGERS[m] * kummer + 1.0
+            total = (w * _INVERSE_SQUARES[m]) * (kummer + total)
         return (decay - decay * low) * total
     tails = marcum_q1_tails(a, b)
     noise_alone = math.exp(-high)
@@ -228,7 +231,7 @@ def at_least_one_probability(p: ArrayLike, n: ArrayLike) -> np.ndarray:
 
 
 def log_at_least_one_probability(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
-    """Return ln(1 - (1-p)^n), of the probability of at least one success in n independent trials.
+    """Return the logarithm of the probability of at least one success in n trials, ln(1 - (1-p)^n).
 
     Parameters
     ----------
@@ -252,15 +255,15 @@ def log_at_least_one_probability(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
         p_none_of_n = np.where(is_likely, p_none_once**n, np.exp(exponent))
         log_p_if_rare = np.log(-np.expm1(exponent))
         log_probability = np.where(exponent > -_LN2, log_p_if_rare, np.log1p(-p_none_of_n))
-        log_probability = np.where(log_p < _LOG_P_TINY, log_p + np.log(n), log_probability)
+        log_probability = np.where(log_p < _LOG_P_LINEAR_MAX, log_p + np.log(n), log_probability)
         return np.where(n > 0.0, log_probability, -np.inf)
 
 
 def log_either_probability(log_p_first: np.ndarray, log_p_second: np.ndarray) -> np.ndarray:
     """Return the natural logarithm of the probability of at least one of two independent events.
 
-    The result is ln(p + q (1 - p)), where ``log_p_first`` is ln p and ``log_p_second`` is ln q. The
-    result is -inf where both probabilities are 0.
+    The result is ln(p + q (1 - p)), with p and q given as ``log_p_first`` = ln p and
+    ``log_p_second`` = ln q. It is -inf where both probabilities are 0.
     """
     with np.errstate(divide="ignore"):
         return np.minimum(

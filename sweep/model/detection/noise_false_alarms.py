@@ -1,4 +1,4 @@
-"""False alarms of noise alone in closed form, and the noise that follows from published figures.
+"""False alarms of noise alone in closed form, and the noise variance that explains published ones.
 
 The threshold-to-noise ratio TNR is the threshold over the standard deviation of |X| in a bin of
 noise. The bin crosses it with the probability p = exp(-x), x = (4 - pi)/4 TNR^2. Both segments of a
@@ -41,7 +41,7 @@ def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
 def alarm_equivalent_bins(
     parameters: Mapping[str, Any], pfa_in_bin: ArrayLike, segment: str = "up"
 ) -> np.ndarray:
-    """Return the number of independent noise bins that alarm as often as a segment's bins.
+    """Return the number of independent noise bins that raise alarms as often as a segment's bins.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from sweep.model.detection.detectors import main_lobe_half_width
 from sweep.model.detection.hoyt import N_PHASE_NODES, PHASE_COSINES, hoyt_tails
 from sweep.model.detection.look_speckle import (
     gamma_sum_tails,
-    speckle_lattice,
+    speckle_lattice_amplitudes,
     vote_probability_given_speckle,
 )
 from sweep.model.detection.looks import COMBINE_POWER, DetectionArrays, Looks
@@ -41,9 +41,9 @@ from sweep.model.detection.speckle_correlation import window_transform
 from sweep.model.spectrum.search_restriction import axis_line_positions, beamlet_line_positions
 from sweep.model.window import Window, window_samples
 
-RATIO_MIN = 0.05
-"""Limit below which a bin X in speckle is treated as circular. It is on |E[X^2]| / E[|X|^2], which
-is 0 for circular X. The probability of detection errs by less than 2e-4."""
+PSEUDO_VARIANCE_RATIO_MIN = 0.05
+"""Limit on |E[X^2]| / E[|X|^2] of a bin X in speckle, below which X is treated as circular. The
+probability of detection errs by less than 2e-4."""
 
 
 class SignalPseudoVariance(NamedTuple):
@@ -53,9 +53,9 @@ class SignalPseudoVariance(NamedTuple):
     """
 
     pseudo_variance_row: np.ndarray
-    """(segments, n) int64: row of ``ratio`` and ``phase_factors`` for each echo. Row 0, in which
-    the pseudo-variance ratio is 0, is for echoes far from DC and Nyquist."""
-    ratio: np.ndarray
+    """(segments, n) int64: row of ``pseudo_variance_ratio`` and ``phase_factors`` for each echo.
+    Row 0, in which the ratio is 0, is for echoes far from DC and Nyquist."""
+    pseudo_variance_ratio: np.ndarray
     """(rows, bins): pseudo-variance ratio E[X^2] / E[|X|^2] of a bin X, by distance [bins] from the
     nearer of DC and Nyquist."""
     phase_factors: np.ndarray
@@ -115,7 +115,7 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
     )
 
 
-def mean_over_phases(
+def mean_joint_pd_over_phases(
     phase_factors: np.ndarray,
     pd_by_segment: tuple[np.ndarray, ...],
     joint_pd_function: Callable[..., tuple[np.ndarray, ...]],
@@ -217,11 +217,13 @@ def _image_reach(window: Window) -> float:
     The unit is the sample rate over the number of samples in the record. The image is the line's
     mirror at the opposite frequency.
     """
-    distance = window.envelope_distances[np.argmax(window.sidelobe_envelope < RATIO_MIN / 2)]
+    distance = window.envelope_distances[
+        np.argmax(window.sidelobe_envelope < PSEUDO_VARIANCE_RATIO_MIN / 2)
+    ]
     return 0.5 * min(float(distance), 12.0)
 
 
-_POWER_FRACTION_MIN = 1e-7
+_EIGENVALUE_FRACTION_MIN = 1e-7
 """Smallest fraction of all looks' power for which an eigenvalue of the covariance of their echo
 amplitudes is kept."""
 
@@ -234,9 +236,9 @@ def multilook_pd_and_miss_near_ends(
     noise_pseudo_variance: np.ndarray,
     look_covariance: np.ndarray,
 ) -> DetectionArrays:
-    """Return probabilities of detection and of a miss in several looks, near DC or Nyquist.
+    """Return probabilities of detection and of a miss in several looks of bins near DC or Nyquist.
 
-    The echo is in developed speckle, and each point has one bin.
+    Echoes are in developed speckle. Each of m echoes is represented by one bin.
 
     Parameters
     ----------
@@ -330,12 +332,14 @@ def multilook_pd_and_miss_near_ends(
         )
         if independence < 1 - 1e-9:
             look_eigenvalues, look_eigenvectors = np.linalg.eigh(covariance_matrix)
-            is_used = look_eigenvalues > _POWER_FRACTION_MIN * n_represented
+            is_used = look_eigenvalues > _EIGENVALUE_FRACTION_MIN * n_represented
             covariance_root = look_eigenvectors[:, is_used] * np.sqrt(look_eigenvalues[is_used])
             # Less the lattice's error for independent looks, in proportion.
-            lattice_error = pd[bin_index] - mean_vote_probability(speckle_lattice(n_represented))
+            lattice_error = pd[bin_index] - mean_vote_probability(
+                speckle_lattice_amplitudes(n_represented)
+            )
             lattice_pd = mean_vote_probability(
-                speckle_lattice(int(is_used.sum())) @ covariance_root.T
+                speckle_lattice_amplitudes(int(is_used.sum())) @ covariance_root.T
             )
             pd[bin_index] = lattice_pd + independence * lattice_error
     pd = np.clip(pd, 0.0, 1.0)

@@ -42,12 +42,13 @@ SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
 """Pairs of segment indices (0 up, 1 Doppler, 2 down), in the order of arrays over pairs."""
 
 LINE_SHIFT_MIN_BINS = 0.01
-"""Limit below which all lines of a footprint count as lying in one bin. It is the line shift per
-standard deviation of the beam, in units of the sample rate over the number of samples."""
+"""Limit on the line shift per standard deviation of the beam. Below it all lines of a footprint
+count as lying in one bin. The unit is a resolution cell, the sample rate over the number of samples
+in the record."""
 
 TRANSFORM_REACH_BINS = 6.0
 """Distance from its centre up to which the window's transform counts in correlation integrals. The
-unit is the sample rate over the number of samples in the record."""
+unit is a resolution cell, the sample rate over the number of samples in the record."""
 
 TRANSFORM_SAMPLES_PER_BIN = 64
 """Number of samples of the tabulated window transform per resolution cell. A cell is the sample
@@ -201,9 +202,10 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def centroid_delay(window: Window) -> np.ndarray:
-    """Return the shift [samples] of a window's centroid without its first k samples, (L + 1,).
+    """Return the shift [samples] of a window's centroid if k samples are missing, (L + 1,).
 
-    Element k is the shift for k = 0 .. L, with the number of samples L.
+    Element k is the shift without the first k samples, k = 0 .. L. L is the window's number of
+    samples.
     """
     w, n = window_samples(window.name, window.length), np.arange(window.length)
     sum_from = np.cumsum(w[::-1])[::-1]
@@ -218,8 +220,8 @@ def centroid_delay(window: Window) -> np.ndarray:
 def _half_maximum_distance(window: Window) -> float:
     """Return the distance at which a window's normalised transform falls to 1/2.
 
-    The distance is in units of the sample rate over the number of samples. It is at most
-    twice TRANSFORM_REACH_BINS.
+    The distance is in units of the sample rate over the number of samples. It is at most 2
+    TRANSFORM_REACH_BINS.
     """
     distances, transform = transform_table(window)
     is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as in Hann's of two

@@ -43,7 +43,7 @@ TABULATED_SPECKLE_POWERS = SPECKLE_POWER_MAX * 2.0 ** (
 """(N_SPECKLE_POWERS,): speckle powers (mean 1), in rising order, at which false alarms due to
 leaked signal are computed."""
 
-INTERPOLATION_POINTS = 6
+N_INTERPOLATION_POINTS = 6
 """Number of adjacent table entries from which a rate is interpolated."""
 
 CERTAIN_CROSSING_RATE = 40.0
@@ -141,7 +141,7 @@ def _rate_table_grid(threshold_ratio):
 
 
 def allocate_rate_table(threshold_ratios: np.ndarray) -> RateTableArrays:
-    """Allocate memory that suffices for the table of any of some thresholds, one at a time.
+    """Allocate arrays that are large enough for the table of any one of several thresholds.
 
     ``threshold_ratios`` (n,) are thresholds over the noise per quadrature; n may be 0.
     """
@@ -151,13 +151,13 @@ def allocate_rate_table(threshold_ratios: np.ndarray) -> RateTableArrays:
         np.empty(n_entries),
         np.empty(n_entries + 8),
         np.empty(n_entries + 8),
-        np.empty((entries_per_power + INTERPOLATION_POINTS - 1, n_columns)),
+        np.empty((entries_per_power + N_INTERPOLATION_POINTS - 1, n_columns)),
     )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _table_size_max(threshold_ratios):
-    """Return the most entries per power and columns that the tables of some thresholds need."""
+    """Return the largest number of entries per power, and of columns, over several thresholds."""
     entries_per_power, n_columns = 0, 0
     for threshold_ratio in threshold_ratios:
         grid = _rate_table_grid(max(threshold_ratio, _TABULATED_THRESHOLD_RATIO_MIN))
@@ -190,16 +190,17 @@ def tabulate_crossing_rates(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fill_rate_table(threshold_ratio, crossing_series, arrays):
-    """Compute the rates of :func:`tabulate_crossing_rates` into arrays.
+    """Fill arrays with the table of :func:`tabulate_crossing_rates`.
 
     Parameters
     ----------
     threshold_ratio : float
         Threshold over sigma, the noise of a bin per quadrature.
     crossing_series : ndarray
-        :func:`sweep.model.detection.added_crossings.fill_crossing_series` of ``threshold_ratio``.
+        Result of :func:`sweep.model.detection.added_crossings.fill_crossing_series` for
+        ``threshold_ratio``.
     arrays : RateTableArrays
-        Result, large enough for this threshold.
+        Arrays to fill, from :func:`allocate_rate_table`.
 
     Returns
     -------
@@ -237,7 +238,7 @@ def fill_rate_table(threshold_ratio, crossing_series, arrays):
             )
             rate = min(-math.log(max(p_signal_stay, 1e-300)), CERTAIN_CROSSING_RATE)
         rates[k] = rate / squared_amplitudes[k]
-    for row in range(grid.entries_per_power + INTERPOLATION_POINTS - 1):
+    for row in range(grid.entries_per_power + N_INTERPOLATION_POINTS - 1):
         for column in range(grid.n_columns):
             arrays.relative_rates[row, column] = rates[
                 min(grid.entries_per_power * column + row, n_entries - 1)
@@ -247,7 +248,7 @@ def fill_rate_table(threshold_ratio, crossing_series, arrays):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def rate_table(grid, arrays):
-    """Return the :class:`SpeckleCrossingRates` in arrays that :func:`fill_rate_table` has filled.
+    """Return the :class:`SpeckleCrossingRates` that :func:`fill_rate_table` has put into arrays.
 
     ``grid`` is the result of that function.
     """
@@ -394,7 +395,7 @@ def add_entry_weights_of_bin(squared_ratio, rate_table, entry_weights):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_rates_from_entry_weights(entry_weights, rate_table, rate_sums):
-    """Add the crossing rates of all bins, given by the weights of table entries, to sums by power.
+    """Add the crossing rates of all bins to sums by speckle power, by the weights of table entries.
 
     Parameters
     ----------

@@ -33,45 +33,47 @@ LINE_DEVIATIONS = np.array(
 unit is max(1, h/2) fs/L, with the sample rate fs, the record's number of samples L, and the main
 lobe's half-width h [fs/L]."""
 
-N_OFFSETS = 9
+N_CENTRE_OFFSETS = 9
 """Number of tabulated positions of an echo's centre relative to the nearest bin. They are evenly
 spaced over -1/2 .. 1/2 FFT bin."""
 
 _TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the window with which tables are computed in place of longer windows of the
 same shape."""
-_POWER_ITERATIONS = 80
-_NODES_MIN = 41
-_NODE_DISTANCE = 0.4
-"""Spacing, at most about this, of the lines that represent a Gaussian density, in the unit in which
-LINE_DEVIATIONS is stated."""
+_POWER_ITERATIONS_MAX = 80
+"""Largest number of steps of the power iteration for an eigenvector."""
+_N_NODES_MIN = 41
+"""Smallest number of lines that represent a Gaussian density."""
+_NODE_SPACING_MAX = 0.4
+"""Largest spacing (approximate) of the lines that represent a Gaussian density, in the unit of
+LINE_DEVIATIONS."""
 _NODE_DEVIATIONS_MAX = 4.5
 """Distance from the centre of the outermost line that represents a Gaussian density, in standard
 deviations of the density."""
 _FULL_REACH_LINE_DEVIATION_MAX = 3.0
 """Largest standard deviation for which tables reach two deviations beyond the main lobe, in the
-unit in which LINE_DEVIATIONS is stated."""
+unit of LINE_DEVIATIONS."""
 
 
 class ModeTable(NamedTuple):
     """Power fraction of the strongest speckle mode, and correlation of neighbouring bins.
 
     A speckle mode is a part of an echo that fades with one amplitude in all bins. The lines of the
-    echo have a Gaussian density of positions. The tables are over its standard deviation, and over
-    its centre relative to the nearest bin.
+    echo have a Gaussian density of positions. The tables are over the density's standard deviation,
+    and over the position of its centre relative to the nearest bin.
     """
 
     line_deviation_bins: np.ndarray
     """(s,): tabulated standard deviations of the lines' positions [FFT bins]; empty in NO_MODES."""
     power_fraction: np.ndarray
-    """(s, N_OFFSETS, k): fraction of a bin's power in the strongest speckle mode. The k bins lie
-    about the bin nearest to the echo's centre."""
+    """(s, N_CENTRE_OFFSETS, k): fraction of a bin's power in the strongest speckle mode. The k bins
+    lie about the bin nearest to the echo's centre."""
     neighbour_correlation: np.ndarray
-    """(s, N_OFFSETS, k): correlation of the echo's amplitudes in a bin and in the bin below it,
+    """(s, N_CENTRE_OFFSETS, k): correlation of the echo's amplitudes in a bin and in the bin below,
     -1..1."""
     power_asymmetry: np.ndarray
-    """(s, N_OFFSETS): :func:`power_asymmetry` of the bin nearest to the echo's centre and its two
-    neighbours. It rises with the centre's offset from that bin."""
+    """(s, N_CENTRE_OFFSETS): :func:`power_asymmetry` of the bin nearest to the echo's centre and
+    its two neighbours. It rises with the centre's offset from that bin."""
 
 
 NO_MODES = ModeTable(np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
@@ -108,8 +110,8 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
         * padding_factor
     )
     bin_positions = np.arange(-half_bins, half_bins + 1) / padding_factor
-    offsets = np.linspace(-0.5, 0.5, N_OFFSETS) / padding_factor
-    power_fraction = np.empty((deviations.size, N_OFFSETS, bin_positions.size))
+    offsets = np.linspace(-0.5, 0.5, N_CENTRE_OFFSETS) / padding_factor
+    power_fraction = np.empty((deviations.size, N_CENTRE_OFFSETS, bin_positions.size))
     neighbour_correlation, asymmetry = (
         np.zeros_like(power_fraction),
         np.empty(power_fraction.shape[:2]),
@@ -147,7 +149,7 @@ def _gaussian_nodes(deviation: float) -> tuple[np.ndarray, np.ndarray]:
 
     ``deviation`` is the standard deviation of the lines in units of LINE_DEVIATIONS.
     """
-    n_nodes = max(_NODES_MIN, math.ceil(2 * _NODE_DEVIATIONS_MAX * deviation / _NODE_DISTANCE))
+    n_nodes = max(_N_NODES_MIN, math.ceil(2 * _NODE_DEVIATIONS_MAX * deviation / _NODE_SPACING_MAX))
     node = np.linspace(-_NODE_DEVIATIONS_MAX, _NODE_DEVIATIONS_MAX, n_nodes)
     weight = np.exp(-0.5 * node * node)
     return node, weight / weight.sum()
@@ -171,8 +173,8 @@ def _strongest_mode(
     Notes
     -----
     With B, the amplitudes times the roots of the powers, the covariance is B B^T. Its leading
-    eigenvector times the root of the eigenvalue is B u, with the leading unit eigenvector u of
-    B^T B. The smaller of both matrices is iterated.
+    eigenvector times the root of the eigenvalue is B u, with the leading unit eigenvector u of B^T
+    B. The smaller of the two matrices is iterated.
     """
     amplitudes = bin_transforms * np.sqrt(line_weights)
     has_fewer_lines = amplitudes.shape[1] < amplitudes.shape[0]
@@ -182,7 +184,7 @@ def _strongest_mode(
     matrix = np.einsum("ti,tj->ij", factors, factors, optimize=False)
     eigenvalue = 1.0
     vector = vector / math.sqrt((vector**2).sum())
-    for _ in range(_POWER_ITERATIONS):
+    for _ in range(_POWER_ITERATIONS_MAX):
         product = (matrix * vector).sum(axis=1)
         eigenvalue = math.sqrt((product**2).sum())
         previous, vector = vector, product / max(eigenvalue, 1e-300)
@@ -245,7 +247,7 @@ def locate_in_mode_table(table, line_deviation_bins, asymmetry):
     )
     offset_index = 0
     while (
-        offset_index < N_OFFSETS - 2
+        offset_index < N_CENTRE_OFFSETS - 2
         and table.power_asymmetry[deviation_index, offset_index + 1] <= asymmetry
     ):
         offset_index += 1
@@ -270,7 +272,7 @@ def interpolate_mode_table(values, cell, bin_offset):
     Parameters
     ----------
     values
-        (s, N_OFFSETS, k): table of the quantity.
+        (s, N_CENTRE_OFFSETS, k): table of the quantity.
     cell
         :class:`ModeTableCell`.
     bin_offset

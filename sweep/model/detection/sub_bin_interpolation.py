@@ -41,7 +41,7 @@ from sweep.kernel_cache import njit
 from sweep.model.table_interpolation import interpolate_tables
 from sweep.model.window import Window, window_samples
 
-_TABLE_INTERVALS = 2048
+_N_TABLE_INTERVALS = 2048
 """Number of intervals in the tables that turn magnitudes into an offset of a tone from a bin.
 Linear interpolation in them errs by about 1e-7 bins."""
 
@@ -49,16 +49,16 @@ _N_SPREAD_POSITIONS, _SPREAD_BINS = 129, 0.05
 """Number of positions between bins at which ``spread_error_factor`` is evaluated, and standard
 deviation [bins] of the spread lines in this evaluation."""
 
-_TONE_DEGREE = 32
+_TONE_POLYNOMIAL_DEGREE = 32
 """Degree of the polynomial that gives a bin's complex value at -2 .. 2 bins from a tone."""
 
-_NEIGHBOUR_HEIGHT_MIN = 0.25
-"""Ratio of |X| of a neighbour to |X| of a bin on which a tone lies, below which positions are found
-by TWO_BINS."""
+_NEIGHBOUR_MAGNITUDE_RATIO_MIN = 0.25
+"""Limit on |X| of a neighbouring bin, over |X| of the bin on which a tone lies. Below it positions
+are estimated by TWO_BINS."""
 
 THREE_BINS, TWO_BINS = 0, 1
-"""Kinds of magnitude ratio from which a tone's position between bins is found. THREE_BINS uses the
-|X| of three bins, TWO_BINS that of the centre bin and its larger neighbour."""
+"""Kinds of magnitude ratio from which a tone's position between bins is estimated. THREE_BINS uses
+the |X| of three bins, TWO_BINS that of the centre bin and its larger neighbour."""
 
 
 class NoiseMixing(NamedTuple):
@@ -84,8 +84,8 @@ class NoiseMixing(NamedTuple):
 class NeighbourWeights(NamedTuple):
     """Least-squares weights of the |X| of three bins in the position of a tone.
 
-    They are tabulated over the tone's distance from the centre bin, (m,) each. |X| is that over the
-    |X| of the centre bin. If only two bins give the position, all weights are 0.
+    They are tabulated over the tone's distance from the centre bin, (m,) each. All |X| are relative
+    to that of the centre bin. If only two bins give the position, all weights are 0.
     """
 
     smaller: np.ndarray
@@ -160,10 +160,10 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
     flat-top window in a padded FFT, no ratio of the magnitudes rises with the offset of the tone
     from the centre bin. The offset is then given as 0, with an error of half a bin.
     """
-    offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
+    offset = np.arange(_N_TABLE_INTERVALS + 1) / _N_TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
     below, centre, above = tone_magnitudes
-    neighbours_vanish = above[0] < _NEIGHBOUR_HEIGHT_MIN * centre[0]
+    neighbours_vanish = above[0] < _NEIGHBOUR_MAGNITUDE_RATIO_MIN * centre[0]
     magnitude_ratios = (
         above / (centre + above)
         if neighbours_vanish
@@ -173,10 +173,10 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
     weight, error = _least_squares_weights(
         tone_magnitudes, offset, correlation_1, correlation_2, two_bins=bool(neighbours_vanish)
     )
-    if not (np.diff(magnitude_ratios[: _TABLE_INTERVALS // 2 + 1]) > 0).all():
+    if not (np.diff(magnitude_ratios[: _N_TABLE_INTERVALS // 2 + 1]) > 0).all():
         weight, error, offset = 0 * weight, np.full_like(error, 1e30), 0 * offset
     magnitude_ratios = np.maximum.accumulate(magnitude_ratios)
-    even_ratios = np.linspace(magnitude_ratios[0], magnitude_ratios[-1], _TABLE_INTERVALS + 1)
+    even_ratios = np.linspace(magnitude_ratios[0], magnitude_ratios[-1], _N_TABLE_INTERVALS + 1)
     interpolation = Interpolator(
         magnitude_ratio_kind=TWO_BINS if neighbours_vanish else THREE_BINS,
         magnitude_ratio_at_centre=float(magnitude_ratios[0]),
@@ -223,7 +223,7 @@ def tone_spectrum(window: Window, fft_size: int) -> Callable[[np.ndarray], np.nd
         ]
         return np.array(values) * np.exp(2j * np.pi * record_middle / fft_size * distances)
 
-    return Chebyshev.interpolate(bin_values, _TONE_DEGREE, domain=[-2, 2])
+    return Chebyshev.interpolate(bin_values, _TONE_POLYNOMIAL_DEGREE, domain=[-2, 2])
 
 
 def _tone_magnitudes(window: Window, fft_size: int, offset: np.ndarray) -> np.ndarray:
@@ -239,9 +239,9 @@ def _least_squares_weights(
     *,
     two_bins: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights that give a tone's position from three bins, and its standard error.
+    """Return weights that give a tone's position from three bins with the smallest standard error.
 
-    The weights have the smallest variance.
+    The standard error is returned too.
 
     Parameters
     ----------
@@ -305,7 +305,7 @@ def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpola
     estimates = np.array(
         [estimate_sub_bin_offset(a, b, c, interpolation) for a, b, c in np.sqrt(power).T]
     )
-    table_positions = np.linspace(0.0, 1.0, _TABLE_INTERVALS + 1)
+    table_positions = np.linspace(0.0, 1.0, _N_TABLE_INTERVALS + 1)
     return np.interp(table_positions, positions, np.abs(estimates - positions)) / _SPREAD_BINS**2
 
 
@@ -450,13 +450,14 @@ def _drift_error_table(window: Window, fft_size: int) -> np.ndarray:
 
 
 _N_LATE_POSITIONS = 65
-"""Number of tone positions, in 0 .. 1 bin, in the tables for echoes that arrive late, after the
-record has begun."""
+"""Number of tone positions, 0 .. 1 bin, in the tables for echoes that arrive after the record has
+begun."""
 _MISSING_FRACTIONS = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
 """Tabulated fractions of the record that pass before the echo arrives."""
-_SLOPE_MIN = 0.05
-"""Lower limit of the derivative of the estimated by the true position. Errors are divided by it."""
-_DIFFERENCE_STEP = 1e-4
+_ESTIMATE_SLOPE_MIN = 0.05
+"""Lower limit of the derivative of the estimated position by the true one. Errors are divided by
+this derivative."""
+_MAGNITUDE_DIFFERENCE_STEP = 1e-4
 """Step in a bin's |X| for numerical derivatives, as a fraction of the centre bin's |X|."""
 
 
@@ -532,17 +533,17 @@ def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.nda
         phase, magnitudes = tone_bins[i] / np.maximum(magnitudes, 1e-300), magnitudes / scale
         estimates = np.array([estimate_sub_bin_offset(*row, interpolation) for row in magnitudes])
         estimates = np.maximum.accumulate(np.maximum(estimates, 0.0))
-        slope = np.maximum(np.gradient(estimates, positions), _SLOPE_MIN)
+        slope = np.maximum(np.gradient(estimates, positions), _ESTIMATE_SLOPE_MIN)
         derivatives = np.empty(magnitudes.shape)
         for k in range(3):
             lowered, raised = magnitudes.copy(), magnitudes.copy()
-            lowered[:, k] -= _DIFFERENCE_STEP
-            raised[:, k] += _DIFFERENCE_STEP
+            lowered[:, k] -= _MAGNITUDE_DIFFERENCE_STEP
+            raised[:, k] += _MAGNITUDE_DIFFERENCE_STEP
             for j in range(positions.size):
                 derivatives[j, k] = (
                     estimate_sub_bin_offset(*raised[j], interpolation)
                     - estimate_sub_bin_offset(*lowered[j], interpolation)
-                ) / (2 * _DIFFERENCE_STEP)
+                ) / (2 * _MAGNITUDE_DIFFERENCE_STEP)
         weight = derivatives * phase
         variance = np.einsum("jk,kl,jl->j", weight.conj(), noise_covariance, weight).real
         error = np.sqrt(np.maximum(variance, 0.0)) / slope

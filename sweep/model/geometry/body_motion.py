@@ -17,7 +17,7 @@ import numpy as np
 from sweep.model.geometry import quaternion as quat
 from sweep.model.geometry.quaternion import rotate
 
-_HORIZONTAL_FRACTION_MIN = 1e-9
+_HORIZONTAL_SPEED_FRACTION_MIN = 1e-9
 """Smallest ratio of horizontal speed to total speed at which the direction of motion has a heading.
 """
 _HORIZONTAL_SPEED_MIN = 1e-100
@@ -100,7 +100,7 @@ def _heading_and_rate(
     horizontal_speed = np.hypot(vx, vy)
     speed = np.linalg.norm(velocity, axis=1)
     if not (
-        horizontal_speed > np.maximum(_HORIZONTAL_FRACTION_MIN * speed, _HORIZONTAL_SPEED_MIN)
+        horizontal_speed > np.maximum(_HORIZONTAL_SPEED_FRACTION_MIN * speed, _HORIZONTAL_SPEED_MIN)
     ).all():
         raise ValueError("a vertical movement (or none) has no heading to follow: state one")
     return np.arctan2(vy, vx), (
@@ -215,9 +215,9 @@ class MountedAttitude:
         return quat.multiply(q, quat.normalise(np.asarray(self.mounting, float))), angular_velocity
 
 
-_TIME_TOLERANCE = 1e-9
-"""Largest distance of a time from the trajectory's interval, as a fraction of the trajectory's
-duration, that counts as rounding."""
+_TIME_TOLERANCE_FRACTION = 1e-9
+"""Largest distance of a time from the trajectory's interval that counts as rounding. It is a
+fraction of the trajectory's duration, or of 1 s if that is longer."""
 
 
 AttitudeLaw = (
@@ -228,7 +228,7 @@ AttitudeLaw = (
     | AttitudeTrack
     | MountedAttitude
 )
-"""Attitude of a body over time: any class with a method ``attitude_and_rate``."""
+"""Attitude of a body over time: an instance of a class with a method ``attitude_and_rate``."""
 
 
 class Motion(NamedTuple):
@@ -269,7 +269,7 @@ def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarra
         If a time lies outside the interval by more than rounding.
     """
     times = np.atleast_1d(np.asarray(times, float))
-    tolerance = _TIME_TOLERANCE * max(stop - start, 1.0)
+    tolerance = _TIME_TOLERANCE_FRACTION * max(stop - start, 1.0)
     if not ((times >= start - tolerance) & (times <= stop + tolerance)).all():
         raise ValueError(f"times must be numbers on the path, {start:g} to {stop:g} s")
     return np.clip(times, start, stop)
@@ -281,7 +281,7 @@ class ConstantAcceleration:
 
     initial_position: FloatSequence
     """(3,): position of the point at time 0 [m], in the world's frame."""
-    velocity: FloatSequence
+    initial_velocity: FloatSequence
     """(3,): velocity of the point at time 0 [m/s], in the world's frame."""
     acceleration: FloatSequence
     """(3,): constant acceleration of the point [m/s^2], in the world's frame."""
@@ -302,7 +302,9 @@ class ConstantAcceleration:
     def motion(self, times: np.ndarray) -> Motion:
         """Return position, velocity and acceleration at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, 0.0, self.duration)[:, None]
-        x0, v0, a = np.array([self.initial_position, self.velocity, self.acceleration], float)
+        x0, v0, a = np.array(
+            [self.initial_position, self.initial_velocity, self.acceleration], float
+        )
         return Motion(x0 + (v0 + 0.5 * a * times) * times, v0 + a * times, a + 0 * times)
 
 
@@ -420,8 +422,8 @@ def require_rising_times(time: FloatSequence) -> np.ndarray:
 
 
 Trajectory = ConstantAcceleration | Waypoints
-"""Motion of a point over time, from ``start`` to ``stop`` [s]: any of the classes of trajectories.
-"""
+"""Motion of a point over time, from ``start`` to ``stop`` [s]: an instance of a trajectory
+class."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """Bounding volume hierarchy: the nearest triangles along bundles of rays, by a tree of boxes.
 
 Each node of the tree has up to eight children. The hit of a ray depends only on the ray and the
-mesh: it is the nearest triangle, and the first in the mesh of equally near ones. The order of the
-rays, their grouping and the shape of the tree change no bit of the result.
+mesh: it is the nearest triangle, or the first in the mesh of several equally near ones. The order
+of the rays, their grouping and the shape of the tree change no bit of the result.
 
 A triangle counts as hit if the three edge functions of the sheared triangle [1]_ have no opposite
 signs. Each edge function is a difference of two products. The neighbour across the edge computes
@@ -31,10 +31,10 @@ LEAF_TRIANGLES_MAX = 2
 """Largest number of triangles in a leaf. It is below 8, so that a leaf's first triangle and its
 number of triangles fit one integer (:attr:`BoxTree.children`)."""
 
-_BOX_SLACK = 2.0**-30
-"""Distance by which boxes are widened, as a fraction of the largest coordinate. It is far above the
-rounding of a hit's position across the ray (some 1e-15 of the range, for ranges up to 1e5 times the
-mesh's size), and below the resolution of float32."""
+_BOX_MARGIN_FRACTION = 2.0**-30
+"""Distance by which boxes are widened, as a fraction of the mesh's largest coordinate. It is far
+above the rounding of a hit's position across the ray (some 1e-15 of the range, for ranges up to 1e5
+times the mesh's size), and below the resolution of float32."""
 
 _EMPTY_BOX_BOUND = np.float32(3e38)
 """Lower bound of an empty box along each axis [m]. Its upper bound is minus this value, so that no
@@ -47,15 +47,15 @@ _STACK_SIZE = 8 * 16
 """Number of entries of the stack that a traversal of the tree uses. The deepest tree needs seven
 entries per level."""
 
-_DIRECTION_MIN = 1e-200
-"""Size of a direction's component below which it is replaced when reciprocals are computed, so that
-these are finite."""
+_DIRECTION_COMPONENT_MIN = 1e-200
+"""Smallest size of a direction's component in reciprocals. Smaller components are replaced by it,
+so that reciprocals are finite."""
 
-_ENTRY_SLACK = 1.0 + 1e-14
+_EXIT_DISTANCE_FACTOR = 1.0 + 1e-14
 """Factor by which the distance at which a ray leaves a box is increased. It exceeds the rounding
 error of this distance (5e-16)."""
 
-_TIE_SLACK = 1.0 + 1e-12
+_TIE_DISTANCE_FACTOR = 1.0 + 1e-12
 """Factor by which the distance of the nearest hit is increased before farther boxes are skipped.
 Rounding then skips no box that holds an equally near triangle."""
 
@@ -70,12 +70,12 @@ _X, _Y, _Z = range(3)
 _LOW_X, _LOW_Y, _LOW_Z, _HIGH_X, _HIGH_Y, _HIGH_Z = range(6)
 """Indices of a box's lower and upper bounds along x, y, z in :attr:`BoxTree.bounds`."""
 _SHEAR_X, _SHEAR_Y, _RECIPROCAL = range(3)
-"""Indices of the rows of :attr:`_Scratch.shears`: the constants of a ray's triangle tests."""
+"""Indices of the rows of :attr:`_Scratch.shears`."""
 (
     _RECIPROCAL_HIGH, _RECIPROCAL_LOW, _NEAR_TERM_HIGH, _NEAR_TERM_LOW, _FAR_TERM_HIGH,
     _FAR_TERM_LOW,
 ) = range(6)  # fmt: skip
-"""Indices of the rows of :attr:`_Scratch.box_test`: the constants of a bundle's box tests."""
+"""Indices of the rows of :attr:`_Scratch.box_test_constants`."""
 
 
 class BoxTree(NamedTuple):
@@ -85,9 +85,9 @@ class BoxTree(NamedTuple):
     """(nodes, 6, 8) float32 [m]: lower bounds x, y, z and upper bounds x, y, z of each child's box.
     """
     children: np.ndarray
-    """(nodes, 8) int32: each child as an integer. A child node is its index. A leaf is -1 - (8
-    start + count), with the index ``start`` of its first triangle in ``faces`` and its number
-    ``count`` of triangles."""
+    """(nodes, 8) int32: reference to each child. A child that is a node is stored as its index. A
+    leaf is stored as -1 - (8 start + count), with the index ``start`` of its first triangle in
+    ``faces`` and its number ``count`` of triangles."""
     faces: np.ndarray
     """(m, 3) int32: indices in ``vertices`` of each triangle's corners. The triangles are in the
     order of the leaves."""
@@ -102,16 +102,16 @@ class _Scratch(NamedTuple):
 
     shears: np.ndarray
     """(3, b): constants of the triangle tests of each ray (:func:`_prepare_bundle`)."""
-    box_test: np.ndarray
+    box_test_constants: np.ndarray
     """(6, 3): constants of the box tests of a bundle of rays, for each coordinate axis
     (:func:`_prepare_bundle`)."""
-    child_entry: np.ndarray
+    child_entry_distance: np.ndarray
     """(8,): smallest distance at which a ray of the bundle may enter each child's box, in units of
     the length of the direction vector; inf if no ray can."""
     node_stack: np.ndarray
     """(_STACK_SIZE,) int64: nodes and leaves still to be visited, encoded as in
     :attr:`BoxTree.children`."""
-    entry_stack: np.ndarray
+    entry_distance_stack: np.ndarray
     """(_STACK_SIZE,): smallest distance at which a ray of the bundle may enter the box of each
     element of ``node_stack``, in units of the length of the direction vector."""
 
@@ -129,18 +129,18 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
     faces : ndarray (m, 3) int
         Vertices of each triangle, m >= 1.
     """
-    leaves = _order_into_leaves(_triangle_centres(vertices, faces))
+    leaves = _order_into_leaves(_doubled_triangle_centres(vertices, faces))
     bounds, children = _build_nodes(vertices, faces, leaves)
     mesh_face_index = leaves[leaves < len(faces)]
     del leaves
-    new_faces, vertex_order = _renumber_by_first_use(faces, mesh_face_index, len(vertices))
+    new_faces, vertex_order = _renumber_vertices_by_first_use(faces, mesh_face_index, len(vertices))
     return BoxTree(bounds, children, new_faces, mesh_face_index, vertices[vertex_order])
 
 
-def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return twice the centres of triangles' bounding boxes, (m, 3) float32 [m].
+def _doubled_triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the doubled centres of triangles' bounding boxes, (m, 3) float32 [m].
 
-    Triangles are sorted into leaves by these centres.
+    Triangles are sorted into leaves by their centres.
     """
     centres = np.empty((len(faces), 3), np.float32)
     for begin in range(0, len(faces), _TRIANGLES_PER_BATCH):  # in batches, to save memory
@@ -156,7 +156,7 @@ def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> 
     A box has its lower bounds along x, y, z, and then its upper bounds negated. ``leaves`` is the
     result of :func:`_order_into_leaves`.
     """
-    slack = _BOX_SLACK * float(max(vertices.max(), -vertices.min()))
+    slack = _BOX_MARGIN_FRACTION * float(max(vertices.max(), -vertices.min()))
     boxes = np.empty((leaves.size // LEAF_TRIANGLES_MAX, 6), np.float32)
     for begin in range(0, leaves.size, _TRIANGLES_PER_BATCH):
         batch_triangles = leaves[begin : begin + _TRIANGLES_PER_BATCH]
@@ -231,8 +231,8 @@ def _order_into_leaves(centres: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _renumber_by_first_use(faces, triangle_order, n_vertices):
-    """Put triangles into a new order, and renumber vertices in the order of their first use.
+def _renumber_vertices_by_first_use(faces, triangle_order, n_vertices):
+    """Reorder triangles, and renumber vertices in the order in which the triangles use them.
 
     The data of a leaf's triangles then lie together in memory.
 
@@ -317,13 +317,13 @@ def _sort_into_halves(points, order):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _larger(a, b):
+def _larger_of_two(a, b):
     """Return the larger of two numbers: one instruction, where max() would also check for nan."""
     return a if a > b else b
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _smaller(a, b):
+def _smaller_of_two(a, b):
     """Return the smaller of two numbers: one instruction, where min() would also check for nan."""
     return a if a < b else b
 
@@ -346,7 +346,7 @@ def find_nearest_triangles(tree, origins, directions, distance, face_index, dist
         Nearest known distance, in lengths of the direction (inf: none); it is replaced if a
         triangle is nearer.
     face_index : ndarray (n, b)
-        Index in the mesh of the nearest triangle; it is replaced with `distance`.
+        Index in the mesh of the nearest triangle; replaced together with `distance`.
     distance_min : float
         Rays pass through triangles up to this distance, >= 0.
 
@@ -416,44 +416,50 @@ def _traverse_tree(
         Smallest distance of a hit, in lengths of the direction.
     """
     bounds, children, tree_faces, vertices = tree.bounds, tree.children, tree.faces, tree.vertices
-    shears, child_entry = scratch.shears, scratch.child_entry
-    node_stack, entry_stack = scratch.node_stack, scratch.entry_stack
+    shears, child_entry_distance = scratch.shears, scratch.child_entry_distance
+    node_stack, entry_distance_stack = scratch.node_stack, scratch.entry_distance_stack
     tests_left = tests_max
-    axis = _prepare_bundle(directions, shears, scratch.box_test)
+    axis = _prepare_bundle(directions, shears, scratch.box_test_constants)
     if axis < 0:
         return False
     kx, ky = (axis + 1) % 3, (axis + 2) % 3
     ox, oy, oz = origin[kx], origin[ky], origin[axis]
-    node_stack[0], entry_stack[0], top = children.shape[0] - 1, 0.0, 1
+    node_stack[0], entry_distance_stack[0], top = children.shape[0] - 1, 0.0, 1
     farthest_hit, is_known = 0.0, False
     while top > 0:
         if not is_known:
             farthest_hit, is_known = distance[0], True
             for i in range(1, distance.size):
-                farthest_hit = _larger(farthest_hit, distance[i])
-            farthest_hit *= _TIE_SLACK
+                farthest_hit = _larger_of_two(farthest_hit, distance[i])
+            farthest_hit *= _TIE_DISTANCE_FACTOR
         top -= 1
         node = node_stack[top]
-        if entry_stack[top] > farthest_hit:
+        if entry_distance_stack[top] > farthest_hit:
             continue
         if node >= 0:
             _box_entry_distances(
-                bounds, node, origin[_X], origin[_Y], origin[_Z], scratch.box_test, farthest_hit,
-                child_entry,
+                bounds, node, origin[_X], origin[_Y], origin[_Z], scratch.box_test_constants,
+                    farthest_hit, child_entry_distance,
             )  # fmt: skip
             stack_base = top
             for child in range(
                 CHILDREN_PER_NODE
             ):  # push the boxes that may be entered, the nearest last
-                if child_entry[child] < np.inf:
+                if child_entry_distance[child] < np.inf:
                     slot = top
-                    while slot > stack_base and entry_stack[slot - 1] < child_entry[child]:
-                        node_stack[slot], entry_stack[slot] = (
+                    while (
+                        slot > stack_base
+                        and entry_distance_stack[slot - 1] < child_entry_distance[child]
+                    ):
+                        node_stack[slot], entry_distance_stack[slot] = (
                             node_stack[slot - 1],
-                            entry_stack[slot - 1],
+                            entry_distance_stack[slot - 1],
                         )
                         slot -= 1
-                    node_stack[slot], entry_stack[slot] = children[node, child], child_entry[child]
+                    node_stack[slot], entry_distance_stack[slot] = (
+                        children[node, child],
+                        child_entry_distance[child],
+                    )
                     top += 1
             continue
         start, count = (-1 - node) >> 3, (-1 - node) & 7
@@ -473,7 +479,7 @@ def _traverse_tree(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _prepare_bundle(directions, shears, box_test):
+def _prepare_bundle(directions, shears, box_test_constants):
     """Compute the constants of a bundle's box and triangle tests, and return its axis.
 
     The axis (0, 1 or 2) is that along which the component of every direction is largest; -1 if this
@@ -486,7 +492,7 @@ def _prepare_bundle(directions, shears, box_test):
     shears : ndarray (3, >= b)
         The result for triangles: the directions' other two components, in cyclic order, over the
         largest, and 1 over the largest.
-    box_test : ndarray (6, 3)
+    box_test_constants : ndarray (6, 3)
         The result for boxes: constants for each coordinate axis, for all directions between `low`
         and `high` along it.
 
@@ -494,9 +500,9 @@ def _prepare_bundle(directions, shears, box_test):
     -----
     The rays o + t d can lie between the box's lower and upper plane only if t high >= lower - o and
     t low <= upper - o. Each condition bounds t from below or from above, by the sign of its factor.
-    The first two rows of `box_test` are the reciprocals 1 / high and 1 / low. The other rows are 0,
-    or infinite. They are added to the two quotients, so that a condition that does not bound t from
-    below (rows 3 and 4), or from above (rows 5 and 6), has no effect there.
+    The first two rows of `box_test_constants` are the reciprocals 1 / high and 1 / low. The other
+    rows are 0, or infinite. They are added to the two quotients, so that a condition that does not
+    bound t from below (rows 3 and 4), or from above (rows 5 and 6), has no effect there.
     """
     axis = -1
     for beamlet in range(directions.shape[0]):
@@ -518,22 +524,24 @@ def _prepare_bundle(directions, shears, box_test):
         low = high = directions[0, component]
         for beamlet in range(1, directions.shape[0]):
             low, high = (
-                _smaller(low, directions[beamlet, component]),
-                _larger(high, directions[beamlet, component]),
+                _smaller_of_two(low, directions[beamlet, component]),
+                _larger_of_two(high, directions[beamlet, component]),
             )
-        low_nonzero = -_DIRECTION_MIN if abs(low) < _DIRECTION_MIN else low
-        high_nonzero = _DIRECTION_MIN if abs(high) < _DIRECTION_MIN else high
-        box_test[_RECIPROCAL_HIGH, component] = 1.0 / high_nonzero
-        box_test[_RECIPROCAL_LOW, component] = 1.0 / low_nonzero
-        box_test[_NEAR_TERM_HIGH, component] = 0.0 if high_nonzero > 0.0 else -np.inf
-        box_test[_NEAR_TERM_LOW, component] = 0.0 if low_nonzero < 0.0 else -np.inf
-        box_test[_FAR_TERM_HIGH, component] = 0.0 if high_nonzero < 0.0 else np.inf
-        box_test[_FAR_TERM_LOW, component] = 0.0 if low_nonzero > 0.0 else np.inf
+        low_nonzero = -_DIRECTION_COMPONENT_MIN if abs(low) < _DIRECTION_COMPONENT_MIN else low
+        high_nonzero = _DIRECTION_COMPONENT_MIN if abs(high) < _DIRECTION_COMPONENT_MIN else high
+        box_test_constants[_RECIPROCAL_HIGH, component] = 1.0 / high_nonzero
+        box_test_constants[_RECIPROCAL_LOW, component] = 1.0 / low_nonzero
+        box_test_constants[_NEAR_TERM_HIGH, component] = 0.0 if high_nonzero > 0.0 else -np.inf
+        box_test_constants[_NEAR_TERM_LOW, component] = 0.0 if low_nonzero < 0.0 else -np.inf
+        box_test_constants[_FAR_TERM_HIGH, component] = 0.0 if high_nonzero < 0.0 else np.inf
+        box_test_constants[_FAR_TERM_LOW, component] = 0.0 if low_nonzero > 0.0 else np.inf
     return axis
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _box_entry_distances(bounds, node, ox, oy, oz, box_test, distance_max, child_entry):
+def _box_entry_distances(
+    bounds, node, ox, oy, oz, box_test_constants, distance_max, child_entry_distance
+):
     """Compute the smallest distance at which rays of a bundle may enter each box of a node.
 
     Parameters
@@ -544,60 +552,60 @@ def _box_entry_distances(bounds, node, ox, oy, oz, box_test, distance_max, child
         Node whose children are tested.
     ox, oy, oz : float
         Origin of the rays [m].
-    box_test : ndarray (6, 3)
+    box_test_constants : ndarray (6, 3)
         Result of :func:`_prepare_bundle`.
     distance_max : float
         Boxes at larger distances are not entered.
-    child_entry : ndarray (8,)
+    child_entry_distance : ndarray (8,)
         The result: distances in lengths of the direction, inf for a box that no ray can enter.
     """
-    # Scalars, not an array: the compiler could not exclude that `child_entry` overlaps with it.
+    # Scalars: the compiler could not exclude that an array overlaps with `child_entry_distance`.
     high_x, high_y, high_z = (
-        box_test[_RECIPROCAL_HIGH, _X],
-        box_test[_RECIPROCAL_HIGH, _Y],
-        box_test[_RECIPROCAL_HIGH, _Z],
+        box_test_constants[_RECIPROCAL_HIGH, _X],
+        box_test_constants[_RECIPROCAL_HIGH, _Y],
+        box_test_constants[_RECIPROCAL_HIGH, _Z],
     )
     low_x, low_y, low_z = (
-        box_test[_RECIPROCAL_LOW, _X],
-        box_test[_RECIPROCAL_LOW, _Y],
-        box_test[_RECIPROCAL_LOW, _Z],
+        box_test_constants[_RECIPROCAL_LOW, _X],
+        box_test_constants[_RECIPROCAL_LOW, _Y],
+        box_test_constants[_RECIPROCAL_LOW, _Z],
     )
     near_high_x, near_high_y, near_high_z = (
-        box_test[_NEAR_TERM_HIGH, _X],
-        box_test[_NEAR_TERM_HIGH, _Y],
-        box_test[_NEAR_TERM_HIGH, _Z],
+        box_test_constants[_NEAR_TERM_HIGH, _X],
+        box_test_constants[_NEAR_TERM_HIGH, _Y],
+        box_test_constants[_NEAR_TERM_HIGH, _Z],
     )
     near_low_x, near_low_y, near_low_z = (
-        box_test[_NEAR_TERM_LOW, _X],
-        box_test[_NEAR_TERM_LOW, _Y],
-        box_test[_NEAR_TERM_LOW, _Z],
+        box_test_constants[_NEAR_TERM_LOW, _X],
+        box_test_constants[_NEAR_TERM_LOW, _Y],
+        box_test_constants[_NEAR_TERM_LOW, _Z],
     )
     far_high_x, far_high_y, far_high_z = (
-        box_test[_FAR_TERM_HIGH, _X],
-        box_test[_FAR_TERM_HIGH, _Y],
-        box_test[_FAR_TERM_HIGH, _Z],
+        box_test_constants[_FAR_TERM_HIGH, _X],
+        box_test_constants[_FAR_TERM_HIGH, _Y],
+        box_test_constants[_FAR_TERM_HIGH, _Z],
     )
     far_low_x, far_low_y, far_low_z = (
-        box_test[_FAR_TERM_LOW, _X],
-        box_test[_FAR_TERM_LOW, _Y],
-        box_test[_FAR_TERM_LOW, _Z],
+        box_test_constants[_FAR_TERM_LOW, _X],
+        box_test_constants[_FAR_TERM_LOW, _Y],
+        box_test_constants[_FAR_TERM_LOW, _Z],
     )
-    for child in range(child_entry.size):  # a constant bound would not be vectorised
+    for child in range(child_entry_distance.size):  # a constant bound would not be vectorised
         lower_x = (bounds[node, _LOW_X, child] - ox) * high_x
         upper_x = (bounds[node, _HIGH_X, child] - ox) * low_x
         lower_y = (bounds[node, _LOW_Y, child] - oy) * high_y
         upper_y = (bounds[node, _HIGH_Y, child] - oy) * low_y
         lower_z = (bounds[node, _LOW_Z, child] - oz) * high_z
         upper_z = (bounds[node, _HIGH_Z, child] - oz) * low_z
-        near_x = _larger(lower_x + near_high_x, upper_x + near_low_x)
-        far_x = _smaller(lower_x + far_high_x, upper_x + far_low_x)
-        near_y = _larger(lower_y + near_high_y, upper_y + near_low_y)
-        far_y = _smaller(lower_y + far_high_y, upper_y + far_low_y)
-        near_z = _larger(lower_z + near_high_z, upper_z + near_low_z)
-        far_z = _smaller(lower_z + far_high_z, upper_z + far_low_z)
-        near = _larger(_larger(near_x, near_y), _larger(near_z, 0.0))
-        far = _smaller(_smaller(far_x, far_y), far_z) * _ENTRY_SLACK
-        child_entry[child] = near if near <= _smaller(far, distance_max) else np.inf
+        near_x = _larger_of_two(lower_x + near_high_x, upper_x + near_low_x)
+        far_x = _smaller_of_two(lower_x + far_high_x, upper_x + far_low_x)
+        near_y = _larger_of_two(lower_y + near_high_y, upper_y + near_low_y)
+        far_y = _smaller_of_two(lower_y + far_high_y, upper_y + far_low_y)
+        near_z = _larger_of_two(lower_z + near_high_z, upper_z + near_low_z)
+        far_z = _smaller_of_two(lower_z + far_high_z, upper_z + far_low_z)
+        near = _larger_of_two(_larger_of_two(near_x, near_y), _larger_of_two(near_z, 0.0))
+        far = _smaller_of_two(_smaller_of_two(far_x, far_y), far_z) * _EXIT_DISTANCE_FACTOR
+        child_entry_distance[child] = near if near <= _smaller_of_two(far, distance_max) else np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -620,8 +628,8 @@ def _intersect_triangle(a, b, c, index, shears, distance_min, distance, face_ind
 
     Notes
     -----
-    A hit's distance is a weighted mean of the corners' depths along the axis. So it lies between
-    the depths at any incidence.
+    A hit's distance is a weighted mean of the corners' depths along the axis, so it lies between
+    these depths at any incidence.
     """
     ax, ay, az = a
     bx, by, bz = b
@@ -634,8 +642,8 @@ def _intersect_triangle(a, b, c, index, shears, distance_min, distance, face_ind
         u = pcx * pby - pcy * pbx
         v = pax * pcy - pay * pcx
         w = pbx * pay - pby * pax
-        edge_min = _smaller(u, _smaller(v, w))
-        edge_max = _larger(u, _larger(v, w))
+        edge_min = _smaller_of_two(u, _smaller_of_two(v, w))
+        edge_max = _larger_of_two(u, _larger_of_two(v, w))
         ray_distance = (u * az + v * bz + w * cz) / (u + v + w) * reciprocal
         ray_distance = (
             ray_distance

@@ -25,7 +25,7 @@ from sweep.model.geometry.double_double import (
 
 @dataclass(frozen=True)
 class SurfaceMaterial:
-    """Optical properties of one kind of surface."""
+    """Optical properties of a kind of surface."""
 
     name: str
     """Name of the surface in the spec of the scene."""
@@ -123,12 +123,14 @@ def require_consistent_mesh(
 
 
 def rounded_centre(vertices: np.ndarray) -> np.ndarray:
-    """Return the centre of the vertices' bounding box, rounded so that subtracting it is exact.
+    """Return the centre (3,) of the bounding box of vertices (n, 3), rounded [m].
 
-    Along an axis it is zero if zero is no farther from the mesh than the mesh is large, since small
-    coordinates would lose their last digits otherwise. Else it is rounded to a power of two not
-    below 1/1024 of the extent. Coordinate and centre are then multiples of the coordinate's last
-    place, and their difference is no larger than the coordinate.
+    Subtracting the result from a vertex has no rounding error. The centre is rounded to multiples
+    of a power of two, which is at least 1/1024 of the box's largest extent.
+
+    A coordinate of the result is 0 if the centre is no farther from 0 along this axis than the
+    largest extent. Small coordinates of vertices would otherwise lose their last digits. If all
+    vertices are equal, the result is their position.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     extent = float((high - low).max())

@@ -98,7 +98,7 @@ class RayCaster:
         poses: Sequence[Pose | None] | None = None,
         range_min: float = 0.0,
     ) -> BundleHits:
-        """Find the first hit of each ray (beamlet) of bundles from one origin each.
+        """Find the first hit of each ray (beamlet) in bundles; rays of a bundle share an origin.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class RayCaster:
         body_index = np.full(shape, -1, np.int16)
         for body_number, frame in enumerate(frames):
             nearer_face = np.full(shape, -1)
-            rays = frame.to_mesh_rounded(origins, directions)
+            rays = frame.rays_in_mesh_frame(origins, directions)
             find_nearest_triangles(
                 self._trees[body_number], *rays, distance, nearer_face, range_min
             )
@@ -245,7 +245,8 @@ class RayCaster:
         poses = [None] * len(self.meshes) if poses is None else poses
         return [
             _MeshFrame(
-                mesh.origin, *((None, None) if pose is None else _pose_matrices(pose, n_bundles))
+                mesh.origin,
+                *((None, None) if pose is None else _rotation_and_position(pose, n_bundles)),
             )
             for mesh, pose in zip(self.meshes, poses, strict=True)
         ]
@@ -299,7 +300,7 @@ class _MeshFrame(NamedTuple):
     position: np.ndarray | None
     """(n, 3): position of the body's frame in the world [m]; None if the frames are equal."""
 
-    def to_mesh_origins(self, origins, ray_rows):
+    def origins_in_mesh_frame(self, origins, ray_rows):
         """Transform origins of m rays to the mesh's frame.
 
         Parameters
@@ -320,10 +321,10 @@ class _MeshFrame(NamedTuple):
         from_body = subtract(world_origin, DoubleDouble.from_float64(self.position[ray_rows].T))
         return subtract(self._rotate_to_body(from_body, ray_rows), mesh_origin)
 
-    def to_mesh_directions(self, directions, ray_rows):
-        """Transform directions (m, 3) to the mesh's frame, DoubleDouble (3, m).
+    def directions_in_mesh_frame(self, directions, ray_rows):
+        """Rotate directions (m, 3) to the mesh's frame; return a DoubleDouble (3, m).
 
-        `ray_rows` are as in :meth:`to_mesh_origins`.
+        `ray_rows` are as in :meth:`origins_in_mesh_frame`.
         """
         world_direction = DoubleDouble.from_float64(directions.T)
         return (
@@ -335,16 +336,16 @@ class _MeshFrame(NamedTuple):
     def _rotate_to_body(self, vector, ray_rows):
         """Rotate double-double vectors (3, m) from the world's frame to the body's.
 
-        ``ray_rows`` (m,) selects the rotation of each.
+        ``ray_rows`` (m,) is the row of each vector in ``rotation``.
         """
         rotations = self.rotation[ray_rows].transpose(1, 2, 0)
         vector_column = DoubleDouble(vector.high[:, None], vector.low[:, None])
         return dot(vector_column, DoubleDouble.from_float64(rotations))
 
-    def to_mesh_rounded(self, origins, directions):
+    def rays_in_mesh_frame(self, origins, directions):
         """Transform origins (n, 3) and directions (n, b, 3) to the mesh's frame, as float64."""
         n_bundles, n_beamlets = directions.shape[:2]
-        mesh_origins = self.to_mesh_origins(origins, np.arange(n_bundles)).high.T
+        mesh_origins = self.origins_in_mesh_frame(origins, np.arange(n_bundles)).high.T
         if self.rotation is not None:
             flat_directions, ray_rows = (
                 directions.reshape(-1, 3),
@@ -355,7 +356,7 @@ class _MeshFrame(NamedTuple):
                 for batch_start in range(0, n_bundles * n_beamlets, _RAYS_PER_BATCH)
             ]
             rotated = [
-                self.to_mesh_directions(flat_directions[batch], ray_rows[batch]).high.T
+                self.directions_in_mesh_frame(flat_directions[batch], ray_rows[batch]).high.T
                 for batch in batches
             ]
             directions = np.concatenate([*rotated, np.empty((0, 3))]).reshape(directions.shape)
@@ -363,10 +364,10 @@ class _MeshFrame(NamedTuple):
         directions.flags.writeable = False  # always, else numba compiles another version
         return np.ascontiguousarray(mesh_origins), directions
 
-    def to_world(self, vector, ray_rows):
+    def rotate_to_world(self, vector, ray_rows):
         """Rotate vectors (3, m) from the body's frame to the world's.
 
-        ``ray_rows`` (m,) selects the rotation of each.
+        ``ray_rows`` (m,) is the row of each vector in ``rotation``.
         """
         if self.rotation is None:
             return vector
@@ -398,17 +399,17 @@ def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
     first_ray, facet_of_ray = np.flatnonzero(starts_facet), np.cumsum(starts_facet) - 1
     corners = mesh.vertices[mesh.faces[face_index[first_ray]]].transpose(1, 2, 0)
     first_corner, _, _ = corners
-    ray_origin = frame.to_mesh_origins(origins[first_ray], bundle[first_ray])
+    ray_origin = frame.origins_in_mesh_frame(origins[first_ray], bundle[first_ray])
     normal = facet_normals(corners)
     plane_height = dot(normal, subtract(DoubleDouble.from_float64(first_corner), ray_origin))
     x, y, z = normal.high
     length = np.sqrt(x * x + y * y + z * z)
-    unit_normal = frame.to_world(normal.high / length, bundle[first_ray])[:, facet_of_ray]
+    unit_normal = frame.rotate_to_world(normal.high / length, bundle[first_ray])[:, facet_of_ray]
     normal, plane_height, ray_origin = (
         DoubleDouble(values.high[..., facet_of_ray], values.low[..., facet_of_ray])
         for values in (normal, plane_height, ray_origin)
     )
-    ray_direction = frame.to_mesh_directions(directions, bundle)
+    ray_direction = frame.directions_in_mesh_frame(directions, bundle)
     distance = plane_distances(
         corners[..., facet_of_ray], normal, plane_height, ray_origin, ray_direction
     )
@@ -416,7 +417,7 @@ def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
     return _FacetIntersections(distance.high, distance.low, unit_normal, x + y + z)
 
 
-def _pose_matrices(pose, n_bundles):
+def _rotation_and_position(pose, n_bundles):
     """Return rotation matrices (n, 3, 3), body to world, and positions (n, 3) [m] of a pose."""
     attitude = np.atleast_2d(quaternion.normalise(pose.attitude))
     position = np.atleast_2d(np.asarray(pose.position, dtype=np.float64))

@@ -75,10 +75,10 @@ TRIAL_TIME_FRACTION = 0.003
 TIMED_SEQUENCE_TIME_FACTOR = 2
 """Target duration of the sequence of points on which a setting is timed.
 
-It is a multiple of the target duration of a trial.
+The unit is the target duration of a trial.
 """
 
-SHORTENING_OF_FIRST_TIMED_SEQUENCE = 8
+FIRST_TIMED_SEQUENCE_SHORTENING_FACTOR = 8
 """Factor by which the first timed sequence of points is shorter than the longest one.
 
 The first sequences only show which settings are slow.
@@ -326,10 +326,11 @@ class AccuracyMeasurement:
             self._sample.split_into_parts(1)[0],
         )
         for setting_number in setting_numbers:  # compiles kernels, which does not count
-            self._time_trial(setting_number, first_part)
+            self._measure_trial_seconds(setting_number, first_part)
         self._start = time.monotonic()
         seconds_per_round = sum(
-            self._time_trial(setting_number, first_part) for setting_number in setting_numbers
+            self._measure_trial_seconds(setting_number, first_part)
+            for setting_number in setting_numbers
         )
         points_that_fit = (
             (FIRST_ROUND_TIME_FRACTION * self._time_limit - self._elapsed_seconds)
@@ -347,16 +348,16 @@ class AccuracyMeasurement:
         """
         n_points, trial_seconds = 1, TRIAL_TIME_FRACTION * self._time_limit
         while (
-            self._time_trial(0, parts[0]) < trial_seconds / 2
+            self._measure_trial_seconds(0, parts[0]) < trial_seconds / 2
             and n_points < self._sample.timed_points_max
         ):
             n_points = min(2 * n_points, self._sample.timed_points_max)
             self._n_timed_points[0] = n_points
-        n_points_first = max(1, n_points // SHORTENING_OF_FIRST_TIMED_SEQUENCE)
+        n_points_first = max(1, n_points // FIRST_TIMED_SEQUENCE_SHORTENING_FACTOR)
         self._n_timed_points[:] = n_points_first
         first_seconds = np.array(
             [
-                self._time_trial(setting_number, parts[0])
+                self._measure_trial_seconds(setting_number, parts[0])
                 for setting_number in range(len(self._settings))
             ]
         )
@@ -380,7 +381,7 @@ class AccuracyMeasurement:
         """Wall time since the start of the trials [s]."""
         return time.monotonic() - self._start
 
-    def _time_trial(self, setting_number: int, part: np.ndarray) -> float:
+    def _measure_trial_seconds(self, setting_number: int, part: np.ndarray) -> float:
         """Compute a part of the sample with one setting. Return the wall time that it took [s]."""
         start = time.monotonic()
         if self._interrupts.is_stopping:
@@ -465,9 +466,9 @@ class AccuracyMeasurement:
 def add_settings_with_fixed_effects(
     setting_ladder: SettingLadder, sample: StudySample, tolerances: Iterable[float] = ()
 ) -> SettingLadder:
-    """Return all settings, with added ones that simulate the same effects at every point.
+    """Add settings that simulate the same effects at every point; return all settings.
 
-    There is one added set of effects for each tolerance in `FIXED_EFFECTS_TOLERANCES`.
+    One set of effects is added for each tolerance in `FIXED_EFFECTS_TOLERANCES`.
     """
     if not any(setting.kind == ALL_EFFECTS_KIND for setting in setting_ladder.settings):
         return setting_ladder  # settings of draws have no such variants
@@ -500,16 +501,15 @@ The first four are in the order of :func:`result_differences`.
 """
 
 N_ERRORS_BOUNDED_BY_TOLERANCE = 3
-"""Number of arrays of errors that the tolerance bounds: the first ones of `ERROR_ARRAY_LONG_NAMES`.
-"""
+"""Number of error arrays that the tolerance bounds, the first ones of `ERROR_ARRAY_LONG_NAMES`."""
 
 
 def result_differences(results: SampleResults, reference: SampleResults) -> tuple[np.ndarray, ...]:
     """Return the largest differences, (n,) each, between two results at n points.
 
     These are the differences of pd, log10 pfa, magnitudes of bins, and probability of leakage
-    peaks. Differences of magnitudes are relative to the second results, or to the noise's standard
-    deviation if the magnitudes are below it.
+    peaks. Differences of magnitudes are relative to the reference's magnitude, or to the noise's
+    standard deviation if that is larger.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log10_pfa_difference = np.abs(results.log10_pfa - reference.log10_pfa)
@@ -565,7 +565,7 @@ class AccuracyStoreTemplate:
     n_timed_points: np.ndarray  # (settings,): number of points that are timed together
     time_domain_differences: dict[int, np.ndarray]
     """Differences of the reference from the time domain, by the point's number in the sample."""
-    time_domain_beamlets: int  # number of beamlets of both; 0 if that of the reference
+    n_time_domain_beamlets: int  # number of beamlets of both; 0 if that of the reference
     stop_reason: StopReason  # reason why the sample is incomplete
     storing_seconds: float = math.nan  # processor time of storing the study [s]
 
@@ -613,7 +613,7 @@ class AccuracyStoreTemplate:
             return attributes
         pd, _, _, magnitude = np.fmax.reduce(list(self.time_domain_differences.values()))
         return attributes | {
-            "truth_beamlets": self.time_domain_beamlets,
+            "truth_beamlets": self.n_time_domain_beamlets,
             "truth_pd_difference": float(pd),
             "truth_magnitude_difference": float(magnitude),
         }

@@ -146,7 +146,7 @@ class AccuracySetting:
 class SettingLadder:
     """All settings that are compared, with notes.
 
-    The last one is the most accurate, the reference.
+    The last setting is the most accurate one, the reference.
     """
 
     settings: tuple[AccuracySetting, ...]
@@ -215,15 +215,15 @@ def build_setting_ladder(spec: AnySpec) -> SettingLadder:
 
 
 def add_settings_for_effect_sets(
-    settings_ladder: SettingLadder,
+    setting_ladder: SettingLadder,
     spec: AnySpec,
     effects_by_tolerance: Mapping[float, frozenset[str]],
     tolerances: Iterable[float] = (),
 ) -> SettingLadder:
     """Add settings that simulate the same effects at every point.
 
-    Each set of effects holds those that one tolerance needs at any point. Each set is tried with
-    all ``tolerances`` for lines and leakage; by default with the tolerance of the set alone.
+    A set of effects holds those that one tolerance needs at any point. Each set is tried with all
+    ``tolerances`` for lines and leakage, by default with the tolerances of all sets.
     """
     tolerance_by_effects: dict[frozenset[str], float] = {}
     for tolerance, effect_names in effects_by_tolerance.items():
@@ -244,15 +244,15 @@ def add_settings_for_effect_sets(
     ]
     all_effects_index = next(
         index
-        for index, setting in enumerate(settings_ladder.settings)
+        for index, setting in enumerate(setting_ladder.settings)
         if setting.kind == ALL_EFFECTS_KIND
     )
     return replace(
-        settings_ladder,
+        setting_ladder,
         settings=(
-            *settings_ladder.settings[:all_effects_index],
+            *setting_ladder.settings[:all_effects_index],
             *fixed_settings,
-            *settings_ladder.settings[all_effects_index:],
+            *setting_ladder.settings[all_effects_index:],
         ),
     )
 

@@ -54,12 +54,12 @@ PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
 """
 
 
-def _effect_flags_of_names(effect_names: Collection[str]) -> np.uint32:
+def _effect_mask_of_names(effect_names: Collection[str]) -> np.uint32:
     """Return an integer in which the bit of each named effect is set."""
     return np.uint32(sum(1 << EFFECT_NAMES.index(effect_name) for effect_name in effect_names))
 
 
-THESIS_EFFECT_MASK = _effect_flags_of_names(
+THESIS_EFFECT_MASK = _effect_mask_of_names(
     [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
 )
 """Effects that the thesis's method can simulate, one bit each.
@@ -67,7 +67,7 @@ THESIS_EFFECT_MASK = _effect_flags_of_names(
 They move or scale a spectral line as a whole.
 """
 
-TIME_DOMAIN_EFFECT_MASK = ~_effect_flags_of_names(
+TIME_DOMAIN_EFFECT_MASK = ~_effect_mask_of_names(
     [effect.name for effect in EFFECTS if effect.is_random or not effect.is_in_time_domain_truth]
 )
 """Effects that simulated time-domain records contain, one bit each."""
@@ -103,8 +103,8 @@ class SampleResults(NamedTuple):
 def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
     """Return the results of some points from the model's outputs.
 
-    If ``n_draws`` is given, the outputs are numbers of draws with a detection, out of that many
-    draws. Otherwise they are probabilities.
+    If ``n_draws`` is above 0, the outputs are the numbers of draws, out of ``n_draws``, that have a
+    detection. Otherwise they are probabilities.
     """
     segments_and_shot = (*SEGMENT_NAMES, "shot")
 
@@ -276,7 +276,7 @@ class StudySample(ABC):
     def _thesis_effect_flags(self) -> np.uint32:
         """Effects of the study that the thesis's method can simulate, one bit each."""
         return (
-            _effect_flags_of_names(self.simulated_effects(AS_WRITTEN_SETTING)) & THESIS_EFFECT_MASK
+            _effect_mask_of_names(self.simulated_effects(AS_WRITTEN_SETTING)) & THESIS_EFFECT_MASK
         )
 
     def _run_setting(self, setting: AccuracySetting, point_indices: np.ndarray) -> Trial:
@@ -465,8 +465,8 @@ class ShotsOfBlock(NamedTuple):
     """Numbers (n,) of the shots in the flight."""
 
 
-class CastShots(NamedTuple):
-    """Geometry of shots, found by rays."""
+class TimedEyepoints(NamedTuple):
+    """Geometry of shots, found by rays, and the time of casting these rays."""
 
     eyepoints: Eyepoints
     """Geometry of each shot."""
@@ -488,7 +488,7 @@ class FlightSample(StudySample):
     def __init__(self, spec: SceneSpec, n_points: int) -> None:
         self.spec = spec
         self.study_with_setting = cache(self._make_study)
-        self._cast_eyepoints: dict[tuple[str, bytes], CastShots] = {}
+        self._cast_eyepoints: dict[tuple[str, bytes], TimedEyepoints] = {}
         # The shots of a block share work that does not depend on their number, such as planning.
         self.timed_points_max = max(int(spec.storage.block_shots), SHOTS_PER_TILE)
         self._flight_blocks, shots_by_part = zip(*self._sample_shots(n_points), strict=True)
@@ -560,7 +560,7 @@ class FlightSample(StudySample):
     def extend_to_complete_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
         """Return the sample indices of all shots in the tiles of some shots, and in the next tiles.
 
-        Tiles are added until the shots from the first tile on are at least `n_shots`.
+        Tiles are added until the tiles from the first one on have at least `n_shots` shots.
         """
         rows_of_block = np.flatnonzero(self._part_of_row == self._part_of_row[point_indices[0]])
         return rows_of_block[
@@ -658,7 +658,7 @@ class FlightSample(StudySample):
 
     def _cast_shots(
         self, setting: AccuracySetting, flight_block: FlightBlock, shot_numbers: np.ndarray
-    ) -> CastShots:
+    ) -> TimedEyepoints:
         """Return the geometry of shots found by rays, and the time of casting these rays [s].
 
         The geometry is cached for settings that share it.
@@ -670,15 +670,16 @@ class FlightSample(StudySample):
             eyepoints = eyepoints_from_arrays(
                 eyepoint_study.cast_shots(shot_numbers), eyepoint_study.beamlet_weights
             )
-            self._cast_eyepoints[cache_key] = CastShots(eyepoints, thread_time() - start)
+            self._cast_eyepoints[cache_key] = TimedEyepoints(eyepoints, thread_time() - start)
         return self._cast_eyepoints[cache_key]
 
 
 def rows_of_complete_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
     """Return the rows of all shots in the tiles of some rows, and in the tiles that follow.
 
-    After the last tile the first follows. ``tile_of_row`` (n,) is the rising number of each row's
-    tile. Tiles are added until those from the first one on have at least `n_shots` shots.
+    The first tile follows the last. ``tile_of_row`` (n,) is the number of each row's tile, in
+    rising order. Tiles are added until the tiles from the first one on have at least `n_shots`
+    shots.
     """
     tiles, counts = np.unique(tile_of_row, return_counts=True)
     own_tiles = np.unique(tile_of_row[rows])
