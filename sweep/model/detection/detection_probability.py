@@ -47,7 +47,7 @@ from sweep.model.detection.echo_detection import (
     pd_and_miss,
 )
 from sweep.model.detection.look_speckle import phase_rotated_look_covariances
-from sweep.model.detection.looks import DetectionArrays, pd_and_miss_any_two_in_speckle
+from sweep.model.detection.looks import PdAndMissArrays, pd_and_miss_any_two_in_speckle
 from sweep.model.detection.pseudo_variance import (
     mean_joint_pd_over_phases,
     multilook_pd_and_miss_near_ends,
@@ -237,7 +237,7 @@ def pd_and_miss_in_looks(
     magnitude: np.ndarray,
     bins: np.ndarray,
     point_indices: np.ndarray | slice = slice(None),
-) -> DetectionArrays:
+) -> PdAndMissArrays:
     """Return the probabilities that a bin is detected in several looks, and that it is missed.
 
     A look is one of several records of the same segment.
@@ -255,7 +255,7 @@ def pd_and_miss_in_looks(
 
     Returns
     -------
-    DetectionArrays
+    PdAndMissArrays
         pd and miss, (..., m); nan where `magnitude` is.
     """
     is_present = np.isfinite(magnitude)
@@ -273,7 +273,7 @@ def pd_and_miss_in_looks(
         detection = shots.looks.pd_and_miss_steady(
             signal_ratio, threshold / noise_sigma, is_real_bin
         )
-    return DetectionArrays(
+    return PdAndMissArrays(
         *(np.where(is_present, probability, np.nan) for probability in detection)
     )
 
@@ -284,7 +284,7 @@ def _pd_and_miss_in_looks_and_speckle(
     threshold_ratio: np.ndarray,
     bins: np.ndarray,
     point_indices: np.ndarray | slice,
-) -> DetectionArrays:
+) -> PdAndMissArrays:
     """Compute :func:`pd_and_miss_in_looks` of bins in developed speckle.
 
     Signal and threshold are relative to the noise sigma.
@@ -330,7 +330,7 @@ def _pd_and_miss_in_looks_and_speckle(
             noise_pseudo_variance_ratio,
             look_covariance,
         )
-    return DetectionArrays(pd, miss)
+    return PdAndMissArrays(pd, miss)
 
 
 def _look_amplitude_covariance(
@@ -523,7 +523,7 @@ def mean_detection_equivalent_bins(
 
 def shot_pd_and_miss(
     shots: "Shots", pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
-) -> DetectionArrays:
+) -> PdAndMissArrays:
     """Return the probabilities that a shot is detected, and that it is missed.
 
     Parameters
@@ -537,7 +537,7 @@ def shot_pd_and_miss(
 
     Returns
     -------
-    DetectionArrays
+    PdAndMissArrays
         (n,): probabilities pd that a shot is detected, and miss that it is not. miss is not
         computed as 1 - pd, so that both keep their precision.
     """
@@ -550,15 +550,15 @@ def shot_pd_and_miss(
     miss_shot = miss_up + pd_up * miss_down
     if shots.speckle.segment_correlations is not None:
         miss_shot = miss_up + np.maximum(pd_up - pd_both, 0.0)
-    return DetectionArrays(pd_both, np.minimum(miss_shot, 1.0))  # rounding may exceed 1
+    return PdAndMissArrays(pd_both, np.minimum(miss_shot, 1.0))  # rounding may exceed 1
 
 
 def _pd_and_miss_any_two(
     shots: "Shots", pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
-) -> DetectionArrays:
+) -> PdAndMissArrays:
     """Compute :func:`shot_pd_and_miss` where detection in any two of three segments suffices."""
     if shots.speckle.segment_correlations is None:
-        return DetectionArrays(
+        return PdAndMissArrays(
             at_least_two_of_three_probability(pd, miss), at_least_two_of_three_probability(miss, pd)
         )
     threshold_ratio = shots.threshold / shots.line_noise_sigma
@@ -587,7 +587,7 @@ def _pd_and_miss_any_two(
                 np.array(pd), 1 - np.array(pd), threshold_ratio, correlations
             ),
         )
-    return DetectionArrays(pd_shot, miss_shot)
+    return PdAndMissArrays(pd_shot, miss_shot)
 
 
 class StrongestPeakProbabilities(NamedTuple):

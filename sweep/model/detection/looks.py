@@ -76,7 +76,7 @@ _N_GAUSS_NODES = 24
 speckle."""
 
 
-class DetectionArrays(NamedTuple):
+class PdAndMissArrays(NamedTuple):
     """Probabilities of detection and of a miss of bins or shots, arrays of one shape."""
 
     pd: np.ndarray
@@ -166,7 +166,7 @@ class Looks(NamedTuple):
 
     def pd_and_miss_steady(
         self, signal: np.ndarray, threshold_ratio: np.ndarray, is_real: np.ndarray | bool = False
-    ) -> DetectionArrays:
+    ) -> PdAndMissArrays:
         """Return the probabilities that a bin with a steady signal is detected and is missed.
 
         Parameters
@@ -178,7 +178,7 @@ class Looks(NamedTuple):
 
         Returns
         -------
-        DetectionArrays
+        PdAndMissArrays
             Of the broadcast shape of the arguments.
         """
         from sweep.model.detection.marcum import marcum_q1
@@ -192,7 +192,7 @@ class Looks(NamedTuple):
                 miss = np.where(is_real, 0.5 * (special.erfc(-near) - special.erfc(far)), miss)
             if self.is_noncoherent:
                 return self.vote_probabilities(pd, miss)
-            return DetectionArrays(pd, miss)
+            return PdAndMissArrays(pd, miss)
         from scipy import stats  # slow to import, and not needed for one look
 
         a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, threshold_ratio))
@@ -210,14 +210,14 @@ class Looks(NamedTuple):
         for members, tail_law in ((is_upper_tail, stats.ncx2.sf), (~is_upper_tail, stats.ncx2.cdf)):
             tail[members] = tail_law(x[members], degrees_of_freedom[members], signal[members])
         pd[near], miss[near] = np.where(is_upper_tail, (tail, 1 - tail), (1 - tail, tail))
-        return DetectionArrays(pd, miss)
+        return PdAndMissArrays(pd, miss)
 
     def pd_and_miss_in_speckle(
         self,
         signal: np.ndarray,
         threshold_ratio: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
-    ) -> DetectionArrays:
+    ) -> PdAndMissArrays:
         """Return the probabilities that a bin in developed speckle is detected and is missed.
 
         Parameters
@@ -230,7 +230,7 @@ class Looks(NamedTuple):
 
         Returns
         -------
-        DetectionArrays
+        PdAndMissArrays
             Of the broadcast shape of the arguments.
         """
         signal, threshold_ratio = np.broadcast_arrays(
@@ -245,9 +245,9 @@ class Looks(NamedTuple):
             pd, miss = np.exp(-y), -np.expm1(-y)
             if self.is_noncoherent:
                 return self.vote_probabilities(pd, miss)
-            return DetectionArrays(pd, miss)
+            return PdAndMissArrays(pd, miss)
         if self.has_independent_speckle:
-            return DetectionArrays(
+            return PdAndMissArrays(
                 special.gammaincc(self.number, self.number * y),
                 special.gammainc(self.number, self.number * y),
             )
@@ -256,7 +256,7 @@ class Looks(NamedTuple):
             tails_given_speckle = self.pd_and_miss_steady(
                 signal[..., None] * magnitude, threshold_ratio[..., None]
             )
-            return DetectionArrays(
+            return PdAndMissArrays(
                 *(np.minimum((v * weight).sum(axis=-1), 1.0) for v in tails_given_speckle)
             )
         n, gamma_threshold = self.number, 0.5 * self.number * np.square(threshold_ratio)
@@ -272,11 +272,11 @@ class Looks(NamedTuple):
             (n - 1) * np.log1p(1 / total_snr) - gamma_threshold / (1 + total_snr) + log_p, 0.0
         )
         pd = np.minimum(noise_tail + np.exp(log_signal_tail), 1.0)
-        return DetectionArrays(pd, np.maximum(-np.expm1(log_signal_tail) - noise_tail, 0.0))
+        return PdAndMissArrays(pd, np.maximum(-np.expm1(log_signal_tail) - noise_tail, 0.0))
 
     def _pd_and_miss_in_moving_speckle(
         self, signal: np.ndarray, threshold_ratio: np.ndarray, look_speckle: "LookSpeckle"
-    ) -> DetectionArrays:
+    ) -> PdAndMissArrays:
         """Compute :meth:`pd_and_miss_in_speckle` for partially correlated speckle of the looks."""
         from sweep.model.detection.look_speckle import (
             mean_power_tails,
@@ -285,7 +285,7 @@ class Looks(NamedTuple):
 
         if self.combine == COMBINE_POWER:
             snr, threshold = 0.5 * np.square(signal), 0.5 * self.number * np.square(threshold_ratio)
-            return DetectionArrays(*mean_power_tails(look_speckle, self.number, snr, threshold))
+            return PdAndMissArrays(*mean_power_tails(look_speckle, self.number, snr, threshold))
         pd = np.empty(signal.shape)
         for segment, point in np.ndindex(signal.shape[-2:]):
             magnitude = self._correlated_magnitudes(look_speckle, segment, point)
@@ -304,7 +304,7 @@ class Looks(NamedTuple):
             independence = (look_speckle.n_effective_looks[index[-2:]] - 1) / (self.number - 1)
             pd[index] += independence * (independent_pd[index] - lattice_pd)
         pd = np.clip(pd, 0.0, 1.0)
-        return DetectionArrays(pd, 1 - pd)
+        return PdAndMissArrays(pd, 1 - pd)
 
     def _lattice_magnitudes(self) -> np.ndarray:
         """Return speckle magnitudes of N looks of independent speckle, in fixed realisations.
@@ -558,7 +558,7 @@ class Looks(NamedTuple):
         correlations: np.ndarray,
         pd: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
-    ) -> DetectionArrays:
+    ) -> PdAndMissArrays:
         """Return the probabilities that two or more, or fewer, of three segments are detected.
 
         Parameters
@@ -577,7 +577,7 @@ class Looks(NamedTuple):
 
         Returns
         -------
-        DetectionArrays
+        PdAndMissArrays
             Both probabilities, (n,); nan where a segment's `pd` is not finite.
 
         Notes
@@ -627,7 +627,7 @@ class Looks(NamedTuple):
             p, 1 - p, np.full(threshold_ratio.shape, 1e100), correlations
         ).pd
         p_any_two = inverse_looks * pd_in_one_speckle + (1 - inverse_looks) * p_any_two
-        return DetectionArrays(
+        return PdAndMissArrays(
             np.where(is_defined, p_any_two, np.nan), np.where(is_defined, 1 - p_any_two, np.nan)
         )
 
@@ -845,13 +845,13 @@ class Looks(NamedTuple):
             )
         return np.asarray(np.minimum(signal_max, 1 / (self.number * threshold_ratio)))
 
-    def vote_probabilities(self, p_cross: np.ndarray, p_stay: np.ndarray) -> DetectionArrays:
+    def vote_probabilities(self, p_cross: np.ndarray, p_stay: np.ndarray) -> PdAndMissArrays:
         """Return the probabilities that ``votes`` or more records cross, and that fewer do.
 
         ``p_cross`` and ``p_stay`` are the probabilities that one record crosses and does not.
         """
         votes_needed, misses_needed = self.votes, self.number - self.votes + 1
-        return DetectionArrays(
+        return PdAndMissArrays(
             special.betainc(votes_needed, misses_needed, p_cross),
             special.betainc(misses_needed, votes_needed, p_stay),
         )
@@ -988,7 +988,7 @@ def solve_threshold_ratio(
 
 def pd_and_miss_any_two_in_speckle(
     pd: np.ndarray, miss: np.ndarray, threshold_ratio: np.ndarray, correlations: np.ndarray
-) -> DetectionArrays:
+) -> PdAndMissArrays:
     """Return the probabilities that at least two of three segments in speckle are detected, or not.
 
     Parameters
@@ -1002,7 +1002,7 @@ def pd_and_miss_any_two_in_speckle(
 
     Returns
     -------
-    DetectionArrays
+    PdAndMissArrays
         (n,): both probabilities; nan where the probability of detection of a segment is nan.
 
     Notes
@@ -1103,7 +1103,7 @@ def pd_and_miss_any_two_in_speckle(
     # A segment that is never detected has an infinite threshold, which was clipped above.
     is_possible = np.count_nonzero(pd > 0.0, axis=0) >= 2
     p_cross, p_stay = np.where(is_possible, [p_cross / total, p_stay / total], [[0.0], [1.0]])
-    return DetectionArrays(
+    return PdAndMissArrays(
         np.where(is_defined, p_cross, np.nan), np.where(is_defined, p_stay, np.nan)
     )
 

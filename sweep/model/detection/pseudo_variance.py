@@ -36,7 +36,7 @@ from sweep.model.detection.look_speckle import (
     speckle_lattice_amplitudes,
     vote_probability_given_speckle,
 )
-from sweep.model.detection.looks import COMBINE_POWER, DetectionArrays, Looks
+from sweep.model.detection.looks import COMBINE_POWER, Looks, PdAndMissArrays
 from sweep.model.detection.speckle_correlation import window_transform
 from sweep.model.spectrum.search_restriction import axis_line_positions, beamlet_line_positions
 from sweep.model.window import Window, window_samples
@@ -235,7 +235,7 @@ def multilook_pd_and_miss_near_ends(
     signal_pseudo_variance: np.ndarray,
     noise_pseudo_variance: np.ndarray,
     look_covariance: np.ndarray,
-) -> DetectionArrays:
+) -> PdAndMissArrays:
     """Return probabilities of detection and of a miss in several looks of bins near DC or Nyquist.
 
     Echoes are in developed speckle. Each of m echoes is represented by one bin.
@@ -291,7 +291,7 @@ def multilook_pd_and_miss_near_ends(
             looks.number - n_kept
         )  # looks that others represent: noise
         gamma_scale = 2 * np.maximum(eigenvalues, 0.0)
-        return DetectionArrays(
+        return PdAndMissArrays(
             *gamma_sum_tails(gamma_shape, gamma_scale, looks.number * np.square(threshold_ratio))
         )
     pd = np.empty(signal.shape)
@@ -343,4 +343,4 @@ def multilook_pd_and_miss_near_ends(
             )
             pd[bin_index] = lattice_pd + independence * lattice_error
     pd = np.clip(pd, 0.0, 1.0)
-    return DetectionArrays(pd, 1 - pd)
+    return PdAndMissArrays(pd, 1 - pd)
