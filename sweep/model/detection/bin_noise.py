@@ -187,10 +187,11 @@ class SearchedBins(NamedTuple):
         ...     window=get_window("rectangular", 1024), fft_size=1024, sample_rate=np.array(1e8),
         ...     acquisition_delay=np.array(0.0), is_complex=False,
         ... )
-        >>> SearchedBins.from_record(
+        >>> bins = SearchedBins.from_record(
         ...     record, noise_bins="correlated", bins_counted="half", search_band=None
         ... )
-        SearchedBins(n_bins=511.0, first_bin=1, neighbour_correlation=0.0, includes_echo=False)
+        >>> bins.n_bins, bins.first_bin
+        (511.0, 1)
         """
         is_correlated, fft_size = noise_bins == "correlated", record.fft_size
         has_real_ends = is_correlated and not record.is_complex
@@ -278,8 +279,8 @@ def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray
     Returns
     -------
     weights
-        (n_bins, NOISE_FILTER_TAPS): weights of the numbers in each bin; their squares have the sum
-        1.
+        (n_bins, NOISE_FILTER_TAPS): weights of the numbers in each bin. The squares of a bin's
+        weights have the sum 1.
     first_number_index
         (n_bins,): index of the first number in each bin.
 

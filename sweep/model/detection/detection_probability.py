@@ -11,11 +11,13 @@ the segments of points         :func:`detect_in_spans`, by one of these two laws
                                range of bins around an echo. Spans are complete here: cut to the
                                search band, empty in segments that no echo reaches, and including
                                the permanent line
-a group of bins                :func:`pd_of_bin_group` in one record, :func:`final_group_pd` in all
+a group of bins                :func:`pd_of_bin_group` in one record, and in all looks
+                               :func:`final_group_pd`
 both chirps of a shot          :func:`joint_detection_probability`
 a shot                         :func:`shot_pd_and_miss`, by both chirps or any two of three segments
-the strongest peak alone       :func:`strongest_peak_of_segments` and :func:`strongest_peak_of_shot`
-one of M independent bins      :func:`sweep.model.detection.echo_detection.independent_bin_pd`
+the strongest peak alone       :func:`strongest_peak_of_segments`,
+                               :func:`strongest_peak_of_shot`
+one of M independent bins      :func:`.echo_detection.independent_bin_pd`
 a segment, given another one   :func:`down_pd_given_up`, :func:`doppler_pd_given_chirps`
 =============================  ====================================================================
 

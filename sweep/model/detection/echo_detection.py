@@ -106,7 +106,8 @@ class DetectionRule(NamedTuple):
     any_bin: bool
     """True if any bin of an echo may detect it, False if only its strongest bin."""
     lobe_half_width: int
-    """Half-width of the window's main lobe [FFT bins], rounded up; 0 unless ``any_bin``."""
+    """Half-width of the window's main lobe [FFT bins], rounded up. 0 unless
+    ``any_bin`` is true."""
     real_noise_at_ends: bool
     """True if the noise in bins 0 and N/2 is real, as in a real record."""
     fft_size: int
@@ -256,14 +257,16 @@ class BinThresholds(NamedTuple):
     noise_without_pedestal: np.ndarray
     """(n,): receiver noise [V], :attr:`BinThreshold.noise_without_pedestal`."""
     side_noise: np.ndarray
-    """(n,): noise per quadrature [V] in bins next to lines, :attr:`BinThreshold.side_noise`."""
+    """(n,): noise per quadrature [V] in bins next to lines,
+    :attr:`BinThreshold.side_noise`."""
     pedestal_reach_bins: np.ndarray
     """(n,): distance from a line [bins] up to which bins of the phase-noise pedestal belong to the
     echo, :attr:`PedestalShape.reach_bins`."""
     pedestal_line_width_bins: np.ndarray
     """(n,): laser line width [FFT bins], :attr:`PedestalShape.line_width_bins`."""
     pedestal_delay: np.ndarray
-    """(n,): delay of the echo [one over the bin width], :attr:`PedestalShape.delay`."""
+    """(n,): delay of the echo [one over the bin width],
+    :attr:`PedestalShape.delay`."""
 
     def select(self, points: np.ndarray) -> "BinThresholds":
         """Return the thresholds and noise of some points, given by their indices."""
@@ -707,8 +710,8 @@ independent_bin_pd_kernel = njit(cache=True, error_model="numpy", borrows=True)(
 def pd_of_independent_bins(bin_pd, n_bins):
     """Return the probability 1 - (1 - q)^M that any of M independent bins is detected.
 
-    The inverse of :func:`independent_bin_pd`; ``bin_pd`` is q, and ``n_bins`` M, not necessarily an
-    integer.
+    The inverse of :func:`independent_bin_pd`. ``bin_pd`` is q, and ``n_bins`` is M,
+    not necessarily an integer.
     """
     return -math.expm1(n_bins * math.log1p(-bin_pd))
 
@@ -860,9 +863,10 @@ def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
 
     Notes
     -----
-    If ``rule.any_bin`` is true, any bin of the echo may detect it (:func:`pd_and_miss_any_bin`, or
-    :func:`pd_and_miss_in_speckle`). Otherwise only the strongest bin counts. The pedestal that the
-    laser's phase noise leaves around a line is light of the echo and fades with it.
+    If ``rule.any_bin`` is true, any bin of the echo may detect it
+    (:func:`pd_and_miss_any_bin`, or :func:`pd_and_miss_in_speckle`). Otherwise only the strongest
+    bin counts. The pedestal that the laser's phase noise leaves around a line is light of the echo
+    and fades with it.
     """
     if rule.in_speckle:
         if rule.any_bin:

@@ -572,8 +572,8 @@ def phase_noise_deviation(
         var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2
 
     The maximum-likelihood frequency in white noise has this error in addition to
-    :func:`beat_frequency_bound`. Estimates that use the correlation of the phase noise could be
-    better by a few percent for short delays, and by a fifth for r = 1/3.
+    :func:`beat_frequency_bound`. Estimates that use the correlation of the phase
+    noise could be better by a few percent for short delays, and by a fifth for r = 1/3.
     """
     delay_fraction = np.minimum(np.asarray(delay, float) / duration, 1.0)
     walk_variance = 12 * np.asarray(line_width, float) / np.asarray(duration, float)
@@ -638,8 +638,8 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
     -------
     numpy.ndarray or None
         The error at m evenly spaced distances, 0..1 bin, of the tone from the peak bin. m is the
-        size of :attr:`sweep.model.detection.sub_bin_interpolation.Interpolator.error_at_sigma`.
-        None for estimators whose error has no known law.
+        size of :attr:`.sub_bin_interpolation.Interpolator.error_at_sigma`. None for
+        estimators whose error has no known law.
 
     Notes
     -----

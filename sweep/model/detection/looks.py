@@ -11,8 +11,8 @@ three ways:
   IRE Trans. Inf. Theory 6, 59, 1960].
 - ``binary``: each record is compared with the threshold, and M of them must cross in the bin.
 - ``coherent``: records are added after the phase between them due to a steady velocity is removed.
-  The sum counts as one record of N times less noise. :func:`coherent_gain` gives its loss by an
-  acceleration; a laser's phase noise adds to the loss.
+  The sum counts as one record of N times less noise. :func:`coherent_gain` gives its
+  loss by an acceleration; a laser's phase noise adds to the loss.
 
 An echo in developed speckle fades. All looks have the same speckle (``speckle: common``), or each
 look has independent speckle, as when the beam moves by its width from look to look (``speckle:

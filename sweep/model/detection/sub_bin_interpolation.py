@@ -65,8 +65,8 @@ class NoiseMixing(NamedTuple):
     """Cholesky factors of the noise covariance of three adjacent bins.
 
     Let z0, z1, z2 be independent standard normal numbers. The noise in one quadrature is z0 in the
-    centre bin, ``from_centre`` z0 + ``above_own`` z1 in the bin above, and ``from_centre`` z0 +
-    ``below_from_above`` z1 + ``below_own`` z2 in the bin below.
+    centre bin, ``from_centre`` z0 + ``above_own`` z1 in the bin above, and
+    ``from_centre`` z0 + ``below_from_above`` z1 + ``below_own`` z2 in the bin below.
     """
 
     from_centre: float

@@ -422,8 +422,8 @@ def require_rising_times(time: FloatSequence) -> np.ndarray:
 
 
 Trajectory = ConstantAcceleration | Waypoints
-"""Motion of a point over time, from ``start`` to ``stop`` [s]: an instance of a trajectory
-class."""
+"""Motion of a point over time, from ``start`` to ``stop`` [s]: an instance of a
+trajectory class."""
 
 
 @dataclass(frozen=True, eq=False)
