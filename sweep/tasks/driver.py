@@ -92,9 +92,8 @@ EYEPOINT_LOCK_POLL_SECONDS = 0.5
 class Outcome(SessionOutcome):
     """Result of a run: what was computed, and why results are missing, if any are."""
 
-    rays_by_scanner: Mapping[str, int] = field(
-        default_factory=dict
-    )  # rays cast in this run, by scanner
+    rays_by_scanner: Mapping[str, int] = field(default_factory=dict)
+    """Number of rays cast in this run, by the scanner's name."""
 
     @classmethod
     def from_session_outcome(

@@ -418,7 +418,7 @@ def _joint_pd_in_one_record(
             for values in (threshold_ratio, correlation, n_equivalent)
         )
         (pd_both[..., near_ends],) = mean_joint_pd_over_phases(
-            speckle_table.phase_factors[speckle_rows[:, near_ends]],
+            speckle_table.relative_power_by_phase[speckle_rows[:, near_ends]],
             (pd_up[..., near_ends], pd_down[..., near_ends]),
             lambda up, down: (
                 echo_detection.joint_pd_in_speckle(
@@ -583,7 +583,7 @@ def _pd_and_miss_any_two(
         threshold_ratio = np.broadcast_to(threshold_ratio, shots.size)[near_ends]
         correlations = correlations[:, near_ends]
         pd_shot[near_ends], miss_shot[near_ends] = mean_joint_pd_over_phases(
-            speckle_table.phase_factors[speckle_table.pseudo_variance_row[:, near_ends]],
+            speckle_table.relative_power_by_phase[speckle_table.pseudo_variance_row[:, near_ends]],
             tuple(pd[:, near_ends]),
             lambda *pd: pd_and_miss_any_two_in_speckle(
                 np.array(pd), 1 - np.array(pd), threshold_ratio, correlations

@@ -298,9 +298,9 @@ class SpeckleTable(NamedTuple):
     pseudo_variance_ratio: np.ndarray
     """(rows, bins): ratio E[X^2] / E[|X|^2] of the signal X, by distance [bins] from the nearer of
     DC and Nyquist."""
-    phase_factors: np.ndarray
+    relative_power_by_phase: np.ndarray
     """(rows, phases): power of the echo's strongest bin at each phase of the speckle, over its mean
-    (:attr:`sweep.model.detection.pseudo_variance.SignalPseudoVariance.phase_factors`)."""
+    (:attr:`sweep.model.detection.pseudo_variance.SignalPseudoVariance.relative_power_by_phase`)."""
 
     def select(self, segment: int, points: np.ndarray) -> "SpeckleTable":
         """Return the table of one segment of some points, given by their indices."""
@@ -309,7 +309,10 @@ class SpeckleTable(NamedTuple):
             for values in (self.line_deviation_bins, self.pseudo_variance_row)
         )
         return SpeckleTable(
-            line_deviation_bins, pseudo_variance_row, self.pseudo_variance_ratio, self.phase_factors
+            line_deviation_bins,
+            pseudo_variance_row,
+            self.pseudo_variance_ratio,
+            self.relative_power_by_phase,
         )
 
 

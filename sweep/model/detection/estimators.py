@@ -420,10 +420,12 @@ def _tone_offsets_and_bins(window: Window, fft_size: int) -> tuple[np.ndarray, n
 
     The values are real, as their phases are relative to the record's middle.
     """
-    from sweep.model.detection.sub_bin_interpolation import tone_spectrum
+    from sweep.model.detection.sub_bin_interpolation import tone_spectrum_function
 
     offset = np.arange(-_TONE_STEPS_PER_BIN, _TONE_STEPS_PER_BIN + 1) / _TONE_STEPS_PER_BIN
-    return offset, tone_spectrum(window, fft_size)(np.array([-1, 0, 1]) - offset[:, None]).real
+    return offset, tone_spectrum_function(window, fft_size)(
+        np.array([-1, 0, 1]) - offset[:, None]
+    ).real
 
 
 @lru_cache(maxsize=16)
@@ -655,11 +657,13 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
     from sweep.model.detection.sub_bin_interpolation import (
         in_phase_noise_correlations,
         interpolator,
-        tone_spectrum,
+        tone_spectrum_function,
     )
 
     offset = np.linspace(0.0, 1.0, interpolator(window, fft_size).error_at_sigma.size)
-    tone_bins = tone_spectrum(window, fft_size)(np.array([-1, 0, 1]) - offset[:, None]).real
+    tone_bins = tone_spectrum_function(window, fft_size)(
+        np.array([-1, 0, 1]) - offset[:, None]
+    ).real
     height = np.maximum(np.abs(tone_bins[:, 1]), 1e-3 * np.abs(tone_bins[0, 1]))
     cnr = window.energy / height**2
     if estimator == "maximum_likelihood":

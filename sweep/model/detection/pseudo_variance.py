@@ -53,12 +53,12 @@ class SignalPseudoVariance(NamedTuple):
     """
 
     pseudo_variance_row: np.ndarray
-    """(segments, n) int64: row of ``pseudo_variance_ratio`` and ``phase_factors`` for each echo.
-    Row 0, in which the ratio is 0, is for echoes far from DC and Nyquist."""
+    """(segments, n) int64: row of ``pseudo_variance_ratio`` and ``relative_power_by_phase`` for
+    each echo. Row 0, in which the ratio is 0, is for echoes far from DC and Nyquist."""
     pseudo_variance_ratio: np.ndarray
     """(rows, bins): pseudo-variance ratio E[X^2] / E[|X|^2] of a bin X, by distance [bins] from the
     nearer of DC and Nyquist."""
-    phase_factors: np.ndarray
+    relative_power_by_phase: np.ndarray
     """(rows, N_PHASE_NODES): echo power at each phase t of the speckle over the mean over t. It is
     1 + q cos t, with the pseudo-variance ratio q of the strongest bin. With ``any_bin`` detection
     the numerator is the power of the bin that is strongest at that phase."""
@@ -116,7 +116,7 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
 
 
 def mean_joint_pd_over_phases(
-    phase_factors: np.ndarray,
+    relative_power_by_phase: np.ndarray,
     pd_by_segment: tuple[np.ndarray, ...],
     joint_pd_function: Callable[..., tuple[np.ndarray, ...]],
 ) -> tuple[np.ndarray, ...]:
@@ -124,7 +124,7 @@ def mean_joint_pd_over_phases(
 
     Parameters
     ----------
-    phase_factors
+    relative_power_by_phase
         (segments, n, N_PHASE_NODES): relative echo power at the phase nodes, as in
         :class:`SignalPseudoVariance`.
     pd_by_segment
@@ -144,7 +144,8 @@ def mean_joint_pd_over_phases(
     that the mean over t is the given probability. Phases of different segments are independent.
     """
     pd_at_phases = [
-        _pd_at_phases(*arguments) for arguments in zip(pd_by_segment, phase_factors, strict=True)
+        _pd_at_phases(*arguments)
+        for arguments in zip(pd_by_segment, relative_power_by_phase, strict=True)
     ]
     sums: list[np.ndarray] = []
     for j in range(N_PHASE_NODES):
@@ -159,24 +160,26 @@ def mean_joint_pd_over_phases(
     return tuple(value / N_PHASE_NODES for value in sums)
 
 
-def _pd_at_phases(mean_pd: np.ndarray, phase_factors: np.ndarray) -> np.ndarray:
+def _pd_at_phases(mean_pd: np.ndarray, relative_power_by_phase: np.ndarray) -> np.ndarray:
     """Return probabilities of detection at all speckle phases, (N_PHASE_NODES, ..., n).
 
     The probabilities are exp(-A / f), with the relative echo power f at each phase. A is found by
     bisection so that the mean over the phases is ``mean_pd`` (..., n).
     """
-    phase_factors = phase_factors.T.reshape(N_PHASE_NODES, *[1] * (mean_pd.ndim - 1), -1)
+    relative_power_by_phase = relative_power_by_phase.T.reshape(
+        N_PHASE_NODES, *[1] * (mean_pd.ndim - 1), -1
+    )
     is_defined = np.isfinite(mean_pd)
     target_pd = np.where(is_defined, mean_pd, 0.5)
     low, high = np.zeros(mean_pd.shape), np.full(mean_pd.shape, 700.0)
     for _ in range(50):
         exponent = 0.5 * (low + high)
-        is_above_target = np.exp(-exponent / phase_factors).mean(axis=0) > target_pd
+        is_above_target = np.exp(-exponent / relative_power_by_phase).mean(axis=0) > target_pd
         low, high = (
             np.where(is_above_target, exponent, low),
             np.where(is_above_target, high, exponent),
         )
-    return np.where(is_defined, np.exp(-0.5 * (low + high) / phase_factors), np.nan)
+    return np.where(is_defined, np.exp(-0.5 * (low + high) / relative_power_by_phase), np.nan)
 
 
 def lines_overlap_images(shots: Any) -> np.ndarray:

@@ -114,8 +114,8 @@ class RateTableArrays(NamedTuple):
     """(entries,): squared amplitude of each entry, over the noise power per quadrature."""
     half_squares: np.ndarray
     """(entries + 8,): half of the squared amplitudes."""
-    rates: np.ndarray
-    """(entries + 8,): relative rate of each entry."""
+    relative_rate_by_entry: np.ndarray
+    """(entries + 8,): relative rate of the entries, in the order of their amplitudes."""
     relative_rates: np.ndarray
     """(rows, columns): the table."""
 
@@ -212,7 +212,7 @@ def fill_rate_table(threshold_ratio, crossing_series, arrays):
     squared_amplitudes, half_squares, rates = (
         arrays.squared_amplitudes,
         arrays.half_squares,
-        arrays.rates,
+        arrays.relative_rate_by_entry,
     )
     n_entries = grid.entries_per_power * grid.n_columns
     n_below_threshold = INTEGER_ZERO

@@ -204,8 +204,8 @@ def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def tone_spectrum(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that gives the complex value of a bin at -2 .. 2 bins from a tone.
+def tone_spectrum_function(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function that gives the complex value of a bin at -2 .. 2 bins from a tone.
 
     The linear phase of half a record is removed, so that the value is real for a symmetric window.
     The remaining phase changes by at most one cycle. A polynomial thus represents the value to
@@ -228,7 +228,9 @@ def tone_spectrum(window: Window, fft_size: int) -> Callable[[np.ndarray], np.nd
 
 def _tone_magnitudes(window: Window, fft_size: int, offset: np.ndarray) -> np.ndarray:
     """Return |X| of three bins about single tones ``offset`` (m,) bins above the middle, (3, m)."""
-    return np.abs(tone_spectrum(window, fft_size)(np.array([[-1.0], [0.0], [1.0]]) - offset))
+    return np.abs(
+        tone_spectrum_function(window, fft_size)(np.array([[-1.0], [0.0], [1.0]]) - offset)
+    )
 
 
 def _least_squares_weights(

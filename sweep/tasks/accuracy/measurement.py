@@ -559,15 +559,24 @@ class AccuracyStoreTemplate:
     """
 
     sample: StudySample
+    """Sample of the study's points."""
     setting_ladder: SettingLadder
-    sample_rows: np.ndarray  # indices in the sample of the points that every setting has tried
-    trials_by_round: list[list[Trial]]  # trials of all these points, by round and setting
-    n_timed_points: np.ndarray  # (settings,): number of points that are timed together
+    """All settings, the reference last."""
+    sample_rows: np.ndarray
+    """Indices, in the sample, of the points on which all settings were tried."""
+    trials_by_round: list[list[Trial]]
+    """Trials on all these points, by round and setting."""
+    n_timed_points: np.ndarray
+    """(settings,): number of points that are timed together."""
     time_domain_differences: dict[int, np.ndarray]
-    """Differences of the reference from the time domain, by the point's number in the sample."""
-    n_time_domain_beamlets: int  # number of beamlets of both; 0 if that of the reference
-    stop_reason: StopReason  # reason why the sample is incomplete
-    storing_seconds: float = math.nan  # processor time of storing the study [s]
+    """Differences between the reference and the time domain, by :func:`result_differences`, at
+    points given by their indices in the sample."""
+    n_time_domain_beamlets: int
+    """Number of beamlets in this comparison; 0 for that of the reference setting."""
+    stop_reason: StopReason
+    """Reason why the sample is incomplete, if it is."""
+    storing_seconds: float = math.nan
+    """Processor time of storing the study [s]."""
 
     @property
     def model_version(self) -> str:

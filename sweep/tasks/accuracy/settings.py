@@ -150,8 +150,11 @@ class SettingLadder:
     """
 
     settings: tuple[AccuracySetting, ...]
-    reference_text: str  # description of the reference
+    """Settings in the order in which they are shown."""
+    reference_text: str
+    """Description of the reference, for users."""
     notes: tuple[str, ...] = ()
+    """Remarks for users on what is not tried, and why."""
 
     @property
     def reference(self) -> AccuracySetting:

@@ -90,14 +90,20 @@ AS_WRITTEN_SETTING = AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
 class SampleResults(NamedTuple):
     """Results that one accuracy setting gives at n points; nan where it gives no result."""
 
-    pd: np.ndarray  # (n, 4): probability of detection in up, Doppler, down segment, and shot
-    log10_pfa: np.ndarray  # (n, 2): log10 of the probability of false alarm of segment and shot
-    leakage: np.ndarray  # (n, 2): probability of leakage in up- and down-chirp
-    magnitude: np.ndarray  # (n, k): |X| of the peak bins, in a unit that all settings share
-    standard_error: np.ndarray  # (n,): largest standard error of pd, if it is a mean over draws
-    noise_sigma: np.ndarray  # (n,): noise of a bin per quadrature, in the unit of magnitudes
+    pd: np.ndarray
+    """(n, 4): probability of detection in up, Doppler, down segment, and shot."""
+    log10_pfa: np.ndarray
+    """(n, 2): log10 of the probability of false alarm of segment and shot."""
+    leakage: np.ndarray
+    """(n, 2): probability of a false peak by leakage, in up and down segment."""
+    magnitude: np.ndarray
+    """(n, k): |X| of the peak bin of each segment, in a unit that all settings share."""
+    standard_error: np.ndarray
+    """(n,): largest standard error of the four pd, if they are means over draws; else nan."""
+    noise_sigma: np.ndarray
+    """(n,): noise of a bin per quadrature, in the unit of ``magnitude``."""
     n_beamlets: np.ndarray
-    """Number of beamlets that sample the beam at each point (n,); in a flight, of rays cast."""
+    """(n,): number of beamlets that sample the beam; in a flight, number of rays per shot."""
 
 
 def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
@@ -149,9 +155,11 @@ class Trial(NamedTuple):
     """Results and computing time of one accuracy setting on some points."""
 
     results: SampleResults
+    """Results of the setting at the points."""
     seconds_per_point: float
     """Processor time per point of this process [s], including the time to plan its effects."""
-    planning_seconds_per_point: float  # processor time of planning per point [s]
+    planning_seconds_per_point: float
+    """Processor time per point to plan the effects [s]."""
 
 
 def merge_trials(trials: Sequence[Trial]) -> Trial:
@@ -187,11 +195,18 @@ class StudySample(ABC):
     """Base of the samples of a study's points. Accuracy settings are tried on these points."""
 
     points_noun = "points"
+    """What the points of the sample are called in messages."""
     spec: AnySpec
-    study_with_setting: Callable[[AccuracySetting], Any]  # returns the study with a setting
-    point_indices: np.ndarray  # (size,): indices of the points, by which they are computed
-    n_study_points: int  # number of points of the study, without the draws of a flight
-    timed_points_max: int  # largest number of points that are timed together
+    """Spec of the study."""
+    study_with_setting: Callable[[AccuracySetting], Any]
+    """Function that returns the study with an accuracy setting."""
+    point_indices: np.ndarray
+    """(size,): indices of the sampled points in the study. In a flight they count the sampled
+    shots."""
+    n_study_points: int
+    """Number of points of the study, without the draws of a flight."""
+    timed_points_max: int
+    """Largest number of points that are timed together."""
 
     @property
     def size(self) -> int:
