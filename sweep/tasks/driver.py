@@ -249,11 +249,11 @@ def extend(
     overwrite: bool = False,
     **options: Any,
 ) -> Outcome:
-    """Turn a store into that of a larger study, and compute only the new points.
+    """Turn a store into the store of a larger study, and compute only the new points.
 
     The larger study has further values on its axes, further axes, more draws or a tighter
     tolerance. It is computed in the same folder and replaces the store when it is complete. Its
-    bytes are those of the larger study run at once.
+    bytes are the same as if the larger study were run at once.
 
     Parameters
     ----------

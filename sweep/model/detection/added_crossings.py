@@ -192,14 +192,14 @@ def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, 
 
 @njit(cache=True, error_model="numpy")
 def any_crossing_probability(probabilities, first, last):
-    """Return the probability of any of several independent crossings, 1 - prod(1 - p).
+    """Return the probability that any of several independent bins crosses, 1 - prod(1 - p).
 
     Small results keep their precision.
 
     Parameters
     ----------
     probabilities : ndarray
-        Probability p of each crossing, 0..1.
+        Crossing probability p of each bin, 0..1.
     first, last : int
         The product is over the indices first .. last - 1.
     """

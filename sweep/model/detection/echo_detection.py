@@ -461,19 +461,17 @@ class SpeckleMixing(NamedTuple):
     """
 
     doppler_from_up: np.ndarray
-    """Weight of the up segment's amplitude in that of the Doppler segment, 0..1."""
+    """Weight of z_0, the up segment's amplitude, in the Doppler segment's amplitude, 0..1."""
     doppler_own: np.ndarray
-    """Weight of an independent amplitude in that of the Doppler segment, 0..1."""
+    """Weight of the independent z_1 in the Doppler segment's amplitude, 0..1."""
     down_from_up: np.ndarray
-    """Weight of the up segment's amplitude in that of the down segment, 0..1."""
+    """Weight of z_0, the up segment's amplitude, in the down segment's amplitude, 0..1."""
     down_from_doppler_re: np.ndarray
-    """Real part of the weight of the Doppler segment's independent amplitude in that of the down
-    segment."""
+    """Real part of the weight of z_1 in the down segment's amplitude."""
     down_from_doppler_im: np.ndarray
-    """Imaginary part of the weight of the Doppler segment's independent amplitude in that of the
-    down segment."""
+    """Imaginary part of the weight of z_1 in the down segment's amplitude."""
     down_own: np.ndarray
-    """Weight of an independent amplitude in that of the down segment, 0..1."""
+    """Weight of the independent z_2 in the down segment's amplitude, 0..1."""
 
     def broadcast(self, n_points: int) -> "SpeckleMixing":
         """Return the coefficients of n points as contiguous arrays (n,) that can be written to."""

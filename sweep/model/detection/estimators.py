@@ -36,8 +36,8 @@ before the FFT,
 
 [Rife and Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974; Kay, Fundamentals of Statistical Signal
 Processing: Estimation Theory, 1993, section 3.11]. This holds for a tone some bins away from DC and
-Nyquist, where the bound does not depend on its phase. For a complex tone, whose power over the
-noise power of I and Q together is cnr, the variance is half of that. The bound is that of the whole
+Nyquist, where the bound does not depend on its phase. For a complex tone, with cnr its power over
+the noise power of I and Q together, the variance is half of that. The bound is that of the whole
 record. A window attenuates samples, so the maximum of a windowed spectrum has a larger error
 (:func:`windowed_peak_deviation`), unless the window is undone first.
 
@@ -702,7 +702,7 @@ def range_velocity_deviation(
     radial_velocity: ArrayLike,
     slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
 ) -> RangeVelocityDeviation:
-    """Return the least standard deviations of range and radial velocity from those of the beats.
+    """Return the least deviations of range and radial velocity from the deviations of the beats.
 
     Parameters
     ----------

@@ -85,7 +85,7 @@ class LinePairGradients(NamedTuple):
     """
 
     strongest_bin_offset: tuple[np.ndarray, np.ndarray]
-    """Frequency [fs/L] of each segment's strongest bin less that of the line on the beam's axis.
+    """Frequency [fs/L] of each segment's strongest bin minus that of the line on the beam's axis.
     fs/L is the sample rate over the number of samples in the record."""
     line_shift: tuple[np.ndarray, np.ndarray]
     """Signed shift [fs/L] of each segment's line per standard deviation of the beam. fs/L is the
@@ -154,8 +154,8 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
 def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
     """Return the modulus of the speckle correlation (3) for a Gaussian window transform, (n,).
 
-    The transform is exp(-x^2 / (4 v)). The variance v is such that it falls to 1/2 at the same
-    distance as the window's own transform. All factors of the integrals are then Gaussian.
+    The transform is exp(-x^2 / (4 v)). The variance v is chosen so that the transform falls to 1/2
+    at the same distance as that of the window. All factors of the integrals are then Gaussian.
     """
     transform_variance = _half_maximum_distance(window) ** 2 / (4 * np.log(2))
     (shift_first, shift_second), (distance_first, distance_second) = (

@@ -8,9 +8,8 @@ of amplitude a sqrt(u). The rate of its bin is
     r(a sqrt(u)) = a^2 u rho(ln a + ln(u) / 2).
 
 The relative rate rho depends on the threshold alone, and is constant for faint signal. It is
-tabulated for a threshold at evenly spaced ln(a), such that the spacing of two speckle powers is a
-whole number of steps. A bin's rates at all powers are then weighted sums of a few rows of the
-table.
+tabulated for a threshold at evenly spaced ln(a), with a whole number of steps between successive
+speckle powers. A bin's rates at all powers are then weighted sums of a few rows of the table.
 """
 
 import math
@@ -65,8 +64,8 @@ _CERTAIN_MARGIN_SIGMA = 9.0
 """Excess of amplitude over threshold beyond which a bin's rate is set to CERTAIN_CROSSING_RATE, in
 units of the noise per quadrature."""
 _TABULATED_THRESHOLD_RATIO_MIN = 1e-3
-"""Smallest threshold over the noise per quadrature of which rates are tabulated. Smaller ones
-count as this one."""
+"""Smallest threshold, over the noise per quadrature, for which rates are tabulated. Smaller
+thresholds count as this one."""
 _ENTRIES_PER_POWER_MIN, _ENTRIES_PER_POWER_MAX = 4, 256
 """Smallest and largest number of table entries between two speckle powers."""
 
@@ -380,7 +379,7 @@ def add_entry_weights_of_bin(squared_ratio, rate_table, entry_weights):
     rate_table : SpeckleCrossingRates
         Crossing rates by squared amplitude and speckle power.
     entry_weights : ndarray
-        Weights of the entries, changed in place; its size is that of :func:`count_entry_weights`.
+        Weights of the entries, changed in place; its size is given by :func:`count_entry_weights`.
     """
     place = _rate_table_place(squared_ratio, rate_table)
     w = _interpolation_weights(place.fraction, squared_ratio)

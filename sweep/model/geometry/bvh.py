@@ -52,12 +52,12 @@ _DIRECTION_COMPONENT_MIN = 1e-200
 so that reciprocals are finite."""
 
 _EXIT_DISTANCE_FACTOR = 1.0 + 1e-14
-"""Factor by which the distance at which a ray leaves a box is increased. It exceeds the rounding
+"""Factor on the distance at which a ray leaves a box. Its excess over 1 is larger than the rounding
 error of this distance (5e-16)."""
 
 _TIE_DISTANCE_FACTOR = 1.0 + 1e-12
-"""Factor by which the distance of the nearest hit is increased before farther boxes are skipped.
-Rounding then skips no box that holds an equally near triangle."""
+"""Factor on the distance of the nearest hit beyond which boxes are skipped. With it, rounding skips
+no box that holds an equally near triangle."""
 
 _BUNDLE_TESTS_MAX = np.int64(128)
 """Largest number of triangles that are tested against a whole bundle of rays. Beyond it each ray of

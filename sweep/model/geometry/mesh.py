@@ -192,7 +192,7 @@ def plane_distances(
     Notes
     -----
     If a plane is so oblique that it lies along the ray within rounding, the hit may be anywhere on
-    the facet. The distance is then limited to those of its corners.
+    the facet. The distance is then limited to the interval between the distances of its corners.
     """
     normal_speed = dot(facet_normal, ray_direction)
     with np.errstate(all="ignore"):  # rays parallel to a plane

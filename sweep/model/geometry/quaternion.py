@@ -108,7 +108,7 @@ def from_heading(
     heading : ndarray or float
         Angle of the forward axis from the world's x, counter-clockwise from above [rad].
     pitch : ndarray or float
-        Angle by which the nose is raised after that [rad], a right-handed rotation about -y.
+        Angle by which the nose is then raised [rad], a right-handed rotation about -y.
     roll : ndarray or float
         Angle by which the left side is raised last [rad], a right-handed rotation about x.
     """

@@ -144,7 +144,7 @@ class BeamCycle:
     """(b, 3): directions of the beams in the body frame; vectors of any length above 0."""
     patterns: Sequence[Sequence[int]] | np.ndarray
     """(p, k): indices of the k beams in each of p patterns. Each measurement cycle fires the beams
-    of one pattern in their order, and the next cycle those of the next pattern."""
+    of one pattern in their order. The next cycle fires the next pattern."""
     rate: float
     """Number of measurement cycles per second [Hz], > 0."""
     interval: float | None = None

@@ -85,7 +85,7 @@ The first sequences only show which settings are slow.
 """
 
 FIRST_ROUND_TIME_FRACTION, TIME_DOMAIN_TIME_FRACTION = 0.6, 0.8
-"""Fractions of the time limit by which two stages are to end.
+"""Fractions of the time limit within which two stages are to end.
 
 The first is for the first round of trials, the second for the comparison with the time domain.
 """
