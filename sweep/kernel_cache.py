@@ -2,8 +2,8 @@
 
 The code of a compiled kernel contains the kernels that it calls and the constants that it reads.
 Numba's cache checks only the file of the kernel itself. After a change of another file it would
-continue with outdated code. Kernels are therefore cached in a folder named by a fingerprint. It
-covers all files of the model, and the libraries and settings that compile them:
+continue with outdated code. Kernels are therefore cached in a folder named by a fingerprint. The
+fingerprint covers all files of the model, and the libraries and settings that compile them:
 
     BASE/sweep-kernels-UID/FINGERPRINT
 
@@ -53,7 +53,7 @@ NUMBA_SETTINGS_OUTSIDE_FINGERPRINT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
 """Numba settings that do not change the compiled code, so the fingerprint leaves them out."""
 
 DEFAULT_NJIT_OPTIONS = {"nogil": True, "no_cfunc_wrapper": True}
-"""Default options of `numba.njit` for every kernel."""
+"""Options that `numba.njit` gets for every kernel, unless the kernel sets them itself."""
 
 _numba_settings: Any = numba.config
 _MODEL_DIR = Path(__file__).parent / "model"
@@ -132,8 +132,8 @@ class KernelCache(FunctionCache):
     A file that is damaged, truncated or unreadable counts as absent.
     """
 
-    borrows = False
-    """True if the kernel neither creates nor returns arrays, as declared to `njit`."""
+    borrows_arrays = False
+    """True if the kernel was declared, by `njit`, to neither create nor return arrays."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the kernel compiled for a signature, or None if it is not cached."""
@@ -154,7 +154,7 @@ class KernelCache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save a compiled kernel; log a warning once if it can't be saved."""
-        if self.borrows and _holds_arrays(data.signature.return_type):
+        if self.borrows_arrays and _holds_arrays(data.signature.return_type):
             name = data.fndesc.qualname
             raise TypeError(f"{name} borrows arrays, and returns {data.signature.return_type}")
         if not _CacheState.can_write:
@@ -182,7 +182,7 @@ class KernelCache(FunctionCache):
 
 
 def is_compiled(kernel: Any) -> bool:
-    """Return True if a kernel is compiled, in this process or in the cache, for any arguments."""
+    """Return True if a kernel is compiled, in this process or in the cache, for some signature."""
     if not isinstance(kernel, Dispatcher) or kernel.signatures:
         return True  # no Dispatcher: NUMBA_DISABLE_JIT is set, and nothing is compiled
     cache_path, name = kernel.stats.cache_path, kernel.py_func.__name__
@@ -196,7 +196,7 @@ def _holds_arrays(kind: Any) -> bool:
 
 
 def _enable_cache(kernel: Any, borrows: bool) -> None:
-    """Let numba cache a kernel in this process's cache folder, if it has one.
+    """Let numba cache a kernel in this process's cache folder, if there is one.
 
     `borrows` declares that the kernel neither creates nor returns arrays, as in `njit`.
     """
@@ -212,7 +212,7 @@ def _enable_cache(kernel: Any, borrows: bool) -> None:
             kernel_cache = KernelCache(kernel.py_func)
         except RuntimeError:  # numba found no writable cache folder for this file
             return
-    kernel_cache.borrows = borrows
+    kernel_cache.borrows_arrays = borrows
     if folder.path in Path(kernel_cache.cache_path).parents:
         # Numba's `enable_caching` sets the same attribute to its own cache class. Numba has no
         # public way to set another class. Its own class raises on a damaged file, and may load
@@ -284,7 +284,7 @@ def create_private_folder(root: Path) -> None:
 
 @cache
 def _model_file_stats() -> dict[str, tuple[str, int, int]]:
-    """Return name, size [bytes] and modification time [ns] of each model file, by its path."""
+    """Return each model file's name, size [bytes] and modification time [ns], by its full path."""
     return {
         str(path): (path.relative_to(_MODEL_DIR).as_posix(), status.st_size, status.st_mtime_ns)
         for path in sorted(_MODEL_DIR.rglob("*.py"))

@@ -78,9 +78,9 @@ class EscapedTextError(Exception):
 class EscapingStream:
     """Text stream that escapes unprintable characters.
 
-    It has no attribute `buffer`, so that no output bypasses it. Rich, which writes escape sequences
-    of its own, uses the wrapped stream `rich_proxied_file`; the text that rich prints is escaped
-    before.
+    It has no attribute `buffer`, so that no output bypasses it. Rich writes escape sequences of its
+    own, and therefore to the wrapped stream, `rich_proxied_file`. Text must be escaped before rich
+    prints it.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -110,8 +110,8 @@ _runs_as_command = False
 """True while the `sweep` command runs."""
 
 EXIT_MISTAKE, EXIT_INCOMPLETE = 2, 3
-"""Exit codes of the command for a user's mistake, and for a run that ended before all its
-blocks."""
+"""Exit codes of the command: for a user's mistake, and for a run that ended before all blocks were
+computed."""
 
 
 class Placeholder(str):
@@ -214,7 +214,7 @@ def option_text(name: str, value: object = True) -> str:
 
 
 def option_name(name: str) -> str:
-    """Return the name of an option of the command, or of an argument of the call.
+    """Return the name of an option as in a shell command, or of an argument as in a Python call.
 
     Examples
     --------

@@ -22,7 +22,7 @@ _FILE_TYPE_NAMES = {
 """Name of each type of file other than regular files."""
 
 READ_BUFFER_BYTES = 1 << 20
-"""Number of bytes read at a time if the content is not kept in memory."""
+"""Number of bytes read at a time from a file whose content is not kept in memory."""
 
 
 class RefusedFileError(OSError):
@@ -154,7 +154,9 @@ def read_regular_file(path: str | Path, bytes_max: int) -> bytes:
 def read_file_below_root(
     root: str | Path, name: str, bytes_max: int, byte_slice: slice = slice(None)
 ) -> bytes:
-    """Return the bytes ``byte_slice`` of a regular file opened as by :func:`open_file_below_root`.
+    """Return the bytes ``byte_slice`` of a regular file below the directory ``root``.
+
+    The file is opened by :func:`open_file_below_root`.
 
     Raises
     ------
@@ -189,7 +191,7 @@ class FileStream(NamedTuple):
     size: int
     """Size of the file [bytes]."""
     pieces: Iterator[bytes]
-    """Content of the file in pieces, which are read as they are asked for."""
+    """Content of the file in pieces; each is read when the iterator advances."""
 
 
 @contextmanager

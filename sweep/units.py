@@ -31,7 +31,7 @@ LOGARITHMIC_UNITS = {
     "dBm": ("W", Fraction(1, 1000)),
     "dBW": ("W", Fraction(1)),
 }
-"""Logarithmic units of power: the SI unit, and its value at 0 dB.
+"""Logarithmic units of power. Each has an SI unit, and the value of 0 dB in that SI unit.
 
 30 dBm is 1 W, and -155 dB/Hz is 10^-15.5 /Hz. For the noise of a laser dB/Hz is also written as
 dBc/Hz.
@@ -44,8 +44,8 @@ _NUMBER_PATTERN = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
 """Pattern of a number in decimal notation."""
 _POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
 """Pattern of a power of two integers, such as ``2^17``."""
-_EXPONENT_MAX = 999
-"""Largest magnitude of the exponent in a power, such as ``10^-3``."""
+_POWER_EXPONENT_MAX = 999
+"""Largest magnitude of the exponent in a written power, such as ``10^-3``."""
 _UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
 """Pattern of text after a number, if that text may be a unit."""
 _QUANTITY_PATTERN = re.compile(
@@ -151,7 +151,7 @@ class Unit:
     symbol: str
     """The unit as text; empty for a pure number."""
     factor: Fraction = Fraction(1)
-    """SI value of one unit; of 0 dB for logarithmic units."""
+    """Value of one such unit in SI units; for a logarithmic unit the value of 0 dB."""
     offset: Fraction = Fraction(0)
     """SI value of 0 in this unit, such as 273.15 K for degC."""
 
@@ -211,7 +211,7 @@ def read_number(
     is_power_ratio : bool
         True if the number may be written in decibels, such as ``"-3 dB"``.
     is_valid : callable
-        Test of a number that errors may suggest.
+        Function that returns True for a number that an error may suggest.
 
     Returns
     -------
@@ -348,7 +348,7 @@ def read_unit(unit_text: str, *, si_unit: str, example: str) -> Unit:
 
 
 def _wrong_dimension_error(unit_text: str, si_unit: str, example: str) -> tuple[str, str]:
-    """Return rule and suggestion for a unit of the wrong dimension."""
+    """Return rule and suggestion of the error for a unit of the wrong dimension."""
     dbm_example = " or '30 dBm'" if (si_unit, unit_text) == ("W", DECIBEL) else ""
     return (
         f"needs a unit like {si_unit}, and '{unit_text}' is none",
@@ -384,15 +384,15 @@ def _parse_power(base: int, exponent: str) -> Fraction:
     """Return an exact power, such as ``2^17`` or ``10^-3``, with an integer exponent."""
     if "." in exponent:
         raise QuantityError("has an exponent that is no whole number")
-    if abs(int(exponent)) > _EXPONENT_MAX:
-        raise QuantityError(f"has an exponent beyond {_EXPONENT_MAX} to either side")
+    if abs(int(exponent)) > _POWER_EXPONENT_MAX:
+        raise QuantityError(f"has an exponent beyond {_POWER_EXPONENT_MAX} to either side")
     if base == 0 and int(exponent) < 0:
         raise QuantityError("divides by zero")
     return Fraction(base) ** int(exponent)
 
 
 def _grouped_digits_error(text: str, number: str) -> tuple[str, str]:
-    """Return rule and suggestion for a number with grouped digits or a decimal comma."""
+    """Return rule and suggestion of the error for grouped digits or a decimal comma."""
     *groups, last_group = re.split(r"[,_'\s]", number)
     remedies = []
     if "," not in number or (len(last_group) == 3 and "." not in number):

@@ -16,7 +16,7 @@ from sweep.cli.terminal import (
     ALLOW_CODE_OPTION,
     EXIT_INCOMPLETE,
     EXIT_MISTAKE,
-    FORMAT_OPTION,
+    FIGURE_FORMAT_OPTION,
     OVERWRITE_OPTION,
     SPEC_ARGUMENT,
     STORE_ARGUMENT,
@@ -64,7 +64,7 @@ def _escape_output_streams() -> None:
             setattr(sys, name, EscapingStream(stream))
 
 
-class _StandardErrorHandler(logging.StreamHandler[Any]):
+class _StderrLogHandler(logging.StreamHandler[Any]):
     """Log handler that writes to the current standard error, above a progress bar if any.
 
     Python's handler of last resort also looks up the stream at each write.
@@ -89,7 +89,7 @@ def _enable_logging(ctx: click.Context, _: click.Parameter, verbosity: int) -> N
     """Write the package's log to standard error: steps with -v, and each task with -vv."""
     if not verbosity:
         return
-    log, handler = logging.getLogger("sweep"), _StandardErrorHandler()
+    log, handler = logging.getLogger("sweep"), _StderrLogHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
     level, propagates = log.level, log.propagate
     log.addHandler(handler)
@@ -264,14 +264,15 @@ def run(
 
     if overwrite and resuming:
         raise click.UsageError("--overwrite starts again, and --resume continues: give one of them")
-    study_spec, path = load(spec), store or _default_store(spec)
+    study_spec, path = load(spec), store or _default_store_path(spec)
     if can_create_store(path) or not resuming:  # else the user confirmed when the study began
         confirm_large_study(study_spec, path, yes=yes)
     outcome = driver.run(study_spec, store=path, overwrite=overwrite, resume=resuming, **options)
     print_outcome_and_exit(outcome, shorten_path(path))
 
 
-def _default_store(spec: Path) -> Path:
+def _default_store_path(spec: Path) -> Path:
+    """Return the path of the store of a spec file, if the user names none."""
     return Path("results") / f"{spec.stem}.zarr"
 
 
@@ -321,8 +322,8 @@ def plan(spec: Path, workers: int | None) -> None:
         from sweep.spec import load
 
         study_spec = load(spec)
-        rows = list(plan_rows(study_spec, _default_store(spec), workers))
-        effects = study_effects_table(study_spec, _default_store(spec))
+        rows = list(plan_rows(study_spec, _default_store_path(spec), workers))
+        effects = study_effects_table(study_spec, _default_store_path(spec))
     if alarms := false_alarm_text(study_spec):
         rows.append(("false alarms", alarms))
     # All rows are computed before printing: each may find a point that can't be simulated.
@@ -330,7 +331,7 @@ def plan(spec: Path, workers: int | None) -> None:
         click.echo(wrap_text(f"{name:>12}  {value}", 2 + len(name)))
     print_effects(effects)
     print_spec_warnings(study_spec)
-    print_echo_warnings(study_spec, _default_store(spec))
+    print_echo_warnings(study_spec, _default_store_path(spec))
 
 
 @main.command()
@@ -341,7 +342,7 @@ def plan(spec: Path, workers: int | None) -> None:
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise [the spec's].")
 @output_dir_option("Directory of the figure [results/<name of the spec>].")
-@FORMAT_OPTION
+@FIGURE_FORMAT_OPTION
 def shot(
     spec: Path, at: tuple[str, ...], noise: bool, seed: int | None, output: Path | None, form: str
 ) -> None:
@@ -436,7 +437,7 @@ def accuracy(
 @main.command()
 @STORE_ARGUMENT
 @output_dir_option("Directory of the figures [NAME-figures next to NAME.zarr].")
-@FORMAT_OPTION
+@FIGURE_FORMAT_OPTION
 def figures(store: Location, output: Path | None, form: str) -> None:
     """Draw the figures and tables of the study in STORE."""
     from sweep.tasks.engine.progress import show_activity

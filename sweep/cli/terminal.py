@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.study_plan import EffectRow, EffectsTable, StudyPlan
 
 ASK_ABOVE_POINTS, ASK_ABOVE_BYTES, ASK_ABOVE_CPU_SECONDS = 10**9, 10**12, 30 * 86400.0
-"""Size of a study above which a run asks for confirmation before it starts.
+"""Limits above which a run asks for confirmation before it starts.
 
-It is the number of points, the size of the results [bytes], and the time on one core [s].
+They are the number of points, the size of the results [bytes], and the time on one core [s].
 """
 
 WALL_TO_CPU_TIME_RATIO_NOTED_MIN = 1.3
-"""Wall time over processor time of this process above which a plan says that others compute."""
+"""Ratio of wall time to processor time above which a plan notes that the processors are busy."""
 
 MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
 """Number of points times draws of a study above which a run first estimates its time."""
@@ -191,7 +191,7 @@ DURABLE_OPTION = click.option(
 
 OVERWRITE_OPTION = click.option("--overwrite", is_flag=True, help="Replace an existing result.")
 
-FORMAT_OPTION = click.option(
+FIGURE_FORMAT_OPTION = click.option(
     "--format",
     "form",
     type=click.Choice(["png", "pdf", "svg"]),
@@ -436,7 +436,10 @@ def _print_scene_summary(store: Location) -> None:
 
 
 def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
-    """Return why the error of the number of beamlets is not checked; '' if it is estimated."""
+    """Return what is not checked about the number of beamlets, and why.
+
+    The text is empty if the error is estimated, or if no footprint is simulated.
+    """
     from sweep.model.beamlet_counts import BEAMLETS_PATH, beamlets_converge
 
     parameters = spec.parameters()
@@ -652,7 +655,10 @@ def plan_rows(
 
 
 def _time_parts_text(study_plan: StudyPlan) -> str:
-    """Return the parts of the processor time of a run in words, and what compiling adds."""
+    """Return the processor time of a run and of its parts in words.
+
+    The text mentions compilation if that is still to be done.
+    """
     from sweep.tasks.engine.progress import duration_text
 
     seconds_by_name: dict[str, float] = defaultdict(float)
@@ -750,13 +756,13 @@ def confirm_large_study(spec: GridSpec | SceneSpec, store: Location, *, yes: boo
 
 
 class _StudySize(NamedTuple):
-    """Size of a study, of which a user may be asked before it begins."""
+    """Size of a study, by which the user is asked for confirmation before a large one begins."""
 
-    points: int
+    n_points: int
     """Number of points."""
     size_bytes: int
     """Size of the results before compression [bytes]."""
-    seconds: float
+    cpu_seconds: float
     """Time on one core [s]; 0 if it is not estimated."""
 
 
@@ -770,23 +776,25 @@ def _study_size(spec: GridSpec | SceneSpec, store: Location) -> _StudySize:
     from sweep.tasks.studies.study_plan import plan_study
 
     computed_study = make_study(spec, store.absolute())
-    points, size_bytes = computed_study.n_points, computed_study.nbytes
-    draws = max(1, spec.draws.number, spec.draws.limit) if isinstance(spec, GridSpec) else 1
-    if points * draws <= MEASURE_TIME_ABOVE_POINT_DRAWS or _excessive_size_text(
-        points, size_bytes, 0.0
+    n_points, size_bytes = computed_study.n_points, computed_study.nbytes
+    n_draws = max(1, spec.draws.number, spec.draws.limit) if isinstance(spec, GridSpec) else 1
+    if n_points * n_draws <= MEASURE_TIME_ABOVE_POINT_DRAWS or _excessive_size_text(
+        n_points, size_bytes, 0.0
     ):
-        return _StudySize(points, size_bytes, 0.0)
-    return _StudySize(points, size_bytes, plan_study(spec, store_path=store).cpu_seconds)
+        return _StudySize(n_points, size_bytes, 0.0)
+    return _StudySize(n_points, size_bytes, plan_study(spec, store_path=store).cpu_seconds)
 
 
-def _excessive_size_text(points: int, size_bytes: int, seconds: float) -> str:
+def _excessive_size_text(n_points: int, size_bytes: int, cpu_seconds: float) -> str:
     """Return the sizes of a study that exceed the limits for asking, in words; '' for none."""
     from sweep.tasks.engine.progress import duration_text
 
-    excess_parts = [f"{points:,} points"] if points > ASK_ABOVE_POINTS else []
+    excess_parts = [f"{n_points:,} points"] if n_points > ASK_ABOVE_POINTS else []
     excess_parts += [decimal(size_bytes)] if size_bytes > ASK_ABOVE_BYTES else []
     excess_parts += (
-        [f"about {duration_text(seconds)} of one core"] if seconds > ASK_ABOVE_CPU_SECONDS else []
+        [f"about {duration_text(cpu_seconds)} of one core"]
+        if cpu_seconds > ASK_ABOVE_CPU_SECONDS
+        else []
     )
     return ", ".join(excess_parts)
 

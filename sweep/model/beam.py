@@ -104,9 +104,9 @@ class GaussianBeam(NamedTuple):
     """Rayleigh range pi w^2 / (M^2 lambda) [m], with the radius w at the telescope and the beam
     quality M^2.
     """
-    focus_curvature: np.ndarray | float = 0.0
-    """Curvature of the wavefront at the telescope [1/m], 1 over the distance of the focus. It is 0
-    for a collimated beam.
+    wavefront_curvature: np.ndarray | float = 0.0
+    """Curvature of the wavefront at the telescope [1/m], 1 over the distance of the focus; 0 for a
+    collimated beam.
     """
 
     @classmethod
@@ -156,7 +156,7 @@ class GaussianBeam(NamedTuple):
         -----
         w(R)^2 = w_a^2 ((1 - R/f)^2 + (R/z_R)^2).
         """
-        defocus = 1 / np.asarray(range, float) - self.focus_curvature
+        defocus = 1 / np.asarray(range, float) - self.wavefront_curvature
         return np.asarray(2 * self.waist * np.hypot(defocus, 1 / self.rayleigh_range))
 
     def radius(self, range: ArrayLike) -> np.ndarray:
@@ -354,7 +354,7 @@ def range_loss_coefficients(
     distance = np.asarray(parameters["target.range"] if range is None else range, float)
     coefficient_sums = [np.asarray(0.0)] * 3
     for beam in transmitted_and_oscillator_beams(parameters):
-        squared_waist, focus_ratio = beam.waist**2, beam.focus_curvature * distance
+        squared_waist, focus_ratio = beam.waist**2, beam.wavefront_curvature * distance
         quadratic_term = focus_ratio**2 + (distance / beam.rayleigh_range) ** 2
         coefficients = (
             1 - 2 * focus_ratio + quadratic_term,
@@ -390,7 +390,7 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
         math.pi
         * (diameter / 2) ** 2
         / parameters[WAVELENGTH_PATH]
-        * (1 / distance - transmitted_beam.focus_curvature)
+        * (1 / distance - transmitted_beam.wavefront_curvature)
     )
     efficiency = truncation_efficiency(2 * transmitted_beam.waist / diameter, rim_phase)
     if np.any(parameters[OSCILLATOR_WAIST_PATH]):
@@ -426,7 +426,7 @@ def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np
     )
 
 
-def axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
+def beam_axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
     """Return the distance [m] between the axes of transmitted and received beam at the target.
 
     Parameters
@@ -451,7 +451,7 @@ def axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
 
 
 def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
-    """Return the fraction of a single mode's echo that remains if its axes are apart, 0..1.
+    """Return the fraction of a single mode's echo that remains with offset beam axes, 0..1.
 
     The axes are those of the transmitted and the received beam at the target.
 
@@ -464,12 +464,12 @@ def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.nda
 
     Notes
     -----
-    exp(-2 d^2 / (w_T^2 + w_L^2)), with the offset d of :func:`axis_offset`.
+    exp(-2 d^2 / (w_T^2 + w_L^2)), with the offset d of :func:`beam_axis_offset`.
     """
     squared_radii = sum(
         beam.radius(range) ** 2 for beam in transmitted_and_oscillator_beams(parameters)
     )
-    return np.asarray(np.exp(-2 * axis_offset(parameters, range) ** 2 / squared_radii))
+    return np.asarray(np.exp(-2 * beam_axis_offset(parameters, range) ** 2 / squared_radii))
 
 
 _UNTRUNCATED_FILL_RATIO_MAX = 0.25
@@ -538,15 +538,16 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
 
 @lru_cache(maxsize=1)
 def _truncation_table() -> np.ndarray:
-    """Return cubic spline coefficients of :func:`truncation_efficiency`.
+    """Return cubic spline coefficients of :func:`truncation_efficiency`, (fill ratios, phases).
 
-    The axes are the angle whose cosine falls from 1 to -1 over the fill ratios, and the root of the
-    defocus phase. The efficiency is even in both at their ends, as ``mode="mirror"`` takes it. The
-    table goes on beyond the largest phase, whose end is none.
+    Rows have equal steps of an angle whose cosine falls from 1 to -1 over the fill ratios. Columns
+    have equal steps of the root of the defocus phase. The efficiency is even about both ends of the
+    angle and about phase 0, as ``mode="mirror"`` assumes. It is not even about the largest phase,
+    so the table has further columns. Interpolation errs by 8e-5.
 
-    Interpolation errs by 8e-5. In the far field a field exp(-c r^2) of the unit circle, c = (a/w)^2
-    - i defocus, becomes its Hankel transform. The integral of the fourth power of the untruncated
-    beam is 1 / (32 |c|^2 Re c).
+    The field exp(-c r^2) in the unit circle, with c = (a/w)^2 - i defocus, becomes its Hankel
+    transform in the far field. The integral of the fourth power of the untruncated beam is 1 / (32
+    |c|^2 Re c).
     """
     from scipy.ndimage import spline_filter  # slow to import, and rarely needed
 

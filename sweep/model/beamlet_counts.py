@@ -1,7 +1,7 @@
 """Number of a footprint's beamlets, derived from the accuracy.
 
-``footprint.beamlets`` 0 leaves the number to ``accuracy.tolerance``. If powers add, the largest
-bin's magnitude r is then accurate to a fraction of itself for which pd is within a quarter of the
+``footprint.beamlets`` 0 leaves the number to ``accuracy.tolerance``. If powers add, the number is
+such that the relative error of the largest bin's magnitude r changes pd by at most a quarter of the
 tolerance. With a = r over sigma, and b the threshold over sigma,
 
     |d Q_1(a, b) / d ln a| <= sqrt(a b / (2 pi)),   a (a - b) = 1/2 at its largest,
@@ -69,7 +69,7 @@ PATTERN_PATH = "footprint.pattern"
 _RAY_GROWTH_MIN, _RAY_GROWTH_MAX = 2, 10
 """Smallest and largest factor by which a shot's number of rays increases when it is cast again."""
 
-_UNRELIABLE_ERROR_RAYS_MAX = 19
+_UNRELIABLE_ERROR_RAY_COUNT_MAX = 19
 """Number of rays up to which the estimated error is unreliable. So few rays make smooth ground look
 far rougher than it is."""
 
@@ -88,22 +88,22 @@ NODE_COUNTS_ACROSS_SLOPE = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
 
 _UNIFORM_QUADRATURE_ERROR = 1e-10
 """Relative error of evenly spaced quadrature nodes, from the Gaussian's tails outside them."""
-_TABLE_WINDOW_SAMPLES = 1024
+_N_TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the windows from which tables of quadrature errors are computed."""
 _N_LAGS = 4096
 """Number of lags of a window's autocorrelation for quadrature errors by spread of the lines."""
 _N_CURVATURE_LAGS = 512
 """Number of lags of a window's autocorrelation for quadrature errors by curvature of the range."""
-_CURVATURES = np.geomspace(1e-6, 100.0, 97)
+_TABULATED_CURVATURES = np.geomspace(1e-6, 100.0, 97)
 """Curvatures for which quadrature errors are tabulated [bins of fs/L]. A curvature c shifts a line
 by c x^2, with x in standard deviations of the beam."""
-_CURVATURE_PHASES = np.geomspace(1e-6, 1e3, 512)
+_TABULATED_QUADRATIC_PHASES = np.geomspace(1e-6, 1e3, 512)
 """Coefficients t [rad] of the phase t x^2 for which quadrature errors are tabulated. x is the
 position in the beam [standard deviations]."""
-_CURVATURE_RATIOS = np.geomspace(1e-6, 1e3, 97)
+_TABULATED_SPREAD_RATIOS = np.geomspace(1e-6, 1e3, 97)
 """Ratios of the lines' quadratic to their linear spread for which quadrature errors are tabulated.
 """
-_CHEBYSHEV_MULTIPLES = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
+_CHEBYSHEV_DISTANCES_SIGMA = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
 """Distances from the mean [standard deviations] at which Chebyshev's inequality is evaluated. The
 best of the resulting bounds is used."""
 
@@ -170,7 +170,7 @@ def split_with_beamlet_counts(
         n_beamlets, pattern, beamlets_error = np.asarray(1), np.asarray("line"), np.asarray(0.0)
         if "footprint" in effects:
             if beamlets_converge(category_parameters):
-                n_beamlets, pattern, beamlets_error = required_beamlets(
+                n_beamlets, pattern, beamlets_error = required_beamlet_count_and_pattern(
                     category_parameters, indices.size
                 )
             else:
@@ -239,7 +239,7 @@ def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -
     if not larger_counts.size:
         return np.zeros(error_ratio.shape, np.int64)
     wanted_counts = n_rays * np.minimum(
-        error_ratio, _RAY_GROWTH_MAX if n_rays > _UNRELIABLE_ERROR_RAYS_MAX else 1
+        error_ratio, _RAY_GROWTH_MAX if n_rays > _UNRELIABLE_ERROR_RAY_COUNT_MAX else 1
     )
     count_index = np.minimum(np.searchsorted(larger_counts, wanted_counts), larger_counts.size - 1)
     return np.where(error_ratio > 1, larger_counts[count_index], 0)
@@ -268,7 +268,7 @@ def has_numerics_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
-    """Return True if the error of points falls to 0 with more beamlets.
+    """Return True if errors fall to 0 as the number of beamlets increases.
 
     All points share text parameters.
     """
@@ -278,7 +278,7 @@ def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
     )
 
 
-def required_beamlets(
+def required_beamlet_count_and_pattern(
     parameters: Mapping[str, np.ndarray], n_points: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the number of beamlets needed for the tolerance, for points whose powers add.
@@ -300,16 +300,18 @@ def required_beamlets(
         Remaining error of the probabilities of detection, summed over the segments.
     """
     budget, error_budget = LinkBudget(parameters), ErrorBudget.from_parameters(parameters)
-    pd_change_per_power = _pd_change_per_power(budget) + np.zeros(n_points)
+    pd_change_per_power = _pd_change_per_relative_power(budget) + np.zeros(n_points)
     power_tolerance = error_budget.allowed_beamlets_error / pd_change_per_power
     window_name = budget.record.window.name
-    spread = _line_spread(budget, n_points, error_budget.beamlets_max)
-    n_lines, n_nodes, error = required_nodes(window_name, spread, power_tolerance, error_budget)
+    spread = _line_spread_coefficients(budget, n_points, error_budget.beamlets_max)
+    n_lines, n_nodes, error = required_node_counts(
+        window_name, spread, power_tolerance, error_budget
+    )
     pattern = np.where(n_lines == 1, "line", np.char.add(n_lines.astype(str), " lines"))
     return n_lines * n_nodes, pattern, np.minimum(error * pd_change_per_power, 1.0)
 
 
-def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
+def _pd_change_per_relative_power(budget: LinkBudget) -> np.ndarray:
     """Return a bound on the change of pd per relative change of a bin's power, (n,).
 
     The changes of pd, the probability of detection, are summed over all segments. See the module's
@@ -321,7 +323,9 @@ def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
     return np.asarray(_N_SEGMENTS * slope_max / 2)
 
 
-def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSpreadCoefficients:
+def _line_spread_coefficients(
+    budget: LinkBudget, n_points: int, beamlets_max: int
+) -> LineSpreadCoefficients:
     """Compute the :class:`LineSpreadCoefficients` of the footprints of n points [bins of fs/L].
 
     `beamlets_max` is the largest number of beamlets. It determines the largest distance of a
@@ -437,7 +441,7 @@ def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
     return np.max(frequencies, axis=0) - np.min(frequencies, axis=0)
 
 
-def required_nodes(
+def required_node_counts(
     window_name: str,
     spread: LineSpreadCoefficients,
     tolerance: np.ndarray,
@@ -472,13 +476,13 @@ def required_nodes(
     )
     table_index = np.searchsorted(tabulated_spreads, spread.deviation)  # of the next wider
     single_line_error = (
-        _single_node_line_error(window_name, spread) / largest_bin_powers[table_index]
+        _single_line_quadrature_error(window_name, spread) / largest_bin_powers[table_index]
     )
     counts = NODE_COUNTS_ALONG_SLOPE[
         : np.searchsorted(NODE_COUNTS_ALONG_SLOPE, error_budget.beamlets_max, "right")
     ]
     total_error = tabulated_errors[: counts.size, table_index] + single_line_error
-    count_index, error = _cheapest_within_tolerance(total_error, counts[:, None], tolerance)
+    count_index, error = _choose_cheapest_within_tolerance(total_error, counts[:, None], tolerance)
     n_lines = np.ones(count_index.shape, np.int64)
     needs_lines = (error > tolerance) & (
         single_line_error > error_budget.single_node_line_fraction * tolerance
@@ -500,7 +504,7 @@ def required_nodes(
     return n_lines, NODE_COUNTS_ALONG_SLOPE[count_index], np.minimum(error, 1.0)
 
 
-def _cheapest_within_tolerance(
+def _choose_cheapest_within_tolerance(
     error: np.ndarray, cost: np.ndarray, tolerance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose, for each of n points, the cheapest of several alternatives within a tolerance.
@@ -531,7 +535,7 @@ def _choose_node_lines(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose the numbers of nodes and lines of nodes where a single line is too inaccurate.
 
-    A node is a beamlet. The parameters are those of :func:`required_nodes`.
+    A node is a beamlet. The parameters are those of :func:`required_node_counts`.
 
     Returns
     -------
@@ -553,7 +557,7 @@ def _choose_node_lines(
     # If curvature alone spreads the lines, only the rules' error for squares counts.
     linear_deviation = spread.deviation * np.minimum(linear_max / quadratic_max, 1.0)
     largest_bin_power = largest_bin_powers[np.searchsorted(tabulated_spreads, spread.deviation)]
-    curvature_index = np.searchsorted(_CURVATURES, quadratic_max)
+    curvature_index = np.searchsorted(_TABULATED_CURVATURES, quadratic_max)
     error_along = (
         tabulated_errors[:, np.searchsorted(tabulated_spreads, linear_deviation)]
         + errors_along[:, curvature_index] / largest_bin_power
@@ -561,18 +565,20 @@ def _choose_node_lines(
     error_across = np.zeros((NODE_COUNTS_ACROSS_SLOPE.size, quadratic_max.size))
     for s, c in zip(spread.smoothing_deviation, spread.quadratic_spread, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.searchsorted(_CURVATURE_RATIOS, np.where(s > 0, c / s, np.inf))
-            smoothed_error = _smoothed_errors_by_curvature()[:, ratio] * (
-                _autocorrelation_peak(window_name) / (2 * np.pi * s)
+            ratio = np.searchsorted(_TABULATED_SPREAD_RATIOS, np.where(s > 0, c / s, np.inf))
+            smoothed_error = _smoothed_quadrature_errors()[:, ratio] * (
+                _autocorrelation_peak_density(window_name) / (2 * np.pi * s)
             )
-        segment_error = np.fmin(errors_across[:, np.searchsorted(_CURVATURES, c)], smoothed_error)
+        segment_error = np.fmin(
+            errors_across[:, np.searchsorted(_TABULATED_CURVATURES, c)], smoothed_error
+        )
         error_across = np.maximum(error_across, segment_error / largest_bin_power)
     total_error = error_along[:, None] + error_across
     cost = NODE_COUNTS_ALONG_SLOPE[:, None] * NODE_COUNTS_ACROSS_SLOPE
     total_error = np.where((cost <= beamlets_max)[..., None], total_error, np.inf).reshape(
         -1, quadratic_max.size
     )
-    best, error = _cheapest_within_tolerance(total_error, cost.reshape(-1, 1), tolerance)
+    best, error = _choose_cheapest_within_tolerance(total_error, cost.reshape(-1, 1), tolerance)
     return (
         best // NODE_COUNTS_ACROSS_SLOPE.size,
         NODE_COUNTS_ACROSS_SLOPE[best % NODE_COUNTS_ACROSS_SLOPE.size],
@@ -580,20 +586,22 @@ def _choose_node_lines(
     )
 
 
-def _single_node_line_error(window_name: str, spread: LineSpreadCoefficients) -> np.ndarray:
+def _single_line_quadrature_error(window_name: str, spread: LineSpreadCoefficients) -> np.ndarray:
     """Return the quadrature error of a single line of nodes due to curvature, (n,).
 
     The error is in units of the power of a bin on which a spectral line is centred. The factor 2
     includes the equal error along the slope with the fewest nodes.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
+        density = _autocorrelation_peak_density(window_name) / (
+            2 * np.pi * spread.smoothing_deviation
+        )
         smoothed_error = (
             density
             * math.sqrt(np.pi / 2)
             * (spread.quadratic_spread / spread.smoothing_deviation) ** 2
         )
-    lobe_shape = window_response(window_name, _TABLE_WINDOW_SAMPLES, _TABLE_WINDOW_SAMPLES)
+    lobe_shape = window_response(window_name, _N_TABLE_WINDOW_SAMPLES, _N_TABLE_WINDOW_SAMPLES)
     return np.asarray(
         2
         * np.fmin(lobe_shape.curvature_max * spread.quadratic_spread**2, smoothed_error).max(axis=0)
@@ -616,10 +624,10 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     """
     spreads = np.geomspace(1e-3, 400.0, 96)
     largest_bin_powers = _largest_bin_power(
-        window_response(window_name, _TABLE_WINDOW_SAMPLES, _TABLE_WINDOW_SAMPLES), spreads
+        window_response(window_name, _N_TABLE_WINDOW_SAMPLES, _N_TABLE_WINDOW_SAMPLES), spreads
     )
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
-    weight = _window_autocorrelation(window_name, lag)
+    weight = _normalised_autocorrelation(window_name, lag)
     errors = np.empty((NODE_COUNTS_ALONG_SLOPE.size, spreads.size + 1))
     for row, n_nodes in zip(errors, NODE_COUNTS_ALONG_SLOPE.tolist(), strict=True):
         row[:] = np.append(_substitute_for_unbounded_error(spreads, n_nodes), np.inf)
@@ -656,26 +664,31 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
     Returns
     -------
     along : ndarray (counts, m + 1)
-        Errors of NODE_COUNTS_ALONG_SLOPE along the slope, at _CURVATURES and beyond the largest.
+        Errors of NODE_COUNTS_ALONG_SLOPE along the slope, at _TABULATED_CURVATURES and beyond the
+        largest.
     across : ndarray (lines, m + 1)
         Errors of NODE_COUNTS_ACROSS_SLOPE across the slope.
     """
     lag = (np.arange(_N_CURVATURE_LAGS) + 0.5) / _N_CURVATURE_LAGS
-    weight = _window_autocorrelation(window_name, lag)
-    phase = 2 * np.pi * lag * _CURVATURES[:, None]
+    weight = _normalised_autocorrelation(window_name, lag)
+    phase = 2 * np.pi * lag * _TABULATED_CURVATURES[:, None]
 
     def errors_of_rule(n_nodes: int) -> np.ndarray:
         """Return the errors of a quadrature with `n_nodes` nodes, (m + 1,).
 
-        The errors apply at _CURVATURES; the last one applies beyond the largest curvature.
+        The errors are those at _TABULATED_CURVATURES; the last one is for larger curvatures.
         """
         rule_errors = (
             weight
-            * np.interp(phase, _CURVATURE_PHASES, _quadrature_error_for_quadratic_phase(n_nodes))
+            * np.interp(
+                phase, _TABULATED_QUADRATIC_PHASES, _quadrature_error_for_quadratic_phase(n_nodes)
+            )
         ).sum(axis=1)
         return np.append(
             np.where(
-                rule_errors < 1, rule_errors, _substitute_for_unbounded_error(_CURVATURES, n_nodes)
+                rule_errors < 1,
+                rule_errors,
+                _substitute_for_unbounded_error(_TABULATED_CURVATURES, n_nodes),
             ),
             1e3,
         )
@@ -687,19 +700,19 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
 
 
 @lru_cache(maxsize=1)
-def _smoothed_errors_by_curvature() -> np.ndarray:
+def _smoothed_quadrature_errors() -> np.ndarray:
     """Tabulate errors of node lines by curvature, smoothed by a linear spread.
 
-    Rows are NODE_COUNTS_ACROSS_SLOPE. Columns are _CURVATURE_RATIOS and one for larger ratios.
-    Errors are means over a Gaussian.
+    Rows are NODE_COUNTS_ACROSS_SLOPE. Columns are _TABULATED_SPREAD_RATIOS and one for larger
+    ratios. Each error is the mean over the Gaussian distribution of the linear spread.
     """
     phase = np.linspace(0.0, 8.0, 801)[1:]
     weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])
-    errors = np.full((NODE_COUNTS_ACROSS_SLOPE.size, _CURVATURE_RATIOS.size + 1), np.inf)
+    errors = np.full((NODE_COUNTS_ACROSS_SLOPE.size, _TABULATED_SPREAD_RATIOS.size + 1), np.inf)
     for row, lines in zip(errors, NODE_COUNTS_ACROSS_SLOPE.tolist(), strict=True):
         rule_errors = np.interp(
-            phase * _CURVATURE_RATIOS[:, None],
-            _CURVATURE_PHASES,
+            phase * _TABULATED_SPREAD_RATIOS[:, None],
+            _TABULATED_QUADRATIC_PHASES,
             _quadrature_error_for_quadratic_phase(2 * lines),
         )
         row[:-1] = (weight * rule_errors).sum(axis=1)
@@ -710,14 +723,16 @@ def _smoothed_errors_by_curvature() -> np.ndarray:
 def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
     """Return the largest error of a quadrature's mean of exp(i t x^2) up to each phase t.
 
-    x is normally distributed. The phases t are _CURVATURE_PHASES. The exact mean is 1 / sqrt(1 - 2
-    i t).
+    x is normally distributed. The phases t are _TABULATED_QUADRATIC_PHASES. The exact mean is 1 /
+    sqrt(1 - 2 i t).
     """
     x, w = gaussian_quadrature(n_nodes)
     rule_mean = np.array(
-        [(w * np.exp(1j * phase * x**2)).sum() for phase in _CURVATURE_PHASES.tolist()]
+        [(w * np.exp(1j * phase * x**2)).sum() for phase in _TABULATED_QUADRATIC_PHASES.tolist()]
     )
-    return np.maximum.accumulate(np.abs(rule_mean - 1 / np.sqrt(1 - 2j * _CURVATURE_PHASES)))
+    return np.maximum.accumulate(
+        np.abs(rule_mean - 1 / np.sqrt(1 - 2j * _TABULATED_QUADRATIC_PHASES))
+    )
 
 
 def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.ndarray:
@@ -727,33 +742,33 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
     :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for_spread`.
     """
     narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
-    wide = (1 - 1 / _CHEBYSHEV_MULTIPLES**2) * lobe_shape.central_energy_min
+    wide = (1 - 1 / _CHEBYSHEV_DISTANCES_SIGMA**2) * lobe_shape.central_energy_min
     return np.maximum(
         narrow,
-        (wide / (2 * _CHEBYSHEV_MULTIPLES * deviation + 2 * lobe_shape.padding_factor + 1)).max(
-            axis=0
-        ),
+        (
+            wide / (2 * _CHEBYSHEV_DISTANCES_SIGMA * deviation + 2 * lobe_shape.padding_factor + 1)
+        ).max(axis=0),
     )
 
 
-def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
+def _normalised_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
     """Return the magnitude of a window's autocorrelation at lags [record lengths].
 
     The magnitude is divided by the signed sum of the autocorrelation over all lags.
     """
-    w = window_samples(window_name, _TABLE_WINDOW_SAMPLES)
-    r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _TABLE_WINDOW_SAMPLES)) ** 2)[
-        : _TABLE_WINDOW_SAMPLES + 1
+    w = window_samples(window_name, _N_TABLE_WINDOW_SAMPLES)
+    r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _N_TABLE_WINDOW_SAMPLES)) ** 2)[
+        : _N_TABLE_WINDOW_SAMPLES + 1
     ]
-    at_lags = np.interp(lag * _TABLE_WINDOW_SAMPLES, np.arange(_TABLE_WINDOW_SAMPLES + 1), r)
+    at_lags = np.interp(lag * _N_TABLE_WINDOW_SAMPLES, np.arange(_N_TABLE_WINDOW_SAMPLES + 1), r)
     return np.asarray(np.abs(at_lags) / at_lags.sum())
 
 
 @lru_cache(maxsize=32)
-def _autocorrelation_peak(window_name: str) -> float:
+def _autocorrelation_peak_density(window_name: str) -> float:
     """Return the largest density of a window's autocorrelation over lags [1/record length]."""
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
-    return float(_window_autocorrelation(window_name, lag).max()) * _N_LAGS
+    return float(_normalised_autocorrelation(window_name, lag).max()) * _N_LAGS
 
 
 def _quadrature_error_for_cosine(n_nodes: int, phase: np.ndarray) -> np.ndarray:

@@ -125,8 +125,8 @@ class ErrorBudget:
 
     beamlets_fraction: float = 0.25
     """Fraction of the tolerance for the number of beamlets, if that number follows from the
-    tolerance. It is included in `effects_fraction`. Half of it costs one more step of
-    `NODE_COUNTS_ALONG_SLOPE` at most points.
+    tolerance. It is included in `effects_fraction`. Halving it costs most points one more step of
+    `NODE_COUNTS_ALONG_SLOPE`.
     """
 
     lines_fraction: float = 1.0
@@ -138,9 +138,9 @@ class ErrorBudget:
     """Fraction of the tolerance that is the default of `leakage_error`."""
 
     single_node_line_fraction: float = 0.1
-    """Part of the beamlets' tolerance that the error of a single line of beamlets may reach. The
-    error is that across the slope. Above it several parallel lines are tried. With a smaller value
-    they are tried at more points. The accuracy is the same.
+    """Fraction of the beamlets' tolerance up to which the error of a single line of beamlets is
+    accepted. The error is that across the slope. If it is larger, several parallel lines are
+    tried. With a smaller fraction they are tried at more points. The accuracy is the same.
     """
 
     beamlets_max: int = 4096
@@ -195,12 +195,12 @@ class ErrorBudget:
 
         Few lines then represent all beamlets.
         """
-        return self._stated_or_fraction(self.line_error, self.lines_fraction)
+        return self._stated_or_tolerance_fraction(self.line_error, self.lines_fraction)
 
     @property
     def allowed_leakage(self) -> np.ndarray:
         """Tolerated probability of a false peak due to leaked signal that is not evaluated."""
-        return self._stated_or_fraction(self.leakage_error, self.leakage_fraction)
+        return self._stated_or_tolerance_fraction(self.leakage_error, self.leakage_fraction)
 
     @property
     def allowed_beamlets_error(self) -> np.ndarray:
@@ -227,7 +227,7 @@ class ErrorBudget:
         errors = (np.asarray(self.line_error), np.asarray(self.leakage_error))
         return np.logical_or(*(error == AUTOMATIC for error in errors))
 
-    def _stated_or_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
+    def _stated_or_tolerance_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
         """Return a stated error, or a fraction of the tolerance where it is `AUTOMATIC`."""
         allowed = fraction * np.asarray(self.tolerance, float)
         return np.where(np.asarray(stated, float) == AUTOMATIC, allowed, stated)
@@ -391,8 +391,9 @@ def grouped_mean_half_width(
 
 
 GROUPED_VARIANCE_RATIO_MAX = 0.25
-"""Largest variance of a draw by the means of groups, over that of independent draws, with which
-these means count. Nearer to 1 the lesser of both estimates would be too small on average."""
+"""Ratio of the variance per draw estimated from the means of groups to that of independent draws,
+below which the estimate from groups is used. With a limit nearer to 1 the lesser of both estimates
+would be too small on average."""
 
 
 def variance_of_grouped_draws(
@@ -403,7 +404,7 @@ def variance_of_grouped_draws(
     group_size: int,
     confidence: ArrayLike,
 ) -> np.ndarray:
-    """Return the variance with which a draw of a whole group counts for a mean over groups.
+    """Return the effective variance of a draw in a whole group, for the variance of the total mean.
 
     Parameters
     ----------

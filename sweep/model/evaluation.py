@@ -137,9 +137,9 @@ def apply_effects(
     effects: Collection[str],
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Return prepared shots with all effects applied that are not random.
+    """Prepare shots, and apply all effects that are not random.
 
-    At first each shot has a single line, that on the beam's axis.
+    Before the effects each shot has a single line, that on the beam's axis.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def shot_statistics(
     snr = shots.snr(magnitude)
     false_alarms = _false_alarm_probabilities(shots, n_exempt)
     measured = measure_range_velocity(shots, segment_results)
-    is_range_misread, is_velocity_misread = find_misread(shots, measured)
+    is_range_misread, is_velocity_misread = find_misread_values(shots, measured)
     if shots.detection_settings.reported_peaks == waveform.STRONGEST_PEAK:
         strongest_peaks = strongest_peak_probabilities(shots, pd, miss, magnitude, is_range_misread)
         by_segment, of_shot = (result._asdict() for result in strongest_peaks)
@@ -308,7 +308,7 @@ MISREAD_TOLERANCE_BINS = 4
 rounding of three peaks to bins, and motion between and within records."""
 
 
-def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
+def find_misread_values(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     """Return whether noiseless spectra give a wrong range or radial velocity of the echo.
 
     Parameters

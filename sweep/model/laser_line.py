@@ -329,7 +329,7 @@ def apparent_line_and_pedestal(
     )
     gamma = np.broadcast_to(2 * np.pi * np.asarray(line_width) * duration, power.shape)
     lag = np.broadcast_to(np.minimum(np.asarray(delay) / duration, 1.0), power.shape)
-    w, double_integral = _window_at_nodes(window)
+    w, double_integral = _window_samples_and_double_integral(window)
     position, phase_variance, coherent_fraction = (
         np.arange(w.size) / w.size,
         gamma * lag,
@@ -383,7 +383,7 @@ def apparent_line_and_pedestal(
 
 
 @lru_cache(maxsize=16)
-def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
+def _window_samples_and_double_integral(window: Window) -> "tuple[np.ndarray, CubicSpline]":
     """Return samples of the window, and its double integral over the position in the record.
 
     The samples, (n,), are at evenly spaced positions and have the sum 1. The integral is a spline

@@ -213,10 +213,10 @@ class NoiseBudget:
 
 
 class EchoScales(NamedTuple):
-    """Echo power [W] and beat amplitude [V] of a target with a relative echo of 1/sr.
+    """Echo power [W] and beat amplitude [V] of a target whose relative echo is 1/sr.
 
-    The relative echo is the backscatter of the beamlets [1/sr]. Effects scale both, and change the
-    transmission of light from the ground that is kept with them.
+    The relative echo is the backscatter of the beamlets [1/sr]. Effects multiply the power, the
+    amplitude, and the transmission of other light from the ground.
     """
 
     echo_power: np.ndarray
@@ -231,7 +231,7 @@ class EchoScales(NamedTuple):
     def scale_echo(
         self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
     ) -> "EchoScales":
-        """Return the record with factors on the echo's power and on the beat's amplitude."""
+        """Return these scales with factors on the echo's power and on the beat's amplitude."""
         return self._replace(
             echo_power=self.echo_power * power_factor,
             beat_amplitude=self.beat_amplitude * amplitude_factor,
@@ -277,7 +277,7 @@ class LinkBudget:
 
     @cached_property
     def echo_scales(self) -> EchoScales:
-        """Echo power [W] and beat amplitude [V] of a target with a relative echo of 1/sr."""
+        """Echo power [W] and beat amplitude [V] of a target whose relative echo is 1/sr."""
         echo_power, current = echo_power_and_beat_current(
             self.waveform.architecture, self.parameters
         )

@@ -462,7 +462,7 @@ EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
 """Effects that were simulated in each shot, by name. A shot whose rays hit nothing has no effects.
 """
 
-_NAN_IF_FALSE_NOTE = "nan: a false one"
+_NAN_FOR_FALSE_POINT_NOTE = "nan: a false one"
 
 POINT_VARIABLES: dict[str, OutputVariable] = _with_dims(
     ("shot", "draw", "return_number"),
@@ -512,10 +512,10 @@ POINT_VARIABLES: dict[str, OutputVariable] = _with_dims(
         "surface": OutputVariable("1", "surface seen", "-1: none, or no true return", "int16"),
         "flags": OutputVariable("1", "what the point is", "0: no point", "uint8"),
         "true_range": OutputVariable(
-            "m", "true range of what the point has seen", _NAN_IF_FALSE_NOTE
+            "m", "true range of what the point has seen", _NAN_FOR_FALSE_POINT_NOTE
         ),
         "true_radial_velocity": OutputVariable(
-            "m s-1", "true radial velocity of what the point has seen", _NAN_IF_FALSE_NOTE
+            "m s-1", "true radial velocity of what the point has seen", _NAN_FOR_FALSE_POINT_NOTE
         ),
     },
 )

@@ -318,7 +318,7 @@ class Shots:
 
     @cached_property
     def bin_noise_sigma(self) -> np.ndarray:
-        """Noise standard deviation per quadrature of a bin [V, summed over the record], (n,)."""
+        """Noise standard deviation per quadrature of a bin [V, FFT not normalised], (n,)."""
         return self._bin_noise_sigma_from_variance(self.noise_variance)
 
     @cached_property
@@ -394,7 +394,7 @@ class Shots:
 
     @cached_property
     def threshold(self) -> np.ndarray:
-        """Threshold on a bin's magnitude [V, summed over the record], (n,)."""
+        """Threshold on a bin's magnitude [V, FFT not normalised], (n,)."""
         return threshold(
             self.detection_settings.tnr,
             self._bin_noise_sigma_from_variance(self.noise_variance_without_echo),
@@ -540,8 +540,9 @@ class Shots:
         """Frequencies [Hz] and chirp rates [Hz/s] of the beats' linear equation, (3, n) each.
 
         A beat is the frequency times the Doppler ratio, minus the chirp rate times the delay 2R/c.
-        Both refer to the shot's start and to a target at constant speed. A record measures the
-        delay at its middle. The curvature of the phase doubles that time.
+        Both refer to the shot's start and to a target at constant speed. The phase is quadratic in
+        the delay, so that a beat at the time t in a segment depends on the delay at 2 t. The time
+        from a segment's start to the middle of its record therefore counts twice.
         """
         starts, chirp_slopes, carriers, walk_time, chirp_rate = (
             np.array([np.broadcast_to(v, self.size) for v in values])
@@ -559,8 +560,8 @@ class Shots:
     def split_by_look(self) -> "list[Shots]":
         """Return one set of shots for each look, with the lines where that look observes them.
 
-        A look is one of several records of a segment. If lines do not drift, every
-        set is these shots, unchanged.
+        A look is one of several records of a segment. If lines do not drift, every set is these
+        shots, unchanged.
         """
         if not np.any(self.motion.line_drift_per_look):
             return [self] * self.looks.number
@@ -639,9 +640,9 @@ class Shots:
 
     @property
     def real_fft_size(self) -> int:
-        """FFT size if noise in bins 0 and N/2 is real-valued, as in a real record; otherwise 0.
+        """FFT size N if the noise in bins 0 and N/2 is real-valued; 0 if it is complex.
 
-        N is the FFT size.
+        It is real-valued in a real record whose noise bins are correlated.
         """
         is_real = self.detection_settings.noise_bins == "correlated" and not self.complex_record
         return self.fft_size if is_real else 0
@@ -749,12 +750,14 @@ class Shots:
     def alarm_equivalent_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Return the number of independent bins with the searched bins' false-alarm probability.
+        """Return the number of independent bins that together raise as many false alarms.
+
+        Their false-alarm probability is that of the searched bins.
 
         Parameters
         ----------
         n_exempt : ndarray (3, m)
-            Bins that the detection occupies, as of :meth:`n_searched_bins`.
+            Bins that the detection occupies, as in :meth:`n_searched_bins`.
         point_indices : ndarray (m,) or slice
             Points to which the columns belong.
         """
@@ -911,12 +914,12 @@ them, and values their names in error messages."""
 
 
 def require_finite(shots: Shots) -> None:
-    """Raise an error if a number of the shots is not finite, as the spectrum would have no peak.
+    """Raise an error if any value of the shots is not finite: their spectra would have no peak.
 
     Raises
     ------
     UnsupportedShotError
-        Names the quantity that is not finite, and the shot.
+        Error that names the quantity that is not finite, and the shot.
     """
     for name, label in (_LABEL_BY_POINT_FIELD | _LABEL_BY_BEAMLET_FIELD).items():
         values = np.asarray(attrgetter(name)(shots))

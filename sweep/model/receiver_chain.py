@@ -68,7 +68,7 @@ ANTIALIAS_DEFAULTS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
 """Default bandwidth [Hz] and order of the anti-alias filter, by parameter name. A bandwidth of 0
 means no filter."""
 
-_ALIASES_PER_SIDE = 32
+_N_ALIASES_PER_SIDE = 32
 """Number of aliases on each side over which the noise after an anti-alias filter is summed. With
 order 3 and a bandwidth of the full sample rate, further aliases have 1e-8 of the noise density."""
 
@@ -208,7 +208,7 @@ def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) ->
     Returns
     -------
     ndarray
-        Sigma [V], that of the sum over the record.
+        Sigma [V] of a bin of the FFT, which is not normalised.
 
     Notes
     -----
@@ -346,7 +346,7 @@ def relative_noise_density(
     if antialias := antialias_filter_parameters(filters):
         folded_frequency = frequency - sample_rate * np.rint(frequency / sample_rate)
         density = np.zeros(())
-        for alias_number in range(-_ALIASES_PER_SIDE, _ALIASES_PER_SIDE + 1):
+        for alias_number in range(-_N_ALIASES_PER_SIDE, _N_ALIASES_PER_SIDE + 1):
             alias_frequency = folded_frequency + alias_number * sample_rate
             amplitude = receiver_transfer(alias_frequency, **poles)
             density = density + np.abs(amplitude) ** 2 * antialias_power_transmission(

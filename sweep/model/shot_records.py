@@ -135,7 +135,7 @@ class SpectrumTolerances(NamedTuple):
     beamlets.
     """
     leakage_probability: np.ndarray
-    """Probability of false alarms due to leaked signal far from the lines that may be neglected."""
+    """Tolerated probability of false alarms due to leaked signal that is not evaluated."""
     leakage_floor: np.ndarray
     """Leaked signal in a bin, over the noise sigma, below which the bin counts as noise alone. The
     value :data:`sweep.model.error_budget.AUTOMATIC` means that it follows from

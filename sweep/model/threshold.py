@@ -146,7 +146,7 @@ def _log_pfa_function(
 def segment_alarm_bins(
     parameters: Mapping[str, Any], threshold_ratio: np.ndarray, segment: str = "up"
 ) -> np.ndarray:
-    """Return the number of independent bins with the false-alarm probability of a segment.
+    """Return the number of independent bins that together have a segment's false-alarm probability.
 
     Parameters
     ----------

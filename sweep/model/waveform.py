@@ -567,8 +567,8 @@ def fit_range_velocity(
         if pattern.sum() < 2 or not np.all(np.ptp(used_rates, axis=0) > 0):
             continue
         used_weights = used_weights / used_weights.max(axis=0)  # products must not underflow
-        solve_beats = _solve_signed_beats if has_signs else _solve_unsigned_beats
-        solutions[:, has_pattern] = solve_beats(
+        fit_peaks = _fit_signed_peaks if has_signs else _fit_unsigned_peaks
+        solutions[:, has_pattern] = fit_peaks(
             used_peaks,
             used_weights,
             used_carriers,
@@ -581,7 +581,7 @@ def fit_range_velocity(
     return RangeVelocity(SPEED_OF_LIGHT * x / (2 * (1 + beta)), SPEED_OF_LIGHT * beta / 2)
 
 
-def _solve_beats(
+def _fit_signed_beats(
     beats: np.ndarray, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit the Doppler ratio and the delay to signed beats by weighted least squares.
@@ -634,14 +634,14 @@ def range_velocity_response(
         Changes of range [m] and radial velocity [m/s]; 0 where beats do not determine a value.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        beta, x = _solve_beats(beats, weights, carriers, chirp_rates)
+        beta, x = _fit_signed_beats(beats, weights, carriers, chirp_rates)
     ranges, velocities = (
         np.where(np.isfinite(value), SPEED_OF_LIGHT / 2 * value, 0.0) for value in (x, beta)
     )
     return ranges, velocities
 
 
-def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
+def _fit_unsigned_peaks(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
     """Fit Doppler ratio and delay to peaks of unknown sign, (2, n).
@@ -657,7 +657,7 @@ def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a
         for folds in product((0, 1), repeat=n_peaks) if n_peaks > 2 else ((0,) * n_peaks,):
             sign, is_folded = np.reshape(signs, (-1, 1)), np.reshape(folds, (-1, 1))
             beats = sign * np.where(is_folded == 1, sample_rate - peaks, peaks)
-            beta, x = _solve_beats(beats, weights, carriers, chirp_rates)
+            beta, x = _fit_signed_beats(beats, weights, carriers, chirp_rates)
             misfit = carriers * beta - chirp_rates * x - beats
             cost = np.sqrt((weights * misfit**2).sum(axis=0) / weights.sum(axis=0)) / bin_width
             cost = np.where(x < delay_min, np.inf, cost + FOLD_PENALTY_BINS * sum(folds))
@@ -679,7 +679,7 @@ def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a
     return solutions
 
 
-def _solve_signed_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
+def _fit_signed_peaks(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
     """Fit Doppler ratio and delay to signed peaks, which are known modulo the sample rate.
@@ -703,4 +703,4 @@ def _solve_signed_beats(  # type: ignore[no-untyped-def]  # seven arrays and a w
     ) / sample_rate
     doppler_beat = (rate_fraction - np.floor(rate_fraction + 0.5)) * sample_rate
     n_sample_rates = np.rint((doppler_beat - chirp_rates * x - peaks) / sample_rate)
-    return _solve_beats(peaks + n_sample_rates * sample_rate, weights, carriers, chirp_rates)
+    return _fit_signed_beats(peaks + n_sample_rates * sample_rate, weights, carriers, chirp_rates)

@@ -22,18 +22,18 @@ import numpy as np
 
 from sweep.model.window import Window, get_window, window_samples
 
-_ROUNDING_ERROR = 1e-6
+_MAIN_LOBE_ROUNDING_MARGIN = 1e-6
 """Relative margin for rounding errors of the smallest main-lobe magnitude within half a bin."""
-_SERIES_TERMS = 28
+_N_MAIN_LOBE_SERIES_TERMS = 28
 """Number of terms of the power series of a window's main lobe."""
-_MAIN_LOBE_STEPS = 1024
+_N_MAIN_LOBE_STEPS = 1024
 """Number of steps of the main-lobe table, from 0 to half an FFT bin."""
 _ENVELOPE_CELLS, _ENVELOPE_KNEE_WINDOW_BINS = 8192, 16.0
 """Number of cells of the sidelobe table, and the distance at its middle [bins of fs/L]. Cells are
 equally spaced in d / (d + middle distance) of the distance d."""
-_CELLS_PER_OCTAVE = 64
+_TABLE_CELLS_PER_OCTAVE = 64
 """Number of cells per factor of 2 in magnitude, in the table of distances by magnitude."""
-_OCTAVE_MIN = -80
+_MAGNITUDE_OCTAVE_MIN = -80
 """Smallest magnitude in the table of distances by magnitude [octaves relative to the peak]."""
 
 
@@ -55,8 +55,8 @@ class WindowResponse(NamedTuple):
     is the minimum over positions of the line between bins.
     """
     sidelobe_envelope: np.ndarray
-    """(cells + 1,): largest magnitude at or beyond tabulated distances d. They are equally spaced
-    in d / (d + knee), with a fixed distance, the knee.
+    """(cells + 1,): largest magnitude at or beyond tabulated distances d. The distances are equally
+    spaced in d / (d + knee), where the knee is a fixed distance.
     """
     distance_by_octave: np.ndarray
     """(cells,): distance [bins] beyond which all magnitudes are smaller than a tabulated one.
@@ -68,7 +68,7 @@ class WindowResponse(NamedTuple):
     def scalloping_gain(self, distance: np.ndarray) -> np.ndarray:
         """Return a bin's magnitude, over the peak, at ``distance`` [bins] from a line, 0..1/2."""
         clipped_distance = np.fmin(distance, 0.5)
-        return self.main_lobe[(clipped_distance * (2 * _MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
+        return self.main_lobe[(clipped_distance * (2 * _N_MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
 
     def magnitude_max_beyond(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest magnitude, over the peak, at ``distance`` [bins] or farther.
@@ -84,8 +84,8 @@ class WindowResponse(NamedTuple):
 
         Magnitudes are relative to the peak. The result is inf if no distance is known.
         """
-        octave = np.log2(np.fmin(np.fmax(magnitude, 2.0**_OCTAVE_MIN), 1.0))
-        return self.distance_by_octave[np.ceil(-octave * _CELLS_PER_OCTAVE).astype(np.int64)]
+        octave = np.log2(np.fmin(np.fmax(magnitude, 2.0**_MAGNITUDE_OCTAVE_MIN), 1.0))
+        return self.distance_by_octave[np.ceil(-octave * _TABLE_CELLS_PER_OCTAVE).astype(np.int64)]
 
 
 @lru_cache(maxsize=32)
@@ -111,7 +111,7 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
     )
     coefficients = _main_lobe_series(w, position)
     main_lobe_samples = main_lobe_magnitude(
-        fft_window, coefficients, np.linspace(0.0, 0.5, _MAIN_LOBE_STEPS + 1) * record_fraction
+        fft_window, coefficients, np.linspace(0.0, 0.5, _N_MAIN_LOBE_STEPS + 1) * record_fraction
     )
     envelope_distance = np.concatenate([[0.0], fft_window.envelope_distances])
     envelope = np.concatenate(
@@ -123,7 +123,9 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
     table_position = np.arange(_ENVELOPE_CELLS + 1) / _ENVELOPE_CELLS
     with np.errstate(divide="ignore"):
         table_distance = _ENVELOPE_KNEE_WINDOW_BINS * table_position / (1 - table_position)
-    magnitude = 2.0 ** (-np.arange(-_OCTAVE_MIN * _CELLS_PER_OCTAVE + 2) / _CELLS_PER_OCTAVE)
+    magnitude = 2.0 ** (
+        -np.arange(-_MAGNITUDE_OCTAVE_MIN * _TABLE_CELLS_PER_OCTAVE + 2) / _TABLE_CELLS_PER_OCTAVE
+    )
     first_below = np.searchsorted(-envelope, -magnitude)
     return WindowResponse(
         main_lobe=main_lobe_samples,
@@ -138,7 +140,7 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
         ),
         sidelobe_envelope=envelope[np.searchsorted(envelope_distance, table_distance, "right") - 1],
         distance_by_octave=np.append(envelope_distance, np.inf)[first_below] / record_fraction,
-        scalloping_gain_min=float(main_lobe_samples.min()) * (1 - _ROUNDING_ERROR),
+        scalloping_gain_min=float(main_lobe_samples.min()) * (1 - _MAIN_LOBE_ROUNDING_MARGIN),
     )
 
 
@@ -148,12 +150,12 @@ def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
     The transform is relative to the window's sum. The coefficients follow from the even moments of
     the window ``w``.
     """
-    moments = np.empty(_SERIES_TERMS)
+    moments = np.empty(_N_MAIN_LOBE_SERIES_TERMS)
     weighted_power = w / w.sum()
-    for k in range(_SERIES_TERMS):
+    for k in range(_N_MAIN_LOBE_SERIES_TERMS):
         moments[k] = weighted_power.sum()
         weighted_power = weighted_power * (position * position)
-    exponent = np.arange(_SERIES_TERMS)
+    exponent = np.arange(_N_MAIN_LOBE_SERIES_TERMS)
     series_factors = [(2 * math.pi) ** (2 * k) / math.factorial(2 * k) for k in exponent.tolist()]
     return np.asarray((-1.0) ** exponent * series_factors * moments)
 
