@@ -174,7 +174,7 @@ def _read_slice_and_close(
     """Return a slice of an open file, and close it."""
     with open(descriptor, "rb", buffering=0) as file:
         start, stop, _ = byte_slice.indices(
-            file_size_within_limit(descriptor, bytes_max, path_in_messages)
+            checked_file_size(descriptor, bytes_max, path_in_messages)
         )
         file.seek(start)
         pieces: list[bytes] = []
@@ -202,11 +202,11 @@ def stream_file_below_root(root: str | Path, name: str, bytes_max: int) -> Itera
     """
     descriptor = open_file_below_root(root, name)
     with open(descriptor, "rb", buffering=0) as file:
-        size = file_size_within_limit(descriptor, bytes_max, f"{root}/{name}")
+        size = checked_file_size(descriptor, bytes_max, f"{root}/{name}")
         yield FileStream(size, iter(lambda: file.read(READ_BUFFER_BYTES), b""))
 
 
-def file_size_within_limit(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
+def checked_file_size(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
     """Return the size of an open file [bytes].
 
     Raise `RefusedFileError` if the size exceeds ``bytes_max``.

@@ -115,7 +115,7 @@ class LineSpreadCoefficients(NamedTuple):
     the linear and c the quadratic spread.
     """
 
-    deviation: np.ndarray
+    line_deviation: np.ndarray
     """(n,): largest standard deviation of line frequencies of any segment [bins of fs/L]."""
     linear_spread: np.ndarray
     """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. If the target has
@@ -377,7 +377,7 @@ def _line_spread_coefficients(
     # Chirp slopes weight the contribution of ranges to the beats.
     chirp_slopes, zeros = np.array(waveform.chirp_slopes(parameters))[:, None], np.zeros(n_points)
     spread = LineSpreadCoefficients(
-        deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
+        line_deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
         + bins_per_speed * velocity_moments.rms
         + zeros,
         linear_spread=abs(
@@ -423,7 +423,9 @@ def _line_spread_coefficients(
         )
         + zeros
     )
-    return LineSpreadCoefficients(np.maximum(spread.deviation, phase_deviation), slope, quadratic)
+    return LineSpreadCoefficients(
+        np.maximum(spread.line_deviation, phase_deviation), slope, quadratic
+    )
 
 
 def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
@@ -474,7 +476,7 @@ def required_node_counts(
     tabulated_spreads, tabulated_errors, largest_bin_powers = _quadrature_errors_by_spread(
         window_name
     )
-    table_index = np.searchsorted(tabulated_spreads, spread.deviation)  # of the next wider
+    table_index = np.searchsorted(tabulated_spreads, spread.line_deviation)  # of the next wider
     single_line_error = (
         _single_line_quadrature_error(window_name, spread) / largest_bin_powers[table_index]
     )
@@ -485,7 +487,7 @@ def required_node_counts(
     count_index, error = _choose_cheapest_within_tolerance(total_error, counts[:, None], tolerance)
     n_lines = np.ones(count_index.shape, np.int64)
     needs_lines = (error > tolerance) & (
-        single_line_error > error_budget.single_node_line_fraction * tolerance
+        single_line_error > error_budget.single_line_error_fraction * tolerance
     )
     if needs_lines.any():
         spread_subset = LineSpreadCoefficients(
@@ -555,8 +557,10 @@ def _choose_node_lines(
         spread.linear_spread.max(axis=0),
     )
     # If curvature alone spreads the lines, only the rules' error for squares counts.
-    linear_deviation = spread.deviation * np.minimum(linear_max / quadratic_max, 1.0)
-    largest_bin_power = largest_bin_powers[np.searchsorted(tabulated_spreads, spread.deviation)]
+    linear_deviation = spread.line_deviation * np.minimum(linear_max / quadratic_max, 1.0)
+    largest_bin_power = largest_bin_powers[
+        np.searchsorted(tabulated_spreads, spread.line_deviation)
+    ]
     curvature_index = np.searchsorted(_TABULATED_CURVATURES, quadratic_max)
     error_along = (
         tabulated_errors[:, np.searchsorted(tabulated_spreads, linear_deviation)]

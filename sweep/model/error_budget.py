@@ -137,7 +137,7 @@ class ErrorBudget:
     leakage_fraction: float = 0.5
     """Fraction of the tolerance that is the default of `leakage_error`."""
 
-    single_node_line_fraction: float = 0.1
+    single_line_error_fraction: float = 0.1
     """Fraction of the beamlets' tolerance up to which the error of a single line of beamlets is
     accepted. The error is that across the slope. If it is larger, several parallel lines are
     tried. With a smaller fraction they are tried at more points. The accuracy is the same.

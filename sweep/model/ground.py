@@ -243,8 +243,8 @@ class FlatGround:
         )
         return BeamGradients(*(np.broadcast_to(column, self._n_points) for column in columns))
 
-    def axis_line(self, n_points: int) -> BeamletTable:
-        """Return a table with one beamlet per footprint, the line on the beam's axis.
+    def axis_beamlet(self, n_points: int) -> BeamletTable:
+        """Return a table with one beamlet per footprint, which lies on the beam's axis.
 
         The table has one row for each distinct grazing angle and `n_points` points.
         """
@@ -304,7 +304,7 @@ class RayTracedGround:
     ) -> None:
         self.beamlets, self.off_axis_surface = beamlet_table, off_axis_surface
 
-    def axis_line(self, n_points: int) -> BeamletTable:
+    def axis_beamlet(self, n_points: int) -> BeamletTable:
         """Return a table with one beamlet per footprint, on the beam's axis, for `n_points` points.
 
         The beamlet has the total echo of the point's beamlets.
@@ -387,11 +387,11 @@ def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
             total_echo, 1.0, range_offsets, range_offsets, velocity_offsets, amplitude_gain
         )
     off_axis_fraction = np.where(off_axis_surface, power_fraction, 0.0)
-    on_axis_fraction = power_fraction - off_axis_fraction
-    on_axis_total = on_axis_fraction.sum(axis=1)
-    on_axis_range_offsets = _weighted_moments(
+    axis_surface_fraction = power_fraction - off_axis_fraction
+    axis_surface_total = axis_surface_fraction.sum(axis=1)
+    axis_surface_range_offsets = _weighted_moments(
         relative_range_offset,
-        on_axis_fraction / np.where(on_axis_total > 0, on_axis_total, 1.0)[:, None],
+        axis_surface_fraction / np.where(axis_surface_total > 0, axis_surface_total, 1.0)[:, None],
     )
     off_axis_range_max = np.where(off_axis_fraction > 0, np.abs(relative_range_offset), 0.0).max(
         axis=1
@@ -400,7 +400,7 @@ def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
         total_echo,
         1.0,
         range_offsets,
-        on_axis_range_offsets,
+        axis_surface_range_offsets,
         velocity_offsets,
         amplitude_gain,
         off_axis_fraction.sum(axis=1),

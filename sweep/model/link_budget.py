@@ -25,7 +25,7 @@ from sweep.model.shot_settings import (
     RecordSettings,
     TargetState,
     WaveformSettings,
-    samples_iq,
+    is_iq_sampled,
 )
 from sweep.model.threshold import tnr_from_parameters
 
@@ -289,7 +289,7 @@ class LinkBudget:
         return receiver_chain.receiver_noise(
             self.waveform.architecture,
             receiver_chain.receiver_parameters(self.parameters),
-            samples_iq(self.parameters),
+            is_iq_sampled(self.parameters),
         )
 
     @cached_property
@@ -334,7 +334,7 @@ def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the noise variance [V^2] that quantisation adds at the ADC."""
     full_scale, bits = (parameters[PROCESSING_PREFIX + name] for name in ("full_scale", "bits"))
     return receiver_chain.quantisation_variance(
-        full_scale=full_scale, bits=bits, samples_iq=samples_iq(parameters)
+        full_scale=full_scale, bits=bits, is_iq_sampled=is_iq_sampled(parameters)
     )
 
 

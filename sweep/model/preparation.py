@@ -429,7 +429,7 @@ class Shots:
     def detects_by_any_two_segments(self) -> bool:
         """True if a shot counts as detected when any two of its three segments detect it."""
         return (
-            self.detection_settings.shot_rule == waveform.ANY_TWO
+            self.detection_settings.shot_detection_rule == waveform.ANY_TWO
             and len(self.waveform.segment_order) == 3
         )
 
@@ -852,7 +852,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
         Ground that the beams meet.
     """
     budget = LinkBudget(parameters)
-    row_of_point, relative_range_offset, doppler_ratio_offset, relative_echo = ground.axis_line(
+    row_of_point, relative_range_offset, doppler_ratio_offset, relative_echo = ground.axis_beamlet(
         n_points
     )
     zeros, architecture = np.zeros(n_points), budget.waveform.architecture

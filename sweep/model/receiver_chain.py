@@ -77,7 +77,7 @@ _LOG_ATTENUATION_MAX = 345.0
 
 
 def receiver_noise(
-    architecture: str, receiver: Mapping[str, np.ndarray], samples_iq: bool = False
+    architecture: str, receiver: Mapping[str, np.ndarray], is_iq_sampled: bool = False
 ) -> ReceiverNoise:
     """Compute the noise variances of a receiver at the ADC.
 
@@ -87,7 +87,7 @@ def receiver_noise(
         One of :data:`ARCHITECTURES`.
     receiver : mapping
         Parameters, as in :func:`receiver_parameters`, (n,) or scalars.
-    samples_iq : bool
+    is_iq_sampled : bool
         True for two receivers that sample I and Q. The variances are then those of a real record
         whose bins have the same noise.
 
@@ -146,11 +146,11 @@ def receiver_noise(
         source: np.asarray(value * squared_transimpedance)
         for source, value in current_variances.items()
     }
-    if samples_iq:
+    if is_iq_sampled:
         for name in variances.keys() - {"local_oscillator_shot"}:
             variances[name] = 2 * variances[name]
     variance_per_square_ampere = (
-        squared_transimpedance / 2 if samples_iq else squared_transimpedance
+        squared_transimpedance / 2 if is_iq_sampled else squared_transimpedance
     )
     return ReceiverNoise(
         bandwidth,
@@ -161,7 +161,7 @@ def receiver_noise(
 
 
 def quantisation_variance(
-    *, full_scale: ArrayLike, bits: ArrayLike, samples_iq: bool = False
+    *, full_scale: ArrayLike, bits: ArrayLike, is_iq_sampled: bool = False
 ) -> np.ndarray:
     """Return the noise variance [V^2] that rounding to ADC steps adds.
 
@@ -172,7 +172,7 @@ def quantisation_variance(
     bits : array_like
         Effective number of bits, not necessarily an integer; 0 for no rounding. It is chosen so
         that rounding makes all of the noise of the real ADC.
-    samples_iq : bool
+    is_iq_sampled : bool
         True for two ADCs that sample I and Q.
 
     Returns
@@ -192,7 +192,7 @@ def quantisation_variance(
     """
     bits = np.asarray(bits, float)
     lsb = 2 * np.asarray(full_scale, float) * 2.0**-bits
-    return np.where(bits > 0, (2 if samples_iq else 1) * (lsb**2 / 12), 0.0)
+    return np.where(bits > 0, (2 if is_iq_sampled else 1) * (lsb**2 / 12), 0.0)
 
 
 def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:

@@ -76,7 +76,7 @@ class DetectionSettings(NamedTuple):
     """Bins that can detect an echo: ``any_bin`` of the echo, or ``peak_bin``, only its largest, as
     in [T].
     """
-    shot_rule: str
+    shot_detection_rule: str
     """Segments that must detect an echo for the shot to be detected: ``both_chirps``, or
     ``any_two``.
     """
@@ -116,7 +116,7 @@ class DetectionSettings(NamedTuple):
         return cls(
             tnr=budget.tnr,
             echo_bins=str(parameters[PROCESSING_PREFIX + "detection"]),
-            shot_rule=str(parameters[waveform.SHOT_DETECTION_PATH]),
+            shot_detection_rule=str(parameters[waveform.SHOT_DETECTION_PATH]),
             reported_peaks=str(parameters[waveform.PEAKS_PATH]),
             two_beat_assumption=str(parameters[waveform.TWO_BEAT_ASSUMPTION_PATH]),
             noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),

@@ -259,7 +259,7 @@ class RecordSettings:
             fft_size=int(np.ravel(parameters[PROCESSING_PREFIX + "fft_size"])[0]),
             sample_rate=parameters[PROCESSING_PREFIX + "sample_rate"],
             acquisition_delay=parameters[PROCESSING_PREFIX + "acquisition_delay"],
-            is_complex=samples_iq(parameters),
+            is_complex=is_iq_sampled(parameters),
         )
 
     @property
@@ -330,6 +330,6 @@ def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
     return 2 * radial_velocity / SPEED_OF_LIGHT
 
 
-def samples_iq(parameters: Mapping[str, Any]) -> bool:
+def is_iq_sampled(parameters: Mapping[str, Any]) -> bool:
     """Return True if two receivers sample the I and Q parts of a complex record."""
     return str(parameters.get(RECORD_PATH, "real")) == "complex"

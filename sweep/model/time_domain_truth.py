@@ -19,7 +19,7 @@ from sweep.model.detection.detection_probability import pd_and_miss_in_looks
 from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import SegmentResults, allocate_segment_results
-from sweep.model.waveform import SAMPLE_TIME_TOLERANCE
+from sweep.model.waveform import TIME_TOLERANCE_SAMPLES
 
 
 def time_domain_spectrum(
@@ -228,7 +228,7 @@ def analytic_record(
     record = amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start_phase))
     if shots.echo_record.n_samples_before_echo is not None:
         has_arrived = (
-            t >= start_delay + delay_change - SAMPLE_TIME_TOLERANCE / shots.sample_rate[point]
+            t >= start_delay + delay_change - TIME_TOLERANCE_SAMPLES / shots.sample_rate[point]
         )
         record *= has_arrived & (t <= _value_of_point(shots.waveform.chirp_duration, point))
     return np.asarray(record)

@@ -270,7 +270,7 @@ def beat_frequency(
     )
 
 
-SAMPLE_TIME_TOLERANCE = 1e-6
+TIME_TOLERANCE_SAMPLES = 1e-6
 """Tolerance for time limits of samples [sample intervals]. A sample outside a limit by less than
 this counts as inside."""
 
@@ -286,7 +286,7 @@ def record_length(parameters: Mapping[str, Any]) -> np.ndarray:
         - parameters["instrument.processing.acquisition_delay"]
     )
     n_available = np.floor(
-        time_left * parameters["instrument.processing.sample_rate"] + SAMPLE_TIME_TOLERANCE
+        time_left * parameters["instrument.processing.sample_rate"] + TIME_TOLERANCE_SAMPLES
     )
     return np.minimum(parameters["instrument.processing.fft_size"], n_available).astype(np.int64)
 
@@ -318,7 +318,7 @@ def count_samples_before_echo(
     arrival_samples = (
         np.asarray(delay) / (1 + np.asarray(doppler_ratio)) - record_start
     ) * sample_rate
-    return np.clip(np.ceil(arrival_samples - SAMPLE_TIME_TOLERANCE), 0, length).astype(np.int64)
+    return np.clip(np.ceil(arrival_samples - TIME_TOLERANCE_SAMPLES), 0, length).astype(np.int64)
 
 
 def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
