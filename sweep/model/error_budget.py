@@ -109,8 +109,8 @@ class ErrorBudget:
 
     interval: str = "clopper_pearson"
     """Kind of confidence interval for a probability that is estimated by counting draws, one of
-    :data:`COUNT_INTERVALS`. The interval of Clopper and Pearson has at least the stated coverage.
-    Wilson's takes fewer draws, and has the stated coverage on average."""
+    :data:`COUNT_INTERVALS`. The interval of Clopper and Pearson has at least the stated
+    coverage. Wilson's takes fewer draws, and has the stated coverage on average."""
 
     stopping_check_growth: float = 1.25
     """Ratio of the numbers of draws at successive checks of the confidence intervals. With a ratio

@@ -42,8 +42,8 @@ class FootprintLines(NamedTuple):
     """
     relative_amplitude: np.ndarray
     """(rows, beamlets): amplitude of each beamlet's beat over
-    :attr:`sweep.model.link_budget.EchoScales.beat_amplitude`. It is the square root of the relative
-    echo [1/sr], or with direct detection the relative echo itself.
+    :attr:`sweep.model.link_budget.EchoScales.beat_amplitude`. It is the square root of the
+    relative echo [1/sr], or with direct detection the relative echo itself.
     """
     adds_powers: bool = True
     """True if the powers of beamlets add, False if their amplitudes do."""
@@ -163,7 +163,7 @@ class PhaseError(NamedTuple):
     record, -1 .. 1, ``sign`` and `arguments`.
     """
     arguments: dict[str, Any]
-    """Arguments of ``phase`` by name, (n,) or scalars; a tuple has one element for each segment."""
+    """Arguments of ``phase`` by name, (n,) or scalars. A tuple has one element per segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
         """Return the arguments of ``phase`` for selected points in one segment.

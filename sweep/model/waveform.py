@@ -351,11 +351,11 @@ peak is the Doppler frequency."""
 
 
 SIGNED_READING = 16
-"""Number, for :func:`beats_of_reading`, of the interpretation of a complex record's signed peaks.
-With the up peak u and the down peak d, the range beat is (d - u) / 2. The Doppler frequency is u
-plus the range beat. Twice the range beat, and the Doppler frequency, are modulo the sample rate.
-Range beats are positive, up to half the sample rate; Doppler shifts have either sign, up to half of
-it."""
+"""Number, for :func:`beats_of_reading`, of the interpretation of signed peaks, which complex
+records have. With the up peak u and the down peak d, the range beat is (d - u) / 2. The Doppler
+frequency is u plus the range beat. Twice the range beat, and the Doppler frequency, are modulo the
+sample rate. Range beats are positive, up to half the sample rate; Doppler shifts have either sign,
+up to half of it."""
 
 NEGATIVE_BEAT_FRACTION_MAX = 1 / 64
 """Largest magnitude of a negative difference of down and up peak, over the sample rate, that counts
@@ -370,7 +370,8 @@ def beats_of_reading(reading, up, down, sample_rate):  # type: ignore[no-untyped
     ----------
     reading : int
         Number of the reading. Bits 8, 4 and 2 mean that the up, Doppler and down peak is folded.
-        Bit 1 exchanges half sum and half difference. :data:`SIGNED_READING` is for signed peaks.
+        Bit 1 exchanges half sum and half difference. :data:`SIGNED_READING` is the number for
+        signed peaks.
     up, down : float or ndarray
         Peaks of up- and down-chirp, in any unit of frequency.
     sample_rate : float or ndarray
