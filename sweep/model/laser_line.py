@@ -22,8 +22,8 @@ length; there the record's length replaces the delay.
 quadrature to the line. With the phase less its mean under the window, the mean of exp(i phi) is the
 line that |X| shows. Only the part of the pedestal in phase with it changes |X|
 (:func:`apparent_line_and_pedestal`). Full spectra are drawn with both parts
-(:func:`phase_walk`). An echo that arrives within the record has the line and the pedestal of its
-own samples, in steps of 1/32 of the record.
+(:func:`phase_walk`). An echo that arrives within the record has the line and the pedestal of
+its own samples, in steps of 1/32 of the record.
 
 References
 ----------
