@@ -42,14 +42,15 @@ NO_VALUE_TEXT = "none"
 
 _NUMBER_PATTERN = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
 """Pattern of a number in decimal notation."""
-_POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
+_INTEGER_POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
 """Pattern of a power of two integers, such as ``2^17``."""
 _POWER_EXPONENT_MAX = 999
 """Largest magnitude of the exponent in a written power, such as ``10^-3``."""
 _UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
 """Pattern of text after a number, if that text may be a unit."""
 _QUANTITY_PATTERN = re.compile(
-    rf"\s*(?:{_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?", re.ASCII
+    rf"\s*(?:{_INTEGER_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?",
+    re.ASCII,
 )
 """Pattern of a number or power with an optional unit."""
 _EXPONENT_PATTERN = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
@@ -376,11 +377,11 @@ def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
         raise QuantityError(rule)
     unit = (match["unit"] or "").strip()
     if match["base"]:
-        return _parse_power(int(match["base"]), match["exponent"]), unit
+        return _parse_integer_power(int(match["base"]), match["exponent"]), unit
     return Fraction(match["number"]), unit
 
 
-def _parse_power(base: int, exponent: str) -> Fraction:
+def _parse_integer_power(base: int, exponent: str) -> Fraction:
     """Return an exact power, such as ``2^17`` or ``10^-3``, with an integer exponent."""
     if "." in exponent:
         raise QuantityError("has an exponent that is no whole number")
@@ -517,7 +518,7 @@ def _multiply_unit_factors(
         root_unit = _root_unit_conversion(name)
         assert root_unit is not None
         factor, offset, powers = root_unit
-        scale *= _exact_power(factor, exponent)
+        scale *= _raise_to_power(factor, exponent)
         for key, power in powers:
             dimension[key] = dimension.get(key, Fraction(0)) + power * exponent
     # The offset of a temperature unit applies to temperatures, but not to products with it (W/K).
@@ -528,7 +529,7 @@ def _multiply_unit_factors(
     )
 
 
-def _exact_power(factor: Fraction, exponent: Fraction) -> Fraction:
+def _raise_to_power(factor: Fraction, exponent: Fraction) -> Fraction:
     """Return a power of a positive fraction, exact for integer exponents, else to 50 digits."""
     if exponent.denominator == 1:
         return factor ** int(exponent)

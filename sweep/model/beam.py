@@ -98,7 +98,7 @@ class GaussianBeam(NamedTuple):
     '4.1 m, 637 urad'
     """
 
-    waist: np.ndarray
+    radius_at_telescope: np.ndarray
     """1/e^2 radius of the beam at the telescope [m]."""
     rayleigh_range: np.ndarray
     """Rayleigh range pi w^2 / (M^2 lambda) [m], with the radius w at the telescope and the beam
@@ -157,7 +157,7 @@ class GaussianBeam(NamedTuple):
         w(R)^2 = w_a^2 ((1 - R/f)^2 + (R/z_R)^2).
         """
         defocus = 1 / np.asarray(range, float) - self.wavefront_curvature
-        return np.asarray(2 * self.waist * np.hypot(defocus, 1 / self.rayleigh_range))
+        return np.asarray(2 * self.radius_at_telescope * np.hypot(defocus, 1 / self.rayleigh_range))
 
     def radius(self, range: ArrayLike) -> np.ndarray:
         """Return the 1/e^2 radius of the beam [m] at ``range`` [m], above 0."""
@@ -354,7 +354,10 @@ def range_loss_coefficients(
     distance = np.asarray(parameters["target.range"] if range is None else range, float)
     coefficient_sums = [np.asarray(0.0)] * 3
     for beam in transmitted_and_oscillator_beams(parameters):
-        squared_waist, focus_ratio = beam.waist**2, beam.wavefront_curvature * distance
+        squared_radius, focus_ratio = (
+            beam.radius_at_telescope**2,
+            beam.wavefront_curvature * distance,
+        )
         quadratic_term = focus_ratio**2 + (distance / beam.rayleigh_range) ** 2
         coefficients = (
             1 - 2 * focus_ratio + quadratic_term,
@@ -362,7 +365,7 @@ def range_loss_coefficients(
             quadratic_term,
         )
         coefficient_sums = [
-            total + squared_waist * coefficient
+            total + squared_radius * coefficient
             for total, coefficient in zip(coefficient_sums, coefficients, strict=True)
         ]
     constant, linear, quadratic = coefficient_sums
@@ -392,10 +395,13 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
         / parameters[WAVELENGTH_PATH]
         * (1 / distance - transmitted_beam.wavefront_curvature)
     )
-    efficiency = truncation_efficiency(2 * transmitted_beam.waist / diameter, rim_phase)
+    efficiency = truncation_efficiency(
+        2 * transmitted_beam.radius_at_telescope / diameter, rim_phase
+    )
     if np.any(parameters[OSCILLATOR_WAIST_PATH]):
         efficiency = np.sqrt(
-            efficiency * truncation_efficiency(2 * oscillator_beam.waist / diameter, rim_phase)
+            efficiency
+            * truncation_efficiency(2 * oscillator_beam.radius_at_telescope / diameter, rim_phase)
         )
     return np.asarray(area * efficiency)
 
@@ -420,7 +426,7 @@ def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np
             parameters
         )
     _, oscillator_beam = transmitted_and_oscillator_beams(parameters)
-    oscillator_waist = oscillator_beam.waist
+    oscillator_waist = oscillator_beam.radius_at_telescope
     return 2 * oscillator_waist, divergence_from_waist(
         oscillator_waist, parameters[WAVELENGTH_PATH]
     )
