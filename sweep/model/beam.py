@@ -492,12 +492,12 @@ _ROOT_PHASE_STEP = math.sqrt(_RIM_PHASE_MAX) / _RIM_PHASE_STEPS
 
 
 def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0) -> np.ndarray:
-    """Return the echo of a beam truncated by its aperture, over that of the full beam.
+    """Return the echo of a beam truncated by its aperture, relative to that of the full beam.
 
     Parameters
     ----------
     fill_ratio : array_like
-        w_a / a: 1/e^2 radius of the beam over the radius of the aperture, up to 1.
+        w_a / a: 1/e^2 radius of the beam divided by the radius of the aperture, up to 1.
     defocus_phase : array_like
         Phase at the rim [rad], pi a^2 / lambda (1/R - 1/f).
 

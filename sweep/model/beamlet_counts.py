@@ -621,10 +621,10 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
     spreads : ndarray (m,)
         Standard deviations [bins of fs/L].
     errors : ndarray (counts, m + 1)
-        Largest error up to each standard deviation, over the power of the largest bin. The last
-        column is for larger standard deviations.
+        Largest error up to each standard deviation, relative to the power of the largest bin. The
+        last column is for larger standard deviations.
     largest_bin_powers : ndarray (m + 1,)
-        Power of the largest bin, over that of one line centred on a bin.
+        Power of the largest bin, relative to that of one line centred on a bin.
     """
     spreads = np.geomspace(1e-3, 400.0, 96)
     largest_bin_powers = _largest_bin_power(
@@ -653,8 +653,9 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
 def _substitute_for_unbounded_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
     """Return the number that tables hold where the error of a quadrature has no bound, at least 1.
 
-    It is the distance between ``n_nodes`` nodes over lines of the standard deviation or curvature
-    ``spread`` [bins of fs/L]. It falls as nodes are added, so that more nodes are preferred.
+    It is the distance between ``n_nodes`` nodes that are spread over lines of the standard
+    deviation or curvature ``spread`` [bins of fs/L]. It falls as nodes are added, so that more
+    nodes are preferred.
     """
     return np.maximum(1.0, 2 * UNIFORM_QUADRATURE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
 
@@ -740,7 +741,7 @@ def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
 
 
 def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.ndarray:
-    """Return a lower bound on the largest bin's power, over that of all lines at one bin's centre.
+    """Return a lower bound on the largest bin's power, relative to that of lines all at its centre.
 
     `deviation` is the standard deviation of line frequencies [bins of fs/L]. See
     :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for_spread`.

@@ -393,7 +393,7 @@ def plane_echo_ratio_bound(
     n_beamlets: int,
     pattern: str,
 ) -> np.ndarray:
-    """Return an upper bound on the echo of all beamlets on a plane, over that on the axis, (n,).
+    """Return an upper bound on the echo of all beamlets on a plane, relative to the axis, (n,).
 
     Parameters
     ----------
@@ -435,8 +435,8 @@ def bins_per_velocity(
 
     Notes
     -----
-    The shift is (2 / c) (f + 2 f_R) over the bin width, with the carrier f and the range beat f_R =
-    2 S R / c of the chirp rate S and the range R.
+    The shift is (2 / c) (f + 2 f_R) divided by the bin width, with the carrier f and the range beat
+    f_R = 2 S R / c of the chirp rate S and the range R.
     """
     doubled_range_beat = (
         np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)

@@ -80,8 +80,8 @@ class ErrorBudget:
     tolerance: ArrayLike = 1e-3
     """Largest error of a probability of detection, of log10 of a probability of false alarm, or of
     a relative magnitude. For points with draws it is the largest half-width of the confidence
-    interval. At 0 nothing is skipped. A tenth of the tolerance rarely doubles the time of a point.
-    With draws it takes a hundred times as many."""
+    interval. At 0 nothing is skipped. A ten times smaller tolerance rarely doubles the time of a
+    point. With draws it takes a hundred times as many draws."""
 
     confidence: ArrayLike = 0.95
     """Confidence level of intervals for probabilities that are estimated by random draws. The
@@ -90,10 +90,9 @@ class ErrorBudget:
     """
 
     line_error: ArrayLike = AUTOMATIC
-    """Tolerated error of a bin's magnitude over the noise sigma, if few lines represent all
+    """Tolerated error of a bin's magnitude, relative to the noise sigma, if few lines represent all
     beamlets. By default it is `lines_fraction` of the tolerance. A smaller error slowly increases
-    the number of lines of a segment.
-    """
+    the number of lines of a segment."""
 
     leakage_error: ArrayLike = AUTOMATIC
     """Tolerated probability of a false peak due to the echo's signal in bins far from its lines.
@@ -102,10 +101,9 @@ class ErrorBudget:
     """
 
     leakage_floor: ArrayLike = AUTOMATIC
-    """Magnitude of leaked signal in a bin, over the noise sigma, below which the bin counts as
-    noise alone. It applies to bins that are evaluated one by one. By default it follows from
-    `leakage_error`. With a lower value more bins are evaluated.
-    """
+    """Magnitude of leaked signal in a bin, relative to the noise sigma, below which the bin counts
+    as noise alone. It applies to bins that are evaluated one by one. By default it follows from
+    `leakage_error`. With a lower value more bins are evaluated."""
 
     interval: str = "clopper_pearson"
     """Kind of confidence interval for a probability that is estimated by counting draws, one of
@@ -191,9 +189,9 @@ class ErrorBudget:
 
     @property
     def allowed_line_error(self) -> np.ndarray:
-        """Tolerated error of a bin's magnitude, over the noise sigma, due to approximated lines.
+        """Tolerated error of a bin's magnitude, relative to the noise sigma, due to few lines.
 
-        Few lines then represent all beamlets.
+        The few lines represent all beamlets.
         """
         return self._stated_or_tolerance_fraction(self.line_error, self.lines_fraction)
 

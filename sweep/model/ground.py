@@ -76,15 +76,15 @@ class BeamletTable(NamedTuple):
     row_of_point: np.ndarray
     """(n,) int64: index of the row of each point."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of a beamlet minus that on the axis, over the range on the axis."""
+    """(rows, beamlets): range of a beamlet minus that on the axis, divided by the range on the
+    axis."""
     doppler_ratio_offset: np.ndarray
     """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis. v_r is the
     radial velocity.
     """
     relative_echo: np.ndarray
     """(rows, beamlets): echo of a beamlet for reflectance 1 [1/sr]. It is the power fraction times
-    the backscatter, over the range loss between the axis's range and the beamlet's.
-    """
+    the backscatter, divided by the range loss between the axis's range and the beamlet's."""
 
 
 class BeamGradients(NamedTuple):
@@ -189,7 +189,7 @@ class FlatGround:
             on the axis.
         delay_cycles : array_like
             Cycles per unit of relative range, (n,) or scalar; dR / R is the range minus that on the
-            axis, over the range on the axis.
+            axis, divided by the range on the axis.
 
         Notes
         -----
@@ -352,10 +352,10 @@ class FootprintExtent(NamedTuple):
     axis_echo: np.ndarray
     """Echo of a single line on the beam's axis for reflectance 1 [1/sr]."""
     total_echo_ratio: np.ndarray | float
-    """Echo of all beamlets, over that of a single line on the beam's axis."""
+    """Ratio of the echo of all beamlets to that of a single line on the beam's axis."""
     range_offsets: OffsetMoments
-    """Moments of the beamlets' relative range offsets: range minus that on the axis, over the range
-    on the axis."""
+    """Moments of the beamlets' relative range offsets: range minus that on the axis, divided by the
+    range on the axis."""
     axis_surface_range_offsets: OffsetMoments
     """Moments of the relative range offsets of those beamlets on the same surface as the axis."""
     velocity_offsets: OffsetMoments

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
 DEVIATION_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
-"""Standard deviation of a Gaussian over its full width at half maximum (FWHM)."""
+"""Ratio of a Gaussian's standard deviation to its full width at half maximum (FWHM)."""
 
 MEAN_POWER_TOLERANCE = 1e-12
 """Error of a mean power computed as a sum over frequency shifts, relative to the power at the
@@ -206,7 +206,7 @@ def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) ->
 def pedestal_power_under_line(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
 ) -> np.ndarray:
-    """Return the pedestal's mean power in its line's bin, over the line's squared amplitude.
+    """Return the pedestal's mean power in its line's bin, relative to the squared line amplitude.
 
     Parameters
     ----------
@@ -314,8 +314,8 @@ def apparent_line_and_pedestal(
     line_fraction : ndarray (n,)
         Fraction of the power |C W(0)|^2 in the line; larger than :func:`pure_line_power_fraction`.
     in_phase_pedestal : ndarray (n,)
-        Mean square of the pedestal in phase with the line, over |C|^2. As noise, half of this
-        counts.
+        Mean square of the pedestal in phase with the line, relative to |C|^2. As noise, half of
+        this counts.
 
     Notes
     -----

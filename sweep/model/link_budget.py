@@ -118,7 +118,7 @@ class ReceiverFilter:
         return np.abs(self._pole_transfer(frequency) * self.antialias_amplitude_gain(frequency))
 
     def relative_noise_density(self, frequency: np.ndarray) -> np.ndarray | float:
-        """Return the receiver's noise density, over that of white noise of the same variance.
+        """Return the receiver's noise density, relative to white noise of the same variance.
 
         Parameters
         ----------
@@ -301,7 +301,7 @@ class LinkBudget:
     def tnr(self) -> np.ndarray:
         """Threshold-to-noise ratio, as set by the processing parameters.
 
-        The ratio is the threshold over the standard deviation of a bin's magnitude with noise
+        The ratio is the threshold divided by the standard deviation of a bin's magnitude with noise
         alone.
         """
         return tnr_from_parameters(self.parameters)
@@ -339,7 +339,7 @@ def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarray:
-    """Return the beat amplitude, over its scale, for a relative echo [1/sr].
+    """Return the beat amplitude, divided by its scale, for a relative echo [1/sr].
 
     Parameters
     ----------

@@ -59,8 +59,7 @@ BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
 present if that number follows from the tolerance."""
 
 CHIRP_SLOPE_PATHS = waveform.DOPPLER_SEGMENT_SLOPE_PATH, waveform.DOWN_SEGMENT_SLOPE_PATH
-"""Parameter paths of the chirp rates of Doppler segment and down-chirp, over that of the up-chirp.
-"""
+"""Parameter paths of the chirp rates of Doppler and down segment, relative to the up-chirp's."""
 SHARED_PARAMETER_PATHS = (
     PROCESSING_PREFIX + "fft_size",
     "footprint.beamlets",
@@ -274,9 +273,9 @@ class Shots:
     def whitening_gain(self) -> np.ndarray:
         """Factor on the amplitude of each segment's lines when noise is whitened, (segments, n).
 
-        Whitening divides the spectrum by the square root of the noise density over that of white
-        noise. Noise added by the ADC is white already. The factor varies little over an echo. It is
-        computed for the line on the beam's axis.
+        Whitening divides the spectrum by the square root of the noise density, relative to white
+        noise. Noise added by the ADC is white already. The factor varies little across an echo. It
+        is computed for the line on the beam's axis.
         """
         return broadcast_rows(
             [self.whitening_gain_at(beat_frequency) for beat_frequency in self.beat_frequencies],
@@ -374,7 +373,7 @@ class Shots:
         )
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the signal-to-noise ratio of a bin, mean signal power over mean noise power.
+        """Return the signal-to-noise ratio of a bin, the ratio of mean signal to mean noise power.
 
         Parameters
         ----------
@@ -402,7 +401,7 @@ class Shots:
 
     @property
     def negligible_signal_ratio(self) -> np.ndarray:
-        """Leaked signal, over the noise sigma, below which a bin counts as noise alone.
+        """Leaked signal, relative to the noise sigma, below which a bin counts as noise alone.
 
         It applies to bins that are evaluated one by one.
         """
@@ -750,9 +749,9 @@ class Shots:
     def alarm_equivalent_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Return the number of independent bins that together raise as many false alarms.
+        """Return the number of independent bins that are equivalent to the searched bins.
 
-        Their false-alarm probability is that of the searched bins.
+        Noise raises a false alarm in both with the same probability.
 
         Parameters
         ----------

@@ -317,7 +317,7 @@ def antialias_power_transmission(
 def relative_noise_density(
     frequency: np.ndarray, *, sample_rate: np.ndarray, **filters: np.ndarray
 ) -> np.ndarray:
-    """Return the noise density of a record, over that of white noise of the same sources.
+    """Return the noise density of a record, relative to white noise of the same sources.
 
     Parameters
     ----------

@@ -34,17 +34,16 @@ class FootprintLines(NamedTuple):
     row_of_point: np.ndarray
     """(n,) int64: index of each point's row in the arrays."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of a beamlet minus that on the beam's axis, over the range on the
-    axis."""
+    """(rows, beamlets): range of a beamlet minus that on the beam's axis, divided by the range on
+    the axis."""
     doppler_ratio_offset: np.ndarray
     """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the beam's axis. v_r is
     the radial velocity.
     """
     relative_amplitude: np.ndarray
-    """(rows, beamlets): amplitude of each beamlet's beat over
+    """(rows, beamlets): amplitude of each beamlet's beat, divided by
     :attr:`sweep.model.link_budget.EchoScales.beat_amplitude`. It is the square root of the
-    relative echo [1/sr], or with direct detection the relative echo itself.
-    """
+    relative echo [1/sr], or with direct detection the relative echo itself."""
     adds_powers: bool = True
     """True if the powers of beamlets add, False if their amplitudes do."""
     phase_cycles: np.ndarray = np.empty((3, 0, 0))  # never written to
@@ -69,9 +68,8 @@ class DetectionSettings(NamedTuple):
     """
 
     tnr: np.ndarray
-    """Threshold-to-noise ratio: threshold over the standard deviation of a noise-only bin's
-    magnitude.
-    """
+    """Threshold-to-noise ratio: threshold divided by the standard deviation of a noise-only bin's
+    magnitude."""
     echo_bins: str
     """Bins that can detect an echo: ``any_bin`` of the echo, or ``peak_bin``, only its largest, as
     in [T].
@@ -131,16 +129,14 @@ class SpectrumTolerances(NamedTuple):
     """Tolerated errors of bin magnitudes and leakage in the evaluation of spectra."""
 
     line_error: np.ndarray
-    """Tolerated error of a bin's magnitude, over the noise sigma, if few lines represent all
-    beamlets.
-    """
+    """Tolerated error of a bin's magnitude, relative to the noise sigma, if few lines represent all
+    beamlets."""
     leakage_probability: np.ndarray
     """Tolerated probability of false alarms due to leaked signal that is not evaluated."""
     leakage_floor: np.ndarray
-    """Leaked signal in a bin, over the noise sigma, below which the bin counts as noise alone. The
-    value :data:`sweep.model.error_budget.AUTOMATIC` means that it follows from
-    ``leakage_probability``.
-    """
+    """Leaked signal in a bin, relative to the noise sigma, below which the bin counts as noise
+    alone. The value :data:`sweep.model.error_budget.AUTOMATIC` means that it follows from
+    ``leakage_probability``."""
 
     @classmethod
     def from_parameters(
@@ -163,7 +159,7 @@ class PhaseError(NamedTuple):
     record, -1 .. 1, ``sign`` and `arguments`.
     """
     arguments: dict[str, Any]
-    """Arguments of ``phase`` by name, (n,) or scalars; tuples are by segment."""
+    """Arguments of ``phase`` by name, (n,) or scalars; tuples hold one for each segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
         """Return the arguments of ``phase`` for selected points in one segment.
@@ -210,9 +206,8 @@ class LineImages(NamedTuple):
     are_summed: bool = False
     """True if the images in a real record's spectrum are summed with its lines."""
     iq_gain: np.ndarray | float = 0.0
-    """(n,): amplitude of a line's image over that of the line, 0..1, in a complex record. It is due
-    to imbalance of I and Q.
-    """
+    """(n,): amplitude of a line's image, relative to that of the line, 0..1, in a complex record.
+    It is due to imbalance of I and Q."""
 
 
 class PermanentLine(NamedTuple):

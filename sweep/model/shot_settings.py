@@ -56,7 +56,7 @@ class TargetState:
 
     @property
     def delay(self) -> np.ndarray:
-        """Delay of the echo [s], twice the range over the speed of light."""
+        """Delay of the echo [s], twice the range divided by the speed of light."""
         return 2 / SPEED_OF_LIGHT * self.range
 
     @property
@@ -102,9 +102,8 @@ class WaveformSettings:
     segment_order: tuple[str, ...]
     """Names of the existing segments, in the order of time."""
     chirp_slopes: tuple[Any, ...]
-    """Signed chirp rates of up, Doppler and down segment, each over the up-chirp's
-    :attr:`chirp_rate`. They are numbers, or arrays if points differ.
-    """
+    """Signed chirp rates of up, Doppler and down segment, each divided by the up-chirp's
+    :attr:`chirp_rate`. They are numbers, or arrays if points differ."""
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
     """Frequency at the start of each segment [Hz]; its product with the echo's delay is a phase."""
     chirp_bandwidth: np.ndarray
@@ -151,7 +150,7 @@ class WaveformSettings:
 
     @property
     def chirp_rate(self) -> np.ndarray:
-        """Chirp rate of the up-chirp [Hz/s], bandwidth over duration."""
+        """Chirp rate of the up-chirp [Hz/s], bandwidth divided by duration."""
         return self.chirp_bandwidth / self.chirp_duration
 
     @property
@@ -264,12 +263,12 @@ class RecordSettings:
 
     @property
     def bin_width(self) -> np.ndarray:
-        """Width of an FFT bin [Hz], sample rate over FFT size."""
+        """Width of an FFT bin [Hz], sample rate divided by FFT size."""
         return self.sample_rate / self.fft_size
 
     @property
     def duration(self) -> np.ndarray:
-        """Duration of the record [s], number of samples over sample rate."""
+        """Duration of the record [s], number of samples divided by sample rate."""
         return self.window.length / self.sample_rate
 
     def bin_noise_sigma(self, noise_variance: np.ndarray, looks: Looks) -> np.ndarray:

@@ -46,7 +46,7 @@ from sweep.model.waveform import SEGMENT_NAMES
 """Parameter paths of five ways to set the detection threshold; exactly one of them is given."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
-"""Mean magnitude of a bin with noise alone, over the noise standard deviation per quadrature."""
+"""Mean magnitude of a noise-only bin, relative to the noise standard deviation per quadrature."""
 
 
 def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
@@ -60,7 +60,7 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
     Returns
     -------
     ndarray
-        Threshold over the standard deviation of |X| in a bin of noise.
+        Threshold divided by the standard deviation of |X| in a bin of noise.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
 def _common_threshold_ratio(
     log_pfa: float, looks: Looks, bins_by_segment: tuple[SearchedBins, ...]
 ) -> np.ndarray:
-    """Return the threshold over the noise sigma for a given probability of false alarm (cached).
+    """Return the ratio of threshold to noise sigma for a probability of false alarm (cached).
 
     ``log_pfa`` is the natural logarithm of the probability that noise raises an alarm in any
     segment.
@@ -126,7 +126,7 @@ def _log_pfa_function(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that gives the log probability of a false alarm in any segment.
 
-    Its argument is the threshold over the noise sigma. ``bins_by_segment`` are the bins of each
+    Its argument is the ratio of threshold to noise sigma. ``bins_by_segment`` are the bins of each
     segment in which noise may raise an alarm.
     """
     from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
@@ -153,7 +153,7 @@ def segment_alarm_bins(
     parameters : mapping
         Parameters by dotted path, of points that share strings and sizes.
     threshold_ratio : ndarray
-        Threshold b over sigma.
+        Ratio b of threshold to noise sigma.
     segment : str
         Name of the segment. Segments differ if a search band is set.
 

@@ -43,9 +43,9 @@ SEGMENT_ORDERS = (
 )  # fmt: skip
 """Possible sets of segments of a shot, each in the order of time."""
 DOPPLER_SEGMENT_SLOPE_PATH = "instrument.chirp.doppler_slope"
-"""Parameter path of the chirp rate of the Doppler segment, over that of the up-chirp."""
+"""Parameter path of the chirp rate of the Doppler segment, relative to that of the up-chirp."""
 DOWN_SEGMENT_SLOPE_PATH = "instrument.chirp.down_slope"
-"""Parameter path of the chirp rate of the down segment, over that of the up-chirp."""
+"""Parameter path of the chirp rate of the down segment, relative to that of the up-chirp."""
 SHOT_DETECTION_PATH = "instrument.processing.shot_detection"
 """Parameter path of the rule by which a shot is detected, one of `SHOT_DETECTION_OPTIONS`."""
 BOTH_CHIRPS, ANY_TWO = SHOT_DETECTION_OPTIONS = ("both_chirps", "any_two")
@@ -62,7 +62,7 @@ FAR_TARGET, FAST_TARGET = TWO_BEAT_ASSUMPTIONS = ("far", "fast")
 """Names of assumptions on two beats of unknown sign. Either the range beat exceeds the Doppler
 shift (``far``), or the Doppler shift exceeds the range beat (``fast``)."""
 DEFAULT_CHIRP_SLOPES = (1, 0, -1)
-"""Default chirp rates of up, Doppler and down segment, each over that of the up-chirp."""
+"""Default chirp rates of up, Doppler and down segment, each relative to that of the up-chirp."""
 WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     SEGMENT_ORDER_PATH: SEGMENT_ORDERS[0],
     SEGMENT_GAP_PATH: 0.0,
@@ -94,9 +94,8 @@ class WaveformSegment(NamedTuple):
     name: str
     """Name of the segment, one of :data:`SEGMENT_NAMES`."""
     chirp_slope: float
-    """Chirp rate of the segment over that of the up-chirp; up, Doppler, down are 1, 0, -1 by
-    default.
-    """
+    """Chirp rate of the segment relative to that of the up-chirp. By default it is 1, 0 and -1 for
+    up, Doppler and down segment."""
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
@@ -188,7 +187,7 @@ def carrier_frequencies(
 
 
 def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the chirp rates of up, Doppler and down segment, over that of the up-chirp.
+    """Return the chirp rates of up, Doppler and down segment, relative to that of the up-chirp.
 
     All points share them.
     """
@@ -358,8 +357,8 @@ sample rate. Range beats are positive, up to half the sample rate; Doppler shift
 up to half of it."""
 
 NEGATIVE_BEAT_FRACTION_MAX = 1 / 64
-"""Largest magnitude of a negative difference of down and up peak, over the sample rate, that counts
-as negative. Rounding of peaks to bins may make this difference, twice the range beat, slightly
+"""Limit up to which a negative difference of down and up peak, relative to the sample rate, stays
+negative. Rounding of peaks to bins may make this difference, twice the range beat, slightly
 negative. Larger negative differences are taken modulo the sample rate."""
 
 

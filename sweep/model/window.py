@@ -52,8 +52,8 @@ class Window:
     envelope_distances: np.ndarray
     """(m,): distance from a line at which the envelope is tabulated [bins of fs/L]."""
     sidelobe_envelope: np.ndarray
-    """(m,): largest magnitude of the window's transform at or beyond each distance, over its peak.
-    """
+    """(m,): largest magnitude of the window's transform at or beyond each distance, relative to its
+    peak."""
     n_missing: int = 0
     """Number of samples at the start that :func:`zero_first_samples` has set to 0."""
 
@@ -93,11 +93,11 @@ class Window:
         return tuple(map(float, weights / weights.sum()))
 
     def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
-        """Return the largest width of a group of lines that J equivalent lines can represent.
+        """Return how wide a group of lines may be that J equivalent lines represent.
 
-        The widths are half-widths times pi [rad]. The result is that of
-        :func:`sweep.model.spectrum.lines.node_phase_limits`, for the tolerances of sums of
-        amplitudes, or of powers with `adds_powers`.
+        The widths are half-widths times pi [rad], by tolerance and by J, as in
+        :func:`sweep.model.spectrum.lines.node_phase_limits`. Tolerances are those of sums of
+        amplitudes or, with `adds_powers`, of sums of powers.
         """
         from sweep.model.spectrum.lines import (
             AMPLITUDE_TOLERANCES,
@@ -112,7 +112,7 @@ class Window:
     def equivalent_noise_bandwidth(self) -> float:
         """Equivalent noise bandwidth [bins of fs/L].
 
-        The bandwidth is L times the sum of squared samples, over the squared sum of samples.
+        The bandwidth is L times the sum of squared samples, divided by the squared sum of samples.
         """
         return self.length * self.energy / self.sum**2
 
@@ -194,8 +194,8 @@ def zero_first_samples(window: Window, n_missing: int) -> Window:
     window : Window
         Window of the full record.
     n_missing : int
-        Number of first samples that are 0. It is rounded to a multiple of the record's length over
-        :data:`ZEROING_STEPS_PER_RECORD`, so that few windows are computed.
+        Number of first samples that are 0. It is rounded to a multiple of the record's length
+        divided by :data:`ZEROING_STEPS_PER_RECORD`, so that few windows are computed.
 
     Returns
     -------
@@ -359,7 +359,7 @@ def _decimate_envelope(
     """Return an envelope reduced to distances that differ by some 2 %.
 
     `envelope` (m,) is the largest magnitude of a window's transform at and beyond each of
-    `distances` (m,), over its peak. The factor 1.03 covers sidelobes whose peaks lie between
+    `distances` (m,), relative to its peak. The factor 1.03 covers sidelobes whose peaks lie between
     samples.
     """
     kept_indices = np.unique(

@@ -38,18 +38,18 @@ _MAGNITUDE_OCTAVE_MIN = -80
 
 
 class WindowResponse(NamedTuple):
-    """Magnitude of a window's transform at the FFT bins around a line, over its peak."""
+    """Magnitude of a window's transform at the FFT bins around a line, relative to its peak."""
 
     main_lobe: np.ndarray
     """(m,): magnitude at distances from a line of 0..1/2 FFT bin, in equal steps."""
     slope_max: float
-    """Upper bound on the slope of the relative power over distance, as a magnitude [1/bin]."""
+    """Upper bound on the magnitude of the relative power's derivative by distance [1/bin]."""
     curvature_max: float
-    """Upper bound on the second derivative of the relative power over distance [1/bin^2]."""
-    padding_factor: float
-    """FFT size over number of samples, the number of FFT bins per bin of fs/L.
-    ``central_energy_min`` includes as many FFT bins on each side.
+    """Upper bound on the magnitude of the relative power's second derivative by distance [1/bin^2].
     """
+    padding_factor: float
+    """FFT size divided by number of samples, the number of FFT bins per bin of fs/L.
+    ``central_energy_min`` includes as many FFT bins on each side."""
     central_energy_min: float
     """Smallest sum of relative powers of the FFT bins within ``padding_factor`` bins of a line. It
     is the minimum over positions of the line between bins.
@@ -66,12 +66,15 @@ class WindowResponse(NamedTuple):
     """Smallest magnitude of the FFT bin nearest to a line, which is up to half a bin away."""
 
     def scalloping_gain(self, distance: np.ndarray) -> np.ndarray:
-        """Return a bin's magnitude, over the peak, at ``distance`` [bins] from a line, 0..1/2."""
+        """Return a bin's magnitude, relative to the peak, at ``distance`` from a line.
+
+        The distance is 0..1/2 [bins].
+        """
         clipped_distance = np.fmin(distance, 0.5)
         return self.main_lobe[(clipped_distance * (2 * _N_MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
 
     def magnitude_max_beyond(self, distance: np.ndarray) -> np.ndarray:
-        """Return the largest magnitude, over the peak, at ``distance`` [bins] or farther.
+        """Return the largest magnitude, relative to the peak, at ``distance`` [bins] or farther.
 
         ``distance`` is from a line.
         """
@@ -209,11 +212,10 @@ class MissingSamples(NamedTuple):
     """Effect of the samples that are taken before the echo arrives, by segment."""
 
     lost_fraction: np.ndarray
-    """Sum of the window's magnitude over the missing samples, over the window's sum."""
+    """Sum of the window's magnitude at the missing samples, divided by the window's sum."""
     step_sidelobe_factor: np.ndarray
-    """Bound on the sidelobes that missing samples add, over those of a rectangular window.
-    Sidelobes are relative to the sum of the window.
-    """
+    """Ratio of a bound on the sidelobes that missing samples add to the sidelobes of a rectangular
+    window. Both are relative to the window's sum."""
     n_missing: np.ndarray
     """Number of samples that are taken before the echo arrives."""
     centroid_bound: np.ndarray
@@ -273,7 +275,7 @@ def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np
 def window_max_near(
     window: Window, first_sample: np.ndarray, reach_samples: np.ndarray
 ) -> np.ndarray:
-    """Return the largest magnitude of the window near a sample, over the window's sum.
+    """Return the largest magnitude of the window near a sample, divided by the window's sum.
 
     Parameters
     ----------
@@ -297,7 +299,7 @@ def window_max_near(
 
 @lru_cache(maxsize=64)
 def _window_max_within(window: Window, exponent: int) -> np.ndarray:
-    """Return the largest magnitude of a window near each position, over its sum, (L + 1,).
+    """Return the largest magnitude of a window near each position, divided by its sum, (L + 1,).
 
     Near means within 2^``exponent`` samples.
     """
