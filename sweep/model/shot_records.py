@@ -159,7 +159,7 @@ class PhaseError(NamedTuple):
     record, -1 .. 1, ``sign`` and `arguments`.
     """
     arguments: dict[str, Any]
-    """Arguments of ``phase`` by name, (n,) or scalars; tuples hold one for each segment."""
+    """Arguments of ``phase`` by name, (n,) or scalars; tuples hold one per segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
         """Return the arguments of ``phase`` for selected points in one segment.
