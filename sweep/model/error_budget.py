@@ -19,11 +19,12 @@ For counts there are two intervals. Wilson's score interval [1]_ has the stated 
 over probabilities. The interval of Clopper and Pearson [2]_ has at least the stated coverage at
 every probability.
 
-For a mean m of n values within 0..1, of sample variance s^2, rare values that no draw has shown may
-add any amount. s^2 = 0 after n equal values proves nothing. But if the true mean lies d above m,
-because of rare values between m and 1, the true variance is larger too, by at most (1 - m) d. If it
-lies d below, because of values down to 0, by at most m d. The interval holds all means that are
-likely with such a variance, as the score interval does:
+For means of n values within 0..1 the interval is as follows. Let m be the mean and s^2 the sample
+variance. Rare values that no draw has shown may change both, so that s^2 = 0 after n equal values
+proves nothing. If the true mean lies d above m, because of rare values between m and 1, the true
+variance exceeds s^2 by at most (1 - m) d. If it lies d below m, because of rare values down to 0,
+it exceeds s^2 by at most m d. The interval holds all means that are likely with such a variance, as
+the score interval does:
 
     n d^2 = z^2 (s^2 + q d),    q = 1 - m above, m below,
     d = (q z^2 / 2 + sqrt(n s^2 z^2 + q^2 z^4 / 4)) / n.
