@@ -60,7 +60,7 @@ def make_store(path, spec):
         )
         deviates = deviates.reshape(extent)
         # What is only summarised packs well, to spare the disk.
-        results = dict.fromkeys(study.chunk_positions(block), np.round(deviates))
+        results = dict.fromkeys(study.chunk_positions_of_block(block), np.round(deviates))
         results |= {
             "pd_shot": ndtr(deviates),
             "miss_shot": ndtr(-deviates),

@@ -191,8 +191,10 @@ def frequency_error_bounds(name: str) -> tuple[np.ndarray, np.ndarray]:
     cnr = estimators.carrier_to_noise_ratio(snr=10 ** (SNR_DB / 10), window=w)
     sample_rate = float(RECORD_LENGTH)
     return (
-        estimators.beat_frequency_bound(cnr=cnr, n_samples=RECORD_LENGTH, sample_rate=sample_rate),
-        estimators.windowed_peak_deviation(cnr=cnr, window=w, sample_rate=sample_rate),
+        estimators.beat_frequency_cramer_rao_bound(
+            cnr=cnr, n_samples=RECORD_LENGTH, sample_rate=sample_rate
+        ),
+        estimators.windowed_peak_frequency_deviation(cnr=cnr, window=w, sample_rate=sample_rate),
     )
 
 

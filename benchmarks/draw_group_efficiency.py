@@ -14,14 +14,18 @@ from benchmark_helpers import experiment_spec, markdown_table, replace_page_part
 from tolerance_of_draws import exact_means
 
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.outputs import PD_OUTPUTS
+from sweep.model.outputs import PD_OUTPUT_NAMES
 from sweep.model.sampling.samplers import (
     DetectionSampler,
     draw_until_accurate,
     simulate_draws,
-    stopping_checks,
+    stopping_check_draws,
 )
-from sweep.tasks.studies.grid_study import GridStudy, random_keys_of_points, select_parameters
+from sweep.tasks.studies.grid_study import (
+    GridStudy,
+    random_keys_of_points,
+    select_parameters_of_points,
+)
 
 TOLERANCES = (0.03, 0.01, 0.003)
 CONFIDENCE_LEVEL, BATCH_DRAWS, DRAWS_MAX = 0.95, 100, 10**7
@@ -79,7 +83,7 @@ def drawn_points(spec) -> list[DrawnPoints]:
         indices = np.arange(study.grid.n_points).reshape(study.grid.shape)[slices].ravel()
         for members, effects in selected.iter_groups_by_effects():
             if "speckle" in effects:
-                subset = select_parameters(parameters, members)
+                subset = select_parameters_of_points(parameters, members)
                 keys = random_keys_of_points(spec, subset, len(members))
                 groups.append(DrawnPoints(indices[members], subset, tuple(effects), keys))
     return groups
@@ -99,7 +103,7 @@ def draw_independently(points: DrawnPoints, error_budget: ErrorBudget) -> dict[s
         points.parameters, points.effects, keys=points.keys, method="probabilities",
         batch_edges=np.array([0, DRAWS_MAX]),
     )  # fmt: skip
-    checks = stopping_checks(BATCH_DRAWS, DRAWS_MAX)
+    checks = stopping_check_draws(BATCH_DRAWS, DRAWS_MAX)
     draw_until_accurate(sampler, np.arange(len(points.keys)), checks, error_budget)
     return sampler.results(error_budget)
 
@@ -112,7 +116,7 @@ def measure(draw, groups: list[DrawnPoints], means: np.ndarray, tolerance: float
     seconds = time.process_time() - start
     errors = [
         np.max([abs(result[name] - exact[points.indices])
-                for name, exact in zip(PD_OUTPUTS, means, strict=True)], axis=0)
+                for name, exact in zip(PD_OUTPUT_NAMES, means, strict=True)], axis=0)
         for points, result in zip(groups, results, strict=True)
     ]  # fmt: skip
     n_draws = np.concatenate([result["n_draws"] for result in results])

@@ -155,7 +155,7 @@ def filled_block_arrays(study, block: int) -> dict[str, np.ndarray]:
         name: np.resize(
             values, [region_slice.stop - region_slice.start for region_slice in region]
         ).astype(study.output_layout_by_name[name].dtype)
-        for name, region in study.chunk_regions(block).items()
+        for name, region in study.chunk_regions_of_block(block).items()
     }
 
 

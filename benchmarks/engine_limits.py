@@ -78,12 +78,12 @@ def make_full_store(directory, n_blocks):
 
 def iter_receipt_lines(n_blocks, points=65_536):
     """Yield the lines of the log of a store whose blocks are all done [bytes]."""
-    from sweep.storage.store_format import append_line_digest
+    from sweep.storage.store_format import log_line_with_digest
 
     record = {**vars(make_receipt(0, points)), "time": round(time.time(), 3)}
     other_fields = json.dumps(record, separators=(",", ":")).partition(",")[2][:-1]
     return (
-        append_line_digest(f'{{"block":{block},{other_fields}'.encode())
+        log_line_with_digest(f'{{"block":{block},{other_fields}'.encode())
         for block in range(n_blocks)
     )
 
@@ -97,7 +97,7 @@ def time_call(function):
 def measure_blocks(n_blocks, store):
     """Print processor times [s] and memory [MB] that a number of blocks takes, as JSON."""
     from sweep.storage.store_format import read_receipt_totals
-    from sweep.tasks.engine.journal import Journal, find_complete_blocks
+    from sweep.tasks.engine.journal import Journal, find_complete_block_mask
     from sweep.tasks.engine.worker import BlockQueue
     from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
@@ -113,7 +113,7 @@ def measure_blocks(n_blocks, store):
     listing_seconds = float("nan")
     if n_blocks <= FILES_MAX:
         is_listed, _, listing_seconds = time_call(
-            lambda: find_complete_blocks(
+            lambda: find_complete_block_mask(
                 store, OneArrayStudy(n_blocks), receipts.points_by_block > 0
             )
         )

@@ -14,13 +14,17 @@ from rich.progress import track
 
 from sweep.model.detection.marcum import marcum_q1
 from sweep.model.error_budget import (
-    COUNT_INTERVALS,
+    COUNT_INTERVAL_FUNCTIONS,
     ConfidenceInterval,
     ErrorBudget,
     bounded_mean_interval,
     interval_half_width,
 )
-from sweep.model.sampling.samplers import NOISE_DRAWS_PER_STEP, draw_until_accurate, stopping_checks
+from sweep.model.sampling.samplers import (
+    NOISE_DRAWS_PER_STEP,
+    draw_until_accurate,
+    stopping_check_draws,
+)
 
 CONFIDENCE_LEVEL, BATCH_DRAWS, DRAWS_MAX = 0.95, 100, 10**7
 TOLERANCES = (0.1, 0.03, 0.01)
@@ -106,14 +110,12 @@ class RepeatedPoint:
             )
         else:
             successes = np.rint(mean * n)
-            interval = COUNT_INTERVALS[self._method](
+            interval = COUNT_INTERVAL_FUNCTIONS[self._method](
                 successes=successes, trials=n, confidence=CONFIDENCE_LEVEL
             )
         return interval_half_width(mean, interval)
 
-    def half_width_over_tolerance(
-        self, points: np.ndarray, error_budget: ErrorBudget
-    ) -> np.ndarray:
+    def half_width_excess(self, points: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return by how much the half-widths of trials exceed the tolerance; 0 if they do not."""
         return np.maximum(self.half_widths(points) - error_budget.tolerance, 0.0)
 
@@ -134,7 +136,7 @@ def simulate_stopping(
     n_trials = N_TRIALS_BY_METHOD["means" if method == "means" else "counts"]
     trials, points = RepeatedPoint(n_trials, sampler, method), np.arange(n_trials)
     check_numbers = (
-        stopping_checks(BATCH_DRAWS, DRAWS_MAX)
+        stopping_check_draws(BATCH_DRAWS, DRAWS_MAX)
         if stopping_times == "shipped"
         else range(BATCH_DRAWS, DRAWS_MAX, BATCH_DRAWS)
     )

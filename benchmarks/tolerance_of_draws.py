@@ -22,7 +22,7 @@ from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.speckle import coherent_echo_fraction
 from sweep.model.evaluation import evaluate_segments, prepare_shots
-from sweep.model.outputs import PD_OUTPUTS
+from sweep.model.outputs import PD_OUTPUT_NAMES
 from sweep.spec import GridSpec, load
 from sweep.storage.accuracy_setting_kinds import ADAPTIVE_KIND
 from sweep.tasks.accuracy.settings import AccuracySetting
@@ -51,7 +51,8 @@ deviations of such a share it is from {confidence:.0%}. It may be {sigmas:g} bel
 surer where what so many draws may have missed decides, and not the variance.
 """
 COLUMNS = (
-    "tolerance", "points", "within", "draws decide", "within of these", *PD_OUTPUTS, "draws", "us",
+    "tolerance", "points", "within", "draws decide", "within of these", *PD_OUTPUT_NAMES,
+    "draws", "us",
 )  # fmt: skip
 
 
@@ -60,7 +61,7 @@ class DrawnResults(NamedTuple):
 
     tolerance: float
     error: np.ndarray
-    """Differences |pd - exact| (4, n), in the order of `PD_OUTPUTS`."""
+    """Differences |pd - exact| (4, n), in the order of `PD_OUTPUT_NAMES`."""
     half_width: np.ndarray
     is_decided_by_draws: np.ndarray
     """Mask (4, n) of values that depend on draws: pd varies, and is not close to 0 or 1."""
@@ -72,7 +73,7 @@ class DrawnResults(NamedTuple):
 def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
     """Return the exact means of pd (4, points), and the error of their integral.
 
-    The order is that of `PD_OUTPUTS`.
+    The order is that of `PD_OUTPUT_NAMES`.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
             )
             pd_shot = float((pd_by_node[0] * pd_by_node[2]) @ weight)
             values = dict(zip(("pd_up", "pd_doppler", "pd_down"), closed_form[:, i], strict=True))
-            means[:, index[i]] = [(values | {"pd_shot": pd_shot})[name] for name in PD_OUTPUTS]
+            means[:, index[i]] = [(values | {"pd_shot": pd_shot})[name] for name in PD_OUTPUT_NAMES]
     return means, integral_error
 
 
@@ -160,7 +161,9 @@ def _draw_with_seed(
         AccuracySetting(name="", kind=ADAPTIVE_KIND, overrides=overrides).apply_to(load(path))
     )
     study.compile_kernels()
-    names = [f"{name}{suffix}" for suffix in ("", "_half_width", "_error") for name in PD_OUTPUTS]
+    names = [
+        f"{name}{suffix}" for suffix in ("", "_half_width", "_error") for name in PD_OUTPUT_NAMES
+    ]
     values = np.empty((len(names) + 1, *study.grid.shape))
     start = thread_time()
     for block in range(study.grid.n_blocks):
@@ -168,7 +171,7 @@ def _draw_with_seed(
         for target, name in zip(values, [*names, "n_draws"], strict=True):
             target[study.grid.block_slices(block)] = results[name]
     cpu_seconds = thread_time() - start
-    pd, half_width, error = values[:-1].reshape(3, len(PD_OUTPUTS), -1)
+    pd, half_width, error = values[:-1].reshape(3, len(PD_OUTPUT_NAMES), -1)
     return pd, half_width, error, values[-1].ravel(), cpu_seconds
 
 
@@ -178,7 +181,7 @@ def missed_tolerances(name: str, rows: Sequence[DrawnResults], confidence: float
         within = (row.error <= row.tolerance).all(axis=0).mean()
         if within < confidence:
             yield f"- {name} at {row.tolerance:g}: {within:.1%} of the points are within it"
-        for quantity, sigmas in zip(PD_OUTPUTS, coverage(row, confidence)[1], strict=True):
+        for quantity, sigmas in zip(PD_OUTPUT_NAMES, coverage(row, confidence)[1], strict=True):
             if sigmas < -ALLOWED_SIGMAS:
                 yield f"- {name} at {row.tolerance:g}: {quantity} covered {sigmas:+.1f} sigma off"
 

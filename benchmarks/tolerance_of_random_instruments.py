@@ -17,7 +17,7 @@ from sweep.model.effects.catalogue import EFFECTS, pack_effect_flags, unpack_eff
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.planning import plan_effects
 from sweep.model.evaluation import PARAMETER_DEFAULTS
-from sweep.tasks.studies.grid_study import evaluate_points, select_parameters
+from sweep.tasks.studies.grid_study import evaluate_points, select_parameters_of_points
 from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
@@ -143,7 +143,7 @@ def errors_at_tolerances(
             index = np.flatnonzero(flags == flag)
             part = evaluate_points(
                 spec,
-                select_parameters(parameters_at_tolerance, index),
+                select_parameters_of_points(parameters_at_tolerance, index),
                 index.size,
                 unpack_effect_flags(int(flag)),
             )

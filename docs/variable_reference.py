@@ -65,13 +65,13 @@ SECTIONS: list[tuple[str, str, str, list[Mapping[str, OutputVariable]]]] = [
         "Grids with whole spectra",
         "Variables of a study with `draws: {method: spectra}`, which replace those of a grid.",
         "axes",
-        [outputs.SPECTRA_OUTPUTS],
+        [outputs.SPECTRA_STUDY_OUTPUTS],
     ),
     (
         "Flights: shots",
         "One group for each scanner; `sweep.open_scene` opens them. The geometry is the truth.",
         "",
-        [outputs.SHOT_VARIABLES, outputs.CYCLE_VARIABLES],
+        [outputs.SHOT_GEOMETRY_VARIABLES, outputs.CYCLE_VARIABLES],
     ),
     (
         "Flights: probabilities",
@@ -79,7 +79,7 @@ SECTIONS: list[tuple[str, str, str, list[Mapping[str, OutputVariable]]]] = [
         "axes",
         [outputs.SHOT_STATISTIC_VARIABLES, outputs.EFFECT_VARIABLES],
     ),
-    ("Flights: points", "The point cloud.", "axes", [outputs.POINT_VARIABLES]),
+    ("Flights: points", "The point cloud.", "axes", [outputs.POINT_CLOUD_VARIABLES]),
     (
         "Flights: navigation",
         "Velocity and altitude from each measurement cycle of three shots or more.",
@@ -90,7 +90,7 @@ SECTIONS: list[tuple[str, str, str, list[Mapping[str, OutputVariable]]]] = [
         "Eyepoints",
         "The rays of each scanner, in a store of their own next to the flight's.",
         "",
-        [outputs.BEAMLET_VARIABLES, {"weight": outputs.BEAMLET_WEIGHT_VARIABLE}],
+        [outputs.BEAMLET_GEOMETRY_VARIABLES, {"weight": outputs.BEAMLET_WEIGHT_VARIABLE}],
     ),
 ]
 

@@ -68,7 +68,7 @@ class CacheFolder(NamedTuple):
 
     path: Path | None
     """The folder; None if kernels are not cached."""
-    reason: str = ""
+    not_cached_reason: str = ""
     """Why kernels are not cached; empty if they are."""
 
 
@@ -202,7 +202,7 @@ def _enable_cache(kernel: Any, borrows: bool) -> None:
     """
     folder = cache_folder()
     if folder.path is None:
-        _warn_not_cached(folder.reason)
+        _warn_not_cached(folder.not_cached_reason)
         return
     if _file_has_changed(kernel.py_func.__code__.co_filename):
         # This process has loaded modules of different versions: no fingerprint describes them.

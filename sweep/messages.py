@@ -65,7 +65,7 @@ def number_with_noun(number: int, thing: str) -> str:
     return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
-class EscapedTextError(Exception):
+class EscapedMessageError(Exception):
     """Base of errors whose text quotes stores, specs and file names.
 
     Unprintable characters are escaped.

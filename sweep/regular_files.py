@@ -188,9 +188,9 @@ def _read_slice_and_close(
 class FileStream(NamedTuple):
     """Open file that is read piece by piece."""
 
-    size: int
+    size_bytes: int
     """Size of the file [bytes]."""
-    pieces: Iterator[bytes]
+    content_pieces: Iterator[bytes]
     """Content of the file in pieces; each is read when the iterator advances."""
 
 

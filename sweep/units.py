@@ -572,12 +572,12 @@ def number_text(value: float, format_spec: str = ".4g") -> str:
     return f"{value:{format_spec}}" if value == value else NO_VALUE_TEXT
 
 
-def percent(share: float, format_spec: str = ".3g") -> str:
+def percent_text(share: float, format_spec: str = ".3g") -> str:
     """Return a fraction as text in percent; ``none`` for nan, such as the quotient 0 / 0.
 
     Examples
     --------
-    >>> percent(0.25), percent(float("nan"))
+    >>> percent_text(0.25), percent_text(float("nan"))
     ('25 %', 'none')
     """
     return f"{100 * share:{format_spec}} %" if share == share else NO_VALUE_TEXT

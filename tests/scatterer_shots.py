@@ -111,7 +111,9 @@ def segment_amplitudes(facet: Facet, shots) -> dict[str, float]:
             amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,
         )
         echo_amplitude = (
-            shots.echo_scales.beat_amplitude * np.sqrt(shots.total_relative_echo) * np.abs(gain)
+            shots.echo_scales.beat_amplitude_scale
+            * np.sqrt(shots.total_relative_echo)
+            * np.abs(gain)
         )
         amplitude_by_segment[segment] = first_value(
             echo_amplitude * shots.whitening_gain[SEGMENTS.index(segment)]
@@ -201,7 +203,7 @@ def searched_bins(mean_power: np.ndarray, shots) -> np.ndarray:
     at or above the threshold, and their neighbours.
     """
     magnitude, positions = np.sqrt(mean_power), np.arange(mean_power.size)
-    if shots.detection_settings.echo_bins == "peak_bin":
+    if shots.detection_settings.echo_bin_rule == "peak_bin":
         return positions == strongest_bin(mean_power)
     half_lobe = math.ceil(main_lobe_half_width(shots.window) * shots.fft_size / shots.window.length)
     searched = np.zeros(positions.size, bool)
@@ -220,8 +222,8 @@ def segment_detections(spectra: SegmentSpectra, shots) -> dict[str, np.ndarray]:
     detected_by_segment = {}
     for segment, values in spectra.values.items():
         power = np.abs(values[:, :, searched_bins(spectra.mean_power[segment], shots)]) ** 2
-        if looks.combine == "binary":
-            is_detected_in_bin = (power >= threshold_power).sum(axis=1) >= looks.votes
+        if looks.combine_kind == "binary":
+            is_detected_in_bin = (power >= threshold_power).sum(axis=1) >= looks.votes_needed
         else:
             is_detected_in_bin = power.mean(axis=1) >= threshold_power
         detected_by_segment[segment] = is_detected_in_bin.any(axis=1)

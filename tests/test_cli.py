@@ -514,7 +514,7 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(work
         widths = store[f"{name}_half_width"]
         assert (row.n_points, row.n_points_within_tolerance) == (80, int((widths <= 0.1).sum()))
         assert row.worst_error == widths.max() and row.excess == row.worst_error - 0.1
-        assert row.samples_at_worst_point == 60 and row.draws_needed == -(
+        assert row.n_samples_at_worst_point == 60 and row.n_draws_needed == -(
             -60 * (row.worst_error / 0.1) ** 2 // 1
         )
         worst = np.argwhere(widths.values == float(widths.max()))[0]
@@ -524,7 +524,7 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(work
         for result in (run, status_result):
             assert (
                 f"{row.n_points_within_tolerance} of 80" in result.stdout
-                and f"{row.draws_needed:,.0f}" in result.stdout
+                and f"{row.n_draws_needed:,.0f}" in result.stdout
             )
     assert 0 < rows["pd_shot"].n_points_within_tolerance < 80
     assert store.accuracy_missed.max() == max(row.excess for row in rows.values())

@@ -13,7 +13,7 @@ from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_COUNT_OUTPUTS,
     GRID_OUTPUTS,
-    SPECTRA_OUTPUTS,
+    SPECTRA_STUDY_OUTPUTS,
     STANDARD_ERROR_OUTPUTS,
 )
 from sweep.spec import GridSpec, SceneSpec
@@ -89,7 +89,7 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
     )
     stored = {*GRID_OUTPUTS, *extra_outputs}
     if spec.draws.draws_whole_spectra:
-        stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
+        stored = {*SPECTRA_STUDY_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
     assert set(dataset.data_vars) == {*stored, "effects", "effects_error"}
     is_detected = dataset.pd_doppler > 0.2  # else there may be no draw to average over
     footprint = spec.footprint

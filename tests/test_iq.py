@@ -12,7 +12,7 @@ import sweep
 from sweep.model import time_domain_truth
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import prepare_shots, shot_statistics
-from sweep.model.pointcloud.pairing import MISPAIRED_FLAG, MISREAD_FLAG, TRUE_FLAG
+from sweep.model.pointcloud.pairing import MISPAIRED_FLAG, MISREAD_FLAG, TRUE_RETURN_FLAG
 from sweep.model.spectrum import segment_spectra
 from sweep.model.waveform import resolve_range_velocity
 from sweep.model.window import window_samples
@@ -99,7 +99,7 @@ def test_imbalance_makes_the_image_of_unequal_samples(phases, velocity, table_4_
     shots = replace(shots, echo_record=shots.echo_record._replace(phase_errors=()))
     g = np.sqrt(10**0.05) * np.exp(1j * np.deg2rad(3.0))
     leak = abs(1 - g) / abs(1 + g)
-    assert shots.images.iq_gain == pytest.approx(leak)
+    assert shots.line_images.iq_image_gain == pytest.approx(leak)
     w = window_samples("hann", 4096)
     for segment in range(3):
         exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
@@ -107,7 +107,9 @@ def test_imbalance_makes_the_image_of_unequal_samples(phases, velocity, table_4_
         accumulated_power = np.zeros(4096)
         accumulated_power[(bins + 2048) % 4096] = magnitude
         assert np.abs(accumulated_power - exact).max() < 1e-9 * exact.max()
-        record = time_domain_truth.analytic_record(shots, 0, segment, 3, with_range_walk=False)
+        record = time_domain_truth.beamlet_analytic_signal(
+            shots, 0, segment, 3, with_range_walk=False
+        )
         unequal = record.real + 1j * (g * record / 1j).real  # Q by its own gain and phase
         spectrum = np.abs(np.fft.fft(w * unequal))
         k = spectrum.argmax()
@@ -158,7 +160,9 @@ def test_a_street_in_complex_records(speed, tmp_path):
         store = tmp_path / f"{kind}.zarr"
         assert sweep.run(spec, store=store, scheduler="none", progress=False).complete
         clouds[kind] = sweep.open_scene(store)["frame"].to_dataset().load()
-    real, n_complex = ((cloud["flags"] & TRUE_FLAG > 0).sum().item() for cloud in clouds.values())
+    real, n_complex = (
+        (cloud["flags"] & TRUE_RETURN_FLAG > 0).sum().item() for cloud in clouds.values()
+    )
     wrong = (clouds["complex"]["flags"] & (MISREAD_FLAG | MISPAIRED_FLAG) > 0).sum().item()
     assert (real == 0) == (speed == 90)  # |f_d| > f_r: exchanged
     assert n_complex > 1000 and n_complex >= 0.99 * real and wrong <= 1e-3 * n_complex

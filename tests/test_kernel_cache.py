@@ -331,7 +331,10 @@ def test_kernels_are_cached_among_temporary_files_where_the_user_has_no_home(mon
 
 def test_the_model_is_cached_by_the_fingerprint():
     folder = sweep.kernel_cache.cache_folder()
-    assert Path(detect_in_spectra.stats.cache_path).parent == folder.path and folder.reason == ""
+    assert (
+        Path(detect_in_spectra.stats.cache_path).parent == folder.path
+        and folder.not_cached_reason == ""
+    )
 
 
 def _sum_of_first_row(table):

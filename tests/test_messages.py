@@ -24,7 +24,7 @@ from sweep.messages import (
 from sweep.spec import SpecError
 from sweep.tasks.engine import progress
 from sweep.tasks.engine.journal import LockHolder
-from sweep.tasks.engine.progress import BusyError, StoreError, TaskError
+from sweep.tasks.engine.progress import RunRequestError, StoreBusyError, StoreError
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\u202egnp\u2066\u200b\x7f"
 """Escape sequences of 7 and 8 bits, a carriage return, and marks that turn text around."""
@@ -83,7 +83,7 @@ def test_failures_locks_and_titles_of_a_store_are_reported_in_printable_text(tmp
     assert "running: process" in text and "complete" not in text.splitlines()
     text = command_output("resume", store, "--scheduler", "none", exit_code=2)
     assert "is being written by process" in text and "complete" not in text.splitlines()
-    with pytest.raises(BusyError) as error_info:
+    with pytest.raises(StoreBusyError) as error_info:
         sweep.resume(store, progress=False)
     assert not OBEYED & set(str(error_info.value))
 
@@ -218,4 +218,4 @@ def test_what_has_failed_before_is_tried_again_by_a_call_in_python(tmp_path):
 def test_functions_that_are_suggested_exist():
     for name in ("run", "resume", "extend", "status", "verify"):
         assert callable(getattr(sweep, name))
-    assert issubclass(TaskError, Exception)
+    assert issubclass(RunRequestError, Exception)

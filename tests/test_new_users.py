@@ -232,7 +232,7 @@ CALLS = [
 def test_a_wrong_call_ends_in_words_and_changes_nothing(working_directory, call, words):
     before = sorted(Path().rglob("*"))
     with pytest.raises(
-        (TypeError, ValueError, SpecError, sweep.tasks.engine.progress.TaskError)
+        (TypeError, ValueError, SpecError, sweep.tasks.engine.progress.RunRequestError)
     ) as error_info:
         call()
     assert words in str(error_info.value)

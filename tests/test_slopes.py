@@ -27,8 +27,8 @@ from sweep.model.sampling.draws import (
 )
 from sweep.model.waveform import (
     ANY_TWO,
-    DOPPLER_SEGMENT_SLOPE_PATH,
-    DOWN_SEGMENT_SLOPE_PATH,
+    DOPPLER_CHIRP_RATE_RATIO_PATH,
+    DOWN_CHIRP_RATE_RATIO_PATH,
     SHOT_DETECTION_PATH,
 )
 from sweep.spec import GridSpec, SpecError
@@ -48,7 +48,7 @@ def beats_of(slopes, far, speed):
     """Carriers, chirp rates and signed beats of segments of such slopes, (k, n) each."""
     carriers = np.array(waveform.carrier_frequencies(
         "homodyne", wavelength=waveform.SPEED_OF_LIGHT / CARRIER, start_frequency=0.0,
-        bandwidth=BANDWIDTH, chirp_slopes=slopes,
+        bandwidth=BANDWIDTH, chirp_rate_ratios=slopes,
     ))[:, None]  # fmt: skip
     rates = RATE * np.array(slopes)[:, None]
     tau, beta = 2 * far / waveform.SPEED_OF_LIGHT, 2 * speed / waveform.SPEED_OF_LIGHT
@@ -291,8 +291,8 @@ def test_lists_that_do_not_tell_range_and_velocity_are_refused(chirp, processing
 def test_lines_of_any_slope_are_those_of_the_record(table_4_1):
     """Sampled in time, and transformed: |X| of the peak, of every segment."""
     p = table_4_1() | {
-        DOPPLER_SEGMENT_SLOPE_PATH: 0.3,
-        DOWN_SEGMENT_SLOPE_PATH: 0.75,
+        DOPPLER_CHIRP_RATE_RATIO_PATH: 0.3,
+        DOWN_CHIRP_RATE_RATIO_PATH: 0.75,
         "target.range": 411.0,
     }
     p |= {"instrument.processing.fft_size": 4096, "instrument.chirp.duration": 1e-4}

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 import sweep
-from sweep.model.pointcloud.pairing import TRUE_FLAG, UNCONFIRMED_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG, UNCONFIRMED_FLAG
 from sweep.spec import GridSpec, SceneSpec
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -104,11 +104,13 @@ def test_no_point_of_a_street_is_lost_whatever_the_slopes(tmp_path, three, recor
     As many true points as by the lander's three segments, but for what three beats tell apart.
     """
     points = flown(tmp_path, record, **chirp)
-    n_kept, before = ((names["flags"] & TRUE_FLAG > 0).sum().item() for names in (points, three))
+    n_kept, before = (
+        (names["flags"] & TRUE_RETURN_FLAG > 0).sum().item() for names in (points, three)
+    )
     assert n_kept >= 0.995 * before > 500
     if "doppler" in chirp["segments"]:  # whose beat, with its sign, confirms what belongs together
         assert (
-            points["flags"] & (TRUE_FLAG | UNCONFIRMED_FLAG) == TRUE_FLAG
+            points["flags"] & (TRUE_RETURN_FLAG | UNCONFIRMED_FLAG) == TRUE_RETURN_FLAG
         ).sum().item() >= 0.99 * n_kept
     nothing = points["flags"] == 0
     assert nothing.any()

@@ -252,8 +252,8 @@ def test_a_number_with_a_comma_or_groups_is_refused_with_its_spelling_here(text,
 
 
 def test_shares_and_numbers_of_nothing_are_none():
-    assert units.percent(0.256, ".1f") == "25.6 %"
-    assert units.percent(math.nan) == units.number_text(math.nan) == "none"
+    assert units.percent_text(0.256, ".1f") == "25.6 %"
+    assert units.percent_text(math.nan) == units.number_text(math.nan) == "none"
     assert units.number_text(0.5) == "0.5"
 
 

@@ -314,7 +314,7 @@ def stated_error(quantity: str, shots: Shots, facet: Facet) -> float:
         if not shots.looks.has_moving_speckle:
             return STATED_ERRORS.alike_looks if quantity == "shot" else STATED_ERRORS.peak_bin
         return STATED_ERRORS.moving_looks if quantity == "shot" else STATED_ERRORS.moving_looks / 2
-    if shots.detection_settings.echo_bins == "peak_bin":
+    if shots.detection_settings.echo_bin_rule == "peak_bin":
         is_any_two_shot = quantity == "shot" and shots.detects_by_any_two_segments
         return STATED_ERRORS.peak_bin_any_two if is_any_two_shot else STATED_ERRORS.peak_bin
     line_deviation_bins, is_padded = line_deviation(facet), shots.fft_size > shots.window.length
@@ -339,7 +339,7 @@ def is_near_end(facet: Facet, line_deviation_bins: float) -> bool:
 
 def detection_rule_text(shots: Shots) -> str:
     """Rule of detection in a few words."""
-    looks, rule = shots.looks, shots.detection_settings.echo_bins
+    looks, rule = shots.looks, shots.detection_settings.echo_bin_rule
     if looks.is_noncoherent:
         speckle = (
             "independent"
@@ -348,7 +348,7 @@ def detection_rule_text(shots: Shots) -> str:
             if looks.has_moving_speckle
             else "common"
         )
-        votes = f"{looks.votes} of" if looks.combine == "binary" else "mean of"
+        votes = f"{looks.votes_needed} of" if looks.combine_kind == "binary" else "mean of"
         rule = f"{votes} {looks.number} {speckle}"
     return rule + (" any_two" if shots.detects_by_any_two_segments else "")
 

@@ -26,16 +26,16 @@ from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
     AS_WRITTEN_KIND,
+    BEAMLET_LATTICE_KIND,
     BEAMLET_ROW_KIND,
-    BEAMLETS_KIND,
     CLOSED_FORM_KIND,
-    COUNTED_DRAWS_KIND,
-    DRAWS_IN_NOISE_KIND,
+    COUNTED_DETECTIONS_IN_NOISE_KIND,
+    COUNTED_DETECTIONS_KIND,
     FIXED_EFFECTS_KIND,
-    IMPROVED_THESIS_KIND,
-    MEAN_OF_DRAWS_KIND,
+    IMPROVED_THESIS_METHOD_KIND,
+    MEAN_PD_OF_DRAWS_KIND,
     REFERENCE_KIND,
-    THESIS_KIND,
+    THESIS_METHOD_KIND,
 )
 from sweep.storage.locations import Location, derived_files_dir
 from sweep.storage.store_format import ACCURACY_STORE_KIND, OPEN_ZARR_KWARGS
@@ -52,13 +52,13 @@ The reference setting, from which errors are measured, has errors of this size i
 
 FIXED_SETTING_KINDS = (
     FIXED_EFFECTS_KIND,
-    BEAMLETS_KIND,
+    BEAMLET_LATTICE_KIND,
     BEAMLET_ROW_KIND,
     CLOSED_FORM_KIND,
     ALL_EFFECTS_KIND,
-    MEAN_OF_DRAWS_KIND,
-    COUNTED_DRAWS_KIND,
-    DRAWS_IN_NOISE_KIND,
+    MEAN_PD_OF_DRAWS_KIND,
+    COUNTED_DETECTIONS_KIND,
+    COUNTED_DETECTIONS_IN_NOISE_KIND,
 )
 """Kinds of settings with the same effects, beamlets and draws at every point of a study."""
 
@@ -95,11 +95,11 @@ class MeasuredSetting:
     """Kind of the setting (:mod:`sweep.storage.accuracy_setting_kinds`)."""
     tolerance: float
     """Tolerance of an adaptive setting."""
-    seconds_by_round: np.ndarray
+    seconds_per_point_by_round: np.ndarray
     """Computing time per point of the study in each round of measurement (rounds,) [s]."""
-    planning_seconds: float
+    planning_seconds_per_point: float
     """Part of the time per point that choosing effects takes, in the fastest round [s]."""
-    pd_error: np.ndarray
+    pd_error_by_point: np.ndarray
     """Largest error of a probability of detection at each point (points,)."""
     log10_pfa_error: float
     """Largest error of log10 of a false-alarm probability at any point; nan if there is none."""
@@ -111,16 +111,16 @@ class MeasuredSetting:
     It is nan if there is none. The tolerance does not limit it, because it jumps where a bin
     reaches the threshold.
     """
-    error_quantile: float
+    error_quantile_level: float
     """Level, 0..1, of the quantile of pd's errors over the points that is the `largest_error`.
 
     Without draws it is 1, which stands for the largest error.
     """
 
     @property
-    def fastest_round_seconds(self) -> float:
+    def fastest_seconds_per_point(self) -> float:
         """Time per point in the fastest round of measurement [s]."""
-        return float(np.min(self.seconds_by_round))
+        return float(np.min(self.seconds_per_point_by_round))
 
     @property
     def largest_error(self) -> float:
@@ -128,13 +128,13 @@ class MeasuredSetting:
 
         With draws it is a quantile of pd's errors over the points.
         """
-        if self.error_quantile < 1.0:
-            return self.pd_error_quantile(self.error_quantile)
+        if self.error_quantile_level < 1.0:
+            return self.pd_error_quantile(self.error_quantile_level)
         promised_errors = self.pd_error_quantile(1.0), self.log10_pfa_error, self.magnitude_error
         return float(np.fmax.reduce(promised_errors))
 
     @property
-    def covers_leakage_error(self) -> bool:
+    def is_leakage_error_acceptable(self) -> bool:
         """False if the setting is a closed form whose leakage error exceeds its other errors.
 
         Closed forms omit leakage, the probability of false peaks due to window sidelobes. Other
@@ -146,7 +146,7 @@ class MeasuredSetting:
 
     def pd_error_quantile(self, fraction: float) -> float:
         """Return a quantile of pd's errors over the points; `fraction` is 0..1."""
-        return float(np.nanquantile(self.pd_error, fraction))
+        return float(np.nanquantile(self.pd_error_by_point, fraction))
 
     def speedup_over(self, other: MeasuredSetting, extra_seconds: float = 0.0) -> float:
         """Return the time of another setting over the time of this one.
@@ -154,18 +154,19 @@ class MeasuredSetting:
         The ratio is the median over the rounds of measurement, or that of the fastest rounds if
         there are few rounds. ``extra_seconds`` is a time per point that is added to both [s].
         """
-        if self.seconds_by_round.size < ROUNDS_FOR_MEDIAN_MIN:
-            return (other.fastest_round_seconds + extra_seconds) / (
-                self.fastest_round_seconds + extra_seconds
+        if self.seconds_per_point_by_round.size < ROUNDS_FOR_MEDIAN_MIN:
+            return (other.fastest_seconds_per_point + extra_seconds) / (
+                self.fastest_seconds_per_point + extra_seconds
             )
         return float(
             np.median(
-                (other.seconds_by_round + extra_seconds) / (self.seconds_by_round + extra_seconds)
+                (other.seconds_per_point_by_round + extra_seconds)
+                / (self.seconds_per_point_by_round + extra_seconds)
             )
         )
 
 
-def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
+def read_measured_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
     """Return the settings in the dataset of a store of `sweep accuracy`, in their order.
 
     Stores of earlier versions call the dimension of settings `rung`.
@@ -173,7 +174,7 @@ def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
     if "rung" in dataset.dims:
         dataset = dataset.rename(rung="setting")
     array_by_name = {name: array.values for name, array in dataset.variables.items()}
-    error_quantile = (
+    error_quantile_level = (
         RANDOM_ERROR_QUANTILE_LEVEL if np.isfinite(array_by_name["standard_error"]).any() else 1.0
     )
     return [
@@ -181,15 +182,15 @@ def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
             name=str(name),
             kind=str(array_by_name["kind"][i]),
             tolerance=float(array_by_name["tolerance"][i]),
-            seconds_by_round=array_by_name["seconds"][i],
-            planning_seconds=float(
+            seconds_per_point_by_round=array_by_name["seconds"][i],
+            planning_seconds_per_point=float(
                 array_by_name["planning"][i, np.argmin(array_by_name["seconds"][i])]
             ),
-            pd_error=array_by_name["pd_error"][i],
+            pd_error_by_point=array_by_name["pd_error"][i],
             log10_pfa_error=float(np.fmax.reduce(array_by_name["log10_pfa_error"][i])),
             magnitude_error=float(np.fmax.reduce(array_by_name["magnitude_error"][i])),
             leakage_error=float(np.fmax.reduce(array_by_name["leakage_error"][i])),
-            error_quantile=error_quantile,
+            error_quantile_level=error_quantile_level,
         )
         for i, name in enumerate(array_by_name["setting"])
     ]
@@ -210,7 +211,7 @@ def drop_reference_setting(settings: Iterable[MeasuredSetting]) -> list[Measured
 def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
     """Return the settings that no other beats in both time and error, fastest first."""
     front_settings: list[MeasuredSetting] = []
-    for setting in sorted(settings, key=lambda s: (s.fastest_round_seconds, s.largest_error)):
+    for setting in sorted(settings, key=lambda s: (s.fastest_seconds_per_point, s.largest_error)):
         if not front_settings or max(setting.largest_error, NEGLIGIBLE_ERROR) < max(
             front_settings[-1].largest_error, NEGLIGIBLE_ERROR
         ):
@@ -224,7 +225,7 @@ def fastest_setting_within_error(
     """Return the fastest setting whose error is at most ``error_max``, or None."""
     error_limit = max(error_max, NEGLIGIBLE_ERROR)
     accurate_settings = [setting for setting in settings if setting.largest_error <= error_limit]
-    return min(accurate_settings, key=lambda s: s.fastest_round_seconds, default=None)
+    return min(accurate_settings, key=lambda s: s.fastest_seconds_per_point, default=None)
 
 
 class SettingComparison(NamedTuple):
@@ -233,9 +234,9 @@ class SettingComparison(NamedTuple):
     An adaptive setting chooses the effects point by point.
     """
 
-    adaptive: MeasuredSetting
+    adaptive_setting: MeasuredSetting
     """Setting that chooses the effects point by point."""
-    other: MeasuredSetting | None
+    other_setting: MeasuredSetting | None
     """Setting with fixed effects, or of the thesis's method; None if none is accurate enough."""
 
     def speedup(self, extra_seconds: float = 0.0) -> float:
@@ -244,7 +245,11 @@ class SettingComparison(NamedTuple):
         Without another setting it is infinite. ``extra_seconds`` is a time per point that is added
         to both [s].
         """
-        return self.adaptive.speedup_over(self.other, extra_seconds) if self.other else math.inf
+        return (
+            self.adaptive_setting.speedup_over(self.other_setting, extra_seconds)
+            if self.other_setting
+            else math.inf
+        )
 
 
 def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
@@ -257,7 +262,7 @@ def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[Set
     fixed_settings = [
         setting
         for setting in select_settings_of_kinds(settings, *FIXED_SETTING_KINDS)
-        if setting.covers_leakage_error
+        if setting.is_leakage_error_acceptable
     ]
     errors = sorted(
         {max(setting.largest_error, NEGLIGIBLE_ERROR) for setting in adaptive_settings},
@@ -274,7 +279,7 @@ def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[Set
 
 
 def compare_adaptive_with_thesis(
-    settings: Sequence[MeasuredSetting], kind: str = THESIS_KIND
+    settings: Sequence[MeasuredSetting], kind: str = THESIS_METHOD_KIND
 ) -> list[SettingComparison]:
     """Compare each setting of the thesis's way with the fastest equally accurate adaptive setting.
 
@@ -321,8 +326,10 @@ def setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
     return [
         [
             s.name,
-            format_microseconds(s.fastest_round_seconds),
-            format_microseconds(s.planning_seconds) if s.planning_seconds else "-",
+            format_microseconds(s.fastest_seconds_per_point),
+            format_microseconds(s.planning_seconds_per_point)
+            if s.planning_seconds_per_point
+            else "-",
             *(format_error(s.pd_error_quantile(fraction)) for fraction in (0.5, 0.9, 1.0)),
             *map(format_error, (s.log10_pfa_error, s.magnitude_error, s.leakage_error)),
             "*" if s in front_settings else "",
@@ -349,7 +356,7 @@ def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]
         cheapest_setting = fastest_setting_within_error(drop_reference_setting(settings), tolerance)
         cells = cheapest_setting and [
             cheapest_setting.name,
-            format_microseconds(cheapest_setting.fastest_round_seconds),
+            format_microseconds(cheapest_setting.fastest_seconds_per_point),
             format_error(cheapest_setting.largest_error),
         ]
         table_rows.append([f"{tolerance:g}", *(cells or ["none", "", ""])])
@@ -401,9 +408,9 @@ def _as_written_setting_sentences(dataset: xr.Dataset, settings: Sequence[Measur
     )
     subject = f"All {n_points:,} {unit} take" if n_points > 1 else "The study takes"
     text = (
-        f"As written: {format_microseconds(as_written.fastest_round_seconds)} us a point, error "
-        f"{format_error(as_written.largest_error)}. "
-        f"{subject} {_format_duration(n_points * as_written.fastest_round_seconds)} on one core"
+        f"As written: {format_microseconds(as_written.fastest_seconds_per_point)} us a point, "
+        f"error {format_error(as_written.largest_error)}. "
+        f"{subject} {_format_duration(n_points * as_written.fastest_seconds_per_point)} on one core"
     )
     if (storing_seconds := dataset.attrs.get(STORING_SECONDS_ATTRIBUTE)) is not None:
         text += (
@@ -430,20 +437,22 @@ def _fixed_setting_sentences(
     if not comparisons:
         return []
     worst_comparison = min(comparisons, key=SettingComparison.speedup)
-    if worst_comparison.other is None:
+    if worst_comparison.other_setting is None:
         return ["No fixed setting is as accurate as any adaptive one."]
     verdict_text = (
         "met"
         if worst_comparison.speedup() >= REQUIRED_SPEEDUP_OVER_FIXED
         else _slowdown_text(worst_comparison, comparisons, attributes)
     )
-    speedups = [f"{comparison.speedup():.2g}" for comparison in comparisons if comparison.other]
+    speedups = [
+        f"{comparison.speedup():.2g}" for comparison in comparisons if comparison.other_setting
+    ]
     low, high = min(speedups, key=float), max(speedups, key=float)
     span_text = low if low == high else f"{low} to {high}"
     return [
         f"At equal error, adaptive settings are {span_text} times as fast as the best single "
-        f"fixed setting. Least speed-up: {worst_comparison.adaptive.name} over "
-        f"{worst_comparison.other.name}. "
+        f"fixed setting. Least speed-up: {worst_comparison.adaptive_setting.name} over "
+        f"{worst_comparison.other_setting.name}. "
         f"Requirement, never slower by more than 10 %: {verdict_text}."
     ]
 
@@ -458,12 +467,15 @@ def _slowdown_text(
     smallest speed-up among `comparisons`.
     """
     n_points = attributes["study_points"]
-    extra_seconds = worst_comparison.adaptive.fastest_round_seconds * (
+    extra_seconds = worst_comparison.adaptive_setting.fastest_seconds_per_point * (
         1 - worst_comparison.speedup()
     )
     lost_text, planning_text = (
         _format_duration(n_points * point_seconds)
-        for point_seconds in (extra_seconds, worst_comparison.adaptive.planning_seconds)
+        for point_seconds in (
+            extra_seconds,
+            worst_comparison.adaptive_setting.planning_seconds_per_point,
+        )
     )
     shortfall_text = f"NOT met, by {lost_text} in all; planning takes {planning_text}"
     if (storing_seconds := attributes.get(STORING_SECONDS_ATTRIBUTE)) is None:
@@ -485,9 +497,9 @@ def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> lis
         return []
     verdict_text = " and ".join(
         f"{'met' if comparison.speedup() >= REQUIRED_SPEEDUP_OVER_THESIS else 'NOT met'} over "
-        f"{comparison.other.name}"
+        f"{comparison.other_setting.name}"
         for comparison in comparisons
-        if comparison.other
+        if comparison.other_setting
     )
     requirement_note = f"Requirement, at least {REQUIRED_SPEEDUP_OVER_THESIS:g}: {verdict_text}."
     if beamlets != THESIS_BEAMLET_COUNT:
@@ -496,7 +508,7 @@ def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> lis
         f"The thesis's way is compared at its own error. {_speedup_sentences(comparisons)} "
         f"{requirement_note}"
     ]
-    if improved_comparisons := compare_adaptive_with_thesis(settings, IMPROVED_THESIS_KIND):
+    if improved_comparisons := compare_adaptive_with_thesis(settings, IMPROVED_THESIS_METHOD_KIND):
         statements.append(
             "Improved versions of it are compared likewise. "
             f"{_speedup_sentences(improved_comparisons)}"
@@ -508,12 +520,13 @@ def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
     """Return sentences with the speed-ups of comparisons, by adaptive setting and error."""
     speedups_by_case: dict[str, list[str]] = {}
     for comparison in comparisons:
-        if comparison.other:
+        if comparison.other_setting:
             case = (
-                f"{comparison.adaptive.name}, error {format_error(comparison.other.largest_error)}"
+                f"{comparison.adaptive_setting.name}, "
+                f"error {format_error(comparison.other_setting.largest_error)}"
             )
             speedups_by_case.setdefault(case, []).append(
-                f"{comparison.speedup():.2g} over {comparison.other.name}"
+                f"{comparison.speedup():.2g} over {comparison.other_setting.name}"
             )
     return " ".join(
         f"Speed-up of {case}: {'; '.join(speedups)}." for case, speedups in speedups_by_case.items()
@@ -531,7 +544,7 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
             for closed_form_setting in select_settings_of_kinds(settings, CLOSED_FORM_KIND)
             for thesis_setting in select_settings_of_kinds(settings, kind)
         )
-        for kind in (THESIS_KIND, IMPROVED_THESIS_KIND)
+        for kind in (THESIS_METHOD_KIND, IMPROVED_THESIS_METHOD_KIND)
     )
     if not described_text:
         return []
@@ -585,11 +598,11 @@ def format_error(value: float) -> str:
 
 
 SETTING_KINDS_NAMED_BY_NUMBER = (
-    BEAMLETS_KIND,
+    BEAMLET_LATTICE_KIND,
     BEAMLET_ROW_KIND,
-    MEAN_OF_DRAWS_KIND,
-    COUNTED_DRAWS_KIND,
-    DRAWS_IN_NOISE_KIND,
+    MEAN_PD_OF_DRAWS_KIND,
+    COUNTED_DETECTIONS_KIND,
+    COUNTED_DETECTIONS_IN_NOISE_KIND,
 )
 """Kinds of accuracy settings whose names begin with a number of beamlets or draws."""
 
@@ -602,15 +615,15 @@ A line connects their marks.
 MARK_BY_SETTING_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
     FIXED_EFFECTS_KIND: ("s", canvas.LINE_COLOURS[2], "the same effects everywhere"),
-    BEAMLETS_KIND: ("^", canvas.LINE_COLOURS[1], "number of beamlets in a lattice"),
+    BEAMLET_LATTICE_KIND: ("^", canvas.LINE_COLOURS[1], "number of beamlets in a lattice"),
     BEAMLET_ROW_KIND: ("<", canvas.LINE_COLOURS[7], "number of beamlets in a line"),
     ALL_EFFECTS_KIND: ("D", canvas.LINE_COLOURS[3], "all effects on"),
-    MEAN_OF_DRAWS_KIND: ("P", canvas.LINE_COLOURS[5], "mean over so many draws"),
-    COUNTED_DRAWS_KIND: ("^", canvas.LINE_COLOURS[1], "detections in so many draws"),
-    DRAWS_IN_NOISE_KIND: ("<", canvas.LINE_COLOURS[7], "the same, noise in every bin"),
+    MEAN_PD_OF_DRAWS_KIND: ("P", canvas.LINE_COLOURS[5], "mean over so many draws"),
+    COUNTED_DETECTIONS_KIND: ("^", canvas.LINE_COLOURS[1], "detections in so many draws"),
+    COUNTED_DETECTIONS_IN_NOISE_KIND: ("<", canvas.LINE_COLOURS[7], "the same, noise in every bin"),
     CLOSED_FORM_KIND: ("X", canvas.LINE_COLOURS[5], "in closed form what the thesis's way has"),
-    THESIS_KIND: ("v", canvas.LINE_COLOURS[4], "the thesis's way"),
-    IMPROVED_THESIS_KIND: ("p", canvas.LINE_COLOURS[4], "the thesis's way, improved"),
+    THESIS_METHOD_KIND: ("v", canvas.LINE_COLOURS[4], "the thesis's way"),
+    IMPROVED_THESIS_METHOD_KIND: ("p", canvas.LINE_COLOURS[4], "the thesis's way, improved"),
     AS_WRITTEN_KIND: ("*", canvas.LINE_COLOURS[6], "as written"),
 }
 """Plot marker, colour and legend text of each kind of accuracy setting."""
@@ -688,14 +701,14 @@ def _draw_setting_mark(
 
 def _setting_plot_position(setting: MeasuredSetting) -> tuple[float, float]:
     """Return the time [us] and the error at which a setting is drawn."""
-    return 1e6 * setting.fastest_round_seconds, max(setting.largest_error, NEGLIGIBLE_ERROR)
+    return 1e6 * setting.fastest_seconds_per_point, max(setting.largest_error, NEGLIGIBLE_ERROR)
 
 
 def _short_setting_name(setting: MeasuredSetting) -> str:
     """Return a short name that distinguishes a setting within its kind."""
     if setting.kind == ADAPTIVE_KIND:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
-    if setting.kind == THESIS_KIND:
+    if setting.kind == THESIS_METHOD_KIND:
         return setting.name.removeprefix("thesis ")
     if setting.kind in SETTING_KINDS_NAMED_BY_NUMBER:
         return setting.name.split()[0]
@@ -722,8 +735,12 @@ def _set_time_and_error_axes(axes: Axes, error_min: float, error_max: float) -> 
 def _sheet_caption(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
     """Return the caption of the figure: the marks, the reference and the study."""
     attributes = dataset.attrs
-    error_quantile = settings[0].error_quantile
-    mark_meaning = "the largest" if error_quantile == 1 else f"that of {100 * error_quantile:.0f} %"
+    error_quantile_level = settings[0].error_quantile_level
+    mark_meaning = (
+        "the largest"
+        if error_quantile_level == 1
+        else f"that of {100 * error_quantile_level:.0f} %"
+    )
     phrases = [
         f"mark: {mark_meaning} of "
         f"{labels.number_with_noun(attributes['points'], attributes['unit'][:-1])}; "
@@ -759,7 +776,7 @@ def open_accuracy_store(store: Location) -> AccuracyResults:
     study_id = read_attributes_of_kind(store, ACCURACY_STORE_KIND)["study_id"]
     with xr.open_zarr(open_verified_store(store, study_id), **OPEN_ZARR_KWARGS) as dataset:
         loaded = dataset.load()
-    return AccuracyResults(loaded, read_settings(loaded))
+    return AccuracyResults(loaded, read_measured_settings(loaded))
 
 
 def write_figure_and_tables(

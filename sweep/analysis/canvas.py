@@ -269,12 +269,12 @@ def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
         ("x", heat_map.x, panel.x_axis),
         ("y", heat_map.y, panel.y_axis),
     ):
-        if axis.kind == CATEGORY_SCALE:
+        if axis.scale == CATEGORY_SCALE:
             axes.set(
                 **{f"{axis_name}ticks": np.arange(values.size), f"{axis_name}ticklabels": values}
             )
             values = np.arange(values.size)
-        mesh_edges.append(cell_edges(values, axis.kind == LOG_SCALE))
+        mesh_edges.append(cell_edges(values, axis.scale == LOG_SCALE))
     values = np.ma.masked_invalid(heat_map.values)
     axes.pcolormesh(*mesh_edges, values, norm=norm, cmap=colour_map(), rasterized=True)
     if len(heat_map.contour_levels) and min(values.shape) > 1 and values.count():
@@ -321,8 +321,8 @@ def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> 
 
 def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None:
     """Set the scale and the limits of an axis."""
-    if axis.kind != CATEGORY_SCALE:
-        axes.set(**{f"{axis_name}scale": axis.kind})
+    if axis.scale != CATEGORY_SCALE:
+        axes.set(**{f"{axis_name}scale": axis.scale})
     if axis.limits is not None:
         axes.set(**{f"{axis_name}lim": axis.limits})
 
@@ -409,9 +409,9 @@ def _draw_line_panel(axes: Axes, panel: Panel) -> None:
         _draw_line(axes, line, solid=has_stated or line.n_averaged_points > 1)
     _set_axis(axes, "x", panel.x_axis)
     _set_axis(axes, "y", panel.y_axis)
-    if panel.x_axis.kind != CATEGORY_SCALE:
+    if panel.x_axis.scale != CATEGORY_SCALE:
         axes.margins(x=0.0 if max(line.x.size for line in panel.lines) > 1 else 0.05)
-    if panel.y_axis.kind != LOG_SCALE:
+    if panel.y_axis.scale != LOG_SCALE:
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 5))
     axes.grid(True)
     axes.set_axisbelow(True)

@@ -48,7 +48,7 @@ class ChartAxis:
 
     label: str = ""
     """Label with units."""
-    kind: str = LINEAR_SCALE
+    scale: str = LINEAR_SCALE
     """Scale: ``linear``, ``log`` or ``category``."""
     limits: tuple[float | None, float | None] | None = None
     """Lowest and highest value; None for the extent of the data."""
@@ -181,7 +181,7 @@ class ChartSizeLimits:
     """Number of heat maps side by side, if there are several parts."""
 
 
-SHEET_SIZE_LIMITS = ChartSizeLimits(
+SHEET_CHART_SIZE_LIMITS = ChartSizeLimits(
     parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_per_row=2
 )
 """Limits of charts on sheets (matplotlib figures).
@@ -192,7 +192,7 @@ A heat map has no more cells than pixels, so that no cell is lost.
 LINES_PER_PANEL_MAX = 8
 """Largest number of lines in a panel; further lines are omitted."""
 
-REDUCED_LINE_CELLS = 500
+REDUCED_LINE_CELLS_MAX = 500
 """Number of cells along the horizontal axis to which the points of a long line are reduced.
 
 Lines with at most twice as many points are not reduced.
@@ -230,7 +230,7 @@ class CoordinateAxis:
 
     def to_axis_units(self, values: np.ndarray) -> np.ndarray:
         """Convert values of the coordinate to the units of the axis; categories become text."""
-        if self.chart_axis.kind == CATEGORY_SCALE:
+        if self.chart_axis.scale == CATEGORY_SCALE:
             return np.array([str(value) for value in values])
         return values * self.unit_factor
 
@@ -305,10 +305,10 @@ def split_into_parts(
 
     In a part only the coordinates with ``shown_names`` vary.
     """
-    if not points.size:
+    if not points.n_points:
         return ShownParts([], 0)
     all_parts = split_by_coordinates(
-        points, points.distinguishing_coordinates(shown_names), points.size
+        points, points.distinguishing_coordinates(shown_names), points.n_points
     ).parts
     varied_parts = [
         part
@@ -330,7 +330,7 @@ def surface_chart(
     y: str,
     variable: str,
     label: str,
-    size_limits: ChartSizeLimits = SHEET_SIZE_LIMITS,
+    size_limits: ChartSizeLimits = SHEET_CHART_SIZE_LIMITS,
     levels: Sequence[float] = (),
 ) -> Chart:
     """Return a chart of heat maps of a variable over two coordinates.
@@ -387,7 +387,7 @@ def surface_chart(
             y_coordinate.cell_means(cells_max[1]),
         )
         contour_levels = (
-            () if CATEGORY_SCALE in (x_axis.chart_axis.kind, y_axis.chart_axis.kind) else levels
+            () if CATEGORY_SCALE in (x_axis.chart_axis.scale, y_axis.chart_axis.scale) else levels
         )
         layer = HeatMap(
             x_axis.to_axis_units(x_values),
@@ -662,8 +662,8 @@ def read_lines_along(
     for points, variable in points_and_variables:
         coordinate = points.sorted_coordinate(x)
         dataset_with_ends, confidence = _value_and_interval_ends(points.dataset, variable)
-        cells_max = REDUCED_LINE_CELLS * (
-            1 if coordinate.values.size > 2 * REDUCED_LINE_CELLS else 2
+        cells_max = REDUCED_LINE_CELLS_MAX * (
+            1 if coordinate.values.size > 2 * REDUCED_LINE_CELLS_MAX else 2
         )
         has_ends = len(dataset_with_ends) > 1
         cell_statistics = (

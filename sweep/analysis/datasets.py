@@ -22,7 +22,7 @@ from sweep.analysis.answers import (
 )
 from sweep.analysis.answers.dataset_lookup import STUDY_ID_NAME, study_marker_name
 from sweep.messages import suggested_call
-from sweep.model.outputs import DRAW_BATCH_DIM, RUNNING_SUMS
+from sweep.model.outputs import DRAW_BATCH_DIM, RUNNING_SUMS_NAME
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
 from sweep.storage.locations import JOURNAL_DIR, Location, parse_location
@@ -35,7 +35,7 @@ from sweep.storage.store_format import (
     TERRAIN_MAP_GROUP,
     NotAStoreError,
     format_software_versions,
-    iter_records,
+    iter_log_records,
     read_receipt_totals,
 )
 from sweep.storage.verified_store import open_verified_store
@@ -123,7 +123,7 @@ def open(
     )
     effect_flags = dataset["effects"]
     n_blocks = _count_chunks(effect_flags)
-    dataset = rechunk_for_reading(dataset.drop_vars(RUNNING_SUMS, errors="ignore"))
+    dataset = rechunk_for_reading(dataset.drop_vars(RUNNING_SUMS_NAME, errors="ignore"))
     if DRAW_BATCH_DIM in dataset.dims:
         dataset = sum_draw_batches(dataset)
     dataset = _add_study_id(_load_coordinates(dataset), attributes["study_id"])
@@ -277,7 +277,7 @@ def require_intact_coordinates(store_path: Location) -> None:
         coordinate_paths |= {
             f"{parent}/{coordinate_name}".lstrip("/") for coordinate_name in coordinate_names
         }
-    for record in iter_records(store_path / JOURNAL_DIR / store_format.MANIFEST_FILE):
+    for record in iter_log_records(store_path / JOURNAL_DIR / store_format.MANIFEST_FILE):
         name = record.get("object", "")
         if f"{name}/".partition("/c/")[0] in coordinate_paths:
             with suppress(OSError):
@@ -334,7 +334,7 @@ def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> d
     ``n_points`` and ``n_blocks`` are the numbers of points and blocks of the complete study.
     """
     receipts = read_receipt_totals(store_path, n_blocks)
-    sessions = iter_records(store_path / JOURNAL_DIR / "sessions.jsonl")
+    sessions = iter_log_records(store_path / JOURNAL_DIR / "sessions.jsonl")
     start_times = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]
     start_times += (
         [receipts.first_receipt_time] if receipts.n_committed_blocks and not start_times else []

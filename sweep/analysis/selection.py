@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 CELL_MEAN, CELL_LOWEST, CELL_HIGHEST = "mean", "lowest", "highest"
 """Names of the statistics of the points in a cell of a figure."""
 
-SUMMED_VALUES_MAX = 2**20
+PARTIAL_SUM_VALUES_MAX = 2**20
 """Largest number of values that one partial sum adds up. The partial sums are then added."""
 
 
@@ -92,7 +92,7 @@ class PointSelection:
         return cls(dataset, tables)
 
     @property
-    def size(self) -> int:
+    def n_points(self) -> int:
         """Number of selected points."""
         return math.prod(map(len, self.table_by_dim.values()))
 
@@ -353,7 +353,7 @@ class StudyCut:
     """Name of the fixed coordinate; empty for the complete study."""
     fixed_value: object
     """Value of the fixed coordinate; None for the complete study."""
-    varying_name: str
+    varying_coordinate: str
     """Name of the varying coordinate."""
 
     def select_from(self, points: PointSelection) -> PointSelection:
@@ -380,9 +380,9 @@ def study_cuts(spec: GridSpec) -> list[StudyCut]:
             "all",
             "",
             None,
-            range_parameter.coordinate
+            range_parameter.coordinate_name
             if range_parameter
-            else angle_parameter.coordinate
+            else angle_parameter.coordinate_name
             if angle_parameter
             else "",
         )
@@ -407,11 +407,11 @@ def study_cuts(spec: GridSpec) -> list[StudyCut]:
     cut_list = [
         StudyCut(
             labels.format_quantity(value, axis_parameter.units).replace("°", " deg"),
-            axis_parameter.coordinate,
+            axis_parameter.coordinate_name,
             value,
-            angle_parameter.coordinate
+            angle_parameter.coordinate_name
             if axis_parameter is range_parameter
-            else range_parameter.coordinate,
+            else range_parameter.coordinate_name,
         )
         for axis_parameter, value in fixed_values
     ]
@@ -456,9 +456,9 @@ def select_beyond_range(
     if range_parameter is None:
         return points
     range_min = float(spec.read_coordinate_value(RANGE_PATH, distance))
-    ranges = points.coordinate_values(range_parameter.coordinate)
+    ranges = points.coordinate_values(range_parameter.coordinate_name)
     return points.isel(
-        points.dim_of_coordinate(range_parameter.coordinate),
+        points.dim_of_coordinate(range_parameter.coordinate_name),
         ranges >= range_min if inclusive else ranges > range_min,
     )
 
@@ -482,7 +482,8 @@ class Statistics:
     def from_values(cls, values: np.ndarray) -> Statistics:
         """Return the statistics of finite values; nan is ignored, and the array sorted in place."""
         total = sum(
-            np.nansum(part) for part in np.array_split(values, values.size // SUMMED_VALUES_MAX + 1)
+            np.nansum(part)
+            for part in np.array_split(values, values.size // PARTIAL_SUM_VALUES_MAX + 1)
         )
         values.sort()  # nan is sorted to the end
         n_finite = int(np.searchsorted(values, np.nan))

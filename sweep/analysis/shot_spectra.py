@@ -29,7 +29,7 @@ from sweep.model.threshold import THRESHOLD_PATHS
 from sweep.spec import GridSpec, SpecError
 from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
-from sweep.units import percent
+from sweep.units import percent_text
 
 ParameterValues = Mapping[str, float | int | str]
 """SI values of parameters by dotted path."""
@@ -56,9 +56,9 @@ class DisplayedSegment:
 
     name: str
     """Display name of the segment."""
-    slope: float
+    chirp_rate_ratio: float
     """Frequency slope over the chirp rate: 1 for the up-chirp, 0 for constant frequency."""
-    bins: np.ndarray
+    bin_numbers: np.ndarray
     """Numbers of the bins (n,), rising; a complex record has negative ones too."""
     frequency: np.ndarray
     """Frequencies of the bins (n,) [Hz]."""
@@ -232,7 +232,7 @@ def _segment_spectrum(
     segment = prepared_shot.waveform_segments[segment_index]
     carrier_frequency = np.asarray(segment.carrier).item()
     beat_frequency = waveform.beat_frequency(
-        segment.chirp_slope,
+        segment.chirp_rate_ratio,
         carrier=carrier_frequency,
         chirp_rate=np.asarray(prepared_shot.waveform.chirp_rate),
         range=prepared_shot.range[0] - np.ravel(segment.range_decrease_since_shot_start)[0],
@@ -240,8 +240,8 @@ def _segment_spectrum(
     )
     return DisplayedSegment(
         name=SEGMENT_DISPLAY_NAMES[segment_index],
-        slope=segment.chirp_slope,
-        bins=signed_bins,
+        chirp_rate_ratio=segment.chirp_rate_ratio,
+        bin_numbers=signed_bins,
         frequency=signed_bins * float(prepared_shot.sample_rate[0]) / prepared_shot.fft_size,
         signal_magnitude=signal_magnitude,
         magnitude=magnitude,
@@ -298,7 +298,7 @@ def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, 
     )
 
 
-def range_or_velocity_at(
+def range_or_velocity_from_frequency(
     shot: SimulatedShot, segment: DisplayedSegment, frequency: np.ndarray
 ) -> np.ndarray:
     """Convert frequencies in a segment's spectrum to range or radial velocity.
@@ -332,10 +332,10 @@ def range_or_velocity_at(
     fold_frequency = np.rint(segment.beat_frequency / sample_rate) * sample_rate
     is_mirrored = segment.beat_frequency < fold_frequency and not prepared_shot.complex_record
     signed_frequency = fold_frequency + (-1.0 if is_mirrored else 1.0) * np.asarray(frequency)
-    if segment.slope == 0:
+    if segment.chirp_rate_ratio == 0:
         return signed_frequency * SPEED_OF_LIGHT / (2 * segment.carrier_frequency)
     beta = float(np.asarray(prepared_shot.motion.doppler_ratio).flat[0])
-    range_beat = (segment.carrier_frequency * beta - signed_frequency) / segment.slope
+    range_beat = (segment.carrier_frequency * beta - signed_frequency) / segment.chirp_rate_ratio
     return (
         range_beat
         * SPEED_OF_LIGHT
@@ -481,7 +481,7 @@ def _annotate_snr_and_pd(axes: Axes, shot: SimulatedShot, segment: DisplayedSegm
         va="top",
     )
     value_at_zero, value_at_1_mhz = (
-        float(q) for q in range_or_velocity_at(shot, segment, np.array([0.0, 1e6]))
+        float(q) for q in range_or_velocity_from_frequency(shot, segment, np.array([0.0, 1e6]))
     )
 
     def to_range_or_velocity(mhz: Any) -> Any:
@@ -492,7 +492,7 @@ def _annotate_snr_and_pd(axes: Axes, shot: SimulatedShot, segment: DisplayedSegm
 
     top_axis = axes.secondary_xaxis("top", functions=(to_range_or_velocity, to_mhz))
     top_axis.set_xlabel(
-        "range (m)" if segment.slope else "radial velocity (m/s)", size=8, labelpad=4
+        "range (m)" if segment.chirp_rate_ratio else "radial velocity (m/s)", size=8, labelpad=4
     )
     top_axis.tick_params(labelsize=8)
     top_axis.ticklabel_format(axis="x", useOffset=False)
@@ -582,12 +582,12 @@ def _noise_table(shot: SimulatedShot) -> PageTable:
         (
             name.replace("_", " "),
             f"{math.sqrt(variance):.4e}",
-            percent(variance / total_variance, ".4g"),
+            percent_text(variance / total_variance, ".4g"),
         )
         for name, variance in sorted(variance_by_source.items(), key=lambda item: -item[1])
         if variance > 0
     ]
-    rows.append(("total", f"{math.sqrt(total_variance):.4e}", percent(1.0, ".4g")))
+    rows.append(("total", f"{math.sqrt(total_variance):.4e}", percent_text(1.0, ".4g")))
     return PageTable("Noise at the ADC", ("source", "V rms", "share"), rows)
 
 
@@ -606,7 +606,7 @@ def _segment_table(shot: SimulatedShot) -> PageTable:
             segment.name,
             f"{segment.beat_frequency / 1e6:+.6f}",
             f"{segment.frequency[segment.peak_index] / 1e6:.6f}",
-            int(segment.bins[segment.peak_index]),
+            int(segment.bin_numbers[segment.peak_index]),
             f"{shot.magnitude_to_dbv(segment.magnitude[segment.peak_index]):.1f}",
             f"{10 * math.log10(segment.snr):.2f}" if segment.snr > 0 else "-",
             f"{segment.pd:.6g}",
@@ -756,7 +756,10 @@ def select_shot_parameters(
 ) -> list[LabelledParameters]:
     """Return the label and the parameters of each shot that :func:`write_shot_report` draws."""
     axis_parameters = [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
-    path_by_name, rule_by_path = {m.coordinate: m.path for m in axis_parameters}, parameter_rules()
+    path_by_name, rule_by_path = (
+        {m.coordinate_name: m.path for m in axis_parameters},
+        parameter_rules(),
+    )
     names_by_path: dict[str, str] = {}
     for name in coordinate_values:
         path = path_by_name.get(name, name)
@@ -779,7 +782,7 @@ def select_shot_parameters(
             path_by_name.get(name, name): value for name, value in coordinate_values.items()
         }
         label = ", ".join(
-            labels.format_coordinate_value(m.coordinate, m.display_values[i], m.units)
+            labels.format_coordinate_value(m.coordinate_name, m.display_values[i], m.units)
             for m in axis_parameters
         )
         labelled_parameters.append(

@@ -101,7 +101,7 @@ class GridResults:
     ) -> charts.Chart | None:
         """Return the chart of a surface or of slices; None if the figure selects no points."""
         points = select_where(self.points, self.spec, figure_spec.where)
-        if not points.size:
+        if not points.n_points:
             return None
         variable_attributes = self.dataset[figure_spec.variable].attrs
         label = labels.axis_label(
@@ -143,7 +143,7 @@ class GridResults:
         """Return the sheet of a figure or the page of a table; a message if it would be empty."""
         if not isinstance(figure_spec, SurfaceFigure | SlicesFigure):
             return self.make_table_page(figure_spec)
-        chart = self.make_chart(figure_spec, charts.SHEET_SIZE_LIMITS)
+        chart = self.make_chart(figure_spec, charts.SHEET_CHART_SIZE_LIMITS)
         if chart is None:
             return f"no point of the study has {describe_selection(figure_spec)}"
         title = "\n".join(filter(None, [self.spec.title, figure_spec.title]))
@@ -246,7 +246,7 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
     zipped_axes = [axis for axis in spec.axes if axis.is_zipped][:1]
     axes = zipped_axes or sorted(spec.axes, key=lambda axis: -axis.size)
     numeric_parameters = [
-        (axis, axis_parameter.coordinate)
+        (axis, axis_parameter.coordinate_name)
         for axis in axes
         for axis_parameter in axis.parameters
         if not labels.is_categorical(np.asarray(axis_parameter.display_values))
@@ -271,15 +271,17 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
             SlicesFigure(kind="slices", variable=v, x=x, **by_option)
             for v in DEFAULT_FIGURE_VARIABLES
         ]
-    by_option = {"by": axes[1].parameters[0].coordinate} if len(axes) > 1 else {}
+    by_option = {"by": axes[1].parameters[0].coordinate_name} if len(axes) > 1 else {}
     columns_option = {"columns": by_option["by"]} if by_option else {}
     figure_specs: list[GridFigure] = [
-        SlicesFigure(kind="slices", variable=v, x=a.parameters[0].coordinate, **by_option)
+        SlicesFigure(kind="slices", variable=v, x=a.parameters[0].coordinate_name, **by_option)
         for a in axes[:1]
         for v in DEFAULT_FIGURE_VARIABLES
     ]
     return figure_specs + [
-        TableFigure(kind="table", variable=v, rows=a.parameters[0].coordinate, **columns_option)
+        TableFigure(
+            kind="table", variable=v, rows=a.parameters[0].coordinate_name, **columns_option
+        )
         for a in axes[:1]
         for v in DEFAULT_FIGURE_VARIABLES
     ]
@@ -485,7 +487,9 @@ def _render_shot_spectra_figure(
     effects = unpack_effect_flags(
         int(recording.read_array("effects", slice(shot_number, shot_number + 1))[0])
     )
-    prepared = prepare_eyepoint_shots(eyepoints, parameters, results.spec.surfaces(), effects)
+    prepared = prepare_eyepoint_shots(
+        eyepoints, parameters, results.spec.surface_materials(), effects
+    )
     shot_remark = (
         f"shot {shot_number:,} of {recording.n_shots:,} at {eyepoints.time[0]:.6g} s, "
         f"beam {eyepoints.beam[0]}, noise drawn for the picture"

@@ -31,7 +31,7 @@ from sweep.model.detection import noise_false_alarms
 from sweep.model.detection.looks import Looks
 from sweep.model.evaluation import evaluate
 from sweep.model.threshold import tnr_from_parameters
-from sweep.units import percent
+from sweep.units import percent_text
 
 if TYPE_CHECKING:
     from sweep.spec import GridSpec
@@ -303,7 +303,7 @@ def noise_false_alarm_reference(
     tnr = float(tnr_from_parameters(parameters))
     pfa_bin = noise_false_alarms.bin_pfa(tnr, Looks.from_parameters(parameters))
     n_bins = [
-        noise_false_alarms.alarm_equivalent_bins(parameters, pfa_bin, s) for s in ("up", "down")
+        noise_false_alarms.n_alarm_equivalent_bins(parameters, pfa_bin, s) for s in ("up", "down")
     ]
     closed_form = noise_false_alarms.segment_pfa(np.asarray(pfa_bin), n_bins).prod()
     outputs = evaluate(parameters)
@@ -338,7 +338,7 @@ def split_by_setting(points: PointSelection, spec: GridSpec, by: str) -> list[Po
         Name, parameters and points of each setting.
     """
     cut_names = {
-        name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_coordinate)
+        name for cut in study_cuts(spec) for name in (cut.varying_coordinate, cut.fixed_coordinate)
     }
     names = [by, *(n for n in points.varying_coordinates() if n != by and n not in cut_names)]
     paths = [spec.axis_parameter(name).path for name in names]
@@ -401,7 +401,7 @@ def false_alarm_records(
             {
                 "setting": setting_parts[i][0],
                 "cut": cut,
-                "points": cut_points.size,
+                "points": cut_points.n_points,
                 **noise_reference,
                 "study_mean": pfa_statistic.mean,
                 "study_variance_excess": mean_excess,
@@ -549,5 +549,5 @@ def _format_record_value(value: TableCell, number_format: str) -> TableCell:
     if not number_format:
         return value
     if number_format.endswith("%"):
-        return percent(float(value), number_format[:-1]) if value == value else "-"
+        return percent_text(float(value), number_format[:-1]) if value == value else "-"
     return format(value, number_format) if value == value else "-"

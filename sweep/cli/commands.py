@@ -152,16 +152,16 @@ class CommandGroup(click.Group):
             from sweep.regular_files import RefusedFileError
             from sweep.scenes.scene_files import SceneError
             from sweep.spec import SpecError
-            from sweep.storage.locations import ObjectStoreError, to_readable_error
+            from sweep.storage.locations import ObjectStoreError, to_object_store_error
             from sweep.storage.store_format import StoreReplacedError
             from sweep.storage.verified_store import DamagedChunkError
-            from sweep.tasks.engine.progress import StoreError, TaskError
+            from sweep.tasks.engine.progress import RunRequestError, StoreError
 
             user_error_types = (
                 DamagedChunkError, ObjectStoreError, StoreReplacedError, SceneError, SpecError,
-                StoreError, TaskError, RefusedFileError, UnsupportedShotError,
+                StoreError, RunRequestError, RefusedFileError, UnsupportedShotError,
             )  # fmt: skip
-            readable_error = to_readable_error(error)
+            readable_error = to_object_store_error(error)
             if message := install_hint(readable_error):
                 echo_wrapped(message, err=True)
             elif isinstance(readable_error, user_error_types):

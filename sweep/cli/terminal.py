@@ -27,7 +27,7 @@ from sweep.messages import (
 )
 from sweep.storage.locations import Location, parse_location
 from sweep.tasks.engine.text_streams import is_terminal
-from sweep.units import number_text, percent
+from sweep.units import number_text, percent_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -386,7 +386,7 @@ def _print_grid_summary(store: Location) -> None:
 
     summary = detection_summary(store)
     print_table(
-        "Probability of detection" + _sampled_share_text(summary.block_fraction),
+        "Probability of detection" + _sampled_share_text(summary.sampled_block_fraction),
         [
             summary.axis_heading,
             "points",
@@ -398,7 +398,7 @@ def _print_grid_summary(store: Location) -> None:
             [
                 row.label,
                 f"{row.n_points:,}",
-                percent(row.detected_fraction, ".1f"),
+                percent_text(row.detected_fraction, ".1f"),
                 number_text(row.median_pd_shot),
                 f"{row.median_pd_doppler:.4g}"
                 if row.median_pd_doppler == row.median_pd_doppler
@@ -426,9 +426,11 @@ def _print_scene_summary(store: Location) -> None:
                 row.label,
                 f"{row.n_shots:,}",
                 number_text(row.mean_pd) if row.mean_pd == row.mean_pd else "no hit",
-                percent(row.shots_with_true_return / row.n_shots, ".1f") if row.n_shots else "-",
-                f"{row.false_points:,}",
-                f"{100 * row.solved_cycles / row.n_cycles:.1f} %" if row.n_cycles else "-",
+                percent_text(row.n_shots_with_true_return / row.n_shots, ".1f")
+                if row.n_shots
+                else "-",
+                f"{row.n_false_points:,}",
+                f"{100 * row.n_solved_cycles / row.n_cycles:.1f} %" if row.n_cycles else "-",
             ]
             for row in flight_summary(store)
         ],
@@ -495,7 +497,7 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
     if rows := accuracy_rows_of_draws(store, done_block_numbers):
         print_table(
             "Half-widths of pd by its draws, and where accuracy.tolerance is met"
-            + _sampled_share_text(rows[0].block_fraction),
+            + _sampled_share_text(rows[0].sampled_block_fraction),
             ["", "met", "worst", "missed by", "draws", "needed", "at"],
             [
                 [
@@ -503,8 +505,8 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
                     f"{row.n_points_within_tolerance:,} of {row.n_points:,}",
                     f"{row.worst_error:.3g}",
                     f"{row.excess:.2g}",
-                    f"{row.samples_at_worst_point:,}",
-                    f"{row.draws_needed:,.0f}" if row.draws_needed < float("inf") else "-",
+                    f"{row.n_samples_at_worst_point:,}",
+                    f"{row.n_draws_needed:,.0f}" if row.n_draws_needed < float("inf") else "-",
                     row.worst_point_label,
                 ]
                 for row in rows
@@ -516,12 +518,12 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
     if rays := accuracy_rows_of_rays(store, done_block_numbers):
         ray_noun, unit_noun = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
-            f"What more {ray_noun} may change{_sampled_share_text(rays[0].block_fraction)}",
+            f"What more {ray_noun} may change{_sampled_share_text(rays[0].sampled_block_fraction)}",
             ["", f"{ray_noun} a {unit_noun}", "met", "worst", "missed by", "at"],
             [
                 [
                     row.name,
-                    f"{row.mean_samples:,.0f}, at most {row.samples_max:,}",
+                    f"{row.mean_n_samples:,.0f}, at most {row.n_samples_max:,}",
                     f"{row.n_points_within_tolerance:,} of {row.n_points:,}",
                     f"{row.worst_error:.3g}",
                     f"{row.excess:.2g}",
@@ -641,7 +643,7 @@ def plan_rows(
         f"{number_with_noun(study_plan.n_workers, computing_unit)}"
         + (
             ", with the processors as busy as now"
-            if study_plan.busy_ratio > WALL_TO_CPU_TIME_RATIO_NOTED_MIN
+            if study_plan.wall_to_cpu_time_ratio > WALL_TO_CPU_TIME_RATIO_NOTED_MIN
             else ""
         ),
     )
@@ -684,7 +686,7 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
     from sweep.model.error_budget import ErrorBudget
     from sweep.tasks.studies.flight_coverage import sample_coverage
 
-    for report in study_plan.scene_reports:
+    for report in study_plan.mesh_reports:
         yield "scene", report
     if spec.is_ray_number_set_by_tolerance:
         parameters = spec.parameters()
@@ -859,8 +861,12 @@ def _effect_row_cells(row: EffectRow) -> list[str]:
     cost, mode_text = row.time_fraction, "" if row.mode == "auto" else f" ({row.mode})"
     return [
         row.name.replace("_", " ") + mode_text,
-        percent(row.simulated_fraction),
-        percent(cost, ".2g") if cost == cost else "not measured" if row.simulated_fraction else "-",
+        percent_text(row.simulated_fraction),
+        percent_text(cost, ".2g")
+        if cost == cost
+        else "not measured"
+        if row.simulated_fraction
+        else "-",
         f"{row.change_bound:.2g}",
         "nowhere, but forced on"
         if row.change_bound == 0 and row.mode == "on"

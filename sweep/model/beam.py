@@ -41,15 +41,15 @@ from scipy.special import j0
 
 from sweep.model.constants import SPEED_OF_LIGHT
 
-SINGLE_MODE = "single_mode"
+SINGLE_MODE_COUPLING = "single_mode"
 """Name of the coupling law by which a receiver detects light of a single spatial mode."""
-APERTURE = "aperture"
+APERTURE_COUPLING = "aperture"
 """Name of the coupling law by which all light in the aperture mixes with the local oscillator."""
-COUPLINGS = (SINGLE_MODE, APERTURE)
+COUPLING_LAWS = (SINGLE_MODE_COUPLING, APERTURE_COUPLING)
 """Names of the coupling laws, which determine what fraction of the echo mixes."""
 
 COUPLING_PATH = "instrument.telescope.coupling"
-"""Parameter path of the coupling law, one of `COUPLINGS`."""
+"""Parameter path of the coupling law, one of `COUPLING_LAWS`."""
 APERTURE_DIAMETER_PATH = "instrument.telescope.aperture"
 """Parameter path of the diameter of the telescope's aperture [m]."""
 WAVELENGTH_PATH = "instrument.laser.wavelength"
@@ -58,7 +58,7 @@ DIVERGENCE_PATH = "instrument.laser.beam_divergence"
 """Parameter path of the full 1/e^2 angle of the transmitted beam in the far field [rad]."""
 WAIST_PATH = "instrument.laser.beam_waist"
 """Parameter path of the 1/e^2 radius of the transmitted beam at the telescope [m]."""
-QUALITY_PATH = "instrument.laser.beam_quality"
+BEAM_QUALITY_PATH = "instrument.laser.beam_quality"
 """Parameter path of the beam quality M^2 of the transmitted beam; 1 for an ideal beam."""
 FOCUS_PATH = "instrument.laser.focus"
 """Parameter path of the distance at which the beam is focused [m]; 0 for a collimated beam."""
@@ -72,10 +72,10 @@ SCAN_RATE_PATH, SEPARATION_PATH, MISALIGNMENT_PATH = (
 )
 
 BEAM_DEFAULTS: dict[str, float | str] = {
-    COUPLING_PATH: SINGLE_MODE,
+    COUPLING_PATH: SINGLE_MODE_COUPLING,
     DIVERGENCE_PATH: 0.0,
     WAIST_PATH: 0.0,
-    QUALITY_PATH: 1.0,
+    BEAM_QUALITY_PATH: 1.0,
     FOCUS_PATH: 0.0,
     OSCILLATOR_WAIST_PATH: 0.0,
 }
@@ -170,7 +170,7 @@ def is_single_mode(parameters: Parameters) -> bool:
     All points must have the same text parameters.
     """
     return (
-        str(parameters[COUPLING_PATH]) == SINGLE_MODE
+        str(parameters[COUPLING_PATH]) == SINGLE_MODE_COUPLING
         and str(parameters[ARCHITECTURE_PATH]) != "direct"
     )
 
@@ -206,7 +206,7 @@ def far_field_divergence(parameters: Parameters) -> np.ndarray:
     if not waist.any():
         return stated_divergence
     divergence_of_waist = divergence_from_waist(
-        np.where(waist > 0, waist, 1.0), parameters[WAVELENGTH_PATH], parameters[QUALITY_PATH]
+        np.where(waist > 0, waist, 1.0), parameters[WAVELENGTH_PATH], parameters[BEAM_QUALITY_PATH]
     )
     return np.where(waist > 0, divergence_of_waist, stated_divergence)
 
@@ -225,12 +225,12 @@ def transmitted_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBe
     waist_of_divergence = divergence_from_waist(
         np.where(stated_divergence > 0, stated_divergence, 1.0),
         parameters[WAVELENGTH_PATH],
-        parameters[QUALITY_PATH],
+        parameters[BEAM_QUALITY_PATH],
     )
     waist = np.where(waist > 0, waist, waist_of_divergence)
     common_arguments = {"wavelength": parameters[WAVELENGTH_PATH], "focus": parameters[FOCUS_PATH]}
     transmitted_beam = GaussianBeam.from_waist(
-        waist=waist, quality=parameters[QUALITY_PATH], **common_arguments
+        waist=waist, quality=parameters[BEAM_QUALITY_PATH], **common_arguments
     )
     return transmitted_beam, GaussianBeam.from_waist(
         waist=np.where(oscillator_waist > 0, oscillator_waist, waist), **common_arguments
@@ -240,9 +240,9 @@ def transmitted_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBe
 class FootprintAngles(NamedTuple):
     """Full 1/e^2 angles of the effective footprint [rad], by position and by light direction."""
 
-    positions: np.ndarray
+    position_spread_angle: np.ndarray
     """Full 1/e^2 angle [rad] of the illuminated positions on the target, seen from the lidar."""
-    directions: np.ndarray
+    direction_spread_angle: np.ndarray
     """Full 1/e^2 angle of the spread of light directions [rad], from which the spread of Doppler
     shifts follows.
     """
@@ -307,7 +307,7 @@ def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
         WAVELENGTH_PATH,
         DIVERGENCE_PATH,
         WAIST_PATH,
-        QUALITY_PATH,
+        BEAM_QUALITY_PATH,
         FOCUS_PATH,
         OSCILLATOR_WAIST_PATH,
     )
@@ -406,7 +406,7 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
     return np.asarray(area * efficiency)
 
 
-def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
+def receiver_diameter_and_view_angle(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
     """Return the diameter and the full angle of view of the receiver for background light.
 
     Returns
@@ -456,7 +456,7 @@ def beam_axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
     return np.asarray(angle_between_axes * distance + parameters[SEPARATION_PATH])
 
 
-def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
+def beam_axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
     """Return the fraction of a single mode's echo that remains with offset beam axes, 0..1.
 
     The axes are those of the transmitted and the received beam at the target.

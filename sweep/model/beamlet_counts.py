@@ -50,7 +50,7 @@ from sweep.model.beamlets import (
     GAUSS_HERMITE_NODES_MAX,
     UNIFORM_QUADRATURE_RADIUS_SIGMA,
     bins_per_velocity,
-    gaussian_quadrature,
+    normal_distribution_quadrature,
     plane_offset_moment_bounds,
 )
 from sweep.model.constants import SPEED_OF_LIGHT
@@ -138,7 +138,7 @@ class LineSpreadCoefficients(NamedTuple):
         )
 
 
-def split_with_beamlet_counts(
+def split_by_category_and_beamlet_count(
     parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Split points into categories, and choose the number of beamlets where none is stated.
@@ -264,7 +264,7 @@ def has_numerics_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
     The value then follows from the tolerance. The result is (n,) or a scalar.
     """
     counts_beamlets = ~(parameters[BEAMLETS_PATH] > np.asarray(0))
-    return counts_beamlets | ErrorBudget.from_parameters(parameters).has_automatic_errors
+    return counts_beamlets | ErrorBudget.from_parameters(parameters).has_errors_set_by_tolerance
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
@@ -375,19 +375,22 @@ def _line_spread_coefficients(
         bin_width=bin_width,
     )
     # Chirp slopes weight the contribution of ranges to the beats.
-    chirp_slopes, zeros = np.array(waveform.chirp_slopes(parameters))[:, None], np.zeros(n_points)
+    chirp_rate_ratios, zeros = (
+        np.array(waveform.chirp_rate_ratios(parameters))[:, None],
+        np.zeros(n_points),
+    )
     spread = LineSpreadCoefficients(
-        line_deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
+        line_deviation=abs(chirp_rate_ratios).max() * bins_per_range * range_rms
         + bins_per_speed * velocity_moments.rms
         + zeros,
         linear_spread=abs(
             bins_per_speed * transverse_velocity * direction_sigma
-            + chirp_slopes * bins_per_range * slope
+            + chirp_rate_ratios * bins_per_range * slope
         )
         + zeros,
         quadratic_spread=abs(
             bins_per_speed * radial_velocity * (direction_sigma / position_sigma) ** 2
-            + chirp_slopes * bins_per_range
+            + chirp_rate_ratios * bins_per_range
         )
         * (position_sigma**2 / 2)
         + zeros,
@@ -437,8 +440,10 @@ def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
     record_middle = budget.record.acquisition_delay + budget.record.duration / 2
     time_since_echo = record_middle - budget.target.delay
     frequencies = [
-        carrier + chirp_slope * settings.chirp_rate * time_since_echo
-        for carrier, chirp_slope in zip(settings.carriers, settings.chirp_slopes, strict=True)
+        carrier + chirp_rate_ratio * settings.chirp_rate * time_since_echo
+        for carrier, chirp_rate_ratio in zip(
+            settings.carriers, settings.chirp_rate_ratios, strict=True
+        )
     ]
     return np.max(frequencies, axis=0) - np.min(frequencies, axis=0)
 
@@ -608,7 +613,9 @@ def _single_line_quadrature_error(window_name: str, spread: LineSpreadCoefficien
     lobe_shape = window_response(window_name, _N_TABLE_WINDOW_SAMPLES, _N_TABLE_WINDOW_SAMPLES)
     return np.asarray(
         2
-        * np.fmin(lobe_shape.curvature_max * spread.quadratic_spread**2, smoothed_error).max(axis=0)
+        * np.fmin(lobe_shape.power_curvature_max * spread.quadratic_spread**2, smoothed_error).max(
+            axis=0
+        )
     )
 
 
@@ -731,7 +738,7 @@ def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
     x is normally distributed. The phases t are _TABULATED_QUADRATIC_PHASES. The exact mean is 1 /
     sqrt(1 - 2 i t).
     """
-    x, w = gaussian_quadrature(n_nodes)
+    x, w = normal_distribution_quadrature(n_nodes)
     rule_mean = np.array(
         [(w * np.exp(1j * phase * x**2)).sum() for phase in _TABULATED_QUADRATIC_PHASES.tolist()]
     )
@@ -746,7 +753,7 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
     `deviation` is the standard deviation of line frequencies [bins of fs/L]. See
     :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for_spread`.
     """
-    narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
+    narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.power_curvature_max * deviation**2
     wide = (1 - 1 / _CHEBYSHEV_DISTANCES_SIGMA**2) * lobe_shape.central_energy_min
     return np.maximum(
         narrow,
@@ -782,7 +789,7 @@ def _quadrature_error_for_cosine(n_nodes: int, phase: np.ndarray) -> np.ndarray:
     The exact mean is exp(-phase^2 / 2).
     """
     if n_nodes <= GAUSS_HERMITE_NODES_MAX:
-        x, w = gaussian_quadrature(n_nodes)
+        x, w = normal_distribution_quadrature(n_nodes)
         rule_mean = (w * np.cos(phase[:, None] * x)).sum(axis=1)
         return np.asarray(np.abs(rule_mean - np.exp(-0.5 * phase**2)))
     step = 2 * UNIFORM_QUADRATURE_RADIUS_SIGMA / (n_nodes - 1)

@@ -58,7 +58,7 @@ UNIFORM_QUADRATURE_RADIUS_SIGMA = 7.0
 
 
 @lru_cache(maxsize=64)
-def gaussian_quadrature(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def normal_distribution_quadrature(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights of a quadrature for means over the standard normal distribution.
 
     Parameters
@@ -173,13 +173,13 @@ def _product_quadrature(pattern: str, n_beamlets: int) -> tuple[np.ndarray, np.n
     if pattern == "square":
         nodes_per_side = max(math.isqrt(n_beamlets), 2)
         (x, x_weights), (y, y_weights) = (
-            gaussian_quadrature(nodes_per_side),
-            gaussian_quadrature(nodes_per_side),
+            normal_distribution_quadrature(nodes_per_side),
+            normal_distribution_quadrature(nodes_per_side),
         )
     else:
         n_lines = 1 if pattern == "line" else int(pattern.split()[0])
-        y, y_weights = gaussian_quadrature(n_beamlets // n_lines)
-        nodes, weights = gaussian_quadrature(2 * n_lines)
+        y, y_weights = normal_distribution_quadrature(n_beamlets // n_lines)
+        nodes, weights = normal_distribution_quadrature(2 * n_lines)
         x, x_weights = nodes[n_lines:], 2 * weights[n_lines:]
     across, along = (v.ravel() for v in np.meshgrid(x, y))
     return np.array([across, along]), np.outer(y_weights, x_weights).ravel()
@@ -288,7 +288,7 @@ class OffsetMoments(NamedTuple):
         )
 
 
-NO_SPREAD = OffsetMoments(0.0, 0.0, 0.0)
+ZERO_OFFSET_MOMENTS = OffsetMoments(0.0, 0.0, 0.0)
 """Moments of offsets that are all 0, as for a single beamlet on the axis."""
 
 

@@ -82,7 +82,7 @@ def product_cycle_fraction(high, low, x):
 
 
 @njit(inline="always")
-def exact_quotient(numerator, denominator):
+def double_double_quotient(numerator, denominator):
     """Return the quotient of two doubles as the sum of two doubles, high and low."""
     high = numerator / denominator
     product, remainder = exact_product(high, denominator)

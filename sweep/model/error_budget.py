@@ -63,7 +63,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import betaincinv, ndtri, stdtrit
 
-AUTOMATIC = -1.0
+SET_BY_TOLERANCE = -1.0
 """Value of an error setting in :class:`ErrorBudget` that means: compute it from the tolerance."""
 
 
@@ -90,25 +90,25 @@ class ErrorBudget:
     draws of 0.95.
     """
 
-    line_error: ArrayLike = AUTOMATIC
+    line_error: ArrayLike = SET_BY_TOLERANCE
     """Tolerated error of a bin's magnitude, relative to the noise sigma, if few lines represent all
     beamlets. By default it is `lines_fraction` of the tolerance. A smaller error slowly increases
     the number of lines of a segment."""
 
-    leakage_error: ArrayLike = AUTOMATIC
+    leakage_error: ArrayLike = SET_BY_TOLERANCE
     """Tolerated probability of a false peak due to the echo's signal in bins far from its lines.
     This part of the leakage is then not evaluated. By default it is `leakage_fraction` of the
     tolerance. With a smaller value more bins are evaluated.
     """
 
-    leakage_floor: ArrayLike = AUTOMATIC
+    leakage_floor: ArrayLike = SET_BY_TOLERANCE
     """Magnitude of leaked signal in a bin, relative to the noise sigma, below which the bin counts
     as noise alone. It applies to bins that are evaluated one by one. By default it follows from
     `leakage_error`. With a lower value more bins are evaluated."""
 
-    interval: str = "clopper_pearson"
+    count_interval_name: str = "clopper_pearson"
     """Kind of confidence interval for a probability that is estimated by counting draws, one of
-    :data:`COUNT_INTERVALS`. The interval of Clopper and Pearson has at least the stated
+    :data:`COUNT_INTERVAL_FUNCTIONS`. The interval of Clopper and Pearson has at least the stated
     coverage. Wilson's takes fewer draws, and has the stated coverage on average."""
 
     stopping_check_growth: float = 1.25
@@ -177,7 +177,7 @@ class ErrorBudget:
                  if f"accuracy.{name}" in parameters}  # fmt: skip
         return cls(**stated_values, **overrides)
 
-    def select(self, point_indices: np.ndarray, n_points: int) -> "ErrorBudget":
+    def select_points(self, point_indices: np.ndarray, n_points: int) -> "ErrorBudget":
         """Return the budget of selected points; tolerance and confidence have one value for each.
 
         `point_indices` select from `n_points` points.
@@ -221,15 +221,15 @@ class ErrorBudget:
         return max(float(np.asarray(self.tolerance)), self.rays_tolerance_min)
 
     @property
-    def has_automatic_errors(self) -> np.ndarray:
+    def has_errors_set_by_tolerance(self) -> np.ndarray:
         """True where the error of lines or of leakage follows from the tolerance."""
         errors = (np.asarray(self.line_error), np.asarray(self.leakage_error))
-        return np.logical_or(*(error == AUTOMATIC for error in errors))
+        return np.logical_or(*(error == SET_BY_TOLERANCE for error in errors))
 
     def _stated_or_tolerance_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
-        """Return a stated error, or a fraction of the tolerance where it is `AUTOMATIC`."""
+        """Return a stated error, or a fraction of the tolerance where it is `SET_BY_TOLERANCE`."""
         allowed = fraction * np.asarray(self.tolerance, float)
-        return np.where(np.asarray(stated, float) == AUTOMATIC, allowed, stated)
+        return np.where(np.asarray(stated, float) == SET_BY_TOLERANCE, allowed, stated)
 
 
 class ConfidenceInterval(NamedTuple):
@@ -300,7 +300,7 @@ def clopper_pearson_interval(
     return _clip_interval(low, high)
 
 
-COUNT_INTERVALS: dict[str, Callable[..., ConfidenceInterval]] = {
+COUNT_INTERVAL_FUNCTIONS: dict[str, Callable[..., ConfidenceInterval]] = {
     "clopper_pearson": clopper_pearson_interval,
     "wilson": wilson_interval,
 }

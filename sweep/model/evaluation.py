@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model import waveform
-from sweep.model.beamlet_counts import split_with_beamlet_counts
+from sweep.model.beamlet_counts import split_by_category_and_beamlet_count
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.detection_probability import (
     joint_detection_probability,
@@ -19,8 +19,8 @@ from sweep.model.detection.detection_probability import (
 from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 from sweep.model.effects.catalogue import (
     DEFAULT_EFFECTS,
+    EFFECT_CATEGORY_KEY_PATHS,
     EFFECT_NAMES,
-    EFFECT_SHARED_PARAMETER_PATHS,
     EFFECTS,
     PARAMETER_DEFAULTS,
 )
@@ -63,7 +63,7 @@ def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
     return tuple(effect for effect in EFFECTS if effect.name in names)
 
 
-def use_beamlet_velocities(names: Collection[str]) -> bool:
+def effects_use_beamlet_velocities(names: Collection[str]) -> bool:
     """Return True if any of the named effects uses the radial velocities of single beamlets."""
     return any(effect.uses_beamlet_velocities for effect in EFFECTS if effect.name in names)
 
@@ -88,13 +88,13 @@ def prepare_shots(
     shots : Shots
         Prepared shots of these points.
     """
-    for point_indices, category_parameters in split_with_beamlet_counts(
-        PARAMETER_DEFAULTS | dict(parameters), effects, EFFECT_SHARED_PARAMETER_PATHS
+    for point_indices, category_parameters in split_by_category_and_beamlet_count(
+        PARAMETER_DEFAULTS | dict(parameters), effects, EFFECT_CATEGORY_KEY_PATHS
     ):
         ground = FlatGround(
             category_parameters,
             point_indices.size,
-            has_velocities=use_beamlet_velocities(effects),
+            has_velocities=effects_use_beamlet_velocities(effects),
         )
         shots = apply_effects(category_parameters, point_indices.size, ground, effects)
         yield (
@@ -237,7 +237,7 @@ def shot_statistics(
     false_alarms = _false_alarm_probabilities(shots, n_exempt)
     measured = measure_range_velocity(shots, segment_results)
     is_range_misread, is_velocity_misread = find_misread_values(shots, measured)
-    if shots.detection_settings.reported_peaks == waveform.STRONGEST_PEAK:
+    if shots.detection_settings.reported_peaks_option == waveform.STRONGEST_PEAK:
         strongest_peaks = strongest_peak_probabilities(shots, pd, miss, magnitude, is_range_misread)
         by_segment, of_shot = (result._asdict() for result in strongest_peaks)
     else:
@@ -282,8 +282,8 @@ def measure_range_velocity(shots: Shots, segment_results: SegmentResults) -> wav
         Result of :func:`evaluate_segments`.
     """
     peak_frequencies, weights = segment_results.frequency, segment_results.magnitude**2
-    if shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
-        return fit_peaks(
+    if shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS:
+        return fit_range_velocity_to_peaks(
             shots, peak_frequencies, np.where(shots.has_segment[:, None], weights, 0.0)
         )
     frequency_up, frequency_doppler, frequency_down = peak_frequencies
@@ -374,7 +374,7 @@ def find_misread_values(shots: Shots, measured: waveform.RangeVelocity) -> np.nd
     ])  # fmt: skip
 
 
-def fit_peaks(
+def fit_range_velocity_to_peaks(
     shots: Shots,
     peak_frequencies: np.ndarray,
     weights: np.ndarray,
@@ -423,7 +423,7 @@ def _false_alarm_probabilities(shots: Shots, n_exempt: np.ndarray) -> dict[str, 
     log_pfa_bin = shots.looks.log_pfa(shots.threshold / shots.bin_noise_sigma)
     has_segment = shots.has_segment[:, None]
     n_equivalent_bins = np.where(
-        has_segment, shots.alarm_equivalent_bins(np.where(has_segment, n_exempt, 0.0)), 0.0
+        has_segment, shots.n_alarm_equivalent_bins(np.where(has_segment, n_exempt, 0.0)), 0.0
     )
     log_pfa_up, log_pfa_doppler, log_pfa_down = log_at_least_one_probability(
         log_pfa_bin, n_equivalent_bins

@@ -148,7 +148,7 @@ class FlatGround:
         share their rows.
     """
 
-    off_axis_surface = None
+    is_on_other_surface = None
     """Mask of beamlets that hit another surface than the beam's axis does. It is None, because a
     plane is a single surface.
     """
@@ -259,7 +259,7 @@ class FlatGround:
     def beamlets(self) -> BeamletTable:
         """Table of all beamlets of the footprints, with one row for each distinct geometry."""
         columns = [column for column in self._geometry if column is not None]
-        first, geometry_of_point = distinct_rows(columns)
+        first, geometry_of_point = find_distinct_rows(columns)
         geometry = _PlaneGeometry(*np.stack(columns)[:, first])
         relative_range_offset, cos_incidence, weights, closing_offset = beamlets.plane_footprint(
             grazing_angle=geometry.grazing_angle,
@@ -295,14 +295,14 @@ class RayTracedGround:
     ----------
     beamlet_table : BeamletTable
         Offsets and echoes of the beamlets.
-    off_axis_surface : ndarray (rows, beamlets) bool, optional
+    is_on_other_surface : ndarray (rows, beamlets) bool, optional
         True for beamlets on other surfaces than the beam's axis.
     """
 
     def __init__(
-        self, beamlet_table: BeamletTable, off_axis_surface: np.ndarray | None = None
+        self, beamlet_table: BeamletTable, is_on_other_surface: np.ndarray | None = None
     ) -> None:
-        self.beamlets, self.off_axis_surface = beamlet_table, off_axis_surface
+        self.beamlets, self.is_on_other_surface = beamlet_table, is_on_other_surface
 
     def axis_beamlet(self, n_points: int) -> BeamletTable:
         """Return a table with one beamlet per footprint, on the beam's axis, for `n_points` points.
@@ -351,22 +351,22 @@ class FootprintExtent(NamedTuple):
 
     axis_echo: np.ndarray
     """Echo of a single line on the beam's axis for reflectance 1 [1/sr]."""
-    total_echo_ratio: np.ndarray | float
+    total_to_axis_echo_ratio: np.ndarray | float
     """Ratio of the echo of all beamlets to that of a single line on the beam's axis."""
-    range_offsets: OffsetMoments
+    range_offset_moments: OffsetMoments
     """Moments of the beamlets' relative range offsets: range minus that on the axis, divided by the
     range on the axis."""
-    axis_surface_range_offsets: OffsetMoments
+    axis_surface_range_offset_moments: OffsetMoments
     """Moments of the relative range offsets of those beamlets on the same surface as the axis."""
-    velocity_offsets: OffsetMoments
+    velocity_offset_moments: OffsetMoments
     """Moments of the beamlets' radial velocities minus that on the beam's axis [m/s]."""
     amplitude_gain_max: np.ndarray | float = 1.0
     """Largest ratio of the beamlets' total amplitude to that of the single line on the axis.
     Beamlets are in phase, or add as powers.
     """
-    off_axis_fraction: np.ndarray | float = 0.0
+    other_surface_echo_fraction: np.ndarray | float = 0.0
     """Fraction of the echo from other surfaces than the one on the beam's axis, 0..1."""
-    off_axis_range_offset_max: np.ndarray | float = 0.0
+    other_surface_range_offset_max: np.ndarray | float = 0.0
     """Largest relative range offset, as a magnitude, of beamlets on other surfaces than the axis's.
     """
 
@@ -374,36 +374,41 @@ class FootprintExtent(NamedTuple):
 def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
     """Compute the :class:`FootprintExtent` of footprints by ray tracing."""
     _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
-    off_axis_surface = ground.off_axis_surface
+    is_on_other_surface = ground.is_on_other_surface
     total_echo = relative_echo.sum(axis=1)
     power_fraction = relative_echo / np.where(total_echo > 0, total_echo, 1.0)[:, None]
-    range_offsets = _weighted_moments(relative_range_offset, power_fraction)
-    velocity_offsets = _weighted_moments(doppler_ratio_offset, power_fraction).scaled_by(
+    range_offset_moments = _weighted_moments(relative_range_offset, power_fraction)
+    velocity_offset_moments = _weighted_moments(doppler_ratio_offset, power_fraction).scaled_by(
         np.asarray(SPEED_OF_LIGHT / 2)
     )
     amplitude_gain = np.sqrt(power_fraction).sum(axis=1)
-    if off_axis_surface is None or not off_axis_surface.any():
+    if is_on_other_surface is None or not is_on_other_surface.any():
         return FootprintExtent(
-            total_echo, 1.0, range_offsets, range_offsets, velocity_offsets, amplitude_gain
+            total_echo,
+            1.0,
+            range_offset_moments,
+            range_offset_moments,
+            velocity_offset_moments,
+            amplitude_gain,
         )
-    off_axis_fraction = np.where(off_axis_surface, power_fraction, 0.0)
-    axis_surface_fraction = power_fraction - off_axis_fraction
+    other_surface_echo_fraction = np.where(is_on_other_surface, power_fraction, 0.0)
+    axis_surface_fraction = power_fraction - other_surface_echo_fraction
     axis_surface_total = axis_surface_fraction.sum(axis=1)
-    axis_surface_range_offsets = _weighted_moments(
+    axis_surface_range_offset_moments = _weighted_moments(
         relative_range_offset,
         axis_surface_fraction / np.where(axis_surface_total > 0, axis_surface_total, 1.0)[:, None],
     )
-    off_axis_range_max = np.where(off_axis_fraction > 0, np.abs(relative_range_offset), 0.0).max(
-        axis=1
-    )
+    off_axis_range_max = np.where(
+        other_surface_echo_fraction > 0, np.abs(relative_range_offset), 0.0
+    ).max(axis=1)
     return FootprintExtent(
         total_echo,
         1.0,
-        range_offsets,
-        axis_surface_range_offsets,
-        velocity_offsets,
+        range_offset_moments,
+        axis_surface_range_offset_moments,
+        velocity_offset_moments,
         amplitude_gain,
-        off_axis_fraction.sum(axis=1),
+        other_surface_echo_fraction.sum(axis=1),
         off_axis_range_max,
     )
 
@@ -420,7 +425,7 @@ def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
     )
 
 
-def distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def find_distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Find the distinct rows of a table that is given by its columns.
 
     Parameters

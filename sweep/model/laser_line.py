@@ -22,7 +22,7 @@ length; there the record's length replaces the delay.
 quadrature to the line. With the phase less its mean under the window, the mean of exp(i phi) is the
 line that |X| shows. Only the part of the pedestal in phase with it changes |X|
 (:func:`apparent_line_and_pedestal`). Full spectra are drawn with both parts
-(:func:`phase_walk`). An echo that arrives within the record has the line and the pedestal of
+(:func:`beat_phase_noise`). An echo that arrives within the record has the line and the pedestal of
 its own samples, in steps of 1/32 of the record.
 
 References
@@ -76,11 +76,11 @@ _LINE_POWER_FRACTION_MIN = 1e-100
 class LaserLine(NamedTuple):
     """Line width of the laser and noise of its phase-noise pedestal; a pure tone by default."""
 
-    gaussian_width: np.ndarray | None = None
+    gaussian_fwhm: np.ndarray | None = None
     """(n,): full width at half maximum [Hz] of the beat's Gaussian line; None without a Gaussian
     line.
     """
-    lorentzian_width: np.ndarray | float = 0.0
+    lorentzian_fwhm: np.ndarray | float = 0.0
     """(n,): full width at half maximum [Hz] of the laser's Lorentzian line, from a random walk of
     its phase.
     """
@@ -100,7 +100,7 @@ class LaserLine(NamedTuple):
 class FrequencyShifts(NamedTuple):
     """Frequency shifts of all lines, with weights, over which the power spectrum is averaged."""
 
-    offset_window_bins: np.ndarray
+    shift_window_bins: np.ndarray
     """(n, k): shift of all lines [bins of fs/L, sample rate over number of samples]."""
     weight: np.ndarray
     """(n, k): weight of the power spectrum at each shift, >= 0; the sum is 1."""
@@ -402,8 +402,8 @@ def _window_samples_and_double_integral(window: Window) -> "tuple[np.ndarray, Cu
     return w / w.sum(), double_integral
 
 
-def n_phase_walk_steps(*, delay: float, length: int) -> int:
-    """Return the even number of steps that :func:`phase_walk` takes.
+def n_beat_phase_noise_steps(*, delay: float, length: int) -> int:
+    """Return the even number of steps that :func:`beat_phase_noise` takes.
 
     Parameters
     ----------
@@ -416,7 +416,7 @@ def n_phase_walk_steps(*, delay: float, length: int) -> int:
     return 2 * (length + min(math.floor(delay), length))
 
 
-def phase_walk(
+def beat_phase_noise(
     steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
 ) -> np.ndarray:
     """Return a laser's phase minus its phase one delay earlier [rad], over a record.
@@ -426,7 +426,7 @@ def phase_walk(
     Parameters
     ----------
     steps : ndarray (n_steps,)
-        Standard normal numbers; :func:`n_phase_walk_steps` gives their number.
+        Standard normal numbers; :func:`n_beat_phase_noise_steps` gives their number.
     variance_per_sample : float
         Variance of theta's change from sample to sample, Gamma / fs [rad^2].
     delay : float

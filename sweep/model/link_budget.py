@@ -55,7 +55,7 @@ class ReceiverFilter:
     """Spectrum of the noise: ``receiver``, filtered as signals are, or ``white``, unfiltered, as in
     [T].
     """
-    antialias_filter: dict[str, np.ndarray] = field(default_factory=dict)
+    antialias_parameters: dict[str, np.ndarray] = field(default_factory=dict)
     """Bandwidth [Hz] and order of the anti-alias filter by parameter name; empty without a filter.
     """
 
@@ -67,12 +67,12 @@ class ReceiverFilter:
             amplifier_bandwidth=parameters[RECEIVER_PREFIX + "amplifier_bandwidth"],
             sample_rate=parameters[PROCESSING_PREFIX + "sample_rate"],
             noise_shape=str(parameters[RECEIVER_PREFIX + "noise_shape"]),
-            antialias_filter=receiver_chain.antialias_filter_parameters(
+            antialias_parameters=receiver_chain.antialias_filter_parameters(
                 receiver_chain.receiver_parameters(parameters)
             ),
         )
 
-    def pole_gain(self, frequency: np.ndarray) -> np.ndarray:
+    def pole_amplitude_gain(self, frequency: np.ndarray) -> np.ndarray:
         """Return the amplitude gain of detector and amplifier for a signal, relative to DC.
 
         Parameters
@@ -101,13 +101,13 @@ class ReceiverFilter:
         frequency : ndarray
             Signed frequency [Hz], before the ADC folds it.
         """
-        if not self.antialias_filter:
+        if not self.antialias_parameters:
             return 1.0
         return np.sqrt(
-            receiver_chain.antialias_power_transmission(frequency, **self.antialias_filter)
+            receiver_chain.antialias_power_transmission(frequency, **self.antialias_parameters)
         )
 
-    def gain(self, frequency: np.ndarray) -> np.ndarray:
+    def amplitude_gain(self, frequency: np.ndarray) -> np.ndarray:
         """Return the amplitude gain of poles and anti-alias filter for a signal, relative to DC.
 
         Parameters
@@ -132,7 +132,7 @@ class ReceiverFilter:
             sample_rate=self.sample_rate,
             detector_bandwidth=self.detector_bandwidth,
             amplifier_bandwidth=self.amplifier_bandwidth,
-            **self.antialias_filter,
+            **self.antialias_parameters,
         )
 
     def whitening_gain(
@@ -182,7 +182,7 @@ class NoiseBudget:
 
     variances: dict[str, np.ndarray]
     """Noise variance of a sample [V^2] by name of the source."""
-    gain: np.ndarray | float = 1.0
+    variance_factor: np.ndarray | float = 1.0
     """Factor on the total noise variance. It accounts for changes of the record after the threshold
     was set.
     """
@@ -192,7 +192,7 @@ class NoiseBudget:
 
         ``variances`` are noise variances [V^2] by name of the source.
         """
-        return NoiseBudget(self.variances | variances, self.gain)
+        return NoiseBudget(self.variances | variances, self.variance_factor)
 
     @cached_property
     def variance_without_echo(self) -> np.ndarray:
@@ -204,7 +204,7 @@ class NoiseBudget:
     def variance(self) -> np.ndarray:
         """Noise variance of a sample [V^2], sum over all sources."""
         echo_variances = (v for name, v in self.variances.items() if name in ECHO_NOISE_SOURCES)
-        return (self.variance_without_echo + sum(echo_variances)) * self.gain
+        return (self.variance_without_echo + sum(echo_variances)) * self.variance_factor
 
     @property
     def adc_noise_fraction(self) -> np.ndarray | float:
@@ -219,13 +219,13 @@ class EchoScales(NamedTuple):
     amplitude, and the transmission of other light from the ground.
     """
 
-    echo_power: np.ndarray
+    echo_power_scale: np.ndarray
     """Echo power on the detector [W] for a relative echo of 1/sr."""
-    beat_amplitude: np.ndarray
+    beat_amplitude_scale: np.ndarray
     """Amplitude of the beat at the ADC [V] for a relative amplitude of 1, before the receiver's
     poles.
     """
-    ground_transmission: np.ndarray | float = 1.0
+    ground_light_transmission: np.ndarray | float = 1.0
     """Fraction of light from the ground, such as sunlight, that reaches the receiver."""
 
     def scale_echo(
@@ -233,8 +233,8 @@ class EchoScales(NamedTuple):
     ) -> "EchoScales":
         """Return these scales with factors on the echo's power and on the beat's amplitude."""
         return self._replace(
-            echo_power=self.echo_power * power_factor,
-            beat_amplitude=self.beat_amplitude * amplitude_factor,
+            echo_power_scale=self.echo_power_scale * power_factor,
+            beat_amplitude_scale=self.beat_amplitude_scale * amplitude_factor,
         )
 
 

@@ -39,7 +39,7 @@ class OutputVariable:
     ``draw`` and ``return_number`` count from 0; ``xyz`` are the axes of the world.
     """
 
-    def empty(self, sizes: Mapping[str, int]) -> np.ndarray:
+    def empty_array(self, sizes: Mapping[str, int]) -> np.ndarray:
         """Return an uninitialised array for the variable.
 
         `sizes` has the length of each dimension, by name.
@@ -207,7 +207,7 @@ STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
 """Standard errors of outputs in studies with draws: output variables by name. The name is that of
 the output with ``_error``. Each has one float for each point."""
 
-PD_OUTPUTS = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
+PD_OUTPUT_NAMES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 """Names of the detection probabilities that a study's tolerance applies to when draws are made."""
 
 ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
@@ -226,11 +226,11 @@ ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
 }
 """Accuracy of estimates by random draws: output variables by name, one value for each point."""
 
-RUNNING_SUMS = "running_sums"
+RUNNING_SUMS_NAME = "running_sums"
 """Name of the output with the sums over draws, to which later draws can be added."""
 
 RUNNING_SUM_OUTPUTS: dict[str, OutputVariable] = {
-    RUNNING_SUMS: OutputVariable(
+    RUNNING_SUMS_NAME: OutputVariable(
         "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
     ),
 }
@@ -245,7 +245,7 @@ OUTPUT_HAS_SQUARED_DEVIATIONS = OUTPUT_IS_LOGARITHM | np.array(
 """(outputs,) bool: True for those of GRID_OUTPUTS whose squared deviations from the mean are summed
 over draws."""
 
-N_GROUP_SUMS = 3 * len(PD_OUTPUTS)
+N_GROUP_SUMS = 3 * len(PD_OUTPUT_NAMES)
 """Number of columns of a row of running sums that describe the means of groups of draws: mean, sum
 of squared deviations, and sum over the unfinished group, of each probability of detection."""
 
@@ -297,7 +297,7 @@ def _measurement_variables(
     }
 
 
-SPECTRA_OUTPUTS: dict[str, OutputVariable] = {
+SPECTRA_STUDY_OUTPUTS: dict[str, OutputVariable] = {
     **{name: GRID_OUTPUTS[name] for name in DETECTOR_INDEPENDENT_OUTPUTS},
     **_segment_variables(
         "pd_{}",
@@ -334,7 +334,7 @@ def _with_dims(
 
 _VECTOR_DIMS = (XYZ_DIM,)
 
-SHOT_VARIABLES: dict[str, OutputVariable] = _with_dims(
+SHOT_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(
     ("shot",),
     {
         "time": OutputVariable(
@@ -394,7 +394,7 @@ CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
 })  # fmt: skip
 """True motion of the instrument in each measurement cycle: output variables by name."""
 
-BEAMLET_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
+BEAMLET_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "offset": OutputVariable("m", "range less that of the reference beamlet"),
     "velocity_offset": OutputVariable(
         "m s-1", "radial velocity less that of the reference beamlet", CLOSING_SIGN_NOTE
@@ -403,7 +403,7 @@ BEAMLET_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "surface": OutputVariable("1", "surface hit", dtype="int16"),
 })  # fmt: skip
 """Geometry of each beamlet of each shot: output variables by name. They belong to an eyepoint
-store, which holds the ray-traced geometry of a flight's shots, and also SHOT_VARIABLES and
+store, which holds the ray-traced geometry of a flight's shots, and also SHOT_GEOMETRY_VARIABLES and
 CYCLE_VARIABLES."""
 
 BEAMLET_WEIGHT_VARIABLE = OutputVariable("1", "power fraction of the beamlet", dims=("beamlet",))
@@ -464,7 +464,7 @@ EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
 
 _NAN_FOR_FALSE_POINT_NOTE = "nan: a false one"
 
-POINT_VARIABLES: dict[str, OutputVariable] = _with_dims(
+POINT_CLOUD_VARIABLES: dict[str, OutputVariable] = _with_dims(
     ("shot", "draw", "return_number"),
     {
         "position": OutputVariable(
@@ -544,7 +544,7 @@ GRID_VARIABLE_NAMES = frozenset().union(
     STANDARD_ERROR_OUTPUTS,
     ACCURACY_OUTPUTS,
     RUNNING_SUM_OUTPUTS,
-    SPECTRA_OUTPUTS,
+    SPECTRA_STUDY_OUTPUTS,
     EFFECT_VARIABLES,
 )
 """Names of all output variables that the store of a grid may have."""

@@ -18,10 +18,10 @@ import numpy as np
 
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.bin_noise import SearchedBins, alarm_equivalent_bins
+from sweep.model.detection.bin_noise import SearchedBins, n_alarm_equivalent_bins
 from sweep.model.detection.detectors import main_lobe_half_width
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH, Looks
-from sweep.model.error_budget import AUTOMATIC
+from sweep.model.error_budget import SET_BY_TOLERANCE
 from sweep.model.ground import Ground
 from sweep.model.laser_line import LaserLine
 from sweep.model.link_budget import (
@@ -58,7 +58,7 @@ BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
 """Parameter path of the error of the detection probability due to the number of beamlets. It is
 present if that number follows from the tolerance."""
 
-CHIRP_SLOPE_PATHS = waveform.DOPPLER_SEGMENT_SLOPE_PATH, waveform.DOWN_SEGMENT_SLOPE_PATH
+CHIRP_RATE_RATIO_PATHS = waveform.DOPPLER_CHIRP_RATE_RATIO_PATH, waveform.DOWN_CHIRP_RATE_RATIO_PATH
 """Parameter paths of the chirp rates of Doppler and down segment, relative to the up-chirp's."""
 SHARED_PARAMETER_PATHS = (
     PROCESSING_PREFIX + "fft_size",
@@ -66,7 +66,7 @@ SHARED_PARAMETER_PATHS = (
     "record",
     LOOKS_NUMBER_PATH,
     LOOKS_VOTES_PATH,
-    *CHIRP_SLOPE_PATHS,
+    *CHIRP_RATE_RATIO_PATHS,
 )
 """Paths of numeric parameters that points must share to be computed together. They must share all
 text parameters as well."""
@@ -83,7 +83,7 @@ class _PedestalShapes(NamedTuple):
     """(n,): distance from the lines up to which the pedestal counts as echo [FFT bins]."""
     line_width_bins: np.ndarray
     """(n,): line width of the laser [FFT bins]."""
-    delay: np.ndarray
+    delay_times_bin_width: np.ndarray
     """(n,): delay of the echo, at most the duration of the record [N/fs, FFT size over sample
     rate]."""
 
@@ -136,7 +136,7 @@ class Shots:
     """Motion of the target during a shot that affects lines and measured values."""
     echo_record: EchoRecord = EchoRecord()  # noqa: RUF009
     """Number of samples before the echo arrives, and phase errors of the echo over the record."""
-    images: LineImages = LineImages()  # noqa: RUF009
+    line_images: LineImages = LineImages()  # noqa: RUF009
     """Images of lines at their negative frequencies, and their amplitudes."""
     laser_line: LaserLine = LaserLine()  # noqa: RUF009
     """Line width of the laser and its phase-noise pedestal."""
@@ -262,7 +262,7 @@ class Shots:
     @property
     def echo_power(self) -> np.ndarray:
         """Echo power on the detector [W], (n,)."""
-        return self.echo_scales.echo_power * self.total_relative_echo
+        return self.echo_scales.echo_power_scale * self.total_relative_echo
 
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
@@ -278,7 +278,10 @@ class Shots:
         is computed for the line on the beam's axis.
         """
         return broadcast_rows(
-            [self.whitening_gain_at(beat_frequency) for beat_frequency in self.beat_frequencies],
+            [
+                self.whitening_gain_at_frequency(beat_frequency)
+                for beat_frequency in self.beat_frequencies
+            ],
             (self.size,),
         )
 
@@ -287,7 +290,7 @@ class Shots:
         """Signed beat frequencies [Hz] of the line on the beam's axis, one array per segment."""
         return tuple(segment.beat_frequency(self.range) for segment in self.waveform_segments)
 
-    def whitening_gain_at(
+    def whitening_gain_at_frequency(
         self, beat_frequency: np.ndarray, bin_frequency: np.ndarray | None = None
     ) -> np.ndarray:
         """Return the amplitude gain of a line in a spectrum whose noise is whitened.
@@ -337,13 +340,13 @@ class Shots:
         )
         shapes = self._pedestal_shapes
         values = BinThresholds(
-            line_noise=self.line_noise_sigma,
+            line_noise_sigma=self.line_noise_sigma,
             threshold=self.threshold,
-            noise_without_pedestal=self.bin_noise_sigma,
-            side_noise=side_noise_sigma,
+            noise_sigma_without_pedestal=self.bin_noise_sigma,
+            side_noise_sigma=side_noise_sigma,
             pedestal_reach_bins=shapes.reach_bins,
             pedestal_line_width_bins=shapes.line_width_bins,
-            pedestal_delay=shapes.delay,
+            pedestal_delay_times_bin_width=shapes.delay_times_bin_width,
         )
         return BinThresholds(*broadcast_rows(values, (self.size,)))
 
@@ -351,14 +354,14 @@ class Shots:
     def _pedestal_shapes(self) -> _PedestalShapes:
         """Shapes of phase-noise pedestals; the reach is 0 where they add no bins to an echo."""
         if (
-            self.detection_settings.echo_bins == "peak_bin"
+            self.detection_settings.echo_bin_rule == "peak_bin"
             or self.looks.is_noncoherent
-            or not np.any(self.laser_line.lorentzian_width)
+            or not np.any(self.laser_line.lorentzian_fwhm)
         ):
             return _PedestalShapes(*np.zeros((3, self.size)))
         from sweep.model.detection.echo_detection import pedestal_reach_bins
 
-        line_width_bins = self.laser_line.lorentzian_width * self.fft_size / self.sample_rate
+        line_width_bins = self.laser_line.lorentzian_fwhm * self.fft_size / self.sample_rate
         delay = np.minimum(2 * self.range / SPEED_OF_LIGHT, self.record.duration)
         delay = delay * self.sample_rate / self.fft_size
         power_ratio = self.laser_line.pedestal_variance_beside_line / self.noise_variance
@@ -408,7 +411,7 @@ class Shots:
         from sweep.model.detection import echo_detection
 
         stated_floor, n_bins = self.tolerances.leakage_floor, self.n_bins
-        if not np.any(stated_floor == AUTOMATIC):
+        if not np.any(stated_floor == SET_BY_TOLERANCE):
             return stated_floor
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             threshold_ratio = self.threshold / self.bin_noise_sigma
@@ -422,7 +425,7 @@ class Shots:
             threshold_ratio=threshold_ratio,
             n_bins=n_bins,
         )
-        return np.where(stated_floor == AUTOMATIC, automatic_floor, stated_floor)
+        return np.where(stated_floor == SET_BY_TOLERANCE, automatic_floor, stated_floor)
 
     @property
     def detects_by_any_two_segments(self) -> bool:
@@ -463,7 +466,7 @@ class Shots:
         return self.waveform.segments(self.target, self.motion)
 
     @property
-    def motion_by_segment(self) -> dict[str, Any]:
+    def range_and_velocity_by_segment(self) -> dict[str, Any]:
         """Range [m] and radial velocity [m/s] of the target, (n,).
 
         They are tuples by segment where the target moves between segments.
@@ -499,7 +502,7 @@ class Shots:
         )
 
     @property
-    def mid_record_drifts(self) -> tuple[np.ndarray, ...]:
+    def mid_record_frequency_drifts(self) -> tuple[np.ndarray, ...]:
         """Frequency drift [Hz] of each segment's lines from its start to mid-record, (n,) each."""
         return tuple(
             self._frequency_drift(segment, self.record_middle_time, self.motion.velocity_drift_time)
@@ -543,18 +546,21 @@ class Shots:
         the delay, so that a beat at the time t in a segment depends on the delay at 2 t. The time
         from a segment's start to the middle of its record therefore counts twice.
         """
-        starts, chirp_slopes, carriers, walk_time, chirp_rate = (
+        starts, chirp_rate_ratios, carriers, walk_time, chirp_rate = (
             np.array([np.broadcast_to(v, self.size) for v in values])
             for values in (
                 self.motion.segment_starts,
-                self.waveform.chirp_slopes,
+                self.waveform.chirp_rate_ratios,
                 self.waveform.carriers,
                 (self.motion.range_reference_time,),
                 (self.waveform.chirp_rate,),
             )
         )
         delay_times = starts + walk_time - (starts[0] + starts[2]) / 2
-        return carriers + chirp_slopes * chirp_rate * delay_times, chirp_slopes * chirp_rate
+        return (
+            carriers + chirp_rate_ratios * chirp_rate * delay_times,
+            chirp_rate_ratios * chirp_rate,
+        )
 
     def split_by_look(self) -> "list[Shots]":
         """Return one set of shots for each look, with the lines where that look observes them.
@@ -594,7 +600,7 @@ class Shots:
             range=self.range,
             doppler_ratio=np.asarray(self.motion.doppler_ratio),
             chirp_rate=self.waveform.chirp_rate,
-            beat_amplitude_scale=self.echo_scales.beat_amplitude,
+            beat_amplitude_scale=self.echo_scales.beat_amplitude_scale,
             detector_bandwidth=self.receiver_filter.detector_bandwidth,
             amplifier_bandwidth=self.receiver_filter.amplifier_bandwidth,
             sample_rate=self.sample_rate,
@@ -604,14 +610,14 @@ class Shots:
             noise_sigma=self.bin_noise_sigma,
             threshold=self.threshold,
             negligible_signal_ratio=self.negligible_signal_ratio,
-            line_noise=self.line_noise_sigma,
+            line_noise_sigma=self.line_noise_sigma,
             leakage_tolerance=self.tolerances.leakage_probability,
             line_error_tolerance=self.tolerances.line_error,
-            image_gain=np.asarray(self.images.iq_gain),
-            side_noise=bin_thresholds.side_noise,
+            image_gain=np.asarray(self.line_images.iq_image_gain),
+            side_noise_sigma=bin_thresholds.side_noise_sigma,
             pedestal_reach_bins=bin_thresholds.pedestal_reach_bins,
             pedestal_line_width_bins=bin_thresholds.pedestal_line_width_bins,
-            pedestal_delay=bin_thresholds.pedestal_delay,
+            pedestal_delay_times_bin_width=bin_thresholds.pedestal_delay_times_bin_width,
         )
         return PointParameters(*broadcast_rows(values, (self.size,)))
 
@@ -638,12 +644,14 @@ class Shots:
         return SegmentParameters(*np.stack(rows_by_segment, axis=1))
 
     @property
-    def real_fft_size(self) -> int:
+    def real_ends_fft_size(self) -> int:
         """FFT size N if the noise in bins 0 and N/2 is real-valued; 0 if it is complex.
 
         It is real-valued in a real record whose noise bins are correlated.
         """
-        is_real = self.detection_settings.noise_bins == "correlated" and not self.complex_record
+        is_real = (
+            self.detection_settings.noise_bin_model == "correlated" and not self.complex_record
+        )
         return self.fft_size if is_real else 0
 
     @cached_property
@@ -651,8 +659,8 @@ class Shots:
         """Bins of each segment that are searched for false alarms, and their noise correlation."""
         return SearchedBins.from_record(
             self.record,
-            noise_bins=self.detection_settings.noise_bins,
-            bins_counted=self.detection_settings.bins_counted,
+            noise_bins=self.detection_settings.noise_bin_model,
+            bins_counted=self.detection_settings.counted_bins_rule,
             search_band=self.detection_settings.search_band,
         )
 
@@ -664,7 +672,7 @@ class Shots:
     @property
     def noise_bin_correlation(self) -> float:
         """Correlation coefficient of the noise of adjacent bins, 0..1."""
-        return self.searched_bins.neighbour_correlation
+        return self.searched_bins.neighbour_noise_correlation
 
     @property
     def detection_rule(self) -> "DetectionRule":
@@ -677,12 +685,12 @@ class Shots:
 
         in_speckle, any_bin = (
             self.speckle.segment_correlations is not None,
-            self.detection_settings.echo_bins != "peak_bin",
+            self.detection_settings.echo_bin_rule != "peak_bin",
         )
-        real_record_in_speckle = in_speckle and not self.complex_record
-        real_noise_at_ends = self.real_fft_size > 0
+        is_real_record_in_speckle = in_speckle and not self.complex_record
+        has_real_noise_at_ends = self.real_ends_fft_size > 0
         noise_ratio, lobe_half_width, modes = np.empty(0), 0, NO_MODES
-        if real_record_in_speckle and real_noise_at_ends:
+        if is_real_record_in_speckle and has_real_noise_at_ends:
             noise_ratio = noise_pseudo_variance_ratio(self.window, self.fft_size)
         if any_bin:
             lobe_half_width = math.ceil(
@@ -691,13 +699,13 @@ class Shots:
             if in_speckle:
                 modes = mode_table(self.window, self.fft_size)
         return DetectionRule(
-            any_bin=any_bin,
+            detects_by_any_bin=any_bin,
             lobe_half_width=lobe_half_width,
-            real_noise_at_ends=real_noise_at_ends,
+            has_real_noise_at_ends=has_real_noise_at_ends,
             fft_size=self.fft_size,
             in_speckle=in_speckle,
-            noise_correlation=self.noise_bin_correlation,
-            real_record_in_speckle=real_record_in_speckle,
+            neighbour_noise_correlation=self.noise_bin_correlation,
+            is_real_record_in_speckle=is_real_record_in_speckle,
             neighbour_crossing_quadrature=joint_tail_quadrature(self.noise_bin_correlation),
             noise_pseudo_variance_ratio=noise_ratio,
             mode_table=modes,
@@ -720,7 +728,7 @@ class Shots:
         if (
             self.speckle.segment_correlations is None
             or self.complex_record
-            or not self.images.are_summed
+            or not self.line_images.are_summed
         ):
             return SpeckleTable(
                 line_deviation_bins, np.zeros(shape, np.int64), np.zeros((1, 0)), np.ones((1, 1))
@@ -746,7 +754,7 @@ class Shots:
         """
         return self.searched_bins.select_points(point_indices).n_bins_outside_echo(n_exempt)
 
-    def alarm_equivalent_bins(
+    def n_alarm_equivalent_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
         """Return the number of independent bins that are equivalent to the searched bins.
@@ -761,12 +769,12 @@ class Shots:
             Points to which the columns belong.
         """
         n_searched = self.n_searched_bins(n_exempt, point_indices)
-        if self.detection_settings.noise_bins == "independent":
+        if self.detection_settings.noise_bin_model == "independent":
             return n_searched
         threshold_ratio = np.broadcast_to(self.threshold / self.bin_noise_sigma, self.size)[
             point_indices
         ]
-        return alarm_equivalent_bins(
+        return n_alarm_equivalent_bins(
             n_searched,
             threshold_ratio=threshold_ratio,
             correlation=self.noise_bin_correlation,
@@ -834,7 +842,7 @@ def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...])
 def parameters_as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
     """Return the parameters as arrays, with the number of samples of the record as ``record``."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
-    arrays["record"] = waveform.record_length(arrays)
+    arrays["record"] = waveform.n_record_samples(arrays)
     return arrays
 
 
@@ -857,7 +865,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
     zeros, architecture = np.zeros(n_points), budget.waveform.architecture
     sample_rate = budget.record.sample_rate + zeros
     return Shots(
-        waveform=replace(budget.waveform, chirp_slopes=waveform.chirp_slopes(parameters)),
+        waveform=replace(budget.waveform, chirp_rate_ratios=waveform.chirp_rate_ratios(parameters)),
         record=replace(budget.record, sample_rate=sample_rate),
         receiver_filter=replace(budget.receiver_filter, sample_rate=sample_rate),
         target=replace(
@@ -896,8 +904,8 @@ _LABEL_BY_POINT_FIELD = {
     "target.radial_velocity": "radial velocity",
     "target.acceleration": "acceleration",
     "motion.doppler_ratio": "Doppler shift",
-    "echo_scales.echo_power": "echo's power",
-    "echo_scales.beat_amplitude": "beat's amplitude",
+    "echo_scales.echo_power_scale": "echo's power",
+    "echo_scales.beat_amplitude_scale": "beat's amplitude",
     "bin_noise_sigma": "noise",
     "threshold": "threshold",
 }

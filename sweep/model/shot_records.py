@@ -42,7 +42,7 @@ class FootprintLines(NamedTuple):
     """
     relative_amplitude: np.ndarray
     """(rows, beamlets): amplitude of each beamlet's beat, divided by
-    :attr:`sweep.model.link_budget.EchoScales.beat_amplitude`. It is the square root of the
+    :attr:`sweep.model.link_budget.EchoScales.beat_amplitude_scale`. It is the square root of the
     relative echo [1/sr], or with direct detection the relative echo itself."""
     adds_powers: bool = True
     """True if the powers of beamlets add, False if their amplitudes do."""
@@ -70,7 +70,7 @@ class DetectionSettings(NamedTuple):
     tnr: np.ndarray
     """Threshold-to-noise ratio: threshold divided by the standard deviation of a noise-only bin's
     magnitude."""
-    echo_bins: str
+    echo_bin_rule: str
     """Bins that can detect an echo: ``any_bin`` of the echo, or ``peak_bin``, only its largest, as
     in [T].
     """
@@ -78,17 +78,17 @@ class DetectionSettings(NamedTuple):
     """Segments that must detect an echo for the shot to be detected: ``both_chirps``, or
     ``any_two``.
     """
-    reported_peaks: str
+    reported_peaks_option: str
     """Peaks that a segment reports: ``all`` above the threshold, or only the ``strongest``."""
     two_beat_assumption: str
     """Assumption that resolves two beats of unknown sign: ``far``, the range beat exceeds the
     Doppler shift, or ``fast``, the opposite.
     """
-    noise_bins: str
+    noise_bin_model: str
     """Treatment of noise in adjacent bins: ``correlated``, as in a record, or ``independent``, as
     in [T].
     """
-    bins_counted: str
+    counted_bins_rule: str
     """Bins that count for false alarms: ``half``, those of a real spectrum, or ``all`` N bins of
     the FFT.
     """
@@ -113,12 +113,12 @@ class DetectionSettings(NamedTuple):
         parameters = budget.parameters
         return cls(
             tnr=budget.tnr,
-            echo_bins=str(parameters[PROCESSING_PREFIX + "detection"]),
+            echo_bin_rule=str(parameters[PROCESSING_PREFIX + "detection"]),
             shot_detection_rule=str(parameters[waveform.SHOT_DETECTION_PATH]),
-            reported_peaks=str(parameters[waveform.PEAKS_PATH]),
+            reported_peaks_option=str(parameters[waveform.REPORTED_PEAKS_PATH]),
             two_beat_assumption=str(parameters[waveform.TWO_BEAT_ASSUMPTION_PATH]),
-            noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
-            bins_counted=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
+            noise_bin_model=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
+            counted_bins_rule=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
             search_band=search_band_start_and_size(
                 parameters, budget.waveform, budget.record, n_points
             ),
@@ -135,7 +135,7 @@ class SpectrumTolerances(NamedTuple):
     """Tolerated probability of false alarms due to leaked signal that is not evaluated."""
     leakage_floor: np.ndarray
     """Leaked signal in a bin, relative to the noise sigma, below which the bin counts as noise
-    alone. The value :data:`sweep.model.error_budget.AUTOMATIC` means that it follows from
+    alone. The value :data:`sweep.model.error_budget.SET_BY_TOLERANCE` means that it follows from
     ``leakage_probability``."""
 
     @classmethod
@@ -154,15 +154,15 @@ class SpectrumTolerances(NamedTuple):
 class PhaseError(NamedTuple):
     """Deterministic phase error over the record, common to all lines of a footprint."""
 
-    phase: Callable[..., np.ndarray]
+    phase_function: Callable[..., np.ndarray]
     """Function that returns the phase error [cycles], (n, m). It takes positions x (m,) in the
     record, -1 .. 1, ``sign`` and `arguments`.
     """
     arguments: dict[str, Any]
-    """Arguments of ``phase`` by name, (n,) or scalars; tuples hold one per segment."""
+    """Arguments of ``phase_function`` by name, (n,) or scalars; tuples hold one per segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the arguments of ``phase`` for selected points in one segment.
+        """Return the arguments of ``phase_function`` for selected points in one segment.
 
         Parameters
         ----------
@@ -205,7 +205,7 @@ class LineImages(NamedTuple):
 
     are_summed: bool = False
     """True if the images in a real record's spectrum are summed with its lines."""
-    iq_gain: np.ndarray | float = 0.0
+    iq_image_gain: np.ndarray | float = 0.0
     """(n,): amplitude of a line's image, relative to that of the line, 0..1, in a complex record.
     It is due to imbalance of I and Q."""
 

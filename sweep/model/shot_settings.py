@@ -23,7 +23,7 @@ LASER_PREFIX, CHIRP_PREFIX, TELESCOPE_PREFIX, RECEIVER_PREFIX, PROCESSING_PREFIX
     f"instrument.{section}."
     for section in ("laser", "chirp", "telescope", "receiver", "processing")
 )
-RECORD_PATH = RECEIVER_PREFIX + "record"
+RECORD_TYPE_PATH = RECEIVER_PREFIX + "record"
 """Parameter path of the record's kind of samples: ``real``, or ``complex`` from I and Q."""
 
 APPROACH_SPEED_PATH = "target.approach"
@@ -101,7 +101,7 @@ class WaveformSettings:
     """Receiver architecture: ``homodyne``, ``heterodyne`` or ``direct``."""
     segment_order: tuple[str, ...]
     """Names of the existing segments, in the order of time."""
-    chirp_slopes: tuple[Any, ...]
+    chirp_rate_ratios: tuple[Any, ...]
     """Signed chirp rates of up, Doppler and down segment, each divided by the up-chirp's
     :attr:`chirp_rate`. They are numbers, or arrays if points differ."""
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -122,11 +122,14 @@ class WaveformSettings:
         """
         parameters = waveform.WAVEFORM_DEFAULTS | dict(parameters)
         architecture = str(parameters[RECEIVER_PREFIX + "architecture"])
-        chirp_slopes: tuple[Any, ...] = (
+        chirp_rate_ratios: tuple[Any, ...] = (
             1.0,
             *(
                 np.asarray(parameters[path], float)
-                for path in (waveform.DOPPLER_SEGMENT_SLOPE_PATH, waveform.DOWN_SEGMENT_SLOPE_PATH)
+                for path in (
+                    waveform.DOPPLER_CHIRP_RATE_RATIO_PATH,
+                    waveform.DOWN_CHIRP_RATE_RATIO_PATH,
+                )
             ),
         )
         chirp_bandwidth = parameters[CHIRP_PREFIX + "bandwidth"]
@@ -135,13 +138,13 @@ class WaveformSettings:
             segment_order=waveform.existing_segments(
                 architecture, str(parameters[waveform.SEGMENT_ORDER_PATH])
             ),
-            chirp_slopes=chirp_slopes,
+            chirp_rate_ratios=chirp_rate_ratios,
             carriers=waveform.carrier_frequencies(
                 architecture,
                 wavelength=parameters[LASER_PREFIX + "wavelength"],
                 start_frequency=parameters[CHIRP_PREFIX + "start_frequency"],
                 bandwidth=chirp_bandwidth,
-                chirp_slopes=chirp_slopes,
+                chirp_rate_ratios=chirp_rate_ratios,
             ),
             chirp_bandwidth=chirp_bandwidth,
             chirp_duration=parameters[CHIRP_PREFIX + "duration"],
@@ -220,7 +223,7 @@ class WaveformSettings:
             )
             for name, slope, carrier, start in zip(
                 waveform.SEGMENT_NAMES,
-                self.chirp_slopes,
+                self.chirp_rate_ratios,
                 self.carriers,
                 motion.segment_starts,
                 strict=True,
@@ -251,7 +254,7 @@ class RecordSettings:
 
         All points must have the same number of samples and the same FFT size.
         """
-        length = waveform.record_length(parameters)
+        length = waveform.n_record_samples(parameters)
         window_name = canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"]))
         return cls(
             window=get_window(window_name, int(np.ravel(length)[0])),
@@ -331,4 +334,4 @@ def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
 
 def is_iq_sampled(parameters: Mapping[str, Any]) -> bool:
     """Return True if two receivers sample the I and Q parts of a complex record."""
-    return str(parameters.get(RECORD_PATH, "real")) == "complex"
+    return str(parameters.get(RECORD_TYPE_PATH, "real")) == "complex"

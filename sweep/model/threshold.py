@@ -136,14 +136,14 @@ def _log_pfa_function(
         (
             log_at_least_one_probability(
                 looks.log_pfa(threshold_ratio),
-                segment_bins.alarm_equivalent_bins(threshold_ratio, looks),
+                segment_bins.n_alarm_equivalent_bins(threshold_ratio, looks),
             )
             for segment_bins in bins_by_segment
         ),
     )
 
 
-def segment_alarm_bins(
+def n_segment_alarm_bins(
     parameters: Mapping[str, Any], threshold_ratio: np.ndarray, segment: str = "up"
 ) -> np.ndarray:
     """Return the number of independent bins that together have a segment's false-alarm probability.
@@ -159,11 +159,11 @@ def segment_alarm_bins(
 
     See Also
     --------
-    sweep.model.preparation.Shots.alarm_equivalent_bins : The number less the bins of a detection.
+    sweep.model.preparation.Shots.n_alarm_equivalent_bins : The number less the bins of a detection.
     """
     looks = Looks.from_parameters(parameters)
     segment_bins = _searched_bins(parameters).select_segment(SEGMENT_NAMES.index(segment))
-    n_bins = segment_bins.alarm_equivalent_bins(threshold_ratio, looks)
+    n_bins = segment_bins.n_alarm_equivalent_bins(threshold_ratio, looks)
     return n_bins + np.zeros(np.shape(threshold_ratio))
 
 

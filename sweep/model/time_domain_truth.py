@@ -56,9 +56,12 @@ def time_domain_spectrum(
     w = window.window_samples(shots.window.name, shots.window.length)
     n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record
     record_sum = np.zeros(shots.window.length, complex)
-    power, image_gain = np.zeros(shots.n_bins), _value_of_point(shots.images.iq_gain, point)
+    power, image_gain = (
+        np.zeros(shots.n_bins),
+        _value_of_point(shots.line_images.iq_image_gain, point),
+    )
     for beamlet in range(shots.footprint.n_beamlets):
-        beamlet_record = analytic_record(
+        beamlet_record = beamlet_analytic_signal(
             shots,
             point,
             segment,
@@ -139,7 +142,7 @@ def evaluate_segments_in_time_domain(
     return results._replace(pd=pd, miss=miss)
 
 
-def analytic_record(
+def beamlet_analytic_signal(
     shots: Shots,
     point: int,
     segment: int,
@@ -170,8 +173,8 @@ def analytic_record(
     and that of its scatterers at their own radial velocity. If the two differ, the beam slides over
     the ground. Scatterers then replace each other, and the beat has the delay of those in the beam.
     """
-    chirp_slope, carrier = (
-        shots.waveform.chirp_slopes[segment],
+    chirp_rate_ratio, carrier = (
+        shots.waveform.chirp_rate_ratios[segment],
         float(_value_of_point(shots.waveform.carriers[segment], point)),
     )
     doppler_ratio_offset, segment_start = (
@@ -210,18 +213,25 @@ def analytic_record(
     )
     if not with_range_walk:
         chirp_phase = start_delay * (delay_change - t)
-    cycles = -carrier * delay_change + chirp_slope * chirp_rate * chirp_phase
+    cycles = -carrier * delay_change + chirp_rate_ratio * chirp_rate * chirp_phase
     start_phase = _start_phase_cycles(
-        chirp_slope, carrier, chirp_rate, axis_range, range_offset, range_decrease_since_shot_start
+        chirp_rate_ratio,
+        carrier,
+        chirp_rate,
+        axis_range,
+        range_offset,
+        range_decrease_since_shot_start,
     )
-    beat = carrier * doppler_ratio - chirp_slope * chirp_rate * start_delay * (1 + doppler_ratio)
+    beat = carrier * doppler_ratio - chirp_rate_ratio * chirp_rate * start_delay * (
+        1 + doppler_ratio
+    )
     gain = receiver_chain.receiver_transfer(
         np.array(beat),
         detector_bandwidth=_value_of_point(shots.receiver_filter.detector_bandwidth, point),
         amplifier_bandwidth=_value_of_point(shots.receiver_filter.amplifier_bandwidth, point),
     )
     amplitude = (
-        _value_of_point(shots.echo_scales.beat_amplitude, point)
+        _value_of_point(shots.echo_scales.beat_amplitude_scale, point)
         * shots.footprint.relative_amplitude[shots.footprint.row_of_point[point], beamlet]
     )
     amplitude = amplitude * shots.whitening_gain[segment][point]
@@ -235,7 +245,7 @@ def analytic_record(
 
 
 def _start_phase_cycles(
-    chirp_slope: float,
+    chirp_rate_ratio: float,
     carrier: float,
     chirp_rate: float,
     axis_range: float,
@@ -245,14 +255,17 @@ def _start_phase_cycles(
     """Compute the phase of a beamlet's beat at the segment's start [cycles], in exact fractions.
 
     The phase is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is
-    ``carrier``, s ``chirp_slope``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR
+    ``carrier``, s ``chirp_rate_ratio``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR
     ``range_offset`` and decrease ``range_decrease_since_shot_start``.
     """
     delay = (
         Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease_since_shot_start)
     )
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
-    phase = -Fraction(carrier) * delay + Fraction(chirp_slope) * Fraction(chirp_rate) * delay**2 / 2
+    phase = (
+        -Fraction(carrier) * delay
+        + Fraction(chirp_rate_ratio) * Fraction(chirp_rate) * delay**2 / 2
+    )
     return float(phase - round(phase))
 
 

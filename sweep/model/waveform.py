@@ -42,9 +42,9 @@ SEGMENT_ORDERS = (
     "doppler down up", "up down doppler", "down up doppler",
 )  # fmt: skip
 """Possible sets of segments of a shot, each in the order of time."""
-DOPPLER_SEGMENT_SLOPE_PATH = "instrument.chirp.doppler_slope"
+DOPPLER_CHIRP_RATE_RATIO_PATH = "instrument.chirp.doppler_slope"
 """Parameter path of the chirp rate of the Doppler segment, relative to that of the up-chirp."""
-DOWN_SEGMENT_SLOPE_PATH = "instrument.chirp.down_slope"
+DOWN_CHIRP_RATE_RATIO_PATH = "instrument.chirp.down_slope"
 """Parameter path of the chirp rate of the down segment, relative to that of the up-chirp."""
 SHOT_DETECTION_PATH = "instrument.processing.shot_detection"
 """Parameter path of the rule by which a shot is detected, one of `SHOT_DETECTION_OPTIONS`."""
@@ -54,33 +54,36 @@ BOTH_CHIRPS, ANY_TWO = SHOT_DETECTION_OPTIONS = ("both_chirps", "any_two")
 TWO_BEAT_ASSUMPTION_PATH = "instrument.processing.two_beats"
 """Parameter path of the assumption that gives range and velocity from two beats of unknown sign. It
 is one of `TWO_BEAT_ASSUMPTIONS`."""
-PEAKS_PATH = "instrument.processing.peaks"
-"""Parameter path of the choice of peaks that a segment reports, one of `REPORTED_PEAKS`."""
-ALL_PEAKS, STRONGEST_PEAK = REPORTED_PEAKS = ("all", "strongest")
+REPORTED_PEAKS_PATH = "instrument.processing.peaks"
+"""Parameter path of the choice of peaks that a segment reports, one of `REPORTED_PEAKS_OPTIONS`."""
+ALL_PEAKS, STRONGEST_PEAK = REPORTED_PEAKS_OPTIONS = ("all", "strongest")
 """Names of the peaks that a segment reports: all above the threshold, or the strongest alone."""
 FAR_TARGET, FAST_TARGET = TWO_BEAT_ASSUMPTIONS = ("far", "fast")
 """Names of assumptions on two beats of unknown sign. Either the range beat exceeds the Doppler
 shift (``far``), or the Doppler shift exceeds the range beat (``fast``)."""
-DEFAULT_CHIRP_SLOPES = (1, 0, -1)
+DEFAULT_CHIRP_RATE_RATIOS = (1, 0, -1)
 """Default chirp rates of up, Doppler and down segment, each relative to that of the up-chirp."""
 WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     SEGMENT_ORDER_PATH: SEGMENT_ORDERS[0],
     SEGMENT_GAP_PATH: 0.0,
-    DOPPLER_SEGMENT_SLOPE_PATH: 0.0,
-    DOWN_SEGMENT_SLOPE_PATH: -1.0,
+    DOPPLER_CHIRP_RATE_RATIO_PATH: 0.0,
+    DOWN_CHIRP_RATE_RATIO_PATH: -1.0,
     SHOT_DETECTION_PATH: BOTH_CHIRPS,
     TWO_BEAT_ASSUMPTION_PATH: FAR_TARGET,
-    PEAKS_PATH: ALL_PEAKS,
+    REPORTED_PEAKS_PATH: ALL_PEAKS,
 }
 """Default values of the waveform's parameters, by dotted path."""
 
 SEARCH_PREFIX = "instrument.processing.search."
 """Common beginning of the dotted paths of the search band's parameters."""
-SEARCH_RANGE_PATHS = SEARCH_PREFIX + "min_range", SEARCH_PREFIX + "max_range"
+SEARCH_RANGE_LIMIT_PATHS = SEARCH_PREFIX + "min_range", SEARCH_PREFIX + "max_range"
 """Parameter paths of the smallest and the largest range at which echoes are searched [m]."""
-SEARCH_VELOCITY_PATHS = SEARCH_PREFIX + "min_radial_velocity", SEARCH_PREFIX + "max_radial_velocity"
+SEARCH_VELOCITY_LIMIT_PATHS = (
+    SEARCH_PREFIX + "min_radial_velocity",
+    SEARCH_PREFIX + "max_radial_velocity",
+)
 """Parameter paths of the smallest and the largest radial velocity of searched echoes [m/s]."""
-SEARCH_BAND_PATHS = SEARCH_RANGE_PATHS + SEARCH_VELOCITY_PATHS
+SEARCH_BAND_PATHS = SEARCH_RANGE_LIMIT_PATHS + SEARCH_VELOCITY_LIMIT_PATHS
 """Parameter paths of the search band's four limits in range and velocity. Either all four are given
 or none."""
 
@@ -93,7 +96,7 @@ class WaveformSegment(NamedTuple):
 
     name: str
     """Name of the segment, one of :data:`SEGMENT_NAMES`."""
-    chirp_slope: float
+    chirp_rate_ratio: float
     """Chirp rate of the segment relative to that of the up-chirp. By default it is 1, 0 and -1 for
     up, Doppler and down segment."""
     chirp_rate: np.ndarray
@@ -101,7 +104,7 @@ class WaveformSegment(NamedTuple):
     carrier: np.ndarray
     """Optical frequency at the segment's start [Hz]. Times a delay, it gives the echo's phase
     [cycles]."""
-    includes_leakage: bool
+    evaluates_leakage: bool
     """True if leakage, false alarms due to the echo's signal far from its line, is evaluated
     here."""
     range_decrease_since_shot_start: np.ndarray | float
@@ -146,7 +149,7 @@ class RangeVelocity(NamedTuple):
 
 def carrier_frequencies(
     architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray,
-    bandwidth: np.ndarray, chirp_slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
+    bandwidth: np.ndarray, chirp_rate_ratios: Sequence[ArrayLike] = DEFAULT_CHIRP_RATE_RATIOS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return the frequency at the start of each segment [Hz]; times a delay it is a phase.
 
@@ -160,7 +163,7 @@ def carrier_frequencies(
         Radio frequency at the start of the up-chirp [Hz], used with direct detection.
     bandwidth : ndarray
         Bandwidth of the up-chirp [Hz].
-    chirp_slopes : sequence
+    chirp_rate_ratios : sequence
         Ratios of the segments' chirp rates to that of the up-chirp.
 
     Returns
@@ -181,19 +184,19 @@ def carrier_frequencies(
         lowest_frequency + bandwidth * np.maximum(np.negative(s), 0.0)
         if np.any(np.less(s, 0))
         else lowest_frequency
-        for s in chirp_slopes
+        for s in chirp_rate_ratios
     )
     return up, doppler, down
 
 
-def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
+def chirp_rate_ratios(parameters: Mapping[str, Any]) -> tuple[float, ...]:
     """Return the chirp rates of up, Doppler and down segment, relative to that of the up-chirp.
 
     All points share them.
     """
     doppler, down = (
         float(np.ravel(parameters.get(path, WAVEFORM_DEFAULTS[path]))[0])
-        for path in (DOPPLER_SEGMENT_SLOPE_PATH, DOWN_SEGMENT_SLOPE_PATH)
+        for path in (DOPPLER_CHIRP_RATE_RATIO_PATH, DOWN_CHIRP_RATE_RATIO_PATH)
     )
     return 1.0, doppler, down
 
@@ -239,7 +242,7 @@ def segment_starts(
 
 
 def beat_frequency(
-    chirp_slope: float | np.ndarray,
+    chirp_rate_ratio: float | np.ndarray,
     *,
     carrier: np.ndarray,
     chirp_rate: np.ndarray,
@@ -250,7 +253,7 @@ def beat_frequency(
 
     Parameters
     ----------
-    chirp_slope : float or ndarray
+    chirp_rate_ratio : float or ndarray
         Ratio s of the segment's chirp rate to that of the up-chirp.
     carrier : ndarray
         Frequency f_seg at the segment's start [Hz].
@@ -264,9 +267,9 @@ def beat_frequency(
     f_seg beta - s S (2 R / c) (1 + beta), beta = 2 v_r / c.
     """
     doppler_ratio = 2 * radial_velocity / SPEED_OF_LIGHT
-    return carrier * doppler_ratio - chirp_slope * chirp_rate * (2 * range / SPEED_OF_LIGHT) * (
-        1 + doppler_ratio
-    )
+    return carrier * doppler_ratio - chirp_rate_ratio * chirp_rate * (
+        2 * range / SPEED_OF_LIGHT
+    ) * (1 + doppler_ratio)
 
 
 TIME_TOLERANCE_SAMPLES = 1e-6
@@ -274,7 +277,7 @@ TIME_TOLERANCE_SAMPLES = 1e-6
 this counts as inside."""
 
 
-def record_length(parameters: Mapping[str, Any]) -> np.ndarray:
+def n_record_samples(parameters: Mapping[str, Any]) -> np.ndarray:
     """Return the number of samples in the record, (n,) int64, for parameters by dotted path.
 
     The number is the FFT size, or the number of samples between the acquisition delay and the
@@ -333,24 +336,24 @@ FOLD_PENALTY_BINS = 4.0
 interpretation is chosen only if its mismatch of the third peak is smaller by more than the
 penalty."""
 
-N_READINGS = 16
+N_POSSIBLE_BEAT_READINGS = 16
 """Number of interpretations (readings) of peaks of unknown sign. They differ in which peaks are
 folded at Nyquist, and in whether half the sum or half the difference is the Doppler frequency.
-:func:`beats_of_reading` defines their numbers."""
+:func:`doppler_and_range_beat` defines their numbers."""
 
-FAR_READING = 1
-"""Number, for :func:`beats_of_reading`, of the interpretation for far targets. The range beat
+FAR_TARGET_READING = 1
+"""Number, for :func:`doppler_and_range_beat`, of the interpretation for far targets. The range beat
 exceeds the Doppler frequency, and no peak is folded at Nyquist. Half the difference of the up and
 down peak is the Doppler frequency."""
 
-FAST_READING = 0
-"""Number, for :func:`beats_of_reading`, of the interpretation for fast targets. The Doppler
+FAST_TARGET_READING = 0
+"""Number, for :func:`doppler_and_range_beat`, of the interpretation for fast targets. The Doppler
 frequency exceeds the range beat, and no peak is folded at Nyquist. Half the sum of the up and down
 peak is the Doppler frequency."""
 
 
-SIGNED_READING = 16
-"""Number, for :func:`beats_of_reading`, of the interpretation of signed peaks, which complex
+SIGNED_BEATS_READING = 16
+"""Number, for :func:`doppler_and_range_beat`, of the interpretation of signed peaks, which complex
 records have. With the up peak u and the down peak d, the range beat is (d - u) / 2. The Doppler
 frequency is u plus the range beat. Twice the range beat, and the Doppler frequency, are modulo the
 sample rate. Range beats are positive, up to half the sample rate; Doppler shifts have either sign,
@@ -362,14 +365,14 @@ negative. Rounding of peaks to bins may make this difference, twice the range be
 negative. Larger negative differences are taken modulo the sample rate."""
 
 
-def beats_of_reading(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
+def doppler_and_range_beat(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
     """Convert the peaks of both chirps to Doppler frequency and range beat, by one interpretation.
 
     Parameters
     ----------
     reading : int
         Number of the reading. Bits 8, 4 and 2 mean that the up, Doppler and down peak is folded.
-        Bit 1 exchanges half sum and half difference. :data:`SIGNED_READING` is the number for
+        Bit 1 exchanges half sum and half difference. :data:`SIGNED_BEATS_READING` is the number for
         signed peaks.
     up, down : float or ndarray
         Peaks of up- and down-chirp, in any unit of frequency.
@@ -381,7 +384,7 @@ def beats_of_reading(reading, up, down, sample_rate):  # type: ignore[no-untyped
     f_d, f_r : float or ndarray
         Signed Doppler frequency, and range beat, in the same unit.
     """
-    if reading == SIGNED_READING:
+    if reading == SIGNED_BEATS_READING:
         rate_fraction = (down - up) / sample_rate
         f_r = (
             (rate_fraction - np.floor(rate_fraction + NEGATIVE_BEAT_FRACTION_MAX))
@@ -407,7 +410,7 @@ def range_velocity_of_beats(  # type: ignore[no-untyped-def]  # of arrays, or co
     Parameters
     ----------
     f_d, f_r : float or ndarray
-        Signed Doppler frequency and range beat [Hz], as in :func:`beats_of_reading`.
+        Signed Doppler frequency and range beat [Hz], as in :func:`doppler_and_range_beat`.
     carrier, bandwidth, duration : float or ndarray
         Carrier of the up-chirp [Hz], bandwidth [Hz] and duration [s] of a chirp.
 
@@ -446,10 +449,10 @@ def resolve_range_velocity(
     sample_rate, bin_width : ndarray
         Sample rate and width of a bin [Hz].
     has_signs : bool
-        True for peaks of complex records, which are read by :data:`SIGNED_READING`.
+        True for peaks of complex records, which are read by :data:`SIGNED_BEATS_READING`.
     two_beat_assumption : str
-        Reading without a Doppler segment: ``far`` is :data:`FAR_READING`, ``fast`` is
-        :data:`FAST_READING`.
+        Reading without a Doppler segment: ``far`` is :data:`FAR_TARGET_READING`, ``fast`` is
+        :data:`FAST_TARGET_READING`.
 
     Returns
     -------
@@ -468,20 +471,20 @@ def resolve_range_velocity(
     """
     if has_signs or doppler is None:
         reading = (
-            SIGNED_READING
+            SIGNED_BEATS_READING
             if has_signs
-            else FAST_READING
+            else FAST_TARGET_READING
             if two_beat_assumption == FAST_TARGET
-            else FAR_READING
+            else FAR_TARGET_READING
         )
-        f_d, f_r = beats_of_reading(reading, up, down, sample_rate)
+        f_d, f_r = doppler_and_range_beat(reading, up, down, sample_rate)
         return RangeVelocity(*range_velocity_of_beats(f_d, f_r, carrier, bandwidth, duration))
     start_carrier_ratio = carrier / (
         carrier + bandwidth / 2
     )  # the Doppler segment's carrier is lower
     least_cost, f_d, f_r = np.array(np.inf), np.zeros(()), np.zeros(())
-    for reading in range(N_READINGS):
-        doppler_beat, range_beat = beats_of_reading(reading, up, down, sample_rate)
+    for reading in range(N_POSSIBLE_BEAT_READINGS):
+        doppler_beat, range_beat = doppler_and_range_beat(reading, up, down, sample_rate)
         unfolded_peak = sample_rate - doppler if reading & 4 else doppler
         n_folds = (reading >> 3 & 1) + (reading >> 2 & 1) + (reading >> 1 & 1)
         cost = abs(abs(doppler_beat) * start_carrier_ratio - unfolded_peak) + n_folds * (

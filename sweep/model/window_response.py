@@ -42,9 +42,9 @@ class WindowResponse(NamedTuple):
 
     main_lobe: np.ndarray
     """(m,): magnitude at distances from a line of 0..1/2 FFT bin, in equal steps."""
-    slope_max: float
+    power_slope_max: float
     """Upper bound on the magnitude of the relative power's derivative by distance [1/bin]."""
-    curvature_max: float
+    power_curvature_max: float
     """Upper bound on the magnitude of the relative power's second derivative by distance [1/bin^2].
     """
     padding_factor: float
@@ -82,7 +82,7 @@ class WindowResponse(NamedTuple):
         table_position = 1 - knee / (np.fmax(distance, 0.0) + knee)
         return self.sidelobe_envelope[(table_position * _ENVELOPE_CELLS).astype(np.int64)]
 
-    def distance_below(self, magnitude: np.ndarray) -> np.ndarray:
+    def reach_of_magnitude(self, magnitude: np.ndarray) -> np.ndarray:
         """Return the distance [bins] from a line beyond which all bins are below ``magnitude``.
 
         Magnitudes are relative to the peak. The result is inf if no distance is known.
@@ -109,7 +109,7 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
     position_variance = float((weight * position**2).sum() - (weight * position).sum() ** 2)
     magnitude_sum_ratio = float(np.abs(w).sum() / w.sum())
     record_fraction = length / fft_size
-    curvature_max = (
+    power_curvature_max = (
         2 * position_variance * (2 * math.pi * record_fraction * magnitude_sum_ratio) ** 2
     )
     coefficients = _main_lobe_series(w, position)
@@ -132,14 +132,14 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
     first_below = np.searchsorted(-envelope, -magnitude)
     return WindowResponse(
         main_lobe=main_lobe_samples,
-        slope_max=magnitude_sum_ratio * math.sqrt(curvature_max),
-        curvature_max=curvature_max,
+        power_slope_max=magnitude_sum_ratio * math.sqrt(power_curvature_max),
+        power_curvature_max=power_curvature_max,
         padding_factor=1 / record_fraction,
         central_energy_min=_central_energy_min(
             fft_window,
             coefficients,
             record_fraction,
-            magnitude_sum_ratio * math.sqrt(curvature_max),
+            magnitude_sum_ratio * math.sqrt(power_curvature_max),
         ),
         sidelobe_envelope=envelope[np.searchsorted(envelope_distance, table_distance, "right") - 1],
         distance_by_octave=np.append(envelope_distance, np.inf)[first_below] / record_fraction,
@@ -187,7 +187,7 @@ def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndar
 
 
 def _central_energy_min(
-    fft_window: Window, coefficients: np.ndarray, record_fraction: float, slope_max: float
+    fft_window: Window, coefficients: np.ndarray, record_fraction: float, power_slope_max: float
 ) -> float:
     """Return the smallest sum of relative powers over bins within one bin of fs/L of a line.
 
@@ -204,11 +204,11 @@ def _central_energy_min(
     if reach_bins <= 2:
         # A bin leaves the sum where it crosses the margin; the others change at most by their
         # slope.
-        return float(max(power.sum(axis=0).min() - 2 * reach_bins * slope_max / 128, 0.5))
+        return float(max(power.sum(axis=0).min() - 2 * reach_bins * power_slope_max / 128, 0.5))
     return float(0.98 * power.sum(axis=0).min())
 
 
-class MissingSamples(NamedTuple):
+class MissingSampleBounds(NamedTuple):
     """Effect of the samples that are taken before the echo arrives, by segment."""
 
     lost_fraction: np.ndarray
@@ -224,7 +224,7 @@ class MissingSamples(NamedTuple):
     """True where all samples are taken before the echo arrives."""
 
 
-def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSamples:
+def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampleBounds:
     """Compute bounds on the effect of samples at the record's start that lack the echo.
 
     Parameters
@@ -247,7 +247,7 @@ def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampl
     with np.errstate(divide="ignore"):
         centroid_bound = np.minimum(lost_fraction / np.maximum(1 - lost_fraction, 1e-300), 1.0)
     step_sidelobe_factor = np.where(n_missing > 0, step_sidelobe_factor, 0.0)
-    return MissingSamples(
+    return MissingSampleBounds(
         lost_fraction, step_sidelobe_factor, n_missing, centroid_bound, n_missing >= window.length
     )
 

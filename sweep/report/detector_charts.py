@@ -45,7 +45,7 @@ from sweep.model.effects.catalogue import EFFECTS, unpack_effect_flags
 from sweep.model.evaluation import prepare_shots
 from sweep.model.threshold import THRESHOLD_PATHS, tnr_from_parameters
 from sweep.report.html_page import HtmlTable
-from sweep.units import percent
+from sweep.units import percent_text
 
 CHART_PARTS_MAX = 6
 """Largest number of parts of a study among which the reader of a chart can choose."""
@@ -150,7 +150,7 @@ def grid_profiles(results: GridResults) -> GridProfiles:
         numeric_parameters, key=lambda m: np.unique(m.display_values).size, default=None
     )
     main_parameter = find_axis_parameter(results.spec, RANGE_PATH) or longest_parameter
-    name = main_parameter.coordinate if main_parameter else ""
+    name = main_parameter.coordinate_name if main_parameter else ""
     parts, n_omitted = charts.split_into_parts(
         results.points, [name] if name else [], CHART_PARTS_MAX
     )
@@ -209,13 +209,13 @@ def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
     lines_by_alarm: dict[str, list[ChartLine]] = {
         alarm: [] for alarm in _PFA_FUNCTION_BY_ALARM_KIND
     }
-    for style_index, index in enumerate(_roc_indices(profile)):
+    for style_index, index in enumerate(_roc_point_indices(profile)):
         point = results.dataset.isel(profile.axis_indices(index)).compute()
         curve = point.sweep.roc(ROC_PFA_BIN_VALUES, draws=N_ROC_DRAWS)
         parameters = parameters_at(results.spec, profile.axis_indices(index))
         study_pfa, study_pd = 10.0 ** point["log10_pfa_bin"].values, point["pd_shot"].values
         n_bins, study_n_bins = (
-            noise_false_alarms.alarm_equivalent_bins(parameters, p)
+            noise_false_alarms.n_alarm_equivalent_bins(parameters, p)
             for p in (ROC_PFA_BIN_VALUES, study_pfa)
         )
         tnr_texts = [f"TNR {t:.3g}" for t in curve["curve_tnr"].values]
@@ -251,12 +251,12 @@ def _point_label(profile: GridProfile, index: int) -> str:
     )
 
 
-def _roc_indices(profile: GridProfile) -> np.ndarray:
+def _roc_point_indices(profile: GridProfile) -> np.ndarray:
     """Return the indices of those points of a profile for which ROC curves are drawn.
 
     Their pd is closest to a value of `ROC_POINT_SELECTION_PDS`.
     """
-    indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_CELLS)
+    indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_CELLS_MAX)
     pd = profile.variable_values("pd_shot", indices)
     if not np.isfinite(pd).any():
         return np.zeros(0, int)
@@ -347,7 +347,7 @@ def noise_budget_panel(
 def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
     """Return the chart with panels of the shares of noise sources."""
     share_texts = ", ".join(
-        f"{line.name} {percent(line.y[0] / 100)} at first" for line in panels[0].lines
+        f"{line.name} {percent_text(line.y[0] / 100)} at first" for line in panels[0].lines
     )
     alt = f"Shares of noise sources in the noise variance at the ADC. {share_texts}."
     return Chart("Noise by source", alt, caption, panels, {"part": "Shown for"})
@@ -447,7 +447,7 @@ MAXIMUM_RANGE_CAPTION = [
 """Caption of the chart or table of the maximum range."""
 
 
-def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
+def maximum_range_chart_or_table(results: GridResults) -> Chart | HtmlTable | None:
     """Return the maximum range of a grid as a chart over another coordinate.
 
     If nothing but range varies, the result is a table; if range does not vary, it is None.
@@ -456,21 +456,21 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
     if range_parameter is None:
         return None
     points = results.points
-    range_axis = CoordinateAxis.from_points(points, range_parameter.coordinate)
+    range_axis = CoordinateAxis.from_points(points, range_parameter.coordinate_name)
     other_names = points.distinguishing_coordinates_along(
-        points.dim_of_coordinate(range_parameter.coordinate), [range_parameter.coordinate]
+        points.dim_of_coordinate(range_parameter.coordinate_name), [range_parameter.coordinate_name]
     )
     varied_parts = [
         part
-        for part in split_by_coordinates(points, other_names, points.size).parts
-        if len(part.points.unique_values(range_parameter.coordinate)) > 1
+        for part in split_by_coordinates(points, other_names, points.n_points).parts
+        if len(part.points.unique_values(range_parameter.coordinate_name)) > 1
     ]
     shown_parts, n_omitted = thin_parts_evenly(varied_parts, CHART_PARTS_MAX)
     max_ranges = [
         NamedPart(
             words,
             _compute_maximum_range(
-                shown_points, range_parameter.coordinate, range_axis.unit_factor
+                shown_points, range_parameter.coordinate_name, range_axis.unit_factor
             ),
         )
         for words, shown_points in shown_parts
@@ -494,7 +494,7 @@ def is_chart_without_values(item: Chart | HtmlTable | None) -> bool:
 
 
 def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
-    """Return sentences on the maximum range, from the result of :func:`maximum_range_item`."""
+    """Return sentences on the result of :func:`maximum_range_chart_or_table`."""
     unbroken_label = next(iter(LIMIT_VARIABLE_BY_LABEL))
     if isinstance(item, Chart):
         range_label, unbroken_panels = (
@@ -562,8 +562,8 @@ def _choose_x_coordinate(results: GridResults, points: PointSelection) -> str:
     """
     varying_names = points.varying_coordinates()
     angle_parameter = find_axis_parameter(results.spec, GRAZING_ANGLE_PATH)
-    if angle_parameter is not None and angle_parameter.coordinate in varying_names:
-        return angle_parameter.coordinate
+    if angle_parameter is not None and angle_parameter.coordinate_name in varying_names:
+        return angle_parameter.coordinate_name
     numeric_names = [
         name for name in varying_names if not labels.is_categorical(points.coordinate_values(name))
     ]

@@ -47,7 +47,7 @@ from sweep.analysis.study_figures import SceneResults
 from sweep.model.effects.catalogue import unpack_effect_flags
 from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
 from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.report.detector_charts import (
     NOISE_BUDGET_POINTS_MAX,
     noise_budget_chart,
@@ -259,7 +259,7 @@ def _cloud_traces(
     if height_map is not None:
         yield from _terrain_traces(cloud_label, cloud, height_map)
     yield go.Scatter3d(
-        **_xyz_columns(cloud.path, slice(None)),
+        **_xyz_columns(cloud.flight_path, slice(None)),
         mode="lines",
         line={"width": 5},
         name="flight path",
@@ -307,7 +307,7 @@ def _terrain_traces(
     """Yield plotly's trace of the shaded terrain around the points; none outside the height map."""
     map_limits = {}
     for axis in ("x", "y"):
-        values = np.concatenate([cloud.points[axis], cloud.path[axis]])
+        values = np.concatenate([cloud.points[axis], cloud.flight_path[axis]])
         margin = 0.1 * (np.ptp(values) + 1.0)
         map_limits[axis] = float(values.min() - margin), float(values.max() + margin)
     cropped = height_map.crop(map_limits["x"], map_limits["y"], TERRAIN_SIDE_NODES_MAX)
@@ -388,7 +388,7 @@ def _framing_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) ->
             for c in clouds
         ]
         values = np.concatenate(
-            [*true_values, *(cloud.path[axis] for cloud in clouds if with_path)]
+            [*true_values, *(cloud.flight_path[axis] for cloud in clouds if with_path)]
         )
         margin = 0.06 * np.ptp(values) + 2.0
         axis_ranges[f"scene.{axis}axis.range"] = [values.min() - margin, values.max() + margin]
@@ -458,7 +458,7 @@ def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) ->
     """Return the chart of errors of range and velocity over time, or None without true points."""
 
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
-        is_true = (column_arrays["flags"].astype(int) & TRUE_FLAG) > 0
+        is_true = (column_arrays["flags"].astype(int) & TRUE_RETURN_FLAG) > 0
         for name in ERROR_CHART_QUANTITIES if is_true.any() else ():
             error_column = {"error": column_arrays[name] - column_arrays[f"true_{name}"]}
             true_columns = {
@@ -582,7 +582,7 @@ def point_count_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlT
     return HtmlTable("Shots and points", caption, pandas.DataFrame(rows), "returns")
 
 
-def returns_sentences(
+def point_count_sentences(
     returns_frame: pandas.DataFrame, groups: Sequence[xr.Dataset], n_omitted: int = 0
 ) -> list[str]:
     """Return sentences on the numbers of points and of velocities that navigation solved.
@@ -695,7 +695,7 @@ def _flight_noise_panel(results: SceneResults, labelled_recording: LabelledRecor
     flags = np.asarray(recording.dataset["effects"].isel(shot=shot_indices[seen_indices]).values)
     parameters, surfaces = (
         parameters_at(results.spec, labelled_recording.axis_position.axis_indices),
-        results.spec.surfaces(),
+        results.spec.surface_materials(),
     )
     budgets = [
         prepare_eyepoint_shots(

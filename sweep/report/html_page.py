@@ -226,7 +226,7 @@ def _to_float32(values: np.ndarray) -> np.ndarray:
 def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]:
     """Yield plotly's traces of a line: its band, if it has one, and then the line."""
     meta = trace_meta(line.style_index, **panel.facet_choices)
-    if panel.y_axis.kind == LOG_SCALE:
+    if panel.y_axis.scale == LOG_SCALE:
         line = _mask_nonpositive(line)
     x, y, low, high = line.x, line.y, line.low, line.high
     trace_options: dict[str, Any] = {
@@ -336,16 +336,16 @@ def wrap_with_html_breaks(text: str, width: int = 44) -> str:
 def _axis_layout(axis: ChartAxis, **options_set: Any) -> dict[str, Any]:
     """Return plotly's layout of an axis: title, scale and limits; options replace the defaults."""
     label = wrap_with_html_breaks(axis.label) if options_set else axis.label
-    axis_options = {"title": {"text": label, "standoff": 12}, "zeroline": False, "type": axis.kind}
+    axis_options = {"title": {"text": label, "standoff": 12}, "zeroline": False, "type": axis.scale}
     if axis.limits is not None:
         axis_options |= (
             {"rangemode": "tozero"} if None in axis.limits else {"range": list(axis.limits)}
         )
-    if axis.kind == "log":
+    if axis.scale == "log":
         axis_options["nticks"] = (
             6  # few ticks, so that only decades are labelled and not 2 and 5 between them
         )
-    if axis.label.startswith("number of") and axis.kind == "linear":  # 8,000, not 8 x 10^3
+    if axis.label.startswith("number of") and axis.scale == "linear":  # 8,000, not 8 x 10^3
         return axis_options | {"exponentformat": "none", "separatethousands": True} | options_set
     return axis_options | {"exponentformat": "power"} | options_set
 

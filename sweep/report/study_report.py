@@ -131,7 +131,7 @@ def _grid_report(store: Location) -> ReportPage:
     dataset, spec = results.dataset, results.spec
     figure_items: list[SectionItem] = list(_iter_figure_charts(results))
     table_items = list(_iter_spec_tables(results))
-    max_range_item = detector_charts.maximum_range_item(results)
+    max_range_item = detector_charts.maximum_range_chart_or_table(results)
     figure_items.append(
         None if detector_charts.is_chart_without_values(max_range_item) else max_range_item
     )
@@ -350,7 +350,7 @@ def _scene_report(store: Location) -> ReportPage:
             scanner_datasets,
             "shots",
             [
-                *flight_charts.returns_sentences(
+                *flight_charts.point_count_sentences(
                     point_count_table.frame, scanner_datasets, n_omitted
                 ),
                 *consistency_sentences(results.tree),

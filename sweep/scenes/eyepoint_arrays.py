@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sweep.model.outputs import BEAMLET_VARIABLES, SHOT_VARIABLES
+from sweep.model.outputs import BEAMLET_GEOMETRY_VARIABLES, SHOT_GEOMETRY_VARIABLES
 from sweep.model.pointcloud.eyepoints import Eyepoints
 
 _EYEPOINT_FIELD_BY_ARRAY = {
@@ -26,7 +26,7 @@ _EYEPOINT_FIELD_BY_ARRAY = {
     "beam_turn_rate": "turn_rate",
     "beam_turning": "direction_rate",
     "platform_acceleration": "platform_acceleration",
-    **dict(zip(BEAMLET_VARIABLES, BEAMLET_VARIABLES, strict=True)),
+    **dict(zip(BEAMLET_GEOMETRY_VARIABLES, BEAMLET_GEOMETRY_VARIABLES, strict=True)),
 }
 """Names of the fields of :class:`Eyepoints`, by the names of the store's arrays."""
 
@@ -42,10 +42,10 @@ def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
     Returns
     -------
     dict of str to ndarray
-        Arrays by name, in the types of the store: shape (n,) or (n, 3) for `SHOT_VARIABLES`, and
-        (n, b) for `BEAMLET_VARIABLES`.
+        Arrays by name, in the types of the store: shape (n,) or (n, 3) for
+        `SHOT_GEOMETRY_VARIABLES`, and (n, b) for `BEAMLET_GEOMETRY_VARIABLES`.
     """
-    outputs = {**SHOT_VARIABLES, **BEAMLET_VARIABLES}
+    outputs = {**SHOT_GEOMETRY_VARIABLES, **BEAMLET_GEOMETRY_VARIABLES}
     arrays = {
         name: np.asarray(getattr(eyepoints, field), outputs[name].dtype)
         for name, field in _EYEPOINT_FIELD_BY_ARRAY.items()
@@ -78,8 +78,8 @@ def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) 
     weight = np.asarray(weight, float)
     for name, field in _EYEPOINT_FIELD_BY_ARRAY.items():
         trailing_shape = (
-            {1: (), 2: (3,)}[len(SHOT_VARIABLES[name].dims)]
-            if name in SHOT_VARIABLES
+            {1: (), 2: (3,)}[len(SHOT_GEOMETRY_VARIABLES[name].dims)]
+            if name in SHOT_GEOMETRY_VARIABLES
             else weight.shape
         )
         expected_shape = (fields["time"].size, *trailing_shape)

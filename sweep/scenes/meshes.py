@@ -92,7 +92,7 @@ class Facets:
     """
 
     @classmethod
-    def on_one_surface(
+    def from_triangles(
         cls,
         vertices: np.ndarray,
         faces: np.ndarray,
@@ -135,7 +135,7 @@ class Facets:
         """
         return replace(self, vertices=rotate(np.asarray(rotation, float), self.vertices * scale))
 
-    def to_mesh(self) -> CleanedMesh:
+    def to_cleaned_mesh(self) -> CleanedMesh:
         """Clean the triangles; return a mesh for ray casting, and the report of the cleaning.
 
         Raises
@@ -338,7 +338,7 @@ def _nonzero_area_mask(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return has_area
 
 
-def read_mesh(
+def read_mesh_facets(
     path: str | Path, *, unit: str | None = None, up: str | None = None, scale: float = 1.0
 ) -> Facets:
     """Read all parts of a mesh file as facets, which are not cleaned yet.
@@ -412,7 +412,7 @@ def _read_polygon_facets(path: Path) -> tuple[list[Facets], str | None]:
         return [], None
     return [
         replace(
-            Facets.on_one_surface(polygons.vertices, triangulation.faces),
+            Facets.from_triangles(polygons.vertices, triangulation.faces),
             reader_notes=triangulation.summary_sentences(),
         )
     ], None
@@ -555,7 +555,7 @@ def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
     faces = np.asarray(mesh.faces, np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored part has inverted normals
-    yield Facets.on_one_surface(vertices, faces)
+    yield Facets.from_triangles(vertices, faces)
 
 
 def _metres_per_unit(path: Path, unit: str | None) -> float:
@@ -581,7 +581,7 @@ def sphere_facets(*, radius: float, subdivisions: int) -> Facets:
     import trimesh
 
     icosphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    return Facets.on_one_surface(np.asarray(icosphere.vertices), np.asarray(icosphere.faces))
+    return Facets.from_triangles(np.asarray(icosphere.vertices), np.asarray(icosphere.faces))
 
 
 def box_facets(*, size: Sequence[float]) -> Facets:
@@ -599,4 +599,4 @@ def box_facets(*, size: Sequence[float]) -> Facets:
         first = (4 >> axis) * side
         a, b, c, d = first, first + far, first + far + near, first + near
         faces += [(a, b, c), (a, c, d)] if side else [(a, c, b), (a, d, c)]
-    return Facets.on_one_surface(corners, np.array(faces))
+    return Facets.from_triangles(corners, np.array(faces))

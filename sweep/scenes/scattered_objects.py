@@ -109,7 +109,7 @@ class MartianRockLaw:
     """Fraction of the ground that rocks of all sizes cover."""
 
     @property
-    def decay_rate(self) -> float:
+    def area_fraction_decay_rate(self) -> float:
         """Rate at which the covered fraction falls with the smallest diameter counted [1/m].
 
         The fraction under rocks of at least diameter D is proportional to ``exp(-q D)``, with this
@@ -131,7 +131,7 @@ class MartianRockLaw:
             Numbers per area [1/m^2].
         """
         d = np.asarray(diameter, float)
-        q = self.decay_rate
+        q = self.area_fraction_decay_rate
         return np.asarray(
             4 * self.area_fraction * q / math.pi * (np.exp(-q * d) / d - q * exp1(q * d))
         )
@@ -142,18 +142,18 @@ class MartianRockLaw:
         This is the inverse of `cumulative_number_density`, by Newton's method on its logarithm.
         """
         n = np.asarray(density, float)
-        scale = 4 * self.area_fraction * self.decay_rate / math.pi
+        scale = 4 * self.area_fraction * self.area_fraction_decay_rate / math.pi
         log_density = np.log(n)
         # N(>D) > scale exp(-q D) / (D (q D + 2)) puts this start below the root. log N is convex in
         # D, so that Newton's method approaches the root from below without overshoot.
-        d = np.minimum(scale / (3 * math.e * n), 1 / self.decay_rate)
+        d = np.minimum(scale / (3 * math.e * n), 1 / self.area_fraction_decay_rate)
         for _ in range(100):
             value = self.cumulative_number_density(d)
             step = (
                 (np.log(value) - log_density)
                 * value
                 * d**2
-                / (scale * np.exp(-self.decay_rate * d))
+                / (scale * np.exp(-self.area_fraction_decay_rate * d))
             )
             d = d + step
             if (np.abs(step) <= 1e-13 * d).all():
@@ -483,7 +483,7 @@ def draw_boulders(
     vertices += centre[:, None, :]
     index_shift = np.arange(len(centre)) * len(dome)
     faces = faces + index_shift[:, None, None]
-    return Facets.on_one_surface(vertices, faces, origin=terrain.origin)
+    return Facets.from_triangles(vertices, faces, origin=terrain.origin)
 
 
 def unit_dome(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
@@ -581,7 +581,7 @@ class MeanTreeDimensions:
         return self.leaf_length * self.leaf_width / 2
 
     @property
-    def number_of_leaves(self) -> int:
+    def n_leaves(self) -> int:
         """Number of leaves of a tree of mean size."""
         crown_area = math.pi * self.crown_diameter**2 / 4
         return round(self.leaf_area_index * crown_area / self.leaf_area)
@@ -698,7 +698,7 @@ def trunk_facets(tree: MeanTreeDimensions, size_factor: float = 1.0) -> Facets:
     faces = np.concatenate(
         [np.column_stack([a, b, b + sides]), np.column_stack([a, b + sides, a + sides])]
     )
-    return Facets.on_one_surface(
+    return Facets.from_triangles(
         size_factor * np.concatenate([lower, upper]), faces, surface=TRUNK_SURFACE
     )
 
@@ -720,7 +720,7 @@ def draw_crown_leaves(
     size_factor : float
         Size of this tree over the mean size.
     """
-    n_leaves = round(tree.number_of_leaves * size_factor**2)
+    n_leaves = round(tree.n_leaves * size_factor**2)
     directions = _draw_unit_vectors(generator, n_leaves)
     unit_ball_points = directions * np.cbrt(generator.random(n_leaves))[:, None]
     semi_axes = (
@@ -735,7 +735,7 @@ def draw_crown_leaves(
     corners = [centres + along, centres + across, centres - along, centres - across]
     leaf_triangles = np.array([[0, 1, 2], [0, 2, 3]])
     faces = 4 * np.arange(n_leaves)[:, None, None] + leaf_triangles
-    return Facets.on_one_surface(np.stack(corners, axis=1), faces, surface=LEAF_SURFACE)
+    return Facets.from_triangles(np.stack(corners, axis=1), faces, surface=LEAF_SURFACE)
 
 
 def _draw_unit_vectors(generator: np.random.Generator, number: int) -> np.ndarray:

@@ -15,12 +15,12 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from sweep.messages import EscapedTextError, number_with_noun
+from sweep.messages import EscapedMessageError, number_with_noun
 from sweep.model.geometry.quaternion import from_heading
 from sweep.units import QuantityError, read_unit
 
 
-class SceneError(EscapedTextError):
+class SceneError(EscapedMessageError):
     """Error about a file or object that can not be used in a scene, with problem and remedy."""
 
     def __init__(self, file: str | Path, problem: str, remedy: str) -> None:

@@ -63,7 +63,7 @@ class AxisParameter:
 
     path: str
     """Dotted path of the parameter, such as ``target.range``."""
-    coordinate: str
+    coordinate_name: str
     """Name of the parameter's coordinate in the store."""
     values: np.ndarray | tuple[str, ...]
     """Values (n,) in SI units, float64 or int64; a tuple of n words if the parameter takes
@@ -91,7 +91,7 @@ class Axis:
     @property
     def is_zipped(self) -> bool:
         """True if the axis is zipped: it has several parameters, or a name of its own."""
-        return len(self.parameters) > 1 or self.parameters[0].coordinate != self.name
+        return len(self.parameters) > 1 or self.parameters[0].coordinate_name != self.name
 
 
 def axis_identity(axis: Axis) -> dict[str, Any]:
@@ -247,10 +247,10 @@ def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
         problem = "is a section, and an axis is named by the whole path of a field"
         raise single_finding_error(location, problem, f"write '{path}: {values_hint}'")
     parameter = _make_axis_parameter(
-        key, read_axis_pieces(raw_axis, _axis_parameter_rule(key, location), location), location
+        key, read_axis_entries(raw_axis, _axis_parameter_rule(key, location), location), location
     )
     _check_values_distinct(parameter, location)
-    return Axis(parameter.coordinate, (parameter,))
+    return Axis(parameter.coordinate_name, (parameter,))
 
 
 def _first_field_path_and_hint(path: str, raw_section: object) -> tuple[str, str]:
@@ -403,7 +403,7 @@ def _read_zipped_piece(raw_piece: object, location: SpecLocation) -> dict[str, l
         with findings.collect_errors():
             rule = _axis_parameter_rule(str(path), value_location)
             if isinstance(raw_value, dict | list):
-                entries_by_path[path] = read_axis_pieces(raw_value, rule, value_location)
+                entries_by_path[path] = read_axis_entries(raw_value, rule, value_location)
             else:
                 entries_by_path[path] = [read_single_value(raw_value, rule, value_location)]
     lengths = {
@@ -439,11 +439,13 @@ def _assign_coordinate_names(axes: list[Axis]) -> list[Axis]:
     named_axes = []
     for axis in axes:
         parameters = tuple(
-            replace(parameter, coordinate=_coordinate_name(parameter.path, paths))
+            replace(parameter, coordinate_name=_coordinate_name(parameter.path, paths))
             for parameter in axis.parameters
         )
-        is_plain = len(axis.parameters) == 1 and axis.name == axis.parameters[0].coordinate
-        named_axes.append(Axis(parameters[0].coordinate if is_plain else axis.name, parameters))
+        is_plain = len(axis.parameters) == 1 and axis.name == axis.parameters[0].coordinate_name
+        named_axes.append(
+            Axis(parameters[0].coordinate_name if is_plain else axis.name, parameters)
+        )
     return named_axes
 
 
@@ -482,13 +484,13 @@ def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
     findings = []
     for axis in axes:
         other_coordinates = {
-            parameter.coordinate
+            parameter.coordinate_name
             for other in axes
             if other is not axis
             for parameter in other.parameters
         }
         own_coordinates = (
-            {parameter.coordinate for parameter in axis.parameters}
+            {parameter.coordinate_name for parameter in axis.parameters}
             if len(axis.parameters) > 1
             else set()
         )
@@ -648,7 +650,7 @@ class AxisEntry:
         )
 
 
-def read_axis_pieces(raw_value: object, rule: Rule, location: SpecLocation) -> list[AxisEntry]:
+def read_axis_entries(raw_value: object, rule: Rule, location: SpecLocation) -> list[AxisEntry]:
     """Read the values of one parameter along an axis.
 
     Parameters
@@ -883,7 +885,7 @@ def _check_within_field_bounds(
     values: AxisEntry, rule: NumericRule, location: SpecLocation
 ) -> None:
     """Raise `FindingsError` if a value of a generator is outside the bounds of the field."""
-    violation = rule.first_out_of_bounds(values.si_values)
+    violation = rule.first_bound_violation(values.si_values)
     if violation is not None:
         value = values.values_in_unit(values.unit)[violation.value_index]
         value_text = f"{value:.12g} {values.unit.symbol}".rstrip()

@@ -636,7 +636,7 @@ def identity_digest(identity: Mapping[str, Any]) -> str:
 class SpecFiles:
     """Files that a spec names, with the digests that they had when it was loaded."""
 
-    base: Path
+    base_folder: Path
     """Folder that paths in the spec are relative to."""
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Digest of each file's content, by the file's path as written in the spec."""
@@ -661,7 +661,7 @@ class SpecFiles:
         SceneError
             If the file has changed since the spec was loaded.
         """
-        path = self.base / os.path.expanduser(raw_path)
+        path = self.base_folder / os.path.expanduser(raw_path)
         expected_digest = self.digests.get(raw_path)
         if expected_digest is not None and digest_of(path) != expected_digest:
             raise SceneError(

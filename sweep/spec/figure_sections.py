@@ -234,7 +234,9 @@ GridFigure = Annotated[
 # Figures of scenes
 
 _PLOTTABLE_OUTPUTS = (
-    outputs.SHOT_VARIABLES | outputs.SHOT_STATISTIC_VARIABLES | outputs.POINT_VARIABLES
+    outputs.SHOT_GEOMETRY_VARIABLES
+    | outputs.SHOT_STATISTIC_VARIABLES
+    | outputs.POINT_CLOUD_VARIABLES
 )
 FIGURE_QUANTITIES = (
     *(name for name, output in _PLOTTABLE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
@@ -504,7 +506,9 @@ def _figure_coordinate_findings(
         else {}
     )
     selection = getattr(figure, "where", {})
-    paths = {parameter.coordinate: parameter.path for axis in axes for parameter in axis.parameters}
+    paths = {
+        parameter.coordinate_name: parameter.path for axis in axes for parameter in axis.parameters
+    }
     known_names = list(dict.fromkeys([*paths, *(axis.name for axis in axes if is_grid_figure)]))
     for field, name in (coordinate_names | {f"where.{name}": name for name in selection}).items():
         location: SpecLocation = (*figure_location, *field.split("."))
@@ -562,7 +566,7 @@ def _figure_variable_findings(
 def _spectra_variable_findings(figure: Any, location: SpecLocation) -> Iterator[Finding]:
     """Yield a finding if a figure shows a result that a study of whole spectra does not store."""
     stored_variables = (
-        outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
+        outputs.SPECTRA_STUDY_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
     )
     variable = getattr(figure, "variable", None)
     if variable is None:

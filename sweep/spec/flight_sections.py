@@ -35,7 +35,9 @@ class StraightPath(SpecSection):
         "Speed at the end; by default the initial speed", default=None
     )
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
+    def build_trajectory(
+        self, files: SpecFiles, span: TimeSpan | None = None
+    ) -> motion_laws.Trajectory:
         """Return the trajectory along the straight line; `files` and `span` are not used."""
         return motion_laws.straight_trajectory(
             start_point=self.begin,
@@ -56,7 +58,9 @@ class AccelerationPath(SpecSection):
     )
     duration: float = declare.duration_field("Duration of the path", at_least="1 ns")
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
+    def build_trajectory(
+        self, files: SpecFiles, span: TimeSpan | None = None
+    ) -> motion_laws.Trajectory:
         """Return the trajectory of constant acceleration; `files` and `span` are not used."""
         path_class = motion_laws.ConstantAcceleration
         return path_class(self.position, self.velocity, self.acceleration, self.duration)
@@ -71,7 +75,9 @@ class WaypointPath(SpecSection):
         "Join the waypoints by a cubic spline, not by straight lines", default=True
     )
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
+    def build_trajectory(
+        self, files: SpecFiles, span: TimeSpan | None = None
+    ) -> motion_laws.Trajectory:
         """Return the trajectory through the waypoints of the table; `span` is not used."""
         from sweep.scenes.scene_files import read_waypoints
 
@@ -88,7 +94,9 @@ class StationaryPath(SpecSection):
         "Duration; by default a target stays throughout the flight", at_least="1 ns", default=None
     )
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
+    def build_trajectory(
+        self, files: SpecFiles, span: TimeSpan | None = None
+    ) -> motion_laws.Trajectory:
         """Return the trajectory of a body at rest, over its `duration` or else over `span`.
 
         Raises
@@ -187,7 +195,9 @@ class SpinningAttitude(Orientation):
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the attitude law of a constant angular velocity, from the start of `path`."""
-        return motion_laws.SpinningAttitude(self.angular_velocity, self.to_quaternion(), path.start)
+        return motion_laws.SpinningAttitude(
+            self.angular_velocity, self.to_quaternion(), path.start_time
+        )
 
 
 class TabulatedAttitude(SpecSection):
@@ -248,7 +258,7 @@ class RigidMotion(SpecSection):
         MovingBody
             Trajectory and attitude law of the body.
         """
-        path = self.path.build_path(files, span)
+        path = self.path.build_trajectory(files, span)
         return motion_laws.MovingBody(path, self.build_attitude(files, path))
 
     def build_attitude(
@@ -311,7 +321,7 @@ class Platform(RigidMotion):
             instrument's frame.
         """
         mounting = self.mounting.to_quaternion()
-        path = self.path.build_path(files, span)
+        path = self.path.build_trajectory(files, span)
         mounted_attitude = motion_laws.MountedAttitude(self.build_attitude(files, path), mounting)
         # MovingBody takes the lever arm in the frame of its attitude law: here the instrument's
         # frame.
@@ -511,5 +521,5 @@ AnyScanner = Annotated[
 def shots_per_cycle(pattern: ScanPattern) -> int:
     """Return the number of shots in one measurement cycle of a scan pattern."""
     if isinstance(pattern, scan_patterns.BeamCycle):
-        return pattern.beams_per_cycle
+        return pattern.shots_per_cycle
     return pattern.n_beams

@@ -20,7 +20,7 @@ import numpy as np
 from sweep.model import beam, waveform
 from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from sweep.model.detection import looks
-from sweep.model.detection.detectors import FIXED_THRESHOLD
+from sweep.model.detection.detectors import FIXED_THRESHOLD_KIND
 from sweep.model.detection.estimators import (
     DETECTOR_PREFIX,
     ESTIMATOR_PREFIX,
@@ -39,8 +39,12 @@ from sweep.model.effects.requirements import (
     is_zero,
 )
 from sweep.model.effects.sweep_error_table import fit_sweep_frequency_error
-from sweep.model.shot_settings import RECORD_PATH
-from sweep.model.waveform import SEARCH_BAND_PATHS, SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
+from sweep.model.shot_settings import RECORD_TYPE_PATH
+from sweep.model.waveform import (
+    SEARCH_BAND_PATHS,
+    SEARCH_RANGE_LIMIT_PATHS,
+    SEARCH_VELOCITY_LIMIT_PATHS,
+)
 from sweep.spec.axes import Axis, parameter_location
 from sweep.spec.fields import AUTO, OFF, ON, rules_by_path
 from sweep.spec.rules import MISSING, Finding
@@ -424,7 +428,7 @@ def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
 # Beams
 
 _SINGLE_MODE_CONDITIONS = {
-    beam.COUPLING_PATH: condition_equal_to(beam.SINGLE_MODE),
+    beam.COUPLING_PATH: condition_equal_to(beam.SINGLE_MODE_COUPLING),
     beam.ARCHITECTURE_PATH: condition_different_from("direct"),
 }
 """Conditions on parameters under which a coherent receiver couples to a single spatial mode."""
@@ -479,7 +483,7 @@ def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
             yield grid.make_finding(
                 path, problem, f"take a smaller one, or a larger aperture, {remedy}"
             )
-        powers = {beam.QUALITY_PATH: 1.0, beam.WAVELENGTH_PATH: 1.0, path: -1.0}
+        powers = {beam.BEAM_QUALITY_PATH: 1.0, beam.WAVELENGTH_PATH: 1.0, path: -1.0}
         narrowest_waist = _argmax_of_product(grid, powers, {path: is_positive})
         if narrowest_waist and narrowest_waist[path] < (
             waist_min := _convert_between_waist_and_divergence(
@@ -513,7 +517,7 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
         M^2, wavelength lambda and aperture diameter D.
     """
     for conditions in (
-        {beam.COUPLING_PATH: condition_equal_to(beam.APERTURE)},
+        {beam.COUPLING_PATH: condition_equal_to(beam.APERTURE_COUPLING)},
         {beam.ARCHITECTURE_PATH: condition_equal_to("direct")},
     ):
         if narrowest := _narrowest_impossible_beam(GridValues(values, axes), conditions):
@@ -539,7 +543,7 @@ def _narrowest_impossible_beam(
     # This product of powers is proportional to the ratio of the waist to the radius of the
     # aperture.
     rising, falling = (
-        (beam.QUALITY_PATH, beam.WAVELENGTH_PATH),
+        (beam.BEAM_QUALITY_PATH, beam.WAVELENGTH_PATH),
         (beam.DIVERGENCE_PATH, beam.APERTURE_DIAMETER_PATH),
     )
     powers = dict.fromkeys(rising, 1.0) | dict.fromkeys(falling, -1.0)
@@ -559,7 +563,9 @@ def _convert_between_waist_and_divergence(
     """Convert a beam's waist radius [m] to its full divergence [rad], or the reverse."""
     return float(
         beam.divergence_from_waist(
-            waist_or_divergence, parameters[beam.WAVELENGTH_PATH], parameters[beam.QUALITY_PATH]
+            waist_or_divergence,
+            parameters[beam.WAVELENGTH_PATH],
+            parameters[beam.BEAM_QUALITY_PATH],
         )
     )
 
@@ -664,7 +670,7 @@ def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
         {
             looks.LOOKS_COMBINE_PATH: condition_equal_to(looks.COMBINE_POWER),
             **several_looks,
-            DETECTOR_PREFIX + "kind": condition_different_from(FIXED_THRESHOLD),
+            DETECTOR_PREFIX + "kind": condition_different_from(FIXED_THRESHOLD_KIND),
         }
     ):
         problem = "sets its threshold by the noise of one record, and here powers are averaged"
@@ -705,7 +711,7 @@ def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
     if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
         problem = "is missing, and a beat depends on both range and velocity"
         yield Finding(tuple(missing_ends[0].split(".")), problem, "give all four ends, or none")
-    for low, high in (SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS):
+    for low, high in (SEARCH_RANGE_LIMIT_PATHS, SEARCH_VELOCITY_LIMIT_PATHS):
         least_span = _least_weighted_sum(grid, {high: 1.0, low: -1.0})
         if least_span is not None and least_span <= 0:
             yield grid.make_finding(
@@ -762,12 +768,14 @@ def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
     """
     if grid.any_point_meets(
         {
-            RECORD_PATH: condition_equal_to("complex"),
+            RECORD_TYPE_PATH: condition_equal_to("complex"),
             beam.ARCHITECTURE_PATH: condition_equal_to("direct"),
         }
     ):
         problem = "samples I and Q, and direct detection has only one of them"
-        yield grid.make_finding(RECORD_PATH, problem, "take a coherent receiver, or record: real")
+        yield grid.make_finding(
+            RECORD_TYPE_PATH, problem, "take a coherent receiver, or record: real"
+        )
     if (
         _least_weighted_sum(grid, {SAMPLE_RATE_PATH: 1.0, ANTIALIAS_BANDWIDTH_PATH: -1.0}) or 0.0
     ) < 0.0:
@@ -836,11 +844,13 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
             waveform.SHOT_DETECTION_PATH, problem, f"{remedy}, or study a flat target"
         )
     if not draws.draws_whole_spectra and grid.any_point_meets(
-        {waveform.PEAKS_PATH: condition_equal_to(waveform.STRONGEST_PEAK)}
+        {waveform.REPORTED_PEAKS_PATH: condition_equal_to(waveform.STRONGEST_PEAK)}
     ):
         problem = f"is found in whole spectra, which draws.method {draws.method!r} does not draw"
         yield grid.make_finding(
-            waveform.PEAKS_PATH, problem, f"set draws.method: {SPECTRA_METHOD}, or take all"
+            waveform.REPORTED_PEAKS_PATH,
+            problem,
+            f"set draws.method: {SPECTRA_METHOD}, or take all",
         )
     voted_on = {
         looks.LOOKS_NUMBER_PATH: exceeds_one,

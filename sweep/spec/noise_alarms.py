@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sweep.model.detection.detectors import DETECTORS, FIXED_THRESHOLD
+from sweep.model.detection.detectors import DETECTORS, FIXED_THRESHOLD_KIND
 from sweep.model.detection.estimators import DETECTOR_PREFIX
 from sweep.model.detection.looks import Looks
-from sweep.model.detection.noise_false_alarms import alarm_equivalent_bins, bin_pfa, segment_pfa
+from sweep.model.detection.noise_false_alarms import bin_pfa, n_alarm_equivalent_bins, segment_pfa
 from sweep.model.threshold import THRESHOLD_PATHS, tnr_from_parameters
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
     -----
     Noise in the up- and down-chirp is independent, so that the probability of a false alarm in both
     chirps is the product of the two. A chirp's probability follows from that of a bin and the
-    number of independent bins that raise as many alarms (`alarm_equivalent_bins`).
+    number of independent bins that raise as many alarms (`n_alarm_equivalent_bins`).
     """
     axes = [
         axis for axis in spec.axes
@@ -70,8 +70,8 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
         parameters = spec.parameters()
         for axis, index in zip(axes, indices, strict=True):
             parameters |= {member.path: member.values[index] for member in axis.parameters}
-        kind = parameters.get("instrument.processing.detector.kind", FIXED_THRESHOLD)
-        if kind == FIXED_THRESHOLD:
+        kind = parameters.get("instrument.processing.detector.kind", FIXED_THRESHOLD_KIND)
+        if kind == FIXED_THRESHOLD_KIND:
             pfa_bin = bin_pfa(
                 float(tnr_from_parameters(parameters)), Looks.from_parameters(parameters)
             )
@@ -80,7 +80,8 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
         else:
             continue
         n_bins_up, n_bins_down = (
-            float(alarm_equivalent_bins(parameters, pfa_bin, segment)) for segment in ("up", "down")
+            float(n_alarm_equivalent_bins(parameters, pfa_bin, segment))
+            for segment in ("up", "down")
         )
         pfa_up, pfa_down, pfa_any = (
             float(segment_pfa(np.asarray(pfa_bin), bins))
@@ -111,16 +112,16 @@ def false_alarm_remedy(spec: GridSpec | SceneSpec) -> str:
     }
     kinds = {
         str(name)
-        for name in values_by_path.get(kind_path, [parameters.get(kind_path, FIXED_THRESHOLD)])
+        for name in values_by_path.get(kind_path, [parameters.get(kind_path, FIXED_THRESHOLD_KIND)])
     }
     remedies = []
-    if FIXED_THRESHOLD in kinds:
+    if FIXED_THRESHOLD_KIND in kinds:
         (threshold_path,) = (
             threshold_path
             for threshold_path in THRESHOLD_PATHS
             if parameters.get(threshold_path) is not None
         )
         remedies.append(f"{'lower' if 'pfa' in threshold_path else 'raise'} {threshold_path}")
-    if kinds & set(DETECTORS) - {FIXED_THRESHOLD}:
+    if kinds & set(DETECTORS) - {FIXED_THRESHOLD_KIND}:
         remedies.append(f"lower {DETECTOR_PREFIX}pfa")
     return " and ".join(remedies)

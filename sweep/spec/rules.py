@@ -401,7 +401,7 @@ class NumericRule(Rule):
         if self.is_integer and number.denominator != 1:
             return False
         try:
-            return self.first_out_of_bounds(np.array([Unit("").to_si(number)])) is None
+            return self.first_bound_violation(np.array([Unit("").to_si(number)])) is None
         except QuantityError:  # beyond the range of floats
             return False
 
@@ -414,12 +414,12 @@ class NumericRule(Rule):
         if self.is_integer and quantity.number.denominator != 1:
             raise QuantityError("must be a whole number")
         value = quantity.to_si()
-        violation = self.first_out_of_bounds(np.array([value]))
+        violation = self.first_bound_violation(np.array([value]))
         if violation is not None:
             raise QuantityError(violation.broken_bound_text)
         return int(quantity.number) if self.is_integer else value
 
-    def first_out_of_bounds(self, values: np.ndarray) -> BoundViolation | None:
+    def first_bound_violation(self, values: np.ndarray) -> BoundViolation | None:
         """Return the first violation of the bounds: index of the value, and broken bound in words.
 
         Parameters

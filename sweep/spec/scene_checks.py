@@ -23,9 +23,9 @@ from sweep.model.ground import beamlet_pattern as beamlet_pattern
 from sweep.model.outputs import (
     CYCLE_VARIABLES,
     NAVIGATION_VARIABLES,
-    POINT_VARIABLES,
+    POINT_CLOUD_VARIABLES,
+    SHOT_GEOMETRY_VARIABLES,
     SHOT_STATISTIC_VARIABLES,
-    SHOT_VARIABLES,
 )
 from sweep.scenes.map_frames import metres_per_height_unit
 from sweep.scenes.scene_files import SceneError
@@ -313,8 +313,8 @@ def _flight_findings(
             files = replace(files, time_origin=platform.read_time_origin(files))
         findings += _motion_findings(platform, ("platform",), files, None)
         if not findings:
-            path = platform.path.build_path(files)
-            span = path.start, path.stop
+            path = platform.path.build_trajectory(files)
+            span = path.start_time, path.stop_time
     for name, scanner in scanners.items():
         findings += _scan_pattern_findings(scanner, ("scanners", name), span)
     for name, scene_object in objects.items():
@@ -343,13 +343,13 @@ def _motion_findings(
     """
     field_name = "path"
     try:
-        path = motion.path.build_path(files, span)
+        path = motion.path.build_trajectory(files, span)
         field_name = "attitude"
         motion.build_attitude(files, path)
         field_name = "mounting"
         flight = motion.build_moving_body(files, span)
         field_name = "attitude"
-        flight.state(np.linspace(path.start, path.stop, _N_ATTITUDE_TRIAL_TIMES))
+        flight.state(np.linspace(path.start_time, path.stop_time, _N_ATTITUDE_TRIAL_TIMES))
     except SceneError as error:
         yield Finding(
             (*location, field_name, "file"), f"names a file that {error.problem}", error.remedy
@@ -358,10 +358,10 @@ def _motion_findings(
     except (ValueError, ArithmeticError) as error:
         yield Finding((*location, field_name), f"can not be made: {error}")
         return
-    if span is not None and not (path.start <= span[0] and path.stop >= span[1]):
+    if span is not None and not (path.start_time <= span[0] and path.stop_time >= span[1]):
         problem = (
-            f"lasts from {path.start:g} to {path.stop:g} s, and the flight from {span[0]:g} to "
-            f"{span[1]:g} s"
+            f"lasts from {path.start_time:g} to {path.stop_time:g} s, and the flight "
+            f"from {span[0]:g} to {span[1]:g} s"
         )
         yield Finding((*location, "path"), problem, "make it last throughout the flight")
 
@@ -398,10 +398,10 @@ def _scan_pattern_findings(
 def store_array_and_dimension_names() -> frozenset[str]:
     """Return the names of a store's arrays and dimensions."""
     output_tables = (
-        SHOT_VARIABLES,
+        SHOT_GEOMETRY_VARIABLES,
         CYCLE_VARIABLES,
         SHOT_STATISTIC_VARIABLES,
-        POINT_VARIABLES,
+        POINT_CLOUD_VARIABLES,
         NAVIGATION_VARIABLES,
     )
     dims = (output.dims for table in output_tables for output in table.values())
@@ -412,7 +412,7 @@ _OTHER_STUDY_REMEDY = "make another study of it"
 _BEAM_WIDTH_PATHS = (
     beam.DIVERGENCE_PATH,
     beam.WAIST_PATH,
-    beam.QUALITY_PATH,
+    beam.BEAM_QUALITY_PATH,
     beam.FOCUS_PATH,
     beam.OSCILLATOR_WAIST_PATH,
     beam.COUPLING_PATH,

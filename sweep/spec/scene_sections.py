@@ -92,9 +92,11 @@ class MeshObject(SolidObject):
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
         """Return the facets of the file before rotation [m]."""
-        from sweep.scenes.meshes import read_mesh
+        from sweep.scenes.meshes import read_mesh_facets
 
-        return read_mesh(files.resolve(self.file), unit=self.unit, up=self.up, scale=self.scale)
+        return read_mesh_facets(
+            files.resolve(self.file), unit=self.unit, up=self.up, scale=self.scale
+        )
 
 
 class Sphere(SolidObject):
@@ -505,7 +507,7 @@ class BuiltScene(NamedTuple):
     All objects at rest form the first body, if there are any. Each moving object is a body of its
     own.
     """
-    surfaces: tuple[SurfaceMaterial, ...]
+    surface_materials: tuple[SurfaceMaterial, ...]
     """Materials of the surfaces, in the order of the surface numbers."""
     body_motions: tuple[MovingBody | None, ...]
     """Motion of each body of the ray caster; None for the body at rest."""
@@ -624,7 +626,7 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
 def _build_mesh(facets: Facets, first_surface: int) -> CleanedMesh:
     """Return the mesh of facets and its report; surface numbers start at `first_surface`."""
     surface = (facets.surface + first_surface).astype(np.int16)
-    return replace(facets, surface=surface).to_mesh()
+    return replace(facets, surface=surface).to_cleaned_mesh()
 
 
 def _object_error(name: str, error: Exception) -> SceneError:

@@ -14,11 +14,11 @@ from pydantic import BaseModel, model_validator
 
 import sweep.spec.fields as declare
 from sweep.model import waveform
-from sweep.model.beam import COUPLINGS
-from sweep.model.detection.detectors import DETECTORS, FIXED_THRESHOLD
+from sweep.model.beam import COUPLING_LAWS
+from sweep.model.detection.detectors import DETECTORS, FIXED_THRESHOLD_KIND
 from sweep.model.detection.estimators import ESTIMATORS, PEAK_BIN
 from sweep.model.detection.looks import COMBINE_KINDS, SPECKLE_KINDS
-from sweep.model.error_budget import AUTOMATIC, COUNT_INTERVALS
+from sweep.model.error_budget import COUNT_INTERVAL_FUNCTIONS, SET_BY_TOLERANCE
 from sweep.model.ground import REFLECTANCE_LAWS
 from sweep.model.threshold import PROCESSING_PREFIX, THRESHOLD_PATHS
 from sweep.spec.fields import (
@@ -118,7 +118,7 @@ class Telescope(SpecSection):
     coupling: str = declare.choice_field(
         "Light that mixes with the local oscillator: that of a single mode, or all in "
         "the aperture, as in the thesis; direct detection always has all",
-        COUPLINGS,
+        COUPLING_LAWS,
     )
 
 
@@ -215,7 +215,7 @@ class Detector(SpecSection):
         ChoiceOrFunctionRule(
             description="Detector: fixed threshold or CFAR", options=tuple(DETECTORS)
         ),
-        FIXED_THRESHOLD,
+        FIXED_THRESHOLD_KIND,
     )
     training: int = declare.integer_field(
         "Training cells of a CFAR detector, half of them on either side; even",
@@ -326,7 +326,7 @@ class Processing(SpecSection):
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
         "alone, which may be another than the echo's (p_wrong_range); in grids without draws, and "
         "in flights that draw whole spectra",
-        waveform.REPORTED_PEAKS,
+        waveform.REPORTED_PEAKS_OPTIONS,
     )
     two_beats: str = declare.choice_field(
         "Assumption by which two beats of a real record give range and velocity: far, "
@@ -470,7 +470,9 @@ def _tolerance_share_field(description: str) -> Any:
     By default the part is chosen automatically.
     """
     description += "; auto: as accuracy.tolerance needs"
-    return declare.number_field(description, "1e-6", "0", "1", default=AUTOMATIC, keyword="auto")
+    return declare.number_field(
+        description, "1e-6", "0", "1", default=SET_BY_TOLERANCE, keyword="auto"
+    )
 
 
 class Accuracy(SpecSection):
@@ -496,7 +498,7 @@ class Accuracy(SpecSection):
         "Bins with less leaked signal than so many noise sigmas count as noise alone, "
         "where bins are taken one by one: in draws, padded FFTs, tabulated windows, under a "
         "Gaussian line; auto: as accuracy.leakage_error allows",
-        "0.1", "1e-9", "1000", default=AUTOMATIC, keyword="auto",
+        "0.1", "1e-9", "1000", default=SET_BY_TOLERANCE, keyword="auto",
     )  # fmt: skip
 
 
@@ -530,7 +532,7 @@ class Draws(SpecSection):
     interval: str = declare.choice_field(
         "Interval of the share of draws with a detection, where noise alone is drawn: "
         "with at least the stated confidence everywhere, or on average",
-        tuple(COUNT_INTERVALS),
+        tuple(COUNT_INTERVAL_FUNCTIONS),
     )
 
     @property

@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 import sweep.spec.fields as declare
 import sweep.spec.scene_sections as scene_sections
 import sweep.spec.sections as sections
-from sweep.model import VERSION, beam, error_budget, waveform
+from sweep.model import MODEL_VERSION, beam, error_budget, waveform
 from sweep.model.beamlet_counts import BEAMLETS_PATH, beamlets_converge, initial_ray_count
 from sweep.model.detection import looks
 from sweep.model.effects import circulator_leak
@@ -376,7 +376,7 @@ class BaseSpec(SpecSection):
         """
         for axis in self.axes:
             for parameter in axis.parameters:
-                if name in (parameter.coordinate, parameter.path):
+                if name in (parameter.coordinate_name, parameter.path):
                     return parameter
         raise KeyError(name)
 
@@ -423,7 +423,7 @@ class BaseSpec(SpecSection):
         """
         section_names = ("draws", "error_floor", "navigation", "storage")
         return {
-            "model": VERSION,
+            "model": MODEL_VERSION,
             "parameters": self.parameters_off_axes(),
             "axes": [axis_identity(axis) for axis in self.axes],
             "effects": self.effect_modes(),
@@ -497,31 +497,31 @@ def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, 
 
 def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if the slopes of segments do not separate range and velocity."""
-    if grid.any_point_meets({waveform.DOWN_SEGMENT_SLOPE_PATH: lambda slope: slope == 1.0}):
+    if grid.any_point_meets({waveform.DOWN_CHIRP_RATE_RATIO_PATH: lambda slope: slope == 1.0}):
         problem = "is the slope of the segment 'up': range and velocity need two slopes"
         yield grid.make_finding(
-            waveform.DOWN_SEGMENT_SLOPE_PATH, problem, "write another, or -1 for a triangle"
+            waveform.DOWN_CHIRP_RATE_RATIO_PATH, problem, "write another, or -1 for a triangle"
         )
     any_two_condition: dict[str, ValueCondition] = {
         waveform.SHOT_DETECTION_PATH: lambda rule: rule == waveform.ANY_TWO
     }
-    slopes = {1.0, *grid.parameter_values(waveform.DOWN_SEGMENT_SLOPE_PATH)}
+    slopes = {1.0, *grid.parameter_values(waveform.DOWN_CHIRP_RATE_RATIO_PATH)}
     if grid.any_point_meets(
         any_two_condition
         | {
-            waveform.DOPPLER_SEGMENT_SLOPE_PATH: lambda doppler_slopes: np.isin(
+            waveform.DOPPLER_CHIRP_RATE_RATIO_PATH: lambda doppler_slopes: np.isin(
                 doppler_slopes, [*slopes]
             )
         }
     ):
         problem = "is another segment's too, and these two give neither range nor velocity: any_two"
         yield grid.make_finding(
-            waveform.DOPPLER_SEGMENT_SLOPE_PATH, problem, "write another, or take both_chirps"
+            waveform.DOPPLER_CHIRP_RATE_RATIO_PATH, problem, "write another, or take both_chirps"
         )
 
 
 STRONGEST_PEAK_CONDITION: dict[str, ValueCondition] = {
-    waveform.PEAKS_PATH: lambda peaks: peaks == waveform.STRONGEST_PEAK
+    waveform.REPORTED_PEAKS_PATH: lambda peaks: peaks == waveform.STRONGEST_PEAK
 }
 """Condition on parameters under which each segment reports only its strongest peak."""
 
@@ -544,7 +544,7 @@ def _strongest_peak_findings(grid: GridValues) -> Iterator[Finding]:
     )  # fmt: skip
     for conditions, problem, remedy in refused_combinations:
         if grid.any_point_meets(STRONGEST_PEAK_CONDITION | conditions):
-            yield grid.make_finding(waveform.PEAKS_PATH, problem, f"take all, or {remedy}")
+            yield grid.make_finding(waveform.REPORTED_PEAKS_PATH, problem, f"take all, or {remedy}")
 
 
 def _grid_size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
@@ -587,7 +587,9 @@ class GridSpec(BaseSpec):
             if draws.has_draws and grid.any_point_meets(STRONGEST_PEAK_CONDITION):
                 problem = "has chances in closed form alone, and the study has draws"
                 findings.append(
-                    grid.make_finding(waveform.PEAKS_PATH, problem, "take all, or no draws")
+                    grid.make_finding(
+                        waveform.REPORTED_PEAKS_PATH, problem, "take all, or no draws"
+                    )
                 )
             findings += () if draws.has_draws else undrawn_effect_findings(grid)
             if draws.number and draws.limit:
@@ -701,7 +703,7 @@ class SceneSpec(BaseSpec):
         return variation_findings(self.parameters(), path, [value], location)
 
     @property
-    def base(self) -> Path:
+    def base_folder(self) -> Path:
         """Folder that paths in the spec are relative to."""
         return self._base_folder
 
@@ -733,7 +735,7 @@ class SceneSpec(BaseSpec):
         """True if the number of rays of each shot follows from the tolerance."""
         return self.footprint.beamlets == 0 and beamlets_converge(self.parameters())
 
-    def surfaces(self) -> tuple[SurfaceMaterial, ...]:
+    def surface_materials(self) -> tuple[SurfaceMaterial, ...]:
         """Return the materials of the scene's surfaces, in the order of their numbers.
 
         No file is read.
@@ -749,7 +751,9 @@ class SceneSpec(BaseSpec):
             If a file or an object is unsuitable.
         """
         flight = self.build_flight()
-        return scene_sections.build_scene(self.scene, self.files, (flight.start, flight.stop))
+        return scene_sections.build_scene(
+            self.scene, self.files, (flight.start_time, flight.stop_time)
+        )
 
     def build_flight(self) -> MovingBody:
         """Return the motion of the instrument in the scene's frame.
@@ -847,9 +851,11 @@ class SceneSpec(BaseSpec):
             float(p[f"instrument.{name}"])
             for name in ("processing.sample_rate", "laser.wavelength")
         )
-        record_duration = float(np.max(waveform.record_length(p))) / sample_rate
+        record_duration = float(np.max(waveform.n_record_samples(p))) / sample_rate
         flight = self.build_flight()
-        state = flight.state(np.linspace(flight.start, flight.stop, _N_ACCELERATION_SAMPLES))
+        state = flight.state(
+            np.linspace(flight.start_time, flight.stop_time, _N_ACCELERATION_SAMPLES)
+        )
         acceleration_max = float(np.sqrt((state.acceleration**2).sum(axis=1)).max())
         drift = 2 * acceleration_max * record_duration**2 / wavelength
         return drift if drift > LINE_DRIFT_WARNING_BINS else 0.0
@@ -857,14 +863,14 @@ class SceneSpec(BaseSpec):
     def number_of_cycles(self, name: str) -> int:
         """Return the number of complete measurement cycles of the scanner `name` in the flight."""
         flight, pattern = self.build_flight(), self.scan_pattern(name)
-        return pattern.count_shots(flight.stop - flight.start) // shots_per_cycle(pattern)
+        return pattern.count_shots(flight.stop_time - flight.start_time) // shots_per_cycle(pattern)
 
     @property
     def beamlet_pattern(self) -> str:
         """Arrangement of the beamlets: a pattern of `sweep.model.beamlets.place_beamlets`."""
         return beamlet_pattern(self.parameters())
 
-    def footprint_full_angles(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
+    def footprint_angles_function(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
         """Return the function that computes the angles of a footprint from its range [m].
 
         The result is None if the divergence is constant.
@@ -934,7 +940,7 @@ class SceneSpec(BaseSpec):
             "origin": index_by_name.get(self.scene.origin, -1),
             "platform": values_by_path(self.platform, digests=digests),
             "scanner": values_by_path(self.scanners[name], digests=digests),
-            "model": VERSION,
+            "model": MODEL_VERSION,
             "beamlets": parameters[BEAMLETS_PATH],
             "pattern": self.beamlet_pattern,
             "beam": {beam.DIVERGENCE_PATH: parameters[beam.DIVERGENCE_PATH]}
@@ -1046,7 +1052,7 @@ def _field_axis_contradiction_findings(
             else si_value in values
         ):
             continue
-        problem = f"is on the axis {parameter.coordinate} too, which does not have this value"
+        problem = f"is on the axis {parameter.coordinate_name} too, which does not have this value"
         remedy = "leave it out here, or put it on the axis"
         yield Finding(tuple(path.split(".")), problem, remedy, value)
 

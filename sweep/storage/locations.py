@@ -98,7 +98,7 @@ ResultT = TypeVar("ResultT")
 #: Error texts of obstore for a truncated response body and a truncated listing.
 _TRUNCATED_RESPONSE_TEXTS = ("body error", "invalid list response")
 
-_clients: dict[str, Any] = {}
+_client_by_bucket_url: dict[str, Any] = {}
 """Clients of the buckets that this process has connected to, by URL of the bucket."""
 
 _clients_lock = threading.RLock()
@@ -155,8 +155,8 @@ class ObjectPath:
         The first access lists the bucket, which checks that it exists and can be read.
         """
         with _clients_lock:
-            if self.bucket_url not in _clients:
-                with translate_errors(self):
+            if self.bucket_url not in _client_by_bucket_url:
+                with translate_object_store_errors(self):
                     if not self.bucket_url.startswith("memory:"):
                         first_client = _connect_to_bucket(
                             self.bucket_url, FIRST_CONTACT_RETRY_CONFIG
@@ -164,12 +164,14 @@ class ObjectPath:
                         _retry_if_truncated(
                             lambda: first_client.list_with_delimiter(self.key or None)
                         )
-                    _clients[self.bucket_url] = _connect_to_bucket(self.bucket_url, RETRY_CONFIG)
-            return _clients[self.bucket_url]
+                    _client_by_bucket_url[self.bucket_url] = _connect_to_bucket(
+                        self.bucket_url, RETRY_CONFIG
+                    )
+            return _client_by_bucket_url[self.bucket_url]
 
     def _read_object_metadata(self) -> Any:
         """Return the metadata of the object, or None if it does not exist."""
-        with translate_errors(self), suppress(FileNotFoundError):
+        with translate_object_store_errors(self), suppress(FileNotFoundError):
             return self.client.head(self.key)
 
     def exists(self) -> bool:
@@ -193,7 +195,7 @@ class ObjectPath:
         """
         from obstore.exceptions import BaseError
 
-        with translate_errors(self):
+        with translate_object_store_errors(self):
             response = self.client.get(self.key)
             if bytes_max is not None:
                 check_file_size(response.meta["size"], bytes_max, str(self))
@@ -204,7 +206,7 @@ class ObjectPath:
 
     def write_bytes(self, content: bytes) -> None:
         """Write a whole object; replace the existing one, if any."""
-        with translate_errors(self):
+        with translate_object_store_errors(self):
             self.client.put(self.key, content)
 
     def unlink(self, missing_ok: bool = False) -> None:
@@ -212,7 +214,7 @@ class ObjectPath:
 
         ``missing_ok`` has no effect; it exists because `pathlib.Path.unlink` has it.
         """
-        with translate_errors(self), suppress(FileNotFoundError):
+        with translate_object_store_errors(self), suppress(FileNotFoundError):
             self.client.delete(self.key)
 
     def iter_objects_below(self) -> Iterator[tuple[str, int]]:
@@ -220,7 +222,7 @@ class ObjectPath:
         from obstore.exceptions import BaseError
 
         last, is_repeated = None, False
-        with translate_errors(self):
+        with translate_object_store_errors(self):
             while True:
                 try:
                     for page in self.client.list(self.key or None, offset=last):
@@ -234,7 +236,7 @@ class ObjectPath:
                     is_repeated = True  # list again, from the last key that was received
 
     def _list_child_names(self) -> list[str]:
-        with translate_errors(self):
+        with translate_object_store_errors(self):
             listing = _retry_if_truncated(lambda: self.client.list_with_delimiter(self.key or None))
         paths = [*listing["common_prefixes"], *(entry["path"] for entry in listing["objects"])]
         return sorted(path.rpartition("/")[2] for path in paths)
@@ -254,7 +256,7 @@ class ObjectPath:
             response = self.client.get(self.key)
             return VersionedContent(bytes(response.bytes()), _object_version(response.meta))
 
-        with translate_errors(self), suppress(FileNotFoundError):
+        with translate_object_store_errors(self), suppress(FileNotFoundError):
             return _retry_if_truncated(ask)
         return None
 
@@ -279,7 +281,7 @@ class ObjectPath:
 
         mode = "create" if expected_version is None else expected_version
         conflict_errors = (AlreadyExistsError, PreconditionError, FileNotFoundError)
-        with translate_errors(self), suppress(*conflict_errors):
+        with translate_object_store_errors(self), suppress(*conflict_errors):
             return _object_version(self.client.put(self.key, content, mode=mode))
         return None
 
@@ -332,7 +334,7 @@ def _s3_endpoint_url() -> str:
 
 
 @contextmanager
-def translate_errors(location: object) -> Iterator[None]:
+def translate_object_store_errors(location: object) -> Iterator[None]:
     """Context manager that translates errors of an object store to ObjectStoreError.
 
     The message states the remedy. If ``location`` is a path on disk, no error is translated.
@@ -345,21 +347,21 @@ def translate_errors(location: object) -> Iterator[None]:
     try:
         yield
     except BaseError as error:
-        error_number, explanation = classify_error_text(str(error), location.bucket_url)
+        error_number, explanation = object_store_errno_and_message(str(error), location.bucket_url)
         raise ObjectStoreError(error_number, explanation, str(location)) from error
 
 
-def to_readable_error(error: Exception) -> Exception:
+def to_object_store_error(error: Exception) -> Exception:
     """Return an ObjectStoreError for an error that an object store raised through Zarr or xarray.
 
     Any other error is returned as it is.
     """
     if type(error).__module__.partition(".")[0] != "obstore":
         return error
-    return ObjectStoreError(*classify_error_text(str(error), ""), "the store")
+    return ObjectStoreError(*object_store_errno_and_message(str(error), ""), "the store")
 
 
-def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
+def object_store_errno_and_message(error_text: str, bucket_url: str) -> tuple[int, str]:
     """Return errno, and message with remedy, for an error text of the object-store library.
 
     ``bucket_url``: scheme and bucket that the message names.
@@ -470,7 +472,7 @@ def read_object(location: Location, object_name: str, bytes_max: int) -> bytes:
     return read_file_below_root(location, object_name, bytes_max)
 
 
-def iter_names_below(location: Location) -> Iterator[str]:
+def iter_file_names_below(location: Location) -> Iterator[str]:
     """Yield the relative paths of all files and links below a location, but not of folders."""
     if isinstance(location, ObjectPath):
         yield from (name for name, _ in location.iter_objects_below())
@@ -493,7 +495,7 @@ def file_sizes_below(location: Location) -> dict[str, int]:
     """Return the sizes [bytes] of all files below a location, by relative path."""
     if isinstance(location, ObjectPath):
         return dict(location.iter_objects_below())
-    return {name: (location / name).lstat().st_size for name in iter_names_below(location)}
+    return {name: (location / name).lstat().st_size for name in iter_file_names_below(location)}
 
 
 def derived_files_dir(location: Location) -> Path:

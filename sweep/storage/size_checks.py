@@ -120,7 +120,7 @@ class ArrayFileLayout(NamedTuple):
         """
         if not content.startswith(_ZSTD_MAGIC):
             return
-        content_bytes = zstd_content_bytes(content)
+        content_bytes = declared_zstd_content_size(content)
         if content_bytes is None:
             raise RefusedFileError(
                 errno.EINVAL, "has a chunk that does not declare its size", path_in_messages
@@ -153,12 +153,12 @@ class ArrayFileLayout(NamedTuple):
             )
 
 
-def zstd_content_bytes(frame: bytes) -> int | None:
+def declared_zstd_content_size(frame: bytes) -> int | None:
     """Return the content size that a zstd frame declares [bytes], or None if it declares none.
 
     RFC 8878, section 3.1.1.1, defines the header.
 
-    >>> zstd_content_bytes(bytes(Zstd().encode(b"x" * 1000)))
+    >>> declared_zstd_content_size(bytes(Zstd().encode(b"x" * 1000)))
     1000
     """
     if len(frame) < 5:

@@ -33,7 +33,7 @@ from zarr.storage import StorePath
 from sweep.messages import (
     SPEC_PLACEHOLDER,
     STORE_PLACEHOLDER,
-    EscapedTextError,
+    EscapedMessageError,
     escape_to_one_line,
     suggested_call,
 )
@@ -134,7 +134,7 @@ _SHARD_INDEX_CONFIGURATION = {
 """Zarr configuration of the index of a shard, the list of the chunks in a file."""
 
 
-class StoreError(EscapedTextError):
+class StoreError(EscapedMessageError):
     """Error of a store that can't be used as requested."""
 
 
@@ -331,7 +331,7 @@ def objects_match_digest(
 
 def read_manifest_attributes(path: Location) -> dict[str, Any]:
     """Return the attributes of a store from its manifest; empty if the manifest is damaged."""
-    attributes: dict[str, Any] = next(iter_records(path / JOURNAL_DIR / MANIFEST_FILE), {}).get(
+    attributes: dict[str, Any] = next(iter_log_records(path / JOURNAL_DIR / MANIFEST_FILE), {}).get(
         "attributes", {}
     )
     return attributes
@@ -499,7 +499,7 @@ def find_irregular_journal_files(path: Location) -> dict[str, str]:
     }
 
 
-class StoreReplacedError(EscapedTextError, ValueError):
+class StoreReplacedError(EscapedMessageError, ValueError):
     """Error of reading a store that was extended, replaced or removed after it was opened."""
 
 
@@ -578,17 +578,17 @@ _RECEIPT_WORKER_PATTERN = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
 """Pattern of the fields in a receipt that name the worker: host and process number."""
 
 
-def encode_record(record: dict[str, Any]) -> bytes:
+def encode_log_record(record: dict[str, Any]) -> bytes:
     """Encode a non-empty record as a line of JSON whose last field is a digest of the others."""
-    return append_line_digest(json.dumps(record, separators=(",", ":")).encode()[:-1])
+    return log_line_with_digest(json.dumps(record, separators=(",", ":")).encode()[:-1])
 
 
-def append_line_digest(line_body: bytes) -> bytes:
+def log_line_with_digest(line_body: bytes) -> bytes:
     """Return a log line, made of encoded fields without the closing brace, and their digest."""
     return line_body + _DIGEST_FIELD_START + _line_digest(line_body) + _LOG_RECORD_END
 
 
-def decode_record(line: bytes) -> dict[str, Any] | None:
+def decode_log_record(line: bytes) -> dict[str, Any] | None:
     """Return the record of a log line, or None if any byte of the line has changed."""
     line_body = verified_line_body(line)
     if line_body is None:
@@ -626,15 +626,15 @@ class LogLine(NamedTuple):
     """Record in the line; None if the line is damaged or truncated."""
 
 
-def iter_lines_and_records(path: Location) -> Iterator[LogLine]:
+def iter_log_lines(path: Location) -> Iterator[LogLine]:
     """Yield each line of a log with its record; None in place of a damaged or truncated record."""
     for line in iter_raw_lines(path):
-        yield LogLine(line, decode_record(line))
+        yield LogLine(line, decode_log_record(line))
 
 
-def iter_records(path: Location) -> Iterator[dict[str, Any]]:
+def iter_log_records(path: Location) -> Iterator[dict[str, Any]]:
     """Yield the records of a log, in order; skip damaged or truncated lines."""
-    return (record for _, record in iter_lines_and_records(path) if record is not None)
+    return (record for _, record in iter_log_lines(path) if record is not None)
 
 
 def stored_objects_digest(
@@ -656,8 +656,8 @@ def stored_objects_digest(
     hasher = hashlib.blake2b(digest_size=16)
     for name in object_names:
         with stream_file_below_root(path, name, bytes_max(name)) as stream:
-            hasher.update(f"{name}\0{stream.size}\0".encode())
-            for piece in stream.pieces:
+            hasher.update(f"{name}\0{stream.size_bytes}\0".encode())
+            for piece in stream.content_pieces:
                 hasher.update(piece)
     return hasher.hexdigest()
 
@@ -704,7 +704,7 @@ class FileLog:
             atomic_write(self._path, b"".join(line for line in lines if is_sound(line)))
 
 
-class ObjectLog:
+class ObjectStoreLog:
     """Append-only log in an object store: objects below one key, numbered in order of writing."""
 
     def __init__(self, path: ObjectPath) -> None:
@@ -773,10 +773,10 @@ class ObjectLog:
         )
 
 
-def open_log(path: Location, *, durable: bool = False) -> FileLog | ObjectLog:
+def open_log(path: Location, *, durable: bool = False) -> FileLog | ObjectStoreLog:
     """Open a log for appending; the caller ensures that no other process appends to it."""
     if isinstance(path, ObjectPath):
-        return ObjectLog(path)
+        return ObjectStoreLog(path)
     path.parent.mkdir(exist_ok=True)
     return FileLog(path, durable=durable)
 
@@ -868,7 +868,7 @@ class ReceiptTotals:
     bytes_by_block: np.ndarray
     first_receipt_time: float = np.inf  # time of the first receipt [s since the epoch]
     last_receipt_time: float = -np.inf  # time of the last receipt [s since the epoch]
-    recent_points: int = 0  # number of points committed at or after `since`
+    n_recent_points: int = 0  # number of points committed at or after `since`
     recent_workers: set[bytes] = field(default_factory=set)  # host and process id of their workers
 
     @property
@@ -907,6 +907,6 @@ def _add_receipt_to_totals(
         max(totals.last_receipt_time, receipt_time),
     )
     if receipt_time >= since:
-        totals.recent_points += points
+        totals.n_recent_points += points
         if worker := _RECEIPT_WORKER_PATTERN.search(line_body):
             totals.recent_workers.add(worker[0])

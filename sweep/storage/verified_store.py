@@ -28,12 +28,12 @@ from sweep.storage.locations import (
     PACKED_ATTRIBUTE,
     Location,
     ObjectPath,
-    to_readable_error,
-    translate_errors,
+    to_object_store_error,
+    translate_object_store_errors,
 )
 from sweep.storage.store_format import (
     MANIFEST_FILE,
-    iter_records,
+    iter_log_records,
     read_receipt_totals,
     read_root_metadata,
 )
@@ -93,7 +93,7 @@ class ChunkBlockMap:
         self.kind, self.is_packed = attributes["kind"], PACKED_ATTRIBUTE in attributes
         nodes = root_metadata["consolidated_metadata"]["metadata"]
         self._arrays = {name: node for name, node in nodes.items() if "data_type" in node}
-        records = iter_records(location / JOURNAL_DIR / MANIFEST_FILE)
+        records = iter_log_records(location / JOURNAL_DIR / MANIFEST_FILE)
         self.template_objects = frozenset(record.get("object", "") for record in records)
         groups_by_kind = {"grid": [""], "eyepoints": [""], "scene": attributes.get("scanners", [])}
         self.n_blocks = 0
@@ -194,7 +194,7 @@ class VerifiedStore(WrapperStore[Any]):
         """Return the bytes of a file or of a part; raise DamagedChunkError for a damaged chunk."""
         prototype = prototype or default_buffer_prototype()
         try:
-            with translate_errors(self._location):
+            with translate_object_store_errors(self._location):
                 return await self._get_verified(key, prototype, byte_range)
         except Exception:
             _loops_with_failed_reads.add(asyncio.get_running_loop())
@@ -222,7 +222,7 @@ class VerifiedStore(WrapperStore[Any]):
         try:
             return await self._store.get(key, prototype, byte_range)
         except Exception as error:
-            if isinstance(self._location, Path) or to_readable_error(error) is error:
+            if isinstance(self._location, Path) or to_object_store_error(error) is error:
                 raise
             return await self._store.get(key, prototype, byte_range)
 

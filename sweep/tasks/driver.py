@@ -35,17 +35,17 @@ from sweep.tasks.engine.journal import (
     REPLACED_STUDY_ID_KEY,
     USER_MODULE_DIGESTS_KEY,
     StoreLock,
-    blocks_with_receipt,
-    committed_blocks,
+    committed_block_mask,
     read_recipe,
+    receipted_block_mask,
     refuse_damaged_recipe,
     remove_predecessors_from_recipe,
     wait_for_stale_lock,
     write_recipe,
 )
 from sweep.tasks.engine.progress import (
-    BusyError,
     ClusterError,
+    StoreBusyError,
     StoreError,
     make_progress,
     raise_as_store_error,
@@ -57,9 +57,9 @@ from sweep.tasks.engine.study_store import (
     find_pending_replacement,
     refuse_damaged_template,
     refuse_foreign_files,
+    refuse_irreplaceable_store,
     refuse_other_blocks,
     refuse_other_versions,
-    refuse_to_replace,
     remove_store,
     sync_file_system,
 )
@@ -402,7 +402,7 @@ def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy)
     if not can_create_store(store_path):
         attributes, stored_study = _read_resumable_study(store_path)
         refuse_other_study(store_path, attributes, stored_study.spec, study.spec)
-        n_blocks_done = int(np.count_nonzero(blocks_with_receipt(store_path, study)))
+        n_blocks_done = int(np.count_nonzero(receipted_block_mask(store_path, study)))
         problem = (
             f"{store_path} holds this study already, {n_blocks_done} of "
             f"{number_with_noun(study.n_blocks, 'block')} done"
@@ -434,7 +434,7 @@ def _compute_into_path(
     working_path, recipe, durable = final_path, _spec_folder_entry(spec), backend.options.durable
     with ExitStack() as stack:
         if replace_existing and not can_create_store(final_path):
-            refuse_to_replace(final_path)
+            refuse_irreplaceable_store(final_path)
             if from_scratch and final_path != source_path:
                 refuse_foreign_files(final_path)
             stack.callback(StoreLock(final_path, backend.progress.say).release)
@@ -452,7 +452,7 @@ def _compute_into_path(
         if already_exists and from_scratch:
             StoreLock(
                 working_path, backend.progress.say
-            ).release()  # a BusyError if another process writes to it
+            ).release()  # a StoreBusyError if another process writes to it
         elif already_exists:
             stored_attributes, stored_study = _read_resumable_study(working_path)
             refuse_other_study(working_path, stored_attributes, stored_study.spec, spec)
@@ -534,7 +534,7 @@ def _spec_folder_entry(spec: AnySpec) -> dict[str, str]:
 
     It is empty for a grid. The recipe is the part of the journal about how the store is made.
     """
-    return {"base": str(spec.base.absolute())} if isinstance(spec, SceneSpec) else {}
+    return {"base": str(spec.base_folder.absolute())} if isinstance(spec, SceneSpec) else {}
 
 
 def _check_user_functions(spec: AnySpec) -> None:
@@ -626,7 +626,8 @@ def _is_flight_complete(store_path: Location, study: FlightStudy) -> bool:
     stores do not count.
     """
     return bool(
-        blocks_with_receipt(store_path, study).all() and committed_blocks(store_path, study).all()
+        receipted_block_mask(store_path, study).all()
+        and committed_block_mask(store_path, study).all()
     ) and all(
         _is_eyepoint_store_complete(eyepoint_store_path, eyepoints)
         for eyepoints in study.eyepoint_studies()
@@ -692,7 +693,7 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
     refuse_damaged_template(eyepoint_store_path)
     refuse_other_blocks(eyepoint_store_path, eyepoints)
     return bool(read_recipe(eyepoint_store_path)) and bool(
-        committed_blocks(eyepoint_store_path, eyepoints).all()
+        committed_block_mask(eyepoint_store_path, eyepoints).all()
     )
 
 
@@ -710,7 +711,7 @@ def _acquire_eyepoint_lock(
             if can_create_store(eyepoint_store_path):
                 create_store(eyepoint_store_path, eyepoints, durable=backend.options.durable)
             return StoreLock(eyepoint_store_path, backend.progress.say)
-        except BusyError as error:
+        except StoreBusyError as error:
             if not has_announced_wait:
                 backend.progress.say(f"waiting for rays that another run casts: {error}")
                 has_announced_wait = True

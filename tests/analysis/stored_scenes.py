@@ -6,7 +6,7 @@ import numpy as np
 import rasterio
 from stored_studies import INSTRUMENT
 
-from sweep.model.outputs import CYCLE_VARIABLES, SHOT_VARIABLES
+from sweep.model.outputs import CYCLE_VARIABLES, SHOT_GEOMETRY_VARIABLES
 from sweep.spec import SceneSpec
 from sweep.spec.axes import remove_fields_on_axes
 from sweep.tasks import driver
@@ -106,7 +106,7 @@ def copy_without_last_cycles(path, directory, *, with_geometry=True):
             dims = array.metadata.dimension_names
             cut_axes = [i for i, dim in enumerate(dims) if dim in ("shot", "cycle")]
             if cut_axes and (
-                with_geometry or array.basename not in SHOT_VARIABLES | CYCLE_VARIABLES
+                with_geometry or array.basename not in SHOT_GEOMETRY_VARIABLES | CYCLE_VARIABLES
             ):
                 last_chunk = -(-array.shape[cut_axes[0]] // array.chunks[cut_axes[0]]) - 1
                 for chunk in (copy / name / array.basename / "c").rglob("*"):

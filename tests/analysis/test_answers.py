@@ -287,7 +287,9 @@ def lone_tone_bound(distance, noise_variance):
         gain = 7e3 / (1 + (beat / 400e6) ** 2)  # two poles, detector's and amplifier's
         amplitude = 2 * 1.1 * np.sqrt(1e-3 * echo) * gain
         cnr = amplitude**2 / (2 * noise_variance)
-        beats.append(estimators.beat_frequency_bound(cnr=cnr, n_samples=size, sample_rate=rate))
+        beats.append(
+            estimators.beat_frequency_cramer_rao_bound(cnr=cnr, n_samples=size, sample_rate=rate)
+        )
     return estimators.range_velocity_deviation(
         up=beats[0], doppler=beats[1], down=beats[2], carriers=(carrier, carrier, carrier + 1e9),
         chirp_rate=slope, range=distance, radial_velocity=150.0,

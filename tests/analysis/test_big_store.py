@@ -61,9 +61,9 @@ def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
 def test_neither_does_that_of_its_figures(tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
     monkeypatch.setattr(
-        charts, "SHEET_SIZE_LIMITS", replace(charts.SHEET_SIZE_LIMITS, columns_max=20)
+        charts, "SHEET_CHART_SIZE_LIMITS", replace(charts.SHEET_CHART_SIZE_LIMITS, columns_max=20)
     )
-    monkeypatch.setattr(charts, "REDUCED_LINE_CELLS", 5)
+    monkeypatch.setattr(charts, "REDUCED_LINE_CELLS_MAX", 5)
     monkeypatch.setattr(canvas, "save_sheet", lambda sheet, path, source: path)
     sizes = stores(tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37

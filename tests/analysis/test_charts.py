@@ -126,7 +126,7 @@ def test_parts_of_zipped_axes_are_distinguished():
     ]}  # fmt: skip
     spec = spec_over_axes({"instrument.laser.power": ["1 W", "3 W"], "cut": cut})
     coordinates = {
-        member.coordinate: (axis.name, member.display_values, {"units": member.units})
+        member.coordinate_name: (axis.name, member.display_values, {"units": member.units})
         for axis in spec.axes
         for member in axis.parameters
     }

@@ -11,7 +11,7 @@ from sweep.analysis.scene_results.consistency import (
 )
 from sweep.analysis.scene_results.point_export import export
 from sweep.cli import main
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.report.study_report import write_report
 from sweep.spec import SceneSpec
 from sweep.tasks import driver
@@ -28,7 +28,7 @@ def cloud(understated=1.0, *, navigated=1.0, shots=SHOTS):
     root = rng.normal(size=(3, 3))
     covariance = root @ root.T
     points = {
-        "flags": (dims, np.full(shape, TRUE_FLAG, np.uint8)),
+        "flags": (dims, np.full(shape, TRUE_RETURN_FLAG, np.uint8)),
         "pd_shot": (("power", "shot"), np.ones((2, shots))),
     }
     for name, sigma in (("range", 0.02), ("radial_velocity", 1e-3)):

@@ -131,7 +131,7 @@ def test_a_grid_is_cut_where_the_thesis_cuts_it_and_left_whole_without_range_and
     grid = spec_over_axes(
         {"target.range": ["1 km", "3.5 km"], "target.grazing_angle": ["15 deg", "30 deg"]}
     )
-    assert [(c.name, c.varying_name) for c in study_cuts(grid)] == [
+    assert [(c.name, c.varying_coordinate) for c in study_cuts(grid)] == [
         ("15 deg", "range"),
         ("3.5 km", "grazing_angle"),
     ]
@@ -196,8 +196,8 @@ def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):
     dataset = open_store(run_into_store(tmp_path, SURFACE_AXES))
     points = PointSelection.from_dataset(dataset)
     near = select_beyond_range(points, spec_over_axes(SURFACE_AXES), "10 m")
-    assert near.size == 23 * 9
+    assert near.n_points == 23 * 9
     assert (
-        select_beyond_range(points, spec_over_axes(SURFACE_AXES), "10 m", inclusive=True).size
+        select_beyond_range(points, spec_over_axes(SURFACE_AXES), "10 m", inclusive=True).n_points
         == 24 * 9
     )

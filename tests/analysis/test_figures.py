@@ -6,7 +6,7 @@ from PIL import Image
 from stored_studies import POWER_AND_CUT_AXES, SURFACE_AXES, run_into_store, spec_over_axes
 
 from sweep.analysis import canvas
-from sweep.analysis.charts import SHEET_SIZE_LIMITS
+from sweep.analysis.charts import SHEET_CHART_SIZE_LIMITS
 from sweep.analysis.study_figures import (
     GridResults,
     default_grid_figures,
@@ -162,20 +162,22 @@ def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path)
     assert all(map(has_content, draw_figures(path)))
     figures = GridResults.from_store(path)
     for figure in figures.figure_specs[:1]:
-        (panel,) = figures.make_chart(figure, SHEET_SIZE_LIMITS).panels
-        assert panel.x_axis.kind == "category"
+        (panel,) = figures.make_chart(figure, SHEET_CHART_SIZE_LIMITS).panels
+        assert panel.x_axis.scale == "category"
         for line in panel.lines:  # in the order of the study, not of the alphabet
             assert line.x.tolist() == ["rectangular", "hann", "blackman"]
     values = figures.dataset.pd_shot
     for figure, words in zip(figures.figure_specs[2:], ("x", "y"), strict=True):
-        (panel,) = figures.make_chart(figure, SHEET_SIZE_LIMITS).panels
-        assert getattr(panel, f"{words}_axis").kind == "category"
+        (panel,) = figures.make_chart(figure, SHEET_CHART_SIZE_LIMITS).panels
+        assert getattr(panel, f"{words}_axis").scale == "category"
         sheet_values = (
             values.transpose("range", "window") if words == "x" else values.transpose("window", ...)
         )
         np.testing.assert_allclose(panel.heat_map.values, sheet_values)
         assert getattr(panel.heat_map, words).tolist() == ["rectangular", "hann", "blackman"]
-        (trace,) = make_interactive_plot(figures.make_chart(figure, SHEET_SIZE_LIMITS)).figure.data
+        (trace,) = make_interactive_plot(
+            figures.make_chart(figure, SHEET_CHART_SIZE_LIMITS)
+        ).figure.data
         assert getattr(trace, words).tolist() == ["rectangular", "hann", "blackman"]
     assert write_report(path, tmp_path / "page.html").stat().st_size > 1e6
 
@@ -186,7 +188,7 @@ def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
     path = run_into_store(tmp_path, SURFACE_AXES, figures=figures)
     assert all(map(has_content, draw_figures(path)))
     surface, slices = (
-        GridResults.from_store(path).make_chart(f, SHEET_SIZE_LIMITS)
+        GridResults.from_store(path).make_chart(f, SHEET_CHART_SIZE_LIMITS)
         for f in GridResults.from_store(path).figure_specs
     )
     assert surface.panels[0].heat_map.contour_levels == (0.5, 0.9) and "0.5 and 0.9" in " ".join(

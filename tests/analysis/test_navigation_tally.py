@@ -11,7 +11,7 @@ from sweep.model.geometry.scanner import corner_directions
 from sweep.model.pointcloud.navigation import solve_velocity
 
 FIELDS = (
-    "n_attempts", "n_solutions", "mean_error", "squared_deviation", "mean_stated_variance",
+    "n_attempts", "n_solutions", "mean_error", "sum_of_squared_deviations", "mean_stated_variance",
 )  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def test_tallies_are_merged_in_a_fixed_tree():
     other = merge_tallies(parts[::-1])
     assert other.n_solutions == merge_tallies(parts).n_solutions
     np.testing.assert_allclose(
-        other.squared_deviation, merge_tallies(parts).squared_deviation, rtol=1e-12
+        other.sum_of_squared_deviations, merge_tallies(parts).sum_of_squared_deviations, rtol=1e-12
     )
     assert not _same_bits(other, merge_tallies(parts))
 

@@ -20,9 +20,9 @@ from sweep.model.outputs import (
     EFFECT_VARIABLES,
     GRID_OUTPUTS,
     NAVIGATION_VARIABLES,
-    POINT_VARIABLES,
+    POINT_CLOUD_VARIABLES,
+    SHOT_GEOMETRY_VARIABLES,
     SHOT_STATISTIC_VARIABLES,
-    SHOT_VARIABLES,
 )
 from sweep.model.pointcloud.eyepoints import compute_eyepoints
 
@@ -129,16 +129,16 @@ def test_a_group_for_each_scanner_holds_what_the_table_of_outputs_says(scene_sto
     for name, navigates in (("square", True), ("pair", False)):
         group = tree.children[name].to_dataset(inherit=False)
         outputs = (
-            SHOT_VARIABLES
+            SHOT_GEOMETRY_VARIABLES
             | CYCLE_VARIABLES
             | SHOT_STATISTIC_VARIABLES
             | EFFECT_VARIABLES
-            | POINT_VARIABLES
+            | POINT_CLOUD_VARIABLES
             | (NAVIGATION_VARIABLES if navigates else {})
         )
         assert set(group.data_vars) == set(outputs)
         for output, described in outputs.items():
-            along = ("power",) if output not in SHOT_VARIABLES | CYCLE_VARIABLES else ()
+            along = ("power",) if output not in SHOT_GEOMETRY_VARIABLES | CYCLE_VARIABLES else ()
             assert group[output].dims == along + described.dims
             assert group[output].attrs["units"] == described.units
             assert group[output].dtype == described.dtype

@@ -8,7 +8,7 @@ import tolerance_of_draws
 from shot_helpers import make_point_keys
 
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.outputs import PD_OUTPUTS
+from sweep.model.outputs import PD_OUTPUT_NAMES
 from sweep.model.sampling.samplers import simulate_draws
 from sweep.spec import load
 from sweep.storage.accuracy_setting_kinds import AS_WRITTEN_KIND
@@ -39,7 +39,7 @@ def test_exact_means_are_those_of_many_draws(few):
     study = GridStudy(few)
     exact = study.evaluate(0)
     assert study.grid.n_blocks == 1 and half_widths < 1e-12
-    for name, mean in zip(PD_OUTPUTS, means, strict=True):
+    for name, mean in zip(PD_OUTPUT_NAMES, means, strict=True):
         error = exact[f"{name}_error"].ravel()
         assert (abs(exact[name].ravel() - mean) <= 5 * error + 1e-9).all(), name
         assert ((error > 1e-4) & (error < 0.01)).sum() >= 4
@@ -87,7 +87,7 @@ def test_speckled_points_are_within_their_half_widths_as_often_as_promised(toler
     assert results["n_draws"].max() <= 4000 and results["n_draws"].mean() < 800
     assert "speckle" in effects
     sigma = np.sqrt(0.95 * 0.05 / samples / grid.n_points)
-    for name, exact in zip(PD_OUTPUTS, means, strict=True):
+    for name, exact in zip(PD_OUTPUT_NAMES, means, strict=True):
         errors = results[name].reshape(-1, samples) - exact[:, None]
         half_width = results[f"{name}_half_width"].reshape(-1, samples)
         assert (half_width <= tolerance).all()

@@ -13,7 +13,7 @@ from sweep.analysis.scene_results.interface_reports import (
     make_reports,
     quantise_and_clip,
 )
-from sweep.model.pointcloud.pairing import TRUE_FLAG, UNCONFIRMED_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG, UNCONFIRMED_FLAG
 from sweep.spec import SpecError
 from sweep.spec.scene_sections import Interface
 
@@ -31,7 +31,11 @@ def make_shots(n=2000, beams=2, every=5e-3, *, noise=0.0, seed=1):
     time = np.arange(n) * every + 3.0
     speed = 40.0 + FALL * (time - 3.0)
     range_ = 3000.0 - 40.0 * (time - 3.0) - FALL * (time - 3.0) ** 2 / 2
-    shots = {"time": time, "beam": np.arange(n) % beams, "flags": np.full(n, TRUE_FLAG, np.uint8)}
+    shots = {
+        "time": time,
+        "beam": np.arange(n) % beams,
+        "flags": np.full(n, TRUE_RETURN_FLAG, np.uint8),
+    }
     shots |= {"range": range_ + noise * rng.normal(size=n)}
     shots |= {"radial_velocity": speed + noise * rng.normal(size=n)}
     shots |= dict.fromkeys(
@@ -122,7 +126,7 @@ def test_the_last_is_the_last_valid_shot_of_the_period():
         valid_shots = [
             i for i in range(400)
             if shots["beam"][i] == beam and int(i * 5e-3 / 50e-3 + 1e-9) == period
-            and shots["flags"][i] == TRUE_FLAG
+            and shots["flags"][i] == TRUE_RETURN_FLAG
         ]  # fmt: skip
         assert reports["shots"][row] == len(valid_shots) and reports["valid"][row] == bool(
             valid_shots

@@ -17,7 +17,7 @@ from sweep.analysis.scene_results.recordings import (
     find_axis_position,
     gather_point_cloud,
 )
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
 
 @pytest.fixture(scope="module")
@@ -51,17 +51,17 @@ def small_cloud(points, **changes):
     number = table["x"].size
     table |= {
         "range": np.arange(number, dtype=float),
-        "flags": np.full(number, TRUE_FLAG, np.uint8),
+        "flags": np.full(number, TRUE_RETURN_FLAG, np.uint8),
     }
     box = {
         axis: (float(table[axis].min()) - 1, float(table[axis].max()) + 1) for axis in WORLD_AXES
     }
     parts = {
         "points": table,
-        "path": {},
+        "flight_path": {},
         "thinned_points": ThinnedRows(number),
         "thinned_dropouts": ThinnedRows(0),
-        "n_outside": 0,
+        "n_false_points_outside": 0,
         "box": box,
     }
     parts["thinned_points"].append(table)
@@ -103,18 +103,18 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
         with_dropouts=True, with_path=True,
     )  # fmt: skip
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(**at.axis_indices, draw=draw)
-    true = (arrays.flags.values & TRUE_FLAG) > 0
+    true = (arrays.flags.values & TRUE_RETURN_FLAG) > 0
     position = arrays.position.values
     for k, axis in enumerate(WORLD_AXES):
         low, high = cloud.box[axis]
-        for inside in (position[true][:, k], cloud.dropouts[axis], cloud.path[axis]):
+        for inside in (position[true][:, k], cloud.dropouts[axis], cloud.flight_path[axis]):
             assert ((low < inside) & (inside < high)).all()
     box = np.array([cloud.box[axis] for axis in WORLD_AXES])
     false_points = position[(arrays.flags.values > 0) & ~true]
     n_beyond = ((false_points < box[:, 0]) | (false_points > box[:, 1])).any(axis=1).sum()
-    assert cloud.n_outside == n_beyond > 0
+    assert cloud.n_false_points_outside == n_beyond > 0
     assert cloud.points["x"].size == cloud.thinned_points.n_total - n_beyond
-    assert np.array_equal(cloud.path["z"], arrays.platform_position.values[:, 2])
+    assert np.array_equal(cloud.flight_path["z"], arrays.platform_position.values[:, 2])
 
 
 def test_crops_cut_points_and_dropouts_and_the_picture(weak):
@@ -156,7 +156,7 @@ def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, a
     )
     sheet = draw_cloud(cloud, tree, view=view, height_map=HeightMap.from_tree(tree))
     picture = sheet.axes[0]
-    true = (cloud.points["flags"] & TRUE_FLAG) > 0
+    true = (cloud.points["flags"] & TRUE_RETURN_FLAG) > 0
     (offsets,) = (c.get_offsets() for c in picture.collections if c.zorder == 3)
     expected = np.column_stack([cloud.points[axis][true] for axis in axes])
     assert np.array_equal(np.sort(offsets, axis=0), np.sort(expected, axis=0))
@@ -219,14 +219,14 @@ def test_false_and_lonely_values_do_not_stretch_a_scale_but_are_counted():
     values = np.concatenate([np.linspace(100, 200, 1000), [5000.0, -7.0]])
     trusted = np.arange(values.size) < 1000
     scale = point_styles.choose_colours("range", values, is_trusted=trusted, surfaces=[])
-    assert (scale.norm.vmin, scale.norm.vmax, scale.extend) == (100, 200, "both")
+    assert (scale.norm.vmin, scale.norm.vmax, scale.colour_bar_extend) == (100, 200, "both")
     lonely = point_styles.choose_colours(
         "range", values, is_trusted=np.ones(1002, bool), surfaces=[]
     )
     assert lonely.norm.vmin > 99 and lonely.norm.vmax < 201
     assert point_styles.choose_colours(
         "range", values[:1000], is_trusted=trusted[:1000], surfaces=[]
-    ).extend == ("neither")
+    ).colour_bar_extend == ("neither")
 
 
 def test_surfaces_and_kinds_of_points_have_names_and_colours_of_their_own():

@@ -13,7 +13,7 @@ from stored_scenes import GROUND_CENTRE, copy_without_last_cycles, run_flight_in
 from sweep.analysis.datasets import NotAStoreError, open_scene_tree
 from sweep.analysis.scene_results.point_export import POINT_COLUMNS, PointTable, export, write_las
 from sweep.analysis.scene_results.recordings import Recording
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.scenes.map_projection import metric_projection_wkt
 from sweep.spec import SpecError
 
@@ -108,7 +108,7 @@ def test_a_las_file_keeps_a_tenth_of_a_millimetre_and_all_other_fields(
         expected_points["scan_angle"], abs=0.0031
     )
     assert np.asarray(las.scan_angle).min() < -500 and np.asarray(las.scan_angle).max() > 500
-    true = (expected_points["flags"] & TRUE_FLAG) > 0
+    true = (expected_points["flags"] & TRUE_RETURN_FLAG) > 0
     assert np.array_equal(np.asarray(las.classification) == 7, ~true) and not true.all()
     decibels = 10 * np.log10(expected_points["snr"])
     assert np.asarray(las.intensity) == pytest.approx(100 * decibels, abs=0.51)

@@ -12,7 +12,7 @@ from sweep.analysis.datasets import NotAStoreError, open_scene_tree
 from sweep.analysis.scene_results import cloud_figures
 from sweep.analysis.scene_results.recordings import find_axis_position
 from sweep.analysis.study_figures import SceneResults, default_scene_figures, draw_figures
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
 
 def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_navigation(scene_store):
@@ -82,7 +82,7 @@ def test_a_scatter_shows_the_values_with_units_and_counts_false_points_beyond(sc
         rows, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
     )
     table, axes = rows.to_columns(), sheet.axes[0]
-    true = (table["flags"] & TRUE_FLAG) > 0
+    true = (table["flags"] & TRUE_RETURN_FLAG) > 0
     expected = np.column_stack([table["time"], table["range"]])
     assert np.array_equal(axes.collections[0].get_offsets(), expected[true])
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "range (m)")

@@ -9,9 +9,9 @@ from stored_scenes import GROUND_SLOPE, copy_without_last_cycles
 
 from sweep.analysis.datasets import open_scene_tree
 from sweep.analysis.scene_results.recordings import (
+    INFINITE_VALUE_LIMITS,
     POINT_KIND_BITS,
     QUANTITY_BY_NAME,
-    UNLIMITED_VALUES,
     ThinnedRows,
     find_axis_position,
     point_kind_indices,
@@ -19,7 +19,7 @@ from sweep.analysis.scene_results.recordings import (
     to_displayed_values,
 )
 from sweep.analysis.selection import parameters_at
-from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
+from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_RETURN_FLAG
 from sweep.spec import SpecError
 from sweep.spec.figure_sections import FIGURE_QUANTITIES as OF_SPECS
 
@@ -89,7 +89,7 @@ def test_altitude_is_the_height_over_the_slope_at_the_start_of_the_cycle(weak, a
 
 
 def test_beams_aim_at_the_slope_or_at_the_block(weak):
-    x, y, z = weak.aim_points(slice(0, weak.n_shots)).T
+    x, y, z = weak.beam_axis_hit_points(slice(0, weak.n_shots)).T
     on_slope = np.abs(z - GROUND_SLOPE * x) < 0.5
     on_block = (np.abs(x - 20) < 20.01) & (np.abs(y) < 15.01) & (np.abs(z) < 20.01)
     assert (on_slope | on_block).all() and on_slope.any() and on_block.any()
@@ -122,7 +122,9 @@ def test_stretches_outside_of_an_interval_of_time_are_not_read(weak, monkeypatch
 def test_rows_within_limits_are_kept_and_those_without_a_value_are_not():
     table = {"x": np.array([0.0, 1.0, np.nan, 3.0]), "y": np.arange(4.0)}
     assert select_rows_within(table, {"x": (0.5, np.inf)})["y"].tolist() == [1, 3]
-    assert select_rows_within(table, {"x": UNLIMITED_VALUES, "y": (-np.inf, 2)})["y"].tolist() == [
+    assert select_rows_within(table, {"x": INFINITE_VALUE_LIMITS, "y": (-np.inf, 2)})[
+        "y"
+    ].tolist() == [
         0,
         1,
     ]
@@ -148,7 +150,12 @@ def test_few_rows_are_not_thinned_and_none_are_none():
 
 def test_flags_say_one_kind_each_and_ratios_are_shown_in_decibels():
     flags = np.array(
-        [0, TRUE_FLAG, FLAG_BITS["sidelobe"] | FLAG_BITS["unconfirmed"], FLAG_BITS["false_alarm"]]
+        [
+            0,
+            TRUE_RETURN_FLAG,
+            FLAG_BITS["sidelobe"] | FLAG_BITS["unconfirmed"],
+            FLAG_BITS["false_alarm"],
+        ]
     )
     names = list(POINT_KIND_BITS)
     assert [names[i] if i >= 0 else "" for i in point_kind_indices(flags)] == [

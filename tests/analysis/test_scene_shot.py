@@ -16,7 +16,7 @@ from sweep.analysis.shot_spectra import BinGroup, DisplayedSegment, simulate_pre
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import unpack_effect_flags
 from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def one(scene_store, spec, recording, number, seed=None):
     effects = unpack_effect_flags(
         int(recording.read_array("effects", slice(number, number + 1))[0])
     )
-    prepared = prepare_eyepoint_shots(eyepoints, parameters, spec.surfaces(), effects)
+    prepared = prepare_eyepoint_shots(eyepoints, parameters, spec.surface_materials(), effects)
     return eyepoints, simulate_prepared_shot(prepared, parameters, seed=seed)
 
 
@@ -53,7 +53,7 @@ def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recor
                         arrays.surface.values[shot, draw], arrays.flags.values[shot, draw],
                         strict=True,
                     )
-                    if flags & TRUE_FLAG
+                    if flags & TRUE_RETURN_FLAG
                 }
             ) == 2
         )  # fmt: skip

@@ -90,13 +90,15 @@ def test_bins_of_complex_records_have_the_signs_and_the_places_of_their_frequenc
     doppler, far = 2 * velocity / 1550e-9, 2e12 * 2 * 6000.0 / 299792458.0
     for segment, beat in zip(shot.segments, (doppler - far, doppler, doppler + far), strict=True):
         expected = (beat / width + half) % 2**14 - half
-        peak_bins = segment.bins[segment.peak_index]
+        peak_bins = segment.bin_numbers[segment.peak_index]
         assert peak_bins == pytest.approx(expected, abs=3)
         assert segment.frequency[segment.peak_index] == peak_bins * width
-        assert segment.bins[0] == -half and segment.bins[-1] == half - 1
-        assert segment.bins[[g.peak_index for g in segment.bin_groups]].tolist() == [peak_bins]
+        assert segment.bin_numbers[0] == -half and segment.bin_numbers[-1] == half - 1
+        assert segment.bin_numbers[[g.peak_index for g in segment.bin_groups]].tolist() == [
+            peak_bins
+        ]
     rows = shot_spectra._segment_table(shot).rows
-    assert [row[3] for row in rows] == [s.bins[s.peak_index] for s in shot.segments]
+    assert [row[3] for row in rows] == [s.bin_numbers[s.peak_index] for s in shot.segments]
     assert [float(row[2]) for row in rows] == pytest.approx(
         [row[3] * width / 1e6 for row in rows], abs=1e-6
     )
@@ -150,9 +152,11 @@ def test_the_upper_axis_reads_true_range_and_velocity_at_the_beats_folded_or_not
     shot = shot_spectra.simulate_shot(parameters)
     for segment in shot.segments:
         at_peak = segment.frequency[segment.peak_index]
-        axis_value = float(shot_spectra.range_or_velocity_at(shot, segment, np.array(at_peak)))
+        axis_value = float(
+            shot_spectra.range_or_velocity_from_frequency(shot, segment, np.array(at_peak))
+        )
         # a bin is 0.343 m of range and 3.55 mm/s of velocity; the peak is within one
-        if segment.slope:
+        if segment.chirp_rate_ratio:
             assert axis_value == pytest.approx(distance, abs=0.35)
         else:
             assert axis_value == pytest.approx(velocity, abs=0.0036)

@@ -21,7 +21,7 @@ float_lists = st.lists(
 @given(values=float_lists, cut=st.integers(1, 9))
 def test_a_mean_is_the_exact_one_but_for_rounding(values, cut):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selection, "SUMMED_VALUES_MAX", cut)
+        patch.setattr(selection, "PARTIAL_SUM_VALUES_MAX", cut)
         statistics = Statistics.from_values(np.array(values))
     exact, size = sum(map(Fraction, values)), sum(abs(Fraction(v)) for v in values)
     assert abs(Fraction(statistics.mean) * len(values) - exact) <= size * len(values) * Fraction(

@@ -15,7 +15,7 @@ from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_COUNT_OUTPUTS,
     RUNNING_SUM_OUTPUTS,
-    SPECTRA_OUTPUTS,
+    SPECTRA_STUDY_OUTPUTS,
     STANDARD_ERROR_OUTPUTS,
 )
 from sweep.spec import Draws, GridSpec
@@ -82,7 +82,7 @@ def test_every_field_estimator_and_array_of_detectors_is_listed():
     fields = {name for name in named(DETECTORS) if name.startswith("detector.")}
     assert fields == {f"detector.{name}" for name in Detector.model_fields}
     assert set(ESTIMATORS) <= set(named(DETECTORS))
-    stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
+    stored = {*SPECTRA_STUDY_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
     about = named(DETECTORS.partition("## What is drawn")[2].partition("## False alarms")[0])
     assert {name for name in about if name != "array"} <= stored
     exported = named(DETECTORS.partition("try code outside of a study")[2])

@@ -102,7 +102,7 @@ def test_times_are_written_as_batch_systems_read_them(seconds, text):
 
 @pytest.mark.parametrize(("workers", "jobs"), [(1, 1), (8, 1), (9, 2), (40, 5)])
 def test_workers_come_in_whole_jobs(workers, jobs):
-    assert jobqueue.count_jobs(described("pbs"), workers) == jobs
+    assert jobqueue.jobs_needed(described("pbs"), workers) == jobs
 
 
 #: Takes a job, as PBS does, and runs it here; once it has run one it refuses the next.

@@ -44,7 +44,7 @@ def test_a_picture_of_anything_else_is_out_of_date(change, tmp_path, monkeypatch
                 (tmp_path / picture.file).write_bytes((ROOT / "docs" / picture.file).read_bytes())
                 assert pictures.is_current(picture)
     if change == "model":
-        monkeypatch.setattr("sweep.spec.specs.VERSION", "another")
+        monkeypatch.setattr("sweep.spec.specs.MODEL_VERSION", "another")
     elif change == "study":
         (tmp_path / "quickstart.yaml").write_text(spec.replace("[0.1 W,", "[0.2 W,"))
     elif change == "figure":

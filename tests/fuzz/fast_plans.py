@@ -15,7 +15,7 @@ def fast_planning() -> Iterator[None]:
     with (
         mock.patch.object(study_plan, "POINT_TIMING_SECONDS", 1e-3),
         mock.patch.object(study_plan, "FLIGHT_TIMING_SECONDS", 1e-3),
-        mock.patch.object(eyepoint_study, "TERRAIN_MAP_NODES_MAX", 24),
+        mock.patch.object(eyepoint_study, "TERRAIN_MAP_LONG_SIDE_NODES", 24),
         mock.patch.object(study_plan, "EFFECT_COST_POINTS_MAX", 1),
         mock.patch.object(study_plan, "EFFECT_COST_TILES_MAX", 1),
         mock.patch.object(study_plan, "EFFECT_COST_ROUNDS_MAX", 1),

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 from study_checks import Verdict, check_mistake, mistake_kind, warnings_as_errors
 
-from sweep.model.detection.detectors import FIXED_THRESHOLD
+from sweep.model.detection.detectors import FIXED_THRESHOLD_KIND
 from sweep.model.detection.estimators import DETECTOR_PREFIX
 from sweep.model.outputs import (
     CYCLE_VARIABLES,
     NAVIGATION_VARIABLES,
-    POINT_VARIABLES,
+    POINT_CLOUD_VARIABLES,
+    SHOT_GEOMETRY_VARIABLES,
     SHOT_STATISTIC_VARIABLES,
-    SHOT_VARIABLES,
 )
 from sweep.model.unsupported_shot import UnsupportedShotError
-from sweep.model.waveform import PEAKS_PATH, STRONGEST_PEAK, existing_segments
+from sweep.model.waveform import REPORTED_PEAKS_PATH, STRONGEST_PEAK, existing_segments
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import SceneSpec, SpecError, from_stored, load
@@ -90,8 +90,10 @@ def _undefined_statistics(study: FlightStudy, tile: FlightBlock) -> set[str]:
         undefined.add("pd_doppler")
     if study.ray_error_budget is None:
         undefined.add("beamlets_error")
-    is_threshold = parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD) == FIXED_THRESHOLD
-    has_probabilities = is_threshold and parameters.get(PEAKS_PATH) != STRONGEST_PEAK
+    is_threshold = (
+        parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD_KIND) == FIXED_THRESHOLD_KIND
+    )
+    has_probabilities = is_threshold and parameters.get(REPORTED_PEAKS_PATH) != STRONGEST_PEAK
     if study.spec.draws.draws_whole_spectra and not has_probabilities:
         undefined |= {name for name in SHOT_STATISTIC_VARIABLES if name.startswith(("pd_", "pfa_"))}
     return undefined
@@ -103,7 +105,7 @@ HIT_ONLY_OUTPUTS = ("beam_radial_velocity", "beam_acceleration", "beam_approach"
 
 def check_shots(eyepoint_results: Results) -> None:
     """Where the instrument is and what its beams hit: numbers throughout, but for misses."""
-    for name in (*SHOT_VARIABLES, *CYCLE_VARIABLES):
+    for name in (*SHOT_GEOMETRY_VARIABLES, *CYCLE_VARIABLES):
         is_missing = (
             np.isinf(eyepoint_results[name]) if name in ("beam_range", "true_altitude") else False
         )
@@ -125,7 +127,7 @@ def check_point_cloud(
     """Statistics, points and navigation: nan where there is nothing, and nowhere else."""
     expected_outputs = {
         *SHOT_STATISTIC_VARIABLES,
-        *POINT_VARIABLES,
+        *POINT_CLOUD_VARIABLES,
         *(NAVIGATION_VARIABLES if navigates else ()),
     }
     assert set(cloud) == expected_outputs, "outputs are missing, or too many"
@@ -152,7 +154,7 @@ def _check_points(cloud: Results, sees_surface: np.ndarray) -> None:
     """Points where flags say so."""
     flags = cloud["flags"]
     is_point, is_true_point = flags > 0, (flags & 1) > 0
-    for name, output in POINT_VARIABLES.items():
+    for name, output in POINT_CLOUD_VARIABLES.items():
         values = cloud[name]
         if output.dtype != "float64":
             continue

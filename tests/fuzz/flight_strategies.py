@@ -157,11 +157,11 @@ def scenes(draw: st.DrawFn, decades: float) -> dict[str, Any]:
 def _limit_cycles(mapping: dict[str, Any], folder: Path, cycles: int) -> None:
     """Set the scanners' rates so that the flight has but a few cycles."""
     try:
-        path = Platform.model_validate(mapping["platform"]).path.build_path(SpecFiles(folder))
+        path = Platform.model_validate(mapping["platform"]).path.build_trajectory(SpecFiles(folder))
     except ValueError:
         return
     for scanner in mapping["scanners"].values():
-        rate = (cycles + 0.01) / (path.stop - path.start)
+        rate = (cycles + 0.01) / (path.stop_time - path.start_time)
         scanner["rate"] = f"{rate:.6g} Hz"
         if scanner["kind"] == "line":
             scanner["line_rate"] = f"{rate * 0.7:.6g} Hz"

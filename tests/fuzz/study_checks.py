@@ -114,7 +114,9 @@ def check_mistake(mistake: Mistake) -> None:
 def check_results(spec: GridSpec, study: GridStudy, results: Results, block: int) -> None:
     """Results of a block: all there, of the right shape, and numbers that can be."""
     extent = study.grid.actual_block_shape(block)
-    assert set(results) == set(study.chunk_positions(block)), "outputs are missing, or too many"
+    assert set(results) == set(study.chunk_positions_of_block(block)), (
+        "outputs are missing, or too many"
+    )
     parameters = study.grid.parameters_of_block(block)
     no_doppler = np.asarray(parameters["instrument.receiver.architecture"]) == "direct"
     no_doppler = no_doppler | (np.char.find(parameters["instrument.chirp.segments"], "doppler") < 0)

@@ -93,7 +93,7 @@ BEAM_PATHS = (beam.DIVERGENCE_PATH, beam.WAIST_PATH, beam.OSCILLATOR_WAIST_PATH,
 """Parameters of which some alone make a beam, such as an aperture can make."""
 
 WORKING_VALUES = {
-    beam.DIVERGENCE_PATH: "50 urad", beam.COUPLING_PATH: beam.APERTURE,
+    beam.DIVERGENCE_PATH: "50 urad", beam.COUPLING_PATH: beam.APERTURE_COUPLING,
     FFT_SIZE: "2^10",  # the usual size would cost much
     ACQUISITION_DELAY_PATH: "13.4 us",  # the echo of 2 km is there from 13.34 us on
 }  # fmt: skip
@@ -255,14 +255,14 @@ def axis_generator(draw: st.DrawFn, rule: NumericRule, kind: str, decades: float
 
 def _all_distinct(rule: NumericRule, raw_values: list[Any]) -> bool:
     """Tell whether a mixed list holds no value twice."""
-    from sweep.spec.axes import read_axis_pieces
+    from sweep.spec.axes import read_axis_entries
     from sweep.spec.rules import FindingsError
 
     try:
         si_values = [
             value
-            for piece in read_axis_pieces(raw_values, rule, ())
-            for value in piece.si_values.tolist()
+            for entry in read_axis_entries(raw_values, rule, ())
+            for value in entry.si_values.tolist()
         ]
     except (FindingsError, QuantityError):
         return False

@@ -55,7 +55,7 @@ def parse_unit(rule: NumericRule, unit_text: str) -> Unit:
 
 def is_within_bounds(rule: NumericRule, values: list[float]) -> bool:
     """Tell whether SI values keep a rule's bounds."""
-    return rule.first_out_of_bounds(np.array(values, float)) is None
+    return rule.first_bound_violation(np.array(values, float)) is None
 
 
 def si_bound(rule: NumericRule, raw_bound: str | None, default: float) -> float:

@@ -6,8 +6,8 @@ from scipy import integrate, stats
 
 from sweep.model import evaluation, time_domain_truth
 from sweep.model.detection.bin_noise import (
-    alarm_equivalent_bins,
     first_circular_bin,
+    n_alarm_equivalent_bins,
     neighbour_noise_correlation,
 )
 from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION, bin_crossing_tails
@@ -21,7 +21,7 @@ NOISE_BINS = "instrument.processing.noise_bins"
 
 def log_segment_pfa(bins, level, correlation):
     """Natural logarithm of the probability that noise alone crosses in any of n adjacent bins."""
-    number = alarm_equivalent_bins(bins, threshold_ratio=level, correlation=correlation)
+    number = n_alarm_equivalent_bins(bins, threshold_ratio=level, correlation=correlation)
     return log_at_least_one_probability(-0.5 * np.square(level), number)
 
 
@@ -97,7 +97,7 @@ def test_correlations_of_neighbours_are_those_of_the_windows_squares():
     assert neighbour_noise_correlation(get_window("rectangular", 1000), 1000) == 0.0
     padded = neighbour_noise_correlation(get_window("rectangular", 1024), 2048)
     assert padded == pytest.approx(2 / np.pi, rel=1e-5)
-    assert alarm_equivalent_bins(0, threshold_ratio=5.0, correlation=known) == 0.0
+    assert n_alarm_equivalent_bins(0, threshold_ratio=5.0, correlation=known) == 0.0
 
 
 @pytest.mark.parametrize("level", [1e-3, 1.0, 6.55, 40.0])
@@ -124,7 +124,9 @@ def test_an_echo_on_dc_is_detected_as_often_as_in_drawn_records(table_4_1, name)
     ((_, shots),) = evaluation.prepare_shots(scene)
     drawn = []
     for i in range(6):
-        record = time_domain_truth.analytic_record(shots, i, 0, 0, with_range_walk=False).real
+        record = time_domain_truth.beamlet_analytic_signal(
+            shots, i, 0, 0, with_range_walk=False
+        ).real
         rng = np.random.default_rng(3)
         noisy = record + rng.normal(size=(10_000, 256)) * np.sqrt(shots.noise_variance[i])
         dc = np.abs(noisy @ window_samples(name, 256))

@@ -122,7 +122,10 @@ def drawn_spectra(scene, beat, bandwidth, order, draws, seed):
         rounding = np.sqrt(unfiltered.noise.variances.get("quantisation", 0.0))
         record = record + rounding * rng.normal(size=record.shape)
         spectra.append(np.fft.rfft(taper * record))
-    line = time_domain_truth.analytic_record(unfiltered, 0, 1, 0) / unfiltered.whitening_gain[1, 0]
+    line = (
+        time_domain_truth.beamlet_analytic_signal(unfiltered, 0, 1, 0)
+        / unfiltered.whitening_gain[1, 0]
+    )
     line = line * butterworth([beat], bandwidth, order)[0]
     return np.concatenate(spectra), np.fft.rfft(taper * line.real)
 

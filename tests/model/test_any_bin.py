@@ -100,7 +100,8 @@ class Instrument(NamedTuple):
                 shared = abs(shots.speckle.segment_correlations.up_down[0])
                 speckle = shared * speckle + np.sqrt(1 - shared**2) * of_down_alone
             beats = np.array(
-                [time_domain_truth.analytic_record(shots, 0, segment, b) for b in range(lines)]
+                [time_domain_truth.beamlet_analytic_signal(shots, 0, segment, b)
+                 for b in range(lines)]
             ) / shots.whitening_gain[segment, 0]  # fmt: skip
             signal = np.sqrt((self.spectra(beats.real) ** 2).sum(axis=0))
             echo = np.zeros(signal.size, bool)

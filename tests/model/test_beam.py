@@ -293,5 +293,5 @@ def test_axes_apart_cost_what_the_overlap_loses(case, table_4_1):
 
 def test_light_from_elsewhere_passes_one_mode(table_4_1):
     p = PARAMETER_DEFAULTS | table_4_1(coupling="single_mode", beam_divergence=2e-4)
-    diameter, angle = beam.receiving_aperture_and_angle(p)
+    diameter, angle = beam.receiver_diameter_and_view_angle(p)
     assert (np.pi / 4 * diameter * angle) ** 2 == pytest.approx(WAVELENGTH**2, rel=1e-12)

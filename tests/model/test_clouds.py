@@ -18,7 +18,7 @@ from sweep.model.effects.scintillation import turbulence_profile, two_way_log_va
 from sweep.model.evaluation import evaluate
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.scanner import LineScan, PointingJitter, cone_directions
-from sweep.model.outputs import POINT_VARIABLES, SHOT_STATISTIC_VARIABLES
+from sweep.model.outputs import POINT_CLOUD_VARIABLES, SHOT_STATISTIC_VARIABLES
 from sweep.model.pointcloud import point_cloud
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.eyepoints import Eyepoints, prepare_eyepoint_shots
@@ -27,7 +27,7 @@ from sweep.model.pointcloud.pairing import (
     MISPAIRED_FLAG,
     MISREAD_FLAG,
     SIDELOBE_FLAG,
-    TRUE_FLAG,
+    TRUE_RETURN_FLAG,
     UNCONFIRMED_FLAG,
 )
 from sweep.model.pointcloud.point_cloud import simulate_cloud
@@ -82,7 +82,7 @@ def _weak(table_4_1, tnr, power=1.6e-3):
     return scene_parameters(table_4_1, fft_size=2**16, power=power, tnr=tnr)
 
 
-KIND = TRUE_FLAG | FALSE_ALARM_FLAG | MISPAIRED_FLAG | MISREAD_FLAG | SIDELOBE_FLAG
+KIND = TRUE_RETURN_FLAG | FALSE_ALARM_FLAG | MISPAIRED_FLAG | MISREAD_FLAG | SIDELOBE_FLAG
 ON_GROUND, ON_TABLE, BOTH, BLIND = -1.0, 1.0, 1e-4, 60.0
 
 
@@ -92,8 +92,8 @@ ON_GROUND, ON_TABLE, BOTH, BLIND = -1.0, 1.0, 1e-4, 60.0
 def test_arrays_are_those_of_the_table(table_4_1):
     cloud = _cloud(_edge([ON_GROUND, BLIND]), _strong(table_4_1), draws=3, returns_max=2)
     sizes = {"shot": 2, "draw": 3, "return_number": 2, "xyz": 3}
-    assert cloud.keys() == SHOT_STATISTIC_VARIABLES.keys() | POINT_VARIABLES.keys()
-    for name, output in (SHOT_STATISTIC_VARIABLES | POINT_VARIABLES).items():
+    assert cloud.keys() == SHOT_STATISTIC_VARIABLES.keys() | POINT_CLOUD_VARIABLES.keys()
+    for name, output in (SHOT_STATISTIC_VARIABLES | POINT_CLOUD_VARIABLES).items():
         assert cloud[name].dtype == output.dtype, name
         assert cloud[name].shape == tuple(sizes[d] for d in output.dims), name
 
@@ -108,7 +108,7 @@ def test_each_surface_in_a_footprint_gives_its_point(table_4_1, method):
     for shot, expected in ((0, {0}), (1, {0, 1}), (2, {1})):
         is_point = cloud["flags"][shot] > 0
         assert (is_point.sum(axis=1) == len(expected)).all()
-        assert (cloud["flags"][shot][is_point] == TRUE_FLAG).all()
+        assert (cloud["flags"][shot][is_point] == TRUE_RETURN_FLAG).all()
         surface = cloud["surface"][shot]
         assert all(set(row[row >= 0]) == expected for row in surface)
         for number in expected:
@@ -257,7 +257,7 @@ def test_dropouts_of_two_surfaces_have_their_probabilities(table_4_1, method):
     joint_pd = groups.pd[:, 0, :2] * groups.pd[:, 2, :2]
     assert ((joint_pd > 0.05) & (joint_pd < 0.999)).all()
     np.testing.assert_array_equal(joint_pd[:, 0], cloud["pd_shot"])
-    right = (cloud["flags"] & (TRUE_FLAG | MISREAD_FLAG)) > 0
+    right = (cloud["flags"] & (TRUE_RETURN_FLAG | MISREAD_FLAG)) > 0
     counts = np.array([(right & (cloud["surface"] == s)).any(axis=2).sum(axis=1) for s in (0, 1)])
     # which is the stronger differs between the shots: the ground in one, the table in the other
     stronger = counts.argmax(axis=0)
@@ -331,21 +331,21 @@ def test_flags_tell_what_a_point_is(table_4_1, method):
         _cloud(shot_eyepoints, _weak(table_4_1, 7.6, power=power), draws=5000, method=method)
         for power in (5e-4, 1.35e-3)
     ]
-    cloud = {name: np.concatenate([part[name] for part in parts]) for name in POINT_VARIABLES}
+    cloud = {name: np.concatenate([part[name] for part in parts]) for name in POINT_CLOUD_VARIABLES}
     kinds, is_point = cloud["flags"] & KIND, cloud["flags"] > 0
-    known = [TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG, SIDELOBE_FLAG]
+    known = [TRUE_RETURN_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG, SIDELOBE_FLAG]
     assert np.isin(kinds[is_point], known).all()
     assert all(
         (kinds == kind).sum() > 20
-        for kind in (TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG)
+        for kind in (TRUE_RETURN_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG)
     )
-    truthful = np.isin(kinds, [TRUE_FLAG, MISREAD_FLAG])
+    truthful = np.isin(kinds, [TRUE_RETURN_FLAG, MISREAD_FLAG])
     np.testing.assert_array_equal(cloud["surface"] >= 0, truthful)
     for name in ("true_range", "true_radial_velocity"):
         np.testing.assert_array_equal(np.isfinite(cloud[name]), truthful)
     np.testing.assert_array_equal(np.isfinite(cloud["range"]), is_point)
     np.testing.assert_array_equal(np.isfinite(cloud["pd"]), is_point & (kinds != FALSE_ALARM_FLAG))
-    true = kinds == TRUE_FLAG
+    true = kinds == TRUE_RETURN_FLAG
     assert np.abs(cloud["range"] - cloud["true_range"])[true].max() < 4 * RANGE_BIN
     assert np.abs(cloud["radial_velocity"] - cloud["true_radial_velocity"])[true].max() < (
         4 * VELOCITY_BIN
@@ -380,7 +380,7 @@ def test_any_split_of_shots_and_of_draws_gives_the_same_bytes(table_4_1, method,
         cloud_part = _cloud(
             shot_eyepoints, parameters, keys=keys, first_draw=first, draws=number, method=method
         )
-        for name in POINT_VARIABLES:
+        for name in POINT_CLOUD_VARIABLES:
             part = cloud[name][:, first : first + number]
             assert cloud_part[name].tobytes() == part.tobytes(), (name, first)
         for name in SHOT_STATISTIC_VARIABLES:

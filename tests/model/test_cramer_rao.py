@@ -28,9 +28,12 @@ def test_the_bound_of_a_beat_is_that_of_the_fisher_information():
         ])  # fmt: skip
         least.append(np.linalg.inv(slopes @ slopes.T / deviation**2)[2, 2])
     cnr = amplitude**2 / (2 * deviation**2)
-    bound = estimators.beat_frequency_bound(cnr=cnr, n_samples=LENGTH, sample_rate=RATE)
+    bound = estimators.beat_frequency_cramer_rao_bound(cnr=cnr, n_samples=LENGTH, sample_rate=RATE)
     assert bound**2 == pytest.approx(np.mean(least), rel=1e-3)
-    assert estimators.beat_frequency_bound(cnr=0.0, n_samples=LENGTH, sample_rate=RATE) == np.inf
+    assert (
+        estimators.beat_frequency_cramer_rao_bound(cnr=0.0, n_samples=LENGTH, sample_rate=RATE)
+        == np.inf
+    )
 
 
 def test_the_ratio_before_the_fft_follows_from_that_after_it():
@@ -56,10 +59,12 @@ def test_the_largest_value_of_a_windowed_spectrum_is_as_far_off_as_it_says(name)
         x = [(turning * (-2j * np.pi * n / LENGTH) ** k).sum(axis=1) for k in range(3)]
         slope = 2 * (x[1] * x[0].conj()).real
         f -= slope / (2 * (abs(x[1]) ** 2 + (x[2] * x[0].conj()).real))
-    expected = estimators.windowed_peak_deviation(
+    expected = estimators.windowed_peak_frequency_deviation(
         cnr=cnr, window=get_window(name, LENGTH), sample_rate=float(LENGTH)
     )
-    bound = estimators.beat_frequency_bound(cnr=cnr, n_samples=LENGTH, sample_rate=float(LENGTH))
+    bound = estimators.beat_frequency_cramer_rao_bound(
+        cnr=cnr, n_samples=LENGTH, sample_rate=float(LENGTH)
+    )
     assert np.std(f) == pytest.approx(expected, rel=5 / np.sqrt(2 * draws) + 0.02)
     assert expected == pytest.approx(bound, rel=1e-9) if name == "rectangular" else expected > bound
 
@@ -73,7 +78,7 @@ def test_the_bound_of_range_and_velocity_is_that_of_beats_differentiated(doppler
     def beats(**at):
         return np.array([
             waveform.beat_frequency(sign, carrier=carrier, chirp_rate=2e12, **(target | at))
-            for sign, carrier in zip(waveform.DEFAULT_CHIRP_SLOPES, carriers, strict=True)
+            for sign, carrier in zip(waveform.DEFAULT_CHIRP_RATE_RATIOS, carriers, strict=True)
         ])  # fmt: skip
 
     slopes = np.stack([
@@ -114,7 +119,7 @@ def test_a_walking_phase_errs_as_the_straight_line_through_it_does(ratio):
     lags = np.abs(time[:, None] - time)
     covariance = 2 * np.pi * width * np.maximum(ratio * duration - lags, 0.0)
     expected = np.sqrt(slope @ covariance @ slope) / (2 * np.pi)
-    deviation = estimators.phase_noise_deviation(
+    deviation = estimators.phase_noise_beat_deviation(
         line_width=width, delay=ratio * duration, duration=duration
     )
     assert deviation == pytest.approx(expected, rel=0.02 if ratio < 0.01 else 1e-4)

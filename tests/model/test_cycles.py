@@ -24,7 +24,7 @@ from sweep.model.pointcloud.navigation import (
     STATUS_WITHHELD,
     solve_navigation,
 )
-from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG, TRUE_FLAG, UNCONFIRMED_FLAG
+from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG, TRUE_RETURN_FLAG, UNCONFIRMED_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
 from sweep.model.sampling import philox
 from sweep.spec.scene_sections import Navigation
@@ -52,7 +52,7 @@ def _points(shot_eyepoints, *, draws=1, returns=3, range_error=0.02, velocity_er
     """Points that state the truth exactly, one for each shot and draw, with standard errors."""
     shape = len(shot_eyepoints.time), draws, returns
     points = {"flags": np.zeros(shape, np.uint8)}
-    points["flags"][..., 0] = TRUE_FLAG
+    points["flags"][..., 0] = TRUE_RETURN_FLAG
     for name, value, error in (
         ("range", shot_eyepoints.range, range_error),
         ("radial_velocity", shot_eyepoints.radial_velocity, velocity_error),
@@ -124,7 +124,7 @@ def test_the_first_confirmed_point_of_a_shot_is_taken_whatever_it_is_in_truth():
     for name in points:
         points[name][..., 1] = points[name][..., 0]  # the truth moves to the second place
     points["flags"][..., 0] = FALSE_ALARM_FLAG | UNCONFIRMED_FLAG
-    points["flags"][..., 2] = TRUE_FLAG
+    points["flags"][..., 2] = TRUE_RETURN_FLAG
     for name in ("range", "radial_velocity"):
         for place in (0, 2):
             points[f"{name}_interpolated"][..., place] = 33.0
@@ -143,7 +143,7 @@ def test_shots_without_a_confirmed_point_are_left_out():
     shot_eyepoints = _seen(FOUR)
     points = _points(shot_eyepoints)
     points["flags"][0] = 0  # nothing
-    points["flags"][4 + 1] = TRUE_FLAG | UNCONFIRMED_FLAG  # nothing to trust
+    points["flags"][4 + 1] = TRUE_RETURN_FLAG | UNCONFIRMED_FLAG  # nothing to trust
     points["flags"][8:10] = 0  # two of four
     points["flags"][12:16] = 0  # all
     solution = _solved(shot_eyepoints, points, FOUR)
@@ -284,7 +284,7 @@ def test_mean_and_covariance_are_those_propagated_from_the_points(table_4_1, bea
     The interpolation is good to 1e-3 bins of bias there, under the 5 sigma of the mean.
     """
     shot_eyepoints, points = _flown(table_4_1, beams, method=method, power=30.0)
-    assert (points["flags"][:, :, 0] == TRUE_FLAG).all()
+    assert (points["flags"][:, :, 0] == TRUE_RETURN_FLAG).all()
     solution = _solved(shot_eyepoints, points, beams)
     assert (solution["velocity_status"] == STATUS_SOLVED).all()
     errors = {

@@ -12,7 +12,7 @@ from shot_helpers import prepare_single_category
 from sweep.model import evaluation, time_domain_truth
 from sweep.model.detection.added_crossings import (
     SERIES_TERMS_MAX,
-    edge_crossing_probability,
+    echo_edge_crossing_probability,
     fill_crossing_series,
 )
 from sweep.model.detection.echo_detection import (
@@ -23,9 +23,9 @@ from sweep.model.detection.echo_detection import (
 )
 from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
 from sweep.model.detection.sub_bin_interpolation import sidelobe_neighbour_noise_correlation
-from sweep.model.error_budget import AUTOMATIC
+from sweep.model.error_budget import SET_BY_TOLERANCE
 from sweep.model.spectrum.bin_spectrum import SpanArrays
-from sweep.model.spectrum.leakage import LeakageLimits, false_peak_probability_of_bins
+from sweep.model.spectrum.leakage import LeakageInputs, false_peak_probability_of_bins
 from sweep.model.spectrum.segment_spectra import segment_spectrum as segment_spectrum
 from sweep.model.window import window_samples
 
@@ -77,7 +77,7 @@ def assess(magnitude, sigma, level, floor, correlation=0.0):
     peak, exempted = mark_exempt_bins(span.magnitude, count, level, exempt, 0)
     assert exempted == exempt.sum()
     marked = set(np.flatnonzero(exempt))
-    limits = LeakageLimits(sigma, level, 0.0, correlation)
+    limits = LeakageInputs(sigma, level, 0.0, correlation)
     return peak, marked, false_peak_probability_of_bins(count, limits, floor, span, series)
 
 
@@ -95,7 +95,7 @@ def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
         for i, m in enumerate(magnitude):
             if i in exempt or m < floor * sigma:
                 if waits:
-                    joins = i in exempt and edge_crossing_probability(
+                    joins = i in exempt and echo_edge_crossing_probability(
                         m / sigma, magnitude[i - 1] / sigma, level / sigma, correlation
                     )
                     quiet, probability = quiet + joins * waits, probability + (1 - joins) * waits
@@ -104,7 +104,7 @@ def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
             crosses = 1 - (1 - q1(mpmath.mpf(m) / sigma, beta)) / (1 - q1(0, beta))
             joins = mpmath.mpf(0)
             if i > 0 and i - 1 in exempt:
-                joins = edge_crossing_probability(
+                joins = echo_edge_crossing_probability(
                     magnitude[i - 1] / sigma, m / sigma, level / sigma, correlation
                 )
             probability += (1 - crosses) * waits
@@ -200,8 +200,8 @@ def test_bins_below_the_floor_leak_no_more_together_than_is_allowed(tnr, chance)
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-5])
 def test_bins_taken_one_by_one_leak_to_within_the_tolerance(table_4_1, tolerance):
     """Many faint bins near a low threshold: below 0.1 sigma they leak 0.1 in some of these."""
-    scene = table_4_1(range=np.geomspace(200, 3000, 12), tnr=1.0, leakage_floor=AUTOMATIC)
-    scene |= {"accuracy.tolerance": tolerance, "accuracy.leakage_error": AUTOMATIC}
+    scene = table_4_1(range=np.geomspace(200, 3000, 12), tnr=1.0, leakage_floor=SET_BY_TOLERANCE)
+    scene |= {"accuracy.tolerance": tolerance, "accuracy.leakage_error": SET_BY_TOLERANCE}
     one_by_one = partial(evaluation.evaluate_segments, bin_by_bin=True)
     every = evaluation.evaluate(
         scene | {"accuracy.leakage_floor": 0.0}, segment_evaluator=one_by_one
@@ -230,7 +230,7 @@ def test_noise_on_the_samples_detects_and_alarms_as_often_as_said(window, table_
     scene = table_4_1(fft_size=256, beamlets=3, tnr=3.0, window=window, range=1800.0)
     shots, results = prepare_single_category(scene), evaluation.evaluate(scene)
     record = sum(
-        time_domain_truth.analytic_record(shots, 0, 0, b, with_range_walk=False).real
+        time_domain_truth.beamlet_analytic_signal(shots, 0, 0, b, with_range_walk=False).real
         for b in range(3)
     )
     rng = np.random.default_rng(51)

@@ -7,15 +7,15 @@ from shot_helpers import prepare_single_category
 from sweep.model.detection.detection_probability import (
     detect_in_spans,
     doppler_pd_given_chirps,
-    down_pd_given_up,
+    down_pd_given_up_result,
+    segment_strongest_peak_probabilities,
     shot_pd_and_miss,
-    strongest_peak_of_segments,
-    strongest_peak_of_shot,
+    shot_strongest_peak_probabilities,
 )
 from sweep.model.detection.echo_detection import (
-    independent_bin_pd,
-    independent_bin_pd_kernel,
-    pd_of_independent_bins,
+    pd_of_any_independent_bin,
+    pd_of_one_independent_bin,
+    pd_of_one_independent_bin_kernel,
 )
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.effects.circulator_leak import ISOLATION_PATH, LEAK_LENGTH_PATH
@@ -106,28 +106,32 @@ def test_pd_given_other_segments_adds_up_to_pd():
     """P(B) = P(A) P(B | A) + P(not A) P(B | not A)."""
     pd_up, pd_down = np.array([0.0, 0.2, 0.7, 1.0]), np.array([0.5, 0.6, 0.4, 0.3])
     pd_both = pd_up * pd_down + np.array([0.0, 0.05, 0.1, 0.0])
-    down = down_pd_given_up(pd_up, pd_down, pd_both)
-    np.testing.assert_allclose(pd_up * down.if_holds + (1 - pd_up) * down.if_fails, pd_down)
-    np.testing.assert_allclose(pd_up[1:] * down.if_holds[1:], pd_both[1:])
+    down = down_pd_given_up_result(pd_up, pd_down, pd_both)
+    np.testing.assert_allclose(
+        pd_up * down.pd_if_condition_holds + (1 - pd_up) * down.pd_if_condition_fails, pd_down
+    )
+    np.testing.assert_allclose(pd_up[1:] * down.pd_if_condition_holds[1:], pd_both[1:])
     one, doppler = pd_up + pd_down - 2 * pd_both, np.array([0.4, 0.5, 0.6, 0.7])
     added = one * np.array([0.5, 0.6, 0.7, 0.8])
     conditional_pd = doppler_pd_given_chirps(
         doppler, one, added, np.array([True, True, True, False])
     )
-    np.testing.assert_allclose(conditional_pd.if_holds, [0.5, 0.6, 0.7, 0.7])
+    np.testing.assert_allclose(conditional_pd.pd_if_condition_holds, [0.5, 0.6, 0.7, 0.7])
     np.testing.assert_allclose(
-        one * conditional_pd.if_holds + (1 - one) * conditional_pd.if_fails, doppler
+        one * conditional_pd.pd_if_condition_holds
+        + (1 - one) * conditional_pd.pd_if_condition_fails,
+        doppler,
     )
 
 
 def test_a_segment_reports_the_echo_or_another_peak_or_none():
     pd = np.array([[0.3, 0.9], [0.5, 0.5], [0.6, 0.99]])
     loss, alarm = 0.2 * pd, np.array([[0.1, 0.5], [0.2, 0.2], [0.3, 0.0]])
-    segments = strongest_peak_of_segments(pd, 1 - pd, loss, alarm)
+    segments = segment_strongest_peak_probabilities(pd, 1 - pd, loss, alarm)
     none = (1 - alarm) * (1 - pd)
     np.testing.assert_allclose(segments.pd + segments.p_wrong_range + none, 1.0)
     np.testing.assert_allclose(segments.pd + segments.miss, 1.0)
-    shot = strongest_peak_of_shot(
+    shot = shot_strongest_peak_probabilities(
         segments,
         alarm,
         shared_speckle_gain=np.zeros(2),
@@ -144,8 +148,8 @@ def test_a_segment_reports_the_echo_or_another_peak_or_none():
 @pytest.mark.parametrize("n_bins", [1.0, 1.7, 12.0])
 def test_independent_bins_together_are_detected_as_the_echo(n_bins):
     pd = np.array([1e-30, 1e-9, 0.2, 0.999])
-    bin_pd = independent_bin_pd(pd, n_bins)
+    bin_pd = pd_of_one_independent_bin(pd, n_bins)
     np.testing.assert_allclose(bin_pd[2:], 1 - (1 - pd[2:]) ** (1 / n_bins), rtol=1e-12)
     for echo_pd, single in zip(pd, bin_pd, strict=True):
-        assert independent_bin_pd_kernel(echo_pd, n_bins) == pytest.approx(single, rel=1e-14)
-        assert pd_of_independent_bins(single, n_bins) == pytest.approx(echo_pd, rel=1e-12)
+        assert pd_of_one_independent_bin_kernel(echo_pd, n_bins) == pytest.approx(single, rel=1e-14)
+        assert pd_of_any_independent_bin(single, n_bins) == pytest.approx(echo_pd, rel=1e-12)

@@ -24,7 +24,7 @@ from sweep.model.sampling.draw_groups import (
     GroupMeans,
     grouped_uniforms,
 )
-from sweep.model.sampling.samplers import stopping_checks
+from sweep.model.sampling.samplers import stopping_check_draws
 
 CONFIDENCE = 0.95
 STREAM = 14
@@ -214,7 +214,7 @@ def test_half_widths_fall_to_students_and_those_of_independent_draws_bound_them(
 
 @pytest.mark.parametrize(("batch", "limit"), [(100, 20_000), (7, 3000), (128, 1000), (64, 100)])
 def test_tests_come_after_whole_groups(batch, limit):
-    ends = np.array(list(stopping_checks(batch, limit, GROUP_SIZE)))
+    ends = np.array(list(stopping_check_draws(batch, limit, GROUP_SIZE)))
     assert ends[-1] == limit and (np.diff(ends) > 0).all()
     late = ends[(ends >= 2 * GROUP_SIZE) & (ends < limit)]
     assert (late % GROUP_SIZE == 0).all()
@@ -253,7 +253,7 @@ def test_stopping_is_as_sure_as_promised_where_groups_do_not_help(pd, tolerance)
     sums = np.cumsum(values, axis=1, dtype=np.int32)
     group_means = values.reshape(n_trials, -1, GROUP_SIZE).mean(axis=2)
     is_open, is_covered = np.ones(n_trials, bool), np.zeros(n_trials, bool)
-    for n in stopping_checks(100, draws_max, GROUP_SIZE):
+    for n in stopping_check_draws(100, draws_max, GROUP_SIZE):
         n_groups = n // GROUP_SIZE
         if n_groups < 2:
             continue

@@ -22,7 +22,7 @@ from small_scenes import observe_shots, straight_flight
 
 from sweep.model import beam
 from sweep.model.detection.speckle_correlation import (
-    TRANSFORM_REACH_BINS,
+    TRANSFORM_REACH_CELLS,
     LinePairGradients,
     peak_bin_correlation,
     window_transform,
@@ -33,7 +33,7 @@ from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
 from sweep.model.sampling import speckle_lines
-from sweep.model.waveform import FAR_READING, beats_of_reading, range_velocity_of_beats
+from sweep.model.waveform import FAR_TARGET_READING, doppler_and_range_beat, range_velocity_of_beats
 from sweep.model.window import get_window
 
 PROCESSING = "instrument.processing."
@@ -105,7 +105,7 @@ def scatterers_reported(p, draws, seed):
         places[segment] = drawn.bins[segment][best] + delta
     width = float(np.ravel(shots.sample_rate)[0]) / shots.fft_size
     up, down = (places[segment] * width for segment in ("up", "down"))
-    beats = beats_of_reading(FAR_READING, up, down, 200e6)
+    beats = doppler_and_range_beat(FAR_TARGET_READING, up, down, 200e6)
     carrier = 299792458.0 / p["instrument.laser.wavelength"]
     chirp = (p["instrument.chirp.bandwidth"], p["instrument.chirp.duration"])
     distance, velocity = range_velocity_of_beats(*beats, carrier, *chirp)
@@ -124,7 +124,7 @@ def fan_of(spread, turn, shape="hann"):
     return speckle_lines.SpeckleLineGrid(
         np.array([spread]), np.array([turn]), rule, np.ones(1, np.int64), node, weight,
         speckle_lines.QUADRATURE_NODE_COUNTS, transform,
-        float(speckle_lines.TRANSFORM_SAMPLES_PER_BIN), 6.0, 0,
+        float(speckle_lines.TRANSFORM_SAMPLES_PER_CELL), 6.0, 0,
     )  # fmt: skip
 
 
@@ -169,7 +169,9 @@ def test_correlations_of_bins_are_the_sums_of_a_fine_grid_of_scatterers(shape):
     lines = LinePairGradients(
         tuple(distance), tuple(spread), rng.uniform(-2, 2, n), rng.uniform(0, 0.1, n)
     )
-    reach = np.minimum(5, TRANSFORM_REACH_BINS / lines.line_shift_max)  # no scatterer beyond counts
+    reach = np.minimum(
+        5, TRANSFORM_REACH_CELLS / lines.line_shift_max
+    )  # no scatterer beyond counts
     y = reach[:, None] * np.linspace(-1, 1, 20_001)
     first, second = (
         window_transform(w, d[:, None] - s[:, None] * y)
@@ -293,7 +295,7 @@ def test_three_segments_of_a_shot_are_detected_together(table_4_1):
     shots, draws = prepare_single_category(p), 8000
     detected, _, _ = scatterers_reported(p, draws, seed=3)
     error = np.sqrt(detected.mean() * (1 - detected.mean()) / draws)
-    assert shots.detection_settings.echo_bins == "peak_bin"
+    assert shots.detection_settings.echo_bin_rule == "peak_bin"
     for method in ("probabilities", "noise"):
         points = flown(p, method, draws)
         flags = points["flags"][0, :, 0]

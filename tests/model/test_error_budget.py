@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sweep.model import error_budget
-from sweep.model.error_budget import AUTOMATIC, ErrorBudget
+from sweep.model.error_budget import SET_BY_TOLERANCE, ErrorBudget
 from sweep.spec.sections import Accuracy as Section
 
 ERROR_BUDGET_DEFAULTS = {field.name: field.default for field in dataclasses.fields(ErrorBudget)}
@@ -33,12 +33,14 @@ def test_accuracy_fields_of_a_spec_are_error_budget_fields_with_the_same_default
 
 
 def test_errors_follow_from_the_tolerance_unless_they_are_given():
-    points = ErrorBudget(np.array([1e-1, 1e-3]), line_error=np.array([AUTOMATIC, 1e-5]))
+    points = ErrorBudget(np.array([1e-1, 1e-3]), line_error=np.array([SET_BY_TOLERANCE, 1e-5]))
     assert points.allowed_line_error.tolist() == [1e-1, 1e-5]
     assert points.allowed_leakage.tolist() == [0.05, 5e-4]
-    assert points.has_automatic_errors.all()
-    error_budget = ErrorBudget(1e-3, line_error=1e-5, leakage_error=np.array([1e-6, AUTOMATIC]))
-    assert error_budget.has_automatic_errors.tolist() == [False, True]
+    assert points.has_errors_set_by_tolerance.all()
+    error_budget = ErrorBudget(
+        1e-3, line_error=1e-5, leakage_error=np.array([1e-6, SET_BY_TOLERANCE])
+    )
+    assert error_budget.has_errors_set_by_tolerance.tolist() == [False, True]
 
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-6])

@@ -12,7 +12,7 @@ import sweep
 from sweep.model.geometry.scanner import BeamCycle
 from sweep.model.pointcloud.error_floor import ErrorFloor, apply_error_floor
 from sweep.model.pointcloud.navigation import solve_navigation
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.model.sampling import philox
 from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 from sweep.spec import SceneSpec
@@ -76,7 +76,7 @@ def _points(shot_eyepoints, draws, noise=0.0):
     """Points that state the truth but for noise of a share of its standard errors."""
     shape, random = (len(shot_eyepoints.time), draws, 1), np.random.default_rng(3)
     points = {
-        "flags": np.full(shape, TRUE_FLAG, np.uint8),
+        "flags": np.full(shape, TRUE_RETURN_FLAG, np.uint8),
         "position": np.full((*shape, 3), np.nan),
     }
     for name, error in NOISE.items():

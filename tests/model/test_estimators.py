@@ -9,7 +9,7 @@ from sweep.model.detection.detectors import SpectrumSettings, cached_window_samp
 from sweep.model.detection.estimators import (
     ESTIMATORS,
     jacobsen_coefficients,
-    position_error_at_sigma,
+    position_error_at_unit_signal,
 )
 from sweep.model.window import get_window
 
@@ -93,8 +93,10 @@ def errors(name, shape, length, decibel):
     delta = np.random.default_rng(9).uniform(-0.5, 0.5, DRAWS)
     spectrum, peak, setting = spectra(shape, length, delta, cnr)
     error = ESTIMATORS[name](spectrum, peak, setting) - BIN - delta
-    bound = estimators.beat_frequency_bound(cnr=cnr, n_samples=length, sample_rate=float(SIZE))
-    return error, bound, estimators.windowed_peak_deviation(
+    bound = estimators.beat_frequency_cramer_rao_bound(
+        cnr=cnr, n_samples=length, sample_rate=float(SIZE)
+    )
+    return error, bound, estimators.windowed_peak_frequency_deviation(
         cnr=cnr, window=w, sample_rate=float(SIZE)
     )  # fmt: skip
 
@@ -129,7 +131,7 @@ def test_the_standard_error_of_a_position_is_the_spread_of_estimates_in_noise(na
         fft_size=fft_size, sample_rate=1.0, window=window, noise_power=1.0, threshold=1.0,
         training=4, guard=1, rank=3, pfa=1e-6, complex_record=True,
     )  # fmt: skip
-    stated_error = position_error_at_sigma(name, window, fft_size)
+    stated_error = position_error_at_unit_signal(name, window, fft_size)
     peak, samples = fft_size // 5, np.arange(length)
     for delta in (0.0, 0.2, 0.45):
         phase = 2 * np.pi * ((peak + delta) * samples / fft_size + rng.random((number, 1)))

@@ -7,7 +7,7 @@ from sweep.model.detection import echo_detection
 from sweep.model.detection.added_crossings import (
     SERIES_TERMS_MAX,
     any_crossing_probability,
-    exclude_bins_joining_echo,
+    exclude_crossings_joining_echo,
     fill_crossing_series,
 )
 from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
@@ -20,7 +20,7 @@ from sweep.model.detection.speckle_crossing_rates import (
     add_entry_weights_of_bin,
     add_rates_by_speckle_power,
     add_rates_from_entry_weights,
-    count_entry_weights,
+    n_entry_weights,
     tabulate_crossing_rates,
 )
 from sweep.model.spectrum import leakage
@@ -63,7 +63,7 @@ def test_sums_by_table_entry_are_the_sums_bin_by_bin(level):
     table, rng = table_of(level), np.random.default_rng(11)
     amplitudes = np.exp(rng.uniform(np.log(1e-7), np.log(level + 60), 500))
     one_by_one, by_entry = np.zeros(N_SPECKLE_POWERS), np.zeros(N_SPECKLE_POWERS)
-    entry_weights = np.zeros(count_entry_weights(table))
+    entry_weights = np.zeros(n_entry_weights(table))
     for amplitude in amplitudes:
         add_rates_by_speckle_power(amplitude**2, 1.0, table, one_by_one)
         add_entry_weights_of_bin(amplitude**2, table, entry_weights)
@@ -94,7 +94,7 @@ def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
     level, correlation = float([4.5, 6.55, 9.0][seed % 3]), [-0.5, 0.0, 0.6][seed % 2]
     magnitude, exempt = run_at_random(seed, level)
     span = SpanArrays(magnitude.copy(), exempt, *np.zeros((2, magnitude.size + 8)))
-    limits = leakage.LeakageLimits(1.0, level, 0.0, correlation)
+    limits = leakage.LeakageInputs(1.0, level, 0.0, correlation)
     mean_by_table = leakage.false_peak_probability_of_bins_in_speckle(
         np.int64(magnitude.size), limits, 0.0, span, table_of(level)
     )
@@ -105,18 +105,18 @@ def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
             root = np.sqrt(SPECKLE_POWER_MAX * 2.0 ** (-k / per_octave))
             chances = np.where(exempt, 0.0, -np.expm1(-direct_rates(root * magnitude, level)))
             brightest = any_crossing_probability(chances, 0, chances.size)
-            exclude_bins_joining_echo(
+            exclude_crossings_joining_echo(
                 chances, 0, chances.size, magnitude, exempt, 1.0 / root, level / root, correlation
             )
             rate = -np.log1p(-min(any_crossing_probability(chances, 0, chances.size), 1 - 1e-15))
-            mean_leakage.append((np.log(max(rate, leakage.RATE_MIN)), brightest))
+            mean_leakage.append((np.log(max(rate, leakage.LEAKAGE_RATE_MIN)), brightest))
         return np.array([f[0] for f in mean_leakage]), mean_leakage[0][1]
 
     of_octaves, brightest = log_rates(1)
     per_octave = 1
     if brightest > leakage.OCTAVE_STEP_LEAKAGE_MAX:
         per_octave, (of_octaves, _) = POWERS_PER_OCTAVE_MAX, log_rates(POWERS_PER_OCTAVE_MAX)
-    expected = leakage.mean_leakage_in_speckle(of_octaves, per_octave)
+    expected = leakage.mean_leakage_from_log_rates(of_octaves, per_octave)
     assert mean_by_table == pytest.approx(expected, rel=5e-5, abs=1e-13)
 
 

@@ -6,7 +6,7 @@ from drawn_leakage import drawn_leakage
 
 from sweep.model.detection.added_crossings import (
     any_crossing_probability,
-    exclude_bins_joining_echo,
+    exclude_crossings_joining_echo,
 )
 from sweep.model.detection.echo_detection import mark_exempt_bins
 from sweep.model.detection.marcum import marcum_q1
@@ -37,10 +37,10 @@ def test_the_mean_of_few_powers_is_that_of_all(signals, level, per_octave):
     number = per_octave * leakage.N_SPECKLE_OCTAVES + 1
     few = chance(leakage.SPECKLE_POWER_MAX * 2.0 ** (-np.arange(number) / per_octave))
     few = np.minimum(few, 1 - 1e-15)
-    rates = np.log(np.maximum(-np.log1p(-few), leakage.RATE_MIN))
+    rates = np.log(np.maximum(-np.log1p(-few), leakage.LEAKAGE_RATE_MIN))
     expected = mean_over_power(chance)
     if expected > 1e-5:
-        assert leakage.mean_leakage_in_speckle(rates, per_octave) == pytest.approx(
+        assert leakage.mean_leakage_from_log_rates(rates, per_octave) == pytest.approx(
             expected, rel=0.02
         )
 
@@ -81,7 +81,7 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
             stays = marcum_q1(np.sqrt(u) * magnitude / sigma, np.array(level / sigma)).p / quiet
             chances = np.where(counts, np.maximum(1.0 - stays, 0.0), 0.0)
             noise, threshold = sigma / np.sqrt(u), level / np.sqrt(u)
-            exclude_bins_joining_echo(
+            exclude_crossings_joining_echo(
                 chances, 0, chances.size, magnitude, exempt, noise, threshold, near
             )
             raised.append(any_crossing_probability(chances, 0, chances.size))

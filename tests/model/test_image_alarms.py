@@ -21,7 +21,7 @@ def shots_with_image(parameters, ratio):
     """Shots whose image in the up-chirp's spectrum is ``ratio`` times the threshold."""
     for _ in range(2):
         ((_, shots),) = prepare_shots(parameters, EFFECTS)
-        image = float(evaluate_segments(shots).magnitude[0, 0] * shots.images.iq_gain)
+        image = float(evaluate_segments(shots).magnitude[0, 0] * shots.line_images.iq_image_gain)
         factor = (ratio * float(shots.threshold[0]) / image) ** 2
         parameters = parameters | {
             "instrument.laser.power": parameters["instrument.laser.power"] * factor

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from shot_helpers import parametrize_product
 
-from sweep.model.detection.estimators import beat_frequency_bound, carrier_to_noise_ratio
+from sweep.model.detection.estimators import beat_frequency_cramer_rao_bound, carrier_to_noise_ratio
 from sweep.model.detection.sub_bin_interpolation import (
     estimate_sub_bin_offset,
     in_phase_noise_correlations,
@@ -24,7 +24,7 @@ DRAWS = 20_000
 def least_error(w, ratio):
     """Cramer-Rao bound [bins] of a tone whose |X| on a bin is `ratio` sigmas."""
     cnr = carrier_to_noise_ratio(snr=ratio**2 / 2, window=w)
-    return float(beat_frequency_bound(cnr=cnr, n_samples=w.length, sample_rate=w.length))
+    return float(beat_frequency_cramer_rao_bound(cnr=cnr, n_samples=w.length, sample_rate=w.length))
 
 
 def _spectrum(name, position, *, length, fft_size, phase):

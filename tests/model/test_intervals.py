@@ -10,7 +10,7 @@ from scipy import stats
 
 from sweep.model.detection.marcum import marcum_q1
 from sweep.model.error_budget import (
-    COUNT_INTERVALS,
+    COUNT_INTERVAL_FUNCTIONS,
     bounded_mean_interval,
     clopper_pearson_interval,
     interval_half_width,
@@ -67,10 +67,10 @@ def coverage(estimate, interval, weight, truth):
 
 
 @pytest.mark.parametrize("n", NUMBERS)
-@pytest.mark.parametrize("name", COUNT_INTERVALS)
+@pytest.mark.parametrize("name", COUNT_INTERVAL_FUNCTIONS)
 def test_counts_are_as_sure_as_promised(name, n):
     k = np.arange(n + 1)
-    interval = COUNT_INTERVALS[name](successes=k, trials=n, confidence=CONFIDENCE)
+    interval = COUNT_INTERVAL_FUNCTIONS[name](successes=k, trials=n, confidence=CONFIDENCE)
     for p in CHANCES:
         coverage_share, step = coverage(k / n, interval, stats.binom.pmf(k, n, p), p)
         assert coverage_share >= CONFIDENCE - (step if name == "wilson" else 1e-12), p
@@ -81,7 +81,7 @@ def test_on_the_average_wilsons_own_interval_is_right_and_clopper_and_pearsons_w
     p = (np.arange(2000) + 0.5) / 2000
     weight = stats.binom.pmf(k, n, p[:, None])
     means = {}
-    for name, interval in COUNT_INTERVALS.items():
+    for name, interval in COUNT_INTERVAL_FUNCTIONS.items():
         low, high = interval(successes=k, trials=n, confidence=CONFIDENCE)
         means[name] = (weight * ((low <= p[:, None]) & (p[:, None] <= high))).sum(axis=1).mean()
     assert means["wilson"] == pytest.approx(CONFIDENCE, abs=0.004)

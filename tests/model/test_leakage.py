@@ -12,7 +12,7 @@ from sweep.model.detection.added_crossings import (
     SERIES_TERMS_MAX,
     any_crossing_probability,
     crossing_rate,
-    fill_added_crossings,
+    fill_added_crossing_probabilities,
     fill_crossing_series,
 )
 from sweep.model.evaluation import evaluate_segments, prepare_ray_traced_shots, prepare_shots
@@ -22,7 +22,7 @@ from sweep.model.spectrum.bin_spectrum import (
     FAR_LINE_LOG_ACCURACY,
     LineBundle,
     allocate_workspace,
-    compute_end_strengths_and_far_lines,
+    compute_end_amplitudes_and_far_lines,
     far_line_weight,
 )
 from sweep.model.spectrum.segment_spectra import SegmentResults, segment_spectrum
@@ -47,7 +47,8 @@ def compare(shots):
         error[name] = np.nanmax(np.abs(fast_values - slow_values) / scale)
     # Of the Doppler segment only draws need to know what leaks.
     listed, every = (
-        list_bin_groups(shots, groups_max=1, every_bin=k).leakage[:, 1] for k in (False, True)
+        list_bin_groups(shots, groups_max=1, every_bin=k).leakage_probability[:, 1]
+        for k in (False, True)
     )
     difference = np.nanmax(np.abs(listed - every) / np.maximum(every, 1e-20), initial=0.0)
     error["leakage"] = max(error["leakage"], difference)
@@ -78,18 +79,18 @@ def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(nam
     generator, shape = np.random.default_rng(5), get_window(name, 4096)
     prepared = line_shape_of_window(shape, 4096)
     layout, tabulated = prepared.layout, prepared.shape.envelope
-    field, gained = allocate_workspace(16).field, []
+    line_spectrum, gained = allocate_workspace(16).line_spectrum, []
     for degree in (0, 1, 2, 4, 6):
         places = np.append(generator.uniform(-half, half, 10), [-half, half])
         s = strengths_without_moments(places / half, degree, generator)
         n, total = places.size, abs(s).sum()
-        lines, bundle = field.lines, LineBundle(0, n, -half, half, total)
+        lines, bundle = line_spectrum.lines, LineBundle(0, n, -half, half, total)
         lines.position[:n], lines.re[:n], lines.im[:n] = places, s.real, s.imag
         clearance = float(layout.clearance_bins)
-        n_sources = compute_end_strengths_and_far_lines(
-            bundle, clearance, FAR_LINE_LOG_ACCURACY, layout, field
+        n_sources = compute_end_amplitudes_and_far_lines(
+            bundle, clearance, FAR_LINE_LOG_ACCURACY, layout, line_spectrum
         )
-        bound = far_line_weight(total, n_sources, layout, field.far_equivalent_lines)
+        bound = far_line_weight(total, n_sources, layout, line_spectrum.far_equivalent_lines)
         distances = np.geomspace(layout.clearance_bins + 1, 2000, 24) + generator.uniform(0, 1)
         y = half + distances[:, None] - places
         kernel = direct_transform(shape, y.ravel()).reshape(y.shape) * np.exp(1j * np.pi * y)
@@ -118,7 +119,7 @@ def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     # Up to Nyquist and beyond: images are as near as the lines at some points, far at others.
     parameters["target.radial_velocity"] = generator.uniform(-470.0, 470.0, 300)
     ((_, shots),) = prepare_shots(parameters)
-    assert shots.images.are_summed
+    assert shots.line_images.are_summed
     spectra = evaluate_segments(shots)
     in_part = evaluate_segments(
         replace(
@@ -216,7 +217,7 @@ def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_s
     """As wide as the band, or all past DC or Nyquist, where only images make spectra even."""
     for seed, spread in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
         shots = drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, spread)
-        held(replace(shots, images=shots.images._replace(are_summed=image)))
+        held(replace(shots, line_images=shots.line_images._replace(are_summed=image)))
 
 
 @pytest.mark.parametrize("fft_size", [64, 255, 1023, 5000])
@@ -295,7 +296,7 @@ def test_added_crossings_have_their_digits(beta):
     fill_crossing_series(beta, series)
     scratch = np.zeros(32)
     scratch[: x.size] = x
-    fill_added_crossings(scratch, x.size, beta, series, out)
+    fill_added_crossing_probabilities(scratch, x.size, beta, series, out)
     with mpmath.workdps(40):
         for value, actual in zip(x, out, strict=False):
             xm, ym = mpmath.mpf(value), mpmath.mpf(y)

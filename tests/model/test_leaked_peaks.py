@@ -140,7 +140,7 @@ def test_any_split_of_draws_has_the_same_false_peaks(method, table_4_1):
     assert (at_once["flags"] & FALSE_ALARM_FLAG > 0).any()
     for first, number in ((0, 7), (7, 53)):
         part, _ = _flown(table_4_1, method, "the same in speckle", draws=number, first=first)
-        for name in outputs.POINT_VARIABLES:
+        for name in outputs.POINT_CLOUD_VARIABLES:
             assert part[name].tobytes() == at_once[name][:, first : first + number].tobytes(), name
 
 
@@ -194,21 +194,25 @@ def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
         bins_end=ends,
         bins=np.arange(bins.size),
         log_amplitude=np.log(bins),
-        group=np.zeros(bins.size, np.int64),
-        exempt_neighbour=np.zeros(bins.size),
+        fading_group=np.zeros(bins.size, np.int64),
+        exempt_neighbour_magnitude_ratio=np.zeros(bins.size),
         threshold_index=law,
         log_crossing_rates=table.log_crossing_rates[None],
         first_log_amplitude=np.array([table.first_log_amplitude]),
         log_amplitude_step=np.array([table.log_amplitude_step]),
         threshold_ratio=levels,
-        crossing_rate_sum=np.full((2, 3), sum(n * _rate(a, level) for a, n in signal.items())),
+        crossing_rate_sum_bound_at_mean=np.full(
+            (2, 3), sum(n * _rate(a, level) for a, n in signal.items())
+        ),
     )
-    means = leaks.mean_leakage()
-    within = {"rel": 1e-6, "abs": 1e-6 * leaked.LEAKAGE_MIN}
+    means = leaks.mean_leakage_probability()
+    within = {"rel": 1e-6, "abs": 1e-6 * leaked.LEAKAGE_PROBABILITY_MIN}
     assert means[1, 2] == pytest.approx(_leakage_by_quadrature(signal, level), **within)
     assert np.count_nonzero(means) == 1
     # Echoes fade each for itself.
-    separate = leaks._replace(group=np.arange(bins.size) % 2).mean_leakage()[1, 2]
+    separate = leaks._replace(fading_group=np.arange(bins.size) % 2).mean_leakage_probability()[
+        1, 2
+    ]
     halves = [dict(zip(*np.unique(half, return_counts=True), strict=True))
               for half in (bins[::2], bins[1::2])]  # fmt: skip
     stays = [1 - _leakage_by_quadrature(half, level) for half in halves]
@@ -273,7 +277,7 @@ def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1
     assert _difference(places, first_bins) < _allowed(draws, draws)
     assert _difference(sizes, own_size) < _allowed(draws, draws)
     # The mean over speckle, or the closed form of a steady echo, is their share.
-    expected = leaks.mean_leakage()[0, 0] if fades else groups.leakage[0, 0]
+    expected = leaks.mean_leakage_probability()[0, 0] if fades else groups.leakage_probability[0, 0]
     assert share == pytest.approx(expected, abs=5 * math.sqrt(0.25 / draws))
 
 
@@ -330,7 +334,7 @@ def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, ta
     groups, listed = leaked.find_groups_and_leakage_bins(shots, 4)
     groups_without = list_bin_groups(shots, with_leakage=False)
     for name, values in groups._asdict().items():
-        if name != "leakage":
+        if name != "leakage_probability":
             np.testing.assert_allclose(
                 values, getattr(groups_without, name), rtol=1e-12, err_msg=name
             )
@@ -341,11 +345,13 @@ def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, ta
         assert (part == same).all()
         for name in ("bins_begin", "bins_end", "bins"):
             assert (getattr(leaks, name) == getattr(other_leaks, name)).all()
-        assert (leaks.group == other_leaks.group).all() and (
+        assert (leaks.fading_group == other_leaks.fading_group).all() and (
             leaks.side_of_adjacent_echo_bin == other_leaks.side_of_adjacent_echo_bin
         ).all()
         np.testing.assert_allclose(leaks.log_amplitude, other_leaks.log_amplitude, rtol=1e-9)
-        np.testing.assert_allclose(groups.leakage[part], other_leaks.mean_leakage(), rtol=1e-9)
+        np.testing.assert_allclose(
+            groups.leakage_probability[part], other_leaks.mean_leakage_probability(), rtol=1e-9
+        )
         number += leaks.bins.size
     assert number > 50
 
@@ -353,11 +359,13 @@ def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, ta
 def test_faint_leakage_is_what_the_average_over_all_bins_together_gives(table_4_1):
     shots = _faint_shots(table_4_1, 1.0)
     ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
-    means = leaks.mean_leakage()
+    means = leaks.mean_leakage_probability()
     together = leaks._replace(
         mean_crossing_probability_sum=leaks.mean_crossing_probability_sum * np.nan
-    ).mean_leakage()
-    faint = (together > leaked.LEAKAGE_MIN) & (together < 0.9 * leaked.FAINT_LEAKAGE_MAX)
+    ).mean_leakage_probability()
+    faint = (together > leaked.LEAKAGE_PROBABILITY_MIN) & (
+        together < 0.9 * leaked.FAINT_LEAKAGE_PROBABILITY_MAX
+    )
     assert faint.sum() > 3
     np.testing.assert_array_equal(means[faint], leaks.mean_crossing_probability_sum[faint])
     np.testing.assert_allclose(means[faint], together[faint], rtol=5e-3)
@@ -367,7 +375,7 @@ def test_rates_stay_below_their_bounds_at_every_octave_of_speckle(table_4_1):
     shots = _faint_shots(table_4_1, 20.0)
     ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
     for octave in range(leaked.N_BOUND_SPECKLE_POWERS):
-        for j, s in np.ndindex(leaks.crossing_rate_sum.shape):
+        for j, s in np.ndindex(leaks.crossing_rate_sum_bound_at_mean.shape):
             bins = slice(leaks.bins_begin[j, s], leaks.bins_end[j, s])
             amplitudes = leaks.log_amplitude[bins] + 0.5 * octave * math.log(2.0)
             law = leaks.threshold_index[j]

@@ -9,8 +9,8 @@ from shot_helpers import line_shape_of_window, parametrize_product
 from sweep.model.spectrum.bin_spectrum import (
     LineBundle,
     allocate_workspace,
-    compute_field,
-    distance_below_level,
+    compute_line_spectrum,
+    falloff_distance,
 )
 from sweep.model.spectrum.segment_spectra import bin_tangents
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, get_window, window_samples
@@ -40,13 +40,15 @@ def transform(name, sizes, phase, y):
 def model_spectrum(sizes, power, places, weights, first, count, shape):
     """F of some bins as the model has it, (count,)."""
     n, places = places.size, places + shape.shift
-    field = allocate_workspace(count + 16).field
-    field.lines.position[:n] = places
-    field.lines.re[:n], field.lines.im[:n] = weights.real, weights.imag
+    line_spectrum = allocate_workspace(count + 16).line_spectrum
+    line_spectrum.lines.position[:n] = places
+    line_spectrum.lines.re[:n], line_spectrum.lines.im[:n] = weights.real, weights.imag
     bundle = LineBundle(0, n, places.min(), places.max(), 0.0)
     tangents = bin_tangents(sizes[0])
-    compute_field(first, count, bundle, 0.0, shape.shape, shape.layout, tangents, field)
-    return field.re[:count] + (0 if power else 1j * field.im[:count])
+    compute_line_spectrum(
+        first, count, bundle, 0.0, shape.shape, shape.layout, tangents, line_spectrum
+    )
+    return line_spectrum.re[:count] + (0 if power else 1j * line_spectrum.im[:count])
 
 
 @pytest.mark.parametrize(
@@ -94,5 +96,5 @@ def test_no_bin_beyond_a_lines_reach_is_above_the_level(name, drift):
     )
     magnitude = exact[np.rint(2 * y).astype(int) % (2 * size)]
     for level in 10.0 ** np.arange(-1, -8, -0.5) * magnitude.max():
-        reach = distance_below_level(level, 1.0, shape.shape.envelope)
+        reach = falloff_distance(level, 1.0, shape.shape.envelope)
         assert magnitude[abs(y - shape.shift) >= reach].max(initial=0.0) <= level

@@ -45,7 +45,9 @@ def test_each_beamlets_echo_falls_with_the_square_of_its_own_range(law, table_4_
     assert far[lit].max() / far[lit].min() > 2
     shots = prepare_single_category(scene)
     power = (
-        shots.echo_scales.beat_amplitude * shots.footprint.relative_amplitude[0] / (2 * 1.1 * GAIN)
+        shots.echo_scales.beat_amplitude_scale
+        * shots.footprint.relative_amplitude[0]
+        / (2 * 1.1 * GAIN)
     ) ** 2 / 1e-3
     scattered = down / np.pi if law == "lambert" else 1 / (2 * np.pi)
     expected = 0.1 * np.pi * 0.0125**2 * share * scattered / (100.0 * far) ** 2

@@ -48,8 +48,8 @@ def random_scene(table_4_1, seed, case):
     scene |= {f"instrument.receiver.{k}": v for k, v in FILTERS[receiver_filter].items()}
     return scene | {
         "instrument.receiver.record": record,
-        waveform.DOPPLER_SEGMENT_SLOPE_PATH: SLOPES[slopes][0],
-        waveform.DOWN_SEGMENT_SLOPE_PATH: SLOPES[slopes][1],
+        waveform.DOPPLER_CHIRP_RATE_RATIO_PATH: SLOPES[slopes][0],
+        waveform.DOWN_CHIRP_RATE_RATIO_PATH: SLOPES[slopes][1],
         waveform.SEGMENT_ORDER_PATH: str(rng.choice(waveform.SEGMENT_ORDERS)),
         waveform.SEGMENT_GAP_PATH: float(rng.choice([0.0, 20e-6])),
         "target.acceleration": rng.uniform(-20, 20, N_POINTS),
@@ -86,7 +86,7 @@ def test_the_planner_has_the_link_budget_of_the_shots(case, table_4_1):
     assert_equal(bin_noise_sigma, at_rest.bin_noise_sigma)
     assert_equal(points.threshold_ratio * bin_noise_sigma, at_rest.threshold)
     assert_equal(
-        points.beat_amplitude, at_rest.echo_scales.beat_amplitude * axis_amplitude(at_rest)
+        points.beat_amplitude, at_rest.echo_scales.beat_amplitude_scale * axis_amplitude(at_rest)
     )
     assert_equal(points.record.duration, at_rest.record.duration)
     assert_equal(points.record.bin_width, at_rest.sample_rate / at_rest.fft_size)
@@ -113,7 +113,9 @@ def test_the_planner_has_the_link_budget_of_the_shots(case, table_4_1):
             amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,
         )
     )
-    magnitude = shots.echo_scales.beat_amplitude * axis_amplitude(shots) * shots.window.sum / 2
+    magnitude = (
+        shots.echo_scales.beat_amplitude_scale * axis_amplitude(shots) * shots.window.sum / 2
+    )
     signal_ratio = magnitude * pole_gain * shots.whitening_gain[shots.has_segment]
     assert_equal(points.line_magnitude_over_sigma, signal_ratio / shots.bin_noise_sigma, shape)
 
@@ -143,7 +145,7 @@ def test_noise_of_the_echo_moves_no_threshold_and_the_adcs_passes_no_filter():
     assert noise.variance_without_echo.tolist() == [4.0, 6.0]
     assert noise.variance.tolist() == [8.0, 6.0]
     assert noise.adc_noise_fraction == pytest.approx([1 / 4, 1 / 6])
-    clipped = NoiseBudget(noise.variances, gain=0.5)
+    clipped = NoiseBudget(noise.variances, variance_factor=0.5)
     assert clipped.variance.tolist() == [4.0, 3.0]
     assert clipped.variance_without_echo.tolist() == [4.0, 6.0]
     assert clipped.with_sources(thermal=np.array(2.0)).variance.tolist() == [5.0, 4.0]
@@ -156,9 +158,11 @@ def test_a_budget_of_a_tile_broadcasts(table_4_1):
     tile = {path: np.asarray(value).flat[0] for path, value in scene.items()}
     budget = LinkBudget(tile | {"target.range": ranges, "instrument.laser.power": powers})
     assert budget.target.delay.shape == (7, 1)
-    assert budget.echo_scales.echo_power.shape == (7, 2)
+    assert budget.echo_scales.echo_power_scale.shape == (7, 2)
     for i, j in np.ndindex(7, 2):
         of_point = LinkBudget(
             tile | {"target.range": ranges[i, 0], "instrument.laser.power": powers[0, j]}
         )
-        assert_equal(budget.echo_scales.echo_power[i, j], of_point.echo_scales.echo_power, ())
+        assert_equal(
+            budget.echo_scales.echo_power_scale[i, j], of_point.echo_scales.echo_power_scale, ()
+        )

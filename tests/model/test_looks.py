@@ -12,7 +12,7 @@ from sweep.analysis.shot_spectra import simulate_shot
 from sweep.model import time_domain_truth, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import bin_noise
-from sweep.model.detection.added_crossings import exclude_bins_joining_echo
+from sweep.model.detection.added_crossings import exclude_crossings_joining_echo
 from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION
 from sweep.model.detection.estimators import ESTIMATOR_PREFIX
 from sweep.model.detection.looks import (
@@ -21,7 +21,7 @@ from sweep.model.detection.looks import (
     LOOKS_SPECKLE_PATH,
     LOOKS_VOTES_PATH,
     Looks,
-    coherent_gain,
+    coherent_amplitude_factor,
 )
 from sweep.model.detection.marcum import at_least_one_probability, marcum_q1
 from sweep.model.evaluation import evaluate, evaluate_segments, prepare_shots
@@ -44,7 +44,10 @@ def amplitudes(rng, *size):
 
 def drawn_detections(looks, speckle, signals, level, correlation=1.0):
     """Share of draws in which each of two segments is detected, and both are."""
-    rng, magnitudes = np.random.default_rng([looks.number, len(looks.combine), len(speckle)]), []
+    rng, magnitudes = (
+        np.random.default_rng([looks.number, len(looks.combine_kind), len(speckle)]),
+        [],
+    )
     n_speckles = looks.number if looks.has_independent_speckle else 1
     for _ in range(DRAWS // PIECE):
         first = amplitudes(rng, PIECE, n_speckles)
@@ -56,8 +59,8 @@ def drawn_detections(looks, speckle, signals, level, correlation=1.0):
             np.abs(a * z + np.sqrt(2) * amplitudes(rng, PIECE, looks.number)) ** 2
             for a, z in zip(signals, pair, strict=True)
         ]
-        if looks.combine == "binary":
-            magnitudes.append([(p >= level**2).sum(axis=1) >= looks.votes for p in power])
+        if looks.combine_kind == "binary":
+            magnitudes.append([(p >= level**2).sum(axis=1) >= looks.votes_needed for p in power])
         else:
             magnitudes.append([p.mean(axis=1) >= level**2 for p in power])
     up, down = np.concatenate(magnitudes, axis=1)
@@ -159,7 +162,7 @@ def test_alarms_and_thresholds_are_those_of_gamma_and_binomial_laws():
         )
 
 
-@pytest.mark.parametrize("looks", [Looks(8), Looks(8, "binary", 3)], ids=lambda it: it.combine)
+@pytest.mark.parametrize("looks", [Looks(8), Looks(8, "binary", 3)], ids=lambda it: it.combine_kind)
 def test_alarms_of_correlated_bins_are_those_of_drawn_records(looks):
     """Hamming, 1024 bins, twice padded: 5 sigma of 4000 segments, and the 3 % of one look."""
     rng, length, level = (
@@ -173,12 +176,12 @@ def test_alarms_of_correlated_bins_are_those_of_drawn_records(looks):
     for _ in range(number):
         records = rng.normal(size=(looks.number, length)) * taper
         power = np.abs(np.fft.rfft(records, 1024)[:, 16:496]) ** 2
-        if looks.combine == "binary":
-            n_alarms += ((power >= (level * sigma) ** 2).sum(axis=0) >= looks.votes).any()
+        if looks.combine_kind == "binary":
+            n_alarms += ((power >= (level * sigma) ** 2).sum(axis=0) >= looks.votes_needed).any()
         else:
             n_alarms += (power.mean(axis=0) >= (level * sigma) ** 2).any()
     correlation = bin_noise.neighbour_noise_correlation(window.get_window("hamming", length), 1024)
-    bins = bin_noise.alarm_equivalent_bins(
+    bins = bin_noise.n_alarm_equivalent_bins(
         480, threshold_ratio=level, correlation=correlation, looks=looks
     )
     expected = float(at_least_one_probability(2e-3, bins))
@@ -302,14 +305,18 @@ def test_acceleration_costs_coherent_looks_what_exact_records_lose(scene):
     ((_, shots),) = prepare_shots(parameters, ("segment_motion", "image"))
     bins = np.exp(-2j * np.pi * 100 * np.arange(1024) / 1024)
     record = partial(
-        time_domain_truth.analytic_record, point=0, segment=0, beamlet=0, with_acceleration=True
+        time_domain_truth.beamlet_analytic_signal,
+        point=0,
+        segment=0,
+        beamlet=0,
+        with_acceleration=True,
     )
     sums = np.array([(record(look) * bins).sum() for look in shots.split_by_look()])
     place = np.arange(8) - 3.5
     phase = np.unwrap(np.angle(sums))
     turned = sums * np.exp(-1j * np.polyfit(place, phase, 1)[0] * place)
     lost = np.abs(turned.mean()) / np.abs(sums).mean()
-    expected = coherent_gain(
+    expected = coherent_amplitude_factor(
         Looks(8, "coherent"), acceleration=np.array(80.0),
         carrier=np.asarray(shots.waveform.carriers[0]), look_period=np.array(20e-6),
     )  # fmt: skip
@@ -395,7 +402,9 @@ def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
     scaled = sigma * np.sqrt((level / sigma) ** 2 - 2 * 3 / 4)
     near = shots.detection_rule.sidelobe_neighbour_noise_correlation
     product = 1 - np.prod(1 - chances)
-    exclude_bins_joining_echo(chances, 0, chances.size, magnitude, is_echo, sigma / 2, scaled, near)
+    exclude_crossings_joining_echo(
+        chances, 0, chances.size, magnitude, is_echo, sigma / 2, scaled, near
+    )
     expected = 1 - np.prod(1 - chances)
     assert 1e-3 < expected < product < 0.9
     assert outputs["p_leakage_up"][0] == pytest.approx(expected, rel=1e-2)

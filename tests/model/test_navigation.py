@@ -99,7 +99,7 @@ def test_four_beams_can_spare_any_one_and_three_can_not():
         measured = np.where(valid, beams @ MOVING, np.nan)
         solution = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
         assert (solution.status == status).all()
-        assert (solution.is_used == valid).all() and (solution.degrees_of_freedom == 0).all()
+        assert (solution.is_beam_used == valid).all() and (solution.degrees_of_freedom == 0).all()
         if status == STATUS_SOLVED:
             np.testing.assert_allclose(solution.value, np.tile(MOVING, (4, 1)), atol=1e-12)
             full = solve_velocity(
@@ -160,12 +160,12 @@ def test_true_beams_are_suspect_at_the_stated_level(beams):
 def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     """Far out, it is found whenever the fit without it passes: in 1 - level of the draws."""
     solution = _drawn_with_alarm(SIXTEEN, alarm=50.0, beam=beam, seed=7)
-    right = (solution.status == STATUS_EXCLUDED) & ~solution.is_used[:, beam]
+    right = (solution.status == STATUS_EXCLUDED) & ~solution.is_beam_used[:, beam]
     assert is_within_5_sigma(right.sum(), 1 - LEVEL)
     assert (solution.status[~right] == STATUS_WITHHELD).all() and np.isnan(
         solution.value[~right]
     ).all()
-    assert (solution.is_used[right].sum(axis=1) == 15).all() and (
+    assert (solution.is_beam_used[right].sum(axis=1) == 15).all() and (
         solution.degrees_of_freedom[right] == 12
     ).all()
     left = np.delete(SIXTEEN, beam, axis=0)
@@ -186,7 +186,7 @@ def test_the_power_of_the_test_is_that_of_the_noncentral_chi_square():
     assert is_within_5_sigma((solution.status != STATUS_SOLVED).sum(), power)
     excluded = solution.status == STATUS_EXCLUDED
     assert (
-        ~solution.is_used[excluded, beam]
+        ~solution.is_beam_used[excluded, beam]
     ).mean() > 0.8  # a beam told from 15 others: 1/16 by chance
 
 
@@ -206,7 +206,7 @@ def test_level_ground_tells_which_of_four_ranges_is_false():
     known = {"direction": FOUR, "range": ranges, "standard_error": 0.1, "test_level": LEVEL}
     solution = altitude(**known, slope=0.0)
     right = (solution.status == STATUS_EXCLUDED) & (
-        solution.is_used.argmin(axis=1) == np.arange(DRAWS) % 4
+        solution.is_beam_used.argmin(axis=1) == np.arange(DRAWS) % 4
     )
     assert is_within_5_sigma(right.sum(), 1 - LEVEL)
     assert (
@@ -341,5 +341,5 @@ def test_a_beam_that_grazes_the_fitted_plane_does_not_run_off_with_the_weight():
     ranges = _ranges(SIXTEEN, 100.0)
     ranges[0] = 9000.0
     solution = altitude(direction=SIXTEEN, range=ranges, standard_error=0.1, test_level=1e-3)
-    assert solution.status == STATUS_EXCLUDED and not solution.is_used[0]
+    assert solution.status == STATUS_EXCLUDED and not solution.is_beam_used[0]
     assert solution.value == pytest.approx(100.0, rel=1e-12)

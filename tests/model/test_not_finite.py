@@ -16,7 +16,7 @@ from small_scenes import (
 from sweep.model.detection.looks import Looks
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.ray_casting import RayCaster
-from sweep.model.pointcloud.bin_groups import GroupBounds, _list_groups
+from sweep.model.pointcloud.bin_groups import GroupBinIndices, _list_strongest_groups
 from sweep.model.pointcloud.eyepoints import HIT_RANGE_MIN, prepare_eyepoint_shots
 from sweep.model.preparation import require_finite
 from sweep.model.spectrum.search_restriction import SearchBand, _mark_searched_echoes
@@ -32,10 +32,10 @@ def test_lists_of_groups_end_wherever_a_magnitude_is_not_finite(value, level):
     for place in range(6):
         magnitude = np.array([1.0, 3.0, 4.0, 1.0, 5.0, 1.0])
         magnitude[place] = value
-        bounds = GroupBounds(*np.full((3, 4), -1))
+        bounds = GroupBinIndices(*np.full((3, 4), -1))
         peak = int(np.nanargmax(magnitude))
         exempt = np.zeros(6, np.bool_)
-        assert _list_groups(magnitude, exempt, peak, level, bounds) <= 4
+        assert _list_strongest_groups(magnitude, exempt, peak, level, bounds) <= 4
         _mark_searched_echoes(magnitude, exempt, 0, level, 0, SearchBand(0, 6, 0), np.array([2.0]))
 
 
@@ -59,7 +59,7 @@ def shots(table_4_1):
     [("target", "range", "the range"),
      ("footprint", "relative_amplitude", "beamlets' echoes"),
      ("footprint", "relative_range_offset", "beamlets' ranges"),
-     ("echo_scales", "echo_power", "echo's power")],
+     ("echo_scales", "echo_power_scale", "echo's power")],
 )  # fmt: skip
 def test_a_shot_with_a_number_that_is_not_finite_is_named(
     table_4_1, record_name, name, words, value

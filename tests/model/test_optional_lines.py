@@ -19,7 +19,7 @@ from sweep.model.sampling import philox
 from sweep.model.sampling.samplers import simulate_draws
 from sweep.model.spectrum import segment_spectra
 from sweep.model.spectrum.segment_spectra import POINTS_PER_BATCH
-from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
+from sweep.model.waveform import DEFAULT_CHIRP_RATE_RATIOS
 from sweep.model.window import direct_transform, window_samples
 
 AGREEMENT = 1e-9
@@ -88,7 +88,7 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
             )
         if distance < 1:  # beats next to DC: images are there, and were left out
             summed = evaluate_segments(
-                replace(shots, images=shots.images._replace(are_summed=True))
+                replace(shots, line_images=shots.line_images._replace(are_summed=True))
             )
             assert abs(summed.magnitude[1] / evaluate_segments(shots).magnitude[1] - 1) > 1e-3
 
@@ -124,7 +124,7 @@ def test_without_leakage_detections_stay_what_they_are(table_4_1, fft_size, imag
     for seed, spread in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
         shots = bundles(table_4_1, 10 * fft_size + seed, fft_size, spread)
         magnitude, pd = same_detections(
-            replace(shots, images=shots.images._replace(are_summed=image))
+            replace(shots, line_images=shots.line_images._replace(are_summed=image))
         )
         assert magnitude < 1e-11 and pd < 1e-12
 
@@ -181,9 +181,11 @@ def exact(shots, i, segment, shifts):
     cycles = np.zeros(length)
     for error in shots.echo_record.phase_errors:
         values = error.select_arguments(segment, np.array([i]))
-        cycles = cycles + error.phase(x, sign=DEFAULT_CHIRP_SLOPES[segment], **values)[0]
+        cycles = (
+            cycles + error.phase_function(x, sign=DEFAULT_CHIRP_RATE_RATIOS[segment], **values)[0]
+        )
     records = [
-        time_domain_truth.analytic_record(shots, i, segment, b, with_range_walk=False)
+        time_domain_truth.beamlet_analytic_signal(shots, i, segment, b, with_range_walk=False)
         for b in range(shots.footprint.n_beamlets)
     ]
     total = np.zeros(half)
@@ -193,7 +195,7 @@ def exact(shots, i, segment, shifts):
             spectrum = np.fft.fft(turn * record, shots.fft_size) / 2
             line, image = (
                 spectrum[:half],
-                spectrum[-np.arange(half)].conj() * shots.images.are_summed,
+                spectrum[-np.arange(half)].conj() * shots.line_images.are_summed,
             )
             power = (
                 abs(line) ** 2 + abs(image) ** 2
@@ -206,12 +208,10 @@ def exact(shots, i, segment, shifts):
 
 def width_by_hermite(shots, i):
     """Shifts [bins of fs/L] of a Gaussian line, by a rule of its own: Gauss and Hermite's."""
-    if shots.laser_line.gaussian_width is None:
+    if shots.laser_line.gaussian_fwhm is None:
         return np.zeros(1), np.ones(1)
     place, weight = np.polynomial.hermite_e.hermegauss(61)
-    bins = (
-        shots.laser_line.gaussian_width[i] * np.broadcast_to(shots.record.duration, shots.size)[i]
-    )
+    bins = shots.laser_line.gaussian_fwhm[i] * np.broadcast_to(shots.record.duration, shots.size)[i]
     return DEVIATION_PER_FWHM * bins * place, weight / weight.sum()
 
 

@@ -70,7 +70,7 @@ def error(shots, degree):
         peak = shots.footprint.relative_amplitude[shots.footprint.row_of_point[i]]
         peak = np.sqrt((peak**2).sum()) if shots.footprint.adds_powers else peak.sum()
         peak *= (
-            np.broadcast_to(shots.echo_scales.beat_amplitude, shots.size)[i]
+            np.broadcast_to(shots.echo_scales.beat_amplitude_scale, shots.size)[i]
             * shots.window.sum
             / 2
             * gain
@@ -89,7 +89,7 @@ def error(shots, degree):
 def test_lines_in_cells_are_as_near_as_cells_can_be(window, phases, table_4_1):
     number = 2 if "kaiser" in window else 12  # whose whole spectrum takes its time
     shots = drawn_scene(table_4_1, number, window=window, phases=phases)
-    shots = replace(shots, images=shots.images._replace(are_summed=False))
+    shots = replace(shots, line_images=shots.line_images._replace(are_summed=False))
     nearest, shared = DEPOSIT[window]
     assert 1e-3 < error(shots, 0) < nearest
     # Powers have twice the bandwidth: 2^10 times the remainder.
@@ -115,7 +115,7 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
             edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
             assert np.abs(spectrum_values - exact[bins])[edge].max() < 1e-8 * exact.max()
             without = segment_spectra.segment_spectrum(
-                replace(shots, images=shots.images._replace(are_summed=False)), i, 1
+                replace(shots, line_images=shots.line_images._replace(are_summed=False)), i, 1
             )[1]
             assert np.abs(without - exact).max() > 0.01 * exact.max()
 

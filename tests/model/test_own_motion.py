@@ -11,7 +11,7 @@ from sweep.model.geometry.body_motion import SpinningAttitude
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.scanner import cone_directions, fixed_beams
 from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion_of_eyepoints
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
 from sweep.model.sampling import philox
 from sweep.scenes.meshes import clean_mesh
@@ -56,7 +56,7 @@ def errors_of_points(eyepoints, parameters, effects=MOVING, **keywords):
         effects=effects,
         **keywords,
     )
-    true = cloud["flags"] & TRUE_FLAG > 0
+    true = cloud["flags"] & TRUE_RETURN_FLAG > 0
     assert true.any(axis=(1, 2)).all()
     errors = {}
     for name in ("range", "radial_velocity"):
@@ -165,7 +165,9 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
         index=range(4),
         number=109,
     )
-    np.testing.assert_allclose(ego_motion_of_eyepoints(shot_eyepoints).acceleration, 0, atol=1e-9)
+    np.testing.assert_allclose(
+        ego_motion_of_eyepoints(shot_eyepoints).closing_acceleration, 0, atol=1e-9
+    )
     parameters = scene_parameters(table_4_1, beamlets=109)
     for acceleration, low, high in ((0.0, 50, 1000), (30.0, 0.9, 1.1), (300.0, 0.09, 0.11)):
         priors = MotionPriors(terrain_slope=0.0, target_acceleration=acceleration)
@@ -204,7 +206,7 @@ def test_known_motion_is_the_true_one_over_level_ground():
         shot_eyepoints = shots(motion)
         known = ego_motion_of_eyepoints(shot_eyepoints)
         np.testing.assert_allclose(
-            known.acceleration, shot_eyepoints.acceleration, rtol=1e-9, atol=1e-9
+            known.closing_acceleration, shot_eyepoints.acceleration, rtol=1e-9, atol=1e-9
         )
         slip = known.slip_at(shot_eyepoints.range)
         np.testing.assert_allclose(

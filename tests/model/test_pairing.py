@@ -41,7 +41,9 @@ def _beats(target_range, radial_velocity):
     return [waveform.fold_frequency(np.array(f), np.array(FS)) / WIDTH for f in signed]
 
 
-def _pair(up, doppler, down, tolerance=CONFIRMATION_TOLERANCE_BINS, assumed=waveform.FAR_READING):
+def _pair(
+    up, doppler, down, tolerance=CONFIRMATION_TOLERANCE_BINS, assumed=waveform.FAR_TARGET_READING
+):
     """(confirmed, [(up, doppler, down, code)])."""
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
     size = max(lists[0].size, lists[2].size, 1)
@@ -51,7 +53,7 @@ def _pair(up, doppler, down, tolerance=CONFIRMATION_TOLERANCE_BINS, assumed=wave
 
 
 def _reported(up, down, code):
-    beats = waveform.beats_of_reading(code, up * WIDTH, down * WIDTH, FS)
+    beats = waveform.doppler_and_range_beat(code, up * WIDTH, down * WIDTH, FS)
     return waveform.range_velocity_of_beats(*beats, *OPTICS.values())
 
 
@@ -162,7 +164,7 @@ def test_a_false_peak_alone_leaves_the_true_pair_as_it_was():
     assert [p[:3] for p in pairs] == [(1, 0, 0)]
 
 
-@pytest.mark.parametrize("assumed", [waveform.FAR_READING, waveform.FAST_READING])
+@pytest.mark.parametrize("assumed", [waveform.FAR_TARGET_READING, waveform.FAST_TARGET_READING])
 @pytest.mark.parametrize(
     ("doppler", "target"),
     [
@@ -178,7 +180,7 @@ def test_without_a_doppler_peak_of_its_own_a_pair_is_read_as_assumed(assumed, do
     confirmed, pairs = _pair(up, doppler, down, assumed=assumed)
     assert confirmed == 0
     assert pairs == [(0, -1, 0, assumed)]
-    right = (target[1] == 60.0) == (assumed == waveform.FAST_READING)
+    right = (target[1] == 60.0) == (assumed == waveform.FAST_TARGET_READING)
     assert _agrees(_reported(up[0], down[0], assumed), target) == right
     f_r = 2e12 * 2 * target[0] / 299792458.0
     f_d = 2 * target[1] / 1550e-9

@@ -103,7 +103,7 @@ def test_random_effects_come_and_go_without_moving_each_others_numbers(table_4_1
     )
     np.testing.assert_array_equal(both.footprint.phase_cycles, speckled.footprint.phase_cycles)
     np.testing.assert_array_equal(
-        both.echo_scales.beat_amplitude, twinkling.echo_scales.beat_amplitude
+        both.echo_scales.beat_amplitude_scale, twinkling.echo_scales.beat_amplitude_scale
     )
     shaken, every = (drawn_shots(parameters, e) for e in (["pointing_jitter"], RANDOM))
     np.testing.assert_array_equal(every.range, shaken.range)
@@ -192,7 +192,7 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
     power = (
         np.concatenate([s.shots.echo_power for s in stretches]) / realisation.shots.echo_power[0]
     )
-    even = scintillation.TurbulenceProfile(uniform=1e-14)
+    even = scintillation.TurbulenceProfile(uniform_strength=1e-14)
     legs = scintillation.two_way_log_variances(
         even, PARAMETER_DEFAULTS | parameters, np.array(3000.0)
     )
@@ -220,7 +220,7 @@ def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
     means = mean_statistics(
         parameters, (*DEFAULT_EFFECTS, "scintillation"), keys=make_point_keys(1), draws=50_000
     )
-    even = scintillation.TurbulenceProfile(uniform=1e-14)
+    even = scintillation.TurbulenceProfile(uniform_strength=1e-14)
     legs = scintillation.two_way_log_variances(
         even, PARAMETER_DEFAULTS | parameters, np.array(4000.0)
     )

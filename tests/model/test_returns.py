@@ -24,7 +24,7 @@ from sweep.model.pointcloud.pairing import (
     MISPAIRED_FLAG,
     MISREAD_FLAG,
     SIDELOBE_FLAG,
-    TRUE_FLAG,
+    TRUE_RETURN_FLAG,
     UNCONFIRMED_FLAG,
     DopplerPrediction,
 )
@@ -36,7 +36,7 @@ from sweep.model.pointcloud.returns import (
     PeakLists,
     beamlet_line_positions,
     compare_return_with_truth,
-    draw_free_bin,
+    draw_false_peak_bin,
     draw_returns,
     draw_segment_peaks,
     empty_group_speckle,
@@ -124,8 +124,8 @@ def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
     np.testing.assert_array_equal(
         groups.strongest_bin[:, :, 0].T, np.rint(expected.frequency * 2**17 / 600e6)
     )
-    np.testing.assert_array_equal(groups.n_exempt.T, expected.n_exempt)
-    np.testing.assert_array_equal(groups.leakage.T[[0, 2]], expected.leakage[[0, 2]])
+    np.testing.assert_array_equal(groups.n_exempt_bins.T, expected.n_exempt)
+    np.testing.assert_array_equal(groups.leakage_probability.T[[0, 2]], expected.leakage[[0, 2]])
     assert not expected.leakage[1].any()  # of the Doppler segment only draws need to know
 
 
@@ -159,7 +159,7 @@ def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
     )
     np.testing.assert_array_equal(returns.range[:, 0, 0], expected.range)
     np.testing.assert_array_equal(returns.radial_velocity[:, 0, 0], expected.radial_velocity)
-    assert (returns.flags[:, 0, 0] == TRUE_FLAG).all()
+    assert (returns.flags[:, 0, 0] == TRUE_RETURN_FLAG).all()
 
 
 def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
@@ -167,7 +167,7 @@ def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
         table_4_1(architecture="direct", range=200.0, power=200.0, radial_velocity=3.0)
     )
     returns = _drawn(shots)
-    assert returns.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
+    assert returns.flags[0, 0].tolist() == [TRUE_RETURN_FLAG, 0, 0, 0]
     assert returns.range_interpolated[0, 0, 0] == pytest.approx(200.0, abs=0.5 * RANGE_BIN)
     assert returns.group[0, 0, 0].tolist() == [0, -1, 0]
 
@@ -181,7 +181,7 @@ def test_a_triangle_loses_no_return_for_want_of_a_third_segment(order, table_4_1
         waveform=dataclasses.replace(shots.waveform, segment_order=tuple(order.split())),
     )
     returns = _drawn(shots)
-    assert returns.flags[0, 0].tolist() == [TRUE_FLAG, TRUE_FLAG, 0, 0]
+    assert returns.flags[0, 0].tolist() == [TRUE_RETURN_FLAG, TRUE_RETURN_FLAG, 0, 0]
     np.testing.assert_allclose(returns.range[0, 0, :2], [300.0, 320.0], atol=2 * RANGE_BIN)
     np.testing.assert_allclose(returns.radial_velocity[0, 0, :2], 1.0, atol=2 * VELOCITY_BIN)
 
@@ -255,7 +255,7 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
     expected = DRAWS * out["pd_up"] * out["pd_down"]
     spread = np.sqrt(expected * (1 - expected / DRAWS))
     assert (np.abs(both_detected.sum(1) - expected) < 5 * spread + slack).all()
-    confirmed = (returns.flags == TRUE_FLAG).any(2).sum(1)
+    confirmed = (returns.flags == TRUE_RETURN_FLAG).any(2).sum(1)
     expected = expected * out["pd_doppler"]
     assert (np.abs(confirmed - expected) < 5 * np.sqrt(expected) + slack).all()
     false = (returns.flags & FALSE_ALARM_FLAG > 0).any(2).sum(1)
@@ -278,7 +278,7 @@ def test_false_peaks_fall_on_every_free_bin_alike():
         free = sorted(set(range(1, half + 1)) - occupied_bins - set(BARRED.tolist()))
         chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
         places, counts = np.unique(
-            [draw_free_bin(u, *bins, BARRED, 1, half, 2 * half, False) for u in chances],
+            [draw_false_peak_bin(u, *bins, BARRED, 1, half, 2 * half, False) for u in chances],
             return_counts=True,
         )
         assert places.tolist() == free
@@ -446,7 +446,7 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
         )
     )  # fmt: skip
     returns = _drawn(shots, draws=1000, method=method)
-    assert (returns.flags[..., 0] == TRUE_FLAG).all()
+    assert (returns.flags[..., 0] == TRUE_RETURN_FLAG).all()
     assert 2 * returns.snr[..., 0].mean() == pytest.approx(64**2, rel=0.4)
     for quantity, expected in (
         ("range", shots.range),
@@ -478,7 +478,7 @@ def test_interpolated_ranges_of_moving_ground_are_those_at_the_beginning(
     for effects in (walking, steady_effects):
         ((_, shots),) = prepare_shots(parameters, effects)
         returns = _drawn(shots, draws=200, method="noise")
-        assert (returns.flags[..., 0] == TRUE_FLAG).all()
+        assert (returns.flags[..., 0] == TRUE_RETURN_FLAG).all()
         errors = returns.range_interpolated[..., 0] - shots.range[:, None]
         stated_error = returns.range_interpolated_standard_error[..., 0]
         assert abs(errors.mean()) < 5 * stated_error.mean() / np.sqrt(errors.size) + 5e-5
@@ -502,7 +502,7 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
         )
     )  # fmt: skip
     returns = _drawn(shots, draws=1)
-    good = returns.flags[..., 0] == TRUE_FLAG
+    good = returns.flags[..., 0] == TRUE_RETURN_FLAG
     error = (returns.range_interpolated[..., 0] - shots.range[:, None])[good]
     stated_error = returns.range_interpolated_standard_error[..., 0][good]
     assert good.mean() > 0.9
@@ -545,8 +545,8 @@ def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
     nowhere = bins + np.array([0, 0, 20])[:, None]
     centres, all_three = np.array([10.9, 5.0, 31.2]), np.zeros(3, np.int8)
     lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
-    assert compare_return_with_truth(all_three, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
-    assert compare_return_with_truth(all_three, centres, *bins, lines, dim) == (TRUE_FLAG, 0)
+    assert compare_return_with_truth(all_three, centres, *bins, lines, lit) == (TRUE_RETURN_FLAG, 1)
+    assert compare_return_with_truth(all_three, centres, *bins, lines, dim) == (TRUE_RETURN_FLAG, 0)
     separate = np.array([0, 0, 1], np.int8)
     assert compare_return_with_truth(separate, centres, *bins, lines, lit) == (MISPAIRED_FLAG, -1)
     assert compare_return_with_truth(all_three, centres, *nowhere, lines, lit) == (
@@ -554,7 +554,10 @@ def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
         -1,
     )
     no_doppler, noise = np.array([0, -2, 0], np.int8), np.array([0, 0, -1], np.int8)
-    assert compare_return_with_truth(no_doppler, centres, *bins, lines, lit) == (TRUE_FLAG, 1)
+    assert compare_return_with_truth(no_doppler, centres, *bins, lines, lit) == (
+        TRUE_RETURN_FLAG,
+        1,
+    )
     assert compare_return_with_truth(noise, centres, *bins, lines, lit) == (FALSE_ALARM_FLAG, -1)
 
 
@@ -584,7 +587,7 @@ def test_a_pair_without_its_doppler_peak_is_read_as_two_beats_are(table_4_1, two
             shots,
             detection_settings=shots.detection_settings._replace(two_beat_assumption=two_beats),
         )
-        kind = TRUE_FLAG if kind == two_beats else MISREAD_FLAG
+        kind = TRUE_RETURN_FLAG if kind == two_beats else MISREAD_FLAG
         groups = _only(_certain(list_bin_groups(shots)), {(1, g): 0.0 for g in range(4)})
         returns = _drawn(shots, groups)
         assert returns.flags[0, 0, 0] == kind | UNCONFIRMED_FLAG
@@ -605,12 +608,12 @@ def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
         shots, detection_settings=shots.detection_settings._replace(includes_leakage=False)
     )
     returns = _drawn(shots, _certain(list_bin_groups(shots)))
-    assert returns.flags[0, 0, 0] == TRUE_FLAG
+    assert returns.flags[0, 0, 0] == TRUE_RETURN_FLAG
     assert (returns.flags[0, 0, 1:] & SIDELOBE_FLAG > 0).all()
 
 
 def test_surfaces_merged_in_one_group_are_one_true_return(table_4_1):
     shots = _surfaces(table_4_1, [400.0, 400.3], [12.0, 12.0])
     returns = _drawn(shots)
-    assert returns.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
+    assert returns.flags[0, 0].tolist() == [TRUE_RETURN_FLAG, 0, 0, 0]
     assert 399.8 < returns.range[0, 0, 0] < 400.5

@@ -7,23 +7,23 @@ import pytest
 from scipy import stats
 
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
-from sweep.model.error_budget import COUNT_INTERVALS, ErrorBudget, interval_half_width
+from sweep.model.error_budget import COUNT_INTERVAL_FUNCTIONS, ErrorBudget, interval_half_width
 from sweep.model.evaluation import evaluate
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_COUNT_OUTPUTS,
     GRID_OUTPUTS,
-    PD_OUTPUTS,
-    RUNNING_SUMS,
+    PD_OUTPUT_NAMES,
+    RUNNING_SUMS_NAME,
     STANDARD_ERROR_OUTPUTS,
 )
 from sweep.model.sampling import philox, realisations, samplers
 from sweep.model.sampling.draw_groups import GROUP_SIZE
-from sweep.model.sampling.samplers import draw_until_accurate, simulate_draws, stopping_checks
+from sweep.model.sampling.samplers import draw_until_accurate, simulate_draws, stopping_check_draws
 
 SPECKLED = (*DEFAULT_EFFECTS, "speckle")
 METHODS = ("probabilities", "noise")
-COUNTS = {name: name.replace("pd_", "n_detected_") for name in PD_OUTPUTS}
+COUNTS = {name: name.replace("pd_", "n_detected_") for name in PD_OUTPUT_NAMES}
 
 
 def keys(n, seed=11):
@@ -43,7 +43,7 @@ def select_points(parameters, index):
 
 @pytest.mark.parametrize(("batch", "limit"), [(100, 10**6), (7, 1000), (50, 20), (1, 1), (3, 9)])
 def test_looks_come_after_whole_batches_ever_further_apart(batch, limit):
-    ends = list(stopping_checks(batch, limit))
+    ends = list(stopping_check_draws(batch, limit))
     assert ends[-1] == limit and ends[0] == min(batch, limit)
     assert all(end % batch == 0 for end in ends[:-1])
     for first, second in pairwise(ends):
@@ -61,10 +61,10 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
     chosen = {"keys": keys(4), "method": method, "error_budget": accuracy}
     results = simulate_draws(parameters, effects, batch=20, limit=400, **chosen)
     drawn = {*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
-    assert set(results) == (drawn | {RUNNING_SUMS} if effects is SPECKLED else drawn)
+    assert set(results) == (drawn | {RUNNING_SUMS_NAME} if effects is SPECKLED else drawn)
     numbers = results["n_draws"]
     group_size = GROUP_SIZE if effects is SPECKLED else 1
-    assert np.isin(numbers, list(stopping_checks(20, 400, group_size))).all()
+    assert np.isin(numbers, list(stopping_check_draws(20, 400, group_size))).all()
     assert np.unique(numbers).size > 1 or (method, effects) == ("probabilities", DEFAULT_EFFECTS)
     for point, number in enumerate(numbers.tolist()):
         fixed = simulate_draws(parameters, effects, batch_sizes=[number], **chosen)
@@ -77,12 +77,12 @@ def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_
     chosen = {"keys": keys(4), "method": "probabilities", "error_budget": accuracy}
     results = simulate_draws(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
     assert (results["accuracy_missed"] == 0).all()
-    for name in PD_OUTPUTS:
+    for name in PD_OUTPUT_NAMES:
         assert (results[f"{name}_half_width"] <= 0.06).all()
     for point, number in enumerate(results["n_draws"].tolist()):
-        for before in [n for n in stopping_checks(20, 10_000, GROUP_SIZE) if n < number]:
+        for before in [n for n in stopping_check_draws(20, 10_000, GROUP_SIZE) if n < number]:
             fixed = simulate_draws(parameters, SPECKLED, batch_sizes=[before], **chosen)
-            widths = [fixed[f"{name}_half_width"][point] for name in PD_OUTPUTS]
+            widths = [fixed[f"{name}_half_width"][point] for name in PD_OUTPUT_NAMES]
             assert max(widths) > 0.06
             assert fixed["accuracy_missed"][point] == max(widths) - 0.06
 
@@ -110,24 +110,24 @@ def test_where_the_limit_comes_first_the_excess_is_reported(table_4_1):
         scene(table_4_1), SPECKLED, keys=keys(4), batch=30, limit=100, method="probabilities",
         error_budget=ErrorBudget(tolerance, 0.95),
     )  # fmt: skip
-    widths = np.max([results[f"{name}_half_width"] for name in PD_OUTPUTS], axis=0)
+    widths = np.max([results[f"{name}_half_width"] for name in PD_OUTPUT_NAMES], axis=0)
     np.testing.assert_array_equal(results["accuracy_missed"], np.maximum(widths - tolerance, 0))
     missed = results["accuracy_missed"] > 0
     assert missed.tolist() == [False, True, False, True]
     assert (results["n_draws"][missed] == 100).all() and (results["n_draws"][~missed] < 100).all()
 
 
-@pytest.mark.parametrize("interval", COUNT_INTERVALS)
+@pytest.mark.parametrize("interval", COUNT_INTERVAL_FUNCTIONS)
 def test_the_share_of_draws_in_noise_has_the_interval_asked_for(interval, table_4_1):
     chosen = {
         "keys": keys(4),
         "method": "noise",
-        "error_budget": ErrorBudget(0.01, 0.9, interval=interval),
+        "error_budget": ErrorBudget(0.01, 0.9, count_interval_name=interval),
     }
     results = simulate_draws(scene(table_4_1), DEFAULT_EFFECTS, batch_sizes=[150, 50], **chosen)
     for name, count in COUNTS.items():
         k = results[count].sum(axis=1)
-        expected = COUNT_INTERVALS[interval](successes=k, trials=200, confidence=0.9)
+        expected = COUNT_INTERVAL_FUNCTIONS[interval](successes=k, trials=200, confidence=0.9)
         np.testing.assert_array_equal(
             results[f"{name}_half_width"], interval_half_width(k / 200, expected)
         )
@@ -147,7 +147,7 @@ def test_probabilities_that_are_known_need_no_draws(table_4_1):
         error_budget=ErrorBudget(0.0),
     )
     assert (results["n_draws"] == 50).all() and (results["accuracy_missed"] == 0).all()
-    for name in PD_OUTPUTS:
+    for name in PD_OUTPUT_NAMES:
         assert (results[f"{name}_half_width"] == 0).all()
 
 
@@ -201,15 +201,15 @@ class Coins:
     def widths(self, points):
         pairs = np.stack([self.hits[points], self.n_draws[points]])
         (k, n), place = np.unique(pairs, axis=1, return_inverse=True)
-        interval = COUNT_INTERVALS[self.method](successes=k, trials=n, confidence=0.95)
+        interval = COUNT_INTERVAL_FUNCTIONS[self.method](successes=k, trials=n, confidence=0.95)
         return interval_half_width(k / n, interval)[place]
 
-    def half_width_over_tolerance(self, points, error_budget):
+    def half_width_excess(self, points, error_budget):
         return np.maximum(self.widths(points) - error_budget.tolerance, 0.0)
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])
-@pytest.mark.parametrize("method", COUNT_INTERVALS)
+@pytest.mark.parametrize("method", COUNT_INTERVAL_FUNCTIONS)
 def test_stopping_costs_little_coverage_and_bias(method, tolerance):
     """5 sigma of 4000 trials are 1.7 %; Wilson's may lack a step at either end of its counts.
 
@@ -219,7 +219,7 @@ def test_stopping_costs_little_coverage_and_bias(method, tolerance):
     trials = 4000
     for pd in (0.0, 1e-4, 0.3 * tolerance, tolerance, 1.3 * tolerance, 0.2, 0.5, 0.8, 0.9999, 1.0):
         coins, points = Coins(pd, trials, method), np.arange(trials)
-        draw_until_accurate(coins, points, stopping_checks(10, 10**6), ErrorBudget(tolerance))
+        draw_until_accurate(coins, points, stopping_check_draws(10, 10**6), ErrorBudget(tolerance))
         estimate = coins.hits / coins.n_draws
         within = (abs(estimate - pd) <= coins.widths(points) + 1e-15).mean()
         n_draws_max = coins.n_draws.max()

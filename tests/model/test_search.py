@@ -18,7 +18,7 @@ from sweep.model.evaluation import evaluate
 from sweep.model.link_budget import LinkBudget
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
-from sweep.model.pointcloud.returns import draw_free_bin, draw_returns
+from sweep.model.pointcloud.returns import draw_false_peak_bin, draw_returns
 from sweep.model.sampling.samplers import simulate_draws
 from sweep.model.spectrum.search_band import search_band_start_and_size
 from sweep.model.threshold import DESIGN_PFA_SEGMENT_PATH, DESIGN_PFA_SHOT_PATH, TNR_PATH
@@ -80,7 +80,7 @@ def noisy_spectra(shots, segment, rng):
     """|X| of DRAWS records: the echo's exact one, and white noise sampled with it."""
     length, shape = shots.window.length, (DRAWS, shots.window.length)
     taper, sigma = window_samples(shots.window.name, length), np.sqrt(shots.noise_variance[0])
-    signal = time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=False)
+    signal = time_domain_truth.beamlet_analytic_signal(shots, 0, segment, 0, with_range_walk=False)
     if shots.complex_record:
         noise = rng.normal(size=shape) + 1j * rng.normal(size=shape)
         spectrum = np.fft.fft(taper * (signal / 2 + sigma * np.sqrt(0.5) * noise), SIZE)
@@ -204,7 +204,7 @@ def test_false_peaks_fall_on_every_free_bin_of_the_band_alike(signed):
     if signed:
         bins[:, 0] += 2 * 512  # runs of complex records count from further on
     drawn_bins = [
-        draw_free_bin(u, strongest, lowest, highest, NONE, first, last, 512, signed)
+        draw_false_peak_bin(u, strongest, lowest, highest, NONE, first, last, 512, signed)
         for u in chances
     ]
     assert drawn_bins == np.repeat(expected, 100).tolist()

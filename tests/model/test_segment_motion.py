@@ -20,7 +20,7 @@ from sweep.model.pointcloud.returns import beamlet_line_positions, draw_returns
 from sweep.model.sampling.realisations import iter_realisations
 from sweep.model.spectrum import segment_spectra
 from sweep.model.waveform import (
-    DEFAULT_CHIRP_SLOPES,
+    DEFAULT_CHIRP_RATE_RATIOS,
     SEGMENT_GAP_PATH,
     SEGMENT_NAMES,
     SEGMENT_ORDER_PATH,
@@ -93,8 +93,8 @@ def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, orde
         )
         | {"target.acceleration": a, SEGMENT_ORDER_PATH: SEGMENT_ORDERS[order]}
     )  # fmt: skip
-    record = time_domain_truth.analytic_record(shots, 0, segment, 0, with_acceleration=True)
-    sign, carrier = DEFAULT_CHIRP_SLOPES[segment], float(shots.waveform.carriers[segment])
+    record = time_domain_truth.beamlet_analytic_signal(shots, 0, segment, 0, with_acceleration=True)
+    sign, carrier = DEFAULT_CHIRP_RATE_RATIOS[segment], float(shots.waveform.carriers[segment])
     expected = []
     with mpmath.workdps(40):
         for n in range(0, 512, 73):

@@ -11,13 +11,13 @@ from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.pointcloud.pairing import (
     FALSE_ALARM_FLAG,
     MISREAD_FLAG,
-    TRUE_FLAG,
+    TRUE_RETURN_FLAG,
     UNCONFIRMED_FLAG,
 )
 from sweep.model.pointcloud.point_cloud import simulate_cloud
 from sweep.model.sampling.noisy_spectra import SpectrumMethods
 from sweep.model.sampling.samplers import simulate_draws
-from sweep.model.waveform import PEAKS_PATH, STRONGEST_PEAK
+from sweep.model.waveform import REPORTED_PEAKS_PATH, STRONGEST_PEAK
 
 EFFECTS = ("footprint", "doppler")
 RECORD = "instrument.receiver.record"
@@ -83,7 +83,7 @@ def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, way):
     assert cloud["snr_up"][0] == pytest.approx(grid["snr_up"][0], rel=1e-9)
     for name in ("range", "radial_velocity"):
         error = (cloud[f"{name}_interpolated"] - cloud[f"true_{name}"])[0, :, 0]
-        assert np.isfinite(error).all() and (cloud["flags"][0, :, 0] == TRUE_FLAG).all()
+        assert np.isfinite(error).all() and (cloud["flags"][0, :, 0] == TRUE_RETURN_FLAG).all()
         bias, rmse = grid[f"{name}_bias"][0], grid[f"{name}_rmse"][0]
         scatter = np.sqrt(max(rmse**2 - bias**2, 0.0))
         allowed = 5 * scatter * np.sqrt(2 / NUMBER)
@@ -104,7 +104,9 @@ def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
     parameters = _given(table_4_1, tnr=6.0, power=1e-2, **chosen)
     cloud, grid = _flown(parameters), _grid(parameters)
     detected_share = (
-        np.isin(cloud["flags"], (TRUE_FLAG, TRUE_FLAG | UNCONFIRMED_FLAG)).any(axis=2).mean()
+        np.isin(cloud["flags"], (TRUE_RETURN_FLAG, TRUE_RETURN_FLAG | UNCONFIRMED_FLAG))
+        .any(axis=2)
+        .mean()
     )
     pd = grid["pd_shot"][0]
     assert 0.1 < pd < 0.95
@@ -118,13 +120,13 @@ def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
 @pytest.mark.parametrize("record", [pytest.param("real", marks=pytest.mark.slow), "complex"])
 def test_the_strongest_peak_is_as_often_wrong_as_the_closed_form_of_a_grid_says(table_4_1, record):
     """A return of both right peaks may be misread for want of a Doppler peak."""
-    changes = {PEAKS_PATH: STRONGEST_PEAK, RECORD: record}
+    changes = {REPORTED_PEAKS_PATH: STRONGEST_PEAK, RECORD: record}
     parameters = _given(table_4_1, tnr=3.0, power=1e-2, **changes)
     cloud = _flown(parameters, draws=2000)
     grid = evaluate(parameters | TARGET, EFFECTS)
     flags = cloud["flags"][0]
     assert not flags[:, 1:].any()  # a shot has one return
-    right = ((flags[:, 0] & (TRUE_FLAG | MISREAD_FLAG)) > 0).mean()
+    right = ((flags[:, 0] & (TRUE_RETURN_FLAG | MISREAD_FLAG)) > 0).mean()
     pd, wrong = grid["pd_shot"][0], grid["p_wrong_range_shot"][0]
     assert 0.2 < pd < 0.8 and wrong > 0.05
     for share, expected in ((right, pd), ((flags[:, 0] > 0).mean() - right, wrong)):
@@ -179,7 +181,7 @@ def test_both_surfaces_of_a_footprint_are_seen_and_fade_each_for_itself(table_4_
     ]
     # One fading of both would have them rise and fall as one.
     assert abs(np.corrcoef(*snr)[0, 1]) < 5 / np.sqrt(both_seen.sum()) < 0.2
-    true = cloud["flags"] == TRUE_FLAG
+    true = cloud["flags"] == TRUE_RETURN_FLAG
     errors = np.abs(cloud["range_interpolated"] - cloud["true_range"])[true]
     assert np.median(errors) < 0.5 * 299792458.0 * 600e6 / (4 * 2**11 * 2e12)
 

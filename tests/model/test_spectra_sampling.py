@@ -9,8 +9,8 @@ from sweep.model.detection.estimators import SPECTRUM_METHOD_DEFAULTS
 from sweep.model.detection.sub_bin_interpolation import in_phase_noise_correlations
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.evaluation import evaluate, prepare_shots
-from sweep.model.laser_line import n_phase_walk_steps, phase_walk
-from sweep.model.outputs import DRAW_COUNT_OUTPUTS, SPECTRA_OUTPUTS
+from sweep.model.laser_line import beat_phase_noise, n_beat_phase_noise_steps
+from sweep.model.outputs import DRAW_COUNT_OUTPUTS, SPECTRA_STUDY_OUTPUTS
 from sweep.model.sampling import philox, samplers
 from sweep.model.sampling.noisy_spectra import (
     DETECTOR_PREFIX,
@@ -85,7 +85,7 @@ def test_the_signal_is_that_of_the_time_domain(table_4_1, record):
     signal = noiseless_signal(shots, 0, 2)
     np.testing.assert_allclose(np.abs(signal.spectrum), expected, atol=1e-8 * expected.max())
     assert signal.strongest_bin == np.argmax(expected)
-    up, down = noiseless_signal(shots, 0, 0).frequency, signal.frequency
+    up, down = noiseless_signal(shots, 0, 0).frequency_bins, signal.frequency_bins
     assert (up > 0) == (record == "real" or 2 * 150.0 / 1550e-9 > 1000.0 * 2e12 / 1.5e8)
     beat = 2 * 150.0 / 1550e-9 / 600e6 * 2048  # half sum of up and down [bins]
     assert (up + down) / 2 == pytest.approx(beat, abs=5e-3)
@@ -171,12 +171,12 @@ def test_batches_points_and_their_order_change_no_bit(table_4_1, effects, record
             np.testing.assert_array_equal(values, parts[name][::-1], err_msg=name)
     single_point = {path: v[1:2] if np.ndim(v) else v for path, v in parameters.items()}
     one = simulate_draws(single_point, effects, keys=keys[1:2], batch_sizes=[70], **WHOLE_SPECTRA)
-    for name in SPECTRA_OUTPUTS:
+    for name in SPECTRA_STUDY_OUTPUTS:
         np.testing.assert_array_equal(one[name], at_once[name][1:2], err_msg=name)
 
 
 def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
-    parameters, accuracy = _points(table_4_1), ErrorBudget(0.1, 0.95, interval="wilson")
+    parameters, accuracy = _points(table_4_1), ErrorBudget(0.1, 0.95, count_interval_name="wilson")
     arguments = {"keys": make_point_keys(3), "error_budget": accuracy} | WHOLE_SPECTRA
     results = simulate_draws(parameters, EFFECTS, batch=20, limit=500, **arguments)
     assert (results["accuracy_missed"] == 0).all() and results["n_draws"].min() < 100
@@ -348,9 +348,9 @@ def test_the_laser_turns_the_record_sample_by_sample(table_4_1):
     delay = 100.0 / SPEED_OF_LIGHT * rate
     spectra = draw_signal_spectra(shots, 0, 2, noiseless_signal(shots, 0, 2), key=key, draws=draws)
     for draw, drawn in zip(draws, spectra, strict=True):
-        steps = n_phase_walk_steps(delay=delay, length=shots.window.length)
+        steps = n_beat_phase_noise_steps(delay=delay, length=shots.window.length)
         numbers = philox.uniforms(key[None], np.array([draw]), philox.STREAM_LASER_PHASE[2], steps)
-        phase = phase_walk(
+        phase = beat_phase_noise(
             philox.to_normals_by_row(numbers)[0],
             variance_per_sample=2 * np.pi * 1e5 / rate,
             delay=delay,

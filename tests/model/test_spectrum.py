@@ -13,7 +13,7 @@ from sweep.model.spectrum.bin_spectrum import compute_magnitudes as magnitudes_o
 from sweep.model.spectrum.lines import (
     AMPLITUDE_TOLERANCES,
     NODES_MAX,
-    count_nodes,
+    n_required_nodes,
     node_phase_limits,
     replace_lines_by_nodes,
 )
@@ -34,7 +34,7 @@ def magnitudes(name, sizes, origin, delta, weights, *, power=False, low=0, high=
     n, count, delta = len(delta), high - low + 1, np.asarray(delta, float)
     prepared = line_shape_of_window(get_window(name, length), fft_size, power=power)
     workspace = allocate_workspace(max(count, n) + 16)
-    lines = workspace.field.lines
+    lines = workspace.line_spectrum.lines
     lines.position[:n], lines.im[:n] = delta, 0.0 if power else np.imag(weights)
     lines.re[:n] = np.abs(weights) ** 2 if power else np.real(weights)
     magnitudes_of(
@@ -101,11 +101,11 @@ def few_for(delta, weights, tolerance, limits):
     """Places and weights of as few lines as stand for many."""
     n, middle, half = delta.size, (delta.max() + delta.min()) / 2, np.ptp(delta) / 2
     workspace = allocate_workspace(n + 16)
-    lines, nodes = workspace.field.lines, workspace.nodes
+    lines, nodes = workspace.line_spectrum.lines, workspace.nodes
     lines.position[:n], lines.re[:n], lines.im[:n] = delta, np.real(weights), np.imag(weights)
-    n_nodes = count_nodes(np.pi * half, tolerance, limits)
+    n_nodes = n_required_nodes(np.pi * half, tolerance, limits)
     number = replace_lines_by_nodes(
-        lines, n, n_nodes, middle, half, workspace.field.line_scratch, nodes
+        lines, n, n_nodes, middle, half, workspace.line_spectrum.line_scratch, nodes
     )
     return nodes.position[:number].copy(), nodes.re[:number] + 1j * nodes.im[:number]
 

@@ -114,7 +114,7 @@ def scores(shape, rule, angle, draws=4000, places=20):
     error, offset, power, fraction, noise = by_segment
     shots = SimpleNamespace(
         window=get_window(shape, LENGTH), fft_size=LENGTH,
-        detection_settings=SimpleNamespace(echo_bins=rule),
+        detection_settings=SimpleNamespace(echo_bin_rule=rule),
         looks=SimpleNamespace(number=1, is_noncoherent=False, has_independent_speckle=False),
     )  # fmt: skip
     peaks = SpecklePeaks(offset, np.ones((count, 3)), power, fraction)

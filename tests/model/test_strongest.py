@@ -16,7 +16,7 @@ from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import evaluate, evaluate_segments, shot_statistics
 from sweep.model.outputs import STRONGEST_PEAK_OUTPUTS
-from sweep.model.waveform import PEAKS_PATH, SEARCH_BAND_PATHS, STRONGEST_PEAK
+from sweep.model.waveform import REPORTED_PEAKS_PATH, SEARCH_BAND_PATHS, STRONGEST_PEAK
 from sweep.model.window import window_samples
 
 RECORD = "instrument.receiver.record"
@@ -34,7 +34,7 @@ def scene_of(table_4_1, speckle="none", record="real", peaks=STRONGEST_PEAK, **c
     """A short record in which the echo is faint, with one beamlet, whose speckle is shared."""
     scene = table_4_1(**(SMALL | changes))
     mixed = {"footprint.phases": "incoherent", "footprint.speckle": speckle}
-    return scene | {RECORD: record, PEAKS_PATH: peaks} | mixed
+    return scene | {RECORD: record, REPORTED_PEAKS_PATH: peaks} | mixed
 
 
 def spectra(shots, segment, echo, rng):
@@ -42,7 +42,7 @@ def spectra(shots, segment, echo, rng):
     length = shots.window.length
     shape = echo.size, length
     taper, sigma = window_samples(shots.window.name, length), np.sqrt(shots.noise_variance[0])
-    signal = echo[:, None] * time_domain_truth.analytic_record(
+    signal = echo[:, None] * time_domain_truth.beamlet_analytic_signal(
         shots, 0, segment, 0, with_range_walk=False
     )
     if shots.complex_record:
@@ -66,7 +66,7 @@ def reported(shots, segment, echo, rng):
     if shots.detection_settings.search_band is not None:
         first, number = shots.detection_settings.search_band[segment, :, 0]
         searched &= (bins - first) % SIZE < number
-    if shots.detection_settings.echo_bins == "peak_bin":
+    if shots.detection_settings.echo_bin_rule == "peak_bin":
         echo_magnitude = magnitude[:, int(np.rint(place)) % SIZE]
     else:
         echo_magnitude = magnitude[:, near & searched].max(axis=1)
@@ -152,7 +152,7 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
         prepare_single_category(scene, WITHOUT_LEAKAGE),
         evaluate(scene, WITHOUT_LEAKAGE),
     )
-    crosses = evaluate(scene | {PEAKS_PATH: "all"}, WITHOUT_LEAKAGE)
+    crosses = evaluate(scene | {REPORTED_PEAKS_PATH: "all"}, WITHOUT_LEAKAGE)
     sigma = shots.bin_noise_sigma[0]
     level, signal = shots.threshold[0] / sigma, np.sqrt(2 * crosses["snr_up"][0])
     law, reach = stats.rice(signal), signal + 20

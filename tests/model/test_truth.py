@@ -167,11 +167,11 @@ def test_the_frequency_of_the_record_is_that_of_the_delayed_chirp_less_the_chirp
     received_less_sent = f * 2 * v / speed_of_light + sign * rate * (
         -delay + (t - delay) * 2 * v / speed_of_light
     )
-    record = time_domain_truth.analytic_record(shots, 0, segment, 0)
+    record = time_domain_truth.beamlet_analytic_signal(shots, 0, segment, 0)
     measured = np.diff(np.unwrap(np.angle(record))) * 600e6 / (2 * np.pi)
     # Rounding: 1e-11 cycles a sample; the walk is 8 v/300 Hz a sample and 4 kHz v/150 in all.
     assert np.abs(measured - received_less_sent).max() < 0.05
-    steady = time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=False)
+    steady = time_domain_truth.beamlet_analytic_signal(shots, 0, segment, 0, with_range_walk=False)
     measured = np.diff(np.unwrap(np.angle(steady))) * 600e6 / (2 * np.pi)
     at_start = f * 2 * v / speed_of_light - sign * rate * 2 * 2000.0 / speed_of_light * (
         1 + 2 * v / speed_of_light
@@ -200,7 +200,9 @@ def test_the_record_is_what_a_balanced_detector_makes_of_two_optical_fields(
     oscillator, received = field(1e-3, t), np.sqrt(0.5) * field(echo, t - delay)
     one, other = (oscillator + received) / np.sqrt(2), (oscillator - received) / np.sqrt(2)
     voltage = 7e3 * 1.1 * 3.0 * (np.abs(one) ** 2 - np.abs(other) ** 2)
-    record = time_domain_truth.analytic_record(prepare_single_category(scene), 0, segment, 0).real
+    record = time_domain_truth.beamlet_analytic_signal(
+        prepare_single_category(scene), 0, segment, 0
+    ).real
     # Phases of 2e9 t + 1e12 t^2 < 1e5 cycles round to 1e-11; powers of 1e-3 W to 1e-19 W, against
     # a beat of sqrt(1e-3 echo) = 2e-7 W.
     assert np.abs(record - voltage).max() < 1e-8 * np.abs(voltage).max()
@@ -241,7 +243,9 @@ def test_incoherent_truth_is_the_root_mean_square_over_independent_phases(table_
     shots = prepare_single_category(scene | {"footprint.phases": "incoherent"})
     weights = 0.54 - 0.46 * np.cos(2 * np.pi * np.arange(512) / 512)
     for segment in range(3):
-        records = [time_domain_truth.analytic_record(shots, 0, segment, b) for b in range(3)]
+        records = [
+            time_domain_truth.beamlet_analytic_signal(shots, 0, segment, b) for b in range(3)
+        ]
         power = np.zeros(257)
         for steps in np.ndindex(5, 5, 5):
             turned = sum(
@@ -268,7 +272,7 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
     evaluated = segment_spectra.evaluate_segments(shots)
     for segment in range(3):
         records = [
-            time_domain_truth.analytic_record(shots, 0, segment, b, with_range_walk=False)
+            time_domain_truth.beamlet_analytic_signal(shots, 0, segment, b, with_range_walk=False)
             for b in range(7)
         ]
         spectra = np.fft.fft(w * np.array(records)) / 2

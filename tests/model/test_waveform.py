@@ -12,7 +12,7 @@ from sweep.model.waveform import (
     FOLD_PENALTY_BINS,
     beat_frequency,
     fold_frequency,
-    record_length,
+    n_record_samples,
     resolve_range_velocity,
 )
 
@@ -86,7 +86,7 @@ def test_the_record_ends_with_the_chirp():
     def length(fft_size, delay, rate=600e6, duration=500e-6):
         parameters = {"fft_size": fft_size, "acquisition_delay": delay, "sample_rate": rate}
         parameters = {f"instrument.processing.{name}": value for name, value in parameters.items()}
-        return record_length(parameters | {"instrument.chirp.duration": duration})
+        return n_record_samples(parameters | {"instrument.chirp.duration": duration})
 
     assert length(2**17, 0.0) == 2**17
     assert length(2**18, 0.0) == 2**18

@@ -20,7 +20,7 @@ from sweep.analysis.datasets import NotAStoreError
 from sweep.analysis.study_figures import GridResults, SceneResults
 from sweep.cli import main
 from sweep.model.evaluation import evaluate
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.model.threshold import TNR_PATH
 from sweep.report import detector_charts, flight_charts
 from sweep.report.html_page import PlotControl
@@ -110,7 +110,7 @@ def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(
     study = GridResults.from_store(grid_store)
     (track, *_), _ = detector_charts.grid_profiles(study)
     chart = detector_charts.roc_chart(study, [track], 0)
-    (place, *_) = detector_charts._roc_indices(track)
+    (place, *_) = detector_charts._roc_point_indices(track)
     point = study.dataset.isel(track.axis_indices(place))
     curve = point.sweep.roc(detector_charts.ROC_PFA_BIN_VALUES)
     by_alarm = {panel.facet_choices["alarm"]: panel.lines[0] for panel in chart.panels}
@@ -175,7 +175,7 @@ def test_a_grid_s_page_opens_with_reach_alarms_and_tolerance(grid_page, grid_sto
 def test_a_flight_s_page_opens_with_its_points_and_velocities(scene_page, scene_store):
     group = sweep.open_scene(scene_store)["four"].to_dataset()
     flags, status = group["flags"].values, group["velocity_status"]
-    true = int(((flags & TRUE_FLAG) > 0).sum())
+    true = int(((flags & TRUE_RETURN_FLAG) > 0).sum())
     shots = flags[..., 0].size
     answer = _answer(scene_page)
     assert answer[1] == (
@@ -189,7 +189,7 @@ def test_a_flight_s_page_opens_with_its_points_and_velocities(scene_page, scene_
 
 def test_an_answer_from_the_parts_that_a_page_shows_says_so():
     counts = pandas.DataFrame([{"what": "four", "shots": 20, "true": 18, "false alarm": 1}] * 2)
-    assert flight_charts.returns_sentences(counts, [], 3) == [
+    assert flight_charts.point_count_sentences(counts, [], 3) == [
         "In the 2 of 5 parts of the study shown here, 40 shots brought back 36 true points and 2 "
         "false ones; a shot counts once a draw."
     ]
@@ -200,7 +200,7 @@ def test_errors_of_a_flight_are_measured_less_true(scene_store):
     recordings, _ = flight_charts.select_recordings(study)
     chart = flight_charts.measurement_error_chart(recordings)
     group = study.tree["four"].to_dataset().isel(draw=0, optical_efficiency=0)
-    true = (group["flags"].values & TRUE_FLAG) > 0
+    true = (group["flags"].values & TRUE_RETURN_FLAG) > 0
     expected = (group["range_interpolated"] - group["true_range"]).values[true]
     values = np.concatenate([line.y for line in chart.panels[0].lines])
     np.testing.assert_array_equal(np.sort(values), np.sort(expected))

@@ -5,7 +5,7 @@ import pytest
 from report_specs import EXPERIMENTS, GRID_SPEC
 
 from sweep.analysis import labels
-from sweep.analysis.charts import SHEET_SIZE_LIMITS
+from sweep.analysis.charts import SHEET_CHART_SIZE_LIMITS
 from sweep.analysis.study_figures import GridResults
 from sweep.report import detector_charts
 from sweep.report.html_page import HtmlTable
@@ -44,7 +44,7 @@ def drawn_lines(chart, **choices):
 @pytest.mark.parametrize("choice,answer", detector_charts.LIMIT_VARIABLE_BY_LABEL.items())
 def test_the_maximum_range_is_the_answer_s_in_the_units_of_the_page(grid_store, choice, answer):
     study = GridResults.from_store(grid_store)
-    chart = detector_charts.maximum_range_item(study)
+    chart = detector_charts.maximum_range_chart_or_table(study)
     expected = (
         study.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL)[answer].compute()
         / 1000
@@ -62,7 +62,7 @@ def test_a_study_of_range_alone_has_its_maximum_range_in_a_table(tmp_path):
     axes = {"target.range": {"step": ["500 m", "12 km", "500 m"]}}
     target = GRID_SPEC["target"] | {"grazing_angle": "50 deg"}
     study = run_study(tmp_path, GRID_SPEC | {"axes": axes, "target": target, "figures": []})
-    table = detector_charts.maximum_range_item(study)
+    table = detector_charts.maximum_range_chart_or_table(study)
     assert isinstance(table, HtmlTable)
     answer = study.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute()
     assert list(table.frame["maximum range (km)"] * 1000) == [
@@ -81,7 +81,7 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     ]}  # fmt: skip
     axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
     study = run_study(tmp_path, GRID_SPEC | {"axes": axes, "figures": []})
-    chart = detector_charts.maximum_range_item(study)
+    chart = detector_charts.maximum_range_chart_or_table(study)
     parts = list(dict.fromkeys(panel.facet_choices["part"] for panel in chart.panels))
     assert parts == ["grazing angle 30°", "grazing angle 85°"]
     steep = study.dataset.isel(cut=study.dataset.grazing_angle.values == 85)
@@ -96,10 +96,10 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     powers = run_study(
         tmp_path / "powers", GRID_SPEC | {"axes": power, "target": target, "figures": []}
     )
-    assert detector_charts.maximum_range_item(powers) is None
+    assert detector_charts.maximum_range_chart_or_table(powers) is None
     near = {"target.range": ["50 m", "60 m"], "target.grazing_angle": ["50 deg", "60 deg"]}
     (tmp_path / "near").mkdir()
-    sure = detector_charts.maximum_range_item(
+    sure = detector_charts.maximum_range_chart_or_table(
         run_study(tmp_path / "near", GRID_SPEC | {"axes": near, "figures": []})
     )
     assert detector_charts.is_chart_without_values(
@@ -111,7 +111,7 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
 
 def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn_study):
     figure = SlicesFigure(kind="slices", variable="pd_shot", x="range", by="grazing_angle")
-    chart = drawn_study.make_chart(figure, SHEET_SIZE_LIMITS)
+    chart = drawn_study.make_chart(figure, SHEET_CHART_SIZE_LIMITS)
     probability = drawn_study.dataset.sweep.detection_probability("shot").compute()
     for angle in (30, 90):
         line = drawn_lines(chart)[f"grazing angle {labels.format_quantity(angle, 'deg')}"]
@@ -124,7 +124,7 @@ def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn_stud
 
 
 def test_the_maximum_range_has_an_interval_where_pd_has(drawn_study):
-    chart = detector_charts.maximum_range_item(drawn_study)
+    chart = detector_charts.maximum_range_chart_or_table(drawn_study)
     expected = (
         drawn_study.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute() / 1000
     )

@@ -6,7 +6,7 @@ import pytest
 from sweep.model.geometry.body_motion import ConstantAcceleration, MovingBody, NadirAttitude
 from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.geometry.scanner import cone_directions, fixed_beams
-from sweep.model.outputs import BEAMLET_VARIABLES, SHOT_VARIABLES
+from sweep.model.outputs import BEAMLET_GEOMETRY_VARIABLES, SHOT_GEOMETRY_VARIABLES
 from sweep.model.pointcloud.eyepoints import compute_eyepoints
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays, eyepoints_to_arrays
 from sweep.scenes.meshes import clean_mesh
@@ -30,7 +30,7 @@ def eyepoints():
 
 def test_arrays_have_names_types_and_dimensions_of_the_store(eyepoints):
     arrays = eyepoints_to_arrays(eyepoints)
-    outputs = {**SHOT_VARIABLES, **BEAMLET_VARIABLES}
+    outputs = {**SHOT_GEOMETRY_VARIABLES, **BEAMLET_GEOMETRY_VARIABLES}
     sizes = {"shot": 24, "beamlet": 7, "xyz": 3}
     assert arrays.keys() == outputs.keys()
     for name, output in outputs.items():

@@ -6,7 +6,7 @@ import trimesh
 from facet_areas import triangle_areas
 
 from sweep.model.geometry.mesh import Mesh, merge_meshes
-from sweep.scenes.meshes import clean_mesh, read_mesh
+from sweep.scenes.meshes import clean_mesh, read_mesh_facets
 from sweep.scenes.scene_files import SceneError
 
 BOX = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
@@ -35,7 +35,7 @@ def volume(facets):
 
 @pytest.mark.parametrize("name", ["box.stl", "box.obj", "box.ply", "box.off"])
 def test_a_box_is_the_same_box_in_every_format(file, name):
-    box = read_mesh(file(BOX, name))
+    box = read_mesh_facets(file(BOX, name))
     assert len(box.faces) == 12
     np.testing.assert_allclose(extents(box), (1, 2, 3), rtol=1e-6)
     assert triangle_areas(box.vertices, box.faces).sum() == pytest.approx(22, rel=1e-6)
@@ -47,18 +47,18 @@ def test_a_box_is_the_same_box_in_every_format(file, name):
 )
 def test_lengths_in_a_stated_unit_become_metres(file, unit, metres):
     for scale in (1.0, 10.0):
-        box = read_mesh(file(BOX, "box.ply"), unit=unit, scale=scale)
+        box = read_mesh_facets(file(BOX, "box.ply"), unit=unit, scale=scale)
         np.testing.assert_allclose(extents(box), scale * metres * np.array([1, 2, 3]), rtol=1e-6)
 
 
 def test_what_was_up_in_gltf_is_up_in_the_scene(file):
-    upright = read_mesh(file(BOX, "box.glb"))
+    upright = read_mesh_facets(file(BOX, "box.glb"))
     np.testing.assert_allclose(extents(upright), (1, 3, 2), rtol=1e-6)
-    as_it_lies = read_mesh(file(BOX, "box.glb"), up="z")
+    as_it_lies = read_mesh_facets(file(BOX, "box.glb"), up="z")
     np.testing.assert_allclose(extents(as_it_lies), (1, 2, 3), rtol=1e-6)
     tall = trimesh.creation.cone(radius=1.0, height=5.0)  # its tip along z of the file
     tall.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # now y
-    cone = read_mesh(file(tall, "cone.glb"))
+    cone = read_mesh_facets(file(tall, "cone.glb"))
     tip = cone.vertices + cone.origin
     assert tip[tip[:, 2].argmax(), 2] == pytest.approx(5.0)
 
@@ -69,7 +69,7 @@ def test_the_parts_of_a_scene_stand_where_its_graph_puts_them(file):
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     mirror[:3, 3] = (-10, 0, 0)
     scene.add_geometry(BOX, transform=mirror)
-    meshes = read_mesh(file(scene, "two.glb"), up="z")
+    meshes = read_mesh_facets(file(scene, "two.glb"), up="z")
     assert len(meshes.faces) == 24
     np.testing.assert_allclose(extents(meshes), (21, 2, 3), rtol=1e-6)
     assert volume(meshes) == pytest.approx(12, rel=1e-6)  # the mirrored one is not inside out
@@ -78,7 +78,7 @@ def test_the_parts_of_a_scene_stand_where_its_graph_puts_them(file):
 def test_faces_without_area_and_double_ones_are_reported_when_the_mesh_is_made(tmp_path):
     path = tmp_path / "dirty.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 3 2 1\nf 2 2 3\nf 2 4 3\n")
-    mesh, report = read_mesh(path).to_mesh()
+    mesh, report = read_mesh_facets(path).to_cleaned_mesh()
     assert len(mesh.faces) == 2
     assert (report.n_duplicate_faces, report.n_degenerate_faces) == (1, 1)
 
@@ -87,7 +87,7 @@ def test_faces_without_area_and_double_ones_are_reported_when_the_mesh_is_made(t
 def test_a_mesh_in_no_unit_of_length_is_refused_with_file_rule_and_remedy(file, unit):
     path = file(BOX, "box.ply")
     with pytest.raises(SceneError, match=unit) as refused:
-        read_mesh(path, unit=unit)
+        read_mesh_facets(path, unit=unit)
     assert str(path) in str(refused.value) and refused.value.remedy
 
 
@@ -99,9 +99,9 @@ def test_files_that_are_no_mesh_are_refused(tmp_path):
     ):
         (tmp_path / name).write_text("0 0 0\n1 0 0\n0 1 0\n")
         with pytest.raises(SceneError, match=message):
-            read_mesh(tmp_path / name)
+            read_mesh_facets(tmp_path / name)
     with pytest.raises(SceneError, match="does not exist"):
-        read_mesh(tmp_path / "gone.stl")
+        read_mesh_facets(tmp_path / "gone.stl")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_binary_stl_of_another_size_than_its_triangles_is_refused(file, size, 
     assert len(content) == 684
     path.write_bytes(content[:size] + bytes(max(0, size - 684)))
     with pytest.raises(SceneError, match=message):
-        read_mesh(path)
+        read_mesh_facets(path)
 
 
 @pytest.mark.parametrize("start", ["solid box\n", "\ufeffsolid\n", "SOLID\n"])
@@ -127,7 +127,7 @@ def test_an_stl_of_text_is_read_however_it_begins(tmp_path, start):
     text = trimesh.exchange.stl.export_stl_ascii(BOX)
     path = tmp_path / "box.stl"
     path.write_text(start + text.partition("\n")[2])
-    assert len(read_mesh(path).faces) == 12
+    assert len(read_mesh_facets(path).faces) == 12
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_an_stl_of_text_is_read_however_it_begins(tmp_path, start):
 def test_counts_below_zero_are_reported(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
     with pytest.raises(SceneError, match=message):
-        read_mesh(tmp_path / name)
+        read_mesh_facets(tmp_path / name)
 
 
 def test_a_link_that_leads_to_itself_is_reported(tmp_path):
@@ -154,7 +154,7 @@ def test_a_link_that_leads_to_itself_is_reported(tmp_path):
     (tmp_path / "folder").symlink_to("folder")
     for name in ("self.stl", "there.stl", "folder/box.stl"):
         with pytest.raises(SceneError, match="is reached by a link that leads back to itself"):
-            read_mesh(tmp_path / name)
+            read_mesh_facets(tmp_path / name)
 
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)

@@ -11,7 +11,7 @@ import trimesh
 from facet_areas import triangle_areas
 from matplotlib.path import Path as Outline
 
-from sweep.scenes.meshes import MESH_FACES_MAX, read_mesh
+from sweep.scenes.meshes import MESH_FACES_MAX, read_mesh_facets
 from sweep.scenes.polygons import PolygonError, Polygons, triangulate_polygons
 from sweep.scenes.scene_files import SceneError
 
@@ -76,14 +76,14 @@ WRITERS = {
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_polygon_that_is_not_convex_covers_itself_and_not_its_notch(tmp_path, name):
     WRITERS[name](tmp_path / name, flat(U, 5.0), [list(range(8))])
-    facets = read_mesh(tmp_path / name)
+    facets = read_mesh_facets(tmp_path / name)
     assert triangle_areas(facets.vertices, facets.faces).sum() == pytest.approx(7.0, rel=1e-12)
     corners = facets.vertices[facets.faces]
     inside = [Outline(corner[:, :2]).contains_point((1.5, 2.0)) for corner in corners]
     assert not any(inside)  # the middle of the notch
     up = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (up[:, 2] > 0).all()  # wound as the polygon is
-    _, report = facets.to_mesh()
+    _, report = facets.to_cleaned_mesh()
     assert "1 polygon cut into triangles, 1 of them not convex" in report.summary()
 
 
@@ -94,12 +94,12 @@ def test_triangles_and_quads_mixed_read_the_same_in_every_format(tmp_path, name)
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4]]
     faces += [[1, 5, 7], [1, 7, 3]]
     WRITERS[name](tmp_path / name, corners, faces)
-    facets = read_mesh(tmp_path / name)
+    facets = read_mesh_facets(tmp_path / name)
     expected = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7]]
     expected += [[2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
     assert facets.faces.tolist() == expected
     np.testing.assert_array_equal(facets.vertices, corners)
-    assert "4 polygons cut into triangles; nothing to mend" in facets.to_mesh()[1].summary()
+    assert "4 polygons cut into triangles; nothing to mend" in facets.to_cleaned_mesh()[1].summary()
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -110,7 +110,7 @@ def test_a_polygon_that_crosses_itself_is_refused_with_its_number(tmp_path, name
     with pytest.raises(
         SceneError, match=r"face 2 of 4 corners crosses itself.*check it"
     ) as refused:
-        read_mesh(tmp_path / name)
+        read_mesh_facets(tmp_path / name)
     assert str(tmp_path / name) in str(refused.value)
 
 
@@ -143,7 +143,7 @@ def test_a_hole_has_to_be_gone_round_against_its_outline():
 def test_a_face_that_names_a_vertex_that_does_not_exist_is_refused_with_its_number(tmp_path):
     write_obj(tmp_path / "a.obj", flat(U), [[0, 1, 2], [0, 1, 2, 98]])
     with pytest.raises(SceneError, match="face 2 names the vertex 99 of 8"):
-        read_mesh(tmp_path / "a.obj")
+        read_mesh_facets(tmp_path / "a.obj")
 
 
 def test_polygons_at_random_are_covered_once_and_nowhere_else():
@@ -200,11 +200,11 @@ def test_polygons_without_area_or_data_are_dropped_and_counted(tmp_path):
     points = [*flat([[0, 0], [1, 0], [2, 0], [3, 0]]), *flat([[0, 0], [1, 0], [1, 1], [0, 1]], 1.0)]
     faces = [[0, 1, 2, 3], [4, 5, 6, 7], [0, 0, 1, 1], [4, 5]]
     write_obj(tmp_path / "a.obj", points, faces)
-    mesh, report = read_mesh(tmp_path / "a.obj").to_mesh()
+    mesh, report = read_mesh_facets(tmp_path / "a.obj").to_cleaned_mesh()
     assert len(mesh.faces) == 2 and report.n_degenerate_faces == 5
     points[0][0] = np.nan
     write_obj(tmp_path / "b.obj", points, faces[:2])
-    mesh, report = read_mesh(tmp_path / "b.obj").to_mesh()
+    mesh, report = read_mesh_facets(tmp_path / "b.obj").to_cleaned_mesh()
     assert (
         len(mesh.faces) == 2 and report.n_non_finite_faces == 2 and report.n_degenerate_faces == 0
     )
@@ -215,7 +215,7 @@ def test_bent_polygons_are_reported_and_those_bent_too_far_refused(tmp_path):
     write_obj(tmp_path / "a.obj", quad, [[0, 1, 2, 3]])
     assert (
         "1 polygon departs from a plane by up to 0.02 units"
-        in read_mesh(tmp_path / "a.obj").to_mesh()[1].summary()
+        in read_mesh_facets(tmp_path / "a.obj").to_cleaned_mesh()[1].summary()
     )
     with pytest.raises(PolygonError, match="face 1 is bent by 35 % of its size"):
         cut(flat([[0, 0], [1, 0], [1, 1], [0, 1]], [0, 0.7, 0, 0.7]))
@@ -228,7 +228,7 @@ def test_a_mesh_of_polygons_alone_needs_no_materials_and_opens_no_pipe(tmp_path)
         "mtllib pipe.mtl\nusemtl red\nv 0 0 0\nv 1 0 0 # corner\nv 1 1 0\nv 0 1 0\n"
         "f -4 -3/1/1 \\\n-2//3 -1\n"
     )
-    assert read_mesh(path).faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert read_mesh_facets(path).faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
 def gltf(path, *, uri=None, accessor=None, nodes=None, images=()):
@@ -256,46 +256,46 @@ def gltf(path, *, uri=None, accessor=None, nodes=None, images=()):
 def test_a_gltf_reads_plain_files_alone_and_no_pictures(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     path = tmp_path / "a.gltf"
-    assert len(read_mesh(gltf(path, images=["pipe"])).faces) == 1
+    assert len(read_mesh_facets(gltf(path, images=["pipe"])).faces) == 1
     for uri, message in (("pipe", "pipe or a device"), ("/dev/zero", "pipe or a device")):
         with pytest.raises(SceneError, match=message):
-            read_mesh(gltf(path, uri=uri))
+            read_mesh_facets(gltf(path, uri=uri))
 
 
 def test_declared_sizes_are_looked_at_before_anything_is_read(tmp_path, monkeypatch):
     huge = {"componentType": 5126, "count": 10**11, "type": "VEC3"}
     with pytest.raises(SceneError, match="100,000,000,000 elements in 36 bytes"):
-        read_mesh(gltf(tmp_path / "a.gltf", accessor=huge))
+        read_mesh_facets(gltf(tmp_path / "a.gltf", accessor=huge))
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\n"
     (tmp_path / "a.ply").write_text(header + "property float x\nend_header\n")
     with pytest.raises(SceneError, match="declares 1,000,000,000,000 vertices"):
-        read_mesh(tmp_path / "a.ply")
+        read_mesh_facets(tmp_path / "a.ply")
     (tmp_path / "a.off").write_text("OFF\n1000000000000 1 0\n0 0 0\n")
     with pytest.raises(SceneError, match="ends after 1 of 1,000,000,000,000 vertices"):
-        read_mesh(tmp_path / "a.off")
+        read_mesh_facets(tmp_path / "a.off")
     monkeypatch.setattr("sweep.scenes.meshes.MESH_FACES_MAX", 10)
     assert MESH_FACES_MAX == 100_000_000
     nodes = [{"children": list(range(1, 21))}, *[{"mesh": 0}] * 20]
     with pytest.raises(SceneError, match="make 20 triangles"):
-        read_mesh(gltf(tmp_path / "many.gltf", nodes=nodes))
+        read_mesh_facets(gltf(tmp_path / "many.gltf", nodes=nodes))
 
 
 @pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.bz2", "a.3mf", "a.dae", "a.dxf", "a"])
 def test_archives_and_formats_that_are_not_read_are_refused_unread(tmp_path, name):
     (tmp_path / name).write_bytes(b"PK\3\4")
     with pytest.raises(SceneError, match=r"no mesh of a format that is read \(.stl, .obj"):
-        read_mesh(tmp_path / name)
+        read_mesh_facets(tmp_path / name)
 
 
 def test_a_mesh_larger_than_the_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
     write_obj(tmp_path / "a.obj", flat(U), [list(range(8))])
     monkeypatch.setattr("psutil.virtual_memory", lambda: type("M", (), {"available": 100}))
     with pytest.raises(SceneError, match=r"GB of memory, of which .* free; reduce the mesh"):
-        read_mesh(tmp_path / "a.obj")
+        read_mesh_facets(tmp_path / "a.obj")
 
 
 @pytest.mark.parametrize("place", [-3.4e38, 1e30, 2e9])
 def test_a_vertex_too_far_off_to_compute_with_is_refused(tmp_path, place):
     write_obj(tmp_path / "a.obj", [[0, 0, 0], [1, 0, 0], [0, 1, place]], [[0, 1, 2]])
     with pytest.raises(ValueError, match="farther than 1e"):
-        read_mesh(tmp_path / "a.obj").to_mesh()
+        read_mesh_facets(tmp_path / "a.obj").to_cleaned_mesh()

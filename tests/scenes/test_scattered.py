@@ -22,7 +22,7 @@ def field(law, ground, smallest=0.2, largest=5.0, **shape):
 
 def area_fraction(law, diameter):
     """Fraction of the ground under rocks of this diameter or larger."""
-    return law.area_fraction * np.exp(-law.decay_rate * diameter)
+    return law.area_fraction * np.exp(-law.area_fraction_decay_rate * diameter)
 
 
 def test_numbers_of_rocks_are_the_integral_of_their_area_law():
@@ -30,7 +30,7 @@ def test_numbers_of_rocks_are_the_integral_of_their_area_law():
     law = scattered_objects.MartianRockLaw(area_fraction=0.1)
     for diameter in (0.01, 0.3, 2.0, 6.0):
         number, error = integrate.quad(
-            lambda d: law.decay_rate * area_fraction(law, d) * 4 / (math.pi * d**2),
+            lambda d: law.area_fraction_decay_rate * area_fraction(law, d) * 4 / (math.pi * d**2),
             diameter,
             np.inf,
             epsabs=0,
@@ -44,14 +44,16 @@ def test_numbers_of_rocks_are_the_integral_of_their_area_law():
 @pytest.mark.parametrize("cover", [0.02, 0.1, 0.4])
 def test_diameters_invert_the_cumulative_numbers(cover):
     law = scattered_objects.MartianRockLaw(area_fraction=cover)
-    diameter = np.geomspace(1e-3, 30 / law.decay_rate, 200)
+    diameter = np.geomspace(1e-3, 30 / law.area_fraction_decay_rate, 200)
     np.testing.assert_allclose(
         law.diameter_at_number_density(law.cumulative_number_density(diameter)), diameter, rtol=1e-9
     )
 
 
 def test_a_tenth_of_cover_has_the_published_decay():
-    assert scattered_objects.MartianRockLaw(area_fraction=0.1).decay_rate == pytest.approx(3.31)
+    assert scattered_objects.MartianRockLaw(
+        area_fraction=0.1
+    ).area_fraction_decay_rate == pytest.approx(3.31)
 
 
 @pytest.mark.parametrize("smallest", [0.2, 0.5, 1.0])
@@ -69,7 +71,9 @@ def test_counts_and_cover_of_a_field_follow_the_law(smallest):
     assert abs((diameter >= smallest).sum() - expected) < 5 * math.sqrt(expected)
     cover = side**2 * (area_fraction(law, smallest) - area_fraction(law, 5.0))
     squares, _ = integrate.quad(
-        lambda d: law.decay_rate * area_fraction(law, d) * math.pi * d**2 / 4, smallest, 5.0
+        lambda d: law.area_fraction_decay_rate * area_fraction(law, d) * math.pi * d**2 / 4,
+        smallest,
+        5.0,
     )
     assert abs(area[diameter >= smallest].sum() - cover) < 5 * math.sqrt(side**2 * squares)
 
@@ -315,7 +319,7 @@ def test_a_crown_has_the_leaf_area_of_its_index():
     outline = math.pi * TREE.crown_diameter**2 / 4
     leaf_area = triangle_areas(leaves.vertices, leaves.faces).sum()
     assert leaf_area == pytest.approx(TREE.leaf_area_index * outline, rel=1e-3)  # whole leaves
-    assert len(leaves.faces) == 2 * TREE.number_of_leaves
+    assert len(leaves.faces) == 2 * TREE.n_leaves
 
 
 def test_leaves_face_every_way():
@@ -334,7 +338,7 @@ def test_gaps_in_a_crown_follow_beers_law():
     generator = np.random.default_rng(3)
     tree = scattered_objects.MeanTreeDimensions(variation=0.0, leaf_length=0.2, leaf_width=0.15)
     a, depth = tree.crown_diameter / 2, tree.height - tree.crown_base
-    density = tree.number_of_leaves * tree.leaf_area / (4 / 3 * math.pi * a**2 * depth / 2)
+    density = tree.n_leaves * tree.leaf_area / (4 / 3 * math.pi * a**2 * depth / 2)
     rays, crowns, gaps, expected = 60, 8, 0, 0.0
     for _ in range(crowns):
         leaves = scattered_objects.draw_crown_leaves(generator, tree)
@@ -390,7 +394,7 @@ def test_a_clump_stands_on_its_hill_apart_and_within_its_radius():
     assert distances.min() >= TREE.crown_diameter / 2
     assert np.hypot(*(feet[:, :2] - 50.0).T).max() <= 15.0
     np.testing.assert_allclose(feet[:, 2], 0.2 * feet[:, 0], atol=1e-9)
-    assert (clump.surface == scattered_objects.LEAF_SURFACE).sum() == 9 * 2 * TREE.number_of_leaves
+    assert (clump.surface == scattered_objects.LEAF_SURFACE).sum() == 9 * 2 * TREE.n_leaves
 
 
 def _clump(seed, **places):

@@ -115,7 +115,7 @@ def test_joined_facets_keep_their_place_digits_and_surfaces():
 
 
 def test_a_placed_object_is_scaled_and_turned_about_its_origin():
-    corner = Facets.on_one_surface(
+    corner = Facets.from_triangles(
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]], origin=(10, 20, 30)
     )
     placed = corner.transform(rotation=from_axis_angle(2, math.pi / 2), scale=2.0)
@@ -125,7 +125,7 @@ def test_a_placed_object_is_scaled_and_turned_about_its_origin():
 
 def test_facets_become_a_mesh_at_the_same_place():
     facets = terrain(hilly(5, 5), origin=FAR).to_facets()
-    mesh, report = replace(facets, surface=facets.surface + 3).to_mesh()
+    mesh, report = replace(facets, surface=facets.surface + 3).to_cleaned_mesh()
     np.testing.assert_allclose(
         np.sort(mesh.vertices + mesh.origin, axis=0),
         np.sort(facets.vertices + facets.origin, axis=0),
@@ -285,7 +285,7 @@ def test_a_grid_is_the_mesh_that_cleaning_its_triangles_would_make(spacing, hole
     heights.ravel()[random.choice(heights.size, holes, replace=False)] = np.nan
     heights[0, 0] = -0.0
     facets = terrain(heights, spacing, (5e5, 4e6, 0.0)).to_facets()
-    mesh, report = facets.to_mesh()
+    mesh, report = facets.to_cleaned_mesh()
     expected, mended = clean_mesh(facets.vertices, facets.faces, facets.surface)
     assert report == mended and report.summary().endswith("nothing to mend")
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)

@@ -66,6 +66,6 @@ def required_values(path: str) -> dict[str, Any]:
 def axis_member_content(member: Any) -> tuple[Any, ...]:
     """All that a parameter along an axis holds."""
     return (
-        member.path, member.coordinate, member.units, np.asarray(member.values).tolist(),
+        member.path, member.coordinate_name, member.units, np.asarray(member.values).tolist(),
         member.display_values.tolist(),
     )  # fmt: skip

@@ -56,7 +56,7 @@ def test_every_beam_meets_the_ground(name):
         assert beam_eyepoints.has_target.all() and (beam_eyepoints.surface >= 0).mean() > 0.999
         assert 2 * beam_eyepoints.range.max() / 299_792_458 < 0.1 * spec.instrument.chirp.duration
     parameters = spec.parameters()
-    reflectances = {surface.reflectance for surface in spec.surfaces()}
+    reflectances = {surface.reflectance for surface in spec.surface_materials()}
     assert parameters["instrument.telescope.optical_efficiency"] == 1 and reflectances == {0.1}
 
 
@@ -72,15 +72,15 @@ def test_every_beam_meets_the_ground(name):
 def test_a_descent_is_that_of_the_thesis(name, first, last, speeds, cycles):
     spec, eyes = only(name)
     flight, (scanner,) = spec.build_flight(), spec.scanners
-    assert flight.stop == pytest.approx(2 * (first - last) / sum(speeds))
-    ends = flight.state(np.array([0.0, flight.stop]))
+    assert flight.stop_time == pytest.approx(2 * (first - last) / sum(speeds))
+    ends = flight.state(np.array([0.0, flight.stop_time]))
     np.testing.assert_allclose(ends.position, [[0, 0, first], [0, 0, last]], atol=1e-9)
     np.testing.assert_allclose(ends.velocity[:, 2], [-speeds[0], -speeds[1]], rtol=1e-12)
     rate = 1 if scanner == "three" else 20
     assert (
         spec.number_of_cycles(scanner)
         == cycles
-        == int(flight.stop * rate - 0.7499 * (rate > 1)) + 1
+        == int(flight.stop_time * rate - 0.7499 * (rate > 1)) + 1
     )
     # v cos(angle from nadir), to the 25 urad by which the reference beamlet may lie off the axis.
     np.testing.assert_allclose(
@@ -109,7 +109,7 @@ def test_a_square_shrinks_as_the_lidar_comes_down(name, angle):
 
 def test_a_diagonal_path_shows_three_velocities():
     spec, eyes = only("oblique_descent")
-    path = spec.build_flight().state(np.array([0.0, spec.build_flight().stop])).position
+    path = spec.build_flight().state(np.array([0.0, spec.build_flight().stop_time])).position
     way = path[1] - path[0]
     assert np.linalg.norm(way) == pytest.approx(400, abs=1e-3) and path[0, 2] == 500
     np.testing.assert_allclose(way / 400, [0.5, 0.5, -np.sqrt(0.5)], atol=1e-5)
@@ -154,7 +154,7 @@ def test_fore_and_aft_beams_see_opposite_velocities_of_two_bins():
 
 def test_the_scan_covers_hills_with_a_clump_of_trees_in_their_middle():
     spec, eyes = only("forest_scan")
-    names = [surface.name for surface in spec.surfaces()]
+    names = [surface.name for surface in spec.surface_materials()]
     leaf = (eyes.surface == names.index("forest.leaf")).any(axis=1)
     ground = grounded(eyes)
     assert 100 < leaf.sum() < 0.15 * len(leaf)

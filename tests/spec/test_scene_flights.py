@@ -28,7 +28,7 @@ def beams_of(**scanner):
 
 def test_a_straight_path_covers_its_distance_at_its_speeds():
     flight = spec_of().build_flight()
-    assert flight.stop == pytest.approx(2 * 400 / (60 + 20), rel=1e-15)
+    assert flight.stop_time == pytest.approx(2 * 400 / (60 + 20), rel=1e-15)
     t = np.array([0.0, 2.5, 10.0])
     fallen = 60 * t - 0.5 * 4 * t**2
     state = flight.state(t)
@@ -37,7 +37,7 @@ def test_a_straight_path_covers_its_distance_at_its_speeds():
 
 
 def test_a_straight_path_keeps_its_speed_where_no_other_is_stated():
-    assert spec_of({"platform.path.final_speed": ...}).build_flight().stop == pytest.approx(
+    assert spec_of({"platform.path.final_speed": ...}).build_flight().stop_time == pytest.approx(
         400 / 60
     )
 
@@ -64,7 +64,7 @@ def test_paths_are_those_of_the_model(tmp_path):
     static_flight = with_path(
         kind="still", position=["1 m", "2 m", "300 m"], duration="7 s"
     ).build_flight()
-    assert static_flight.stop == 7
+    assert static_flight.stop_time == 7
     np.testing.assert_array_equal(static_flight.state(np.array([6.0])).velocity, 0)
     table = "time [s], x [m], y [m], z [km]\n0, 0, 0, 0.5\n5, 10, 0, 0.4\n10, 20, 0, 0.3\n"
     (tmp_path / "path.csv").write_text(table)
@@ -284,7 +284,7 @@ def test_tables_of_gps_seconds_share_the_origin_of_the_platforms_first_time(tmp_
     spec = SceneSpec.from_mapping(mapping, base=tmp_path)
     assert spec.files.time_origin == first
     flight, (ball,) = spec.build_flight(), spec.build_scene().body_motions
-    assert (flight.start, flight.stop) == (0, 1)
+    assert (flight.start_time, flight.stop_time) == (0, 1)
     state = flight.state(np.linspace(0, 1, 333))
     assert np.abs(state.acceleration).max() < 1e-8
     np.testing.assert_allclose(state.velocity[:, 0], 100, atol=1e-9)

@@ -163,7 +163,10 @@ def test_the_order_of_objects_numbers_their_surfaces():
         expected_spec.geometry_id("three") != other_spec.geometry_id("three")
         and expected_spec.id != other_spec.id
     )
-    assert other_spec.surfaces()[0].name == "ball" and expected_spec.surfaces()[0].name == "ground"
+    assert (
+        other_spec.surface_materials()[0].name == "ball"
+        and expected_spec.surface_materials()[0].name == "ground"
+    )
 
 
 def test_a_geometry_is_seen_through_one_scanner():
@@ -258,13 +261,13 @@ def test_a_stored_study_needs_its_files_only_where_rays_do(study_with_files):
     moved = folder.rename(folder.parent / "there")
     lost = from_stored(text)
     assert lost.id == spec.id and lost.geometry_id("three") == spec.geometry_id("three")
-    assert [surface.name for surface in lost.surfaces()] == ["ground", "thing"]
+    assert [surface.name for surface in lost.surface_materials()] == ["ground", "thing"]
     for look in (lost.build_flight, lost.build_scene):
         with pytest.raises(SceneError, match="does not exist"):
             look()
     stored_spec = from_stored(text, base=moved)
     assert stored_spec.number_of_cycles("three") == 21 and stored_spec.build_scene().mesh_reports
-    assert stored_spec.files.base == moved and stored_spec == lost
+    assert stored_spec.files.base_folder == moved and stored_spec == lost
 
 
 def test_a_file_that_has_changed_since_is_refused(study_with_files):
@@ -272,7 +275,7 @@ def test_a_file_that_has_changed_since_is_refused(study_with_files):
     spec = spec_of(mapping, folder)
     stored = from_stored(spec.to_json(), base=folder)
     trimesh.creation.box(extents=[2.0, 2, 3]).export(folder / "box.stl")
-    assert spec.build_flight().stop == 10
+    assert spec.build_flight().stop_time == 10
     for one in (spec, stored):
         with pytest.raises(SceneError, match=r"box\.stl: has changed since .* bring the old"):
             one.build_scene()

@@ -63,7 +63,10 @@ def test_a_plane_is_seen_at_its_distance_and_closing_speed():
     np.testing.assert_allclose(eyes.radial_velocity, -eyes.velocity[:, 2] * slant, rtol=1e-9)
     np.testing.assert_allclose(np.arccos(eyes.cos_incidence[:, 0]), math.radians(20), rtol=1e-9)
     assert (eyes.surface == 0).all() and world.body_motions == (None,)
-    assert world.surfaces == spec.surfaces() and world.surfaces[0].reflectance == 0.1
+    assert (
+        world.surface_materials == spec.surface_materials()
+        and world.surface_materials[0].reflectance == 0.1
+    )
 
 
 def test_a_plane_slopes_and_rises_where_it_says():
@@ -224,12 +227,12 @@ def test_drawn_ground_is_the_same_for_a_seed_and_another_for_another(ground):
 def test_trees_have_leaves_and_trunks_of_their_own_on_the_ground():
     mapping = scene_with_object(TREES_OBJECT, "forest", radius="8 m", number=3)
     spec, world = built(mapping)
-    assert [surface.name for surface in spec.surfaces()] == [
+    assert [surface.name for surface in spec.surface_materials()] == [
         "ground",
         "forest.leaf",
         "forest.trunk",
     ]
-    assert [surface.reflectance for surface in world.surfaces] == [0.1, 0.4, 0.2]
+    assert [surface.reflectance for surface in world.surface_materials] == [0.1, 0.4, 0.2]
     mesh = world.caster.meshes[0]
     heights = {
         k: (mesh.vertices + mesh.origin)[mesh.faces[mesh.surface_index == k]] for k in (1, 2)

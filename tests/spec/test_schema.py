@@ -195,7 +195,7 @@ def test_an_editor_sees_the_mistake_in_a_flight_by_the_schema(changes, validator
 def test_every_law_of_the_model_is_one_that_surfaces_take(law, validator):
     mapping = scene_with_object(SPHERE_OBJECT, reflectance_law=law)
     validator.validate(mapping)
-    assert SceneSpec.from_mapping(mapping).surfaces()[1].reflectance_law == law
+    assert SceneSpec.from_mapping(mapping).surface_materials()[1].reflectance_law == law
 
 
 def test_every_parameter_is_described_with_an_example():

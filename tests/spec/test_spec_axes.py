@@ -23,7 +23,7 @@ def member(path, values):
 
 def test_a_list_keeps_the_users_unit_next_to_si():
     power = member("instrument.laser.power", ["1 W", "3000 mW", "5 W"])
-    assert (power.coordinate, power.units) == ("power", "W")
+    assert (power.coordinate_name, power.units) == ("power", "W")
     assert power.values.tolist() == power.display_values.tolist() == [1.0, 3.0, 5.0]
 
 
@@ -145,7 +145,7 @@ def test_zipped_pieces_are_laid_end_to_end_with_single_values_repeated():
     )
     assert (cut.name, cut.size, cut.is_zipped) == ("cut", 6, True)
     distance, angle = cut.parameters
-    assert (distance.coordinate, distance.units) == ("range", "m")
+    assert (distance.coordinate_name, distance.units) == ("range", "m")
     assert distance.values.tolist() == [5.0, 6.0, 7.0, 3500.0, 3500.0, 9.0]
     assert angle.display_values.tolist() == [15.0, 15.0, 15.0, 1.0, 2.0, 90.0]
 
@@ -230,7 +230,7 @@ def test_a_field_and_its_axis_must_agree_and_a_store_keeps_the_axis_alone():
 
 def test_no_coordinate_bears_the_name_of_a_variable(tmp_path):
     beamlets = member("footprint.beamlets", [19, 37])
-    assert beamlets.coordinate == "footprint_beamlets"
+    assert beamlets.coordinate_name == "footprint_beamlets"
     pieces = [{"target.range": f"{r} km", "target.grazing_angle": "45 deg"} for r in (1, 2)]
     for name in ("pd_shot", "range_error", "effects", "n_draws", "range_bias"):
         with pytest.raises(SpecError, match=f"axes.{name}: has the name of a variable"):

@@ -131,7 +131,7 @@ def test_any_value_of_a_numeric_parameter_is_written_so_that_it_reads_back(data)
     value = data.draw(st.floats(1e-300, 1e300, allow_nan=False))
     rule = parameter_rules()[parameter.path]
     assert isinstance(rule, NumericRule)
-    if rule.si_unit != "dB" and rule.first_out_of_bounds(np.array([value])) is None:
+    if rule.si_unit != "dB" and rule.first_bound_violation(np.array([value])) is None:
         assert rule.read(rule.format(value)) == value
 
 

@@ -16,7 +16,7 @@ from sweep.model.threshold import (
     THRESHOLD_PATHS,
     TNR_PATH,
 )
-from sweep.model.waveform import PEAKS_PATH, SEARCH_BAND_PATHS
+from sweep.model.waveform import REPORTED_PEAKS_PATH, SEARCH_BAND_PATHS
 from sweep.spec import GridSpec, describe_differences
 from sweep.spec.grid_checks import is_detector_or_estimator_parameter
 from sweep.spec.rules import ChoiceRule
@@ -195,7 +195,7 @@ def test_every_parameter_is_part_of_the_id(path):
     every |= required_values(path)
     if path in SEARCH_BAND_PATHS:
         every |= BAND
-    if path == PEAKS_PATH:  # of closed forms, without draws
+    if path == REPORTED_PEAKS_PATH:  # of closed forms, without draws
         every = {}
     instead = {TNR_PATH: ...} if path in THRESHOLD_PATHS and path != TNR_PATH else {}
     base, changed_spec = spec(every), spec(every | instead | {path: other_value(path)})
@@ -215,7 +215,7 @@ def test_draws_seed_and_blocks_are_part_of_the_id(changes):
 
 def test_the_models_version_is_part_of_the_id(monkeypatch):
     before, id_before = spec().identity(), spec().id
-    monkeypatch.setattr(sweep.spec.specs, "VERSION", "another")
+    monkeypatch.setattr(sweep.spec.specs, "MODEL_VERSION", "another")
     assert spec().id != id_before
     (line,) = describe_differences(before, spec())
     assert line.startswith("model: ") and line.endswith("-> another")

@@ -7,7 +7,7 @@ import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.preparation import Shots
-from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
+from sweep.model.waveform import DEFAULT_CHIRP_RATE_RATIOS
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, window_samples
 
 
@@ -41,7 +41,7 @@ class ExactLine:
     """One beamlet's beat in one segment of a shot: place [bins], weight at t_0."""
 
     def __init__(self, shots: Shots, point: int, segment: int, beamlet: int) -> None:
-        row, sign = shots.footprint.row_of_point[point], DEFAULT_CHIRP_SLOPES[segment]
+        row, sign = shots.footprint.row_of_point[point], DEFAULT_CHIRP_RATE_RATIOS[segment]
         rate, carrier = (
             point_value(shots.waveform.chirp_rate, point),
             point_value(shots.waveform.carriers[segment], point),
@@ -59,7 +59,7 @@ class ExactLine:
         self.phase = -carrier * delay + sign * rate * delay**2 / 2 + start
         poles = 1 + 1j * self.beat / point_value(shots.receiver_filter.detector_bandwidth, point)
         poles *= 1 + 1j * self.beat / point_value(shots.receiver_filter.amplifier_bandwidth, point)
-        scale = point_value(shots.echo_scales.beat_amplitude, point) * mp.mpf(
+        scale = point_value(shots.echo_scales.beat_amplitude_scale, point) * mp.mpf(
             float(shots.footprint.relative_amplitude[row, beamlet])
         )
         self.weight = scale / 2 / poles * mp.expjpi(2 * self.phase)

@@ -10,7 +10,11 @@ from shot_helpers import segment_lines
 from table_4_1_shots import prepare_shot, table_4_1_parameters
 
 from sweep.model import beamlets
-from sweep.model.elementary_functions import exact_quotient, product_cycle_fraction, sincos_cycles
+from sweep.model.elementary_functions import (
+    double_double_quotient,
+    product_cycle_fraction,
+    sincos_cycles,
+)
 from sweep.model.geometry import quaternion
 from sweep.model.preparation import Shots
 
@@ -172,7 +176,7 @@ def fast_target() -> float:
 
 def optical_phase_error(*ranges_m: float) -> float:
     """Worst error of 2 R / lambda, R exact, in cycles."""
-    high, low = exact_quotient(2.0, WAVELENGTH)
+    high, low = double_double_quotient(2.0, WAVELENGTH)
     worst = 0.0
     with mp.workdps(60):
         for range_m in ranges_m:

@@ -145,7 +145,7 @@ def false_alarms_by_logarithm() -> float:
             statistics = evaluate(table_4_1_parameters(reflectance=0.0, tnr=tnr, fft_size=1024), ())
             log = -(4 - mp.pi) / 4 * mp.mpf(tnr) ** 2
             n_bins = int(
-                prepare_shot((), reflectance=0.0, fft_size=1024).alarm_equivalent_bins(
+                prepare_shot((), reflectance=0.0, fft_size=1024).n_alarm_equivalent_bins(
                     np.array([0])
                 )[0]
             )
@@ -290,7 +290,8 @@ def wider_than_the_band() -> float:
     _, magnitude = segment_spectrum(single_shot, 0, 1)
     half_amplitude = (
         float(
-            single_shot.echo_scales.beat_amplitude * single_shot.footprint.relative_amplitude[0, 0]
+            single_shot.echo_scales.beat_amplitude_scale
+            * single_shot.footprint.relative_amplitude[0, 0]
         )
         / 2
     )
@@ -386,7 +387,7 @@ def gaussian_line_shifts() -> float:
         )
         for order, moment in ((0, 1.0), (2, width**2), (4, 3 * width**4)):
             weighted_moment = math.fsum(
-                (line_shifts.weight * line_shifts.offset_window_bins**order)[0]
+                (line_shifts.weight * line_shifts.shift_window_bins**order)[0]
             )
             worst = max(worst, abs(weighted_moment / moment - 1))
     return worst

@@ -17,9 +17,9 @@ from sweep.model.evaluation import evaluate_segments
 from sweep.model.spectrum.bin_spectrum import (
     LineBundle,
     allocate_workspace,
-    compute_field,
+    compute_line_spectrum,
 )
-from sweep.model.spectrum.line_shape import SHARED_TABLE_BINS
+from sweep.model.spectrum.line_shape import SHARED_TABLE_HALF_WIDTH_BINS
 from sweep.model.spectrum.segment_spectra import bin_tangents
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, get_window, window_samples
 
@@ -41,11 +41,15 @@ def window_magnitudes(
 ) -> Iterator[float]:
     """|W| of single bins, unpadded, for a line `delta` bins off bin 0."""
     prepared = line_shape_of_window(get_window(window_name, size), size)
-    field = allocate_workspace(16).field
-    field.lines.position[0], field.lines.re[0], field.lines.im[0] = line_offset, 1.0, 0.0
+    line_spectrum = allocate_workspace(16).line_spectrum
+    line_spectrum.lines.position[0], line_spectrum.lines.re[0], line_spectrum.lines.im[0] = (
+        line_offset,
+        1.0,
+        0.0,
+    )
     bundle = LineBundle(0, 1, line_offset, line_offset, 1.0)
     for k in bins:
-        compute_field(
+        compute_line_spectrum(
             k,
             1,
             bundle,
@@ -53,14 +57,20 @@ def window_magnitudes(
             prepared.shape,
             prepared.layout,
             bin_tangents(size),
-            field,
+            line_spectrum,
         )
-        yield float(np.hypot(field.re[0], field.im[0]))
+        yield float(np.hypot(line_spectrum.re[0], line_spectrum.im[0]))
 
 
 def far_bins(size: int) -> list[int]:
     """Bins from beyond the table to well before Nyquist."""
-    return [SHARED_TABLE_BINS + 9, SHARED_TABLE_BINS + 123, size // 8, size // 4, size // 3]
+    return [
+        SHARED_TABLE_HALF_WIDTH_BINS + 9,
+        SHARED_TABLE_HALF_WIDTH_BINS + 123,
+        size // 8,
+        size // 4,
+        size // 3,
+    ]
 
 
 def far_sidelobe_error(window_name: str) -> float:

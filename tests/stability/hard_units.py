@@ -208,7 +208,7 @@ def round_trips() -> Iterator[int]:
         if isinstance(rule, NumericRule) and rule.si_unit and rule.si_unit != "dB":
             for digits in ("1e-12", "0.07071067811865476", "1.2345678901234567", "1e12"):
                 value = float(digits)
-                if rule.first_out_of_bounds(np.array([value])) is None:
+                if rule.first_bound_violation(np.array([value])) is None:
                     yield float_steps(value, rule.read(rule.format(value)))
 
 

@@ -101,6 +101,6 @@ def test_what_is_meaningless_together_is_refused_with_field_rule_value_and_remed
 def test_a_remedy_is_a_value_that_would_be_taken():
     for path, rule in RULES.items():
         if isinstance(rule, NumericRule):
-            assert rule.first_out_of_bounds(np.array([float(rule.read(rule.example))])) is None, (
+            assert rule.first_bound_violation(np.array([float(rule.read(rule.example))])) is None, (
                 path
             )

@@ -68,9 +68,9 @@ def faults(server, monkeypatch):
             monkeypatch.setattr(
                 locations, name, {**getattr(locations, name), "backoff": SHORT_BACKOFF}
             )
-        locations._clients.clear()
+        locations._client_by_bucket_url.clear()
         yield faulty
-        locations._clients.clear()
+        locations._client_by_bucket_url.clear()
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from small_studies import small_spec
 
 import sweep
 from sweep.cli import main
-from sweep.storage.store_format import NotAStoreError, append_line_digest
+from sweep.storage.store_format import NotAStoreError, log_line_with_digest
 from sweep.tasks.engine import study_store
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies.grid_study import GridStudy
@@ -247,6 +247,6 @@ def test_resuming_writes_through_no_link_out_of_a_store(store_copy, tmp_path, pl
 @pytest.mark.parametrize("body", [b"[1", b'{"block":', b'{"a":' + b"[" * 10**5, b'"x'])
 def test_a_log_whose_lines_have_digests_but_no_records_is_read_as_damaged(store_copy, body):
     for name in ("receipts.jsonl", "sessions.jsonl"):
-        (store_copy / ".sweep" / name).write_bytes(append_line_digest(body))
+        (store_copy / ".sweep" / name).write_bytes(log_line_with_digest(body))
     assert sweep.open(store_copy).attrs["blocks_committed"] == 0
     assert status(store_copy).blocks_done == 0

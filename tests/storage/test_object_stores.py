@@ -34,7 +34,7 @@ import sweep
 from sweep.cli import main
 from sweep.storage import locations, store_format
 from sweep.storage.locations import JOURNAL_DIR, ObjectStoreError, parse_location
-from sweep.storage.store_format import decode_record, encode_record, iter_records
+from sweep.storage.store_format import decode_log_record, encode_log_record, iter_log_records
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.engine.journal import LOCK_FILE, LockHolder, StoreLock, read_lock_holder
 from sweep.tasks.engine.progress import StoreError
@@ -55,7 +55,7 @@ def remote_tree(place) -> dict[str, str]:
 def receipts(place) -> list[int]:
     """Blocks with a receipt, in the order of the log."""
     return [
-        r["block"] for r in iter_records(parse_location(place) / JOURNAL_DIR / "receipts.jsonl")
+        r["block"] for r in iter_log_records(parse_location(place) / JOURNAL_DIR / "receipts.jsonl")
     ]
 
 
@@ -200,7 +200,7 @@ def test_of_many_that_find_the_lock_of_a_dead_driver_one_gets_it(faults, place):
     for lock in tries:
         lock.join()
     assert len(outcomes) == 1 and len(refused) == 5
-    assert outcomes[0].is_held()
+    assert outcomes[0].is_held_by_this_process()
     outcomes[0].release()
     assert read_lock_holder(path) is None
     StoreLock(path).release()
@@ -211,10 +211,10 @@ def test_a_lock_whose_answers_are_lost_is_had_kept_and_left(faults, place):
         DROP_REPLY if method == "PUT" and number % 2 else PASS_ON
     )
     lock = StoreLock(parse_location(place))
-    assert lock.is_held()
+    assert lock.is_held_by_this_process()
     lock._lock.send_heartbeat()
     lock._lock.send_heartbeat()
-    assert lock.is_held()
+    assert lock.is_held_by_this_process()
     lock.release()
     assert read_lock_holder(parse_location(place)) is None
 
@@ -242,7 +242,7 @@ def test_what_is_wrong_is_said_in_one_line(faults, monkeypatch, spoil, message, 
 
 def test_figures_that_are_no_status_are_not_taken_for_one():
     message = "Server error, status code: 503 Service Unavailable, after 2.403s"
-    number, words = locations.classify_error_text(message, "s3://bucket")
+    number, words = locations.object_store_errno_and_message(message, "s3://bucket")
     assert number == errno.EIO and words.endswith(
         "keeps failing (503 Service Unavailable): try again"
     )
@@ -310,16 +310,16 @@ def test_many_objects_of_a_log_become_few_and_say_the_same(memory, monkeypatch, 
     monkeypatch.setattr(store_format, "LOG_OBJECTS_MAX", objects_max)
     monkeypatch.setattr(store_format, "MERGED_LOG_OBJECT_BYTES", 200)
     path = parse_location(memory) / "log"
-    log = store_format.ObjectLog(path)
-    lines = [encode_record({"block": block, "text": "x" * 50}) for block in range(9)]
+    log = store_format.ObjectStoreLog(path)
+    lines = [encode_log_record({"block": block, "text": "x" * 50}) for block in range(9)]
     for line in lines:
         log.append(line)
         log.flush(force=True)
     (path / store_format.list_log_objects(path)[4]).write_bytes(lines[4][:-9] + b"\n")
-    log.remove_damaged_lines(lambda line: decode_record(line) is not None)
+    log.remove_damaged_lines(lambda line: decode_log_record(line) is not None)
     assert list(store_format.iter_raw_lines(path)) == lines[:4] + lines[5:]
     assert len(store_format.list_log_objects(path)) == (9 if objects_max == 100 else 3)
-    reopened = store_format.ObjectLog(path)
+    reopened = store_format.ObjectStoreLog(path)
     reopened.append(lines[4])
     reopened.flush(force=True)
     assert list(store_format.iter_raw_lines(path)) == [*lines[:4], *lines[5:], lines[4]]
@@ -410,9 +410,9 @@ def test_a_lock_that_is_cut_twice_is_no_strangers(faults, place, fate):
     with StoreLock(parse_location(place)) as lock:
         faults.fate = one_in(1, fate, is_lock)
         with pytest.raises(ObjectStoreError, match="cuts its answers short: try again"):
-            lock.is_held()
+            lock.is_held_by_this_process()
         faults.fate = lambda *_: PASS_ON
-        assert lock.is_held()
+        assert lock.is_held_by_this_process()
 
 
 def test_a_lock_that_is_damaged_as_a_whole_is_nobodys(faults, place):
@@ -435,7 +435,7 @@ def test_a_listing_that_is_cut_is_asked_for_once_more(faults, read_only_place, f
     assert resume(read_only_place, scheduler="none", progress=False).complete
     listed = sorted(parse_location(read_only_place).iter_objects_below())
     assert [key for key in listed if "sessions" not in key[0]] == names
-    locations._clients.clear()
+    locations._client_by_bucket_url.clear()
     assert parse_location(read_only_place).exists()  # at first contact too
     assert faults.seen[fate] > 4
 
@@ -495,6 +495,6 @@ def test_lines_of_a_log_that_are_cut_twice_are_not_dropped(faults, place):
     with pytest.raises(ObjectStoreError, match="cuts its answers short"):
         store_format.open_log(
             parse_location(place) / JOURNAL_DIR / "receipts.jsonl"
-        ).remove_damaged_lines(lambda line: decode_record(line) is not None)
+        ).remove_damaged_lines(lambda line: decode_log_record(line) is not None)
     faults.fate = lambda *_: PASS_ON
     assert receipts(place) == n_receipts

@@ -24,8 +24,8 @@ from sweep.cli import main
 from sweep.regular_files import RefusedFileError, open_regular_file, read_file_below_root
 from sweep.safe_json import parse_json
 from sweep.storage.locations import parse_location
-from sweep.storage.size_checks import ArrayFileLayout, zstd_content_bytes
-from sweep.storage.store_format import NotAStoreError, append_line_digest, encode_record
+from sweep.storage.size_checks import ArrayFileLayout, declared_zstd_content_size
+from sweep.storage.store_format import NotAStoreError, encode_log_record, log_line_with_digest
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.engine import journal
 from sweep.tasks.studies.store_verification import pack_store, verify
@@ -240,13 +240,13 @@ BOMBS = {
 
 
 def test_frames_declare_what_zstd_says():
-    assert zstd_content_bytes(frame(None)) is None and bytes(Zstd().decode(frame(None))) == bytes(
-        1 << 19
-    )
-    assert zstd_content_bytes(frame(1 << 40)) == 1 << 40
+    assert declared_zstd_content_size(frame(None)) is None and bytes(
+        Zstd().decode(frame(None))
+    ) == bytes(1 << 19)
+    assert declared_zstd_content_size(frame(1 << 40)) == 1 << 40
     for size in (0, 1, 255, 256, 257, 65535, 65536, 65791, 65792, 1 << 20):
         for content in (bytes(size), np.random.default_rng(1).bytes(size)):
-            assert zstd_content_bytes(bytes(Zstd().encode(content))) == size
+            assert declared_zstd_content_size(bytes(Zstd().encode(content))) == size
 
 
 @pytest.mark.parametrize(("bomb", "message"), BOMBS.values(), ids=BOMBS)
@@ -323,11 +323,11 @@ def test_deep_nesting_ends_in_words(store_copy, location, depth):
     document = json.loads((store_copy / "zarr.json").read_text())
     if location == "log":
         (store_copy / ".sweep" / "sessions.jsonl").write_bytes(
-            append_line_digest(b'{"event":"begun","time":' + nested(depth).encode())
+            log_line_with_digest(b'{"event":"begun","time":' + nested(depth).encode())
         )
     elif location == "listed":
         body = json.dumps({"objects": 0})[:-1].encode() + b',"attributes":' + nested(depth).encode()
-        (store_copy / ".sweep" / "template.jsonl").write_bytes(append_line_digest(body))
+        (store_copy / ".sweep" / "template.jsonl").write_bytes(log_line_with_digest(body))
         (store_copy / "zarr.json").write_text("")
     else:
         if location == "attributes":
@@ -390,7 +390,7 @@ def test_saved_parts_of_others_make_no_room_for_what_they_declare(tmp_path):
             "study": "one", "block": 7, "points": 1.0, "seconds": 1.0,
             "digest": journal._content_digest(content),
         }  # fmt: skip
-        (tmp_path / ".sweep" / "begun-7").write_bytes(encode_record(facts) + content)
+        (tmp_path / ".sweep" / "begun-7").write_bytes(encode_log_record(facts) + content)
         assert journal.read_checkpoint(tmp_path, "one", 7) == journal.Checkpoint()
 
 

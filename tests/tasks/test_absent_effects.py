@@ -136,9 +136,9 @@ def test_bare_shots_hold_nothing_of_any_effect():
         and bare.footprint.phase_cycles.size == 0
         and bare.motion.doppler_ratio == 0.0
     )
-    assert bare.echo_record.phase_errors == () and bare.laser_line.gaussian_width is None
+    assert bare.echo_record.phase_errors == () and bare.laser_line.gaussian_fwhm is None
     assert (
-        not bare.images.are_summed
+        not bare.line_images.are_summed
         and not bare.detection_settings.includes_leakage
         and bare.footprint.adds_powers
     )

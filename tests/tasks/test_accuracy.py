@@ -13,8 +13,8 @@ from sweep.model.effects.catalogue import EFFECT_NAMES
 from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     AS_WRITTEN_KIND,
+    BEAMLET_LATTICE_KIND,
     BEAMLET_ROW_KIND,
-    BEAMLETS_KIND,
     FIXED_EFFECTS_KIND,
     REFERENCE_KIND,
 )
@@ -92,7 +92,9 @@ def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
     tolerances = [setting.overrides["accuracy.tolerance"] for setting in adaptive]
     assert tolerances == [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
     fixed = [
-        setting for setting in ladder.settings if setting.kind in (BEAMLETS_KIND, BEAMLET_ROW_KIND)
+        setting
+        for setting in ladder.settings
+        if setting.kind in (BEAMLET_LATTICE_KIND, BEAMLET_ROW_KIND)
     ]
     numbers = [setting.overrides["footprint.beamlets"] for setting in fixed]
     assert numbers == [*settings.TRIED_BEAMLET_COUNTS, *settings.TRIED_LINE_BEAMLET_COUNTS]
@@ -454,7 +456,9 @@ def test_storing_is_the_making_of_the_store_and_the_writing_of_each_block(
     assert {block for block, _ in written_blocks} == {study.n_blocks // 2}
     # Whole chunks of all the block's arrays: anything else would have been refused.
     assert (
-        written_blocks[0][1].keys() == study.chunk_positions(study.n_blocks // 2).keys() >= {name}
+        written_blocks[0][1].keys()
+        == study.chunk_positions_of_block(study.n_blocks // 2).keys()
+        >= {name}
     )
     assert not list(tmp_path.iterdir())
 

@@ -53,8 +53,8 @@ def test_the_worst_point_is_reported_with_its_own_tolerance(store):
         assert row.excess == pytest.approx(float(over[row.name].max()), rel=1e-12)
         assert (
             row.tolerance_at_worst_point == 0
-            and row.draws_needed == math.inf
-            and row.samples_at_worst_point == 400
+            and row.n_draws_needed == math.inf
+            and row.n_samples_at_worst_point == 400
         )
         assert (
             row.n_points_within_tolerance == int((over[row.name] <= 0).sum()) and row.n_points == 18
@@ -75,9 +75,9 @@ def test_draws_that_are_said_to_do_about_do(tmp_path):
     few = small_spec(**ROUGH | {"draws": {"number": 300}}, axes=axes, accuracy=accuracy)
     rows = accuracy_rows_of_draws(run_serially(few, tmp_path / "few.zarr").store)
     assert [row.n_points_within_tolerance for row in rows] == [0, 0, 0, 0] and {
-        row.samples_at_worst_point for row in rows
+        row.n_samples_at_worst_point for row in rows
     } == {300}
-    needed = int(max(row.draws_needed for row in rows))
+    needed = int(max(row.n_draws_needed for row in rows))
     enough = small_spec(**ROUGH | {"draws": {"number": needed}}, axes=axes, accuracy=accuracy)
     for row in accuracy_rows_of_draws(run_serially(enough, tmp_path / "enough.zarr").store):
         assert row.worst_error < 0.022
@@ -118,7 +118,7 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
     )
     store = run_serially(spec, tmp_path / "wide.zarr").store
     (row,) = accuracy_rows_of_rays(store)
-    assert (row.n_points, row.n_points_within_tolerance, row.samples_max, row.worst_error) == (
+    assert (row.n_points, row.n_points_within_tolerance, row.n_samples_max, row.worst_error) == (
         3,
         2,
         4096,
@@ -143,12 +143,14 @@ def test_a_large_study_is_reported_by_some_of_its_blocks(tmp_path, monkeypatch):
         small_spec(**ROUGH | draws, axes=axes, storage={"block_points": 1}), tmp_path / "l"
     )
     all_rows = accuracy_rows_of_draws(store.store)
-    assert {row.block_fraction for row in all_rows} == {1.0} and {
+    assert {row.sampled_block_fraction for row in all_rows} == {1.0} and {
         row.n_points for row in all_rows
     } == {8}
     monkeypatch.setattr(store_summary, "SAMPLED_BLOCKS_MAX", 2)
     rows = accuracy_rows_of_draws(store.store)
-    assert {row.block_fraction for row in rows} == {2 / 8} and {row.n_points for row in rows} == {2}
+    assert {row.sampled_block_fraction for row in rows} == {2 / 8} and {
+        row.n_points for row in rows
+    } == {2}
     assert all(
         row.worst_error <= all_.worst_error for row, all_ in zip(rows, all_rows, strict=True)
     )

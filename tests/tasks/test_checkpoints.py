@@ -63,7 +63,7 @@ def saved(monkeypatch):
     points, real = [], journal.write_checkpoint
 
     def write(path, study_id, block, checkpoint):
-        points.append(checkpoint.points)
+        points.append(checkpoint.n_points_done)
         real(path, study_id, block, checkpoint)
 
     monkeypatch.setattr(journal, "write_checkpoint", write)
@@ -181,7 +181,7 @@ from sweep.tasks.engine import journal
 
 def write(path, study_id, block, found, real=journal.write_checkpoint):
     real(path, study_id, block, found)
-    if found.points > 0.5:
+    if found.n_points_done > 0.5:
         os.kill(os.getpid(), 9)
 
 journal.write_checkpoint = write
@@ -262,27 +262,29 @@ def test_what_is_saved_is_read_as_it_was_in_a_folder_and_in_an_object_store(plac
     )
     assert (
         journal.read_checkpoint(store, "one", 7) == Checkpoint()
-        and journal.read_checkpoint_points(store, "one") == {}
+        and journal.read_checkpoint_point_counts(store, "one") == {}
     )
     for points in (0.5, 0.25):  # less than there is takes no place
         journal.write_checkpoint(
             store, "one", 7, Checkpoint(EarlierResults(unfinished=part), points, 1.5)
         )
     checkpoint = journal.read_checkpoint(store, "one", 7)
-    assert (checkpoint.points, checkpoint.seconds) == (
+    assert (checkpoint.n_points_done, checkpoint.seconds) == (
         0.5,
         1.5,
-    ) and not checkpoint.results.finished.local_indices.size
-    np.testing.assert_array_equal(checkpoint.results.unfinished.local_indices, part.local_indices)
+    ) and not checkpoint.results.finished.indices_in_block.size
+    np.testing.assert_array_equal(
+        checkpoint.results.unfinished.indices_in_block, part.indices_in_block
+    )
     for name, values in part.results.items():
         np.testing.assert_array_equal(checkpoint.results.unfinished.results[name], values)
     assert (
-        journal.read_checkpoint_points(store, "one") == {7: 0.5}
-        and journal.read_checkpoint_points(store, "two") == {}
+        journal.read_checkpoint_point_counts(store, "one") == {7: 0.5}
+        and journal.read_checkpoint_point_counts(store, "two") == {}
     )
     journal.delete_checkpoints(store, 7)
     journal.delete_checkpoints(store, 7)
-    assert journal.read_checkpoint_points(store, "one") == {}
+    assert journal.read_checkpoint_point_counts(store, "one") == {}
 
 
 def test_an_extended_study_goes_on_in_pieces_too(undivided_stores, saved, tmp_path):

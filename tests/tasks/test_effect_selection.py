@@ -278,7 +278,7 @@ def test_a_plan_tells_the_shares_of_points_that_the_store_has(kind, flight, tmp_
     shares = {name: float(np.mean(flags >> k & 1)) for k, name in enumerate(EFFECT_NAMES)}
     table = effects_table(make_study(spec, store), costs=False)
     assert {row.name: row.simulated_fraction for row in table.rows} == pytest.approx(shares)
-    assert len(set(shares.values())) > 1 and table.tile_fraction == 1
+    assert len(set(shares.values())) > 1 and table.planned_tile_fraction == 1
 
 
 def test_a_plan_measures_few_points_where_each_takes_long(monkeypatch):

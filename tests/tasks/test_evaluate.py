@@ -13,10 +13,10 @@ from sweep.model.outputs import (
     DRAW_COUNT_OUTPUTS,
     GRID_OUTPUTS,
     N_RUNNING_SUMS,
-    RUNNING_SUMS,
+    RUNNING_SUMS_NAME,
     STANDARD_ERROR_OUTPUTS,
 )
-from sweep.tasks.studies.grid_study import evaluate_points, select_parameters
+from sweep.tasks.studies.grid_study import evaluate_points, select_parameters_of_points
 from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 from sweep.tasks.studies.store_summary import count_unsupported_points
 
@@ -36,7 +36,7 @@ def points(**draws):
 def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
     spec, parameters, count = points(**much, method=method)
     together = evaluate_points(spec, parameters, count, effects)
-    sums = {RUNNING_SUMS: (N_RUNNING_SUMS,)} if effects == RANDOM else {}
+    sums = {RUNNING_SUMS_NAME: (N_RUNNING_SUMS,)} if effects == RANDOM else {}
     assert set(together) == {
         *GRID_OUTPUTS,
         *STANDARD_ERROR_OUTPUTS,
@@ -47,7 +47,9 @@ def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
     random = together["pd_up_error"] > 0
     assert random.any() if effects == RANDOM else not random.any()
     for i in range(count):
-        single = evaluate_points(spec, select_parameters(parameters, np.array([i])), 1, effects)
+        single = evaluate_points(
+            spec, select_parameters_of_points(parameters, np.array([i])), 1, effects
+        )
         for name, values in single.items():
             in_batches = name in DRAW_COUNT_OUTPUTS and "number" in much
             assert values.shape == (1, *((2,) if in_batches else sums.get(name, ())))

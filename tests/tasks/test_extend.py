@@ -337,7 +337,7 @@ def test_a_damaged_block_is_computed_again(tmp_path, serial_store, computed, nam
     size = next(
         GridStudy(small_spec()).count_block_points(b)
         for b in range(12)
-        if GridStudy(small_spec()).chunk_positions(b)[name] == (0, 1, 0)
+        if GridStudy(small_spec()).chunk_positions_of_block(b)[name] == (0, 1, 0)
     )
     assert sum(computed) == outcome.points_computed == 72 + size
     assert file_digests(store) == at_once(spec, tmp_path)

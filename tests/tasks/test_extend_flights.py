@@ -228,7 +228,7 @@ def chunk(store, name, part, scanner="three"):
     """File of a block's chunk, by its place on the axis, draws and cycles."""
     study = FlightStudy(flight(), store)
     block = study.first_block_of_group(scanner) + study.scanner_grids[scanner].block_at(part)
-    place = study.chunk_positions(block)[f"{scanner}/{name}"]
+    place = study.chunk_positions_of_block(block)[f"{scanner}/{name}"]
     return store.joinpath(scanner, name, "c", *map(str, place))
 
 

@@ -23,8 +23,10 @@ def test_the_parts_of_the_time_are_its_sum(tmp_path):
     assert names >= {"start", "scene", "checks", "compiling", "model", "rays", "shots", "writing"}
     assert plan.cpu_seconds == sum(part.cpu_seconds for part in plan.time_parts)
     assert all(part.cpu_seconds >= 0 and 1 <= part.n_parallel <= 2 for part in plan.time_parts)
-    assert plan.busy_ratio >= 1
-    wall_seconds = plan.busy_ratio * sum(p.cpu_seconds / p.n_parallel for p in plan.time_parts)
+    assert plan.wall_to_cpu_time_ratio >= 1
+    wall_seconds = plan.wall_to_cpu_time_ratio * sum(
+        p.cpu_seconds / p.n_parallel for p in plan.time_parts
+    )
     assert plan.wall_seconds == study_plan.WORKER_START_SECONDS + wall_seconds
     text = terminal._time_parts_text(plan)
     assert "shots" in text and "compil" not in text

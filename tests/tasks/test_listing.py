@@ -16,7 +16,7 @@ from small_studies import (
 from sweep.storage.locations import parse_location
 from sweep.tasks.driver import resume
 from sweep.tasks.engine import journal, session
-from sweep.tasks.engine.journal import ChunkScan, find_complete_blocks, find_existing_chunks
+from sweep.tasks.engine.journal import ChunkScan, find_complete_block_mask, find_existing_chunk_mask
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
@@ -39,7 +39,7 @@ def test_the_owner_of_a_chunk_is_the_block_that_writes_it(tmp_path, name):
     owners = study.chunk_owner_blocks()
     left = {array: np.full(owner.shape, -1) for array, owner in owners.items()}
     for block in range(study.n_blocks):
-        for array, position in study.chunk_positions(block).items():
+        for array, position in study.chunk_positions_of_block(block).items():
             left[array][position] = block
     for array, owner in owners.items():
         np.testing.assert_array_equal(left[array], owner, err_msg=array)
@@ -48,15 +48,17 @@ def test_the_owner_of_a_chunk_is_the_block_that_writes_it(tmp_path, name):
 def test_a_block_is_whole_where_all_of_its_chunks_are_and_hold_something(serial_store, tmp_path):
     store, study = copy_store(serial_store, tmp_path), GridStudy(small_spec())
     every = np.ones(12, bool)
-    assert find_complete_blocks(store, study, every).all()
+    assert find_complete_block_mask(store, study, every).all()
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
     (store / "pd_shot" / "c" / "0" / "7" / "0").write_bytes(b"")
     (store / "pd_shot" / "c" / "0" / "notes").write_bytes(b"not a chunk")
     (store / "pd_shot" / "c" / "0" / "99").mkdir()
-    assert np.flatnonzero(~find_complete_blocks(store, study, every)).tolist() == [5, 7]
-    assert not find_complete_blocks(store, study, ~every).any()
+    assert np.flatnonzero(~find_complete_block_mask(store, study, every)).tolist() == [5, 7]
+    assert not find_complete_block_mask(store, study, ~every).any()
     but_five = np.arange(12) != 5
-    assert np.flatnonzero(but_five & ~find_complete_blocks(store, study, but_five)).tolist() == [7]
+    assert np.flatnonzero(
+        but_five & ~find_complete_block_mask(store, study, but_five)
+    ).tolist() == [7]
 
 
 def test_folders_and_object_stores_are_listed_alike(tmp_path):
@@ -73,12 +75,12 @@ def test_folders_and_object_stores_are_listed_alike(tmp_path):
         (remote_path / name).write_bytes(content)
     expected = [[False, True], [False, False], [False, True]]
     assert (
-        find_existing_chunks(local_path, (3, 2)).tolist()
-        == find_existing_chunks(remote_path, (3, 2)).tolist()
+        find_existing_chunk_mask(local_path, (3, 2)).tolist()
+        == find_existing_chunk_mask(remote_path, (3, 2)).tolist()
         == expected
     )
     (tmp_path / "scalar").write_bytes(b"four")
-    assert find_existing_chunks(tmp_path / "scalar", ()) and not find_existing_chunks(
+    assert find_existing_chunk_mask(tmp_path / "scalar", ()) and not find_existing_chunk_mask(
         tmp_path / "none", ()
     )
 
@@ -100,13 +102,13 @@ def test_status_says_what_there_is_of_a_run(tmp_path):
 
 def slow_to_look(monkeypatch, seconds):
     """Folders that show what they hold only after some time, and a run that waits for nothing."""
-    find_existing_chunks = journal.find_existing_chunks
+    find_existing_chunk_mask = journal.find_existing_chunk_mask
 
     def late(folder, shape):
         time.sleep(seconds)
-        return find_existing_chunks(folder, shape)
+        return find_existing_chunk_mask(folder, shape)
 
-    monkeypatch.setattr(journal, "find_existing_chunks", late)
+    monkeypatch.setattr(journal, "find_existing_chunk_mask", late)
     monkeypatch.setattr(session, "CHUNK_SCAN_TIMEOUT_SECONDS", 0.01)
 
 
@@ -134,4 +136,4 @@ def test_a_look_that_is_stopped_ends_soon(serial_store, monkeypatch):
     slow_to_look(monkeypatch, 0.02)
     look = ChunkScan(serial_store, GridStudy(small_spec()), np.ones(12, bool))
     look.stop()
-    assert look.wait(1.0) and look.complete_blocks().all()
+    assert look.wait(1.0) and look.complete_block_mask().all()

@@ -24,7 +24,7 @@ from sweep.storage.locations import JOURNAL_DIR, parse_location, process_start_i
 from sweep.tasks.driver import resume, run
 from sweep.tasks.engine import journal
 from sweep.tasks.engine.journal import LockHolder, StoreLock, is_holder_alive, read_lock_holder
-from sweep.tasks.engine.progress import BusyError, StoreError
+from sweep.tasks.engine.progress import StoreBusyError, StoreError
 from sweep.tasks.studies.store_verification import pack_store
 
 
@@ -40,7 +40,7 @@ def test_a_held_lock_refuses_a_second_driver_and_says_who_holds_it(tmp_path):
     held = StoreLock(tmp_path)
     with pytest.raises(StoreError, match=f"process {os.getpid()} on {socket.gethostname()}"):
         StoreLock(tmp_path)
-    assert held.is_held()
+    assert held.is_held_by_this_process()
     held.release()
     assert read_lock_holder(tmp_path) is None
     StoreLock(tmp_path).release()
@@ -58,7 +58,7 @@ def test_the_lock_of_a_dead_process_is_taken_over(tmp_path, caplog):
     assert dead is not None and dead.pid != os.getpid()
     assert not is_holder_alive(tmp_path, dead)
     lock = StoreLock(tmp_path)
-    assert lock.is_held()
+    assert lock.is_held_by_this_process()
     lock.release()
     waited, taken_over, locked, released = (record.getMessage() for record in caplog.records)
     lock_path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
@@ -76,7 +76,7 @@ def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path
     )
     assert not is_holder_alive(tmp_path, read_lock_holder(tmp_path))
     lock = StoreLock(tmp_path)
-    assert lock.is_held()
+    assert lock.is_held_by_this_process()
     lock.release()
 
 
@@ -114,7 +114,7 @@ def test_a_lock_taken_by_someone_else_is_not_ours_to_release(tmp_path):
     held = StoreLock(tmp_path)
     other = LockHolder(host="elsewhere", pid=1, start=1, token="t")
     put(tmp_path, other)
-    assert not held.is_held()
+    assert not held.is_held_by_this_process()
     held.release()
     assert read_lock_holder(tmp_path) == other
 
@@ -167,7 +167,7 @@ def test_a_lock_beats_from_the_first_on_and_not_once_it_is_left(kind, tmp_path):
     )
     assert read_lock_holder(store) is None and journal.heartbeat_age(store) == float("inf")
     held = StoreLock(store)
-    assert held.is_held() and journal.heartbeat_age(store) < 60
+    assert held.is_held_by_this_process() and journal.heartbeat_age(store) < 60
     held.release()
     assert read_lock_holder(store) is None
 
@@ -191,7 +191,7 @@ def test_no_two_heartbeats_of_an_object_are_alike():
     for _ in range(3):
         states.append((store / JOURNAL_DIR / journal.LOCK_FILE).read_bytes())
         held._lock.send_heartbeat()
-        assert held.is_held()
+        assert held.is_held_by_this_process()
     held.release()
     assert len(set(states)) == 3
 
@@ -237,7 +237,7 @@ def test_a_clock_that_is_set_takes_no_lock_from_a_living_process(holding, monkey
     monkeypatch.setattr(time, "time", clock.time)
     os.utime(store / JOURNAL_DIR / journal.LOCK_FILE, (1e9, 1e9))
     assert is_holder_alive(store, read_lock_holder(store))
-    with pytest.raises(BusyError, match=f"process {process.pid} on"):
+    with pytest.raises(StoreBusyError, match=f"process {process.pid} on"):
         StoreLock(store)
 
 
@@ -282,7 +282,7 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
         beating.start()
     try:
         if kind == "beating":
-            with pytest.raises(BusyError, match="process 1 on elsewhere"):
+            with pytest.raises(StoreBusyError, match="process 1 on elsewhere"):
                 StoreLock(tmp_path, messages.append)
         else:
             StoreLock(tmp_path, messages.append).release()
@@ -300,7 +300,7 @@ def test_an_object_whose_heartbeats_are_counted_is_alive(monkeypatch):
     monkeypatch.setattr(LockHolder, "is_on_this_machine", False)
     store = parse_location(f"memory://bucket/{time.time_ns()}/s.zarr")
     held = StoreLock(store)
-    with pytest.raises(BusyError):
+    with pytest.raises(StoreBusyError):
         StoreLock(store, lambda text: None)
     held._is_released.set()  # it stands still
     held._heartbeat_thread.join()
@@ -318,7 +318,7 @@ def test_a_lock_that_changes_hands_while_it_is_watched_is_not_taken(tmp_path, mo
         return marked
 
     monkeypatch.setattr(journal._FileLock, "heartbeat_version", overtaken)
-    with pytest.raises(BusyError):
+    with pytest.raises(StoreBusyError):
         StoreLock(tmp_path, lambda text: None)
     assert read_lock_holder(tmp_path).host == "third"
 
@@ -332,7 +332,7 @@ def test_a_lock_of_another_version_is_judged_by_its_heartbeat(tmp_path, monkeypa
         "", "[]", '{"pid": "x"}', "[" * 10**5,
     ):  # fmt: skip
         path.write_text(text)
-        with pytest.raises(BusyError):
+        with pytest.raises(StoreBusyError):
             StoreLock(tmp_path)
         os.utime(path, (1e9, 1e9))
         StoreLock(tmp_path, lambda text: None).release()
@@ -357,7 +357,7 @@ def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkey
         and messages[0].startswith("warning: ")
         and "has no flock" in messages[0]
     )
-    with pytest.raises(BusyError):
+    with pytest.raises(StoreBusyError):
         StoreLock(tmp_path, messages.append)
     held.release()
     StoreLock(tmp_path, messages.append).release()
@@ -373,8 +373,10 @@ def test_a_file_system_without_links_is_warned_of_once_and_used(tmp_path, monkey
     monkeypatch.setattr(journal, "_issued_warnings", set())
     messages = []
     held = StoreLock(tmp_path, messages.append)
-    assert held.is_held() and len(messages) == 1 and "has no hard links" in messages[0]
-    with pytest.raises(BusyError):
+    assert (
+        held.is_held_by_this_process() and len(messages) == 1 and "has no hard links" in messages[0]
+    )
+    with pytest.raises(StoreBusyError):
         StoreLock(tmp_path, messages.append)
     held.release()
     put(tmp_path, replace(LockHolder.of_this_process(), pid=2**22 + 1))
@@ -416,9 +418,9 @@ def test_a_lock_that_another_takes_between_is_left_to_it(tmp_path, monkeypatch, 
             quicker.append(StoreLock(tmp_path, lambda text: None))
 
     monkeypatch.setattr(StoreLock, "_refuse_living_holder", overtaken)
-    with pytest.raises(BusyError):
+    with pytest.raises(StoreBusyError):
         StoreLock(tmp_path, lambda text: None)
-    assert quicker[1].is_held()
+    assert quicker[1].is_held_by_this_process()
     quicker[1].release()
 
 

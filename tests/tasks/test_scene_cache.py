@@ -47,7 +47,10 @@ def assert_same_scene(scene, other):
         for flag in ("C_CONTIGUOUS", "WRITEABLE", "ALIGNED"):  # what kernels are compiled for
             assert values.flags[flag] == other_values.flags[flag]
         np.testing.assert_array_equal(values, other_values)
-    assert scene.mesh_reports == other.mesh_reports and scene.surfaces == other.surfaces
+    assert (
+        scene.mesh_reports == other.mesh_reports
+        and scene.surface_materials == other.surface_materials
+    )
 
 
 def test_a_cached_scene_has_the_arrays_of_a_built_one(root):

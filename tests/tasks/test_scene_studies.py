@@ -24,9 +24,9 @@ from sweep.model.outputs import (
     CYCLE_VARIABLES,
     EFFECT_VARIABLES,
     NAVIGATION_VARIABLES,
-    POINT_VARIABLES,
+    POINT_CLOUD_VARIABLES,
+    SHOT_GEOMETRY_VARIABLES,
     SHOT_STATISTIC_VARIABLES,
-    SHOT_VARIABLES,
 )
 from sweep.storage.locations import eyepoint_store_location
 from sweep.tasks.driver import resume, run
@@ -82,19 +82,19 @@ def test_a_study_holds_every_array_that_the_model_names(serial_outcome):
     assert set(dataset.children) == {"three", "line", "scene_map"}
     assert set(dataset["scene_map"].data_vars) == {"height"}
     assert set(dataset["three"].data_vars) == {
-        *SHOT_VARIABLES,
+        *SHOT_GEOMETRY_VARIABLES,
         *CYCLE_VARIABLES,
         *SHOT_STATISTIC_VARIABLES,
         *EFFECT_VARIABLES,
-        *POINT_VARIABLES,
+        *POINT_CLOUD_VARIABLES,
         *NAVIGATION_VARIABLES,
     }
     assert set(dataset["line"].data_vars) == {
-        *SHOT_VARIABLES,
+        *SHOT_GEOMETRY_VARIABLES,
         *CYCLE_VARIABLES,
         *SHOT_STATISTIC_VARIABLES,
         *EFFECT_VARIABLES,
-        *POINT_VARIABLES,
+        *POINT_CLOUD_VARIABLES,
     }
     three = dataset["three"]
     assert three.range.dims == ("power", "shot", "draw", "return_number")
@@ -294,21 +294,21 @@ def test_the_summary_counts_what_the_arrays_hold(serial_outcome):
     flags = dataset["three"].flags.values[0]
     assert (
         weak.n_shots == 222 * 5
-        and weak.shots_with_true_return == ((flags & 1) > 0).any(axis=-1).sum()
+        and weak.n_shots_with_true_return == ((flags & 1) > 0).any(axis=-1).sum()
     )
-    assert weak.false_points == ((flags > 0) & (flags & 1 == 0)).sum()
+    assert weak.n_false_points == ((flags > 0) & (flags & 1 == 0)).sum()
     assert weak.mean_pd == pytest.approx(float(dataset["three"].pd_shot[0].mean()), rel=1e-12)
     assert weak.n_cycles == 74 * 5
-    assert weak.solved_cycles == (dataset["three"].velocity_status.values[0] <= 1).sum()
+    assert weak.n_solved_cycles == (dataset["three"].velocity_status.values[0] <= 1).sum()
     strong = rows["three, power 1 W"]
     assert (
-        strong.shots_with_true_return
+        strong.n_shots_with_true_return
         == ((dataset["three"].flags.values[1] & 1) > 0).any(axis=-1).sum()
     )
     # In one draw of a hundred a leaked peak pairs with the echo; whole spectra have it too.
     assert (
-        weak.shots_with_true_return < strong.shots_with_true_return
-        and 0.98 * 222 * 5 < strong.shots_with_true_return <= strong.n_shots == 222 * 5
+        weak.n_shots_with_true_return < strong.n_shots_with_true_return
+        and 0.98 * 222 * 5 < strong.n_shots_with_true_return <= strong.n_shots == 222 * 5
     )
     assert rows["line, power 1 W"].n_cycles == 0
 
@@ -326,11 +326,11 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(serial
     weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
     assert (weak.n_shots, weak.n_cycles) == (120 * 3, 40 * 3)
     status = opened(serial_outcome.store)["three"].velocity_status.values[0, :40, :3]
-    assert weak.solved_cycles == (status <= 1).sum()
+    assert weak.n_solved_cycles == (status <= 1).sum()
     assert (
         strong.n_shots
         == strong.n_cycles
-        == strong.solved_cycles
+        == strong.n_solved_cycles
         == rows["line, power 1 W"].n_shots
         == 0
     )

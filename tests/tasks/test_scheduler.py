@@ -11,7 +11,7 @@ from sweep.tasks.engine.dispatcher import (
     TASKS_PER_SECOND_MAX,
     TaskDispatcher,
     ThroughputEstimator,
-    WorkerThreadCount,
+    WorkerThreadCounter,
     _InFlightTask,
     task_key,
 )
@@ -63,7 +63,7 @@ def test_ten_million_blocks_are_handed_out_without_being_listed():
 
 
 def pace(seconds_a_block: float) -> ThroughputEstimator:
-    return ThroughputEstimator(n_blocks=100, work_seconds=100 * seconds_a_block)
+    return ThroughputEstimator(n_finished_blocks=100, work_seconds=100 * seconds_a_block)
 
 
 def test_the_first_tasks_have_a_block_each():
@@ -103,9 +103,9 @@ class Client:
 
 
 def test_workers_that_may_come_are_counted_so_that_their_coming_is_asked_for():
-    assert WorkerThreadCount(Client()).current_count() == 2
-    assert WorkerThreadCount(Client(), expected_worker_threads=40).current_count() == 40
-    assert WorkerThreadCount(Client(), expected_worker_threads=1).current_count() == 2
+    assert WorkerThreadCounter(Client()).current_count() == 2
+    assert WorkerThreadCounter(Client(), n_expected_worker_threads=40).current_count() == 40
+    assert WorkerThreadCounter(Client(), n_expected_worker_threads=1).current_count() == 2
 
 
 def test_the_same_work_has_the_same_key_and_other_work_another():
@@ -171,7 +171,7 @@ def test_a_task_that_is_over_is_not_sent_again_before_its_answer_is_looked_at():
     scheduler = TaskDispatcher(
         client, 0, TaskSettings("x.zarr", "0", None), blocks, verify_receipt=None, say=None
     )
-    scheduler._slots.current_count()
+    scheduler._thread_counter.current_count()
     for block, over in ((4, True), (5, False)):
         task = _InFlightTask([block], {str(block): Sent(str(block), over)}, last_sent_at=-1e9)
         scheduler._in_flight[str(block)] = task

@@ -100,7 +100,7 @@ def test_patience_grows_with_the_time_of_a_task_and_waits_for_nothing_that_is_no
     monitor = stalls.InProcessMonitor(messages.append, lambda: 7)
     monitor.report_if_stalled()
     assert not messages
-    with monitor.list_while_computed(5):
+    with monitor.mark_in_progress(5):
         monitor.report_if_stalled()
         assert "the model is being loaded, or compiled once" in messages[0]
         monitor.record_result(1, 0.0)

@@ -97,7 +97,7 @@ def test_a_block_of_nothing_but_the_fill_value_is_written_all_the_same(path, stu
         name: np.full(
             study.grid.actual_block_shape(1), layouts[name].fill_value, dtype=layouts[name].dtype
         )
-        for name in study.chunk_positions(1)
+        for name in study.chunk_positions_of_block(1)
     }
     study_store.BlockWriter(path, study).write(1, results)
     assert is_whole(path, study_store.chunk_names_of_block(study, 1))

@@ -18,7 +18,7 @@ from small_studies import RecordingProgress, run_serially, small_spec
 import sweep
 from sweep.spec.axes import remove_fields_on_axes
 from sweep.tasks.engine import user_code
-from sweep.tasks.engine.progress import CodeError, TaskError
+from sweep.tasks.engine.progress import CodeError, RunRequestError
 from sweep.tasks.studies import study_plan as planned
 from sweep.tasks.studies import user_functions
 from sweep.tasks.studies.study_plan import plan_study
@@ -309,7 +309,7 @@ def test_stores_of_whole_spectra_hold_the_same_whatever_the_blocks(tmp_path):
 def test_what_accuracy_costs_is_not_asked_of_whole_spectra(tmp_path):
     from sweep.tasks.accuracy.measurement import measure_accuracy
 
-    with pytest.raises(TaskError, match="draws whole spectra"):
+    with pytest.raises(RunRequestError, match="draws whole spectra"):
         measure_accuracy(study(), store_path=tmp_path / "a.zarr")
 
 

@@ -22,8 +22,13 @@ from sweep.analysis.answers.dataset_lookup import (
 from sweep.analysis.charts import LOG_SCALE, Chart, ChartAxis, ChartLine, Panel
 from sweep.model.error_budget import clopper_pearson_interval
 from sweep.model.error_budget import interval_half_width as interval_half_width
-from sweep.model.outputs import GRID_OUTPUTS, PD_OUTPUTS, SHOT_STATISTIC_VARIABLES, SPECTRA_OUTPUTS
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.outputs import (
+    GRID_OUTPUTS,
+    PD_OUTPUT_NAMES,
+    SHOT_STATISTIC_VARIABLES,
+    SPECTRA_STUDY_OUTPUTS,
+)
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
 PD_ROUNDING_ERROR_MAX = 1e-12
 """Largest difference of a probability of detection that rounding on another processor explains."""
@@ -66,8 +71,8 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     ours, other = (
         provenance.check_single_study(dataset, require_axes=True) for dataset in (ours, other)
     )
-    variables = [n for n in {**GRID_OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
-    return compute_differences(ours, other, variables, bounded_variables=PD_OUTPUTS)
+    variables = [n for n in {**GRID_OUTPUTS, **SPECTRA_STUDY_OUTPUTS} if n in ours and n in other]
+    return compute_differences(ours, other, variables, bounded_variables=PD_OUTPUT_NAMES)
 
 
 def compute_differences(
@@ -311,7 +316,7 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
         quantities_of_both[0],
         quantities_of_both[1],
         variables,
-        bounded_variables=(*PD_OUTPUTS, DETECTED_FRACTION_VARIABLE),
+        bounded_variables=(*PD_OUTPUT_NAMES, DETECTED_FRACTION_VARIABLE),
     )
     return result.assign_coords(shot_coords).assign_attrs(
         ours=study_title_with_id(ours), other=study_title_with_id(other), scanner=scanner,
@@ -381,7 +386,7 @@ def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: boo
     if not all_drawn:
         return quantities
     confidence, draws = spec_of_dataset(quantities).accuracy.confidence, group.sizes["draw"]
-    detections = ((group["flags"] & TRUE_FLAG) > 0).any("return_number").sum("draw")
+    detections = ((group["flags"] & TRUE_RETURN_FLAG) > 0).any("return_number").sum("draw")
 
     def half_width(successes: np.ndarray) -> np.ndarray:
         interval = clopper_pearson_interval(
@@ -411,7 +416,7 @@ OpenedStore = xr.Dataset | xr.DataTree
 """Dataset of a grid, or tree of a flight, as `sweep.open` and `sweep.open_scene` return them."""
 
 DIFFERENCE_TABLE_VARIABLES = (
-    *PD_OUTPUTS, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
+    *PD_OUTPUT_NAMES, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
     "log10_pfa_shot", "p_leakage_up", "p_leakage_down", "snr_up", "snr_doppler", "snr_down",
     "noise_variance", "range_error", "radial_velocity_error", "false_alarms", "range_rmse",
     "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED_FRACTION_VARIABLE,
@@ -522,7 +527,9 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> AgreementVerdict
             has_other_axes = any(n > 1 for dim, n in differences.sizes.items() if dim != "shot")
             noun, count_note = "shot", ", counted at each place along the axes" * has_other_axes
         pairs = [
-            (differences[n], differences[f"{n}_agrees"]) for n in PD_OUTPUTS if n in differences
+            (differences[n], differences[f"{n}_agrees"])
+            for n in PD_OUTPUT_NAMES
+            if n in differences
         ]
         n_points += max((int(array.notnull().sum()) for array, _ in pairs), default=0)
         n_different += max(
@@ -565,7 +572,7 @@ def pd_difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Cha
     compared_groups = list(differences_by_scanner.values())
     variables = [
         n
-        for n in PD_OUTPUTS
+        for n in PD_OUTPUT_NAMES
         if any(n in part and part[n].notnull().any() for part in compared_groups)
     ]
     if not variables:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.spec import GridSpec, SceneSpec, from_stored
-from sweep.spec.axes import read_in_unit
+from sweep.spec.axes import STUDY_MARKER_NAME_PATTERN, read_in_unit
 from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 from sweep.units import QuantityError, read_number, read_quantity
@@ -28,9 +27,6 @@ JOIN_REMEDY = (
     "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
 )
 """Advice in error messages on how to join the stores of several studies."""
-
-_STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
-"""Pattern of the name of a coordinate that marks the study from which a dataset comes."""
 
 JOINED_SPECS_ATTRIBUTE = "specs"
 """Name of the attribute in which a join of studies keeps their specs and variable names.
@@ -54,7 +50,7 @@ def study_marker_name(study_ids: Iterable[str]) -> str:
 
 def study_marker_names(dataset: xr.Dataset | xr.DataTree) -> list[str]:
     """Return the names of a dataset's coordinates that mark studies (:func:`study_marker_name`)."""
-    return [name for name in map(str, dataset.coords) if _STUDY_MARKER_PATTERN.fullmatch(name)]
+    return [name for name in map(str, dataset.coords) if STUDY_MARKER_NAME_PATTERN.fullmatch(name)]
 
 
 def spec_of_dataset(dataset: xr.Dataset | xr.DataTree) -> GridSpec | SceneSpec:

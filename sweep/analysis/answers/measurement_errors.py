@@ -25,7 +25,7 @@ from sweep.model.effects.catalogue import (
     unpack_effect_flags,
 )
 from sweep.model.evaluation import prepare_shots
-from sweep.model.sampling.speckle_wander import mean_wander_variance
+from sweep.model.sampling.speckle_wander import mean_range_velocity_wander_variance
 from sweep.model.waveform import SEGMENT_NAMES
 from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
@@ -208,7 +208,9 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
                 np.array([columns[name][rows] for name in names]) for names in (pd_names, snr_names)
             )
             for batch_rows, shots in prepare_shots(fixed_parameters | varying_values, effects):
-                estimate_errors = mean_wander_variance(shots, pd[:, batch_rows], snr[:, batch_rows])
+                estimate_errors = mean_range_velocity_wander_variance(
+                    shots, pd[:, batch_rows], snr[:, batch_rows]
+                )
                 variance[rows[batch_rows]] = getattr(estimate_errors, quantity)
         return np.sqrt(variance).reshape(shape)
 
@@ -268,7 +270,7 @@ def _cramer_rao_bounds_of_group(
         f"instrument.processing.{name}": value for name, value in record_parameters.items()
     }
     record_length = int(
-        waveform.record_length(
+        waveform.n_record_samples(
             record_parameters | {"instrument.chirp.duration": parameters["duration"][0]}
         )
     )
@@ -283,7 +285,7 @@ def _cramer_rao_bounds_of_group(
         wavelength=parameters["wavelength"],
         start_frequency=parameters["start_frequency"],
         bandwidth=parameters["bandwidth"],
-        chirp_slopes=slopes,
+        chirp_rate_ratios=slopes,
     )
     chirp_rate = parameters["bandwidth"] / parameters["duration"]
     deviations = []
@@ -358,10 +360,10 @@ def _cramer_rao_bounds_of_group(
             cnr = estimators.carrier_to_noise_ratio(
                 snr=segment_snr / amplitude_loss**2, window=taper
             )
-            deviation = estimators.beat_frequency_bound(
+            deviation = estimators.beat_frequency_cramer_rao_bound(
                 cnr=cnr, n_samples=remaining_samples, sample_rate=sample_rate
             )
-        phase_noise_deviation = estimators.phase_noise_deviation(
+        phase_noise_beat_deviation = estimators.phase_noise_beat_deviation(
             line_width=np.where(
                 parameters["line_shape"] == "lorentzian", parameters["line_width"], 0.0
             ),
@@ -372,7 +374,7 @@ def _cramer_rao_bounds_of_group(
         deviation = deviation / np.sqrt(
             np.where(parameters["combine"] == COMBINE_COHERENT, 1.0, parameters["looks"])
         )
-        deviation = np.hypot(deviation, phase_noise_deviation / np.sqrt(parameters["looks"]))
+        deviation = np.hypot(deviation, phase_noise_beat_deviation / np.sqrt(parameters["looks"]))
         deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
     up, doppler, down = deviations
     resolved = estimators.range_velocity_deviation(

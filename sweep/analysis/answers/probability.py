@@ -397,7 +397,7 @@ def roc(
     looks = _looks_of_study(grid_spec_of_dataset(dataset))
     detection_rule, peak_rule = (
         parameter_in_si(dataset, path, grid_spec_of_dataset(dataset))
-        for path in (waveform.SHOT_DETECTION_PATH, waveform.PEAKS_PATH)
+        for path in (waveform.SHOT_DETECTION_PATH, waveform.REPORTED_PEAKS_PATH)
     )
     dataset = dataset[list(dict.fromkeys(variables))].compute()
     threshold_ratio = xr.DataArray(

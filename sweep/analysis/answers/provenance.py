@@ -124,10 +124,10 @@ def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> N
     for axis_parameter in _axis_parameters(spec):
         if parameter_coordinate(dataset, axis_parameter.path) is None:
             raise ValueError(
-                f"the dataset lacks the coordinate {axis_parameter.coordinate} "
+                f"the dataset lacks the coordinate {axis_parameter.coordinate_name} "
                 f"({axis_parameter.path}), an axis of its "
                 "study: it was dropped, or averaged or summed over. Select one value and keep it: "
-                f"ds.sweep.sel({axis_parameter.coordinate}=...), or isel without drop=True"
+                f"ds.sweep.sel({axis_parameter.coordinate_name}=...), or isel without drop=True"
             )
 
 
@@ -176,9 +176,9 @@ def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSp
     """
     restored_coords = {}
     for axis_parameter in _axis_parameters(spec):
-        coord = dataset.coords.get(axis_parameter.coordinate)
+        coord = dataset.coords.get(axis_parameter.coordinate_name)
         if coord is not None and not {"path", "units"} & set(coord.attrs):
-            restored_coords[axis_parameter.coordinate] = coord.assign_attrs(
+            restored_coords[axis_parameter.coordinate_name] = coord.assign_attrs(
                 path=axis_parameter.path, units=axis_parameter.units
             )
     return dataset.assign_coords(restored_coords) if restored_coords else dataset

@@ -32,7 +32,7 @@ from sweep.analysis.scene_results.recordings import (
     to_displayed_values,
     within_limits_mask,
 )
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.storage.store_format import TERRAIN_MAP_GROUP
 
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 40.0
@@ -427,8 +427,8 @@ def _draw_cloud_marks(picture: AxisAlignedView | ObliqueView, point_colours: np.
             zorder=5,
             **picture.scatter_options,
         )
-    if cloud.path:
-        path_columns = to_columns(_positions_in_box(cloud, cloud.path))
+    if cloud.flight_path:
+        path_columns = to_columns(_positions_in_box(cloud, cloud.flight_path))
         axes.plot(*path_columns, color=PATH_COLOUR, linewidth=1.5, zorder=6)
         axes.plot(
             *(column[:1] for column in path_columns), "o", color=PATH_COLOUR, markersize=5, zorder=6
@@ -515,7 +515,7 @@ def _legend_handles(cloud: PointCloud, *, shows_ground: bool) -> list[Any]:
     if cloud.dropouts and cloud.dropouts["x"].size:
         style = {"markerfacecolor": "none", "markeredgecolor": DROPOUT_COLOUR, "markersize": 5}
         handles.append(point_styles.legend_marker("o", "shot without\na point", **style))
-    if cloud.path:
+    if cloud.flight_path:
         handles.append(
             Line2D([], [], color=PATH_COLOUR, linewidth=1.6, label="flight path,\ndot: start")
         )
@@ -541,7 +541,7 @@ def draw_scatter_sheet(
     """Return the sheet of a scatter plot of one quantity over another, coloured by a third."""
     column_arrays = thinned_rows.to_columns()
     is_true = (
-        (column_arrays["flags"] & TRUE_FLAG) > 0
+        (column_arrays["flags"] & TRUE_RETURN_FLAG) > 0
         if "flags" in column_arrays
         else np.ones(len(column_arrays[x]), bool)
     )

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
-from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.storage.locations import Location
 
 CONSISTENT_ERROR_RATIO_MAX = 2.0
@@ -203,7 +203,7 @@ _NEEDED_VARIABLES = (
 
 def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
     """Return the sizes of all finite errors, relative to their standard errors, by quantity."""
-    is_true = (sample["flags"] & TRUE_FLAG).values > 0
+    is_true = (sample["flags"] & TRUE_RETURN_FLAG).values > 0
     errors_by_quantity: dict[str, np.ndarray] = {}
     for quantity, variable in _VARIABLE_BY_QUANTITY.items():
         reported = sample[f"{variable}_interpolated"].values[is_true]

@@ -37,7 +37,7 @@ class ErrorTally:
     """Number of attempts that gave a navigation solution, in each altitude bin (bins,)."""
     mean_error: np.ndarray
     """Mean error of the solutions in each altitude bin, by component (bins, m)."""
-    squared_deviation: np.ndarray
+    sum_of_squared_deviations: np.ndarray
     """Sum of squared deviations of errors from their mean, by altitude bin (bins, m).
 
     The second dimension is the component of the solution.
@@ -63,7 +63,7 @@ class ErrorTally:
             self.n_attempts + other.n_attempts,
             n_solutions,
             self.mean_error + other_fraction * mean_difference,
-            self.squared_deviation + other.squared_deviation + between_squares,
+            self.sum_of_squared_deviations + other.sum_of_squared_deviations + between_squares,
             self.mean_stated_variance
             + other_fraction * (other.mean_stated_variance - self.mean_stated_variance),
         )
@@ -82,14 +82,14 @@ class ErrorTally:
     def rmse(self) -> np.ndarray:
         """RMS error of each component (bins, m), including the bias; nan without solutions."""
         return np.sqrt(
-            _quotient_or_nan(self.squared_deviation, self.n_solutions[..., None])
+            _quotient_or_nan(self.sum_of_squared_deviations, self.n_solutions[..., None])
             + self.mean_error**2
         )
 
     @property
     def variance(self) -> np.ndarray:
         """Unbiased variance of the errors (bins, m); nan with fewer than two solutions."""
-        return _quotient_or_nan(self.squared_deviation, self.n_solutions[..., None] - 1)
+        return _quotient_or_nan(self.sum_of_squared_deviations, self.n_solutions[..., None] - 1)
 
     @property
     def stated_variance(self) -> np.ndarray:
@@ -271,13 +271,13 @@ def tally_errors(
     mean_correction = (
         _sum_by_bin(residual, altitude_bin, n_bins) / divisor
     )  # rounding error of the mean
-    squared_deviation = _sum_by_bin(residual * residual, altitude_bin, n_bins)
+    sum_of_squared_deviations = _sum_by_bin(residual * residual, altitude_bin, n_bins)
     mean_stated_variance = _sum_by_bin(variance, altitude_bin, n_bins) / divisor
     return ErrorTally(
         n_attempts,
         n_solutions,
         mean_error + mean_correction,
-        squared_deviation,
+        sum_of_squared_deviations,
         mean_stated_variance,
     )
 

@@ -24,7 +24,7 @@ from sweep.analysis.scene_results.recordings import (
 )
 from sweep.analysis.study_figures import SceneResults
 from sweep.model.outputs import CLOSING_SIGN_NOTE
-from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
+from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_RETURN_FLAG
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import suggest_similar_name
 from sweep.storage.locations import Location, write_path_atomically
@@ -296,7 +296,7 @@ def _to_las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # t
     points["user_data"] = np.minimum(rows["beam"], _LAS_BEAM_NUMBER_MAX)
     points["scan_angle"] = np.round(rows["scan_angle"] / _LAS_SCAN_ANGLE_STEP_DEG)
     points["classification"] = np.where(
-        rows["flags"] & TRUE_FLAG, LAS_UNCLASSIFIED_CLASS, LAS_NOISE_CLASS
+        rows["flags"] & TRUE_RETURN_FLAG, LAS_UNCLASSIFIED_CLASS, LAS_NOISE_CLASS
     )
     snr_db = 10 * np.log10(np.maximum(rows["snr"], 1e-30))
     points["intensity"] = np.clip(np.round(100 * np.nan_to_num(snr_db)), 0, 65535)
@@ -316,7 +316,7 @@ def _assign_return_numbers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     tuple of numpy.ndarray
         Return number of each point, and the number of returns of its shot and kind.
     """
-    is_false = (rows["flags"] & TRUE_FLAG) == 0
+    is_false = (rows["flags"] & TRUE_RETURN_FLAG) == 0
     order = np.lexsort((rows["range"], is_false, rows["shot"]))
     starts_group = np.ones(rows.size, bool)
     starts_group[1:] = np.diff(rows["shot"][order].astype(np.int64)) != 0
@@ -495,10 +495,10 @@ def _find_request_mistakes(
             )
             problem = f"has {axis.size} values, and a file holds the points of one"
             remedy = (
-                f"choose {axis_parameter.coordinate} from "
+                f"choose {axis_parameter.coordinate_name} from "
                 f"{value_list}{', ...' if axis.size > 5 else ''}"
             )
-            mistakes.append(Mistake(f"where.{axis_parameter.coordinate}", problem, "", remedy))
+            mistakes.append(Mistake(f"where.{axis_parameter.coordinate_name}", problem, "", remedy))
     return mistakes
 
 

@@ -57,7 +57,7 @@ class ContinuousColourScale:
     """Normalisation of values to 0..1."""
     label: str
     """Label of the colour bar, with units."""
-    extend: str = "neither"
+    colour_bar_extend: str = "neither"
     """Ends of the colour bar beyond which there are values: neither, min, max or both."""
 
     def to_rgba_colours(self, values: np.ndarray) -> np.ndarray:
@@ -218,7 +218,9 @@ class SheetWithLegends:
                 self.width + 0.15, (self.height - bar_height) * 0.62, 0.17, bar_height
             )
             colour_bar = self.sheet.colorbar(
-                ScalarMappable(colouring.norm, colouring.cmap), cax=axes, extend=colouring.extend
+                ScalarMappable(colouring.norm, colouring.cmap),
+                cax=axes,
+                extend=colouring.colour_bar_extend,
             )
             colour_bar.set_label(colouring.label, fontsize=9)
             colour_bar.ax.tick_params(labelsize=8)

@@ -17,15 +17,15 @@ from sweep.analysis.datasets import (
 )
 from sweep.analysis.selection import matches_any_value
 from sweep.model.outputs import (
-    BEAMLET_VARIABLES,
+    BEAMLET_GEOMETRY_VARIABLES,
     CYCLE_VARIABLES,
-    POINT_VARIABLES,
+    POINT_CLOUD_VARIABLES,
+    SHOT_GEOMETRY_VARIABLES,
     SHOT_STATISTIC_VARIABLES,
-    SHOT_VARIABLES,
     XYZ_DIM,
 )
 from sweep.model.pointcloud.eyepoints import Eyepoints
-from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
+from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_RETURN_FLAG
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import suggest_similar_name
@@ -102,9 +102,9 @@ def _list_quantities() -> dict[str, Quantity]:
     """Return all quantities of shots and points, with their descriptions and units."""
     quantities = {}
     for table, is_per_point in (
-        (SHOT_VARIABLES, False),
+        (SHOT_GEOMETRY_VARIABLES, False),
         (SHOT_STATISTIC_VARIABLES, False),
-        (POINT_VARIABLES, True),
+        (POINT_CLOUD_VARIABLES, True),
     ):
         for name, output in table.items():
             if XYZ_DIM not in output.dims:
@@ -162,7 +162,7 @@ ColumnArrays = dict[str, np.ndarray]
 ValueLimits = tuple[float, ...]
 """Lowest and highest value of a quantity."""
 
-UNLIMITED_VALUES: ValueLimits = (-np.inf, np.inf)
+INFINITE_VALUE_LIMITS: ValueLimits = (-np.inf, np.inf)
 """Limits that exclude no finite value."""
 
 
@@ -198,7 +198,7 @@ class Recording:
         """Number of shots."""
         return int(self.dataset.sizes["shot"])
 
-    def iter_shot_slices(self, time_limits: ValueLimits = UNLIMITED_VALUES) -> Iterator[slice]:
+    def iter_shot_slices(self, time_limits: ValueLimits = INFINITE_VALUE_LIMITS) -> Iterator[slice]:
         """Yield slices of shots that are read together, in the order of shots.
 
         Slices without a computed shot within `time_limits`, the earliest and the latest time [s],
@@ -292,7 +292,7 @@ class Recording:
         is_per_point = any(QUANTITY_BY_NAME[name].is_per_point for name in names)
         limits = {"time": time_limits} if time_limits else {}
         thinned = ThinnedRows(rows_max)
-        for shot_slice in self.iter_shot_slices(time_limits or UNLIMITED_VALUES):
+        for shot_slice in self.iter_shot_slices(time_limits or INFINITE_VALUE_LIMITS):
             if is_per_point:
                 names_read = list(dict.fromkeys([*names, "flags", "time"]))
                 column_arrays = self.point_columns(names_read, shot_slice, draw, ranges)
@@ -342,7 +342,7 @@ class Recording:
             return np.asarray(altitudes.values)[cycle - cycle[0]]
         return self.read_array(name, shot_slice)
 
-    def aim_points(self, shot_slice: slice) -> np.ndarray:
+    def beam_axis_hit_points(self, shot_slice: slice) -> np.ndarray:
         """Return the points (k, 3) [m] where the beam axes of k shots meet the scene, or nan."""
         beam_range = self.read_array("beam_range", shot_slice)
         beam_range = np.where(np.isfinite(beam_range), beam_range, np.nan)[:, None]
@@ -360,7 +360,7 @@ def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
     fallback_shot = None
     for shot_slice in recording.iter_shot_slices():
         surface_numbers = np.where(
-            (recording.read_array("flags", shot_slice, draw) & TRUE_FLAG) > 0,
+            (recording.read_array("flags", shot_slice, draw) & TRUE_RETURN_FLAG) > 0,
             recording.read_array("surface", shot_slice, draw).astype(float), np.nan,
         )  # fmt: skip
         low = np.where(np.isnan(surface_numbers), np.inf, surface_numbers).min(axis=1)
@@ -507,7 +507,7 @@ def _match_axis_values(
     """
     for axis in spec.axes:
         for axis_parameter in axis.parameters:
-            if name == axis_parameter.coordinate:
+            if name == axis_parameter.coordinate_name:
                 coordinate_values: list[object] = [
                     spec.read_coordinate_value(name, value) for value in wanted_values
                 ]
@@ -525,7 +525,7 @@ def _match_axis_values(
             is_wanted = np.isin(np.arange(axis.size), [int(str(v)) for v in wanted_values])
             return axis.name, is_wanted, f"they are numbered 0 to {axis.size - 1}"
     coordinate_names = [
-        axis_parameter.coordinate for axis in spec.axes for axis_parameter in axis.parameters
+        axis_parameter.coordinate_name for axis in spec.axes for axis_parameter in axis.parameters
     ]
     otherwise = (
         f"the coordinates are {', '.join(coordinate_names)}"
@@ -542,7 +542,7 @@ def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> st
     """Return a text with the coordinates of a position, along axes with several values."""
     return ", ".join(
         labels.format_coordinate_value(
-            axis_parameter.coordinate,
+            axis_parameter.coordinate_name,
             axis_parameter.display_values[axis_indices[axis.name]],
             axis_parameter.units,
         )
@@ -568,13 +568,13 @@ class PointCloud:
 
     points: ColumnArrays
     """Columns of the points: x, y, z, flags, and the requested quantities."""
-    path: ColumnArrays
+    flight_path: ColumnArrays
     """Columns x, y and z of the flight path [m]; empty if it was not requested."""
     thinned_points: ThinnedRows
     """Points including those outside the box, with the number of points before thinning."""
     thinned_dropouts: ThinnedRows
     """Positions of the dropouts, with their number before thinning."""
-    n_outside: int
+    n_false_points_outside: int
     """Number of false points that are left out because they lie outside the box."""
     box: CoordinateBox
     """Box of the picture."""
@@ -590,7 +590,7 @@ class PointCloud:
     @property
     def true_point_mask(self) -> np.ndarray:
         """Mask of the true points among the points."""
-        return np.asarray((self.points["flags"] & TRUE_FLAG) > 0)
+        return np.asarray((self.points["flags"] & TRUE_RETURN_FLAG) > 0)
 
     @property
     def remarks(self) -> list[str]:
@@ -598,9 +598,10 @@ class PointCloud:
         count_texts = [self.thinned_points.describe_count("point")]
         if self.dropouts:
             count_texts.append(self.thinned_dropouts.describe_count("shot", " without a point"))
-        if self.n_outside:
+        if self.n_false_points_outside:
             count_texts.append(
-                f"{labels.number_with_noun(self.n_outside, 'false point')} outside of the picture"
+                f"{labels.number_with_noun(self.n_false_points_outside, 'false point')}"
+                " outside of the picture"
             )
         return count_texts
 
@@ -648,7 +649,7 @@ def gather_point_cloud(
         ThinnedRows(CLOUD_DROPOUTS_MAX),
         ThinnedRows(CLOUD_PATH_POINTS_MAX),
     )
-    time_limits = crops.get("time", UNLIMITED_VALUES)
+    time_limits = crops.get("time", INFINITE_VALUE_LIMITS)
     for shot_slice in recording.iter_shot_slices(time_limits):
         point_columns = recording.point_columns(
             list(dict.fromkeys([*kept_names, *crops])), shot_slice, draw, ranges
@@ -662,11 +663,11 @@ def gather_point_cloud(
             has_no_point &= recording.computed_shot_mask(shot_slice, draw) & (
                 is_in_time | ("time" not in crops)
             )
-            aim_points = recording.aim_points(shot_slice)[has_no_point]
-            aim_points = aim_points[np.isfinite(aim_points[:, 0])]
+            beam_axis_hit_points = recording.beam_axis_hit_points(shot_slice)[has_no_point]
+            beam_axis_hit_points = beam_axis_hit_points[np.isfinite(beam_axis_hit_points[:, 0])]
             thinned_dropouts.append(
                 select_rows_within(
-                    dict(zip(WORLD_AXES, aim_points.T, strict=True)), coordinate_crops
+                    dict(zip(WORLD_AXES, beam_axis_hit_points.T, strict=True)), coordinate_crops
                 )
             )
         if with_path:
@@ -681,10 +682,10 @@ def gather_point_cloud(
     is_in_box = within_limits_mask(column_arrays, box)
     return PointCloud(
         points={name: values[is_in_box] for name, values in column_arrays.items()},
-        path=thinned_path.to_columns(),
+        flight_path=thinned_path.to_columns(),
         thinned_points=thinned_points,
         thinned_dropouts=thinned_dropouts,
-        n_outside=int((~is_in_box).sum()) * thinned_points.step,
+        n_false_points_outside=int((~is_in_box).sum()) * thinned_points.step,
         box=box,
     )
 
@@ -699,12 +700,12 @@ def _bounding_box(
 
     `coordinate_crops` are the limits of x, y and z [m].
     """
-    is_true = (point_columns["flags"] & TRUE_FLAG) > 0
+    is_true = (point_columns["flags"] & TRUE_RETURN_FLAG) > 0
     box: CoordinateBox = {}
     for axis in WORLD_AXES:
         values = point_columns[axis][is_true] if is_true.any() else point_columns[axis]
         value_arrays = [values, *(t[axis] for t in (dropout_columns, path_columns) if t)]
-        crop_low, crop_high = coordinate_crops.get(axis, UNLIMITED_VALUES)
+        crop_low, crop_high = coordinate_crops.get(axis, INFINITE_VALUE_LIMITS)
         low = min(float(v.min()) for v in value_arrays if v.size)
         high = max(float(v.max()) for v in value_arrays if v.size)
         box[axis] = (max(low, crop_low), min(high, crop_high))
@@ -732,6 +733,7 @@ def read_eyepoints(
     )
     selected = dataset.isel(shot=np.asarray(shot_indices))
     arrays = {
-        name: np.asarray(selected[name].values) for name in (*SHOT_VARIABLES, *BEAMLET_VARIABLES)
+        name: np.asarray(selected[name].values)
+        for name in (*SHOT_GEOMETRY_VARIABLES, *BEAMLET_GEOMETRY_VARIABLES)
     }
     return eyepoints_from_arrays(arrays, np.asarray(dataset["weight"].values))

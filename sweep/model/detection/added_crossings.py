@@ -37,7 +37,7 @@ quadrature. Above it, Marcum's Q is evaluated bin by bin."""
 SERIES_TERMS_MAX = 800
 """Size of the array of coefficients of the crossing series, and so the largest number of terms."""
 
-JOINED_PROBABILITY_MIN = 1e-9
+ALL_JOIN_PROBABILITY_MIN = 1e-9
 """Limit on the probability that all bins from an echo up to some bin cross the threshold. Bins
 beyond hardly ever join the echo and are not counted among those that may."""
 
@@ -90,7 +90,7 @@ def _n_series_terms(x, y):
 
 
 @njit(cache=True, error_model="numpy")
-def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabilities):
+def fill_added_crossing_probabilities(half_squares, n_bins, threshold_ratio, series, probabilities):
     """Fill ``probabilities`` with those that signal makes a bin cross where noise alone does not.
 
     The probability of a bin is (Q_1(a, b) - e^-y) / (1 - e^-y), 0..1, with Marcum's Q_1.
@@ -251,7 +251,7 @@ def weighted_crossing_rate(probabilities, weights):
 
 
 @njit(cache=True, error_model="numpy")
-def edge_crossing_probability(
+def echo_edge_crossing_probability(
     edge_ratio, neighbour_ratio, threshold_ratio, sidelobe_neighbour_noise_correlation
 ):
     """Return the probability that an echo's outermost bin crosses, given that the next bin does.
@@ -306,7 +306,7 @@ def edge_crossing_probability(
 
 
 @njit(cache=True, error_model="numpy")
-def exclude_bins_joining_echo(
+def exclude_crossings_joining_echo(
     probabilities,
     first_index,
     end_index,
@@ -350,7 +350,7 @@ def exclude_bins_joining_echo(
         p_join_below, p_join_above = 0.0, 0.0
         if n_bins > 0 and gap_begin > first_index and probabilities[gap_begin] > 0.0:
             n_joining_below = _count_joining_bins(probabilities, gap_begin, STEP_UP, n_bins)
-            p_join_below = edge_crossing_probability(
+            p_join_below = echo_edge_crossing_probability(
                 magnitudes[gap_begin - 1] / noise_sigma,
                 magnitudes[gap_begin] / noise_sigma,
                 threshold / noise_sigma,
@@ -358,7 +358,7 @@ def exclude_bins_joining_echo(
             )
         if n_bins > 0 and gap_end < end_index and probabilities[gap_end - 1] > 0.0:
             n_joining_above = _count_joining_bins(probabilities, gap_end - 1, STEP_DOWN, n_bins)
-            p_join_above = edge_crossing_probability(
+            p_join_above = echo_edge_crossing_probability(
                 magnitudes[gap_end] / noise_sigma,
                 magnitudes[gap_end - 1] / noise_sigma,
                 threshold / noise_sigma,
@@ -384,10 +384,10 @@ def _count_joining_bins(probabilities, first_index, step, n_bins):
 
     A bin joins the echo if it crosses the threshold together with all bins between it and the echo.
     The bins start at ``first_index`` and go on by ``step``, 1 or -1. The count ends where all of
-    them cross with a probability of at most :data:`JOINED_PROBABILITY_MIN`.
+    them cross with a probability of at most :data:`ALL_JOIN_PROBABILITY_MIN`.
     """
     n_joining, p_all_cross = 1, 1.0
-    while n_joining < n_bins and p_all_cross > JOINED_PROBABILITY_MIN:
+    while n_joining < n_bins and p_all_cross > ALL_JOIN_PROBABILITY_MIN:
         p_all_cross *= probabilities[first_index + n_joining * step]
         n_joining += 1
     return n_joining

@@ -80,7 +80,7 @@ def _noise_correlations_at(window: Window, fft_size: int, bin_distances: np.ndar
     return np.where(correlations > 1e-12, correlations, 0.0)
 
 
-def alarm_equivalent_bins(
+def n_alarm_equivalent_bins(
     n_bins: ArrayLike, *, threshold_ratio: ArrayLike, correlation: float, looks: Looks = SINGLE_LOOK
 ) -> np.ndarray:
     """Return the number, 0..n, of independent bins that raise an alarm as often as n adjacent ones.
@@ -151,7 +151,7 @@ class SearchedBins(NamedTuple):
     first_bin: int
     """Distance of the first searched bin from DC and from Nyquist [bins]. It is above 1 in a real
     record whose noise is correlated, since the noise of nearer bins is not circular."""
-    neighbour_correlation: float
+    neighbour_noise_correlation: float
     """Correlation coefficient of the noise of adjacent bins, 0..1; 0 if bins count as
     independent."""
     includes_echo: bool
@@ -208,7 +208,7 @@ class SearchedBins(NamedTuple):
         return cls(
             n_bins=n_bins,
             first_bin=first_bin,
-            neighbour_correlation=(
+            neighbour_noise_correlation=(
                 neighbour_noise_correlation(record.window, fft_size) if is_correlated else 0.0
             ),
             includes_echo=bins_counted == "all" and search_band is None,
@@ -243,7 +243,7 @@ class SearchedBins(NamedTuple):
             return np.full(np.shape(n_exempt), self.n_bins)
         return np.asarray(np.maximum(self.n_bins - n_exempt, 0.0))
 
-    def alarm_equivalent_bins(self, threshold_ratio: ArrayLike, looks: Looks) -> np.ndarray:
+    def n_alarm_equivalent_bins(self, threshold_ratio: ArrayLike, looks: Looks) -> np.ndarray:
         """Return the number of independent bins with these bins' false-alarm probability.
 
         Parameters
@@ -253,15 +253,15 @@ class SearchedBins(NamedTuple):
         looks : Looks
             Number of looks (records of each segment) and how they are combined.
         """
-        return alarm_equivalent_bins(
+        return n_alarm_equivalent_bins(
             self.n_bins,
             threshold_ratio=threshold_ratio,
-            correlation=self.neighbour_correlation,
+            correlation=self.neighbour_noise_correlation,
             looks=looks,
         )
 
 
-NOISE_FILTER_TAPS = 17
+N_NOISE_FILTER_TAPS = 17
 """Number of independent normal numbers whose weighted sum is the simulated noise of a bin."""
 
 
@@ -279,7 +279,7 @@ def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray
     Returns
     -------
     weights
-        (n_bins, NOISE_FILTER_TAPS): weights of the numbers in each bin. The squares of a bin's
+        (n_bins, N_NOISE_FILTER_TAPS): weights of the numbers in each bin. The squares of a bin's
         weights have the sum 1.
     first_number_index
         (n_bins,): index of the first number in each bin.
@@ -293,12 +293,12 @@ def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray
     filter_length = min(window.length, 512) // 2 * 2
     window_values = window_samples(window.name, max(filter_length, 1))
     position = np.arange(n_bins) * (window.length / fft_size)
-    first_number_index = np.rint(position).astype(np.int64) - NOISE_FILTER_TAPS // 2
+    first_number_index = np.rint(position).astype(np.int64) - N_NOISE_FILTER_TAPS // 2
     offset, offset_index = np.unique(
         np.round(position - first_number_index, 9), return_inverse=True
     )
     record_position = (np.arange(window_values.size) - window_values.size // 2) / window_values.size
-    cycles = (offset[:, None] - np.arange(NOISE_FILTER_TAPS))[..., None] * record_position
+    cycles = (offset[:, None] - np.arange(N_NOISE_FILTER_TAPS))[..., None] * record_position
     weights = (np.cos(2 * np.pi * cycles) * window_values).sum(axis=-1)
     weights /= np.sqrt((weights**2).sum(axis=1, keepdims=True))
     return weights[offset_index.ravel()], first_number_index

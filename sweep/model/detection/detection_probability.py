@@ -12,13 +12,13 @@ the segments of points         :func:`detect_in_spans`, by one of these two laws
                                search band, empty in segments that no echo reaches, and including
                                the permanent line
 a group of bins                :func:`pd_of_bin_group` in one record, and in all looks
-                               :func:`final_group_pd`
+                               :func:`group_pd_in_all_looks`
 both chirps of a shot          :func:`joint_detection_probability`
 a shot                         :func:`shot_pd_and_miss`, by both chirps or any two of three segments
-the strongest peak alone       :func:`strongest_peak_of_segments`,
-                               :func:`strongest_peak_of_shot`
-one of M independent bins      :func:`.echo_detection.independent_bin_pd`
-a segment, given another one   :func:`down_pd_given_up`, :func:`doppler_pd_given_chirps`
+the strongest peak alone       :func:`segment_strongest_peak_probabilities`,
+                               :func:`shot_strongest_peak_probabilities`
+one of M independent bins      :func:`.echo_detection.pd_of_one_independent_bin`
+a segment, given another one   :func:`down_pd_given_up_result`, :func:`doppler_pd_given_chirps`
 =============================  ====================================================================
 
 Developed speckle makes the segments of a shot fade together. Far from DC and Nyquist an echo's bins
@@ -194,7 +194,7 @@ def pd_of_bin_group(magnitude, strongest, first, last, first_bin, rule, bin_thre
     ).pd
 
 
-def final_group_pd(
+def group_pd_in_all_looks(
     shots: "Shots",
     pd: np.ndarray,
     magnitude: np.ndarray,
@@ -271,7 +271,9 @@ def pd_and_miss_in_looks(
             shots, signal_ratio, threshold / noise_sigma, bins, point_indices
         )
     else:
-        is_real_bin = np.isin(bins, (0, shots.real_fft_size // 2)) & (shots.real_fft_size > 0)
+        is_real_bin = np.isin(bins, (0, shots.real_ends_fft_size // 2)) & (
+            shots.real_ends_fft_size > 0
+        )
         detection = shots.looks.pd_and_miss_steady(
             signal_ratio, threshold / noise_sigma, is_real_bin
         )
@@ -313,7 +315,7 @@ def _pd_and_miss_in_looks_and_speckle(
         ]
         noise_pseudo_variance_ratio = (
             rule.noise_pseudo_variance_ratio[bins_from_end[is_near_end]]
-            if rule.real_noise_at_ends
+            if rule.has_real_noise_at_ends
             else np.zeros(signal_pseudo_variance_ratio.size)
         )
         near_threshold_ratio = np.broadcast_to(threshold_ratio, signal_ratio.shape)[is_near_end]
@@ -403,7 +405,7 @@ def _joint_pd_in_one_record(
     ``correlation`` (n,) is the magnitude of the correlation of the two segments' speckle.
     """
     threshold_ratio = shots.threshold / shots.line_noise_sigma
-    n_equivalent = mean_detection_equivalent_bins(shots, (pd_up, pd_down), magnitudes)
+    n_equivalent = mean_n_detection_equivalent_bins(shots, (pd_up, pd_down), magnitudes)
     pd_both = echo_detection.joint_pd_in_speckle(
         pd_up, pd_down, threshold_ratio, correlation, n_equivalent
     )
@@ -493,7 +495,7 @@ def _pd_in_looks_far_from_ends(
     return pd_up, pd_down
 
 
-def mean_detection_equivalent_bins(
+def mean_n_detection_equivalent_bins(
     shots: "Shots", probabilities: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]
 ) -> np.ndarray | float:
     """Return the number of independent bins that are detected as often as an echo's bins.
@@ -511,7 +513,7 @@ def mean_detection_equivalent_bins(
     magnitudes : tuple of ndarray
         |X| of the segments' strongest bins [V].
     """
-    if shots.detection_settings.echo_bins == "peak_bin":
+    if shots.detection_settings.echo_bin_rule == "peak_bin":
         return 1.0
     noise_sigma = shots.line_noise_sigma
     threshold_ratio = shots.threshold / noise_sigma
@@ -608,7 +610,7 @@ class StrongestPeakProbabilities(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def pd_decrease(at_threshold, at_level):
+def pd_decrease_with_threshold(at_threshold, at_level):
     """Return the decrease of pd from the threshold b to a higher level z, P_b - P_z >= 0.
 
     It is computed from miss instead of pd where that is more precise.
@@ -616,7 +618,7 @@ def pd_decrease(at_threshold, at_level):
     Parameters
     ----------
     at_threshold, at_level
-        :class:`~sweep.model.detection.echo_detection.Detection` of an echo at the threshold b and
+        :class:`~sweep.model.detection.echo_detection.PdAndMiss` of an echo at the threshold b and
         at the higher level z.
     """
     decrease = at_threshold.pd - at_level.pd
@@ -625,7 +627,7 @@ def pd_decrease(at_threshold, at_level):
     return max(decrease, 0.0)
 
 
-def strongest_peak_of_segments(
+def segment_strongest_peak_probabilities(
     pd: np.ndarray, miss: np.ndarray, pd_loss: np.ndarray, p_alarm: np.ndarray
 ) -> StrongestPeakProbabilities:
     """Return the probabilities that a segment's strongest peak is the echo's, or another one.
@@ -650,7 +652,7 @@ def strongest_peak_of_segments(
     )
 
 
-def strongest_peak_of_shot(
+def shot_strongest_peak_probabilities(
     segments: StrongestPeakProbabilities,
     p_alarm: np.ndarray,
     *,
@@ -706,13 +708,15 @@ def strongest_peak_of_shot(
 class ConditionalPd(NamedTuple):
     """Probabilities of detection in a segment, given the result in other segments of the shot."""
 
-    if_fails: np.ndarray
+    pd_if_condition_fails: np.ndarray
     """(...): probability if the condition does not hold."""
-    if_holds: np.ndarray
+    pd_if_condition_holds: np.ndarray
     """(...): probability if the condition holds."""
 
 
-def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> ConditionalPd:
+def down_pd_given_up_result(
+    pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
+) -> ConditionalPd:
     """Return the probability of detection in the down segment, given the result in the up segment.
 
     Parameters
@@ -764,12 +768,15 @@ def doppler_pd_given_chirps(
         A / E if the condition holds, (D - A) / (1 - E) if it does not.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        if_holds = np.where(
+        pd_if_condition_holds = np.where(
             detects_any_two & (pd_exactly_one > 0),
             np.clip(pd_added_by_doppler / pd_exactly_one, 0.0, 1.0),
             pd_doppler,
         )
-        if_fails = np.clip((pd_doppler - pd_added_by_doppler) / (1 - pd_exactly_one), 0.0, 1.0)
+        pd_if_condition_fails = np.clip(
+            (pd_doppler - pd_added_by_doppler) / (1 - pd_exactly_one), 0.0, 1.0
+        )
     return ConditionalPd(
-        np.where(detects_any_two & (pd_exactly_one < 1), if_fails, pd_doppler), if_holds
+        np.where(detects_any_two & (pd_exactly_one < 1), pd_if_condition_fails, pd_doppler),
+        pd_if_condition_holds,
     )

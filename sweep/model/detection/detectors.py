@@ -36,7 +36,7 @@ from scipy.special import gammaln
 
 from sweep.model.window import Window, window_samples
 
-FIXED_THRESHOLD = "fixed"
+FIXED_THRESHOLD_KIND = "fixed"
 CA_CFAR, OS_CFAR, GOCA_CFAR = "ca_cfar", "os_cfar", "goca_cfar"
 
 
@@ -217,7 +217,7 @@ def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
 
 DETECTORS: dict[str, Detector] = {
-    FIXED_THRESHOLD: exceeds_fixed_threshold,
+    FIXED_THRESHOLD_KIND: exceeds_fixed_threshold,
     CA_CFAR: ca_cfar,
     OS_CFAR: os_cfar,
     GOCA_CFAR: goca_cfar,

@@ -103,30 +103,30 @@ def negligible_signal_ratio(
 class DetectionRule(NamedTuple):
     """Rule of detection from the bins of an echo in one record; common to all points."""
 
-    any_bin: bool
+    detects_by_any_bin: bool
     """True if any bin of an echo may detect it, False if only its strongest bin."""
     lobe_half_width: int
     """Half-width of the window's main lobe [FFT bins], rounded up. 0 unless
-    ``any_bin`` is true."""
-    real_noise_at_ends: bool
+    ``detects_by_any_bin`` is true."""
+    has_real_noise_at_ends: bool
     """True if the noise in bins 0 and N/2 is real, as in a real record."""
     fft_size: int
     """FFT size N, including zero padding."""
     in_speckle: bool
     """True if echoes are in developed speckle."""
-    noise_correlation: float
+    neighbour_noise_correlation: float
     """Modulus of the correlation of the noise of neighbouring bins, 0..1."""
-    real_record_in_speckle: bool
+    is_real_record_in_speckle: bool
     """True for echoes in developed speckle in a real record. Near DC and Nyquist the quadratures of
     their amplitudes have unequal variances."""
     neighbour_crossing_quadrature: JointTailQuadrature
     """Quadrature for the probability that two neighbouring bins both cross the threshold."""
     noise_pseudo_variance_ratio: np.ndarray
     """(bins,): ratio E[n^2] / E[|n|^2] of the noise n, 0 if circular, by distance [bins] from the
-    nearer of DC and Nyquist. Empty unless ``real_noise_at_ends`` and ``in_speckle``."""
+    nearer of DC and Nyquist. Empty unless ``has_real_noise_at_ends`` and ``in_speckle``."""
     mode_table: ModeTable
     """Table of the strongest speckle mode, the part of an echo that fades with one amplitude in all
-    its bins. ``NO_MODES`` unless ``any_bin`` and ``in_speckle``."""
+    its bins. ``NO_MODES`` unless ``detects_by_any_bin`` and ``in_speckle``."""
     sidelobe_neighbour_noise_correlation: float = 0.0
     """Correlation, -1..1, of two neighbouring bins' noise components in phase with a line's
     sidelobes. Sidelobes alternate in sign from bin to bin."""
@@ -184,7 +184,7 @@ class BinsGivenMode(NamedTuple):
     and Nyquist that part of the noise changes with the phase of the strongest mode."""
 
 
-class Detection(NamedTuple):
+class PdAndMiss(NamedTuple):
     """Probabilities that an echo is detected and that it is missed.
 
     Both are computed separately to keep precision in both tails.
@@ -218,7 +218,7 @@ class PedestalShape(NamedTuple):
     of the main lobe."""
     line_width_bins: float
     """Width (FWHM) of the laser's line [FFT bins]."""
-    delay: float
+    delay_times_bin_width: float
     """Delay of the echo, at most the record's duration, in units of one over the bin width."""
 
 
@@ -233,14 +233,14 @@ class BinThreshold(NamedTuple):
     noise leaves around a line.
     """
 
-    line_noise: float
+    line_noise_sigma: float
     """Noise per quadrature [V] in bins that hold lines. It includes the part of the phase-noise
     pedestal that changes |X| in these bins."""
     threshold: float
     """Threshold on |X| [V]."""
-    noise_without_pedestal: float
+    noise_sigma_without_pedestal: float
     """Noise per quadrature [V] of the receiver alone, without the laser's phase noise."""
-    side_noise: float
+    side_noise_sigma: float
     """Noise per quadrature [V] in bins next to the lines. It includes the whole phase-noise
     pedestal."""
     pedestal: PedestalShape = NO_PEDESTAL
@@ -250,23 +250,23 @@ class BinThreshold(NamedTuple):
 class BinThresholds(NamedTuple):
     """Threshold on |X| and noise of n points: arrays (n,) of fields of :class:`BinThreshold`."""
 
-    line_noise: np.ndarray
-    """(n,): noise per quadrature [V] in bins with lines, :attr:`BinThreshold.line_noise`."""
+    line_noise_sigma: np.ndarray
+    """(n,): noise per quadrature [V] in bins with lines, :attr:`BinThreshold.line_noise_sigma`."""
     threshold: np.ndarray
     """(n,): threshold on |X| [V], :attr:`BinThreshold.threshold`."""
-    noise_without_pedestal: np.ndarray
-    """(n,): receiver noise [V], :attr:`BinThreshold.noise_without_pedestal`."""
-    side_noise: np.ndarray
+    noise_sigma_without_pedestal: np.ndarray
+    """(n,): receiver noise [V], :attr:`BinThreshold.noise_sigma_without_pedestal`."""
+    side_noise_sigma: np.ndarray
     """(n,): noise per quadrature [V] in bins next to lines,
-    :attr:`BinThreshold.side_noise`."""
+    :attr:`BinThreshold.side_noise_sigma`."""
     pedestal_reach_bins: np.ndarray
     """(n,): distance from a line [bins] up to which bins of the phase-noise pedestal belong to the
     echo, :attr:`PedestalShape.reach_bins`."""
     pedestal_line_width_bins: np.ndarray
     """(n,): laser line width [FFT bins], :attr:`PedestalShape.line_width_bins`."""
-    pedestal_delay: np.ndarray
+    pedestal_delay_times_bin_width: np.ndarray
     """(n,): delay of the echo [one over the bin width],
-    :attr:`PedestalShape.delay`."""
+    :attr:`PedestalShape.delay_times_bin_width`."""
 
     def select(self, points: np.ndarray) -> "BinThresholds":
         """Return the thresholds and noise of some points, given by their indices."""
@@ -320,14 +320,14 @@ class SpeckleTable(NamedTuple):
 def bin_threshold_at(bin_thresholds, point):
     """Return the :class:`BinThreshold` of point number ``point`` of :class:`BinThresholds`."""
     return BinThreshold(
-        bin_thresholds.line_noise[point],
+        bin_thresholds.line_noise_sigma[point],
         bin_thresholds.threshold[point],
-        bin_thresholds.noise_without_pedestal[point],
-        bin_thresholds.side_noise[point],
+        bin_thresholds.noise_sigma_without_pedestal[point],
+        bin_thresholds.side_noise_sigma[point],
         PedestalShape(
             bin_thresholds.pedestal_reach_bins[point],
             bin_thresholds.pedestal_line_width_bins[point],
-            bin_thresholds.pedestal_delay[point],
+            bin_thresholds.pedestal_delay_times_bin_width[point],
         ),
     )
 
@@ -348,7 +348,7 @@ def pedestal_power_ratio(pedestal, distance):
 
     ``pedestal`` is a :class:`PedestalShape`; ``distance`` is that from the line [bins].
     """
-    gamma, delay = 2.0 * math.pi * pedestal.line_width_bins, pedestal.delay
+    gamma, delay = 2.0 * math.pi * pedestal.line_width_bins, pedestal.delay_times_bin_width
     coherence, omega = math.exp(-gamma * delay), 2.0 * math.pi * distance
     if not distance > 0.0 or not gamma * delay > 1e-5:
         return 1.0
@@ -409,11 +409,17 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
         (bins,): output array.
     """
     largest = 0.0
-    noise_power = bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
+    noise_power = (
+        bin_threshold.noise_sigma_without_pedestal * bin_threshold.noise_sigma_without_pedestal
+    )
     for i in range(magnitude.size):
         largest = max(largest, magnitude[i] if is_echo[i] else 0.0)
-    ratio_under_lines = bin_threshold.line_noise * bin_threshold.line_noise / noise_power - 1.0
-    ratio_beside_lines = bin_threshold.side_noise * bin_threshold.side_noise / noise_power - 1.0
+    ratio_under_lines = (
+        bin_threshold.line_noise_sigma * bin_threshold.line_noise_sigma / noise_power - 1.0
+    )
+    ratio_beside_lines = (
+        bin_threshold.side_noise_sigma * bin_threshold.side_noise_sigma / noise_power - 1.0
+    )
     line_distance = float(magnitude.size)
     for i in range(magnitude.size):
         line_distance = 0.0 if is_echo[i] and magnitude[i] >= 0.5 * largest else line_distance + 1.0
@@ -452,8 +458,8 @@ class SpeckleMixing(NamedTuple):
     With independent circular complex Gaussian z of unit power, the amplitudes are
 
         A_up      = z_0
-        A_doppler = doppler_from_up z_0 + doppler_own z_1
-        A_down    = down_from_up z_0 + down_from_doppler z_1 + down_own z_2
+        A_doppler = doppler_from_up z_0 + doppler_from_independent z_1
+        A_down    = down_from_up z_0 + down_from_doppler z_1 + down_from_independent z_2
 
     The coefficients are the Cholesky factor of the correlation matrix of the amplitudes. Fields are
     (n,) for n points, or scalars in kernels (:func:`speckle_mixing_at`). They are (0,) or zeros
@@ -462,7 +468,7 @@ class SpeckleMixing(NamedTuple):
 
     doppler_from_up: np.ndarray
     """Weight of z_0, the up segment's amplitude, in the Doppler segment's amplitude, 0..1."""
-    doppler_own: np.ndarray
+    doppler_from_independent: np.ndarray
     """Weight of the independent z_1 in the Doppler segment's amplitude, 0..1."""
     down_from_up: np.ndarray
     """Weight of z_0, the up segment's amplitude, in the down segment's amplitude, 0..1."""
@@ -470,7 +476,7 @@ class SpeckleMixing(NamedTuple):
     """Real part of the weight of z_1 in the down segment's amplitude."""
     down_from_doppler_im: np.ndarray
     """Imaginary part of the weight of z_1 in the down segment's amplitude."""
-    down_own: np.ndarray
+    down_from_independent: np.ndarray
     """Weight of the independent z_2 in the down segment's amplitude, 0..1."""
 
     def broadcast(self, n_points: int) -> "SpeckleMixing":
@@ -495,11 +501,11 @@ def speckle_mixing_at(mixing, point):
     """
     return SpeckleMixing(
         mixing.doppler_from_up[point],
-        mixing.doppler_own[point],
+        mixing.doppler_from_independent[point],
         mixing.down_from_up[point],
         mixing.down_from_doppler_re[point],
         mixing.down_from_doppler_im[point],
-        mixing.down_own[point],
+        mixing.down_from_independent[point],
     )
 
 
@@ -527,19 +533,23 @@ class SegmentCorrelations(NamedTuple):
         rotated_doppler_down = doppler_down * np.exp(
             1j * np.angle(self.up_doppler * self.doppler_down * np.conj(self.up_down))
         )
-        doppler_own = np.sqrt(1 - up_doppler**2)
+        doppler_from_independent = np.sqrt(1 - up_doppler**2)
         with np.errstate(divide="ignore", invalid="ignore"):
             down_from_doppler = np.where(
-                doppler_own > 1e-7, (rotated_doppler_down - up_doppler * up_down) / doppler_own, 0.0
+                doppler_from_independent > 1e-7,
+                (rotated_doppler_down - up_doppler * up_down) / doppler_from_independent,
+                0.0,
             )
-        down_own = np.sqrt(np.maximum(1 - up_down**2 - np.abs(down_from_doppler) ** 2, 0.0))
+        down_from_independent = np.sqrt(
+            np.maximum(1 - up_down**2 - np.abs(down_from_doppler) ** 2, 0.0)
+        )
         return SpeckleMixing(
             doppler_from_up=up_doppler,
-            doppler_own=doppler_own,
+            doppler_from_independent=doppler_from_independent,
             down_from_up=up_down,
             down_from_doppler_re=down_from_doppler.real,
             down_from_doppler_im=down_from_doppler.imag,
-            down_own=down_own,
+            down_from_independent=down_from_independent,
         )
 
 
@@ -599,7 +609,7 @@ def joint_pd_in_speckle(
     with np.errstate(divide="ignore"):
         bin_pds = [np.where(is_defined, p, 1.0) for p in (pd_first, pd_second)]
         bin_pd_first, bin_pd_second = (
-            np.where(n_independent_bins > 1, independent_bin_pd(p, n_independent_bins), p)
+            np.where(n_independent_bins > 1, pd_of_one_independent_bin(p, n_independent_bins), p)
             for p in bin_pds
         )
         a, b = (np.minimum(-np.log(p), 700.0) for p in (bin_pd_first, bin_pd_second))
@@ -678,7 +688,7 @@ def n_detection_equivalent_bins(
     return np.clip(np.nan_to_num(n_bins, nan=1.0), 1.0, N_INDEPENDENT_BINS_MAX)
 
 
-def independent_bin_pd(
+def pd_of_one_independent_bin(
     pd: np.ndarray | float, n_independent_bins: np.ndarray | float
 ) -> np.ndarray | float:
     """Return the probability of detection of each of M equal and independent bins of an echo.
@@ -697,21 +707,23 @@ def independent_bin_pd(
 
     Examples
     --------
-    >>> round(float(independent_bin_pd(0.75, 2.0)), 6)
+    >>> round(float(pd_of_one_independent_bin(0.75, 2.0)), 6)
     0.5
     """
     return -np.expm1(np.log1p(-pd) / n_independent_bins)
 
 
-independent_bin_pd_kernel = njit(cache=True, error_model="numpy", borrows=True)(independent_bin_pd)
-""":func:`independent_bin_pd` of single numbers, compiled for calls from kernels."""
+pd_of_one_independent_bin_kernel = njit(cache=True, error_model="numpy", borrows=True)(
+    pd_of_one_independent_bin
+)
+""":func:`pd_of_one_independent_bin` of single numbers, compiled for calls from kernels."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def pd_of_independent_bins(bin_pd, n_bins):
+def pd_of_any_independent_bin(bin_pd, n_bins):
     """Return the probability 1 - (1 - q)^M that any of M independent bins is detected.
 
-    The inverse of :func:`independent_bin_pd`. ``bin_pd`` is q, and ``n_bins`` is M,
+    The inverse of :func:`pd_of_one_independent_bin`. ``bin_pd`` is q, and ``n_bins`` is M,
     not necessarily an integer.
     """
     return -math.expm1(n_bins * math.log1p(-bin_pd))
@@ -795,19 +807,19 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def is_real_bin(bin_, real_noise_at_ends, fft_size):
+def is_real_bin(bin_, has_real_noise_at_ends, fft_size):
     """Test if the noise of a bin is real, as at DC and Nyquist of a real record.
 
     Parameters
     ----------
     bin_ : int
         Number of the bin.
-    real_noise_at_ends : bool
-        True if the noise at DC and Nyquist is real (:attr:`DetectionRule.real_noise_at_ends`).
+    has_real_noise_at_ends : bool
+        True if the noise at DC and Nyquist is real (:attr:`DetectionRule.has_real_noise_at_ends`).
     fft_size : int
         FFT size.
     """
-    return real_noise_at_ends and (bin_ == 0 or 2 * bin_ == fft_size)
+    return has_real_noise_at_ends and (bin_ == 0 or 2 * bin_ == fft_size)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -860,19 +872,19 @@ def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
 
     Returns
     -------
-    Detection
+    PdAndMiss
 
     Notes
     -----
-    If ``rule.any_bin`` is true, any bin of the echo may detect it
+    If ``rule.detects_by_any_bin`` is true, any bin of the echo may detect it
     (:func:`pd_and_miss_any_bin`, or :func:`pd_and_miss_in_speckle`). Otherwise only the strongest
     bin counts. The pedestal that the laser's phase noise leaves around a line is light of the echo
     and fades with it.
     """
     if rule.in_speckle:
-        if rule.any_bin:
+        if rule.detects_by_any_bin:
             return pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle)
-        if bin_threshold.line_noise > bin_threshold.noise_without_pedestal:
+        if bin_threshold.line_noise_sigma > bin_threshold.noise_sigma_without_pedestal:
             return _pd_and_miss_of_peak_on_pedestal(
                 echo.magnitude[peak_index],
                 echo.first_bin + peak_index,
@@ -887,27 +899,27 @@ def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
             bin_threshold,
             bin_speckle,
         )
-    if rule.any_bin:
+    if rule.detects_by_any_bin:
         if bin_threshold.pedestal.reach_bins > 0.0:
             return _pd_and_miss_on_pedestal(echo, rule, bin_threshold)
         return pd_and_miss_any_bin(echo, rule, bin_threshold)
-    line_noise = bin_threshold.line_noise
+    line_noise_sigma = bin_threshold.line_noise_sigma
     tails = bin_crossing_tails(
-        echo.magnitude[peak_index] / line_noise,
-        bin_threshold.threshold / line_noise,
-        is_real_bin(echo.first_bin + peak_index, rule.real_noise_at_ends, rule.fft_size),
+        echo.magnitude[peak_index] / line_noise_sigma,
+        bin_threshold.threshold / line_noise_sigma,
+        is_real_bin(echo.first_bin + peak_index, rule.has_real_noise_at_ends, rule.fft_size),
     )
-    return Detection(tails.above, tails.below)
+    return PdAndMiss(tails.above, tails.below)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_speckle):
-    """Return the :class:`Detection` by one bin in developed speckle, without laser phase noise.
+    """Return the :class:`PdAndMiss` by one bin in developed speckle, without laser phase noise.
 
     ``magnitude`` is the root mean square |X| of the bin's signal [V], ``bin_`` its number.
     """
     signal_power = magnitude * magnitude
-    noise_power = 2.0 * bin_threshold.line_noise * bin_threshold.line_noise
+    noise_power = 2.0 * bin_threshold.line_noise_sigma * bin_threshold.line_noise_sigma
     ratio = 0.0
     if bin_speckle.pseudo_variance_ratio.size > 0:
         nyquist_bin = rule.fft_size // 2
@@ -919,21 +931,21 @@ def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_sp
         )
         ratio /= signal_power + noise_power
     tails = hoyt_tails(signal_power + noise_power, ratio, bin_threshold.threshold)
-    return Detection(tails.above, tails.below)
+    return PdAndMiss(tails.above, tails.below)
 
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_speckle):
-    """Return the :class:`Detection` by one bin in developed speckle, with laser phase noise.
+    """Return the :class:`PdAndMiss` by one bin in developed speckle, with laser phase noise.
 
     The phase noise leaves a pedestal around the line, which fades with it. ``magnitude`` is the
     root mean square |X| of the bin's signal [V], ``bin_`` its number.
     """
-    noise = bin_threshold.noise_without_pedestal
+    noise = bin_threshold.noise_sigma_without_pedestal
     bins_given_mode = _zero_bins_given_mode(INTEGER_ONE)
     bins_given_mode.signal_ratio[:] = magnitude / noise
     bins_given_mode.threshold_ratio[:] = bin_threshold.threshold / noise
-    bins_given_mode.pedestal_power_ratio[:] = (bin_threshold.line_noise / noise) ** 2 - 1.0
+    bins_given_mode.pedestal_power_ratio[:] = (bin_threshold.line_noise_sigma / noise) ** 2 - 1.0
     echo = EchoBins(np.full(1, magnitude), np.ones(1, np.bool_), bin_)
     return _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle)
 
@@ -949,7 +961,7 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
 
     Returns
     -------
-    Detection
+    PdAndMiss
 
     Notes
     -----
@@ -979,19 +991,21 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
             previous_p_stay = -1.0
             continue
         noise = (
-            bin_threshold.line_noise if magnitude[i] >= 0.5 * largest else bin_threshold.side_noise
+            bin_threshold.line_noise_sigma
+            if magnitude[i] >= 0.5 * largest
+            else bin_threshold.side_noise_sigma
         )
-        is_real = is_real_bin(echo.first_bin + i, rule.real_noise_at_ends, rule.fft_size)
+        is_real = is_real_bin(echo.first_bin + i, rule.has_real_noise_at_ends, rule.fft_size)
         tails = bin_crossing_tails(magnitude[i] / noise, threshold / noise, is_real)
         if not tails.below > 0.0:
-            return Detection(1.0, 0.0)
+            return PdAndMiss(1.0, 0.0)
         given_neighbour, quantile = _crossing_given_neighbour_below(
             tails, previous_p_stay, previous_quantile, rule.neighbour_crossing_quadrature
         )
         pd += miss * given_neighbour.above
         miss *= given_neighbour.below
         previous_p_stay, previous_quantile = tails.below, quantile
-    return Detection(pd if pd < 0.5 else 1.0 - miss, miss)
+    return PdAndMiss(pd if pd < 0.5 else 1.0 - miss, miss)
 
 
 @njit(cache=True, error_model="numpy")
@@ -1005,12 +1019,12 @@ def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
     pedestal_ratios, bins_given_mode = np.empty(n_bins), _zero_bins_given_mode(n_bins)
     fill_pedestal_ratios(echo.magnitude, echo.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
-        noise = bin_threshold.noise_without_pedestal * math.sqrt(1.0 + pedestal_ratios[k])
+        noise = bin_threshold.noise_sigma_without_pedestal * math.sqrt(1.0 + pedestal_ratios[k])
         bins_given_mode.signal_ratio[k] = echo.magnitude[k] / noise
         bins_given_mode.threshold_ratio[k] = bin_threshold.threshold / noise
-        bins_given_mode.neighbour_noise_correlation[k] = rule.noise_correlation
+        bins_given_mode.neighbour_noise_correlation[k] = rule.neighbour_noise_correlation
     return _pd_and_miss_given_mode(
-        bins_given_mode, 1.0, echo, rule.real_noise_at_ends, rule.fft_size, np.inf, 0.0
+        bins_given_mode, 1.0, echo, rule.has_real_noise_at_ends, rule.fft_size, np.inf, 0.0
     )
 
 
@@ -1059,7 +1073,7 @@ def _crossing_given_neighbour_below(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def any_crossing_of_chain(probabilities, n_bins, neighbour_crossing_quadrature):
+def any_crossing_probability_in_chain(probabilities, n_bins, neighbour_crossing_quadrature):
     """Return the probability that any bin of a run crosses, from the probability of each bin.
 
     The bins of the run are adjacent, and neighbours are correlated as in
@@ -1138,7 +1152,7 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
 
     Returns
     -------
-    Detection
+    PdAndMiss
 
     Notes
     -----
@@ -1178,7 +1192,7 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     bin_run = _pd_and_miss_of_adjacent_bins(
         echo, run_begin, magnitude.size, rule, bin_threshold, bin_speckle
     )
-    return Detection(pd + miss * bin_run.pd, miss * bin_run.miss)
+    return PdAndMiss(pd + miss * bin_run.pd, miss * bin_run.miss)
 
 
 _N_GAUSS_NODES = 6
@@ -1202,13 +1216,13 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_N_GAUSS_NODES)
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_speckle):
-    """Return the :class:`Detection` of a run of bins of an echo in developed speckle.
+    """Return the :class:`PdAndMiss` of a run of bins of an echo in developed speckle.
 
     The adjacent bins of the run fade together (:func:`pd_and_miss_in_speckle`). They are bins begin
     .. end - 1 of ``echo``.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
-    nyquist_bin = rule.fft_size // 2 if rule.real_record_in_speckle else 0
+    nyquist_bin = rule.fft_size // 2 if rule.is_real_record_in_speckle else 0
     while begin < end - 1 and not is_echo[begin]:
         begin += 1
     while end > begin + 1 and not is_echo[end - 1]:
@@ -1219,14 +1233,18 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
             strongest = i
     below = magnitude[strongest - 1] if strongest > 0 else 0.0
     above = magnitude[strongest + 1] if strongest + 1 < magnitude.size else 0.0
-    if rule.real_record_in_speckle and (
+    if rule.is_real_record_in_speckle and (
         echo.first_bin + strongest == 0 or echo.first_bin + strongest == nyquist_bin
     ):
         below = above = max(below, above)  # bins mirror there
     asymmetry = power_asymmetry(below, magnitude[strongest], above)
     mode_table = rule.mode_table
     cell = locate_in_mode_table(mode_table, bin_speckle.line_deviation_bins, asymmetry)
-    noise_power = 2.0 * bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
+    noise_power = (
+        2.0
+        * bin_threshold.noise_sigma_without_pedestal
+        * bin_threshold.noise_sigma_without_pedestal
+    )
     n_bins = end - begin
     bin_run = EchoBins(magnitude[begin:end], is_echo[begin:end], echo.first_bin + begin)
     # Not by _zero_bins_given_mode: a call and zeros cost 6 % of the time of an echo.
@@ -1267,7 +1285,7 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
                 * magnitude[i - 1]
             )
             noise_covariance += noise_power * math.copysign(
-                rule.noise_correlation, neighbour_correlation
+                rule.neighbour_noise_correlation, neighbour_correlation
             )
             bins_given_mode.neighbour_noise_correlation[k] = min(
                 max(0.5 * noise_covariance * inverse_noise * previous_inverse_noise, -0.999), 0.999
@@ -1285,18 +1303,20 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle):
-    """Return the mean :class:`Detection` over the power of the strongest speckle mode.
+    """Return the mean :class:`PdAndMiss` over the power of the strongest speckle mode.
 
     Near DC and Nyquist of a real record it is also the mean over the mode's phase.
     """
     if bin_speckle.pseudo_variance_ratio.size == 0:
-        return _mean_over_mode_power(bins_given_mode, echo, rule.real_noise_at_ends, rule.fft_size)
+        return _mean_over_mode_power(
+            bins_given_mode, echo, rule.has_real_noise_at_ends, rule.fft_size
+        )
     return _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy")
 def _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
-    """Return the mean :class:`Detection` over power and phase t of the strongest speckle mode.
+    """Return the mean :class:`PdAndMiss` over power and phase t of the strongest speckle mode.
 
     The result applies to bins near DC and Nyquist. Let q be the ratio E[X^2] / E[|X|^2] of a bin X.
     At the phase t the power of all modes in the bin is 1 + q cos t times the mean over t.
@@ -1328,14 +1348,16 @@ def _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
                 * inverse_noise
                 * inverse_noise
             )
-        at_phase = _mean_over_mode_power(given_phase, echo, rule.real_noise_at_ends, rule.fft_size)
+        at_phase = _mean_over_mode_power(
+            given_phase, echo, rule.has_real_noise_at_ends, rule.fft_size
+        )
         pd, miss = pd + at_phase.pd / N_PHASE_NODES, miss + at_phase.miss / N_PHASE_NODES
-    return Detection(pd, miss)
+    return PdAndMiss(pd, miss)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
-    """Return the mean :class:`Detection` over the power of the strongest speckle mode.
+def _mean_over_mode_power(bins_given_mode, echo, has_real_noise_at_ends, fft_size):
+    """Return the mean :class:`PdAndMiss` over the power of the strongest speckle mode.
 
     The mode has the amplitude z in all bins. The signal of a bin is |z| times
     ``bins_given_mode.signal_ratio``. The density of |z| at z is 2 z e^(-z^2).
@@ -1344,7 +1366,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
     ----------
     bins_given_mode, echo
         :class:`BinsGivenMode` and :class:`EchoBins`.
-    real_noise_at_ends, fft_size
+    has_real_noise_at_ends, fft_size
         Fields of :class:`DetectionRule`.
     """
     is_echo = echo.is_echo
@@ -1380,7 +1402,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
         z_last = max(z_first, min(z_last, 4.5))  # |z| is larger with a probability of 2e-9
         z_between = z_middle if z_first < z_middle < z_last else 0.5 * (z_first + z_last)
         interval_ends = (z_first, z_between, z_last)
-    is_real = is_real_bin(echo.first_bin + strongest_index, real_noise_at_ends, fft_size)
+    is_real = is_real_bin(echo.first_bin + strongest_index, has_real_noise_at_ends, fft_size)
     # From the largest |z| down: bins that hardly add to the sum so far can then be left out.
     pd, miss, p_below_first = math.exp(-z_last * z_last), 0.0, -math.expm1(-z_first * z_first)
     for interval in range(1, -1, -1):
@@ -1403,7 +1425,7 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
                 bins_given_mode,
                 z,
                 echo,
-                real_noise_at_ends,
+                has_real_noise_at_ends,
                 fft_size,
                 squared_distance_max,
                 negligible_probability,
@@ -1425,14 +1447,14 @@ def _mean_over_mode_power(bins_given_mode, echo, real_noise_at_ends, fft_size):
             bins_given_mode,
             0.6 * z_first,
             echo,
-            real_noise_at_ends,
+            has_real_noise_at_ends,
             fft_size,
             squared_distance_max,
             negligible_probability,
         )
         pd, miss = pd + p_below_first * at_z.pd, miss + p_below_first * at_z.miss
     total = pd + miss  # 1 but for the quadrature
-    return Detection(pd / total, miss / total)
+    return PdAndMiss(pd / total, miss / total)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1476,12 +1498,12 @@ def _pd_and_miss_given_mode(
     bins_given_mode,
     z,
     echo,
-    real_noise_at_ends,
+    has_real_noise_at_ends,
     fft_size,
     squared_distance_max,
     negligible_probability,
 ):
-    """Return the :class:`Detection` by any bin given the magnitude z of the strongest speckle mode.
+    """Return the :class:`PdAndMiss` by any bin given the magnitude z of the strongest speckle mode.
 
     The law is that of :func:`pd_and_miss_any_bin`, with a noise correlation r of each pair of
     neighbours. The powers of two neighbours, with signals a and b over the noise, are correlated by
@@ -1494,7 +1516,7 @@ def _pd_and_miss_given_mode(
     ----------
     bins_given_mode, z, echo
         :class:`BinsGivenMode`, magnitude of the mode, and :class:`EchoBins`.
-    real_noise_at_ends, fft_size
+    has_real_noise_at_ends, fft_size
         Fields of :class:`DetectionRule`.
     squared_distance_max
         Squared distance [sigma^2] below the threshold beyond which bins are left out.
@@ -1510,7 +1532,7 @@ def _pd_and_miss_given_mode(
         scale = 1.0 / math.sqrt(1.0 + bins_given_mode.pedestal_power_ratio[k] * z * z)
         signal = bins_given_mode.signal_ratio[k] * z * scale
         distance_below = bins_given_mode.threshold_ratio[k] * scale - signal
-        is_real = is_real_bin(echo.first_bin + k, real_noise_at_ends, fft_size)
+        is_real = is_real_bin(echo.first_bin + k, has_real_noise_at_ends, fft_size)
         if distance_below > 0.0 and distance_below * distance_below > (
             2.0 * squared_distance_max if is_real else squared_distance_max
         ):
@@ -1519,7 +1541,7 @@ def _pd_and_miss_given_mode(
         tails = bin_crossing_tails(signal, bins_given_mode.threshold_ratio[k] * scale, is_real)
         p_cross, p_stay = tails.above, tails.below
         if not p_stay > 0.0:
-            return Detection(1.0, 0.0)
+            return PdAndMiss(1.0, 0.0)
         if p_cross < _RARE_CROSSING_PROBABILITY_MAX or miss * p_cross < negligible_probability:
             # That both of a pair cross is at most as likely.
             pd, miss, previous_p_stay = pd + miss * p_cross, miss * p_stay, -1.0
@@ -1537,7 +1559,7 @@ def _pd_and_miss_given_mode(
         pd += miss * conditional_cross
         miss *= conditional_stay
         previous_p_stay, previous_quantile, previous_signal = p_stay, quantile, signal
-    return Detection(pd if pd < 0.5 else 1.0 - miss, miss)
+    return PdAndMiss(pd if pd < 0.5 else 1.0 - miss, miss)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)

@@ -21,7 +21,7 @@ half a record per bin; those of a single tone are then real and even in the dist
   by the remaining noise.
 - ``chirp_z``: the maximum of the windowed record's spectrum on a grid of 1/32 bin, by a chirp-z
   transform [Rabiner, Schafer and Rader, Bell Syst. Tech. J. 48, 1249, 1969], refined by a parabola;
-  it reaches :func:`windowed_peak_deviation`.
+  it reaches :func:`windowed_peak_frequency_deviation`.
 - ``maximum_likelihood``: the record is divided by the window, and Newton's method finds the maximum
   of the unwindowed spectrum. This is repeated without the tone's image at negative frequency. For a
   single tone in white noise this is the maximum-likelihood estimate [Rife and Boorstyn, IEEE Trans.
@@ -39,7 +39,7 @@ Processing: Estimation Theory, 1993, section 3.11]. This holds for a tone some b
 Nyquist, where the bound does not depend on its phase. For a complex tone, with cnr its power over
 the noise power of I and Q together, the variance is half of that. The bound is that of the whole
 record. A window attenuates samples, so the maximum of a windowed spectrum has a larger error
-(:func:`windowed_peak_deviation`), unless the window is undone first.
+(:func:`windowed_peak_frequency_deviation`), unless the window is undone first.
 
 Three segments determine two unknowns: the Fisher information of independent beats adds, weighted
 with the derivatives of each beat by range and velocity (:mod:`sweep.model.waveform`). Only the
@@ -61,8 +61,12 @@ from numpy.typing import ArrayLike
 from scipy import fft
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.detectors import FIXED_THRESHOLD, SpectrumSettings, cached_window_samples
-from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
+from sweep.model.detection.detectors import (
+    FIXED_THRESHOLD_KIND,
+    SpectrumSettings,
+    cached_window_samples,
+)
+from sweep.model.waveform import DEFAULT_CHIRP_RATE_RATIOS
 from sweep.model.window import Window
 
 Estimator = Callable[[np.ndarray, np.ndarray, SpectrumSettings], np.ndarray]
@@ -80,7 +84,7 @@ DETECTOR_PREFIX, ESTIMATOR_PREFIX = (
     "instrument.processing.estimator.",
 )
 SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
-    DETECTOR_PREFIX + "kind": FIXED_THRESHOLD,
+    DETECTOR_PREFIX + "kind": FIXED_THRESHOLD_KIND,
     DETECTOR_PREFIX + "training": 32,
     DETECTOR_PREFIX + "guard": 4,
     DETECTOR_PREFIX + "rank": 0,
@@ -531,7 +535,7 @@ def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
     return np.asarray(snr, float) * 2 * window.energy / window.sum**2
 
 
-def beat_frequency_bound(
+def beat_frequency_cramer_rao_bound(
     *, cnr: ArrayLike, n_samples: ArrayLike, sample_rate: ArrayLike
 ) -> np.ndarray:
     """Return the least standard deviation of a tone's frequency [Hz], by the Cramer-Rao bound.
@@ -551,7 +555,7 @@ def beat_frequency_bound(
     return np.sqrt(variance) * np.asarray(sample_rate) / (2 * math.pi)
 
 
-def phase_noise_deviation(
+def phase_noise_beat_deviation(
     *, line_width: ArrayLike, delay: ArrayLike, duration: ArrayLike
 ) -> np.ndarray:
     """Return the standard deviation of a beat's frequency [Hz] due to laser phase noise.
@@ -574,7 +578,7 @@ def phase_noise_deviation(
         var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2
 
     The maximum-likelihood frequency in white noise has this error in addition to
-    :func:`beat_frequency_bound`. Estimates that use the correlation of the phase
+    :func:`beat_frequency_cramer_rao_bound`. Estimates that use the correlation of the phase
     noise could be better by a few percent for short delays, and by a fifth for r = 1/3.
     """
     delay_fraction = np.minimum(np.asarray(delay, float) / duration, 1.0)
@@ -585,7 +589,7 @@ def phase_noise_deviation(
     )
 
 
-def windowed_peak_deviation(
+def windowed_peak_frequency_deviation(
     *, cnr: ArrayLike, window: Window, sample_rate: ArrayLike
 ) -> np.ndarray:
     """Return the standard deviation [Hz] of the frequency at which a windowed |X(f)| is largest.
@@ -624,7 +628,9 @@ def windowed_peak_deviation(
 
 
 @lru_cache(maxsize=32)
-def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np.ndarray | None:
+def position_error_at_unit_signal(
+    estimator: str, window: Window, fft_size: int
+) -> np.ndarray | None:
     """Return the standard error [bins] of an estimator's position of a tone in noise, (m,).
 
     It holds if |X| of the peak bin equals the noise per quadrature, and falls as 1/|X|.
@@ -640,7 +646,7 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
     -------
     numpy.ndarray or None
         The error at m evenly spaced distances, 0..1 bin, of the tone from the peak bin. m is the
-        size of :attr:`.sub_bin_interpolation.Interpolator.error_at_sigma`. None for
+        size of :attr:`.sub_bin_interpolation.Interpolator.error_at_unit_signal`. None for
         estimators whose error has no known law.
 
     Notes
@@ -649,7 +655,7 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
     per quadrature, W the window's transform at the tone's distance, and E = sum(w^2). The tone's
     power over the noise power before the FFT is then cnr = rho^2 E / W^2. ``maximum_likelihood``
     has the Cramer-Rao bound of the samples that it uses, ``chirp_z`` the error of
-    :func:`windowed_peak_deviation`. ``candan`` has R = Re[N / D] with N = Z_+ - Z_- and
+    :func:`windowed_peak_frequency_deviation`. ``candan`` has R = Re[N / D] with N = Z_+ - Z_- and
     D = 2 Z_0 + Z_- + Z_+. Noise in phase with the tone changes R by the sum of g_j times the noise
     of the bins, with g_+- = +-1 / D - R / D and g_0 = -2 R / D. With the covariance C of the noise
     of three bins, the variance is g' C g / (dR / d delta)^2.
@@ -660,7 +666,7 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
         tone_spectrum_function,
     )
 
-    offset = np.linspace(0.0, 1.0, interpolator(window, fft_size).error_at_sigma.size)
+    offset = np.linspace(0.0, 1.0, interpolator(window, fft_size).error_at_unit_signal.size)
     tone_bins = tone_spectrum_function(window, fft_size)(
         np.array([-1, 0, 1]) - offset[:, None]
     ).real
@@ -672,7 +678,7 @@ def position_error_at_sigma(estimator: str, window: Window, fft_size: int) -> np
         squared_length = ((sample - sample.mean()) ** 2).sum()
         return np.asarray(fft_size / (2 * math.pi) / np.sqrt(cnr * squared_length))
     if estimator == "chirp_z":
-        return windowed_peak_deviation(cnr=cnr, window=window, sample_rate=fft_size)
+        return windowed_peak_frequency_deviation(cnr=cnr, window=window, sample_rate=fft_size)
     if estimator != "candan":
         return None
     correlation_1, correlation_2 = in_phase_noise_correlations(window, fft_size)
@@ -700,7 +706,7 @@ def range_velocity_deviation(
     chirp_rate: ArrayLike,
     range: ArrayLike,
     radial_velocity: ArrayLike,
-    slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
+    slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_RATE_RATIOS,
 ) -> RangeVelocityDeviation:
     """Return the least deviations of range and radial velocity from the deviations of the beats.
 

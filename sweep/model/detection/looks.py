@@ -11,7 +11,7 @@ three ways:
   IRE Trans. Inf. Theory 6, 59, 1960].
 - ``binary``: each record is compared with the threshold, and M of them must cross in the bin.
 - ``coherent``: records are added after the phase between them due to a steady velocity is removed.
-  The sum counts as one record of N times less noise. :func:`coherent_gain` gives its
+  The sum counts as one record of N times less noise. :func:`coherent_amplitude_factor` gives its
   loss by an acceleration; a laser's phase noise adds to the loss.
 
 An echo in developed speckle fades. All looks have the same speckle (``speckle: common``), or each
@@ -60,7 +60,7 @@ LOOKS_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     LOOKS_SPECKLE_PATH: SPECKLE_MOTION,
 }
 
-DRIFT_POSITIONS_MAX = 64
+N_DRIFT_POSITIONS_MAX = 64
 """Largest number of line positions that are evaluated where a line moves from look to look. More
 looks are represented by this number."""
 
@@ -97,11 +97,11 @@ class Looks(NamedTuple):
 
     number: int = 1
     """Number N of records of each segment."""
-    combine: str = COMBINE_POWER
+    combine_kind: str = COMBINE_POWER
     """How the records of a segment are combined, one of :data:`COMBINE_KINDS`."""
-    votes: int = 1
+    votes_needed: int = 1
     """Number of records that must cross the threshold in a bin for a detection. Only used if
-    ``combine`` is ``binary``."""
+    ``combine_kind`` is ``binary``."""
     has_independent_speckle: bool = False
     """True if the echo fades independently from record to record."""
     has_moving_speckle: bool = False
@@ -132,17 +132,17 @@ class Looks(NamedTuple):
 
         False for a single record, and for records that are added as amplitudes.
         """
-        return self.number > 1 and self.combine != COMBINE_COHERENT
+        return self.number > 1 and self.combine_kind != COMBINE_COHERENT
 
     @property
     def n_coherent(self) -> int:
         """Number of records that are added coherently; 1 if none are."""
-        return self.number if self.combine == COMBINE_COHERENT else 1
+        return self.number if self.combine_kind == COMBINE_COHERENT else 1
 
     @property
     def n_power_averaged(self) -> int:
         """Number of records whose powers are averaged; 1 if none are."""
-        return self.number if self.combine == COMBINE_POWER else 1
+        return self.number if self.combine_kind == COMBINE_POWER else 1
 
     @property
     def amplitude_gain_max(self) -> float:
@@ -184,7 +184,7 @@ class Looks(NamedTuple):
         from sweep.model.detection.marcum import marcum_q1
 
         signal, threshold_ratio, is_real = np.broadcast_arrays(signal, threshold_ratio, is_real)
-        if not self.is_noncoherent or self.combine == COMBINE_BINARY:
+        if not self.is_noncoherent or self.combine_kind == COMBINE_BINARY:
             pd, miss = marcum_q1(signal, threshold_ratio)
             if is_real.any():
                 near, far = 0.5 * (threshold_ratio - signal), 0.5 * (threshold_ratio + signal)
@@ -240,7 +240,7 @@ class Looks(NamedTuple):
             return self._pd_and_miss_in_moving_speckle(signal, threshold_ratio, look_speckle)
         y = np.square(threshold_ratio) / (2 + np.square(signal))
         if not self.is_noncoherent or (
-            self.combine == COMBINE_BINARY and self.has_independent_speckle
+            self.combine_kind == COMBINE_BINARY and self.has_independent_speckle
         ):
             pd, miss = np.exp(-y), -np.expm1(-y)
             if self.is_noncoherent:
@@ -251,7 +251,7 @@ class Looks(NamedTuple):
                 special.gammaincc(self.number, self.number * y),
                 special.gammainc(self.number, self.number * y),
             )
-        if self.combine == COMBINE_BINARY:
+        if self.combine_kind == COMBINE_BINARY:
             magnitude, weight = self.speckle_magnitude_quadrature(threshold_ratio, signal)
             tails_given_speckle = self.pd_and_miss_steady(
                 signal[..., None] * magnitude, threshold_ratio[..., None]
@@ -283,7 +283,7 @@ class Looks(NamedTuple):
             vote_probability_given_speckle,
         )
 
-        if self.combine == COMBINE_POWER:
+        if self.combine_kind == COMBINE_POWER:
             snr, threshold = 0.5 * np.square(signal), 0.5 * self.number * np.square(threshold_ratio)
             return PdAndMissArrays(*mean_power_tails(look_speckle, self.number, snr, threshold))
         pd = np.empty(signal.shape)
@@ -292,14 +292,14 @@ class Looks(NamedTuple):
             for lead in np.ndindex(signal.shape[:-2]):
                 index = (*lead, segment, point)
                 pd_given_speckle = vote_probability_given_speckle(
-                    signal[index], threshold_ratio[index], self.votes, magnitude
+                    signal[index], threshold_ratio[index], self.votes_needed, magnitude
                 )
                 pd[index] = pd_given_speckle.mean()
         record_pd = np.exp(-np.square(threshold_ratio) / (2 + np.square(signal)))
         independent_pd = self.vote_probabilities(record_pd, 1 - record_pd).pd
         for index in np.ndindex(signal.shape):
             lattice_pd = vote_probability_given_speckle(
-                signal[index], threshold_ratio[index], self.votes, self._lattice_magnitudes()
+                signal[index], threshold_ratio[index], self.votes_needed, self._lattice_magnitudes()
             ).mean()
             independence = (look_speckle.n_effective_looks[index[-2:]] - 1) / (self.number - 1)
             pd[index] += independence * (independent_pd[index] - lattice_pd)
@@ -358,7 +358,7 @@ class Looks(NamedTuple):
         numpy.ndarray
             (..., k): weights of the realisations, of the sum 1.
         """
-        if self.combine == COMBINE_POWER or (
+        if self.combine_kind == COMBINE_POWER or (
             look_speckle is None and not self.has_independent_speckle
         ):
             n_effective_looks = np.broadcast_to(
@@ -386,7 +386,7 @@ class Looks(NamedTuple):
             )
             for values, signal in zip(pd_by_signal, signals, strict=True):
                 values[index] = vote_probability_given_speckle(
-                    signal[index], threshold_ratio[index], self.votes, magnitude
+                    signal[index], threshold_ratio[index], self.votes_needed, magnitude
                 )
         return pd_by_signal, np.full(SPECKLE_LATTICE_SIZE, 1 / SPECKLE_LATTICE_SIZE)
 
@@ -473,7 +473,7 @@ class Looks(NamedTuple):
             np.square(correlation) * np.prod(list(echo_fractions), axis=0), 1 - 1e-9
         )
         y, z = (np.square(threshold_ratio) / (2 + np.square(v)) for v in (a, b))
-        if self.combine == COMBINE_BINARY:
+        if self.combine_kind == COMBINE_BINARY:
             p_both = joint_pd_in_speckle(
                 np.exp(-y), np.exp(-z), infinite_threshold, squared_correlation**0.5
             )
@@ -650,12 +650,12 @@ class Looks(NamedTuple):
         if not self.is_noncoherent:
             return np.asarray(-y)
         with np.errstate(divide="ignore"):
-            if self.combine == COMBINE_POWER:
+            if self.combine_kind == COMBINE_POWER:
                 k, log_y = np.arange(n), np.log(n * y)[..., None]
                 terms = np.where(k > 0, k * np.where(np.isneginf(log_y), -1e300, log_y), 0.0)
                 log_tail = special.logsumexp(terms - special.gammaln(k + 1), axis=-1) - n * y
                 return np.where(n * y < n, np.log1p(-special.gammainc(n, n * y)), log_tail)
-            k, log_p_stay = np.arange(self.votes, n + 1), np.log(-np.expm1(-y))[..., None]
+            k, log_p_stay = np.arange(self.votes_needed, n + 1), np.log(-np.expm1(-y))[..., None]
             log_combinations = (
                 special.gammaln(n + 1) - special.gammaln(k + 1) - special.gammaln(n - k + 1)
             )
@@ -684,8 +684,8 @@ class Looks(NamedTuple):
         magnitudes
             (N, ...): |X| in each record.
         """
-        if self.combine == COMBINE_BINARY:
-            return np.asarray(np.sort(magnitudes, axis=0)[-self.votes])
+        if self.combine_kind == COMBINE_BINARY:
+            return np.asarray(np.sort(magnitudes, axis=0)[-self.votes_needed])
         return np.sqrt(np.mean(np.square(magnitudes), axis=0))
 
     def p_stay_given_neighbour_crosses(
@@ -716,7 +716,7 @@ class Looks(NamedTuple):
         from sweep.model.detection.marcum import marcum_q1
 
         y, r, n = 0.5 * np.square(np.asarray(threshold_ratio, float)), correlation**2, self.number
-        if self.combine == COMBINE_BINARY:
+        if self.combine_kind == COMBINE_BINARY:
             scaled_threshold = threshold_ratio / math.sqrt(1 - r)
             p_first_only = marcum_q1(correlation * scaled_threshold, scaled_threshold).p
             p_first_only = (
@@ -766,11 +766,11 @@ class Looks(NamedTuple):
                 np.nan_to_num((p_second - p_both) / (1 - p_first)), 0.0, 1.0
             )
         probability = np.zeros(np.shape(p_first))
-        for k in range(self.votes, n + 1):
+        for k in range(self.votes_needed, n + 1):
             p_too_few = sum(
                 binomial.pmf(i, k, p_second_if_first)
-                * binomial.cdf(self.votes - 1 - i, n - k, p_second_if_not_first)
-                for i in range(min(self.votes - 1, k) + 1)
+                * binomial.cdf(self.votes_needed - 1 - i, n - k, p_second_if_not_first)
+                for i in range(min(self.votes_needed - 1, k) + 1)
             )
             probability = probability + binomial.pmf(k, n, p_first) * p_too_few
         return probability
@@ -846,11 +846,11 @@ class Looks(NamedTuple):
         return np.asarray(np.minimum(signal_max, 1 / (self.number * threshold_ratio)))
 
     def vote_probabilities(self, p_cross: np.ndarray, p_stay: np.ndarray) -> PdAndMissArrays:
-        """Return the probabilities that ``votes`` or more records cross, and that fewer do.
+        """Return the probabilities that ``votes_needed`` or more records cross, and that fewer do.
 
         ``p_cross`` and ``p_stay`` are the probabilities that one record crosses and does not.
         """
-        votes_needed, misses_needed = self.votes, self.number - self.votes + 1
+        votes_needed, misses_needed = self.votes_needed, self.number - self.votes_needed + 1
         return PdAndMissArrays(
             special.betainc(votes_needed, misses_needed, p_cross),
             special.betainc(misses_needed, votes_needed, p_stay),
@@ -904,7 +904,7 @@ class Looks(NamedTuple):
         )
         interval_ends = [0 * magnitude_max, magnitude_max]
         # The vote's probability changes within a fraction of one record's transition width.
-        n_pieces = 2 if self.combine == COMBINE_POWER else 2 + math.isqrt(self.number)
+        n_pieces = 2 if self.combine_kind == COMBINE_POWER else 2 + math.isqrt(self.number)
         snr_at_threshold = np.maximum(squared_threshold - 2, 0.0)
         width = 16 * np.sqrt((snr_at_threshold + 1) / self.n_power_averaged)
         for signal in signals:
@@ -934,7 +934,7 @@ SINGLE_LOOK = Looks()
 """Looks of a shot with a single record of each segment."""
 
 
-def coherent_gain(
+def coherent_amplitude_factor(
     looks: Looks, *, acceleration: np.ndarray, carrier: np.ndarray, look_period: np.ndarray
 ) -> np.ndarray:
     """Return the factor by which acceleration reduces the amplitude of coherently added looks.

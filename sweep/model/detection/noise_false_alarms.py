@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION
 from sweep.model.detection.looks import SINGLE_LOOK, Looks
-from sweep.model.threshold import segment_alarm_bins
+from sweep.model.threshold import n_segment_alarm_bins
 
 
 def bin_pfa_exponent(tnr: float) -> float:
@@ -38,7 +38,7 @@ def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
     return math.exp(-bin_pfa_exponent(tnr))
 
 
-def alarm_equivalent_bins(
+def n_alarm_equivalent_bins(
     parameters: Mapping[str, Any], pfa_in_bin: ArrayLike, segment: str = "up"
 ) -> np.ndarray:
     """Return the number of independent noise bins that raise alarms as often as a segment's bins.
@@ -55,7 +55,7 @@ def alarm_equivalent_bins(
     threshold_ratio = Looks.from_parameters(parameters).threshold_ratio_from_log_pfa(
         np.log(np.maximum(pfa_in_bin, 1e-300))
     )
-    return segment_alarm_bins(parameters, threshold_ratio, segment)
+    return n_segment_alarm_bins(parameters, threshold_ratio, segment)
 
 
 def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:

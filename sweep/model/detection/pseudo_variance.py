@@ -103,7 +103,7 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
         )[:, 0]
         phase_power = (
             peak_power
-            if shots.detection_settings.echo_bins == "peak_bin"
+            if shots.detection_settings.echo_bin_rule == "peak_bin"
             else power_by_phase.max(axis=1)
         )
         peak_mean_power = mean_power.max(axis=1)[:, None]
@@ -268,7 +268,7 @@ def multilook_pd_and_miss_near_ends(
     circular and for real noise are averaged.
     """
     signal_power = np.square(signal)
-    if looks.combine == COMBINE_POWER:
+    if looks.combine_kind == COMBINE_POWER:
         quadrature_scales = np.stack(
             [
                 np.sqrt(1 + signal_pseudo_variance),
@@ -317,7 +317,7 @@ def multilook_pd_and_miss_near_ends(
                     vote_probabilities = vote_probability_given_speckle(
                         signal[bin_index],
                         threshold_ratio[bin_index],
-                        looks.votes,
+                        looks.votes_needed,
                         magnitudes,
                         is_real,
                     )

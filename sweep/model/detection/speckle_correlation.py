@@ -41,16 +41,16 @@ from sweep.model.window import Window, centred_transform, window_samples
 SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
 """Pairs of segment indices (0 up, 1 Doppler, 2 down), in the order of arrays over pairs."""
 
-LINE_SHIFT_MIN_BINS = 0.01
+LINE_SHIFT_MIN_CELLS = 0.01
 """Limit on the line shift per standard deviation of the beam. Below it all lines of a footprint
 count as lying in one bin. The unit is a resolution cell, the sample rate over the number of samples
 in the record."""
 
-TRANSFORM_REACH_BINS = 6.0
+TRANSFORM_REACH_CELLS = 6.0
 """Distance from its centre up to which the window's transform counts in correlation integrals. The
 unit is a resolution cell, the sample rate over the number of samples in the record."""
 
-TRANSFORM_SAMPLES_PER_BIN = 64
+TRANSFORM_SAMPLES_PER_CELL = 64
 """Number of samples of the tabulated window transform per resolution cell. A cell is the sample
 rate over the number of samples in the record."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(48)
@@ -130,7 +130,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
     )
 
     half_interval = np.minimum(
-        _BEAM_DEVIATIONS_MAX, TRANSFORM_REACH_BINS / np.maximum(gradients.line_shift_max, 1e-300)
+        _BEAM_DEVIATIONS_MAX, TRANSFORM_REACH_CELLS / np.maximum(gradients.line_shift_max, 1e-300)
     )
     is_resolved = np.abs(gradients.phase_difference) * half_interval <= _RESOLVED_PHASE_MAX
     correlation = _gaussian_correlation(window, gradients).astype(complex)
@@ -143,7 +143,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
         gradients.phase_difference,
         gradients.relative_power_gradient,
         transform,
-        TRANSFORM_SAMPLES_PER_BIN,
+        TRANSFORM_SAMPLES_PER_CELL,
         _GAUSS_NODES,
         _GAUSS_WEIGHTS,
         correlation,
@@ -190,7 +190,7 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     """Return the normalised window transform G, G(0) = 1, about the record's middle; it is real.
 
     ``distance`` is in units of the sample rate over the window's number of samples. G is set to 0
-    beyond 2 TRANSFORM_REACH_BINS.
+    beyond 2 TRANSFORM_REACH_CELLS.
 
     >>> from sweep.model.window import get_window
     >>> float(np.round(window_transform(get_window("hann", 1024), np.array([1.0]))[0], 3))
@@ -201,7 +201,7 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def centroid_delay(window: Window) -> np.ndarray:
+def late_echo_centroid_shift(window: Window) -> np.ndarray:
     """Return the shift [samples] of a window's centroid if k samples are missing, (L + 1,).
 
     Element k is the shift without the first k samples, k = 0 .. L. L is the window's number of
@@ -221,7 +221,7 @@ def _half_maximum_distance(window: Window) -> float:
     """Return the distance at which a window's normalised transform falls to 1/2.
 
     The distance is in units of the sample rate over the number of samples. It is at most 2
-    TRANSFORM_REACH_BINS.
+    TRANSFORM_REACH_CELLS.
     """
     distances, transform = transform_table(window)
     is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as in Hann's of two
@@ -233,13 +233,13 @@ def _half_maximum_distance(window: Window) -> float:
 
 @lru_cache(maxsize=16)
 def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances 0 .. 2 TRANSFORM_REACH_BINS, and a window's transform at these distances.
+    """Return distances 0 .. 2 TRANSFORM_REACH_CELLS, and a window's transform at these distances.
 
     The unit of distance is the sample rate over the number of samples. The transform is 1 at 0.
     """
     distances = (
-        np.arange(int(2 * TRANSFORM_REACH_BINS * TRANSFORM_SAMPLES_PER_BIN) + 1)
-        / TRANSFORM_SAMPLES_PER_BIN
+        np.arange(int(2 * TRANSFORM_REACH_CELLS * TRANSFORM_SAMPLES_PER_CELL) + 1)
+        / TRANSFORM_SAMPLES_PER_CELL
     )
     transform = centred_transform(window, distances).real
     return distances, transform / transform[0]

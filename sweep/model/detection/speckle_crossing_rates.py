@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.detection.added_crossings import crossing_rate, fill_added_crossings
+from sweep.model.detection.added_crossings import crossing_rate, fill_added_crossing_probabilities
 from sweep.model.detection.marcum import marcum_q1_tails
 from sweep.model.kernel_integers import INTEGER_ZERO
 
@@ -223,7 +223,9 @@ def fill_rate_table(threshold_ratio, crossing_series, arrays):
     for k in range(n_entries + 8):
         rates[k] = 0.0
     p_noise_stay = -math.expm1(-0.5 * threshold_ratio * threshold_ratio)
-    fill_added_crossings(half_squares, n_below_threshold, threshold_ratio, crossing_series, rates)
+    fill_added_crossing_probabilities(
+        half_squares, n_below_threshold, threshold_ratio, crossing_series, rates
+    )
     for k in range(n_entries):
         rate = CERTAIN_CROSSING_RATE
         if k < n_below_threshold:
@@ -357,7 +359,7 @@ def add_rates_by_speckle_power(squared_ratio, weight, rate_table, rate_sums):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def count_entry_weights(rate_table):
+def n_entry_weights(rate_table):
     """Return the size of ``entry_weights`` in :func:`add_entry_weights_of_bin`, for a table."""
     return rate_table.entries_per_power * rate_table.relative_rates.shape[1]
 
@@ -379,7 +381,7 @@ def add_entry_weights_of_bin(squared_ratio, rate_table, entry_weights):
     rate_table : SpeckleCrossingRates
         Crossing rates by squared amplitude and speckle power.
     entry_weights : ndarray
-        Weights of the entries, changed in place; its size is given by :func:`count_entry_weights`.
+        Weights of the entries, changed in place; its size is given by :func:`n_entry_weights`.
     """
     place = _rate_table_place(squared_ratio, rate_table)
     w = _interpolation_weights(place.fraction, squared_ratio)

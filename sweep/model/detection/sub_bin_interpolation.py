@@ -65,18 +65,18 @@ class NoiseMixing(NamedTuple):
     """Cholesky factors of the noise covariance of three adjacent bins.
 
     Let z0, z1, z2 be independent standard normal numbers. The noise in one quadrature is z0 in the
-    centre bin, ``from_centre`` z0 + ``above_own`` z1 in the bin above, and
-    ``from_centre`` z0 + ``below_from_above`` z1 + ``below_own`` z2 in the bin below.
+    centre bin, ``from_centre`` z0 + ``above_from_independent`` z1 in the bin above, and
+    ``from_centre`` z0 + ``below_from_above`` z1 + ``below_from_independent`` z2 in the bin below.
     """
 
     from_centre: float
     """Factor on z0, the number of the centre bin, in the noise of both neighbours."""
-    above_own: float
+    above_from_independent: float
     """Factor on z1 in the noise of the bin above: the part independent of the centre bin's noise.
     """
     below_from_above: float
     """Factor on z1 in the noise of the bin below."""
-    below_own: float
+    below_from_independent: float
     """Factor on z2 in the noise of the bin below: the part independent of the noise of both other
     bins."""
 
@@ -115,7 +115,7 @@ class Interpolator(NamedTuple):
     rises from ``magnitude_ratio_at_centre`` by ``magnitude_ratio_step``."""
     weights: NeighbourWeights
     """(m,) in each field: weights by which the |X| of the three bins correct the position."""
-    error_at_sigma: np.ndarray
+    error_at_unit_signal: np.ndarray
     """(m,): standard error of the position [bins], by the tone's distance from the centre bin. It
     holds if the centre bin's |X| equals the noise per quadrature, and falls as 1/|X|."""
     noise_mixing: NoiseMixing
@@ -183,7 +183,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         magnitude_ratio_step=max(float(even_ratios[1] - even_ratios[0]), 1e-12),
         offset=np.interp(even_ratios, magnitude_ratios, offset),
         weights=NeighbourWeights(*(0 * weight if neighbours_vanish else weight)),
-        error_at_sigma=error,
+        error_at_unit_signal=error,
         noise_mixing=_noise_mixing(correlation_1, correlation_2),
         sidelobe_neighbour_noise_correlation=sidelobe_neighbour_noise_correlation(window, fft_size),
         spread_error_factor=np.zeros(0),
@@ -316,13 +316,17 @@ def _noise_mixing(correlation_1: float, correlation_2: float) -> NoiseMixing:
 
     The arguments are the correlations of the noise of bins one and two apart.
     """
-    above_own = math.sqrt(max(1 - correlation_1**2, 0.0))
-    below_from_above = (correlation_2 - correlation_1**2) / above_own if above_own > 0 else 0.0
+    above_from_independent = math.sqrt(max(1 - correlation_1**2, 0.0))
+    below_from_above = (
+        (correlation_2 - correlation_1**2) / above_from_independent
+        if above_from_independent > 0
+        else 0.0
+    )
     return NoiseMixing(
         from_centre=correlation_1,
-        above_own=above_own,
+        above_from_independent=above_from_independent,
         below_from_above=below_from_above,
-        below_own=math.sqrt(max(1 - correlation_1**2 - below_from_above**2, 0.0)),
+        below_from_independent=math.sqrt(max(1 - correlation_1**2 - below_from_above**2, 0.0)),
     )
 
 
@@ -391,7 +395,8 @@ def sub_bin_standard_error(offset, magnitude_ratio, interpolation):
         return 0.5
     return min(
         _interpolate_table(
-            interpolation.error_at_sigma, abs(offset) * (interpolation.error_at_sigma.size - 1)
+            interpolation.error_at_unit_signal,
+            abs(offset) * (interpolation.error_at_unit_signal.size - 1),
         )
         / magnitude_ratio,
         0.5,
@@ -555,8 +560,8 @@ def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.nda
         # The error factor is relative to the standard error at the uncorrected position.
         whole_echo_error = np.interp(
             estimates,
-            np.linspace(0, 1, interpolation.error_at_sigma.size),
-            interpolation.error_at_sigma,
+            np.linspace(0, 1, interpolation.error_at_unit_signal.size),
+            interpolation.error_at_unit_signal,
         )
         is_distinct = np.append(True, np.diff(estimates) > 1e-9)
         shift[i] = np.interp(positions, estimates[is_distinct], positions[is_distinct]) - positions

@@ -249,11 +249,13 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
         power_factor=transmission**2,
         amplitude_factor=transmission**2 if is_direct else transmission,
     )
-    ground_transmission = echo_scales.ground_transmission * transmission
-    return replace(shots, echo_scales=echo_scales._replace(ground_transmission=ground_transmission))
+    ground_light_transmission = echo_scales.ground_light_transmission * transmission
+    return replace(
+        shots, echo_scales=echo_scales._replace(ground_light_transmission=ground_light_transmission)
+    )
 
 
-def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
+def extinction_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return bounds on the changes of the echo and of shot noise if extinction is omitted.
 
     The shot noise is that of light from the target.
@@ -265,7 +267,7 @@ def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
         -optical_depth(profile, **_path_geometry(points.parameters, points.range))
     )
     light_noise_ratio = points.echo_shot_noise_ratio
-    if (solar_bound := noise_sources.solar_background_bound(points)) is not None:
+    if (solar_bound := noise_sources.solar_background_error_bound(points)) is not None:
         light_noise_ratio = light_noise_ratio + solar_bound.noise_variance_change
     # The threshold follows the sunlight's part, not the echo's. The worse case is assumed for both.
     return ErrorBound(
@@ -280,7 +282,7 @@ EXTINCTION = Effect(
     name="extinction",
     description="air, haze and dust that dim the light",
     stage="light",
-    error_bound=extinction_bound,
+    error_bound=extinction_error_bound,
     apply=apply_extinction,
     parameters=(
         Parameter(
@@ -438,7 +440,7 @@ def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndar
     ``integral`` [1/m^2] is that of :func:`backscatter_integral`.
     """
     collected_power = parameters[LASER_PREFIX + "power"] * aperture_area(
-        beam.receiving_aperture_and_angle(parameters)[0]
+        beam.receiver_diameter_and_view_angle(parameters)[0]
     )
     collected_power = collected_power * parameters[TELESCOPE_PREFIX + "optical_efficiency"]
     return np.asarray(collected_power * integral / parameters["atmosphere.lidar_ratio"])
@@ -455,7 +457,7 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     profile = extinction_profile(parameters)
     if profile is None:
         return shots
-    aperture, field_angle = beam.receiving_aperture_and_angle(parameters)
+    aperture, field_angle = beam.receiver_diameter_and_view_angle(parameters)
     power = _backscattered_power(
         parameters,
         backscatter_integral(
@@ -480,7 +482,7 @@ def backscatter_error_bound(points: PlannerInputs) -> ErrorBound | None:
     if profile is None:
         return None
     path_geometry = _path_geometry(parameters, points.range)
-    aperture, field_angle = beam.receiving_aperture_and_angle(parameters)
+    aperture, field_angle = beam.receiver_diameter_and_view_angle(parameters)
     lowest_height = np.minimum(path_geometry["start_height"], path_geometry["end_height"])
     near_range = aperture / field_angle
     extinction = optical_depth(

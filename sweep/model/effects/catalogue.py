@@ -26,7 +26,7 @@ from sweep.model.effects import (
     speckle,
 )
 from sweep.model.effects.effect import Effect, Parameter
-from sweep.model.shot_settings import RECORD_PATH
+from sweep.model.shot_settings import RECORD_TYPE_PATH
 
 EFFECTS: tuple[Effect, ...] = (
     footprint.FOOTPRINT,
@@ -70,7 +70,7 @@ EFFECT_PARAMETERS: tuple[Parameter, ...] = tuple(
 )
 """All fields that effects add to a spec, effect by effect."""
 
-EFFECT_SHARED_PARAMETER_PATHS = tuple(
+EFFECT_CATEGORY_KEY_PATHS = tuple(
     parameter.path for parameter in EFFECT_PARAMETERS if parameter.is_category_key
 )
 """Dotted paths of the effects' numeric parameters that must be equal in all points that are
@@ -80,7 +80,7 @@ PARAMETER_DEFAULTS: dict[str, float | int | str | np.ndarray] = (
     beam.BEAM_DEFAULTS
     | waveform.WAVEFORM_DEFAULTS
     | looks.LOOKS_DEFAULTS
-    | {RECORD_PATH: "real"}
+    | {RECORD_TYPE_PATH: "real"}
     | {parameter.path: parameter.default for parameter in EFFECT_PARAMETERS}
 )
 """Default values of parameters of beam, waveform, looks, record and effects, by dotted path."""

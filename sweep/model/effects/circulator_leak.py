@@ -45,7 +45,7 @@ from sweep.model.effects.requirements import ParameterRequirement, exceeds_one, 
 from sweep.model.link_budget import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX, beat_current
 from sweep.model.preparation import Shots
 from sweep.model.shot_records import PermanentLine
-from sweep.model.waveform import SEARCH_RANGE_PATHS
+from sweep.model.waveform import SEARCH_RANGE_LIMIT_PATHS
 
 LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
 """Dotted paths of two parameters of the leaked light. The first is its optical path less that of
@@ -205,7 +205,7 @@ CIRCULATOR_LEAK = Effect(
                     "take instrument.looks.number: 1",
                 ),
                 ParameterRequirement(
-                    SEARCH_RANGE_PATHS[0],
+                    SEARCH_RANGE_LIMIT_PATHS[0],
                     is_positive,
                     "is that of a line which masks bins, and no law joins that with a search band",
                     "leave instrument.processing.search out",

@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sweep.model.beamlets import NO_SPREAD
+from sweep.model.beamlets import ZERO_OFFSET_MOMENTS
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import ErrorBound, magnitude_change_from_power
 from sweep.model.effects.planner_inputs import PlannerInputs
@@ -76,7 +76,7 @@ def line_shift_error_bound(points: PlannerInputs, shift_bins: np.ndarray) -> Err
     coherent_change: np.ndarray | float = 0.0
     if points.waveform.architecture != "direct":
         near_change = magnitude_change_from_power(
-            points.peak_power_change_bound(NO_SPREAD, points.line_spread, shift_bins)
+            points.peak_power_change_bound(ZERO_OFFSET_MOMENTS, points.line_spread, shift_bins)
         )
         magnitude_change = np.where(is_far, 0.0, near_change)
     if points.adds_amplitudes:

@@ -125,7 +125,7 @@ class DrawAddresses(NamedTuple):
     """(n, 2) uint64: key of each point's own random stream."""
     draw_numbers: np.ndarray
     """(n,) int64: number of each point's draw (realisation of everything random)."""
-    are_grouped: bool = False
+    draws_are_grouped: bool = False
     """True if consecutive draws of a point form groups over which random numbers are spread evenly
     (:mod:`sweep.model.sampling.draw_groups`); False for independent draws."""
 
@@ -149,7 +149,7 @@ class DrawAddresses(NamedTuple):
         from sweep.model.sampling.draw_groups import grouped_uniforms
         from sweep.model.sampling.philox import uniforms
 
-        if not self.are_grouped:
+        if not self.draws_are_grouped:
             return uniforms(self.point_keys, self.draw_numbers, stream, count)
         return grouped_uniforms(
             self.point_keys, self.draw_numbers, stream, count, are_polar=are_polar

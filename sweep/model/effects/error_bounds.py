@@ -53,10 +53,10 @@ class PhaseErrorBound(NamedTuple):
     coefficients: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)
     """Largest magnitudes of the phase's coefficients of x, x^2, x^3, x^4 [cycles]. x is the
     position in the record, -1..1."""
-    non_polynomial: np.ndarray | float = 0.0
+    non_polynomial_phase: np.ndarray | float = 0.0
     """Largest magnitude [cycles] of the part of the phase error beyond the polynomial of
     ``coefficients``."""
-    constant: np.ndarray | float = 0.0
+    mid_record_phase: np.ndarray | float = 0.0
     """Largest magnitude of the phase error in the record's middle [cycles]. It only matters to
     lines near their images."""
     extra_shift_window_bins: np.ndarray | float = 0.0

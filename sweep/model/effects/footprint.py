@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sweep.model.beamlets import BEAMLET_PATTERNS, NO_SPREAD, OffsetMoments
+from sweep.model.beamlets import BEAMLET_PATTERNS, ZERO_OFFSET_MOMENTS, OffsetMoments
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import image_and_leakage
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
@@ -26,7 +26,7 @@ def axis_surface_line_spread(points: PlannerInputs) -> OffsetMoments:
 
     The offsets are due to the ranges of beamlets on the surface that the axis meets.
     """
-    return points.footprint_extent.axis_surface_range_offsets.scaled_by(
+    return points.footprint_extent.axis_surface_range_offset_moments.scaled_by(
         points.bins_per_relative_range
     )
 
@@ -43,12 +43,14 @@ def footprint_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if points.n_beamlets == 1:
         return None
-    power_change = points.peak_power_change_bound(axis_surface_line_spread(points), NO_SPREAD)
-    echo_change = 2 * np.abs(points.footprint_extent.total_echo_ratio - 1)
+    power_change = points.peak_power_change_bound(
+        axis_surface_line_spread(points), ZERO_OFFSET_MOMENTS
+    )
+    echo_change = 2 * np.abs(points.footprint_extent.total_to_axis_echo_ratio - 1)
     if points.waveform.architecture != "direct":
         return ErrorBound(magnitude_change=magnitude_change_from_power(power_change + echo_change))
     range_deviation = (
-        points.range * points.footprint_extent.axis_surface_range_offsets.largest_magnitude
+        points.range * points.footprint_extent.axis_surface_range_offset_moments.largest_magnitude
     )
     highest_frequency = points.carriers + 2 * points[CHIRP_PREFIX + "bandwidth"]
     phase_change = np.minimum(4 * np.pi / SPEED_OF_LIGHT * highest_frequency * range_deviation, 2.0)
@@ -72,8 +74,8 @@ def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
     of the ground (:mod:`sweep.model.ground`). Its amplitude is the square root of its echo power.
     """
     row, range_offset, _, echo = context.ground.beamlets
-    if context.ground.off_axis_surface is not None:
-        range_offset = np.where(context.ground.off_axis_surface, 0.0, range_offset)
+    if context.ground.is_on_other_surface is not None:
+        range_offset = np.where(context.ground.is_on_other_surface, 0.0, range_offset)
     return replace(
         shots,
         footprint=shots.footprint._replace(
@@ -169,17 +171,21 @@ def several_returns_error_bound(points: PlannerInputs) -> ErrorBound | None:
     bin holds at most a plus the peak power of a line of power f there. If amplitudes add, the only
     bound is their sum in phase.
     """
-    off_axis_fraction = np.minimum(points.footprint_extent.off_axis_fraction, 1.0)
-    if not (off_axis_fraction > 0).any():
+    other_surface_echo_fraction = np.minimum(
+        points.footprint_extent.other_surface_echo_fraction, 1.0
+    )
+    if not (other_surface_echo_fraction > 0).any():
         return None
     if points.adds_amplitudes:
         return ErrorBound(
             magnitude_change=np.where(
-                off_axis_fraction > 0, points.footprint_extent.amplitude_gain_max + 1.0, 0.0
+                other_surface_echo_fraction > 0,
+                points.footprint_extent.amplitude_gain_max + 1.0,
+                0.0,
             )
         )
     line_distance_bins = (
-        points.footprint_extent.off_axis_range_offset_max * points.bins_per_relative_range
+        points.footprint_extent.other_surface_range_offset_max * points.bins_per_relative_range
     )
     power_min = points.peak_power_bounds_for_spread(axis_surface_line_spread(points)).power_min
     gain_ratio_max = np.minimum(
@@ -187,11 +193,11 @@ def several_returns_error_bound(points: PlannerInputs) -> ErrorBound | None:
         1 / points.transfer_gain**2,
     )
     added_power = (
-        off_axis_fraction
+        other_surface_echo_fraction
         * np.maximum(gain_ratio_max, 1.0)
         * np.where(points.is_near_image, 2.0, 1.01)
     )
-    kept_power = np.maximum((1 - off_axis_fraction) * power_min, 1e-9)
+    kept_power = np.maximum((1 - other_surface_echo_fraction) * power_min, 1e-9)
     return ErrorBound(
         magnitude_change=np.where(
             line_distance_bins > 0, np.minimum(added_power / kept_power, 1e3), 0.0
@@ -206,7 +212,7 @@ def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
     """
     range_offset = context.ground.beamlets.relative_range_offset
     if (
-        context.ground.off_axis_surface is None
+        context.ground.is_on_other_surface is None
         or shots.footprint.relative_range_offset.shape != range_offset.shape
     ):
         return shots

@@ -51,7 +51,7 @@ from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import PROCESSING_PREFIX
 from sweep.model.preparation import Shots
-from sweep.model.shot_settings import RECORD_PATH
+from sweep.model.shot_settings import RECORD_TYPE_PATH
 from sweep.model.window import get_window
 from sweep.model.window_response import window_response
 
@@ -75,7 +75,7 @@ def image_error_bound(points: PlannerInputs) -> ErrorBound | None:
     amplitudes add, they may cancel. Images then add to any bin at most the largest sidelobe at e
     bins, relative to the sum of all lines in phase.
     """
-    if points.shared_option(RECORD_PATH) == "complex":
+    if points.shared_option(RECORD_TYPE_PATH) == "complex":
         return None
     log10_pfa_change, bins_from_light_to_edge = (
         _image_log10_pfa_change(points),
@@ -145,7 +145,7 @@ def _image_log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     if points.shared_option(PROCESSING_PREFIX + "bins_counted") == "all":
         return 0.0
     response, nyquist_bin = points.window_response, points.fft_size / 2
-    chirp_slice = slice(None, None, 2) if len(points.existing_chirp_rates) == 3 else slice(None)
+    chirp_slice = slice(None, None, 2) if len(points.existing_chirp_slopes) == 3 else slice(None)
     extent_bins = np.minimum(
         points.line_spread.largest_magnitude + points.phase_error_shift_bins, nyquist_bin
     )
@@ -153,15 +153,15 @@ def _image_log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
         points.line_magnitude_over_sigma * points.footprint_extent.amplitude_gain_max, 1e-300
     )
     threshold_distance = np.minimum(
-        response.distance_below(points.threshold_ratio / total_ratio), nyquist_bin
+        response.reach_of_magnitude(points.threshold_ratio / total_ratio), nyquist_bin
     )
     if points.missing_samples is not None:  # sidelobes of an echo that begins within the record
         step_ratio = np.maximum(total_ratio * points.missing_samples.step_sidelobe_factor, 1e-300)
         rectangular_response = window_response("rectangular", points.window.length, points.fft_size)
         threshold_distance = np.minimum(
             np.maximum(
-                response.distance_below(0.5 * points.threshold_ratio / total_ratio),
-                rectangular_response.distance_below(0.5 * points.threshold_ratio / step_ratio)
+                response.reach_of_magnitude(0.5 * points.threshold_ratio / total_ratio),
+                rectangular_response.reach_of_magnitude(0.5 * points.threshold_ratio / step_ratio)
                 + points.padding_factor,
             ),
             nyquist_bin,
@@ -199,7 +199,9 @@ def apply_image(shots: Shots, context: EffectContext) -> Shots:
     Bin k is X[k] = W(k - nu) a / 2 + (W(k + nu) a / 2)^*, for a line of amplitude a at the position
     nu [bins]. W is the window's transform, and ^* the complex conjugate.
     """
-    return replace(shots, images=shots.images._replace(are_summed=not shots.complex_record))
+    return replace(
+        shots, line_images=shots.line_images._replace(are_summed=not shots.complex_record)
+    )
 
 
 IMAGE = Effect(

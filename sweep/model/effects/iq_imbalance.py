@@ -27,7 +27,7 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.requirements import ParameterRequirement, condition_equal_to
 from sweep.model.link_budget import RECEIVER_PREFIX
 from sweep.model.preparation import Shots
-from sweep.model.shot_settings import RECORD_PATH
+from sweep.model.shot_settings import RECORD_TYPE_PATH
 
 GAIN_IMBALANCE_PATH, PHASE_IMBALANCE_PATH = (
     RECEIVER_PREFIX + "iq_gain_imbalance",
@@ -87,11 +87,11 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     image_amplitude = image_gain(
         gain=context.parameters[GAIN_IMBALANCE_PATH], phase=context.parameters[PHASE_IMBALANCE_PATH]
     )
-    return replace(shots, images=shots.images._replace(iq_gain=image_amplitude))
+    return replace(shots, line_images=shots.line_images._replace(iq_image_gain=image_amplitude))
 
 
 _COMPLEX_RECORD_REQUIREMENT = ParameterRequirement(
-    RECORD_PATH,
+    RECORD_TYPE_PATH,
     condition_equal_to("real"),
     "is one of I and Q, and the record is real",
     "set instrument.receiver.record: complex",

@@ -34,7 +34,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH
     if not (beam.is_single_mode(points.parameters) and points.any_nonzero(*paths)):
         return None
-    lost_fraction = 1 - beam.axis_offset_transmission(points.parameters, points.range)
+    lost_fraction = 1 - beam.beam_axis_offset_transmission(points.parameters, points.range)
     echo_shot_noise_ratio = points.echo_shot_noise_ratio
     return ErrorBound(
         magnitude_change=magnitude_change_from_power(lost_fraction),
@@ -54,7 +54,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     """
     if not beam.is_single_mode(context.parameters):
         return shots
-    kept_fraction = beam.axis_offset_transmission(context.parameters, shots.range)
+    kept_fraction = beam.beam_axis_offset_transmission(context.parameters, shots.range)
     echo_scales = shots.echo_scales.scale_echo(
         power_factor=kept_fraction, amplitude_factor=np.sqrt(kept_fraction)
     )
@@ -69,7 +69,7 @@ _SINGLE_MODE_REQUIREMENTS = tuple(
         "take a coherent receiver of coupling: single_mode",
     )
     for other_path, word in (
-        (beam.COUPLING_PATH, beam.APERTURE),
+        (beam.COUPLING_PATH, beam.APERTURE_COUPLING),
         (beam.ARCHITECTURE_PATH, "direct"),
     )
 )

@@ -113,7 +113,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         return ErrorBound(magnitude_change=magnitude_change)
     half_reach = 0.5 * _LINE_REACH_DEVIATIONS * line_deviation
     coherent_change = coherent_sum_change(
-        points, PhaseErrorBound((half_reach, 0.0, 0.0, 0.0), constant=half_reach)
+        points, PhaseErrorBound((half_reach, 0.0, 0.0, 0.0), mid_record_phase=half_reach)
     )
     return ErrorBound(
         magnitude_change=np.where(points.amplitudes_may_cancel, 0.0, magnitude_change),
@@ -132,7 +132,7 @@ def _lorentzian_error_bound(points: PlannerInputs) -> ErrorBound:
     )
     densest_width = np.minimum(line_width, _DENSEST_PEDESTAL_EXPONENT / (2 * np.pi * delay))
     density = pedestal_density_under_line(line_width=densest_width, delay=delay)
-    echo_ratio = points.footprint_extent.total_echo_ratio
+    echo_ratio = points.footprint_extent.total_to_axis_echo_ratio
     beat_amplitude = points.beat_amplitude * (
         echo_ratio if points.waveform.architecture == "direct" else np.sqrt(echo_ratio)
     )
@@ -188,9 +188,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     """
     line_width = np.asarray(context.parameters[_WIDTH_PATH], float)
     if str(context.parameters[_SHAPE_PATH]) == "gaussian":
-        return replace(
-            shots, laser_line=LaserLine(gaussian_width=line_width + np.zeros(shots.size))
-        )
+        return replace(shots, laser_line=LaserLine(gaussian_fwhm=line_width + np.zeros(shots.size)))
     delay = 2 * shots.range / SPEED_OF_LIGHT
     line_width = line_width + np.zeros(shots.size)
     timing = {"line_width": line_width, "delay": delay, "duration": shots.record.duration}
@@ -203,7 +201,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
             "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
         )
     line_fraction, in_phase_pedestal = _line_fraction_and_pedestal(shots, timing)
-    line_power = (shots.echo_scales.beat_amplitude / 2) ** 2 * shots.total_relative_echo
+    line_power = (shots.echo_scales.beat_amplitude_scale / 2) ** 2 * shots.total_relative_echo
     side_pedestal = pedestal_power_under_line(window=shots.window, **timing)
     if shots.echo_record.n_samples_before_echo is not None:
         side_pedestal = (
@@ -215,7 +213,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
         shots,
         echo_scales=shots.echo_scales.scale_echo(amplitude_factor=np.sqrt(line_fraction)),
         laser_line=LaserLine(
-            lorentzian_width=line_width,
+            lorentzian_fwhm=line_width,
             pedestal_variance_beside_line=line_power * side_pedestal / shots.window.energy,
             pedestal_variance_under_line=line_power * 2 * in_phase_pedestal / shots.window.energy,
         ),

@@ -41,7 +41,7 @@ from sweep.model.preparation import Shots
 # reports.
 
 
-def signal_shot_noise_bound(points: PlannerInputs) -> ErrorBound:
+def signal_shot_noise_error_bound(points: PlannerInputs) -> ErrorBound:
     """Return the variance of the echo's shot noise over that of the receiver's noise.
 
     The threshold is set without it, because it comes with the echo.
@@ -69,7 +69,7 @@ SIGNAL_SHOT_NOISE = Effect(
     name="signal_shot_noise",
     description="shot noise of the echo itself",
     stage="noise",
-    error_bound=signal_shot_noise_bound,
+    error_bound=signal_shot_noise_error_bound,
     apply=apply_signal_shot_noise,
     needs_separate_batches=False,
 )
@@ -133,7 +133,7 @@ def received_sunlight(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
         elevation=parameters[_SUN_ELEVATION_PATH],
     )
     field_of_view = np.asarray(parameters[_FIELD_OF_VIEW_PATH], float)
-    aperture_diameter, field_angle = beam.receiving_aperture_and_angle(parameters)
+    aperture_diameter, field_angle = beam.receiver_diameter_and_view_angle(parameters)
     area = receiver_chain.aperture_area(
         np.where(field_of_view > 0, parameters[TELESCOPE_PREFIX + "aperture"], aperture_diameter)
     )
@@ -143,7 +143,7 @@ def received_sunlight(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(light * parameters[TELESCOPE_PREFIX + "optical_efficiency"])
 
 
-def solar_background_bound(points: PlannerInputs) -> ErrorBound | None:
+def solar_background_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the variance of sunlight's shot noise over that of the receiver's noise.
 
     Extinction in the air is neglected. The threshold is set on the noise with sunlight.
@@ -167,7 +167,9 @@ def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
     """
     effect_mask = context.effect_mask("solar_background")
     light = (
-        received_sunlight(context.parameters) * shots.echo_scales.ground_transmission * effect_mask
+        received_sunlight(context.parameters)
+        * shots.echo_scales.ground_light_transmission
+        * effect_mask
     )
     return add_noise_sources(
         shots, solar_shot=np.asarray(shots.receiver_noise.shot_noise_variance_per_watt * light)
@@ -178,7 +180,7 @@ SOLAR_BACKGROUND = Effect(
     name="solar_background",
     description="shot noise of sunlight on the target",
     stage="noise",
-    error_bound=solar_background_bound,
+    error_bound=solar_background_error_bound,
     apply=apply_solar_background,
     needs_separate_batches=False,
     parameters=(
@@ -251,7 +253,7 @@ def intensity_noise_current_variance(
     return np.asarray(current**2 * intensity_density * electrical_bandwidth)
 
 
-def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
+def relative_intensity_noise_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the ratio of the local oscillator's intensity noise to the receiver's noise.
 
     The ratio is that of variances, and exact, not a bound. The threshold is set on noise that
@@ -290,7 +292,7 @@ RELATIVE_INTENSITY_NOISE = Effect(
     name="relative_intensity_noise",
     description="fluctuation of the local oscillator's power",
     stage="noise",
-    error_bound=relative_intensity_noise_bound,
+    error_bound=relative_intensity_noise_error_bound,
     apply=apply_relative_intensity_noise,
     parameters=(
         Parameter(

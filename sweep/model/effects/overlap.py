@@ -24,7 +24,7 @@ that begin at 0 and are complete (``overlap: off``).
 One n_0, that of the beam's axis, serves all lines of a footprint's segment. A beamlet that is d
 farther away has 2 d f_s / c samples fewer. One n_0, that of the middle look, serves all looks of a
 shot, between which the range changes. Both differences are neglected. The error counts in
-``effects_error``, and :func:`residual_bound` bounds it. Positions between bins are
+``effects_error``, and :func:`residual_magnitude_bound` bounds it. Positions between bins are
 corrected for n_0 (:func:`sweep.model.detection.sub_bin_interpolation.late_echo_correction`).
 
 Error bound: let c be the largest bin's magnitude over that of all lines on a bin, and b the
@@ -78,7 +78,10 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         np.where(line_amplitude_min > 0, missing.lost_fraction / line_amplitude_min, np.inf),
         0.0,
     )
-    bound, all_missing = residual_bound(points), missing.all_missing.any(axis=0).astype(float)
+    bound, all_missing = (
+        residual_magnitude_bound(points),
+        missing.all_missing.any(axis=0).astype(float),
+    )
     residual: dict[str, Any] = {
         "residual_magnitude_change": bound,
         "residual_coherent_sum_change": bound * points.footprint_extent.amplitude_gain_max,
@@ -109,7 +112,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     )
 
 
-def residual_bound(points: PlannerInputs) -> np.ndarray:
+def residual_magnitude_bound(points: PlannerInputs) -> np.ndarray:
     """Return a bound on the error of using one number of missing samples for all echoes.
 
     The echoes are those of all beamlets and looks. The number used is that of the samples before
@@ -122,7 +125,7 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
     """
     missing = points.missing_samples
     assert missing is not None
-    range_moments = points.footprint_extent.range_offsets
+    range_moments = points.footprint_extent.range_offset_moments
     mean_range = np.minimum(
         np.abs(range_moments.mean) + range_moments.rms, range_moments.largest_magnitude
     )

@@ -70,7 +70,7 @@ import numpy as np
 
 from sweep.model import shot_settings
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.looks import coherent_gain
+from sweep.model.detection.looks import coherent_amplitude_factor
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import (
     NO_PHASE_ERROR,
@@ -189,7 +189,7 @@ def polynomial_phase_bound(
                 + math.comb(j, k) * record_middle ** (j - k) * half_duration**k * coefficient
             )
     constant, *coefficients = (np.abs(coefficient) for coefficient in polynomial)
-    return PhaseErrorBound(tuple(coefficients), constant=constant)
+    return PhaseErrorBound(tuple(coefficients), mid_record_phase=constant)
 
 
 def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray:
@@ -210,7 +210,7 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
         Bound, the mean of |phi| over the record [rad], weighted with |w| / sum w for the window w.
     """
     moments = window_moments(window)
-    total = phase_bound.non_polynomial * moments.magnitude_sum_ratio
+    total = phase_bound.non_polynomial_phase * moments.magnitude_sum_ratio
     for value, mean in zip(phase_bound.coefficients, moments.absolute_moments, strict=True):
         total = total + value * mean
     return np.minimum(_RADIANS_PER_CYCLE * total, 2 * moments.magnitude_sum_ratio)
@@ -225,7 +225,11 @@ def coherent_sum_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> 
     moments = window_moments(points.window)
     phase_anywhere = np.minimum(
         _RADIANS_PER_CYCLE
-        * (sum(phase_bound.coefficients) + phase_bound.non_polynomial + phase_bound.constant),
+        * (
+            sum(phase_bound.coefficients)
+            + phase_bound.non_polynomial_phase
+            + phase_bound.mid_record_phase
+        ),
         2.0,
     )
     phase_change = np.where(
@@ -263,7 +267,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     for other_name, other_bound in points.phase_error_bounds.items():
         other_bounds = other_bounds if other_name == name else other_bounds.plus(other_bound)
     linear, quadratic, cubic, quartic = own_bound.coefficients
-    non_polynomial = _RADIANS_PER_CYCLE * own_bound.non_polynomial
+    non_polynomial = _RADIANS_PER_CYCLE * own_bound.non_polynomial_phase
     odd_phase = non_polynomial * moments.magnitude_sum_ratio
     odd_phase = odd_phase + _RADIANS_PER_CYCLE * (
         linear * moments.absolute_moments.linear + cubic * moments.absolute_moments.cubic
@@ -281,7 +285,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     if len(points.phase_error_bounds) > 1:
         others_phase = mean_phase_bound(other_bounds, points.window)
         others_far = _RADIANS_PER_CYCLE * (
-            sum(other_bounds.coefficients) + other_bounds.non_polynomial
+            sum(other_bounds.coefficients) + other_bounds.non_polynomial_phase
         )
         turned_by_others = mean_phase_bound(own_bound, points.window) * np.minimum(others_far, 2.0)
     missing = points.missing_samples
@@ -289,7 +293,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     if missing is not None:
         others_phase = others_phase + missing.lost_fraction
         turned_by_others = turned_by_others + missing.lost_fraction * np.minimum(
-            _RADIANS_PER_CYCLE * (sum(own_bound.coefficients) + own_bound.non_polynomial), 2.0
+            _RADIANS_PER_CYCLE * (sum(own_bound.coefficients) + own_bound.non_polynomial_phase), 2.0
         )
     a = (
         np.minimum(odd_phase, 2 * moments.magnitude_sum_ratio)
@@ -430,7 +434,7 @@ def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     if not drift_ratio.any():
         return None
     return polynomial_phase_bound(
-        points, {2: points.existing_chirp_rates * points.waveform.chirp_rate * drift_ratio}
+        points, {2: points.existing_chirp_slopes * points.waveform.chirp_rate * drift_ratio}
     )
 
 
@@ -443,7 +447,7 @@ def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
     from the chirp's rising Doppler shift.
     """
     velocity, slide = (
-        shots.motion_by_segment["radial_velocity"],
+        shots.range_and_velocity_by_segment["radial_velocity"],
         shots.target.approach_speed - shots.target.radial_velocity,
     )
     shots = _add_phase_error(
@@ -453,11 +457,11 @@ def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
         radial_velocity=velocity,
         slide=slide,
     )
-    walk_time = shots.motion.range_reference_time + chirp_drift_time(shots)
+    walk_time = shots.motion.range_reference_time + slope_of_squared_time(shots)
     return replace(shots, motion=shots.motion._replace(range_reference_time=walk_time))
 
 
-def chirp_drift_time(shots: Shots) -> np.ndarray:
+def slope_of_squared_time(shots: Shots) -> np.ndarray:
     """Return the mean slope of t^2 over the records of both chirps [s], (n,) or scalar.
 
     t is the time since the segment's start. The slope is that of the best straight line, weighted
@@ -558,7 +562,7 @@ def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     if not points.any_nonzero(_ACCELERATION_PATH):
         return None
     alpha = points[_ACCELERATION_PATH] / SPEED_OF_LIGHT
-    signed_chirp_rate = points.existing_chirp_rates * points.waveform.chirp_rate
+    signed_chirp_rate = points.existing_chirp_slopes * points.waveform.chirp_rate
     coefficient_by_power = {
         2: alpha * (points.carriers - signed_chirp_rate * points.target.delay),
         3: alpha * signed_chirp_rate * (1 + points.target.doppler_ratio),
@@ -577,7 +581,7 @@ def acceleration_error_bound(points: PlannerInputs) -> ErrorBound | None:
     if bound is None or points.looks.n_coherent == 1:
         return bound
     up_carrier, *_ = points.carriers
-    gain = coherent_gain(
+    gain = coherent_amplitude_factor(
         points.looks, acceleration=points.target.acceleration, carrier=up_carrier,
         look_period=points.waveform.look_period,
     )  # fmt: skip
@@ -591,7 +595,7 @@ def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
     """
     if shots.looks.n_coherent > 1:
         up_carrier, _, _ = shots.waveform.carriers
-        gain = coherent_gain(
+        gain = coherent_amplitude_factor(
             shots.looks, acceleration=shots.target.acceleration, carrier=up_carrier,
             look_period=shots.waveform.look_period,
         )  # fmt: skip
@@ -604,7 +608,7 @@ def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
         carrier=shots.waveform.carriers,
         chirp_rate=shots.waveform.chirp_rate,
         acceleration=shots.target.acceleration,
-        **shots.motion_by_segment,
+        **shots.range_and_velocity_by_segment,
     )
 
 
@@ -634,7 +638,7 @@ _SWEEP_ERROR_PERIODS_PATH = CHIRP_PREFIX + "error_periods"
 ERROR_TABLE_PATH, NO_TABLE = CHIRP_PREFIX + "error_table", "none"
 
 
-def error_table_phase(
+def sweep_error_table_phase(
     position: np.ndarray,
     *,
     table: SweepFrequencyError,
@@ -758,7 +762,7 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
             else _sweep_error_table_phase_bound(points, fit_sweep_frequency_error(table_text))
         )
     quadratic, cubic, sinusoidal = (points[path] for path in _SWEEP_ERROR_PEAK_PATHS)
-    half_duration, chirp_rates = 0.5 * points.record.duration, points.existing_chirp_rates
+    half_duration, chirp_rates = 0.5 * points.record.duration, points.existing_chirp_slopes
     record_middle, position_per_second = (
         points.record.acquisition_delay + half_duration,
         2 / points[CHIRP_PREFIX + "duration"],
@@ -835,7 +839,7 @@ def _sweep_error_table_phase_bound(
     record_duration, delay_rate, slope_magnitude = (
         points.record.duration,
         np.abs(points.target.doppler_ratio),
-        np.abs(points.existing_chirp_rates),
+        np.abs(points.existing_chirp_slopes),
     )
     delay_max = points.target.delay + delay_rate * (
         points.record.acquisition_delay + record_duration
@@ -872,12 +876,12 @@ def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
     """
     parameters, phase_inputs = (
         context.parameters,
-        {"chirp_duration": shots.waveform.chirp_duration, **shots.motion_by_segment},
+        {"chirp_duration": shots.waveform.chirp_duration, **shots.range_and_velocity_by_segment},
     )
     if (table_text := str(parameters[ERROR_TABLE_PATH])) != NO_TABLE:
         shots = _add_phase_error(
             shots,
-            partial(error_table_phase, table=fit_sweep_frequency_error(table_text)),
+            partial(sweep_error_table_phase, table=fit_sweep_frequency_error(table_text)),
             **phase_inputs,
         )
     return _add_phase_error(

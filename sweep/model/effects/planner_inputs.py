@@ -16,7 +16,7 @@ import numpy as np
 
 from sweep.model import beam, beamlet_counts, ground, waveform
 from sweep.model.beamlets import (
-    NO_SPREAD,
+    ZERO_OFFSET_MOMENTS,
     OffsetMoments,
     bins_per_velocity,
     place_beamlets,
@@ -36,7 +36,7 @@ from sweep.model.shot_settings import LineMotion
 from sweep.model.waveform import WaveformSegment
 from sweep.model.window import Window
 from sweep.model.window_response import (
-    MissingSamples,
+    MissingSampleBounds,
     WindowResponse,
     missing_sample_bounds,
     window_response,
@@ -106,8 +106,8 @@ class PlannerInputs(LinkBudget):
                 n_beamlets,
                 ground.beamlet_pattern(self.parameters),
             )
-        self.existing_chirp_rates = self.stack_segments(
-            *self._select_existing_segments(self.waveform.chirp_slopes)
+        self.existing_chirp_slopes = self.stack_segments(
+            *self._select_existing_segments(self.waveform.chirp_rate_ratios)
         )
         """Signed chirp rate of each existing segment, relative to that of the up-chirp."""
         is_direct = self.waveform.architecture == "direct"
@@ -176,13 +176,13 @@ class PlannerInputs(LinkBudget):
         return self.stack_segments(*self._select_existing_segments(self.waveform.carriers))
 
     @property
-    def noise_maximum_ratio(self) -> float | None:
+    def noise_maximum_over_sigma(self) -> float | None:
         """Level of |X| over the noise per quadrature that the noise in any bin hardly ever exceeds.
 
         The probability that noise exceeds it in any bin is at most 0.001. The result is None if
         segments report all peaks that cross the threshold.
         """
-        if self.shared_option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
+        if self.shared_option(waveform.REPORTED_PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
         return float(np.sqrt(2 * np.log(1e3 * self.fft_size)))
 
@@ -206,15 +206,18 @@ class PlannerInputs(LinkBudget):
         grazing_angle = self["target.grazing_angle"]
         axis_echo = backscatter(self.shared_option("target.reflectance_law"), np.sin(grazing_angle))
         if self.n_beamlets == 1:
-            return FootprintExtent(axis_echo, 1.0, NO_SPREAD, NO_SPREAD, NO_SPREAD)
+            return FootprintExtent(
+                axis_echo, 1.0, ZERO_OFFSET_MOMENTS, ZERO_OFFSET_MOMENTS, ZERO_OFFSET_MOMENTS
+            )
         geometry: dict[str, Any] = {
-            "grazing_angle": grazing_angle, "beam_divergence": self.footprint_full_angles.positions,
+            "grazing_angle": grazing_angle,
+            "beam_divergence": self.footprint_full_angles.position_spread_angle,
             "n_beamlets": self.n_beamlets, "pattern": self.beamlet_pattern,
         }  # fmt: skip
         range_moments, velocity_moments = plane_offset_moment_bounds(
             transverse_velocity=self["target.transverse_velocity"],
             radial_velocity=self.target.radial_velocity,
-            direction_spread_angle=self.footprint_full_angles.directions,
+            direction_spread_angle=self.footprint_full_angles.direction_spread_angle,
             **geometry,
         )
         echo_ratio = plane_echo_ratio_bound(
@@ -237,7 +240,7 @@ class PlannerInputs(LinkBudget):
     @cached_property
     def beat_amplitude(self) -> np.ndarray:
         """Amplitude of the beat of the line on the axis [V], before the receiver's poles."""
-        return self.echo_scales.beat_amplitude * relative_amplitude(
+        return self.echo_scales.beat_amplitude_scale * relative_amplitude(
             self.waveform.architecture, self.footprint_extent.axis_echo
         )
 
@@ -245,10 +248,10 @@ class PlannerInputs(LinkBudget):
     def echo_shot_noise_ratio(self) -> np.ndarray:
         """Variance of the echo's shot noise over that of the receiver's noise."""
         total_echo = self.footprint_extent.axis_echo * np.maximum(
-            self.footprint_extent.total_echo_ratio, 1.0
+            self.footprint_extent.total_to_axis_echo_ratio, 1.0
         )
         return (
-            self.echo_scales.echo_power
+            self.echo_scales.echo_power_scale
             * total_echo
             * self.receiver_noise.shot_noise_variance_per_watt
             / self.noise.variance_without_echo
@@ -291,7 +294,7 @@ class PlannerInputs(LinkBudget):
         return self.stack_segments(*(s.beat_frequency(self.range) for s in self.existing_segments))
 
     @cached_property
-    def missing_samples(self) -> MissingSamples | None:
+    def missing_samples(self) -> MissingSampleBounds | None:
         """Samples without an echo, and bounds on their effect; None if echoes fill all records."""
         if "overlap" in self.effects_off:
             return None
@@ -303,7 +306,7 @@ class PlannerInputs(LinkBudget):
             )
         ).astype(np.int64)
         latest_delay = delay * np.minimum(
-            self.footprint_extent.range_offsets.largest_magnitude, 1e3
+            self.footprint_extent.range_offset_moments.largest_magnitude, 1e3
         )  # beyond the axis's
         latest_delay = (
             latest_delay
@@ -358,7 +361,7 @@ class PlannerInputs(LinkBudget):
     @cached_property
     def transfer_gain(self) -> np.ndarray:
         """Amplitude gain of the receiver at the line's frequency, relative to that at DC."""
-        return self.receiver_filter.gain(self.beat_frequency)
+        return self.receiver_filter.amplitude_gain(self.beat_frequency)
 
     @cached_property
     def gain_slope_max(self) -> np.ndarray:
@@ -375,16 +378,16 @@ class PlannerInputs(LinkBudget):
         """
         receiver_filter, noise = self.receiver_filter, self.noise
         # Where an anti-alias filter passes almost no noise, the ADC's noise remains.
-        if receiver_filter.antialias_filter and receiver_filter.noise_shape != "white":
+        if receiver_filter.antialias_parameters and receiver_filter.noise_shape != "white":
             noise = noise.with_sources(**{ADC_NOISE_SOURCE: adc_noise_variance(self.parameters)})
         sigma = self.record.bin_noise_sigma(noise.variance_without_echo, self.looks)
-        gain = receiver_filter.pole_gain(self.beat_frequency) * receiver_filter.whitening_gain(
-            self.beat_frequency, noise.adc_noise_fraction
-        )
+        gain = receiver_filter.pole_amplitude_gain(
+            self.beat_frequency
+        ) * receiver_filter.whitening_gain(self.beat_frequency, noise.adc_noise_fraction)
         return self.beat_amplitude * (0.5 * self.window.sum) / sigma * gain
 
     @cached_property
-    def peak_ratio(self) -> np.ndarray:
+    def peak_magnitude_over_sigma(self) -> np.ndarray:
         """|X| in the largest bin of the line on the beam's axis, over the noise per quadrature.
 
         There is a value for each segment.
@@ -399,7 +402,9 @@ class PlannerInputs(LinkBudget):
         beat_per_relative_range = (
             self.waveform.chirp_rate * self.target.delay * (1 + np.abs(self.target.doppler_ratio))
         )
-        return np.abs(self.existing_chirp_rates) * (beat_per_relative_range / self.record.bin_width)
+        return np.abs(self.existing_chirp_slopes) * (
+            beat_per_relative_range / self.record.bin_width
+        )
 
     @cached_property
     def bins_per_velocity(self) -> np.ndarray:
@@ -412,7 +417,7 @@ class PlannerInputs(LinkBudget):
     @cached_property
     def line_spread_by_range(self) -> OffsetMoments:
         """Moments of the offsets [FFT bins] of beamlets' lines from the axis's, due to range."""
-        return self.footprint_extent.range_offsets.scaled_by(self.bins_per_relative_range)
+        return self.footprint_extent.range_offset_moments.scaled_by(self.bins_per_relative_range)
 
     @cached_property
     def line_spread_by_velocity(self) -> OffsetMoments:
@@ -420,7 +425,7 @@ class PlannerInputs(LinkBudget):
 
         These offsets are due to the beamlets' radial velocities.
         """
-        return self.footprint_extent.velocity_offsets.scaled_by(self.bins_per_velocity)
+        return self.footprint_extent.velocity_offset_moments.scaled_by(self.bins_per_velocity)
 
     @cached_property
     def line_spread(self) -> OffsetMoments:
@@ -516,12 +521,13 @@ class PlannerInputs(LinkBudget):
             moments,
         )
         axis_power = response.scalloping_gain(self.bin_offset) ** 2
-        if moments is NO_SPREAD or self.n_beamlets == 1:
+        if moments is ZERO_OFFSET_MOMENTS or self.n_beamlets == 1:
             return PeakPowerBounds(axis_power, axis_power * np.where(self.is_near_image, 2.0, 1.01))
-        curvature_loss = 0.5 * response.curvature_max * rms * rms
+        curvature_loss = 0.5 * response.power_curvature_max * rms * rms
         power_min = (
             axis_power
-            - np.minimum(response.slope_max, response.curvature_max * self.bin_offset) * mean
+            - np.minimum(response.power_slope_max, response.power_curvature_max * self.bin_offset)
+            * mean
         )
         power_min = power_min - curvature_loss - gain_slope * rms
         power_min = np.maximum(
@@ -536,7 +542,7 @@ class PlannerInputs(LinkBudget):
                 / (2 * half_width + 2 * response.padding_factor + 1)
             )
             power_min = np.maximum(power_min, power_max * np.exp(-gain_slope * half_width))
-        power_max = np.minimum(axis_power + response.slope_max * mean + curvature_loss, 1.0)
+        power_max = np.minimum(axis_power + response.power_slope_max * mean + curvature_loss, 1.0)
         gain_rise = np.exp(np.minimum(gain_slope * extreme, 50.0))
         power_max = power_max * np.where(self.is_near_image, 2.0, 1.01)
         power_max = power_max * (1 + gain_rise * np.minimum(gain_slope * rms, 50.0))
@@ -574,8 +580,8 @@ class PlannerInputs(LinkBudget):
             self.window_response,
             self.peak_power_bounds_for_spread(present_moments).power_min,
         )
-        power_change = response.slope_max * (added_moments.mean + shift_bins)
-        power_change = power_change + response.curvature_max * (
+        power_change = response.power_slope_max * (added_moments.mean + shift_bins)
+        power_change = power_change + response.power_curvature_max * (
             present_moments.rms * added_moments.rms + added_moments.rms**2 / 2
         )
         gain_exponent = self.gain_slope_max * (
@@ -599,7 +605,9 @@ class PlannerInputs(LinkBudget):
             * self.record.bin_width
         )
         line_change = (
-            np.sqrt(self.window_response.curvature_max) + 2 * self.gain_slope_max + phase_per_bin
+            np.sqrt(self.window_response.power_curvature_max)
+            + 2 * self.gain_slope_max
+            + phase_per_bin
         ) * shift_bins
         gain_rise = np.exp(
             np.minimum(

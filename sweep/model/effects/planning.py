@@ -57,7 +57,7 @@ class EffectPlan(NamedTuple):
     residual error, and effects that are off, can make the sum exceed the tolerance."""
     residual_error: np.ndarray
     """(tiles,): error, 0..1, of pd or the relative |X| due to what simulated effects neglect."""
-    keeps_all_optional: np.ndarray
+    keeps_all_optional_effects: np.ndarray
     """(tiles,) bool: True if every effect is kept that is not forced on or off."""
 
     def select(self, tile_mask: np.ndarray) -> "EffectPlan":
@@ -70,7 +70,7 @@ class EffectPlan(NamedTuple):
             omission_error,
             total_error,
             residual_error,
-            self.keeps_all_optional[tile_mask],
+            self.keeps_all_optional_effects[tile_mask],
         )
 
 
@@ -273,8 +273,10 @@ def omission_errors(
     """
     signal_ratio_min, signal_ratio_max = signal_ratio_bounds(bounds, points)
     threshold = points.threshold_ratio
-    if points.noise_maximum_ratio is not None:  # an echo has to exceed the noise as well
-        threshold = np.maximum(threshold, np.minimum(signal_ratio_max, points.noise_maximum_ratio))
+    if points.noise_maximum_over_sigma is not None:  # an echo has to exceed the noise as well
+        threshold = np.maximum(
+            threshold, np.minimum(signal_ratio_max, points.noise_maximum_over_sigma)
+        )
     b = points.looks.equivalent_threshold_ratio(threshold)
     steepest_signal = 0.5 * (b + np.sqrt(b * b + 2))
     signal = np.minimum(np.maximum(steepest_signal, signal_ratio_min), signal_ratio_max)
@@ -379,7 +381,9 @@ def signal_ratio_bounds(
 
     The bounds hold whichever of the effects are simulated.
     """
-    signal_ratio_min = signal_ratio_max = points.peak_ratio * points.looks.amplitude_gain_max
+    signal_ratio_min = signal_ratio_max = (
+        points.peak_magnitude_over_sigma * points.looks.amplitude_gain_max
+    )
     coherent_change: np.ndarray | float = 0.0
     for bound in bounds.values():
         if _may_be_nonzero(bound.magnitude_change):
@@ -409,7 +413,7 @@ def _may_be_nonzero(value: np.ndarray | float) -> bool:
 def _sum_over_segments(value: np.ndarray | float, points: PlannerInputs) -> np.ndarray | float:
     """Return the sum over the segments; values without an axis of segments are equal in all."""
     if np.ndim(value) <= points.ndim:
-        return value * (len(points.existing_chirp_rates) if np.ndim(value) else 1)
+        return value * (len(points.existing_chirp_slopes) if np.ndim(value) else 1)
     return np.asarray(value).sum(axis=0)
 
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.beamlets import NO_SPREAD, pattern_radius
+from sweep.model.beamlets import ZERO_OFFSET_MOMENTS, pattern_radius
 from sweep.model.effects.effect import DrawAddresses, Effect, Parameter
 from sweep.model.effects.error_bounds import (
     ErrorBound,
@@ -117,7 +117,7 @@ def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndar
     if points.n_beamlets > 1:
         rim_angle = (
             pattern_radius(points.n_beamlets, points.beamlet_pattern)
-            * points.footprint_full_angles.positions
+            * points.footprint_full_angles.position_spread_angle
             / 4
         )
     lowest_grazing = points["target.grazing_angle"] - rim_angle
@@ -168,7 +168,8 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     range_ratio, shift_bins = _largest_range_change_and_line_shift(points)
     echo_change = 3 * range_ratio * (1 + range_ratio) ** 2
     power_change = (
-        points.peak_power_change_bound(NO_SPREAD, points.line_spread, shift_bins) + echo_change
+        points.peak_power_change_bound(ZERO_OFFSET_MOMENTS, points.line_spread, shift_bins)
+        + echo_change
     )
     is_unknown = points.amplitudes_may_cancel & (points[_JITTER_PATH] > 0)
     coherent_change: np.ndarray | float = 0.0

@@ -187,7 +187,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     return replace(
         shots,
         echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gains.signal_gain),
-        noise=replace(shots.noise, gain=shots.noise.gain * gains.noise_gain),
+        noise=replace(shots.noise, variance_factor=shots.noise.variance_factor * gains.noise_gain),
     )
 
 
@@ -203,17 +203,17 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
     }  # fmt: skip
     beat_frequencies = [
         waveform.beat_frequency(
-            shots.waveform.chirp_slopes[segment_index],
+            shots.waveform.chirp_rate_ratios[segment_index],
             carrier=shots.waveform.carriers[segment_index],
             **beat_inputs,
         )
         for segment_index in np.flatnonzero(shots.has_segment)
     ]
     lowest_beat = np.min(np.abs(beat_frequencies), axis=0)
-    gain = shots.receiver_filter.gain(lowest_beat)
+    gain = shots.receiver_filter.amplitude_gain(lowest_beat)
     echo = shots.total_relative_echo
     echo = echo if shots.waveform.architecture == "direct" else np.sqrt(echo)
-    return np.asarray(shots.echo_scales.beat_amplitude * echo * gain)
+    return np.asarray(shots.echo_scales.beat_amplitude_scale * echo * gain)
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -229,7 +229,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if not points.any_nonzero(_FULL_SCALE_PATH):
         return None
-    echo_ratio = np.maximum(points.footprint_extent.total_echo_ratio, 1.0)
+    echo_ratio = np.maximum(points.footprint_extent.total_to_axis_echo_ratio, 1.0)
     amplitude_ratio = (
         echo_ratio if points.waveform.architecture == "direct" else np.sqrt(echo_ratio)
     )

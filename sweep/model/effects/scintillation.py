@@ -53,7 +53,7 @@ class TurbulenceProfile(NamedTuple):
     Valley's model.
     """
 
-    uniform: float = 0.0
+    uniform_strength: float = 0.0
     """Part of C_n^2 that is the same at all heights [m^(-2/3)]. If the other fields are 0, it is
     C_n^2."""
     surface_layer_strength: float = 0.0
@@ -107,7 +107,7 @@ def structure_constant(turbulence: TurbulenceProfile, height: ArrayLike) -> np.n
     aloft = 0.00594 * (turbulence.wind_speed / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
     mid_altitude_strength = turbulence.mid_altitude_strength * np.exp(-h / 1.5e3)
     return (
-        turbulence.uniform
+        turbulence.uniform_strength
         + aloft
         + mid_altitude_strength
         + turbulence.surface_layer_strength * np.exp(-h / 100)
@@ -324,7 +324,7 @@ def turbulence_profile(parameters: Mapping[str, np.ndarray]) -> TurbulenceProfil
     """Return the turbulence over height; None in still air. All points share text parameters."""
     name = str(parameters[_TURBULENCE_PATH])
     if name == "uniform":
-        return TurbulenceProfile(uniform=float(parameters[_STRUCTURE_CONSTANT_PATH]))
+        return TurbulenceProfile(uniform_strength=float(parameters[_STRUCTURE_CONSTANT_PATH]))
     return HUFNAGEL_VALLEY if name == "hufnagel_valley" else None
 
 
@@ -394,7 +394,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     )
     segment_bound = slope * mean_log_amplitude + 0.5 * (curvature + slope**2) * mean_square
     return ErrorBound(
-        probability_change=np.minimum(len(points.existing_chirp_rates) * segment_bound, 1.0)
+        probability_change=np.minimum(len(points.existing_chirp_slopes) * segment_bound, 1.0)
     )
 
 

@@ -32,7 +32,7 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.looks import DRIFT_POSITIONS_MAX, LOOKS_NUMBER_PATH
+from sweep.model.detection.looks import LOOKS_NUMBER_PATH, N_DRIFT_POSITIONS_MAX
 from sweep.model.effects.doppler import line_shift_error_bound
 from sweep.model.effects.effect import Effect, EffectContext
 from sweep.model.effects.error_bounds import ErrorBound
@@ -65,7 +65,7 @@ def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
         points.segment_starts + points.middle_look_delay
     )
     bins_per_metre = (
-        np.abs(points.existing_chirp_rates)
+        np.abs(points.existing_chirp_slopes)
         * points.waveform.chirp_rate
         * (2 / SPEED_OF_LIGHT)
         / points.record.bin_width
@@ -178,8 +178,8 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
         if looks.n_power_averaged == 1 or fade_independently
         else math.inf
     )
-    if last_look >= DRIFT_POSITIONS_MAX:  # few positions represent all looks
-        drift_limit = min(drift_limit, DRIFT_POSITIONS_MAX / 2)
+    if last_look >= N_DRIFT_POSITIONS_MAX:  # few positions represent all looks
+        drift_limit = min(drift_limit, N_DRIFT_POSITIONS_MAX / 2)
     turned_cycles = np.abs(shots.footprint.doppler_ratio_offset).max(initial=0.0) * np.max(
         shots.waveform.carriers[0] * shots.waveform.look_period
     )

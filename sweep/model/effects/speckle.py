@@ -47,11 +47,11 @@ from numpy.typing import ArrayLike
 from sweep.model.beam import ARCHITECTURE_PATH
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.speckle_correlation import (
-    LINE_SHIFT_MIN_BINS,
+    LINE_SHIFT_MIN_CELLS,
     SEGMENT_PAIRS,
     LineGradients,
     LinePairGradients,
-    centroid_delay,
+    late_echo_centroid_shift,
     peak_bin_correlation,
     window_transform,
 )
@@ -513,7 +513,7 @@ class BeamSpread(NamedTuple):
                 variance - phase.phase_per_deviation(self.beam_gradients) ** 2, 0.0
             )
         gradients = _line_pair_gradients(shots, pair, phase, self.beam_gradients)
-        wide_points = np.flatnonzero(gradients.line_shift_max > LINE_SHIFT_MIN_BINS)
+        wide_points = np.flatnonzero(gradients.line_shift_max > LINE_SHIFT_MIN_CELLS)
         if wide_points.size:
             bin_correlations = peak_bin_correlation(shots.window, gradients.select(wide_points))
             correlations[wide_points] = bin_correlations * np.exp(
@@ -541,7 +541,7 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
     else:
         row, offset, doppler, echo = ground.beamlets
         moments = _moments_about_surface_means(
-            echo, np.array([doppler, offset]), ground.off_axis_surface, row
+            echo, np.array([doppler, offset]), ground.is_on_other_surface, row
         )
         beam_gradients = _ray_traced_gradients(moments)
         variance_across = moments.covariance[0, 0] - beam_gradients.doppler_ratio**2
@@ -624,7 +624,7 @@ def _mid_record_frequencies_and_times(shots: Shots) -> tuple[list[np.ndarray], n
     middle_shift = (
         0.0
         if shots.echo_record.n_samples_before_echo is None
-        else centroid_delay(shots.window)[shots.echo_record.n_samples_before_echo]
+        else late_echo_centroid_shift(shots.window)[shots.echo_record.n_samples_before_echo]
     )
     middle_shift = (
         np.broadcast_to(middle_shift, (len(shots.waveform.carriers), shots.size))
@@ -634,7 +634,7 @@ def _mid_record_frequencies_and_times(shots: Shots) -> tuple[list[np.ndarray], n
     return [
         carrier + slope * shots.waveform.chirp_rate * (middle - delay)
         for carrier, slope, middle in zip(
-            shots.waveform.carriers, shots.waveform.chirp_slopes, record_middles, strict=True
+            shots.waveform.carriers, shots.waveform.chirp_rate_ratios, record_middles, strict=True
         )
     ], record_middles
 
@@ -660,7 +660,7 @@ def _line_pair_gradients(
         line_shifts.append(np.broadcast_to(shift_hertz / window_bin_width, shots.size))
         bin_position = np.broadcast_to(bin_position, shots.size)
         nearest_bin = bin_position
-        if shots.detection_settings.echo_bins == "peak_bin":
+        if shots.detection_settings.echo_bin_rule == "peak_bin":
             nearest_bin = _strongest_bins_with_images(
                 shots, bin_position, line_shifts[-1] * padding_factor
             )
@@ -689,7 +689,7 @@ def _strongest_bins_with_images(
     the standard deviation of the lines.
     """
     nearest_bins = np.rint(line_positions)
-    if not shots.real_fft_size or not shots.images.are_summed:
+    if not shots.real_ends_fft_size or not shots.line_images.are_summed:
         return nearest_bins
     nyquist_bin = shots.fft_size // 2
     spectrum_ends = np.rint(line_positions / nyquist_bin) * nyquist_bin
@@ -742,24 +742,24 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     return _moments_about_surface_means(
         shots.footprint.relative_amplitude**2,
         values,
-        ground.off_axis_surface,
+        ground.is_on_other_surface,
         shots.footprint.row_of_point,
     )
 
 
 def _moments_about_surface_means(
-    power: np.ndarray, values: np.ndarray, off_axis_surface: np.ndarray | None, row: np.ndarray
+    power: np.ndarray, values: np.ndarray, is_on_other_surface: np.ndarray | None, row: np.ndarray
 ) -> BeamletMoments:
     """Return power-weighted moments of values (2, rows, beamlets), for points with the given rows.
 
-    ``off_axis_surface`` (rows, beamlets) bool marks beamlets on another surface than the axis's, or
-    is None.
+    ``is_on_other_surface`` (rows, beamlets) bool marks beamlets on another surface than the axis's;
+    it may be None.
     """
     power_fraction = power / np.maximum(power.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)[:, None]
     mean = (power_fraction * values).sum(axis=-1)
     centred = values - mean[:, :, None]
-    if off_axis_surface is not None and off_axis_surface.any():
-        for surface in (off_axis_surface, ~off_axis_surface):
+    if is_on_other_surface is not None and is_on_other_surface.any():
+        for surface in (is_on_other_surface, ~is_on_other_surface):
             weight = np.where(surface, power_fraction, 0.0)
             surface_power = np.maximum(weight.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)
             surface_mean = (weight * values).sum(axis=-1) / surface_power

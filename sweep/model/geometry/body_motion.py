@@ -287,7 +287,7 @@ class ConstantAcceleration:
     """(3,): constant acceleration of the point [m/s^2], in the world's frame."""
     duration: float
     """Duration of the trajectory [s], above 0."""
-    start: float = field(default=0.0, init=False)
+    start_time: float = field(default=0.0, init=False)
     """Time at which the trajectory begins [s]."""
 
     def __post_init__(self) -> None:
@@ -295,7 +295,7 @@ class ConstantAcceleration:
             raise ValueError(f"a path must last longer than 0 s, not {self.duration} s")
 
     @property
-    def stop(self) -> float:
+    def stop_time(self) -> float:
         """Time at which the trajectory ends [s]."""
         return self.duration
 
@@ -383,18 +383,18 @@ class Waypoints:
         object.__setattr__(self, "_origin", origin)
 
     @property
-    def start(self) -> float:
+    def start_time(self) -> float:
         """Time of the first position [s]."""
         return float(self._interpolant.x[0])
 
     @property
-    def stop(self) -> float:
+    def stop_time(self) -> float:
         """Time of the last position [s]."""
         return float(self._interpolant.x[-1])
 
     def motion(self, times: np.ndarray) -> Motion:
         """Return position, velocity and acceleration at times (n,) [s] from start to stop."""
-        times = _clip_to_duration(times, self.start, self.stop)
+        times = _clip_to_duration(times, self.start_time, self.stop_time)
         return Motion(
             self._interpolant(times) + self._origin,
             self._interpolant(times, 1),
@@ -422,7 +422,7 @@ def require_rising_times(time: FloatSequence) -> np.ndarray:
 
 
 Trajectory = ConstantAcceleration | Waypoints
-"""Motion of a point over time, from ``start`` to ``stop`` [s]: an instance of a
+"""Motion of a point over time, from ``start_time`` to ``stop_time`` [s]: an instance of a
 trajectory class."""
 
 
@@ -438,19 +438,19 @@ class MovingBody:
     """(3,): position of the instrument in the body frame [m]."""
 
     @property
-    def start(self) -> float:
+    def start_time(self) -> float:
         """Time at which the trajectory begins [s]."""
-        return self.trajectory.start
+        return self.trajectory.start_time
 
     @property
-    def stop(self) -> float:
+    def stop_time(self) -> float:
         """Time at which the trajectory ends [s]."""
-        return self.trajectory.stop
+        return self.trajectory.stop_time
 
     def state(self, times: np.ndarray) -> BodyState:
         """Return position, attitude and motion of the instrument at times (n,) [s].
 
-        Times are from ``start`` to ``stop``.
+        Times are from ``start_time`` to ``stop_time``.
 
         Raises
         ------
@@ -458,7 +458,7 @@ class MovingBody:
             For a time outside the trajectory, or a heading that the velocity leaves undefined.
         """
         motion = self.trajectory.motion(times)
-        clipped_times = _clip_to_duration(times, self.start, self.stop)
+        clipped_times = _clip_to_duration(times, self.start_time, self.stop_time)
         attitude, angular_velocity = self.attitude_law.attitude_and_rate(
             clipped_times, motion.velocity, motion.acceleration
         )

@@ -72,7 +72,7 @@ def corner_directions(angle: float) -> np.ndarray:
     return steered_directions(angle * np.array([1, -1, -1, 1]), angle * np.array([1, 1, -1, -1]))
 
 
-def stacked_angles(element_angles: Sequence[float]) -> np.ndarray:
+def stacked_deflections(element_angles: Sequence[float]) -> np.ndarray:
     """Return all deflections [rad] that a stack of n steering elements can give, ascending, (2^n,).
 
     Each element deflects the beam to one side or the other by its angle [rad], and deflections add.
@@ -90,7 +90,7 @@ def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.nda
     Parameters
     ----------
     element_angles : sequence of float
-        Angles of the n elements of each axis [rad], as in :func:`stacked_angles`.
+        Angles of the n elements of each axis [rad], as in :func:`stacked_deflections`.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.nda
     ValueError
         If the elements do not reach distinct angles, or reach nadir.
     """
-    angles = stacked_angles(element_angles)
+    angles = stacked_deflections(element_angles)
     if angles.min() >= 0 or len(np.unique(np.round(angles, 12))) < len(angles) or 0 in angles:
         raise ValueError("the elements must reach as many different angles, and not nadir")
     positive_angles = angles[angles > 0]
@@ -191,19 +191,19 @@ class BeamCycle:
         return len(self._unit_directions)
 
     @property
-    def beams_per_cycle(self) -> int:
+    def shots_per_cycle(self) -> int:
         """Number of shots of a measurement cycle."""
         return int(self._pattern_table.shape[1])
 
     def count_shots(self, duration: float) -> int:
         """Return the number of shots that begin within a duration [s], including its end."""
-        return _count_begun_shots(duration, self.rate, self.beams_per_cycle, self._shot_interval)
+        return _count_begun_shots(duration, self.rate, self.shots_per_cycle, self._shot_interval)
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
         """Return times and directions of the shots with given numbers (n,), counted from 0."""
         patterns = self._pattern_table
         cycle_number, shot_in_cycle = np.divmod(
-            np.asarray(shot_numbers, np.int64), self.beams_per_cycle
+            np.asarray(shot_numbers, np.int64), self.shots_per_cycle
         )
         beam_number = patterns[cycle_number % len(patterns), shot_in_cycle]
         zero_rate = np.zeros((beam_number.size, 3))

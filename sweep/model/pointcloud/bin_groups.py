@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.detection.detection_probability import final_group_pd, pd_of_bin_group
+from sweep.model.detection.detection_probability import group_pd_in_all_looks, pd_of_bin_group
 from sweep.model.detection.echo_detection import bin_speckle_at, bin_threshold_at
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
@@ -38,10 +38,10 @@ class BinGroups(NamedTuple):
     strongest bin, of that bin, and of the bin above it."""
     pd: np.ndarray
     """(n, 3, groups): probability that the group is detected in noise."""
-    n_exempt: np.ndarray
+    n_exempt_bins: np.ndarray
     """(n, 3): number of bins of a segment that belong to echoes, and so cannot raise a false alarm.
     """
-    leakage: np.ndarray
+    leakage_probability: np.ndarray
     """(n, 3): probability of a false peak raised by leaked signal (echo power far from its line),
     in addition to false peaks of noise alone."""
 
@@ -73,7 +73,7 @@ class BinGroups(NamedTuple):
         )
 
 
-class GroupBounds(NamedTuple):
+class GroupBinIndices(NamedTuple):
     """Strongest, first and last bins of the groups of one segment, as indices in its span."""
 
     strongest: np.ndarray
@@ -117,8 +117,8 @@ def allocate_bin_groups(n_points: int, groups_max: int) -> BinGroups:
         last_bin=np.full(shape, -1, np.int64),
         neighbour_magnitudes=np.full((*shape, 3), np.nan),
         pd=np.full(shape, np.nan),
-        n_exempt=np.full((n_points, 3), np.nan),
-        leakage=np.full((n_points, 3), np.nan),
+        n_exempt_bins=np.full((n_points, 3), np.nan),
+        leakage_probability=np.full((n_points, 3), np.nan),
     )
 
 
@@ -157,7 +157,7 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
         shots.speckle_table,
         bin_groups,
     )
-    bin_groups.pd[spans.point_numbers] = final_group_pd(
+    bin_groups.pd[spans.point_numbers] = group_pd_in_all_looks(
         shots,
         bin_groups.pd[spans.point_numbers],
         bin_groups.magnitude[spans.point_numbers],
@@ -171,7 +171,10 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
         lacks_group, spans.peak_magnitude.T, strongest_magnitudes
     )
     n_exempt_or_nan = np.where((spans.n_bins > 0) | ~spans.peak_is_searched, spans.n_exempt, np.nan)
-    bin_groups.n_exempt[spans.point_numbers], bin_groups.leakage[spans.point_numbers] = (
+    (
+        bin_groups.n_exempt_bins[spans.point_numbers],
+        bin_groups.leakage_probability[spans.point_numbers],
+    ) = (
         n_exempt_or_nan.T,
         spans.leakage.T,
     )
@@ -245,12 +248,12 @@ def _find_and_write_groups(
             end = begin + n_bins[segment, j]
             magnitude = magnitudes[begin:end]
             is_echo = is_exempt[begin : end if nyquist_bin == 0 else begin]
-            bounds = GroupBounds(
+            bounds = GroupBinIndices(
                 bin_groups.strongest_bin[i, segment],
                 bin_groups.first_bin[i, segment],
                 bin_groups.last_bin[i, segment],
             )
-            n_groups = _list_groups(
+            n_groups = _list_strongest_groups(
                 magnitude, is_echo, peak_index[segment, j], bin_threshold.threshold, bounds
             )
             for group in range(n_groups):
@@ -292,10 +295,10 @@ def _magnitude_of_bin_or_mirror(magnitude, first_bin, index, nyquist_bin):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _list_groups(magnitude, is_echo, peak_index, threshold, bounds):
+def _list_strongest_groups(magnitude, is_echo, peak_index, threshold, bounds):
     """List the strongest groups of adjacent bins at or above the threshold; return their number.
 
-    The result is written into ``bounds``, a :class:`GroupBounds` of indices in ``magnitude``.
+    The result is written into ``bounds``, a :class:`GroupBinIndices` of indices in ``magnitude``.
     Groups whose strongest bin is no bin of an echo (``is_echo``) are leaked signal, and omitted. If
     ``is_echo`` is empty, none is omitted. If the bin ``peak_index`` is below the threshold, it is
     listed alone.

@@ -81,7 +81,7 @@ class EgoMotion(NamedTuple):
     closing_speed: np.ndarray
     """Component of the instrument's velocity along the beam [m/s]: the speed at which ground at
     rest approaches."""
-    acceleration: np.ndarray
+    closing_acceleration: np.ndarray
     """Time derivative of ``closing_speed`` [m/s^2]."""
     slip_at_range_0: np.ndarray
     """Slip [m/s] at range 0: closing speed minus the speed at which the range to level ground
@@ -221,7 +221,7 @@ def assumed_motion_along_beams(
 
     return EgoMotion(
         closing_speed=closing_speed,
-        acceleration=closing_rate,
+        closing_acceleration=closing_rate,
         slip_at_range_0=np.where(meets_ground, closing_speed - velocity[:, 2] / direction_z, 0.0),
         slip_per_range=np.where(meets_ground, -direction_rate[:, 2] / direction_z, 0.0),
         slip_per_slope=slip_gradient(velocity),

@@ -176,7 +176,7 @@ def compute_eyepoints(
     """
     shot_numbers = np.asarray(shot_numbers)
     shots = scanner.shots(shot_numbers)
-    time = flight.start + shots.time
+    time = flight.start_time + shots.time
     state = flight.state(time)
     (across, along), weight = place_beamlets(n_beamlets, pattern)
     attitude = (

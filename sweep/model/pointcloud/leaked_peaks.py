@@ -46,7 +46,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.detection.added_crossings import crossing_rate, edge_crossing_probability
+from sweep.model.detection.added_crossings import crossing_rate, echo_edge_crossing_probability
 from sweep.model.detection.looks import Looks
 from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
 from sweep.model.kernel_integers import INTEGER_ZERO, NO_INDEX
@@ -70,7 +70,7 @@ TABLE_AMPLITUDE_MIN_SIGMA = 1e-2
 tabulated. c is the probability that signal lifts a bin above the threshold. At lower amplitudes the
 rate is proportional to the amplitude squared."""
 
-LEAKAGE_MIN = 1e-9
+LEAKAGE_PROBABILITY_MIN = 1e-9
 """Smallest probability of a false peak by leaked signal in a segment for which such peaks are
 drawn."""
 
@@ -114,7 +114,7 @@ BRIGHT_SPECKLE_LOG_AMPLITUDE = math.log(4.0)
 """ln of the factor by which bright speckle raises the signal amplitude, where rates are compared
 with JOINING_CROSSING_RATE_MIN."""
 
-FAINT_LEAKAGE_MAX = 1e-5
+FAINT_LEAKAGE_PROBABILITY_MAX = 1e-5
 """Largest probability of a false peak by leaked signal for which the means over speckle of the
 bins' probabilities are simply added.
 
@@ -161,14 +161,14 @@ class LeakageBins(NamedTuple):
     ``BinGroups.strongest_bin`` numbers bins."""
     log_amplitude: np.ndarray
     """(bins,): ln of the leaked signal |X| over the noise sigma of a bin per quadrature."""
-    group: np.ndarray
+    fading_group: np.ndarray
     """(bins,) int64: index of the echo (group of bins) whose speckle makes the bin fade."""
-    exempt_neighbour: np.ndarray
+    exempt_neighbour_magnitude_ratio: np.ndarray
     """(bins,): |X| / sigma of the adjacent bin that belongs to an echo, and so cannot raise a false
     alarm; 0 if no adjacent bin does."""
     side_of_adjacent_echo_bin: np.ndarray
     """(bins,) int64: 1 if the adjacent bin of the echo is above the bin, -1 if it is below."""
-    crossing_rate_sum: np.ndarray
+    crossing_rate_sum_bound_at_mean: np.ndarray
     """(m, 3): upper bound on the sum of rates -ln(1 - c) of a segment's bins at mean speckle power.
     c is the probability that a bin crosses the threshold."""
     crossing_rate_sum_bounds: np.ndarray
@@ -233,10 +233,10 @@ class LeakageBins(NamedTuple):
             bins_end=no_indices,
             bins=no_bins,
             log_amplitude=np.empty(0),
-            group=no_bins,
-            exempt_neighbour=np.empty(0),
+            fading_group=no_bins,
+            exempt_neighbour_magnitude_ratio=np.empty(0),
             side_of_adjacent_echo_bin=no_bins,
-            crossing_rate_sum=np.zeros(sum_shape),
+            crossing_rate_sum_bound_at_mean=np.zeros(sum_shape),
             crossing_rate_sum_bounds=np.zeros((*sum_shape, N_BOUND_SPECKLE_POWERS)),
             mean_crossing_probability_sum=np.full(sum_shape, np.nan),
             permanent_line_begin=no_indices,
@@ -264,7 +264,7 @@ class LeakageBins(NamedTuple):
         by_point = (
             "bins_begin",
             "bins_end",
-            "crossing_rate_sum",
+            "crossing_rate_sum_bound_at_mean",
             "crossing_rate_sum_bounds",
             "mean_crossing_probability_sum",
             "permanent_line_begin",
@@ -276,12 +276,12 @@ class LeakageBins(NamedTuple):
         )
         return self._replace(**{name: getattr(self, name)[points] for name in by_point})
 
-    def mean_leakage(self) -> np.ndarray:
+    def mean_leakage_probability(self) -> np.ndarray:
         """Return the probability of a false peak by leaked signal in each segment, (m, 3).
 
         It is the mean over speckle and over the phase of the line of leaked light.
         """
-        leakage = np.empty(self.crossing_rate_sum.shape)
+        leakage = np.empty(self.crossing_rate_sum_bound_at_mean.shape)
         _mean_segment_leakage(self, leakage)
         return leakage
 
@@ -300,9 +300,9 @@ class _LeakedBinLocations(NamedTuple):
 def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
     """Return indices of points with a notable probability of a false peak by leaked signal.
 
-    The probability exceeds LEAKAGE_MIN in at least one segment.
+    The probability exceeds LEAKAGE_PROBABILITY_MIN in at least one segment.
     """
-    return np.flatnonzero((groups.leakage > LEAKAGE_MIN).any(axis=1))
+    return np.flatnonzero((groups.leakage_probability > LEAKAGE_PROBABILITY_MIN).any(axis=1))
 
 
 def fading_group_of_bins(
@@ -357,10 +357,10 @@ def bins_without_noise_peaks(
     Returns
     -------
     LeakageBins
-        Bins that raise no leaked peaks. ``group`` holds the group of each listed bin.
+        Bins that raise no leaked peaks. ``fading_group`` holds the group of each listed bin.
     """
     return LeakageBins.empty(points.size)._replace(
-        group=fading_group_of_bins(shots, groups, points, spectra),
+        fading_group=fading_group_of_bins(shots, groups, points, spectra),
         no_noise_peak_begin=spectra.leaked_begin,
         no_noise_peak_end=spectra.leaked_end,
         no_noise_peak_bins=_locate_leaked_bins(spectra).bin_number,
@@ -406,8 +406,8 @@ def iter_leakage_bins(
                 bins_end=spectra.leaked_end,
                 bins=_locate_leaked_bins(spectra).bin_number,
                 log_amplitude=np.log(spectra.leaked_magnitude_ratio),
-                group=fading_group,
-                exempt_neighbour=spectra.exempt_neighbour_magnitude_ratio,
+                fading_group=fading_group,
+                exempt_neighbour_magnitude_ratio=spectra.exempt_neighbour_magnitude_ratio,
                 side_of_adjacent_echo_bin=spectra.side_of_adjacent_echo_bin,
             )
             yield batch, _add_crossing_rate_tables(shots, batch, leakage_bins)
@@ -418,7 +418,7 @@ def find_groups_and_leakage_bins(
 ) -> tuple[BinGroups, list[tuple[np.ndarray, LeakageBins]]]:
     """Find groups of bins and bins of leaked signal together, for echoes in developed speckle.
 
-    The field ``leakage`` of the groups is a mean over speckle. Shots with a search
+    The field ``leakage_probability`` of the groups is a mean over speckle. Shots with a search
     band or a line of leaked light need two separate searches instead
     (:func:`sweep.model.pointcloud.bin_groups.list_bin_groups`, :func:`iter_leakage_bins`).
     The second result is a list of pairs, as :func:`iter_leakage_bins` yields them.
@@ -428,7 +428,7 @@ def find_groups_and_leakage_bins(
     for spans in _iter_leaking_spans(shots, np.arange(shots.size)):
         find_groups_in_spans(shots, spans, groups)
         leakage_bins = _leakage_bins_of_spans(shots, groups, spans)
-        groups.leakage[spans.point_numbers] = leakage_bins.mean_leakage()
+        groups.leakage_probability[spans.point_numbers] = leakage_bins.mean_leakage_probability()
         leakage_bins_by_part.append((spans.point_numbers, leakage_bins))
     return groups, leakage_bins_by_part
 
@@ -461,7 +461,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         for array in (spans.first_bin, spans.n_bins, spans.peak_index, spans.span_start)
     )
     bins, group, side_of_adjacent_echo_bin = np.empty((3, n_bins.sum()), np.int64)
-    log_amplitude, exempt_neighbour = np.empty((2, bins.size))
+    log_amplitude, exempt_neighbour_magnitude_ratio = np.empty((2, bins.size))
     bins_begin, bins_end = np.empty((2, spans.point_numbers.size, 3), np.int64)
     n_listed = _fill_leakage_bins(
         spans.point_numbers,
@@ -481,7 +481,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         bins,
         log_amplitude,
         group,
-        exempt_neighbour,
+        exempt_neighbour_magnitude_ratio,
         side_of_adjacent_echo_bin,
     )
     leakage_bins = LeakageBins.empty(spans.point_numbers.size)._replace(
@@ -489,8 +489,8 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         bins_end=bins_end,
         bins=bins[:n_listed],
         log_amplitude=log_amplitude[:n_listed],
-        group=group[:n_listed],
-        exempt_neighbour=exempt_neighbour[:n_listed],
+        fading_group=group[:n_listed],
+        exempt_neighbour_magnitude_ratio=exempt_neighbour_magnitude_ratio[:n_listed],
         side_of_adjacent_echo_bin=side_of_adjacent_echo_bin[:n_listed],
     )
     return _add_crossing_rate_tables(shots, spans.point_numbers, leakage_bins)
@@ -515,7 +515,7 @@ def _fill_leakage_bins(
     bins,
     log_amplitude,
     group,
-    exempt_neighbour,
+    exempt_neighbour_magnitude_ratio,
     side_of_adjacent_echo_bin,
 ):
     """List the bins of leaked signal in spans (adjacent bins of a segment); return their number.
@@ -537,7 +537,7 @@ def _fill_leakage_bins(
         Number of bins of a complex record, else 0.
     bins_begin, bins_end, bins, log_amplitude, group
         Results, as in :class:`LeakageBins`.
-    exempt_neighbour, side_of_adjacent_echo_bin
+    exempt_neighbour_magnitude_ratio, side_of_adjacent_echo_bin
         Results, as in :class:`LeakageBins`.
     """
     n_listed = 0
@@ -573,7 +573,7 @@ def _fill_leakage_bins(
                     first_bin[s, j] + index_in_span,
                     math.log(signal_ratio),
                 )
-                group[n_listed], exempt_neighbour[n_listed] = (
+                group[n_listed], exempt_neighbour_magnitude_ratio[n_listed] = (
                     nearest_group,
                     max(ratio_below, ratio_above),
                 )
@@ -867,7 +867,7 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
             leakage_bins.permanent_line_log_amplitude[phase, k] = math.log(
                 max(leakage_bins.permanent_line_log_amplitude[phase, k], 1e-300)
             )
-    for j in range(leakage_bins.crossing_rate_sum.shape[0]):
+    for j in range(leakage_bins.crossing_rate_sum_bound_at_mean.shape[0]):
         threshold_index = leakage_bins.threshold_index[j]
         rate_table = CrossingRateTable(
             leakage_bins.log_crossing_rates[threshold_index],
@@ -913,7 +913,7 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
                         + min(table_position - table_index, 1.0) * (mean_at_next - mean_at_index)
                     )
             (
-                leakage_bins.crossing_rate_sum[j, s],
+                leakage_bins.crossing_rate_sum_bound_at_mean[j, s],
                 leakage_bins.permanent_line_crossing_rate_sum[j, s],
             ) = rate_sums[0], 0.0
             if mean_probabilities.shape[1] > 0:
@@ -1135,8 +1135,8 @@ def _compute_separate_peak_rates(
             break
         if (
             is_evaluated[end_index]
-            or leakage_bins.group[end_index] != leakage_bins.group[bin_index]
-            or leakage_bins.exempt_neighbour[end_index] > 0.0
+            or leakage_bins.fading_group[end_index] != leakage_bins.fading_group[bin_index]
+            or leakage_bins.exempt_neighbour_magnitude_ratio[end_index] > 0.0
         ):
             break
         end_index += step
@@ -1157,7 +1157,7 @@ def _compute_separate_peak_rates(
         mean_power_node - int(ECHO_EDGE_LOG_SPECKLE_POWER_DEPTH / log_power_step), 0
     )
     edge_ratio, neighbour_ratio = (
-        leakage_bins.amplitude_gain_max * leakage_bins.exempt_neighbour[bin_index],
+        leakage_bins.amplitude_gain_max * leakage_bins.exempt_neighbour_magnitude_ratio[bin_index],
         leakage_bins.amplitude_gain_max * math.exp(leakage_bins.log_amplitude[bin_index]),
     )
     p_edge_after, step_begin = 0.0, -nodes_per_step
@@ -1165,7 +1165,7 @@ def _compute_separate_peak_rates(
         step_end = first_edge_node if step_begin < 0 else step_begin + nodes_per_step
         root_power = math.exp(0.5 * log_power_step * (step_end - mean_power_node))
         p_edge_before = p_edge_after
-        p_edge_after = edge_crossing_probability(
+        p_edge_after = echo_edge_crossing_probability(
             edge_ratio * root_power,
             neighbour_ratio * root_power,
             leakage_bins.threshold_ratio[threshold_index],
@@ -1211,7 +1211,8 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
             for s in range(3):
                 needs_quadrature |= (
                     leakage_bins.threshold_index[j] == threshold_index
-                    and not leakage_bins.mean_crossing_probability_sum[j, s] <= FAINT_LEAKAGE_MAX
+                    and not leakage_bins.mean_crossing_probability_sum[j, s]
+                    <= FAINT_LEAKAGE_PROBABILITY_MAX
                 )
         quadrature, node_scratch, faint_first_node = no_quadrature, np.empty((2, 0)), 0
         if needs_quadrature:
@@ -1228,7 +1229,8 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
                 begin, end = leakage_bins.bins_begin[j, s], leakage_bins.bins_end[j, s]
                 first_node = (
                     faint_first_node
-                    if leakage_bins.crossing_rate_sum[j, s] <= FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX
+                    if leakage_bins.crossing_rate_sum_bound_at_mean[j, s]
+                    <= FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX
                     else 0
                 )
                 rate_sums, separate_peak_rates = (
@@ -1236,16 +1238,19 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
                     node_scratch[1, first_node:],
                 )
                 p_leakage, n_groups = 0.0, 0
-                if leakage_bins.mean_crossing_probability_sum[j, s] <= FAINT_LEAKAGE_MAX:
+                if (
+                    leakage_bins.mean_crossing_probability_sum[j, s]
+                    <= FAINT_LEAKAGE_PROBABILITY_MAX
+                ):
                     p_leakage, end = leakage_bins.mean_crossing_probability_sum[j, s], begin
                 for k in range(begin, end):
-                    n_groups = max(n_groups, leakage_bins.group[k] + 1)
+                    n_groups = max(n_groups, leakage_bins.fading_group[k] + 1)
                 for group in range(n_groups):
                     rate_sums[:] = 0.0
                     for k in range(begin, end):
                         if (
-                            leakage_bins.exempt_neighbour[k] > 0.0
-                            and leakage_bins.group[k] == group
+                            leakage_bins.exempt_neighbour_magnitude_ratio[k] > 0.0
+                            and leakage_bins.fading_group[k] == group
                             and not is_evaluated[k]
                         ):
                             last_joined = _compute_separate_peak_rates(
@@ -1262,7 +1267,7 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
                             is_evaluated[min(k, last_joined) : max(k, last_joined) + 1] = True
                             rate_sums += separate_peak_rates
                     for k in range(begin, end):
-                        if leakage_bins.group[k] == group and not is_evaluated[k]:
+                        if leakage_bins.fading_group[k] == group and not is_evaluated[k]:
                             _add_rates_at_nodes(
                                 leakage_bins.log_amplitude[k], rate_table, quadrature, rate_sums
                             )
@@ -1386,8 +1391,8 @@ def draw_leaked_peaks(
             leakage_bins.bins_end[point, segment],
             leakage_bins.bins,
             leakage_bins.log_amplitude,
-            leakage_bins.group,
-            leakage_bins.exempt_neighbour,
+            leakage_bins.fading_group,
+            leakage_bins.exempt_neighbour_magnitude_ratio,
             fading_factors[:, segment],
             rate_sum_bound,
             rate_table,
@@ -1411,8 +1416,8 @@ def draw_leaked_peaks(
             leakage_bins.permanent_line_end[point, segment],
             leakage_bins.permanent_line_bins,
             leakage_bins.permanent_line_log_amplitude[phase],
-            leakage_bins.group[:0],
-            leakage_bins.exempt_neighbour[:0],
+            leakage_bins.fading_group[:0],
+            leakage_bins.exempt_neighbour_magnitude_ratio[:0],
             fading_factors[:, segment],
             leakage_bins.permanent_line_crossing_rate_sum[point, segment],
             rate_table,
@@ -1436,7 +1441,7 @@ def _draw_raised_bins(
     bins,
     log_amplitude,
     group,
-    exempt_neighbour,
+    exempt_neighbour_magnitude_ratio,
     fading_factors,
     crossing_rate_sum,
     rate_table,
@@ -1462,7 +1467,7 @@ def _draw_raised_bins(
         Index of the segment's first bin in the arrays, and of its last bin plus 1.
     bins, log_amplitude
         Numbers of the bins, and ln(|X| / sigma).
-    group, exempt_neighbour
+    group, exempt_neighbour_magnitude_ratio
         Fields of :class:`LeakageBins`; empty for bins that do not fade and join no echo.
     fading_factors
         (groups,): factors on the echoes' magnitudes by speckle.
@@ -1503,12 +1508,12 @@ def _draw_raised_bins(
             key_0, key_1, draw, stream, first_random + 1
         ) * _added_crossing_probability(signal, scaled_threshold)
         if (
-            exempt_neighbour.size > 0 and exempt_neighbour[k] > 0.0
+            exempt_neighbour_magnitude_ratio.size > 0 and exempt_neighbour_magnitude_ratio[k] > 0.0
         ):  # its noise is correlated with that of this bin
             re, im = philox.normal_pair(
                 key_0, key_1, draw, stream, ECHO_EDGE_FIRST_RANDOM_INDEX + k - bins_begin
             )
-            echo_bin_signal = exempt_neighbour[k] * fading_factor * root_looks
+            echo_bin_signal = exempt_neighbour_magnitude_ratio[k] * fading_factor * root_looks
             echo_bin_in_phase = echo_bin_signal + noise_correlation * (
                 _magnitude_at_crossing_probability(signal, scaled_threshold, probability) - signal
             )

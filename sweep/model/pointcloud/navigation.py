@@ -140,7 +140,7 @@ class NavigationSolution(NamedTuple):
     degrees_of_freedom: np.ndarray
     """(...,) int64: number of observations minus number of unknowns; 0 for an undetermined cycle.
     It is the expectation of ``chi_square``."""
-    is_used: np.ndarray
+    is_beam_used: np.ndarray
     """(..., b) bool: True for beams whose measurements the solution uses."""
     status: np.ndarray
     """(...,) int8: STATUS_SOLVED, STATUS_EXCLUDED, STATUS_WITHHELD or STATUS_UNDETERMINED."""
@@ -609,10 +609,10 @@ def solve_navigation(
     Parameters
     ----------
     shot_arrays
-        Arrays of :data:`sweep.model.outputs.SHOT_VARIABLES` by name, cycle by cycle.
+        Arrays of :data:`sweep.model.outputs.SHOT_GEOMETRY_VARIABLES` by name, cycle by cycle.
     point_arrays
-        Arrays of :data:`sweep.model.outputs.POINT_VARIABLES` by name, cycle by cycle. Positions are
-        used if `error_floor` has an error of pointing.
+        Arrays of :data:`sweep.model.outputs.POINT_CLOUD_VARIABLES` by name, cycle by cycle.
+        Positions are used if `error_floor` has an error of pointing.
     shots_per_cycle
         Number of shots in a cycle.
     ground_slope, relief
@@ -636,7 +636,7 @@ def solve_navigation(
     n, draws = point_arrays["flags"].shape[:2]
     cycles = n // shots_per_cycle
     sizes = {"cycle": cycles, "draw": draws, "xyz": 3, "xyz_again": 3}
-    results = {name: output.empty(sizes) for name, output in NAVIGATION_VARIABLES.items()}
+    results = {name: output.empty_array(sizes) for name, output in NAVIGATION_VARIABLES.items()}
     step = max(1, BEAMS_PER_BATCH // max(1, shots_per_cycle * draws))
     for first in range(0, cycles, step):
         cycle_slice = slice(first, min(first + step, cycles))
@@ -660,7 +660,7 @@ def solve_navigation(
             error_floor,
         )
         for quantity, spread_name, solution in solutions:
-            n_beams = np.where(solution.is_available, solution.is_used.sum(axis=-1), 0)
+            n_beams = np.where(solution.is_available, solution.is_beam_used.sum(axis=-1), 0)
             results[quantity][cycle_slice] = solution.value
             results[f"{quantity}_{spread_name}"][cycle_slice] = solution.covariance
             results[f"{quantity}_status"][cycle_slice] = solution.status
@@ -712,7 +712,7 @@ def _select_points(
     Parameters
     ----------
     point_arrays
-        Arrays of :data:`sweep.model.outputs.POINT_VARIABLES` by name.
+        Arrays of :data:`sweep.model.outputs.POINT_CLOUD_VARIABLES` by name.
     shot_slice
         The shots, those of whole cycles.
     shots_per_cycle
@@ -829,7 +829,7 @@ def _solve_cycles(
         "offset": (positions - positions[:, :1])[:, None] + delay * velocities[:, None],
     }
     altitude_solution = solve_altitude(**ground_points, **test_arguments)
-    is_used = altitude_solution.is_used & altitude_solution.is_available[..., None]
+    is_used = altitude_solution.is_beam_used & altitude_solution.is_available[..., None]
     gradient = ground_gradient(**ground_points, is_used=is_used)
     missing_slip = _slip_due_to_ground_gradient(beam_motion, beams["range"], gradient)
     unknown_slip = beams["radial_velocity_slip_error"]

@@ -22,14 +22,14 @@ this cancels in the half sum, as the Doppler segment is in the middle. With othe
 cancel, and the tolerance is wider by the known motion.
 
 Complex records keep the signs of beats. Their only reading is
-:data:`sweep.model.waveform.SIGNED_READING`, and each surface's Doppler peak confirms it. Segments
-of other slopes are paired in the same way, by the Doppler beat that an up and a down beat predict.
-Their pairs are then evaluated by :func:`sweep.model.waveform.fit_range_velocity`.
+:data:`sweep.model.waveform.SIGNED_BEATS_READING`, and each surface's Doppler peak confirms it.
+Segments of other slopes are paired in the same way, by the Doppler beat that an up and a down beat
+predict. Their pairs are then evaluated by :func:`sweep.model.waveform.fit_range_velocity`.
 
 Without a Doppler segment no peak can confirm a pair, and no pair is marked as unconfirmed. The
 strongest up peak is paired with the strongest down peak, and so on. The reading is
-:data:`sweep.model.waveform.FAR_READING`, :data:`~sweep.model.waveform.FAST_READING` or
-:data:`~sweep.model.waveform.SIGNED_READING`.
+:data:`sweep.model.waveform.FAR_TARGET_READING`, :data:`~sweep.model.waveform.FAST_TARGET_READING`
+or :data:`~sweep.model.waveform.SIGNED_BEATS_READING`.
 """
 
 import math
@@ -41,9 +41,9 @@ from sweep.kernel_cache import njit
 from sweep.model.kernel_integers import NO_INDEX
 from sweep.model.waveform import (
     FOLD_PENALTY_BINS,
-    N_READINGS,
+    N_POSSIBLE_BEAT_READINGS,
     NEGATIVE_BEAT_FRACTION_MAX,
-    SIGNED_READING,
+    SIGNED_BEATS_READING,
 )
 
 CONFIRMATION_TOLERANCE_BINS = 3.0
@@ -65,7 +65,7 @@ _UNPAIRED_COST_BINS = 1e9
 """Cost [bins] of an up peak that stays without a down peak. It exceeds any sum of distances between
 Doppler peaks and their predicted positions."""
 
-TRUE_FLAG = 1
+TRUE_RETURN_FLAG = 1
 """Flag bit of a return whose range and velocity are those of a true surface, sampled by a beamlet
 (:data:`FLAG_BITS`)."""
 FALSE_ALARM_FLAG = 2
@@ -84,7 +84,7 @@ UNCONFIRMED_FLAG = 32
 """Flag bit of a return for which no Doppler peak is near the position that the up and down peak
 predict (:data:`FLAG_BITS`)."""
 FLAG_BITS = {
-    "true": TRUE_FLAG,
+    "true": TRUE_RETURN_FLAG,
     "false_alarm": FALSE_ALARM_FLAG,
     "mispaired": MISPAIRED_FLAG,
     "misread": MISREAD_FLAG,
@@ -146,7 +146,7 @@ class PeakPairs(NamedTuple):
     """(pairs,) int64: index of the down peak."""
     reading: np.ndarray
     """(pairs,) int64: which reading of the beats gave range and velocity, as numbered by
-    :func:`sweep.model.waveform.beats_of_reading`."""
+    :func:`sweep.model.waveform.doppler_and_range_beat`."""
 
     @classmethod
     def allocate(cls, pairs_max: int) -> "PeakPairs":
@@ -168,7 +168,7 @@ class ConfirmingPeak(NamedTuple):
     """Index of the Doppler peak in the list of the segment's peaks; -1 if no peak fits."""
     reading: int
     """Number of the reading of the beats that gives range and velocity, counted as in
-    :func:`sweep.model.waveform.beats_of_reading`; -1 if no peak fits."""
+    :func:`sweep.model.waveform.doppler_and_range_beat`; -1 if no peak fits."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -233,7 +233,7 @@ def pair_peaks(
         while j < down.size and is_down_used[j]:
             j += 1
         if down_of_up[i] < 0 and j < down.size:
-            n_readings = 1 if down_beat_sign else N_READINGS
+            n_readings = 1 if down_beat_sign else N_POSSIBLE_BEAT_READINGS
             chance_tolerance = CHANCE_MATCH_PROBABILITY * fft_size / (4.0 * n_readings)
             reading = find_confirming_peak(
                 up[i],
@@ -289,8 +289,8 @@ def find_confirming_peak(
     tolerance += motion_shift_max_bins
     for k in range(doppler.size):
         for reading in range(
-            SIGNED_READING if down_beat_sign else 0,
-            SIGNED_READING + 1 if down_beat_sign else N_READINGS,
+            SIGNED_BEATS_READING if down_beat_sign else 0,
+            SIGNED_BEATS_READING + 1 if down_beat_sign else N_POSSIBLE_BEAT_READINGS,
         ):
             if down_beat_sign:
                 rate_fraction = down_beat_sign * (down - up) / fft_size
@@ -396,7 +396,7 @@ def compare_return_with_truth(
     Returns
     -------
     flag
-        TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG or SIDELOBE_FLAG.
+        TRUE_RETURN_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG or SIDELOBE_FLAG.
     beamlet
         The nearest to the peaks of all beamlets with a line in every peak; -1 for none.
     """
@@ -423,4 +423,4 @@ def compare_return_with_truth(
             nearest_beamlet, least_distance = beamlet, distance
     if held_segments != 7:
         return SIDELOBE_FLAG, -1
-    return (TRUE_FLAG if nearest_beamlet >= 0 else MISPAIRED_FLAG), nearest_beamlet
+    return (TRUE_RETURN_FLAG if nearest_beamlet >= 0 else MISPAIRED_FLAG), nearest_beamlet

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.detection.detection_probability import joint_detection_probability
-from sweep.model.detection.detectors import FIXED_THRESHOLD
+from sweep.model.detection.detectors import FIXED_THRESHOLD_KIND
 from sweep.model.detection.estimators import DETECTOR_PREFIX
 from sweep.model.detection.marcum import at_least_one_probability
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
@@ -24,7 +24,7 @@ from sweep.model.effects.effect import DrawAddresses, EffectContext
 from sweep.model.evaluation import prepare_ray_traced_shots
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.ground import BeamletTable
-from sweep.model.outputs import POINT_VARIABLES, SHOT_STATISTIC_VARIABLES
+from sweep.model.outputs import POINT_CLOUD_VARIABLES, SHOT_STATISTIC_VARIABLES
 from sweep.model.pointcloud.bin_groups import BinGroups, list_bin_groups
 from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion_of_eyepoints
 from sweep.model.pointcloud.eyepoints import Eyepoints, parameters_and_ground_of_eyepoints
@@ -103,15 +103,15 @@ def simulate_cloud(
     -------
     dict of str to ndarray
         :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`, (n,), and
-        :data:`sweep.model.outputs.POINT_VARIABLES`, (n, draws, returns[, 3]). ``surface``,
+        :data:`sweep.model.outputs.POINT_CLOUD_VARIABLES`, (n, draws, returns[, 3]). ``surface``,
         ``true_range`` and ``true_radial_velocity`` are those of the beamlet that a true or a
         misread point measures, so that the error of a misread point shows.
     """
     n_shots = len(eyepoints.time)
     sizes = {"shot": n_shots, "draw": draws, "return_number": returns_max, "xyz": 3}
     results = {
-        name: output.empty(sizes)
-        for name, output in (SHOT_STATISTIC_VARIABLES | POINT_VARIABLES).items()
+        name: output.empty_array(sizes)
+        for name, output in (SHOT_STATISTIC_VARIABLES | POINT_CLOUD_VARIABLES).items()
     }
     step = max(1, VALUES_PER_BATCH // (12 * draws * returns_max + 12 * eyepoints.weight.size))
     for first in range(0, n_shots, step):
@@ -134,12 +134,14 @@ def simulate_cloud(
         draw_arguments = {"first_draw": first_draw, "draws": draws}
         if method == SPECTRA_METHOD:
             if (
-                shots.detection_settings.reported_peaks == STRONGEST_PEAK
-                or parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD) != FIXED_THRESHOLD
+                shots.detection_settings.reported_peaks_option == STRONGEST_PEAK
+                or parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD_KIND)
+                != FIXED_THRESHOLD_KIND
             ):
                 # Probabilities are those of crossing the fixed threshold.
                 bin_groups = bin_groups._replace(
-                    pd=bin_groups.pd * np.nan, leakage=bin_groups.leakage * np.nan
+                    pd=bin_groups.pd * np.nan,
+                    leakage_probability=bin_groups.leakage_probability * np.nan,
                 )
             part_returns = draw_spectra_returns(
                 shots,
@@ -245,7 +247,9 @@ def _prepare_batch(
         for bins in (bin_groups.strongest_bin, bin_groups.first_bin, bin_groups.last_bin):
             bins[without_target] = -1
         bin_groups.neighbour_magnitudes[without_target] = bin_groups.pd[without_target] = np.nan
-        bin_groups.n_exempt[without_target] = bin_groups.leakage[without_target] = 0.0
+        bin_groups.n_exempt_bins[without_target] = bin_groups.leakage_probability[
+            without_target
+        ] = 0.0
     if leaks_in_speckle and not finds_groups_with_leakage:
         known_leakage_bins = (
             [] if shots.permanent_line is None else None
@@ -253,7 +257,7 @@ def _prepare_batch(
         for indices, leakage_bins in iter_leakage_bins(
             shots, bin_groups, np.flatnonzero(has_target)
         ):
-            bin_groups.leakage[indices] = leakage_bins.mean_leakage()
+            bin_groups.leakage_probability[indices] = leakage_bins.mean_leakage_probability()
             if known_leakage_bins is not None:
                 known_leakage_bins.append((indices, leakage_bins))
     return _PreparedBatch(shots, ground.beamlets, bin_groups, known_leakage_bins)
@@ -270,9 +274,9 @@ def _closed_form_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np
     )
     pfa_bin = np.exp(shots.looks.log_pfa(shots.threshold / shots.bin_noise_sigma))[:, None]
     pfa_noise = at_least_one_probability(
-        pfa_bin, shots.alarm_equivalent_bins(bin_groups.n_exempt.T).T[:, [0, 2]]
+        pfa_bin, shots.n_alarm_equivalent_bins(bin_groups.n_exempt_bins.T).T[:, [0, 2]]
     )
-    p_leakage = bin_groups.leakage[:, [0, 2]]
+    p_leakage = bin_groups.leakage_probability[:, [0, 2]]
     pfa = p_leakage + pfa_noise * (1 - p_leakage)
     is_above_threshold = (bin_groups.strongest_bin[:, 0] >= 0) & (
         bin_groups.magnitude[:, 0] >= shots.threshold[:, None]
@@ -292,7 +296,7 @@ def _closed_form_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np
 def _cloud_points(
     eyepoints: Eyepoints, shot_returns: Returns, n_lines: int
 ) -> dict[str, np.ndarray]:
-    """Return points and their truth by name of POINT_VARIABLES, (n, draws, returns[, 3]).
+    """Return points and their truth by name of POINT_CLOUD_VARIABLES, (n, draws, returns[, 3]).
 
     ``n_lines`` is the number of lines of a shot in ``shot_returns``. It is 1 if the effect of the
     footprint is skipped, else the number of beamlets.
@@ -311,7 +315,9 @@ def _cloud_points(
     )
     displacement = shot_returns.range_interpolated[..., None] * eyepoints.direction[:, None, None]
     reported = {
-        name: getattr(shot_returns, name) for name in POINT_VARIABLES if name in Returns._fields
+        name: getattr(shot_returns, name)
+        for name in POINT_CLOUD_VARIABLES
+        if name in Returns._fields
     }
     return reported | {
         "position": eyepoints.position[:, None, None] + displacement,

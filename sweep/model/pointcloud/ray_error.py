@@ -147,7 +147,7 @@ def estimate_ray_error(
         bin_powers = _bin_powers(shots, beamlet_table, s, indices, peak_bins[indices, s])
         _fill_power_errors(bin_powers.power, beamlet_pairs, relative_power_error)
         pd_error = _pd_change_bound(shots, a[indices], b[indices], relative_power_error)
-        if shots.detection_rule.in_speckle and shots.detection_rule.any_bin:
+        if shots.detection_rule.in_speckle and shots.detection_rule.detects_by_any_bin:
             # Bins of a wide echo fade by themselves, and their powers err by different rays.
             pd_error = np.minimum(pd_error * np.sqrt(bin_powers.echo_width), 1.0)
         pd_change[indices] += pd_error

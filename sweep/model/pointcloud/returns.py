@@ -54,9 +54,9 @@ from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.bin_noise import noise_filter
 from sweep.model.detection.detection_probability import (
-    down_pd_given_up,
+    down_pd_given_up_result,
     joint_detection_probability,
-    mean_detection_equivalent_bins,
+    mean_n_detection_equivalent_bins,
 )
 from sweep.model.detection.echo_detection import (
     BinThresholds,
@@ -64,10 +64,10 @@ from sweep.model.detection.echo_detection import (
     bin_threshold_at,
     echo_bounds,
     fill_pedestal_ratios,
-    independent_bin_pd,
-    independent_bin_pd_kernel,
     is_real_bin,
-    pd_of_independent_bins,
+    pd_of_any_independent_bin,
+    pd_of_one_independent_bin,
+    pd_of_one_independent_bin_kernel,
     speckle_mixing_at,
 )
 from sweep.model.detection.estimators import RangeVelocityDeviation, range_velocity_deviation
@@ -83,7 +83,7 @@ from sweep.model.detection.sub_bin_interpolation import (
     line_spread_error,
     sub_bin_standard_error,
 )
-from sweep.model.evaluation import fit_peaks
+from sweep.model.evaluation import fit_range_velocity_to_peaks
 from sweep.model.kernel_integers import INTEGER_ZERO, NO_INDEX, THREE_BINS
 from sweep.model.pointcloud.bin_groups import BinGroups
 from sweep.model.pointcloud.ego_motion import EgoMotion
@@ -100,7 +100,7 @@ from sweep.model.pointcloud.pairing import (
     FALSE_PEAK_GROUP,
     MISREAD_FLAG,
     NO_PEAK_GROUP,
-    TRUE_FLAG,
+    TRUE_RETURN_FLAG,
     UNCONFIRMED_FLAG,
     DopplerPrediction,
     PeakPairs,
@@ -221,10 +221,10 @@ class Returns(NamedTuple):
     """Returns (measured points) of each shot and draw, (n, draws, returns); nan without a return.
 
     Confirmed returns come before unconfirmed ones, stronger up peaks before weaker ones, and a
-    false up peak last. Units are those of :data:`sweep.model.outputs.POINT_VARIABLES`. Fields with
-    ``_interpolated`` follow from positions between bins. Their errors are those of noise and of the
-    spread of the groups' lines. Fields without it follow from whole bins, and their errors include
-    rounding, 1/sqrt(12) bin.
+    false up peak last. Units are those of :data:`sweep.model.outputs.POINT_CLOUD_VARIABLES`. Fields
+    with ``_interpolated`` follow from positions between bins. Their errors are those of noise and
+    of the spread of the groups' lines. Fields without it follow from whole bins, and their
+    errors include rounding, 1/sqrt(12) bin.
     """
 
     range: np.ndarray
@@ -341,7 +341,7 @@ def draw_returns(
             noise_filter=filter_rule, noise_covariance_root=noise_roots[n_noise_bins]
         )
         if (
-            shots.real_fft_size
+            shots.real_ends_fft_size
             and shots.speckle.segment_correlations is not None
             and (shots.speckle_table.pseudo_variance_row > 0).any()
         ):
@@ -352,7 +352,7 @@ def draw_returns(
             n_filter_bins = 2 * (n_near_bins + window_bins + int(spectra.n_bins.max(initial=0)))
             end_filter = NoiseFilter(
                 *noise_filter(shots.window, shots.fft_size, n_filter_bins),
-                shots.real_fft_size,
+                shots.real_ends_fft_size,
             )
             part_config = part_config._replace(
                 spectrum_end_noise_filter=end_filter,
@@ -396,7 +396,7 @@ def _iter_spectra(
         for indices, spectra in iter_noiseless_spectra(shots):
             yield indices, spectra, bins_without_noise_peaks(shots, bin_groups, indices, spectra)
         return
-    n_noise_bins = np.nan_to_num(shots.alarm_equivalent_bins(bin_groups.n_exempt.T).T)
+    n_noise_bins = np.nan_to_num(shots.n_alarm_equivalent_bins(bin_groups.n_exempt_bins.T).T)
     leaking_indices = find_leaking_points(shots, bin_groups)
     is_leaking_point = np.zeros(shots.size, bool)
     is_leaking_point[leaking_indices] = True
@@ -447,7 +447,7 @@ class DrawConfig(NamedTuple):
     two_beat_reading: int
     """Number of the reading (way to interpret an up and a down beat as range and velocity) that is
     used without a Doppler peak."""
-    real_fft_size: int
+    real_ends_fft_size: int
     """FFT size N if noise in the bins at frequency 0 (DC) and at Nyquist is real, else 0."""
     lobe_half_width: int
     """Half-width of the main lobe of a line [bins] if any bin of an echo may detect it; 0 if only
@@ -490,19 +490,19 @@ class DrawConfig(NamedTuple):
             probabilities of detection.
         """
         two_beat_reading = (
-            waveform.FAST_READING
+            waveform.FAST_TARGET_READING
             if shots.detection_settings.two_beat_assumption == waveform.FAST_TARGET
-            else waveform.FAR_READING
+            else waveform.FAR_TARGET_READING
         )
         down_beat_sign = 0.0
         _, has_doppler, _ = shots.has_segment
-        _, _, down_slope = shots.waveform.chirp_slopes
+        _, _, down_slope = shots.waveform.chirp_rate_ratios
         if shots.complex_record:
             two_beat_reading, down_beat_sign = (
-                waveform.SIGNED_READING,
+                waveform.SIGNED_BEATS_READING,
                 math.copysign(1.0, 1.0 - down_slope),
             )
-        votes = shots.looks.votes if shots.looks.combine == COMBINE_BINARY else 0
+        votes = shots.looks.votes_needed if shots.looks.combine_kind == COMBINE_BINARY else 0
         if shots.speckle.look_speckle is not None and shots.looks.number > CORRELATED_LOOKS_MAX:
             votes = -1
         return cls(
@@ -513,7 +513,7 @@ class DrawConfig(NamedTuple):
             shots.fft_size // 2,
             down_beat_sign,
             two_beat_reading,
-            shots.real_fft_size,
+            shots.real_ends_fft_size,
             shots.detection_rule.lobe_half_width,
             make_echo_noise_filter(shots, NoiselessSpectra.empty(0)),
             np.zeros((0, 0)),
@@ -658,7 +658,7 @@ class DrawnPeaks(NamedTuple):
     """
     reading: np.ndarray
     """(n, draws, returns) int64: which reading of the beats gave range and velocity, as numbered by
-    :func:`sweep.model.waveform.beats_of_reading`; -1 without a return."""
+    :func:`sweep.model.waveform.doppler_and_range_beat`; -1 without a return."""
     group: np.ndarray
     """(n, draws, returns, 3) int8: index of the group of adjacent bins to which the up, Doppler and
     down peak belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
@@ -692,7 +692,7 @@ class ListedReturns(NamedTuple):
     """(m, 3) in each field: up, Doppler and down peak of each return; nan for none."""
     reading: np.ndarray
     """(m,) int64: which reading of the beats gave range and velocity, as numbered by
-    :func:`sweep.model.waveform.beats_of_reading`."""
+    :func:`sweep.model.waveform.doppler_and_range_beat`."""
     group: np.ndarray
     """(m, 3) int8: index of the group of adjacent bins to which the up, Doppler and down peak
     belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
@@ -756,7 +756,7 @@ def make_draw_inputs(
     pd_both = joint_detection_probability(
         shots, pd_up.T, pd_down.T, (bin_groups.magnitude[:, 0].T, bin_groups.magnitude[:, 2].T)
     ).T
-    down_pd = down_pd_given_up(pd_up, pd_down, pd_both)
+    down_pd = down_pd_given_up_result(pd_up, pd_down, pd_both)
     magnitude_below, magnitude, magnitude_above = np.ascontiguousarray(
         np.moveaxis(bin_groups.neighbour_magnitudes, -1, 0)
     )
@@ -783,12 +783,12 @@ def make_draw_inputs(
         threshold_ratio=threshold_ratio,
         line_noise_ratio=line_noise_ratio,
         bin_thresholds=shots.bin_thresholds,
-        pfa_noise=np.zeros(bin_groups.leakage.shape),
+        pfa_noise=np.zeros(bin_groups.leakage_probability.shape),
         doppler_prediction=DopplerPrediction(
             *(np.array(np.broadcast_to(v, shots.size)) for v in _doppler_prediction(shots, motion))
         ),
-        down_pd_if_up_missed=np.ascontiguousarray(down_pd.if_fails),
-        down_pd_if_up_detected=np.ascontiguousarray(down_pd.if_holds),
+        down_pd_if_up_missed=np.ascontiguousarray(down_pd.pd_if_condition_fails),
+        down_pd_if_up_detected=np.ascontiguousarray(down_pd.pd_if_condition_holds),
         first_searched_bin=first_searched_bin,
         last_searched_bin=last_searched_bin,
         line_grid=speckle_line_grid(shots),
@@ -828,13 +828,13 @@ def _n_independent_bins(
     For the chirps it is that of :func:`joint_detection_probability`; near DC and Nyquist it is 1.
     """
     n_independent = np.ones(bin_groups.pd.shape)
-    if shots.detection_settings.echo_bins == "peak_bin":
+    if shots.detection_settings.echo_bin_rule == "peak_bin":
         return n_independent
     for segments in ((0, 2), (1,)):
         pd_by_segment = tuple(bin_groups.pd[:, s].T for s in segments)
         magnitudes_by_segment = tuple(bin_groups.magnitude[:, s].T for s in segments)
         n_equivalent = np.asarray(
-            mean_detection_equivalent_bins(shots, pd_by_segment, magnitudes_by_segment)
+            mean_n_detection_equivalent_bins(shots, pd_by_segment, magnitudes_by_segment)
         ).T
         for s in segments:
             n_independent[:, s] = n_equivalent
@@ -852,12 +852,12 @@ def _speckle_draw_inputs(shots: Shots, bin_groups: BinGroups) -> tuple[np.ndarra
     if shots.speckle.line_gradients is None:
         return np.zeros(bin_groups.pd.shape), np.ones(bin_groups.pd.shape)
     has_noncircular_bins = (shots.speckle_table.pseudo_variance_row.T > 0)[:, :, None] & (
-        shots.real_fft_size > 0
+        shots.real_ends_fft_size > 0
     )
     n_independent = _n_independent_bins(shots, bin_groups, has_noncircular_bins)
     with np.errstate(divide="ignore", invalid="ignore"):
         # Fraction for one bin of equal probability, as in `joint_pd_in_speckle`.
-        single_bin_pd = independent_bin_pd(bin_groups.pd, n_independent)
+        single_bin_pd = pd_of_one_independent_bin(bin_groups.pd, n_independent)
         echo_fraction = (
             1
             + np.log(np.where(n_independent > 1, single_bin_pd, bin_groups.pd))
@@ -877,14 +877,14 @@ def _doppler_prediction(shots: Shots, motion: EgoMotion | None = None) -> Dopple
     The known ``motion`` sets the shift that is added to the tolerance of the prediction. The shift
     is 0 if ``motion`` is None.
     """
-    _, doppler, down = shots.waveform.chirp_slopes
+    _, doppler, down = shots.waveform.chirp_rate_ratios
     up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.waveform.carriers)
     determinant = at_down - down * up_carrier
     up_share = (doppler * at_down - down * at_doppler) / determinant
     down_share = (at_doppler - doppler * up_carrier) / determinant
     if motion is None:
         return DopplerPrediction(up_share, down_share, np.zeros(()))
-    known_motion = (motion.acceleration, motion.slip_at(shots.range))
+    known_motion = (motion.closing_acceleration, motion.slip_at(shots.range))
     mismatch = sum(
         abs((up_share * up_beat + down_share * down_beat - doppler_beat) * known_value)
         for (up_beat, doppler_beat, down_beat), known_value in zip(
@@ -904,7 +904,7 @@ def _searched_bins(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
     taken as circular in all. A search band narrows them.
     """
     first_searched, nyquist_bin = shots.first_searched_bin, shots.fft_size // 2
-    last_searched = nyquist_bin - first_searched if shots.real_fft_size else nyquist_bin
+    last_searched = nyquist_bin - first_searched if shots.real_ends_fft_size else nyquist_bin
     first_bins, last_bins = np.empty((2, shots.size, 3), np.int64)
     first_bins[:], last_bins[:] = (
         (0, shots.fft_size - 1) if shots.complex_record else (first_searched, last_searched)
@@ -1001,7 +1001,7 @@ def _measure_listed_returns(
 
     The fields of the result are (m,).
     """
-    uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
+    uses_fit = shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS
     point, at_returns = (
         listed_returns.point,
         partial(_values_of_points, shots, listed_returns.point),
@@ -1047,7 +1047,7 @@ def _measure_listed_returns(
     is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK_GROUP)
     up_index, _, down_index = group.T
     pd = inputs.pd[point, 0, up_index] * inputs.down_pd_if_up_detected[point, down_index]
-    is_misread = (listed_returns.flags & TRUE_FLAG > 0) & ~is_right
+    is_misread = (listed_returns.flags & TRUE_RETURN_FLAG > 0) & ~is_right
     up_ratio, _, down_ratio = listed_returns.peaks.magnitude_ratio.T
     uncorrected = interpolated
     if not uses_fit:  # refer to the shot's start by the measured velocity
@@ -1081,7 +1081,9 @@ def _measure_listed_returns(
         snr=np.minimum(up_ratio, down_ratio) ** 2 / 2,
         pd=np.where(is_signal, pd, np.nan),
         flags=np.where(
-            is_misread, listed_returns.flags ^ (TRUE_FLAG | MISREAD_FLAG), listed_returns.flags
+            is_misread,
+            listed_returns.flags ^ (TRUE_RETURN_FLAG | MISREAD_FLAG),
+            listed_returns.flags,
         ),
         beamlet=listed_returns.beamlet,
         group=np.maximum(listed_returns.group, FALSE_PEAK_GROUP),
@@ -1123,7 +1125,7 @@ def _wander_covariance(
     mean_power = signal_power + 2 * (line_sigma / noise_sigma) ** 2
     offset = peaks.offset
     if (
-        shots.detection_settings.echo_bins == "peak_bin"
+        shots.detection_settings.echo_bin_rule == "peak_bin"
     ):  # the position is relative to the group's strongest bin
         bin_shift = peaks.bin - inputs.strongest_bin[point_column, segment, group_index]
         if shots.complex_record:
@@ -1135,7 +1137,7 @@ def _wander_covariance(
     )
     segment_pairs = (
         CHIRP_PAIRS_WITH_SELF
-        if shots.waveform.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
+        if shots.waveform.chirp_rate_ratios == waveform.DEFAULT_CHIRP_RATE_RATIOS
         else SEGMENT_PAIRS_WITH_SELF
     )
     covariance[is_echo] = position_error_moments(
@@ -1161,7 +1163,7 @@ def _add_drift_errors(
             shots,
             target=replace(
                 shots.target,
-                acceleration=motion.acceleration,
+                acceleration=motion.closing_acceleration,
                 approach_speed=motion.approach_speed_at(shots.range),
             ),
         )
@@ -1260,11 +1262,11 @@ def _correct_for_motion(
     known_slip = motion.slip_at(interpolated.range)
     interpolated = interpolated._replace(
         range=interpolated.range
-        - (per_slip.range * known_slip + per_acceleration.range * motion.acceleration),
+        - (per_slip.range * known_slip + per_acceleration.range * motion.closing_acceleration),
         radial_velocity=interpolated.radial_velocity
         - (
             per_slip.radial_velocity * known_slip
-            + per_acceleration.radial_velocity * motion.acceleration
+            + per_acceleration.radial_velocity * motion.closing_acceleration
         ),
     )
     slip_error = motion.slip_standard_error(interpolated.range)
@@ -1297,7 +1299,7 @@ def _response_to_motion(
     point = listed_returns.point
     point_index: np.ndarray | slice = point
     if (
-        shots.waveform.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
+        shots.waveform.chirp_rate_ratios == waveform.DEFAULT_CHIRP_RATE_RATIOS
     ):  # half sum and half difference of up and down beat, which all returns of a point share
         point_index = slice(None)
         weights = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates
@@ -1373,7 +1375,7 @@ def _measure_by_reading(
         f_d, f_r = np.full((2, up.size), np.nan)
         for reading in np.unique(listed_returns.reading):
             has_reading = listed_returns.reading == reading
-            f_d[has_reading], f_r[has_reading] = waveform.beats_of_reading(
+            f_d[has_reading], f_r[has_reading] = waveform.doppler_and_range_beat(
                 reading, up[has_reading], down[has_reading], sample_rate[has_reading]
             )
         measured_range, measured_velocity = waveform.range_velocity_of_beats(
@@ -1431,7 +1433,7 @@ def _measure_by_fit(
             down=down,
             carriers=tuple(carrier[points] for carrier in carriers),
             chirp_rate=chirp_rate[points],
-            slopes=shots.waveform.chirp_slopes,
+            slopes=shots.waveform.chirp_rate_ratios,
             range=shots.range[points],
             radial_velocity=shots.target.radial_velocity[points],
         )
@@ -1440,7 +1442,9 @@ def _measure_by_fit(
         """Fit range and velocity to the peaks of returns, at ``peak_positions`` (m, 3) [bins]."""
         errors = np.where(is_finite, position_error, np.inf)
         errors = np.hypot(errors, math.sqrt(rounding_variance))
-        fitted = fit_peaks(shots, peak_positions.T * bin_width[point], 1 / errors**2, point)
+        fitted = fit_range_velocity_to_peaks(
+            shots, peak_positions.T * bin_width[point], 1 / errors**2, point
+        )
         deviations = deviations_by_errors(errors, point)
         if wander_covariance is not None:
             beat_covariance = wander_covariance * (bin_width[point] ** 2)[:, None, None]
@@ -2159,7 +2163,7 @@ def draw_segment_peaks(
                 point, segment
             ]
         ]
-        false_bin = draw_free_bin(
+        false_bin = draw_false_peak_bin(
             philox.to_uniform(bin_word),
             strongest_bins,
             inputs.first_bin[point, segment],
@@ -2219,7 +2223,7 @@ def list_noisy_leaked_peaks(
         Bins of leaked signal of all points, with |X| / sigma. sigma is the noise of a bin per
         quadrature.
     leakage_bins : LeakageBins
-        Bins of leaked signal; ``group`` is the echo whose speckle makes each bin fade.
+        Bins of leaked signal; ``fading_group`` is the echo whose speckle makes each bin fade.
     speckle_factors : ndarray (groups,)
         Factors by speckle on the magnitudes of the point's echoes in this segment.
     threshold_ratio : float
@@ -2242,7 +2246,7 @@ def list_noisy_leaked_peaks(
         re, im = philox.normal_pair(
             key_0, key_1, draw, philox.STREAM_NOISE[segment], spectra.leaked_index[n]
         )
-        speckle_factor = speckle_factors[leakage_bins.group[n]]
+        speckle_factor = speckle_factors[leakage_bins.fading_group[n]]
         ratio = math.hypot(spectra.leaked_magnitude_ratio[n] * speckle_factor + re, im)
         if ratio < threshold_ratio:
             continue
@@ -2313,7 +2317,7 @@ def detect_by_peak_bin(
     )
     k = strongest_bin - spectra.first_bin[point, segment]
     re, im = philox.normal_pair(key_0, key_1, draw, stream, k)
-    is_real = is_real_bin(strongest_bin, config.real_fft_size > 0, config.real_fft_size)
+    is_real = is_real_bin(strongest_bin, config.real_ends_fft_size > 0, config.real_ends_fft_size)
     if is_real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * line_noise_ratio, im * line_noise_ratio
@@ -2342,7 +2346,9 @@ def detect_by_peak_bin(
     re_above, im_above = philox.normal_pair(key_0, key_1, draw, stream, k + 1)
     re_below, im_below = re_below * line_noise_ratio, im_below * line_noise_ratio
     re_above, im_above = re_above * line_noise_ratio, im_above * line_noise_ratio
-    from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
+    from_centre, above_from_independent, below_from_above, below_from_independent = (
+        interpolation.noise_mixing
+    )
     amplitude_below = speckled_amplitude(
         inputs.magnitude_below[point, segment, group] / noise_sigma, speckle, group, segment, 0
     )
@@ -2351,14 +2357,14 @@ def detect_by_peak_bin(
     )
     below_ratio = math.hypot(
         amplitude_below.real
-        + (from_centre * re + below_from_above * re_above + below_own * re_below),
+        + (from_centre * re + below_from_above * re_above + below_from_independent * re_below),
         amplitude_below.imag
-        + (from_centre * im + below_from_above * im_above + below_own * im_below),
+        + (from_centre * im + below_from_above * im_above + below_from_independent * im_below),
     )
     centre_ratio = math.hypot(amplitude.real + re, amplitude.imag + im)
     above_ratio = math.hypot(
-        amplitude_above.real + (from_centre * re + above_own * re_above),
-        amplitude_above.imag + (from_centre * im + above_own * im_above),
+        amplitude_above.real + (from_centre * re + above_from_independent * re_above),
+        amplitude_above.imag + (from_centre * im + above_from_independent * im_above),
     )
     if near_end:
         below_ratio = abs(
@@ -2462,7 +2468,7 @@ def detect_in_speckle(
     )
     n_independent_bins = inputs.n_independent_bins[point, segment, group]
     if n_independent_bins > 1.0:
-        pd = independent_bin_pd_kernel(pd, n_independent_bins)
+        pd = pd_of_one_independent_bin_kernel(pd, n_independent_bins)
     echo_fraction, is_noncircular = (
         inputs.echo_fraction[point, segment, group],
         is_near_spectrum_end(first_bin, n_bins, config),
@@ -2604,7 +2610,7 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
         if math.exp(-power) < (
             single_bin_pd
             if n_bins_left >= 1.0
-            else pd_of_independent_bins(single_bin_pd, n_bins_left)
+            else pd_of_any_independent_bin(single_bin_pd, n_bins_left)
         ):
             return True
         n_bins_left, random_index = n_bins_left - 1.0, random_index + 1
@@ -2629,8 +2635,8 @@ def draw_adjacent_bin_noise(address, stream, first_index, first_bin, n_bins, con
         :class:`sweep.model.sampling.draws.NoiseScratch`, the result. It has at least as many bins;
         for bins near DC or Nyquist as many as ``config.spectrum_end_noise_filter``.
     """
-    touches_end = config.real_fft_size > 0 and (
-        first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_fft_size
+    touches_end = config.real_ends_fft_size > 0 and (
+        first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_ends_fft_size
     )
     if is_near_spectrum_end(first_bin, n_bins, config):
         draw_noise_near_spectrum_end(address, stream, first_index, first_bin, n_bins, config, noise)
@@ -2726,7 +2732,9 @@ def draw_three_bin_noise(address, stream, first_index, interpolation, noise):
         :class:`sweep.model.sampling.draws.NoiseScratch`, the result.
     """
     noise_re, noise_im = noise.in_phase, noise.in_quadrature
-    from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
+    from_centre, above_from_independent, below_from_above, below_from_independent = (
+        interpolation.noise_mixing
+    )
     key_0, key_1, draw = address
     block = first_index >> 1
     # Each block of four words makes two pairs, of which the first has an even index.
@@ -2744,12 +2752,12 @@ def draw_three_bin_noise(address, stream, first_index, interpolation, noise):
         re, im = philox.to_normals(even_radius, even_angle)
         re_above, im_above = philox.to_normals(odd_radius, odd_angle)
         re_below, im_below = philox.to_normals(next_even_radius, next_even_angle)
-    noise_re[0] = from_centre * re + below_from_above * re_above + below_own * re_below
-    noise_im[0] = from_centre * im + below_from_above * im_above + below_own * im_below
+    noise_re[0] = from_centre * re + below_from_above * re_above + below_from_independent * re_below
+    noise_im[0] = from_centre * im + below_from_above * im_above + below_from_independent * im_below
     noise_re[1], noise_im[1] = re, im
     noise_re[2], noise_im[2] = (
-        from_centre * re + above_own * re_above,
-        from_centre * im + above_own * im_above,
+        from_centre * re + above_from_independent * re_above,
+        from_centre * im + above_from_independent * im_above,
     )
 
 
@@ -2945,7 +2953,7 @@ def store_peak(peak, group, segment, index, peak_lists):
 
 
 @njit(cache=True, error_model="numpy")
-def draw_free_bin(
+def draw_false_peak_bin(
     uniform_number,
     strongest_bins,
     first_bins,

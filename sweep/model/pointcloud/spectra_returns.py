@@ -19,8 +19,8 @@ grouped.
 
 Standard errors by noise are those of interpolation by three bins. In developed speckle they are
 those of the estimator where its law is known
-(:func:`sweep.model.detection.estimators.position_error_at_sigma`). Those of ``peak_bin`` include
-its rounding.
+(:func:`sweep.model.detection.estimators.position_error_at_unit_signal`). Those of
+``peak_bin`` include its rounding.
 """
 
 import math
@@ -34,7 +34,7 @@ from sweep.model.detection.estimators import (
     ESTIMATOR_PREFIX,
     PEAK_BIN,
     SPECTRUM_METHOD_DEFAULTS,
-    position_error_at_sigma,
+    position_error_at_unit_signal,
 )
 from sweep.model.detection.sub_bin_interpolation import interpolator, sub_bin_standard_error
 from sweep.model.pointcloud.bin_groups import BinGroups
@@ -115,15 +115,17 @@ def draw_spectra_returns(
     workspace = DrawWorkspace.allocate(0, groups_max)
     zero_index, peaks_max = (
         zero_frequency_index(shots),
-        1 if shots.detection_settings.reported_peaks == STRONGEST_PEAK else groups_max + 1,
+        1 if shots.detection_settings.reported_peaks_option == STRONGEST_PEAK else groups_max + 1,
     )
     estimator = str(method_parameters[ESTIMATOR_PREFIX + "kind"])
     rounding_error = math.sqrt(ROUNDING_VARIANCE) if estimator == PEAK_BIN else 0.0
     error_law = interpolation
     if shots.speckle.line_gradients is not None:
-        error_at_sigma = position_error_at_sigma(estimator, shots.window, shots.fft_size)
-        if error_at_sigma is not None:
-            error_law = interpolation._replace(error_at_sigma=error_at_sigma)
+        error_at_unit_signal = position_error_at_unit_signal(
+            estimator, shots.window, shots.fft_size
+        )
+        if error_at_unit_signal is not None:
+            error_law = interpolation._replace(error_at_unit_signal=error_at_unit_signal)
     for point in range(shots.size):
         point_spectra = prepare_point_spectra(
             shots,
@@ -224,7 +226,7 @@ def _echo_bin_bounds(
     shift = centring_shift(shots, signal.strongest_bin)
     if shots.complex_record:
         echo_indices = (echo_indices + shift - 1) % shots.fft_size + 1
-    if shots.detection_settings.echo_bins != "any_bin":
+    if shots.detection_settings.echo_bin_rule != "any_bin":
         return EchoBounds(echo_indices, echo_indices)
     if echo_indices.size == 1:
         return EchoBounds(np.array([signal.first_bin + shift]), np.array([signal.last_bin + shift]))
@@ -273,7 +275,7 @@ def list_flagged_peaks(
         rotate_to_centre(shots, values, signal.strongest_bin) for values in (all_power, flags)
     )
     end_index = power.size - 1
-    if shots.real_fft_size and signal.last_bin >= signal.first_bin:
+    if shots.real_ends_fft_size and signal.last_bin >= signal.first_bin:
         # Groups exclude DC and Nyquist: flag the inner neighbour of an echo's bin flagged there.
         for end, inner_bin in ((0, 1), (end_index, end_index - 1)):
             if flags[end] and end in (signal.first_bin, signal.last_bin):

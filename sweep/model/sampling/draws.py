@@ -23,10 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
+from sweep.model.detection.bin_noise import N_NOISE_FILTER_TAPS, noise_filter
 from sweep.model.detection.detection_probability import (
     doppler_pd_given_chirps,
-    down_pd_given_up,
+    down_pd_given_up_result,
 )
 from sweep.model.detection.echo_detection import (
     BinThresholds,
@@ -230,7 +230,7 @@ def count_by_probability(
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
     n_rows, probabilities = draw_ranges.point_index.size, _event_probabilities(outputs)
-    no_filter = NoiseFilter(np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0)
+    no_filter = NoiseFilter(np.empty((0, N_NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0)
     inputs = DrawCountInputs(
         threshold_ratio=np.zeros(n_rows),
         line_noise_ratio=np.zeros(n_rows),
@@ -319,12 +319,12 @@ class NoiseFilter(NamedTuple):
     """Filter that makes the noise of adjacent bins from independent normal numbers."""
 
     weights: np.ndarray
-    """(bins, NOISE_FILTER_TAPS): weights of the independent normal numbers whose weighted sum is a
-    bin's noise. The squares of a bin's weights sum to 1."""
+    """(bins, N_NOISE_FILTER_TAPS): weights of the independent normal numbers whose weighted sum is
+    a bin's noise. The squares of a bin's weights sum to 1."""
     first_number_index: np.ndarray
     """(bins,) int64: index of the first independent number that each bin uses, minus the index at
     the first bin."""
-    real_fft_size: int
+    real_ends_fft_size: int
     """FFT size N if the noise in the bins at frequency 0 (DC) and at Nyquist is real, else 0."""
 
 
@@ -346,7 +346,7 @@ class NoiseScratch(NamedTuple):
     @classmethod
     def allocate(cls, n_bins: int) -> "NoiseScratch":
         """Allocate arrays for the noise of ``n_bins`` bins."""
-        return cls(*np.empty((4, n_bins + NOISE_FILTER_TAPS)))
+        return cls(*np.empty((4, n_bins + N_NOISE_FILTER_TAPS)))
 
 
 def make_echo_noise_filter(
@@ -369,15 +369,17 @@ def make_echo_noise_filter(
         The filter. It has no bins if only the largest bin of an echo detects it.
     """
     n_echo_bins = (
-        max(int(spectra.n_bins.max(initial=1)), bins_min) if shots.detection_rule.any_bin else 0
+        max(int(spectra.n_bins.max(initial=1)), bins_min)
+        if shots.detection_rule.detects_by_any_bin
+        else 0
     )
     n_filter_bins = 1 << (n_echo_bins - 1).bit_length() if n_echo_bins else 0
-    if shots.detection_settings.noise_bins == "independent":
-        weights = np.zeros((n_filter_bins, NOISE_FILTER_TAPS))
-        weights[:, NOISE_FILTER_TAPS // 2] = 1.0
-        return NoiseFilter(weights, np.arange(n_filter_bins) - NOISE_FILTER_TAPS // 2, 0)
+    if shots.detection_settings.noise_bin_model == "independent":
+        weights = np.zeros((n_filter_bins, N_NOISE_FILTER_TAPS))
+        weights[:, N_NOISE_FILTER_TAPS // 2] = 1.0
+        return NoiseFilter(weights, np.arange(n_filter_bins) - N_NOISE_FILTER_TAPS // 2, 0)
     return NoiseFilter(
-        *noise_filter(shots.window, shots.fft_size, n_filter_bins), shots.real_fft_size
+        *noise_filter(shots.window, shots.fft_size, n_filter_bins), shots.real_ends_fft_size
     )
 
 
@@ -396,12 +398,12 @@ def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
     weights, start = filter_rule.weights, filter_rule.first_number_index
     n_bins = min(weights.shape[0], COVARIANCE_ROOT_BINS_MAX)
     number_weights = np.zeros(
-        (n_bins, int(start[n_bins - 1] - start[0]) + NOISE_FILTER_TAPS if n_bins else 0)
+        (n_bins, int(start[n_bins - 1] - start[0]) + N_NOISE_FILTER_TAPS if n_bins else 0)
     )
     for k in range(n_bins):
-        number_weights[k, start[k] - start[0] : start[k] - start[0] + NOISE_FILTER_TAPS] = weights[
-            k
-        ]
+        number_weights[k, start[k] - start[0] : start[k] - start[0] + N_NOISE_FILTER_TAPS] = (
+            weights[k]
+        )
     root = np.zeros((n_bins, n_bins))
     for k in range(n_bins):
         for j in range(k + 1):
@@ -427,7 +429,7 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilitie
     )
     stated_both = outputs.get(PD_BOTH_CHIRPS, np.full(pd_up.shape, np.nan))
     both = np.where(np.isfinite(stated_both), stated_both, pd_shot)
-    down_pd = down_pd_given_up(pd_up, pd_down, both)
+    down_pd = down_pd_given_up_result(pd_up, pd_down, both)
     pd_doppler = np.nan_to_num(outputs["pd_doppler"])
     doppler_pd = doppler_pd_given_chirps(
         pd_doppler, pd_up + pd_down - 2 * both, pd_shot - both, np.isfinite(stated_both)
@@ -442,8 +444,12 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilitie
     alarm_down = 1 - (1 - pfa_noise_down) * (1 - outputs["p_leakage_down"])
     return EventProbabilities(
         alarm=np.array([alarm_up, np.zeros_like(alarm_up), alarm_down]),
-        pd_if_condition_fails=np.array([pd_up, doppler_pd.if_fails, down_pd.if_fails]),
-        pd_if_condition_holds=np.array([pd_up, doppler_pd.if_holds, down_pd.if_holds]),
+        pd_if_condition_fails=np.array(
+            [pd_up, doppler_pd.pd_if_condition_fails, down_pd.pd_if_condition_fails]
+        ),
+        pd_if_condition_holds=np.array(
+            [pd_up, doppler_pd.pd_if_condition_holds, down_pd.pd_if_condition_holds]
+        ),
     )
 
 
@@ -553,7 +559,7 @@ def iter_noiseless_spectra(
     point_indices
         Points to include; by default all.
     """
-    noise_sigma, has_real_ends = shots.bin_noise_sigma, shots.real_fft_size > 0
+    noise_sigma, has_real_ends = shots.bin_noise_sigma, shots.real_ends_fft_size > 0
     # Without leakage only the peak is evaluated.
     negligible_ratio = (
         shots.negligible_signal_ratio + np.zeros(shots.size)
@@ -586,12 +592,12 @@ def iter_noiseless_spectra(
         leaked_end = np.cumsum(n_leaked).reshape(-1, 3)
         exists = spans.n_bins.T > 0
         n_exempt = np.where(exists, spans.n_exempt.T, 0.0)
-        n_noise_bins = shots.alarm_equivalent_bins(n_exempt.T, spans.point_numbers).T - n_leaked
+        n_noise_bins = shots.n_alarm_equivalent_bins(n_exempt.T, spans.point_numbers).T - n_leaked
         spectra = NoiselessSpectra(
             first_bin=np.where(exists, spans.first_bin.T, 0),
             peak_index=np.where(exists, spans.peak_index.T, 0),
             peak_has_real_noise=np.isin(
-                (spans.first_bin + spans.peak_index).T, (0, shots.real_fft_size / 2)
+                (spans.first_bin + spans.peak_index).T, (0, shots.real_ends_fft_size / 2)
             )
             & exists
             & has_real_ends,
@@ -657,7 +663,7 @@ def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
     is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
     for j in range(draw_ranges.point_index.size):
         threshold_ratio, line_noise_ratio = inputs.threshold_ratio[j], inputs.line_noise_ratio[j]
-        in_speckle = inputs.speckle_mixing.doppler_own.size > 0
+        in_speckle = inputs.speckle_mixing.doppler_from_independent.size > 0
         i, batch = draw_ranges.point_index[j], 0
         for first in range(draw_ranges.first_draw[j], draw_ranges.end_draw[j], _DRAWS_PER_STEP):
             n_draws = min(_DRAWS_PER_STEP, draw_ranges.end_draw[j] - first)
@@ -963,17 +969,17 @@ def speckle_amplitudes(address, group, mixing):
     re_0, im_0 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group)
     re_1, im_1 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group + 1)
     re_2, im_2 = philox.normal_pair(key_0, key_1, draw, stream, 3 * group + 2)
-    doppler_re = mixing.doppler_from_up * re_0 + mixing.doppler_own * re_1
-    doppler_im = mixing.doppler_from_up * im_0 + mixing.doppler_own * im_1
+    doppler_re = mixing.doppler_from_up * re_0 + mixing.doppler_from_independent * re_1
+    doppler_im = mixing.doppler_from_up * im_0 + mixing.doppler_from_independent * im_1
     down_re = (
         mixing.down_from_up * re_0
         + (mixing.down_from_doppler_re * re_1 - mixing.down_from_doppler_im * im_1)
-        + mixing.down_own * re_2
+        + mixing.down_from_independent * re_2
     )
     down_im = (
         mixing.down_from_up * im_0
         + (mixing.down_from_doppler_re * im_1 + mixing.down_from_doppler_im * re_1)
-        + mixing.down_own * im_2
+        + mixing.down_from_independent * im_2
     )
     return SegmentAmplitudes(
         complex(root_half * re_0, root_half * im_0),
@@ -1118,11 +1124,11 @@ def _mark_any_bin_crossings(
     first_index, last_index = _first_and_last_echo_index(point, segment, spectra)
     if last_index < 0:
         return
-    threshold_ratio = bin_threshold.threshold / bin_threshold.noise_without_pedestal
+    threshold_ratio = bin_threshold.threshold / bin_threshold.noise_sigma_without_pedestal
     pedestal_power = np.zeros(n_bins)
     if (
-        bin_threshold.side_noise > bin_threshold.noise_without_pedestal
-        or bin_threshold.line_noise > bin_threshold.noise_without_pedestal
+        bin_threshold.side_noise_sigma > bin_threshold.noise_sigma_without_pedestal
+        or bin_threshold.line_noise_sigma > bin_threshold.noise_sigma_without_pedestal
     ):
         fill_pedestal_ratios(bin_magnitude_ratios, is_echo, bin_threshold, pedestal_power)
     for d in range(n_draws):
@@ -1177,12 +1183,12 @@ def draw_bin_noise(address, stream, first_index, first_bin, n_bins, filter_rule,
     """
     key_0, key_1, draw = address
     weights, start = filter_rule.weights, filter_rule.first_number_index
-    real_fft_size = filter_rule.real_fft_size
+    real_ends_fft_size = filter_rule.real_ends_fft_size
     n_taps = weights.shape[1]
     is_from_nyquist = (
-        real_fft_size > 0 and 2 * (first_bin + n_bins - 1) == real_fft_size
+        real_ends_fft_size > 0 and 2 * (first_bin + n_bins - 1) == real_ends_fft_size
     )  # counted from Nyquist
-    is_symmetric = is_from_nyquist or (real_fft_size > 0 and first_bin == 0)
+    is_symmetric = is_from_nyquist or (real_ends_fft_size > 0 and first_bin == 0)
     first_number = 0 if is_symmetric else start[0]
     for j in range(start[n_bins - 1] + n_taps - first_number):
         re, im = philox.normal_pair(key_0, key_1, draw, stream, first_index + j)

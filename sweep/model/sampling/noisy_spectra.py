@@ -19,7 +19,7 @@ phases of a separate tone, and separate speckle. A phase common to all bins make
 circular noise and is omitted.
 
 The phase of a laser of Lorentzian line width is a random walk. Each draw has a walk, with a step at
-every sample, which rotates the signal's record (:func:`sweep.model.laser_line.phase_walk`).
+every sample, which rotates the signal's record (:func:`sweep.model.laser_line.beat_phase_noise`).
 
 In several looks (:mod:`sweep.model.detection.looks`) each record has noise and a phase walk of its
 own, and its signal follows the moving target. Speckle is common to all looks or separate. Bins are
@@ -45,7 +45,7 @@ from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.detectors import (
     DETECTORS,
-    FIXED_THRESHOLD,
+    FIXED_THRESHOLD_KIND,
     Detector,
     SpectrumSettings,
     cached_window_samples,
@@ -58,8 +58,8 @@ from sweep.model.detection.estimators import (
     ESTIMATORS,
     Estimator,
     RangeVelocityDeviation,
-    beat_frequency_bound,
-    phase_noise_deviation,
+    beat_frequency_cramer_rao_bound,
+    phase_noise_beat_deviation,
     range_velocity_deviation,
 )
 from sweep.model.detection.looks import COMBINE_BINARY
@@ -68,11 +68,11 @@ from sweep.model.detection.sub_bin_interpolation import (
     estimate_sub_bin_offset,
     interpolator,
 )
-from sweep.model.evaluation import fit_peaks
+from sweep.model.evaluation import fit_range_velocity_to_peaks
 from sweep.model.laser_line import (
     apparent_line_and_pedestal,
-    n_phase_walk_steps,
-    phase_walk,
+    beat_phase_noise,
+    n_beat_phase_noise_steps,
 )
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.sampling.draws import DrawCounts
@@ -141,7 +141,7 @@ class SegmentSignal(NamedTuple):
     last_bin: int
     """Index of the last bin that the signal occupies. It is below ``first_bin`` if there is no
     echo, or if the strongest bin is outside the search band."""
-    frequency: float
+    frequency_bins: float
     """Signed frequency [bins] of a pure tone whose magnitudes equal those of the signal about its
     strongest bin."""
     cnr: float
@@ -230,7 +230,7 @@ def noiseless_signal(
         )
         magnitude = magnitude / math.sqrt(line_power_fraction)
     window, last_index = shots.window, magnitude.size - 1
-    margin = 0 if shots.real_fft_size or shots.complex_record else 1  # omits DC and Nyquist
+    margin = 0 if shots.real_ends_fft_size or shots.complex_record else 1  # omits DC and Nyquist
     strongest_bin = int(np.clip(np.argmax(magnitude), margin, last_index - margin))
     if not magnitude[strongest_bin] > 0:
         peak_position = float(strongest_bin - zero_frequency_index(shots))
@@ -312,7 +312,7 @@ def noiseless_signal(
         strongest_bin=strongest_bin,
         first_bin=first_bin,
         last_bin=last_bin,
-        frequency=peak_position - zero_frequency_index(shots),
+        frequency_bins=peak_position - zero_frequency_index(shots),
         cnr=float(signal_power / shots.noise_variance[point]),
         segment=segment,
         nearest_echo=nearest_echo,
@@ -447,7 +447,7 @@ def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
     ``duration`` of the record [s].
     """
     return {
-        "line_width": _value_at(shots.laser_line.lorentzian_width, point),
+        "line_width": _value_at(shots.laser_line.lorentzian_fwhm, point),
         "delay": 2 * _value_at(shots.range, point) / SPEED_OF_LIGHT,
         "duration": _value_at(shots.record.duration, point),
     }
@@ -501,10 +501,10 @@ def draw_signal_spectra(
     for draw in draws:
         uniform_numbers = uniforms(
             key[None], draw[None], STREAM_LASER_PHASE[segment],
-            n_phase_walk_steps(delay=delay_samples, length=record_length),
+            n_beat_phase_noise_steps(delay=delay_samples, length=record_length),
         )  # fmt: skip
         # The initial phase of a record matters only if looks are added in amplitude.
-        phase = phase_walk(
+        phase = beat_phase_noise(
             to_normals_by_row(uniform_numbers)[0],
             variance_per_sample=phase_variance_per_sample,
             delay=delay_samples,
@@ -584,10 +584,13 @@ def draw_bin_speckle(
     n_bins, zero_index = signal.spectrum.size, zero_frequency_index(shots)
     factors = np.empty((draws.size, n_bins), complex)
     is_real_bin = np.zeros(n_bins, bool)  # the real part alone has all of the power
-    is_real_bin[[0, -1]] = shots.real_fft_size > 0
+    is_real_bin[[0, -1]] = shots.real_ends_fft_size > 0
     echo_bin_ranges = [
         EchoBinRange(
-            signal.strongest_bin, signal.frequency + zero_index, signal.first_bin, signal.last_bin
+            signal.strongest_bin,
+            signal.frequency_bins + zero_index,
+            signal.first_bin,
+            signal.last_bin,
         )
     ]
     if signal.nearest_echo is not None and signal.multiple_echo_peaks is not None:
@@ -628,7 +631,7 @@ def draw_bin_speckle(
             has_speckle &= signal.nearest_echo[bins % n_bins] == echo_number
         bins = bins[has_speckle] % n_bins
         factors[:, bins] = amplitudes[:, has_speckle]
-        if shots.real_fft_size and shots.speckle_table.pseudo_variance_row[segment, point] > 0:
+        if shots.real_ends_fft_size and shots.speckle_table.pseudo_variance_row[segment, point] > 0:
             # Refer their phases to the record's middle, as those of the noise are.
             first_sample = (
                 0
@@ -893,7 +896,7 @@ class SegmentDetections(NamedTuple):
     alarms."""
     n_false_bins: np.ndarray
     """(m,) int64: number of flagged bins in the false alarms that ``n_false_groups`` counts."""
-    frequency: np.ndarray
+    frequency_bins: np.ndarray
     """(m,): estimated frequency of the echo [bins], signed for a complex record."""
     peak_offset: np.ndarray
     """(m,): estimated position minus the largest bin of the detected group of adjacent flagged bins
@@ -959,7 +962,7 @@ def prepare_point_spectra(
         echo_bins,
         line_grid,
         settings.threshold
-        if str(parameters[DETECTOR_PREFIX + "kind"]) == FIXED_THRESHOLD
+        if str(parameters[DETECTOR_PREFIX + "kind"]) == FIXED_THRESHOLD_KIND
         else math.inf,
     )
     signals = tuple(
@@ -1003,12 +1006,12 @@ def flag_detected_bins(
     """
     powers = [spectrum.real**2 + spectrum.imag**2 for spectrum in spectra]
     power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
-    if point_spectra.shots.looks.combine == COMBINE_BINARY:
+    if point_spectra.shots.looks.combine_kind == COMBINE_BINARY:
         votes = sum(
             np.array(point_spectra.detect(spectrum, point_spectra.settings), np.int64)
             for spectrum in powers
         )
-        flags = np.asarray(votes >= point_spectra.shots.looks.votes)
+        flags = np.asarray(votes >= point_spectra.shots.looks.votes_needed)
     else:
         flags = np.array(point_spectra.detect(power, point_spectra.settings), bool)
     bins = np.arange(flags.shape[1]) - zero_frequency_index(point_spectra.shots)
@@ -1064,9 +1067,9 @@ def detect_and_estimate_frequency(
     )
     bins, end_index = np.arange(power.shape[1]), power.shape[1] - 1
     first_detecting, end_detecting = strongest_index, strongest_index + 1
-    if shots.detection_settings.echo_bins == "any_bin" and last_index >= first_index:
+    if shots.detection_settings.echo_bin_rule == "any_bin" and last_index >= first_index:
         first_detecting, end_detecting = first_index, last_index + 1
-        if not shots.real_fft_size:
+        if not shots.real_ends_fft_size:
             first_detecting, end_detecting = max(first_detecting, 1), min(end_detecting, end_index)
     signed_peak = signal.strongest_bin - zero_frequency_index(shots)
     flags_of_echo = flags[:, first_detecting:end_detecting] & is_searched(
@@ -1278,15 +1281,19 @@ def measurement_bound(
             record_lengths - shots.echo_record.n_samples_before_echo[:, point], 2
         )
         phase_noise_arguments["duration"] = record_lengths[0] / np.asarray(sample_rate)
-    laser_deviation = phase_noise_deviation(**phase_noise_arguments)
+    laser_deviation = phase_noise_beat_deviation(**phase_noise_arguments)
     cnr_factor = 2 if shots.complex_record else 1  # two samples (I, Q) for the noise of one
     if is_used is None:
-        is_used = (True, shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES, True)
+        is_used = (
+            True,
+            shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS,
+            True,
+        )
     up, doppler, down = (
         np.inf
         if s is None or not exists
         else np.hypot(
-            beat_frequency_bound(
+            beat_frequency_cramer_rao_bound(
                 cnr=cnr_factor * s.cnr, n_samples=record_length, sample_rate=sample_rate
             ),
             laser_deviation,
@@ -1299,7 +1306,8 @@ def measurement_bound(
     return range_velocity_deviation(
         up=up, doppler=doppler, down=down, carriers=_carriers_at(shots, point),
         chirp_rate=_value_at(shots.waveform.chirp_rate, point), range=shots.range[point],
-        radial_velocity=shots.target.radial_velocity[point], slopes=shots.waveform.chirp_slopes,
+        radial_velocity=shots.target.radial_velocity[point],
+        slopes=shots.waveform.chirp_rate_ratios,
     )  # fmt: skip
 
 
@@ -1315,7 +1323,7 @@ def _measurement_errors(
     bin_width = point_spectra.settings.sample_rate / point_spectra.settings.fft_size
     up_carrier, _, _ = shots.waveform.carriers
     _, has_doppler, _ = shots.has_segment
-    up, doppler, down = (segment.frequency * bin_width for segment in detections)
+    up, doppler, down = (segment.frequency_bins * bin_width for segment in detections)
     measured = waveform.resolve_range_velocity(
         up=up,
         doppler=doppler if has_doppler else None,
@@ -1335,12 +1343,12 @@ def _measurement_errors(
         _value_at(shots.motion.range_reference_time, point) * measured_velocity
     )  # to the shot's start
     measured_range = measured.range + range_walk
-    uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or (
+    uses_fit = shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS or (
         shots.detects_by_any_two_segments & ~is_detected.all(axis=0)
     )
     if np.any(uses_fit):
         cnr = np.array([[0.0 if s is None else s.cnr] for s in point_spectra.signals])
-        fitted_values = fit_peaks(
+        fitted_values = fit_range_velocity_to_peaks(
             shots, np.array([up, doppler, down]), is_detected * cnr, np.array([point])
         )
         measured_range = np.where(uses_fit, fitted_values.range, measured_range)

@@ -271,7 +271,7 @@ class TwoBinErrors(NamedTuple):
             Prepared shots, for window, FFT size and rule of detection.
         """
         tables = _two_bin_error_tables(
-            shots.window, shots.fft_size, shots.detection_settings.echo_bins == "peak_bin"
+            shots.window, shots.fft_size, shots.detection_settings.echo_bin_rule == "peak_bin"
         )
         spread_cells = np.sqrt(squared_shift) * shots.window.length / shots.fft_size
         log_coordinates = (
@@ -287,9 +287,9 @@ class TwoBinErrors(NamedTuple):
         )
         variance = np.exp(log_variance)
         mean = relative_mean * np.sqrt(variance)
-        error_at_sigma = interpolator(shots.window, shots.fft_size).error_at_sigma
+        error_at_unit_signal = interpolator(shots.window, shots.fft_size).error_at_unit_signal
         noise_error = noise_ratio * np.interp(
-            np.abs(offset), np.linspace(0, 1, error_at_sigma.size), error_at_sigma
+            np.abs(offset), np.linspace(0, 1, error_at_unit_signal.size), error_at_unit_signal
         )
         variance -= np.minimum(noise_error, 0.5) ** 2
         return cls(np.sign(offset) * mean, wander_gain, np.maximum(variance, 0.0))

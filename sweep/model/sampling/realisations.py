@@ -18,16 +18,16 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.beamlet_counts import split_with_beamlet_counts
-from sweep.model.effects.catalogue import EFFECT_SHARED_PARAMETER_PATHS, PARAMETER_DEFAULTS
+from sweep.model.beamlet_counts import split_by_category_and_beamlet_count
+from sweep.model.effects.catalogue import EFFECT_CATEGORY_KEY_PATHS, PARAMETER_DEFAULTS
 from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext
-from sweep.model.evaluation import apply_effects, select_effects, use_beamlet_velocities
+from sweep.model.evaluation import apply_effects, effects_use_beamlet_velocities, select_effects
 from sweep.model.ground import FlatGround
 from sweep.model.outputs import (
     GRID_OUTPUTS,
     OUTPUT_HAS_SQUARED_DEVIATIONS,
     OUTPUT_IS_LOGARITHM,
-    RUNNING_SUMS,
+    RUNNING_SUMS_NAME,
     STANDARD_ERROR_OUTPUTS,
 )
 from sweep.model.preparation import Parameters, Shots
@@ -65,7 +65,7 @@ def iter_realisations(
     keys: np.ndarray,
     first_draw: int = 0,
     draws: int,
-    are_grouped: bool = True,
+    draws_are_grouped: bool = True,
 ) -> Iterator[RealisedShots]:
     """Yield prepared shots of every draw of n points on a flat plane, batch by batch.
 
@@ -82,14 +82,14 @@ def iter_realisations(
         alone.
     draws
         Number of draws of each point.
-    are_grouped
+    draws_are_grouped
         True to spread random numbers evenly over groups of draws; False for independent draws.
     """
     all_parameters = PARAMETER_DEFAULTS | dict(parameters)
     # One parameter has n values, so that there are n points even if they differ in nothing.
     all_parameters["target.range"] = np.broadcast_to(all_parameters["target.range"], len(keys))
-    for indices, category_parameters in split_with_beamlet_counts(
-        all_parameters, effects, EFFECT_SHARED_PARAMETER_PATHS
+    for indices, category_parameters in split_by_category_and_beamlet_count(
+        all_parameters, effects, EFFECT_CATEGORY_KEY_PATHS
     ):
         batch_size = min(
             DRAWS_PER_BATCH,
@@ -108,7 +108,7 @@ def iter_realisations(
                 _realise_batch(
                     batch_parameters,
                     effects,
-                    DrawAddresses(keys[point_indices], draw_numbers, are_grouped),
+                    DrawAddresses(keys[point_indices], draw_numbers, draws_are_grouped),
                 ),
             )
 
@@ -127,7 +127,8 @@ def _realise_batch(
         if effect.perturb_parameters is not None:
             parameters = effect.perturb_parameters(parameters, draw_keys)
     context = EffectContext(
-        parameters, FlatGround(parameters, n_points, has_velocities=use_beamlet_velocities(effects))
+        parameters,
+        FlatGround(parameters, n_points, has_velocities=effects_use_beamlet_velocities(effects)),
     )
     shots = apply_effects(parameters, n_points, context.ground, effects)
     for effect in random:
@@ -229,12 +230,12 @@ class RunningMeans:
         """Restore means and sums from the results of earlier draws, so that draws can be added.
 
         `results` are those of :meth:`results` by name, with the array of :meth:`running_sums` as
-        RUNNING_SUMS; further columns are not used. Points without draws have zeros there.
+        RUNNING_SUMS_NAME; further columns are not used. Points without draws have zeros there.
         """
         sizes = [a.sum() for a in (OUTPUT_HAS_SQUARED_DEVIATIONS, OUTPUT_IS_LOGARITHM)]
         split_rows = np.cumsum([len(self.names), *sizes])
         n_values, squared_deviations, largest_logarithms, _ = np.split(
-            results[RUNNING_SUMS].T, split_rows
+            results[RUNNING_SUMS_NAME].T, split_rows
         )
         self.n_values[...] = n_values
         self.squared_deviations[OUTPUT_HAS_SQUARED_DEVIATIONS] = squared_deviations

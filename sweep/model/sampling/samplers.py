@@ -12,7 +12,7 @@ compared with known probabilities, pd is exact, and the counts sample it.
 
 Drawing until the tolerance is met goes in rounds over all points that do not meet it yet. A
 sequential test stops sooner, on average, if the draws happen to vary little. This reduces coverage
-and adds bias. Tests at the numbers of :func:`stopping_checks` are rare enough to keep both
+and adds bias. Tests at the numbers of :func:`stopping_check_draws` are rare enough to keep both
 small; ``benchmarks/stopping_rule.py`` measures them. Tests come at the same numbers of draws for
 every point. With random effects these are whole groups of draws, over which random numbers are
 spread evenly (:mod:`sweep.model.sampling.draw_groups`). The half-width then follows from the
@@ -33,7 +33,7 @@ import numpy as np
 from sweep.model import waveform
 from sweep.model.detection.estimators import SPECTRUM_METHOD_DEFAULTS
 from sweep.model.error_budget import (
-    COUNT_INTERVALS,
+    COUNT_INTERVAL_FUNCTIONS,
     ErrorBudget,
     bounded_mean_interval,
     grouped_mean_half_width,
@@ -46,8 +46,8 @@ from sweep.model.outputs import (
     DETECTOR_INDEPENDENT_OUTPUTS,
     DRAW_COUNT_OUTPUTS,
     N_GROUP_SUMS,
-    PD_OUTPUTS,
-    RUNNING_SUMS,
+    PD_OUTPUT_NAMES,
+    RUNNING_SUMS_NAME,
 )
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.sampling.draw_groups import GROUP_SIZE, GroupMeans
@@ -84,10 +84,10 @@ SPECTRA_METHOD = "spectra"
 ``probabilities`` and ``noise``."""
 
 PD_COUNT_ROWS = [
-    list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
+    list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUT_NAMES
 ]
-"""Rows of arrays of counts that hold numbers of detections, in the order of ``PD_OUTPUTS``. The
-rows of such an array are in the order of ``DRAW_COUNT_OUTPUTS``."""
+"""Rows of arrays of counts that hold numbers of detections, in the order of
+``PD_OUTPUT_NAMES``. The rows of such an array are in the order of ``DRAW_COUNT_OUTPUTS``."""
 
 
 STANDARD_ERROR_GROUPS_MIN = 4
@@ -111,8 +111,8 @@ class PriorDraws(NamedTuple):
     """(names, n, batches) int64: number of draws with each event, in the order of
     DRAW_COUNT_OUTPUTS, in each batch of draws."""
     means: Mapping[str, np.ndarray]
-    """Means (n,) by the names of outputs, and RUNNING_SUMS (n, columns). They are used for points
-    with random effects or full spectra."""
+    """Means (n,) by the names of outputs, and RUNNING_SUMS_NAME (n, columns). They are used for
+    points with random effects or full spectra."""
 
 
 class Sampler(ABC):
@@ -185,7 +185,7 @@ class Sampler(ABC):
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        The result is (4, points), in the order of PD_OUTPUTS; nan for a segment that does not
+        The result is (4, points), in the order of PD_OUTPUT_NAMES; nan for a segment that does not
         exist. ``error_budget`` states the confidence.
         """
 
@@ -205,30 +205,29 @@ class Sampler(ABC):
         }
 
     def n_detected(self) -> np.ndarray:
-        """Return the numbers of draws with a detection, (4, n), in the order of PD_OUTPUTS."""
+        """Return the numbers of draws with a detection, (4, n), in the order of PD_OUTPUT_NAMES."""
         return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
 
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return half-widths of the confidence intervals of fractions of detections, (4, points).
 
-        The half-widths follow from the counts of draws alone. Rows are in the order of PD_OUTPUTS.
+        The half-widths follow from the counts of draws alone. Rows are in the order of
+        PD_OUTPUT_NAMES.
         """
         counts, n = self.n_detected()[:, point_indices], self.n_draws[point_indices]
-        confidence = error_budget.select(point_indices, self.n_draws.size).confidence
-        interval = COUNT_INTERVALS[error_budget.interval](
+        confidence = error_budget.select_points(point_indices, self.n_draws.size).confidence
+        interval = COUNT_INTERVAL_FUNCTIONS[error_budget.count_interval_name](
             successes=counts, trials=n, confidence=confidence
         )
         return interval_half_width(counts / n, interval)
 
-    def half_width_over_tolerance(
-        self, point_indices: np.ndarray, error_budget: ErrorBudget
-    ) -> np.ndarray:
+    def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return each point's largest half-width minus the tolerance, but at least 0, (points,).
 
         The half-widths are those of the confidence intervals of detection probabilities.
         """
         widths = self.half_widths(point_indices, error_budget)
-        excess = widths - error_budget.select(point_indices, self.n_draws.size).tolerance
+        excess = widths - error_budget.select_points(point_indices, self.n_draws.size).tolerance
         return np.fmax.reduce(excess, axis=0, initial=0.0)
 
     def accuracy_arrays(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
@@ -237,11 +236,11 @@ class Sampler(ABC):
         The names are those of ACCURACY_OUTPUTS.
         """
         point_indices = np.arange(self.n_draws.size)
-        widths = zip(PD_OUTPUTS, self.half_widths(point_indices, error_budget), strict=True)
+        widths = zip(PD_OUTPUT_NAMES, self.half_widths(point_indices, error_budget), strict=True)
         return {
             "n_draws": self.n_draws,
             **{f"{name}_half_width": width for name, width in widths},
-            "accuracy_missed": self.half_width_over_tolerance(point_indices, error_budget),
+            "accuracy_missed": self.half_width_excess(point_indices, error_budget),
         }
 
 
@@ -250,7 +249,7 @@ def never_stop() -> bool:
     return False
 
 
-def stopping_checks(batch_size: int, draws_max: int, group_size: int = 1) -> Iterator[int]:
+def stopping_check_draws(batch_size: int, draws_max: int, group_size: int = 1) -> Iterator[int]:
     """Yield, in rising order, the numbers of draws after which sampling may stop.
 
     After each of these numbers of draws, the half-widths of the confidence intervals of detection
@@ -333,9 +332,9 @@ def simulate_draws(
     -------
     dict of str to ndarray
         By names of :mod:`sweep.model.outputs`: (n,) those of GRID_OUTPUTS and
-        STANDARD_ERROR_OUTPUTS, or of SPECTRA_OUTPUTS, and of ACCURACY_OUTPUTS; those of
+        STANDARD_ERROR_OUTPUTS, or of SPECTRA_STUDY_OUTPUTS, and of ACCURACY_OUTPUTS; those of
         DRAW_COUNT_OUTPUTS, (n, batches) with `batch_sizes`, else (n,). With random effects or full
-        spectra outputs are means over the draws, and RUNNING_SUMS (n, columns) is included.
+        spectra outputs are means over the draws, and RUNNING_SUMS_NAME (n, columns) is included.
     """
     batch_edges = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
     sampler_arguments: dict[str, Any] = {
@@ -356,7 +355,7 @@ def simulate_draws(
         group_size = GROUP_SIZE if random_effects(effects) and method != SPECTRA_METHOD else 1
         check_draws = [
             n_draws
-            for n_draws in stopping_checks(batch, limit, group_size)
+            for n_draws in stopping_check_draws(batch, limit, group_size)
             if n_draws == limit or group_size == 1 or _can_be_accurate(n_draws, error_budget)
         ]
         draw_until_accurate(sampler, point_indices, check_draws, error_budget, should_stop)
@@ -402,7 +401,7 @@ def draw_until_accurate(
             is_checked = n_draws <= check_at
             is_open = ~is_checked
             is_open[is_checked] = (
-                sampler.half_width_over_tolerance(point_indices[is_checked], error_budget) > 0
+                sampler.half_width_excess(point_indices[is_checked], error_budget) > 0
             )
             point_indices = point_indices[is_open]
             if not point_indices.size:
@@ -435,13 +434,15 @@ class DetectionSampler(Sampler):
         super().__init__(parameters, effects, prior_draws=prior_draws, **base_arguments)
         self._draws_noise, n_points = method == "noise", self.n_draws.size
         self._running_means = RunningMeans(n_points) if random_effects(effects) else None
-        self._group_means = GroupMeans(n_points, PD_OUTPUTS)
+        self._group_means = GroupMeans(n_points, PD_OUTPUT_NAMES)
         if self._running_means is None:
             values = evaluate(parameters, effects)
             self._outputs = {name: np.broadcast_to(v, (n_points,)) for name, v in values.items()}
         elif prior_draws is not None:
             self._running_means.restore_from_results(prior_draws.means)
-            self._group_means.restore_state(prior_draws.means[RUNNING_SUMS][:, -N_GROUP_SUMS:].T)
+            self._group_means.restore_state(
+                prior_draws.means[RUNNING_SUMS_NAME][:, -N_GROUP_SUMS:].T
+            )
 
     def draws_per_step(self, n_points: int) -> int:
         """Return the number of draws of each point that are made in one step."""
@@ -468,7 +469,7 @@ class DetectionSampler(Sampler):
                 keys=keys,
                 first_draw=first_draw,
                 draws=end_draw - first_draw,
-                are_grouped=self.draws_are_grouped,
+                draws_are_grouped=self.draws_are_grouped,
             ):
                 draw_statistics = shot_statistics(shots)
                 self._running_means.add(point_indices[members], draw_statistics)
@@ -495,11 +496,11 @@ class DetectionSampler(Sampler):
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        The result is (4, points), in the order of PD_OUTPUTS.
+        The result is (4, points), in the order of PD_OUTPUT_NAMES.
         """
-        confidence = error_budget.select(point_indices, self.n_draws.size).confidence
+        confidence = error_budget.select_points(point_indices, self.n_draws.size).confidence
         if self._running_means is not None:
-            mean, variance, n_values = self._running_means.moments(PD_OUTPUTS, point_indices)
+            mean, variance, n_values = self._running_means.moments(PD_OUTPUT_NAMES, point_indices)
             groups = self._group_means.statistics(point_indices, n_values)
             common_inputs: dict[str, Any] = {
                 "variance": variance,
@@ -517,7 +518,9 @@ class DetectionSampler(Sampler):
             )
             has_groups = (groups.n_groups > 1) & self.draws_are_grouped
             return np.where(has_groups, grouped_width, independent_width)
-        zero_or_nan = np.stack([0.0 * self._outputs[name][point_indices] for name in PD_OUTPUTS])
+        zero_or_nan = np.stack(
+            [0.0 * self._outputs[name][point_indices] for name in PD_OUTPUT_NAMES]
+        )
         return zero_or_nan + (
             self.count_half_widths(point_indices, error_budget) if self._draws_noise else 0.0
         )
@@ -530,7 +533,7 @@ class DetectionSampler(Sampler):
             group_sums = self._group_means.state().T
             running_sums = np.concatenate([self._running_means.running_sums(), group_sums], axis=1)
             outputs = self._running_means.results() | self._standard_errors()
-            outputs[RUNNING_SUMS] = running_sums
+            outputs[RUNNING_SUMS_NAME] = running_sums
         return outputs | self.accuracy_arrays(error_budget)
 
     def _standard_errors(self) -> dict[str, np.ndarray]:
@@ -542,7 +545,7 @@ class DetectionSampler(Sampler):
         """
         assert self._running_means is not None
         point_indices = np.arange(self.n_draws.size)
-        _, variance, n = self._running_means.moments(PD_OUTPUTS, point_indices)
+        _, variance, n = self._running_means.moments(PD_OUTPUT_NAMES, point_indices)
         n_groups, group_variance = self._group_means.statistics(point_indices, n)
         grouped_variance = variance_of_grouped_draws(
             variance=variance,
@@ -554,7 +557,7 @@ class DetectionSampler(Sampler):
         n_grouped = GROUP_SIZE * np.where(n_groups >= STANDARD_ERROR_GROUPS_MIN, n_groups, 0)
         squared_sum_error = n_grouped * grouped_variance + (n - n_grouped) * variance
         errors = np.sqrt(squared_sum_error) / np.where(n > 0, n, np.nan)
-        return {f"{name}_error": row for name, row in zip(PD_OUTPUTS, errors, strict=True)}
+        return {f"{name}_error": row for name, row in zip(PD_OUTPUT_NAMES, errors, strict=True)}
 
 
 class SpectraSampler(Sampler):
@@ -584,7 +587,7 @@ class SpectraSampler(Sampler):
                 self._shot_of_point |= {int(p): (shots, i) for i, p in enumerate(indices)}
         if prior_draws is not None:
             value_sums, statistic_sums = np.split(
-                prior_draws.means[RUNNING_SUMS].T, [3 * len(AVERAGED_VALUE_NAMES)]
+                prior_draws.means[RUNNING_SUMS_NAME].T, [3 * len(AVERAGED_VALUE_NAMES)]
             )
             self._value_means.restore_state(value_sums)
             if not self._shot_of_point:
@@ -651,7 +654,7 @@ class SpectraSampler(Sampler):
         """Return terms (4, n) that, added to outputs, set those of missing segments to nan.
 
         A term is nan for a segment that does not exist, else 0. Rows are in the order of
-        PD_OUTPUTS.
+        PD_OUTPUT_NAMES.
         """
         is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
         segment_orders = np.asarray(
@@ -660,16 +663,16 @@ class SpectraSampler(Sampler):
             )
         )
         lacks_doppler = is_direct | (np.char.find(segment_orders, "doppler") < 0)
-        zero_or_nan = np.zeros((len(PD_OUTPUTS), self.n_draws.size))
+        zero_or_nan = np.zeros((len(PD_OUTPUT_NAMES), self.n_draws.size))
         zero_or_nan[
-            PD_OUTPUTS.index("pd_doppler"), np.broadcast_to(lacks_doppler, self.n_draws.shape)
+            PD_OUTPUT_NAMES.index("pd_doppler"), np.broadcast_to(lacks_doppler, self.n_draws.shape)
         ] = np.nan
         return zero_or_nan
 
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        The result is (4, points), in the order of PD_OUTPUTS.
+        The result is (4, points), in the order of PD_OUTPUT_NAMES.
         """
         return (
             self.count_half_widths(point_indices, error_budget)
@@ -690,7 +693,7 @@ class SpectraSampler(Sampler):
         )
         outputs = {name: statistics[name] for name in DETECTOR_INDEPENDENT_OUTPUTS}
         detected_fractions = self.n_detected() / self.n_draws + self._nan_for_missing_segments()
-        outputs |= dict(zip(PD_OUTPUTS, detected_fractions, strict=True))
+        outputs |= dict(zip(PD_OUTPUT_NAMES, detected_fractions, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             for name in ("pfa_bin", "false_alarms"):
                 outputs |= {name: mean[name], f"{name}_error": error[name]}
@@ -707,4 +710,4 @@ class SpectraSampler(Sampler):
                     + np.where(n[bound_name] > 0, 0.0, np.nan),
                 }
         running_sums = np.concatenate([values.state(), self._statistic_means.state()]).T
-        return outputs | self.accuracy_arrays(error_budget) | {RUNNING_SUMS: running_sums}
+        return outputs | self.accuracy_arrays(error_budget) | {RUNNING_SUMS_NAME: running_sums}

@@ -46,12 +46,12 @@ import numpy as np
 from scipy import special
 
 from sweep.kernel_cache import njit
-from sweep.model.beamlets import gaussian_quadrature
+from sweep.model.beamlets import normal_distribution_quadrature
 from sweep.model.detection.speckle_correlation import (
-    TRANSFORM_REACH_BINS,
-    TRANSFORM_SAMPLES_PER_BIN,
+    TRANSFORM_REACH_CELLS,
+    TRANSFORM_SAMPLES_PER_CELL,
     LineGradients,
-    centroid_delay,
+    late_echo_centroid_shift,
     transform_table,
 )
 from sweep.model.detection.sub_bin_interpolation import (
@@ -171,7 +171,7 @@ def _quadrature_tables() -> tuple[np.ndarray, np.ndarray]:
     """
     node, weight = np.zeros((2, QUADRATURE_NODE_COUNTS.size, QUADRATURE_NODE_COUNTS[-1]))
     for row, n_nodes in enumerate(QUADRATURE_NODE_COUNTS.tolist()):
-        node[row, :n_nodes], weight[row, :n_nodes] = gaussian_quadrature(n_nodes)
+        node[row, :n_nodes], weight[row, :n_nodes] = normal_distribution_quadrature(n_nodes)
     return node, weight
 
 
@@ -193,7 +193,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     quadrature_index = np.searchsorted(_QUADRATURE_PHASE_SLOPE_MAX, phase_max)
     line_shift_max = np.sqrt((line_shift**2).sum(axis=-1)).max(axis=1)
     peak_search_half_width = np.ones(n_points, np.int64)
-    if shots.detection_settings.echo_bins == "any_bin":
+    if shots.detection_settings.echo_bin_rule == "any_bin":
         is_wide = line_shift_max > 0.02 * padding_factor
         peak_search_half_width = np.where(is_wide, 1 + np.ceil(2.5 * line_shift_max), 1).astype(
             np.int64
@@ -207,9 +207,9 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
         weight,
         QUADRATURE_NODE_COUNTS,
         window_transform,
-        TRANSFORM_SAMPLES_PER_BIN / padding_factor,
-        TRANSFORM_REACH_BINS * padding_factor,
-        shots.real_fft_size // 2,
+        TRANSFORM_SAMPLES_PER_CELL / padding_factor,
+        TRANSFORM_REACH_CELLS * padding_factor,
+        shots.real_ends_fft_size // 2,
     )
 
 
@@ -719,7 +719,7 @@ class FootprintRecord(NamedTuple):
         length = window.length
         half_length = max(0.5 * (length - 1 - first_sample), 0.5)
         radians_per_sample = 2 * np.pi * line_offsets / fft_size
-        record_middle = 0.5 * length + float(centroid_delay(window)[first_sample])
+        record_middle = 0.5 * length + float(late_echo_centroid_shift(window)[first_sample])
         series_nodes, series_matrix = _chebyshev_nodes_and_matrix(
             _n_chebyshev_coefficients(np.abs(radians_per_sample).max() * half_length)
         )
@@ -1084,7 +1084,7 @@ def position_error_moments(
         mean_error = spread_error + peaks.folding_sign * shape_errors.imaginary_shift_error
         shape_deviation = np.sqrt(shift_ratio * (1 + shift_ratio)) * spread_error
         imaginary_shift_deviation = peaks.folding_sign * shape_errors.imaginary_shift_deviation
-        if shots.detection_settings.echo_bins == "peak_bin":
+        if shots.detection_settings.echo_bin_rule == "peak_bin":
             wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
     n_looks = (
         shots.looks.number

@@ -59,7 +59,7 @@ def range_velocity_wander_variance(
     is_resolved = np.array(
         [
             True,
-            shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
+            shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS
             or shots.detects_by_any_two_segments,
             True,
         ]
@@ -82,7 +82,9 @@ def range_velocity_wander_variance(
     )
 
 
-def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> MeanSquareErrors:
+def mean_range_velocity_wander_variance(
+    shots: Shots, pd: np.ndarray, snr: np.ndarray
+) -> MeanSquareErrors:
     """Return the mean square errors of range and radial velocity at n points due to speckle.
 
     The means are over detected echoes.

@@ -189,7 +189,7 @@ class FarBins(NamedTuple):
     """
 
 
-class FieldWorkspace(NamedTuple):
+class LineSpectrumWorkspace(NamedTuple):
     """Lines, their spectrum without images, and the scratch arrays for computing it."""
 
     lines: LineArrays
@@ -251,7 +251,7 @@ class LeakageQuadrature(NamedTuple):
 class SpectrumWorkspace(NamedTuple):
     """Arrays for computing the spectrum of one segment of one point."""
 
-    field: FieldWorkspace
+    line_spectrum: LineSpectrumWorkspace
     """Lines of the segment, and their spectrum without images (mirrors at negative frequency)."""
     inverse_gain_re: np.ndarray
     """Scratch of :func:`sweep.model.spectrum.lines.compute_lines`: real part of 1 over the gain."""
@@ -304,7 +304,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
         return [next(rows) for _ in range(n_rows)]
 
     lines = LineArrays(*next_rows(3))
-    field = FieldWorkspace(
+    line_spectrum = LineSpectrumWorkspace(
         lines=lines,
         line_scratch=LineScratch(*next_rows(3)),
         cell_re=next(rows),
@@ -316,7 +316,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
         im=next(rows),
     )
     return SpectrumWorkspace(
-        field=field,
+        line_spectrum=line_spectrum,
         inverse_gain_re=next(rows),
         inverse_gain_im=next(rows),
         nodes=LineArrays(*next_rows(3)),
@@ -328,8 +328,8 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
-    """Add the lines' spectrum in bins of the line-shape table to ``field``.
+def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, line_spectrum):
+    """Add the lines' spectrum in bins of the line-shape table to ``line_spectrum``.
 
     Each line is spread over cells around its position. The table holds the spectrum of a line in a
     cell.
@@ -341,16 +341,16 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
     n_bins : int
         Number of bins.
     bundle : LineBundle
-        Number and range of the lines in ``field.lines``.
+        Number and range of the lines in ``line_spectrum.lines``.
     shape : LineShape
         Shape of the lines, with its table (:class:`sweep.model.spectrum.line_shape.LineShape`).
     layout : SpectrumLayout
         Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
-    field : FieldWorkspace
+    line_spectrum : LineSpectrumWorkspace
         Lines and scratch arrays. The spectrum is added to ``re`` and ``im`` [V].
     """
     fft_size, cells_per_bin = layout.fft_size, layout.cells_per_bin
-    lines, last_line_bin = field.lines, math.floor(bundle.highest_position)
+    lines, last_line_bin = line_spectrum.lines, math.floor(bundle.highest_position)
     table_reach = layout.table_half_width_bins + LINE_BATCH_WIDTH_BINS
     for batch_bin in range(
         math.floor(bundle.lowest_position), last_line_bin + 1, LINE_BATCH_WIDTH_BINS
@@ -364,16 +364,20 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
             + N_KERNEL_CELLS
         )
         for c in range(n_cells + N_ZERO_WEIGHT_CELLS):
-            field.cell_re[c], field.cell_im[c] = 0.0, 0.0
+            line_spectrum.cell_re[c], line_spectrum.cell_im[c] = 0.0, 0.0
         for line in range(bundle.n_lines):
             if batch_bin <= lines.position[line] < batch_bin + LINE_BATCH_WIDTH_BINS:
                 cell_position = (lines.position[line] - batch_bin) * cells_per_bin
                 _spread_line_over_cells(
-                    cell_position, lines.re[line], lines.im[line], field.cell_re, field.cell_im
+                    cell_position,
+                    lines.re[line],
+                    lines.im[line],
+                    line_spectrum.cell_re,
+                    line_spectrum.cell_im,
                 )
         for n_periods in range(n_periods_min, n_periods_max + 1):
             _add_spectrum_of_cells(
-                first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field
+                first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, line_spectrum
             )
 
 
@@ -422,8 +426,10 @@ def _end_bin_in_table(batch_bin, n_periods, layout):
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def _add_spectrum_of_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, field):
-    """Add the spectrum of the cells of one interval of lines to ``field``.
+def _add_spectrum_of_cells(
+    first_bin, n_bins, batch_bin, n_cells, n_periods, shape, layout, line_spectrum
+):
+    """Add the spectrum of the cells of one interval of lines to ``line_spectrum``.
 
     The first cell lies N_KERNEL_CELLS / 2 - 1 cells below ``batch_bin``, the interval's first bin.
     """
@@ -436,7 +442,7 @@ def _add_spectrum_of_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, sha
     if not layout.holds_all_bins and low >= high:
         return
     for c in range(n_cells):
-        re, im = sign * field.cell_re[c], sign * field.cell_im[c]
+        re, im = sign * line_spectrum.cell_re[c], sign * line_spectrum.cell_im[c]
         cell_index = c + 1 - N_KERNEL_CELLS // 2
         bin_, row = begin_bin + cell_index // cells_per_bin, cell_index % cells_per_bin
         if layout.holds_all_bins:
@@ -445,19 +451,19 @@ def _add_spectrum_of_cells(first_bin, n_bins, batch_bin, n_cells, n_periods, sha
             continue
         # Unsigned indices need no test for counting from an array's end.
         table_index = np.uint64(row * n_columns + low - bin_)
-        field_index = np.uint64(low - first_bin)
+        spectrum_index = np.uint64(low - first_bin)
         if adds_powers:
             for i in range(np.uint64(high - low)):
-                field.re[field_index + i] += re * shape.table_re[table_index + i]
+                line_spectrum.re[spectrum_index + i] += re * shape.table_re[table_index + i]
         else:
             for i in range(np.uint64(high - low)):
                 g, h = shape.table_re[table_index + i], shape.table_im[table_index + i]
-                field.re[field_index + i] += re * g - im * h
-                field.im[field_index + i] += re * h + im * g
+                line_spectrum.re[spectrum_index + i] += re * g - im * h
+                line_spectrum.im[spectrum_index + i] += re * h + im * g
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layout, field):
+def compute_end_amplitudes_and_far_lines(bundle, distance_min, log_accuracy, layout, line_spectrum):
     """Compute the lines' amplitudes at the record's ends, and equivalent lines for far bins.
 
     Far from the lines, a few equivalent lines (sources) give the same spectrum.
@@ -465,15 +471,15 @@ def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layo
     Parameters
     ----------
     bundle
-        :class:`LineBundle` of the lines in ``field.lines``.
+        :class:`LineBundle` of the lines in ``line_spectrum.lines``.
     distance_min
         Distance from the lines [bins] from which on the sources replace them.
     log_accuracy
         -ln of the relative error of the sources.
     layout
         :class:`SpectrumLayout`.
-    field
-        :class:`FieldWorkspace`. Results are ``line_ends``, and the sources in
+    line_spectrum
+        :class:`LineSpectrumWorkspace`. Results are ``line_ends``, and the sources in
         ``far_equivalent_lines``.
 
     Returns
@@ -483,7 +489,11 @@ def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layo
     """
     adds_powers = layout.adds_powers
     half_record_ratio = 0.5 * layout.record_length / layout.fft_size
-    lines, line_ends, sources = field.lines, field.line_ends, field.far_equivalent_lines
+    lines, line_ends, sources = (
+        line_spectrum.lines,
+        line_spectrum.line_ends,
+        line_spectrum.far_equivalent_lines,
+    )
     for line in range(bundle.n_lines):
         sine, cosine = sincos_cycles(
             (2.0 if adds_powers else 1.0) * half_record_ratio * lines.position[line]
@@ -507,7 +517,7 @@ def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layo
         n_sources,
         middle,
         half_width,
-        field.line_scratch,
+        line_spectrum.line_scratch,
         LineArrays(sources.position, sources.start_re, sources.start_im),
     )
     return replace_lines_by_nodes(
@@ -516,7 +526,7 @@ def compute_end_strengths_and_far_lines(bundle, distance_min, log_accuracy, layo
         n_sources,
         middle,
         half_width,
-        field.line_scratch,
+        line_spectrum.line_scratch,
         LineArrays(sources.position, sources.end_re, sources.end_im),
     )
 
@@ -596,15 +606,23 @@ def prepare_far_bins(first_bin, n_bins, layout, bin_tangents, far_bins):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def add_line_by_record_ends(
-    begin_offset, end_offset, field_offset, strengths, line, log_accuracy, ends, layout, field
+    begin_offset,
+    end_offset,
+    spectrum_offset,
+    strengths,
+    line,
+    log_accuracy,
+    ends,
+    layout,
+    line_spectrum,
 ):
-    """Add the spectrum of one line, or equivalent line, to ``field`` in bins far from it.
+    """Add the spectrum of one line, or equivalent line, to ``line_spectrum`` in bins far from it.
 
     Parameters
     ----------
     begin_offset, end_offset
-        First bin, and the bin after the last, in the batch ``field.far_bins``.
-    field_offset
+        First bin, and the bin after the last, in the batch ``line_spectrum.far_bins``.
+    spectrum_offset
         Index in F of the first bin.
     strengths
         :class:`RecordEndAmplitudes` of lines or sources.
@@ -616,8 +634,8 @@ def add_line_by_record_ends(
         :class:`sweep.model.spectrum.line_shape.EndPolynomials` A and B.
     layout
         :class:`SpectrumLayout`.
-    field
-        :class:`FieldWorkspace`.
+    line_spectrum
+        :class:`LineSpectrumWorkspace`.
 
     Notes
     -----
@@ -628,12 +646,12 @@ def add_line_by_record_ends(
 
     If powers add, F is |A|^2 + |B|^2 - 2 Re(e^{2 i pi r (k - nu)} A conj B), times a = |C|^2.
     """
-    far_bins, relative_cut = field.far_bins, math.exp(-log_accuracy)
+    far_bins, relative_cut = line_spectrum.far_bins, math.exp(-log_accuracy)
     a_re, a_im = strengths.start_re[line], strengths.start_im[line]
     b_re, b_im = strengths.end_re[line], strengths.end_im[line]
     line_tangent = math.tan(math.pi * strengths.position[line] / layout.fft_size)
     begin, stop = np.uint64(begin_offset), np.uint64(end_offset)
-    shift = np.uint64(field_offset - begin_offset)
+    shift = np.uint64(spectrum_offset - begin_offset)
     for i in range(begin, stop):
         far_bins.cotangent[i] = (1.0 + far_bins.tangent[i] * line_tangent) / (
             far_bins.tangent[i] - line_tangent
@@ -671,7 +689,7 @@ def add_line_by_record_ends(
             u, v = far_bins.phasor_re[i], far_bins.phasor_im[i]
             u, v = u * u - v * v, 2.0 * u * v
             u, v = u * b_re - v * b_im, u * b_im + v * b_re
-            field.re[shift + i] += a_re * (p * p + q * q + r * r + s * s) - 2.0 * (
+            line_spectrum.re[shift + i] += a_re * (p * p + q * q + r * r + s * s) - 2.0 * (
                 u * (p * r + q * s) - v * (q * r - p * s)
             )
         return
@@ -681,13 +699,15 @@ def add_line_by_record_ends(
         v_re = b_re * far_bins.end_re[i] - b_im * far_bins.end_im[i]
         v_im = b_re * far_bins.end_im[i] + b_im * far_bins.end_re[i]
         c, s = far_bins.phasor_re[i], far_bins.phasor_im[i]
-        field.re[shift + i] += c * (u_re - v_re) - s * (u_im + v_im)
-        field.im[shift + i] += c * (u_im - v_im) + s * (u_re + v_re)
+        line_spectrum.re[shift + i] += c * (u_re - v_re) - s * (u_im + v_im)
+        line_spectrum.im[shift + i] += c * (u_im - v_im) + s * (u_re + v_re)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bin_tangents, field):
-    """Compute the lines' spectrum F in ``n_bins`` bins: ``re`` and ``im`` of ``field``.
+def compute_line_spectrum(
+    first_bin, n_bins, bundle, negligible_ratio, shape, layout, bin_tangents, line_spectrum
+):
+    """Compute the lines' spectrum F in ``n_bins`` bins: ``re`` and ``im`` of ``line_spectrum``.
 
     Parameters
     ----------
@@ -696,7 +716,7 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
     n_bins
         Number of bins; up to seven more are computed.
     bundle
-        :class:`LineBundle` of the lines in ``field.lines``.
+        :class:`LineBundle` of the lines in ``line_spectrum.lines``.
     negligible_ratio
         Allowed error of F over the sum of the lines' amplitudes.
     shape
@@ -705,14 +725,14 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
         :class:`SpectrumLayout`.
     bin_tangents
         tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
-    field
-        :class:`FieldWorkspace`.
+    line_spectrum
+        :class:`LineSpectrumWorkspace`.
     """
     lowest_position, highest_position = bundle.lowest_position, bundle.highest_position
     n_bins = (n_bins + 7) // 8 * 8  # whole vectors: a remainder takes as long
     for i in range(n_bins):
-        field.re[i], field.im[i] = 0.0, 0.0
-    add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field)
+        line_spectrum.re[i], line_spectrum.im[i] = 0.0, 0.0
+    add_lines_by_table(first_bin, n_bins, bundle, shape, layout, line_spectrum)
     table_reach = layout.table_half_width_bins - TABLE_SHORTFALL_BINS  # from any line
     if layout.holds_all_bins or (
         highest_position - first_bin < table_reach
@@ -731,8 +751,8 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
             log_accuracy,
             4.0 + (2.0 * envelope_log_ratio if layout.adds_powers else envelope_log_ratio),
         )
-    n_sources = compute_end_strengths_and_far_lines(
-        bundle, source_distance, log_accuracy, layout, field
+    n_sources = compute_end_amplitudes_and_far_lines(
+        bundle, source_distance, log_accuracy, layout, line_spectrum
     )
     polynomial_log_accuracy = log_accuracy + FAR_LINE_EXTRA_LOG_ACCURACY
     # In some bins the table holds some lines and not others. Sources serve all bins but these.
@@ -755,25 +775,25 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
             )
         is_far = not is_in_part_of_table
         if is_far or last_batch_bin > first_batch_bin:
-            prepare_far_bins(current, stop - current, layout, bin_tangents, field.far_bins)
+            prepare_far_bins(current, stop - current, layout, bin_tangents, line_spectrum.far_bins)
         if is_far:
             for source in range(n_sources):
                 add_line_by_record_ends(
                     INTEGER_ZERO,
                     stop - current,
                     current - first_bin,
-                    field.far_equivalent_lines,
+                    line_spectrum.far_equivalent_lines,
                     source,
                     polynomial_log_accuracy,
                     shape.end_polynomials,
                     layout,
-                    field,
+                    line_spectrum,
                 )
         elif last_batch_bin > first_batch_bin:
             for line in range(bundle.n_lines):  # the bins that the table does not hold for it
                 batch_bin = (
                     first_batch_bin
-                    + int(field.lines.position[line] - first_batch_bin)
+                    + int(line_spectrum.lines.position[line] - first_batch_bin)
                     // LINE_BATCH_WIDTH_BINS
                     * LINE_BATCH_WIDTH_BINS
                 )
@@ -786,12 +806,12 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, bi
                             start - current,
                             until - current,
                             start - first_bin,
-                            field.line_ends,
+                            line_spectrum.line_ends,
                             line,
                             polynomial_log_accuracy,
                             shape.end_polynomials,
                             layout,
-                            field,
+                            line_spectrum,
                         )
                     start = max(start, _end_bin_in_table(batch_bin, n_periods, layout))
         current = stop
@@ -852,7 +872,7 @@ def compute_magnitudes(
     n_bins : int
         Number of bins.
     bundle : LineBundle
-        Number, range and total weight of the lines, which are in ``workspace.field.lines``.
+        Number, range and total weight of the lines, which are in ``workspace.line_spectrum.lines``.
     negligible_ratio : float
         Allowed error of |X| over the sum of the lines' amplitudes.
     shifts : AveragingShifts
@@ -867,7 +887,7 @@ def compute_magnitudes(
         Lines and scratch arrays. The result is ``span.magnitude``, |X| [V, summed over the record]
         of each bin without noise.
     """
-    field, span = workspace.field, workspace.span
+    line_spectrum, span = workspace.line_spectrum, workspace.span
     is_mirror_image = is_mirrored(
         bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout.spectrum_type
     )
@@ -879,7 +899,7 @@ def compute_magnitudes(
         shift = shifts.offset[m] if is_averaged else 0.0
         if is_averaged:
             for line in range(bundle.n_lines):
-                field.lines.position[line] += shift
+                line_spectrum.lines.position[line] += shift
         shifted_bundle = LineBundle(
             bundle.origin_bin,
             bundle.n_lines,
@@ -891,14 +911,14 @@ def compute_magnitudes(
             2 if layout.spectrum_type == REAL_WITH_IMAGES else 1
         ):  # the lines, then their images
             direction = sign if image_pass == 0 else -sign
-            first_field_bin = (
+            first_spectrum_bin = (
                 first_bin - bundle.origin_bin
                 if direction > 0
                 else 1 - first_bin - n_bins - bundle.origin_bin
             )
             if image_pass == 1:
                 image_distance = bins_to_nearest_line(
-                    first_field_bin,
+                    first_spectrum_bin,
                     n_bins,
                     shifted_bundle.lowest_position,
                     shifted_bundle.highest_position,
@@ -907,19 +927,19 @@ def compute_magnitudes(
                 image_index = envelope_index(image_distance, shape.envelope)
                 if shape.envelope.magnitude[image_index] <= negligible_ratio:
                     continue
-            compute_field(
-                first_field_bin,
+            compute_line_spectrum(
+                first_spectrum_bin,
                 n_bins,
                 shifted_bundle,
                 negligible_ratio,
                 shape,
                 layout,
                 bin_tangents,
-                field,
+                line_spectrum,
             )
             for i in range(n_bins):
                 j = i if direction > 0 else n_bins - 1 - i
-                re, im = field.re[j], direction * field.im[j]
+                re, im = line_spectrum.re[j], direction * line_spectrum.im[j]
                 span.magnitude[i] = re if image_pass == 0 else span.magnitude[i] + re
                 workspace.imaginary_part[i] = (
                     im if image_pass == 0 else workspace.imaginary_part[i] + im
@@ -931,14 +951,14 @@ def compute_magnitudes(
             for i in range(n_bins):
                 workspace.mean_square[i] += shifts.weight[m] * span.magnitude[i]
             for line in range(bundle.n_lines):
-                field.lines.position[line] -= shift
+                line_spectrum.lines.position[line] -= shift
     square = workspace.mean_square if is_averaged else span.magnitude
     for i in range(n_bins):
         span.magnitude[i] = math.sqrt(max(square[i], 0.0))
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def distance_below_level(level, weight_sum, envelope):
+def falloff_distance(level, weight_sum, envelope):
     """Return the distance [bins] from the lines beyond which their spectrum stays below a level.
 
     The result is infinite if the lines exceed the level at any distance.
@@ -1061,10 +1081,10 @@ def falloff_distance_with_images(level, weight_sum, folded_range, envelope, layo
             folded_range.lowest_position, 0.5 * layout.fft_size - folded_range.highest_position
         )  # no bin is nearer to an image
         level_fraction = (
-            0.5 if image_distance < distance_below_level(0.1 * level, weight_sum, envelope) else 0.9
+            0.5 if image_distance < falloff_distance(0.1 * level, weight_sum, envelope) else 0.9
         )
-        return distance_below_level(level_fraction * level, weight_sum, envelope) + 1.0
-    return distance_below_level(level, weight_sum, envelope) + 1.0
+        return falloff_distance(level_fraction * level, weight_sum, envelope) + 1.0
+    return falloff_distance(level, weight_sum, envelope) + 1.0
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
@@ -1085,7 +1105,7 @@ def detect_in_span(
     Parameters
     ----------
     bundle
-        :class:`LineBundle` of the lines in ``workspace.field.lines``.
+        :class:`LineBundle` of the lines in ``workspace.line_spectrum.lines``.
     negligible_magnitude
         Largest |X| of images that may be left out [V, summed over the record].
     threshold
@@ -1136,11 +1156,15 @@ def detect_in_span(
         and bundle.n_lines > 1
         and shifts.offset.size == 0
     ):
-        n_sources = compute_end_strengths_and_far_lines(
-            bundle, float(layout.clearance_bins), FAR_LINE_LOG_ACCURACY, layout, workspace.field
+        n_sources = compute_end_amplitudes_and_far_lines(
+            bundle,
+            float(layout.clearance_bins),
+            FAR_LINE_LOG_ACCURACY,
+            layout,
+            workspace.line_spectrum,
         )
         far_weight = far_line_weight(
-            weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
+            weight_sum, n_sources, layout, workspace.line_spectrum.far_equivalent_lines
         )
         margin_bins = max(
             falloff_distance_with_images(

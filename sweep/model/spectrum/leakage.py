@@ -21,10 +21,10 @@ false alarm with the probability 1 - exp(-R(u)). The mean is
     P = int_0^inf e^{-u} (1 - exp(-R(u))) du.
 
 ln R is computed at powers an octave or half an octave apart, and interpolated by a monotone cubic
-(:func:`mean_leakage_in_speckle`). Bins exempt at the mean power are exempt at any power.
+(:func:`mean_leakage_from_log_rates`). Bins exempt at the mean power are exempt at any power.
 
 Bins that cross next to an echo whose outermost bin crosses are part of the echo
-(:func:`sweep.model.detection.added_crossings.exclude_bins_joining_echo`), and no leakage.
+(:func:`sweep.model.detection.added_crossings.exclude_crossings_joining_echo`), and no leakage.
 """
 
 import math
@@ -34,11 +34,11 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.added_crossings import (
-    JOINED_PROBABILITY_MIN,
+    ALL_JOIN_PROBABILITY_MIN,
     any_crossing_probability,
     crossing_rate,
-    exclude_bins_joining_echo,
-    fill_added_crossings,
+    exclude_crossings_joining_echo,
+    fill_added_crossing_probabilities,
     largest_or_zero,
     weighted_crossing_rate,
 )
@@ -53,7 +53,7 @@ from sweep.model.detection.speckle_crossing_rates import (
     add_entry_weights_of_bin,
     add_rates_by_speckle_power,
     add_rates_from_entry_weights,
-    count_entry_weights,
+    n_entry_weights,
     rate_at_brightest_speckle,
 )
 from sweep.model.kernel_integers import INTEGER_ZERO, STEP_DOWN, STEP_UP
@@ -64,7 +64,7 @@ from sweep.model.spectrum.bin_spectrum import (
     DetectedSpan,
     add_line_by_record_ends,
     bins_around_lines,
-    compute_end_strengths_and_far_lines,
+    compute_end_amplitudes_and_far_lines,
     compute_magnitudes,
     envelope_index,
     falloff_distance_with_images,
@@ -95,7 +95,7 @@ are NumPy booleans, because numba would compile the function anew for Python's."
 OCTAVE_STEP_LEAKAGE_MAX = 0.5
 """Leakage of the brightest speckle up to which one speckle power per octave is enough. Leakage is
 the probability of false alarms due to the echo's signal far from its lines."""
-RATE_MIN = 1e-30
+LEAKAGE_RATE_MIN = 1e-30
 """Lower limit of the bins' summed rate of false alarms due to leaked signal. Smaller sums count as
 this value. The probability of at least one false alarm is 1 - exp(-sum)."""
 CERTAIN_LEAKAGE_RATE = 34.5
@@ -132,7 +132,7 @@ for _n in range(1, _GAUSS_ORDER_MAX + 1):
     _GAUSS_NODES[_n, :_n], _GAUSS_WEIGHTS[_n, :_n] = np.polynomial.legendre.leggauss(_n)
 
 
-class LeakageLimits(NamedTuple):
+class LeakageInputs(NamedTuple):
     """Noise, threshold and tolerance for computing leakage."""
 
     noise_sigma: float
@@ -186,7 +186,7 @@ class NearEndCorrection(NamedTuple):
 def detect_with_leakage(
     bundle,
     negligible_magnitude,
-    limits,
+    inputs,
     speckle_power_max,
     lobe_half_width,
     shape,
@@ -203,11 +203,11 @@ def detect_with_leakage(
     Parameters
     ----------
     bundle : LineBundle
-        Number, range and total weight of the lines, which are in ``workspace.field.lines``
+        Number, range and total weight of the lines, which are in ``workspace.line_spectrum.lines``
         (:class:`sweep.model.spectrum.bin_spectrum.LineBundle`).
     negligible_magnitude : float
         Largest |X| of images that may be left out [V, summed over the record].
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise, threshold and tolerated leakage.
     speckle_power_max : float
         SPECKLE_POWER_MAX if the echo is in developed speckle, else 1.
@@ -241,11 +241,11 @@ def detect_with_leakage(
     span, weight_sum, envelope = workspace.span, bundle.weight_sum, shape.envelope
     # Bounds are those of the brightest speckle.
     inverse_root = 1.0 / math.sqrt(speckle_power_max)
-    brightest_limits = LeakageLimits(
-        limits.noise_sigma * inverse_root,
-        limits.threshold * inverse_root,
-        limits.tolerance,
-        limits.sidelobe_neighbour_noise_correlation,
+    brightest_inputs = LeakageInputs(
+        inputs.noise_sigma * inverse_root,
+        inputs.threshold * inverse_root,
+        inputs.tolerance,
+        inputs.sidelobe_neighbour_noise_correlation,
     )
     nyquist_bin, clearance, far_weight = layout.fft_size // 2, layout.clearance_bins, weight_sum
     if lobe_half_width > clearance // 2:  # an echo whose pedestal reaches far
@@ -260,36 +260,36 @@ def detect_with_leakage(
     )
     distance_min = crossing_distance = max(
         falloff_distance_with_images(
-            brightest_limits.threshold, weight_sum, folded_range, envelope, layout
+            brightest_inputs.threshold, weight_sum, folded_range, envelope, layout
         ),
         float(clearance),
     )
-    tolerance_left = limits.tolerance - _far_leakage_bound(
-        far_weight, distance_min, image_distance, brightest_limits, envelope
+    tolerance_left = inputs.tolerance - _far_leakage_bound(
+        far_weight, distance_min, image_distance, brightest_inputs, envelope
     )
     if tolerance_left < 0.0 or crossing_distance > clearance:
-        n_sources = compute_end_strengths_and_far_lines(
-            bundle, float(clearance), FAR_LINE_LOG_ACCURACY, layout, workspace.field
+        n_sources = compute_end_amplitudes_and_far_lines(
+            bundle, float(clearance), FAR_LINE_LOG_ACCURACY, layout, workspace.line_spectrum
         )
         far_weight = far_line_weight(
-            weight_sum, n_sources, layout, workspace.field.far_equivalent_lines
+            weight_sum, n_sources, layout, workspace.line_spectrum.far_equivalent_lines
         )
         crossing_distance = max(
             falloff_distance_with_images(
-                brightest_limits.threshold, far_weight, folded_range, envelope, layout
+                brightest_inputs.threshold, far_weight, folded_range, envelope, layout
             ),
             float(clearance),
         )
         distance_min = min(crossing_distance, float(clearance + nyquist_bin))
-        tolerance_left = limits.tolerance - _far_leakage_bound(
-            far_weight, distance_min, image_distance, brightest_limits, envelope
+        tolerance_left = inputs.tolerance - _far_leakage_bound(
+            far_weight, distance_min, image_distance, brightest_inputs, envelope
         )
         while (
             tolerance_left < 0.0 and distance_min < layout.table_half_width_bins
         ):  # bins of the table take less time than an integral
             distance_min = min(1.25 * distance_min, float(layout.table_half_width_bins))
-            tolerance_left = limits.tolerance - _far_leakage_bound(
-                far_weight, distance_min, image_distance, brightest_limits, envelope
+            tolerance_left = inputs.tolerance - _far_leakage_bound(
+                far_weight, distance_min, image_distance, brightest_inputs, envelope
             )
     # Wide enough if the integral may be left out, else a first guess.
     is_integral_negligible = tolerance_left >= 0.0
@@ -301,7 +301,7 @@ def detect_with_leakage(
         extra_bins = _extra_bins_min(
             far_weight,
             bundle.highest_position - bundle.lowest_position,
-            brightest_limits,
+            brightest_inputs,
             crossing_distance,
             envelope,
             layout,
@@ -328,23 +328,23 @@ def detect_with_leakage(
             workspace,
         )
         peak_index, n_exempt = mark_exempt_bins(
-            span.magnitude, n_bins, limits.threshold, span.is_exempt, lobe_half_width
+            span.magnitude, n_bins, inputs.threshold, span.is_exempt, lobe_half_width
         )
         if is_integral_negligible:
             leakage = 0.0
             if not (
                 tolerance_left > 0.0
-                and _leakage_bound_of_span(n_bins, brightest_limits, span) <= tolerance_left
+                and _leakage_bound_of_span(n_bins, brightest_inputs, span) <= tolerance_left
             ):
                 leakage = _leakage_of_span(
-                    n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates
+                    n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
                 )
             return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, leakage)
         result = _leakage_of_all_bins(
             DetectedSpan(first_bin, n_bins, peak_index, n_exempt, 0.0),
             bundle,
             folded_range,
-            limits,
+            inputs,
             speckle_power_max,
             shape,
             layout,
@@ -359,7 +359,7 @@ def detect_with_leakage(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates):
+def _leakage_of_span(n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates):
     """Return the leakage of the computed bins around the lines, or its mean over speckle.
 
     Leakage is the probability of false alarms due to the echo's signal.
@@ -368,7 +368,7 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
     ----------
     n_bins : int
         Number of computed bins.
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise and threshold.
     speckle_power_max : float
         The mean over developed speckle is taken if it is above 1.
@@ -381,12 +381,12 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
         Crossing rates at the same threshold, used in developed speckle.
     """
     if speckle_power_max > 1.0:
-        return _false_peak_probability_averaged_over_speckle(n_bins, limits, span, speckle_rates)
-    return _false_peak_probability(n_bins, limits, span, crossing_series)
+        return _false_peak_probability_averaged_over_speckle(n_bins, inputs, span, speckle_rates)
+    return _false_peak_probability(n_bins, inputs, span, crossing_series)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def false_peak_probability_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_series):
+def false_peak_probability_of_bins(n_bins, inputs, negligible_signal_ratio, span, crossing_series):
     """Return the probability of a false peak that leaked signal raises in the bins of a span.
 
     A span is the computed bins around a segment's lines. Magnitudes below
@@ -396,8 +396,8 @@ def false_peak_probability_of_bins(n_bins, limits, negligible_signal_ratio, span
     ----------
     n_bins
         Number of bins of the span.
-    limits
-        :class:`LeakageLimits`; the tolerance is not used.
+    inputs
+        :class:`LeakageInputs`; the tolerance is not used.
     negligible_signal_ratio
         |X| over sigma below which a bin counts as noise alone.
     span
@@ -406,13 +406,13 @@ def false_peak_probability_of_bins(n_bins, limits, negligible_signal_ratio, span
         :func:`sweep.model.detection.added_crossings.fill_crossing_series` of the threshold over
         sigma.
     """
-    _clear_negligible_bins(n_bins, limits.noise_sigma, negligible_signal_ratio, span)
-    return _false_peak_probability(n_bins, limits, span, crossing_series)
+    _clear_negligible_bins(n_bins, inputs.noise_sigma, negligible_signal_ratio, span)
+    return _false_peak_probability(n_bins, inputs, span, crossing_series)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def false_peak_probability_of_bins_in_speckle(
-    n_bins, limits, negligible_signal_ratio, span, speckle_rates
+    n_bins, inputs, negligible_signal_ratio, span, speckle_rates
 ):
     """Return the mean of :func:`false_peak_probability_of_bins` over developed speckle.
 
@@ -420,7 +420,7 @@ def false_peak_probability_of_bins_in_speckle(
     ----------
     n_bins : int
         Number of bins of the span, the computed bins around the lines.
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise and threshold; the tolerance is not used.
     negligible_signal_ratio : float
         |X| over sigma below which a bin counts as noise alone. sigma is the noise of a bin per
@@ -430,8 +430,8 @@ def false_peak_probability_of_bins_in_speckle(
     speckle_rates : SpeckleCrossingRates
         Crossing rates at the threshold over sigma, by speckle power.
     """
-    _clear_negligible_bins(n_bins, limits.noise_sigma, negligible_signal_ratio, span)
-    return _false_peak_probability_averaged_over_speckle(n_bins, limits, span, speckle_rates)
+    _clear_negligible_bins(n_bins, inputs.noise_sigma, negligible_signal_ratio, span)
+    return _false_peak_probability_averaged_over_speckle(n_bins, inputs, span, speckle_rates)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -446,40 +446,40 @@ def _clear_negligible_bins(n_bins, noise_sigma, negligible_signal_ratio, span):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _false_peak_probability(n_bins, limits, span, crossing_series):
+def _false_peak_probability(n_bins, inputs, span, crossing_series):
     """Return the probability that leaked signal raises a false peak apart from the echo.
 
     A false peak is a group of adjacent bins above the threshold. The crossing probabilities of the
     bins go to ``span.crossing_probability``.
     """
-    _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
-    exclude_bins_joining_echo(
+    _fill_crossing_probabilities(n_bins, inputs, span, crossing_series)
+    exclude_crossings_joining_echo(
         span.crossing_probability,
         INTEGER_ZERO,
         n_bins,
         span.magnitude,
         span.is_exempt,
-        limits.noise_sigma,
-        limits.threshold,
-        limits.sidelobe_neighbour_noise_correlation,
+        inputs.noise_sigma,
+        inputs.threshold,
+        inputs.sidelobe_neighbour_noise_correlation,
     )
     return any_crossing_probability(span.crossing_probability, INTEGER_ZERO, n_bins)
 
 
 @njit(cache=True, error_model="numpy")
-def _false_peak_probability_averaged_over_speckle(n_bins, limits, span, speckle_rates):
+def _false_peak_probability_averaged_over_speckle(n_bins, inputs, span, speckle_rates):
     """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
     The bins are the computed ones around a segment's lines (a span).
     """
     return _mean_leakage_over_speckle(
-        INTEGER_ZERO, n_bins, limits, span, speckle_rates, np.zeros(N_SPECKLE_POWERS)
+        INTEGER_ZERO, n_bins, inputs, span, speckle_rates, np.zeros(N_SPECKLE_POWERS)
     )
 
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_over_speckle(
-    first_index, end_index, limits, span, speckle_rates, relative_rates_of_far_bins
+    first_index, end_index, inputs, span, speckle_rates, relative_rates_of_far_bins
 ):
     """Return the probability of a false peak due to leaked signal, averaged over speckle.
 
@@ -490,8 +490,8 @@ def _mean_leakage_over_speckle(
     ----------
     first_index, end_index
         First bin of the span that counts, and the bin after the last.
-    limits
-        :class:`LeakageLimits`; the tolerance is not used.
+    inputs
+        :class:`LeakageInputs`; the tolerance is not used.
     span
         :class:`sweep.model.spectrum.bin_spectrum.SpanArrays`.
     speckle_rates
@@ -501,7 +501,7 @@ def _mean_leakage_over_speckle(
         (N_SPECKLE_POWERS,): sum of the crossing rates of the bins beyond the span at each speckle
         power, over this power.
     """
-    noise_sigma, threshold = limits.noise_sigma, limits.threshold
+    noise_sigma, threshold = inputs.noise_sigma, inputs.threshold
     n_listed_max = _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates)
     rate_sums, scale = np.zeros(N_SPECKLE_POWERS), 1.0 / (noise_sigma * noise_sigma)
     # Bins that may join an echo, the echo's bins next to them, and one for all that lie between.
@@ -511,7 +511,7 @@ def _mean_leakage_over_speckle(
     )
     magnitudes, is_echo = np.zeros(n_listed_max), np.zeros(n_listed_max, np.bool_)
     n_listed, is_gap_listed = INTEGER_ZERO, True
-    entry_weights = np.zeros(count_entry_weights(speckle_rates))
+    entry_weights = np.zeros(n_entry_weights(speckle_rates))
     for i in range(first_index, end_index):
         squared_ratio = span.magnitude[i] * span.magnitude[i] * scale
         if span.is_exempt[i]:
@@ -547,7 +547,7 @@ def _mean_leakage_over_speckle(
             for i in range(n_listed):
                 probabilities[i] = -math.expm1(-power * joining_rates[i, power_index])
             root_power = math.sqrt(power)
-            exclude_bins_joining_echo(
+            exclude_crossings_joining_echo(
                 probabilities,
                 INTEGER_ZERO,
                 n_listed,
@@ -555,12 +555,12 @@ def _mean_leakage_over_speckle(
                 is_echo,
                 noise_sigma / root_power,
                 threshold / root_power,
-                limits.sidelobe_neighbour_noise_correlation,
+                inputs.sidelobe_neighbour_noise_correlation,
             )
             for i in range(n_listed):
                 rate += crossing_rate(probabilities[i])
-        log_rates[k] = math.log(min(max(rate, RATE_MIN), CERTAIN_LEAKAGE_RATE))
-    return mean_leakage_in_speckle(log_rates, powers_per_octave)
+        log_rates[k] = math.log(min(max(rate, LEAKAGE_RATE_MIN), CERTAIN_LEAKAGE_RATE))
+    return mean_leakage_from_log_rates(log_rates, powers_per_octave)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -598,7 +598,7 @@ def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, 
     -1.
     """
     n_marked, p_all_cross = 0, 1.0
-    while n_marked < n_bins and p_all_cross > JOINED_PROBABILITY_MIN:
+    while n_marked < n_bins and p_all_cross > ALL_JOIN_PROBABILITY_MIN:
         i = first_index + n_marked * step
         signal_ratio = span.magnitude[i] / noise_sigma
         if n_marked > 0:
@@ -628,7 +628,7 @@ def _harmonic_mean_slope(first, second):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def mean_leakage_in_speckle(log_rates, powers_per_octave):
+def mean_leakage_from_log_rates(log_rates, powers_per_octave):
     """Return the mean leakage over developed speckle, int_0^inf e^-u (1 - exp(-R(u))) du.
 
     Here u is the speckle's power relative to its mean, and R(u) the sum of the bins' false-alarm
@@ -684,7 +684,7 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelope):
+def _far_leakage_bound(weight_sum, distance_min, image_distance, inputs, envelope):
     """Return a bound on the probability of false alarms due to leaked signal far from the lines.
 
     The bins are ``distance_min`` or more bins away from the lines.
@@ -697,8 +697,8 @@ def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelop
         Least distance from the lines [bins].
     image_distance
         Least distance of a bin from an image [bins]; inf if there are no images.
-    limits
-        :class:`LeakageLimits`; the tolerance is not used.
+    inputs
+        :class:`LeakageInputs`; the tolerance is not used.
     envelope
         :class:`sweep.model.spectrum.line_shape.LineEnvelope`.
 
@@ -718,7 +718,7 @@ def _far_leakage_bound(weight_sum, distance_min, image_distance, limits, envelop
     nearest bin has the largest value. All bins together add at most y e^{-y} times this value times
     the sum of x. Images are no nearer to a bin than the lines, nor than ``image_distance`` bins.
     """
-    weight_ratio, b = weight_sum / limits.noise_sigma, limits.threshold / limits.noise_sigma
+    weight_ratio, b = weight_sum / inputs.noise_sigma, inputs.threshold / inputs.noise_sigma
     y = 0.5 * b * b
     far_bounds = _envelope_tail(distance_min, envelope)
     nearest_envelope, square_sum = far_bounds.magnitude, far_bounds.square_sum
@@ -747,14 +747,14 @@ def _envelope_tail(distance_min, envelope):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _leakage_bound_of_span(n_bins, limits, span):
+def _leakage_bound_of_span(n_bins, inputs, span):
     """Return a bound on the leakage of computed bins; inf if a bin is too strong.
 
     Parameters
     ----------
     n_bins : int
         Number of computed bins.
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise and threshold.
     span : SpanArrays
         Magnitudes of the computed bins [V], and which of them belong to the echo.
@@ -775,14 +775,14 @@ def _leakage_bound_of_span(n_bins, limits, span):
         square_sum += magnitude * magnitude
     if not largest > 0.0:
         return 0.0
-    a, b = largest / limits.noise_sigma, limits.threshold / limits.noise_sigma
+    a, b = largest / inputs.noise_sigma, inputs.threshold / inputs.noise_sigma
     if a * a > b * b - 4.0:
         return np.inf
     return 1.2 * square_sum / (largest * largest) * math.exp(-0.5 * (b - a) * (b - a))
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
+def _fill_crossing_probabilities(n_bins, inputs, span, crossing_series):
     """Compute the increase of each bin's crossing probability that signal causes over noise alone.
 
     Bins of the echo are left out. Bins above the threshold, which bright speckle may contain, are
@@ -792,7 +792,7 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
     ----------
     n_bins : int
         Number of computed bins.
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise and threshold.
     span : SpanArrays
         Magnitudes of the computed bins [V], and which of them belong to the echo. The result is
@@ -801,7 +801,7 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
         :func:`sweep.model.detection.added_crossings.fill_crossing_series` of the threshold over
         sigma, the noise of a bin per quadrature.
     """
-    noise_sigma, threshold = limits.noise_sigma, limits.threshold
+    noise_sigma, threshold = inputs.noise_sigma, inputs.threshold
     threshold_ratio, scale = threshold / noise_sigma, 0.5 / (noise_sigma * noise_sigma)
     any_above = False
     for i in range(n_bins):
@@ -809,7 +809,7 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
         any_above |= is_above
         half_square = span.magnitude[i] * span.magnitude[i] * scale
         span.half_square[i] = 0.0 if span.is_exempt[i] or is_above else half_square
-    fill_added_crossings(
+    fill_added_crossing_probabilities(
         span.half_square, n_bins, threshold_ratio, crossing_series, span.crossing_probability
     )
     if any_above:
@@ -824,7 +824,7 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope, layout):
+def _extra_bins_min(weight_sum, line_extent, inputs, crossing_distance, envelope, layout):
     """Return the number of bins to compute one by one beyond the clearance from the lines.
 
     The leakage integral covers the bins beyond them. The number is a heuristic, and a multiple of
@@ -836,7 +836,7 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
         Sum of the magnitudes of the lines' weights as seen from far bins [V].
     line_extent : float
         Distance of the highest from the lowest line [bins]; 3/4 of it are computed.
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise and threshold, of the brightest speckle.
     crossing_distance : float
         Distance from the lines up to which signal alone may cross the threshold [bins].
@@ -846,9 +846,9 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
         Sizes of the spectrum; it has the clearance from the lines [bins].
     """
     clearance = layout.clearance_bins
-    edge_signal = envelope.magnitude[clearance] * weight_sum / limits.noise_sigma
+    edge_signal = envelope.magnitude[clearance] * weight_sum / inputs.noise_sigma
     smooth_distance = 4.0 + 1.5 * math.sqrt(
-        edge_signal * clearance * limits.threshold / limits.noise_sigma
+        edge_signal * clearance * inputs.threshold / inputs.noise_sigma
     )
     distance_min = max(crossing_distance, max(smooth_distance, 0.75 * line_extent)) - clearance
     return int(
@@ -864,7 +864,7 @@ def _leakage_of_all_bins(
     detected,
     bundle,
     folded_range,
-    limits,
+    inputs,
     speckle_power_max,
     shape,
     layout,
@@ -883,10 +883,10 @@ def _leakage_of_all_bins(
     detected : DetectedSpan
         Computed bins around the lines, whose magnitudes are in ``workspace.span``.
     bundle : LineBundle
-        Number, range and total weight of the lines, which are in ``workspace.field.lines``.
+        Number, range and total weight of the lines, which are in ``workspace.line_spectrum.lines``.
     folded_range : FoldedLineRange
         Range of the lines after negative frequencies are folded at DC [bins].
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise, threshold and tolerated leakage.
     speckle_power_max : float
         SPECKLE_POWER_MAX if the echo is in developed speckle, else 1.
@@ -912,18 +912,18 @@ def _leakage_of_all_bins(
     """
     span, integral = workspace.span, workspace.leakage_quadrature
     first_bin, n_bins, peak_index = detected.first_bin, detected.n_bins, detected.peak_index
-    noise_sigma, threshold = limits.noise_sigma, limits.threshold
+    noise_sigma, threshold = inputs.noise_sigma, inputs.threshold
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     threshold_ratio, scale = threshold / noise_sigma, 0.5 / (noise_sigma * noise_sigma)
     goes_on_below, goes_on_above = first_bin > 0, first_bin + n_bins - 1 < nyquist_bin
     if not goes_on_below and not goes_on_above:
         return LeakageResult(
             _leakage_of_span(
-                n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates
+                n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
             ),
             True,
         )
-    _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
+    _fill_crossing_probabilities(n_bins, inputs, span, crossing_series)
     centre_bin = abs(
         math.floor(0.5 * (folded_range.lowest_position + folded_range.highest_position) + 0.5)
     )
@@ -957,7 +957,7 @@ def _leakage_of_all_bins(
         INTEGRAL_END_CORRECTION_BINS if goes_on_below else INTEGER_ZERO,
         n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
-    exclude_bins_joining_echo(
+    exclude_crossings_joining_echo(
         span.crossing_probability,
         first_index,
         end_index,
@@ -965,7 +965,7 @@ def _leakage_of_all_bins(
         span.is_exempt,
         noise_sigma,
         threshold,
-        limits.sidelobe_neighbour_noise_correlation,
+        inputs.sidelobe_neighbour_noise_correlation,
     )
     span_leakage = any_crossing_probability(span.crossing_probability, first_index, end_index)
     while n_points % 8:  # whole vectors: a remainder takes as long
@@ -979,7 +979,7 @@ def _leakage_of_all_bins(
         integral.cotangent[i] = 1.0 / cotangent
     log_accuracy = min(
         max(
-            math.log(200.0 * threshold_ratio * threshold_ratio / max(limits.tolerance, 1e-300)),
+            math.log(200.0 * threshold_ratio * threshold_ratio / max(inputs.tolerance, 1e-300)),
             4.0,
         ),
         FAR_LINE_LOG_ACCURACY,
@@ -992,7 +992,7 @@ def _leakage_of_all_bins(
         integral.half_square[i] *= scale
         span.half_square[i] = integral.half_square[i]
     largest_far_half_square = largest_or_zero(integral.half_square[:n_points])
-    fill_added_crossings(
+    fill_added_crossing_probabilities(
         span.half_square, n_points, threshold_ratio, crossing_series, span.crossing_probability
     )
     far_rate += weighted_crossing_rate(
@@ -1012,7 +1012,7 @@ def _leakage_of_all_bins(
             _mean_leakage_of_all_bins(
                 n_bins,
                 n_points,
-                limits,
+                inputs,
                 goes_on_below,
                 goes_on_above,
                 span,
@@ -1026,7 +1026,7 @@ def _leakage_of_all_bins(
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_of_all_bins(
-    n_bins, n_points, limits, goes_on_below, goes_on_above, span, integral, speckle_rates
+    n_bins, n_points, inputs, goes_on_below, goes_on_above, span, integral, speckle_rates
 ):
     """Return the mean leakage over developed speckle of computed bins and of the integral's bins.
 
@@ -1038,7 +1038,7 @@ def _mean_leakage_of_all_bins(
         Number of computed bins.
     n_points : int
         Number of quadrature points of the integral.
-    limits : LeakageLimits
+    inputs : LeakageInputs
         Noise and threshold.
     goes_on_below, goes_on_above : bool
         True if the integral has bins below or above the computed ones.
@@ -1051,7 +1051,7 @@ def _mean_leakage_of_all_bins(
         Crossing rates at the threshold over sigma, by speckle power.
     """
     relative_rates_of_far_bins = np.zeros(N_SPECKLE_POWERS)
-    scale = 1.0 / (limits.noise_sigma * limits.noise_sigma)
+    scale = 1.0 / (inputs.noise_sigma * inputs.noise_sigma)
     for side in (-1, 1):
         if not (goes_on_below if side < 0 else goes_on_above):
             continue
@@ -1078,7 +1078,7 @@ def _mean_leakage_of_all_bins(
         n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
     return _mean_leakage_over_speckle(
-        first_index, end_index, limits, span, speckle_rates, relative_rates_of_far_bins
+        first_index, end_index, inputs, span, speckle_rates, relative_rates_of_far_bins
     )
 
 
@@ -1109,7 +1109,7 @@ def _fill_far_powers(
     centre_bin : int
         Bin in the middle of the lines, 0 .. N/2, from which the distance q [bins] of points counts.
     bundle : LineBundle
-        Number, range and total weight of the lines, which are in ``workspace.field.lines``.
+        Number, range and total weight of the lines, which are in ``workspace.line_spectrum.lines``.
     log_accuracy : float
         -ln of the relative error.
     shape : LineShape
@@ -1122,8 +1122,8 @@ def _fill_far_powers(
         Lines and scratch arrays. ``leakage_quadrature.cotangent`` contains tan(pi q / N) of each
         point. The result is ``leakage_quadrature.half_square``, |X|^2 [V^2].
     """
-    field, integral = workspace.field, workspace.leakage_quadrature
-    far_bins = field.far_bins
+    line_spectrum, integral = workspace.line_spectrum, workspace.leakage_quadrature
+    far_bins = line_spectrum.far_bins
     is_mirror_image = is_mirrored(
         bundle.origin_bin, bundle.lowest_position, bundle.highest_position, layout.spectrum_type
     )
@@ -1139,30 +1139,30 @@ def _fill_far_powers(
                 direction * (tangent + tangent_shift) / (1.0 - tangent * tangent_shift)
             )
             far_bins.phasor_re[i], far_bins.phasor_im[i] = 1.0, 0.0
-            field.re[i], field.im[i] = 0.0, 0.0
+            line_spectrum.re[i], line_spectrum.im[i] = 0.0, 0.0
         distance_min = float(layout.clearance_bins)
         if image_pass == 1:  # images are as far from DC and Nyquist as the lines
             edge_distance = min(centre_bin, layout.fft_size // 2 - centre_bin) - 0.5 * (
                 bundle.highest_position - bundle.lowest_position
             )
             distance_min = max(distance_min, edge_distance - 2.0)
-        n_sources = compute_end_strengths_and_far_lines(
-            bundle, distance_min, log_accuracy, layout, field
+        n_sources = compute_end_amplitudes_and_far_lines(
+            bundle, distance_min, log_accuracy, layout, line_spectrum
         )
         for source in range(n_sources):
             add_line_by_record_ends(
                 INTEGER_ZERO,
                 n_points,
                 INTEGER_ZERO,
-                field.far_equivalent_lines,
+                line_spectrum.far_equivalent_lines,
                 source,
                 log_accuracy + FAR_LINE_EXTRA_LOG_ACCURACY,
                 shape.end_polynomials,
                 layout,
-                field,
+                line_spectrum,
             )
         for i in range(n_points):
-            re, im = field.re[i], direction * field.im[i]
+            re, im = line_spectrum.re[i], direction * line_spectrum.im[i]
             integral.re[i] = re if image_pass == 0 else integral.re[i] + re
             integral.im[i] = im if image_pass == 0 else integral.im[i] + im
     for i in range(n_points):

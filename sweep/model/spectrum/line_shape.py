@@ -92,7 +92,7 @@ LINE_SHAPE_TIERS = (
 """Sizes of line-shape tables, from few modes to many. A line shape uses the first tier with enough
 modes."""
 
-SHARED_TABLE_BINS = 256
+SHARED_TABLE_HALF_WIDTH_BINS = 256
 """Half-width [bins of fs/L, L samples] of a line-shape table that many points share. It is wide
 enough for wide footprints."""
 
@@ -327,7 +327,7 @@ def line_shape_tables(
         True if many points share a shape, which then has a wide table.
     """
     n_modes, clearance_bins, table_half_width = LINE_SHAPE_TIERS[tier]
-    table_half_width = SHARED_TABLE_BINS if shared else table_half_width
+    table_half_width = SHARED_TABLE_HALF_WIDTH_BINS if shared else table_half_width
     ratio, length = window.length / fft_size, window.length
     table_half_width_bins = math.ceil(table_half_width / ratio)
     cell_density, cell_distances = (

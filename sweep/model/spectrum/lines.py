@@ -21,7 +21,7 @@ from scipy.special import gammaln
 from sweep.kernel_cache import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.elementary_functions import (
-    exact_quotient,
+    double_double_quotient,
     fraction_of_cycle,
     product_cycle_fraction,
     sincos_cycles,
@@ -191,7 +191,7 @@ class PointParameters(NamedTuple):
     """Detection threshold on a bin's magnitude [V, summed over the record]."""
     negligible_signal_ratio: np.ndarray
     """Signal magnitude over ``noise_sigma`` below which a bin counts as noise alone."""
-    line_noise: np.ndarray
+    line_noise_sigma: np.ndarray
     """Noise standard deviation per quadrature in bins that contain lines [V, summed over the
     record]. It includes the part of the laser's phase-noise pedestal that changes the magnitude.
     """
@@ -203,7 +203,7 @@ class PointParameters(NamedTuple):
     image_gain: np.ndarray
     """Amplitude of the image that I/Q imbalance makes of a line, over that of the line; 0 if there
     is no image."""
-    side_noise: np.ndarray
+    side_noise_sigma: np.ndarray
     """Noise standard deviation per quadrature in bins next to the lines [V, summed over the
     record]. It includes the whole phase-noise pedestal of the laser.
     """
@@ -213,7 +213,7 @@ class PointParameters(NamedTuple):
     """
     pedestal_line_width_bins: np.ndarray
     """Line width of the laser [FFT bins]."""
-    pedestal_delay: np.ndarray
+    pedestal_delay_times_bin_width: np.ndarray
     """Delay of the echo, at most the duration of the record [N/fs, FFT size over sample rate]."""
 
 
@@ -384,7 +384,9 @@ def compute_lines(
     centre_offset = centre_position - folding_shift - origin_bin
     pole_product = 1.0 / (beat.detector_bandwidth * beat.amplifier_bandwidth)
     pole_sum = 1.0 / beat.detector_bandwidth + 1.0 / beat.amplifier_bandwidth
-    cycles_per_metre_high, cycles_per_metre_low = exact_quotient(2.0 * beat.carrier, SPEED_OF_LIGHT)
+    cycles_per_metre_high, cycles_per_metre_low = double_double_quotient(
+        2.0 * beat.carrier, SPEED_OF_LIGHT
+    )
     axis_phase = -product_cycle_fraction(
         cycles_per_metre_high, cycles_per_metre_low, beat.range
     ) + fraction_of_cycle(centre_frequency * beat.record_start)
@@ -557,7 +559,7 @@ def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def count_nodes(phase_span, tolerance, phase_limits):
+def n_required_nodes(phase_span, tolerance, phase_limits):
     """Return the number of equivalent lines that represent a group of lines to a tolerance.
 
     ``phase_span`` is pi h [rad] of lines within +-h bins of fs/L; 2 pi h if powers add.

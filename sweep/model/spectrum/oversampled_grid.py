@@ -198,7 +198,7 @@ def grid_magnitudes(
             holds_all_bins=False,
             clearance_bins=0,
         ),
-        shots.images.are_summed,
+        shots.line_images.are_summed,
         np.array(
             [
                 1 / np.prod(np.delete(node - polynomial_nodes, node_number))

@@ -115,13 +115,13 @@ def line_of_point(
         amplifier_bandwidth,
         acquisition_delay,
     ) = (float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in shot_columns)
-    beat_frequency = -shots.waveform_segments[segment].chirp_slope * chirp_rate * delay
+    beat_frequency = -shots.waveform_segments[segment].chirp_rate_ratio * chirp_rate * delay
     transfer_gain = receiver_chain.receiver_transfer(
         np.array(beat_frequency),
         detector_bandwidth=np.array(detector_bandwidth),
         amplifier_bandwidth=np.array(amplifier_bandwidth),
     )
-    whitened = shots.whitening_gain_at(
+    whitened = shots.whitening_gain_at_frequency(
         np.array(beat_frequency), None if noise_frequency is None else np.array(noise_frequency)
     )
     whitening_gain = float(np.broadcast_to(whitened, shots.size)[i])
@@ -340,7 +340,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
         magnitudes[bin_slice] = equivalent_magnitudes
         peak_is_masked[segment_index, i] = is_masked[bins[peak]]
         n_exempt[segment_index, i] += np.count_nonzero(is_masked & is_searched)
-        if shots.waveform_segments[segment_index].includes_leakage:
+        if shots.waveform_segments[segment_index].evaluates_leakage:
             alarm_probability = line_alarm_probability(
                 shots.looks,
                 line,

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 
 from sweep.model.shot_settings import RecordSettings, WaveformSettings
 from sweep.model.waveform import (
-    SEARCH_RANGE_PATHS,
-    SEARCH_VELOCITY_PATHS,
+    SEARCH_RANGE_LIMIT_PATHS,
+    SEARCH_VELOCITY_LIMIT_PATHS,
     SEGMENT_NAMES,
     beat_frequency,
     fold_frequency,
@@ -54,7 +54,7 @@ def search_band_start_and_size(
         are 0 .. N/2, or -N/2 .. N/2 - 1 of a complex record. Without ``n_points``, the last
         dimensions are those of the parameters.
     """
-    if SEARCH_RANGE_PATHS[0] not in parameters:
+    if SEARCH_RANGE_LIMIT_PATHS[0] not in parameters:
         return None
     beats = [
         beat_frequency(
@@ -65,9 +65,9 @@ def search_band_start_and_size(
             radial_velocity=np.asarray(parameters[velocity_path], float),
         )
         / record.bin_width
-        for slope, carrier in zip(waveform.chirp_slopes, waveform.carriers, strict=True)
-        for range_path in SEARCH_RANGE_PATHS
-        for velocity_path in SEARCH_VELOCITY_PATHS
+        for slope, carrier in zip(waveform.chirp_rate_ratios, waveform.carriers, strict=True)
+        for range_path in SEARCH_RANGE_LIMIT_PATHS
+        for velocity_path in SEARCH_VELOCITY_LIMIT_PATHS
     ]
     beats_by_segment = np.split(np.array(np.broadcast_arrays(*beats)), len(SEGMENT_NAMES))
     band_bins = np.array(

@@ -13,7 +13,7 @@ from sweep.kernel_cache import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.added_crossings import (
     any_crossing_probability,
-    exclude_bins_joining_echo,
+    exclude_crossings_joining_echo,
 )
 from sweep.model.detection.echo_detection import (
     EchoSpans,
@@ -86,7 +86,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     )
     evaluates_leakage = np.array(
         [
-            shots.detection_settings.includes_leakage and segment.includes_leakage
+            shots.detection_settings.includes_leakage and segment.evaluates_leakage
             for segment in shots.waveform_segments
         ]
     )
@@ -146,8 +146,8 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
         range_beat = axis_range_beat * relative_range - hertz_per_metre * (
             by_point(segment.range_decrease_since_shot_start) + range_drift
         )
-        beat = by_point(segment.carrier) * beta - segment.chirp_slope * range_beat * (1 + beta)
-        beat += by_point(shots.mid_record_drifts[s])
+        beat = by_point(segment.carrier) * beta - segment.chirp_rate_ratio * range_beat * (1 + beta)
+        beat += by_point(shots.mid_record_frequency_drifts[s])
         positions[:, s] = _fold_to_bins(shots, beat / by_point(shots.sample_rate))
     return positions
 
@@ -180,7 +180,9 @@ def axis_line_positions(shots: Any) -> np.ndarray:
     """Return the positions [FFT bins] of the lines on the beam's axis, (segments, n)."""
     cycles_per_sample = [
         (beat + drift) / shots.sample_rate
-        for beat, drift in zip(shots.beat_frequencies, shots.mid_record_drifts, strict=True)
+        for beat, drift in zip(
+            shots.beat_frequencies, shots.mid_record_frequency_drifts, strict=True
+        )
     ]
     return np.array(
         [np.broadcast_to(_fold_to_bins(shots, cycles), shots.size) for cycles in cycles_per_sample]
@@ -323,7 +325,7 @@ def _restrict_spans(
                     magnitudes,
                     is_exempt,
                     threshold,
-                    bin_threshold.noise_without_pedestal,
+                    bin_threshold.noise_sigma_without_pedestal,
                     negligible_signal_ratio[j],
                     threshold,
                     rule.sidelobe_neighbour_noise_correlation,
@@ -417,7 +419,7 @@ def span_leakage_probability(
             probabilities[k] = (
                 marcum_q1_excess(magnitudes[k] / noise_sigma, threshold_ratio) / p_noise_stay
             )
-    exclude_bins_joining_echo(
+    exclude_crossings_joining_echo(
         probabilities,
         0,
         magnitudes.size,

@@ -16,7 +16,7 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.added_crossings import (
     SERIES_TERMS_MAX,
     any_crossing_probability,
-    exclude_bins_joining_echo,
+    exclude_crossings_joining_echo,
     fill_crossing_series,
 )
 from sweep.model.detection.detection_probability import (
@@ -26,17 +26,17 @@ from sweep.model.detection.echo_detection import (
     BinThreshold,
     DetectionRule,
     PedestalShape,
-    any_crossing_of_chain,
+    any_crossing_probability_in_chain,
     clear_image_exemptions,
 )
-from sweep.model.detection.looks import DRIFT_POSITIONS_MAX
+from sweep.model.detection.looks import N_DRIFT_POSITIONS_MAX
 from sweep.model.detection.speckle_crossing_rates import (
     RateTableGrid,
     allocate_rate_table,
     fill_rate_table,
     rate_table,
 )
-from sweep.model.ground import distinct_rows
+from sweep.model.ground import find_distinct_rows
 from sweep.model.laser_line import gaussian_frequency_shifts
 from sweep.model.preparation import LINE_APPROXIMATIONS_MAX, Shots
 from sweep.model.spectrum import line_shape
@@ -49,7 +49,7 @@ from sweep.model.spectrum.bin_spectrum import (
 from sweep.model.spectrum.leakage import (
     GAUSS_POINTS_MAX,
     SPECKLE_POWER_MAX,
-    LeakageLimits,
+    LeakageInputs,
     detect_with_leakage,
     false_peak_probability_of_bins,
     false_peak_probability_of_bins_in_speckle,
@@ -70,8 +70,8 @@ from sweep.model.spectrum.lines import (
     allowed_relative_error,
     beat_parameters_at,
     compute_lines,
-    count_nodes,
     fold_lines,
+    n_required_nodes,
     node_phase_limits,
     replace_lines_by_nodes,
     summarise_lines,
@@ -380,7 +380,7 @@ def _apply_looks_to_leakage(shots: Shots, spans: BinSpans) -> BinSpans:
     for s, column in (
         np.argwhere(spans.n_bins > 0) if shots.detection_settings.includes_leakage else ()
     ):
-        if not shots.waveform_segments[s].includes_leakage:
+        if not shots.waveform_segments[s].evaluates_leakage:
             continue
         span_slice = slice(
             spans.span_start[s, column], spans.span_start[s, column] + spans.n_bins[s, column]
@@ -415,7 +415,7 @@ def _apply_looks_to_leakage(shots: Shots, spans: BinSpans) -> BinSpans:
         for root_power, weight, probabilities in zip(
             root_powers, weights, crossing_probabilities, strict=True
         ):
-            exclude_bins_joining_echo(
+            exclude_crossings_joining_echo(
                 probabilities,
                 0,
                 probabilities.size,
@@ -495,7 +495,7 @@ def spectrum_type(shots: Shots) -> int:
         COMPLEX_RECORD
         if shots.complex_record
         else REAL_WITH_IMAGES
-        if shots.images.are_summed
+        if shots.line_images.are_summed
         else REAL_WITHOUT_IMAGES
     )
 
@@ -508,7 +508,7 @@ def _leakage_method(shots: Shots, group: LineShapeGroup, bin_by_bin: bool) -> in
     layout = group.tables.layout
     if not shots.detection_settings.includes_leakage:
         return NO_LEAKAGE
-    is_averaged = shots.laser_line.gaussian_width is not None and not shots.footprint.adds_powers
+    is_averaged = shots.laser_line.gaussian_fwhm is not None and not shots.footprint.adds_powers
     is_averaged |= (
         shots.looks.is_noncoherent
         or bin_by_bin
@@ -533,7 +533,7 @@ def _iter_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[LineSh
     window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     has_modes = line_shape.window_has_modes(window, fft_size)
     segments = len(shots.waveform_segments)
-    lines_stand_still = shots.laser_line.gaussian_width is None and not np.any(
+    lines_stand_still = shots.laser_line.gaussian_fwhm is None and not np.any(
         shots.motion.line_drift_per_look
     )
     has_few_shapes = lines_stand_still and (
@@ -750,7 +750,7 @@ def _find_distinct_line_shapes(shots: Shots, batch: np.ndarray) -> DistinctLineS
         return DistinctLineShapes(batch[:1], np.zeros(batch.size, np.int64))
     if not shots.echo_record.shares_phase_errors:
         return DistinctLineShapes(batch, np.arange(batch.size))
-    first_of_shape, line_shape_index = distinct_rows([first_varying, *varying])
+    first_of_shape, line_shape_index = find_distinct_rows([first_varying, *varying])
     return DistinctLineShapes(batch[first_of_shape], line_shape_index)
 
 
@@ -764,8 +764,10 @@ def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray
     for segment in np.flatnonzero(shots.has_segment):
         for error in shots.echo_record.phase_errors:
             arguments = error.select_arguments(int(segment), points)
-            phase[segment] += error.phase(
-                record_positions, sign=shots.waveform_segments[segment].chirp_slope, **arguments
+            phase[segment] += error.phase_function(
+                record_positions,
+                sign=shots.waveform_segments[segment].chirp_rate_ratio,
+                **arguments,
             )
     return phase
 
@@ -822,7 +824,7 @@ def _evaluate_batch(
         EvaluationSettings(
             segment_exists=shots.has_segment,
             leakage_methods=np.array(
-                [leakage_method * segment.includes_leakage for segment in shots.waveform_segments]
+                [leakage_method * segment.evaluates_leakage for segment in shots.waveform_segments]
             ),
             window_sum=shots.window.sum,
             detection_rule=shots.detection_rule,
@@ -876,15 +878,15 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
     drift of lines over looks. Shifts of weight 0 are the last ones.
     """
     segments = len(shots.waveform_segments)
-    if shots.laser_line.gaussian_width is None:
+    if shots.laser_line.gaussian_fwhm is None:
         offset_rows, weight_rows = np.empty((points.size, 0)), np.empty((points.size, 0))
     else:
         duration = np.broadcast_to(shots.record.duration, shots.size)[points]
         shifts = gaussian_frequency_shifts(
-            fwhm=shots.laser_line.gaussian_width[points], duration=duration
+            fwhm=shots.laser_line.gaussian_fwhm[points], duration=duration
         )
         padding_factor = shots.fft_size / shots.window.length
-        offset_rows, weight_rows = padding_factor * shifts.offset_window_bins, shifts.weight
+        offset_rows, weight_rows = padding_factor * shifts.shift_window_bins, shifts.weight
         # A point has shifts of weight 0 if another point has a wider line.
         order = np.argsort(weight_rows == 0, axis=1, kind="stable")
         offset_rows, weight_rows = (
@@ -900,7 +902,7 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
         offset, weight = np.zeros((*drift.shape, 1)), np.ones((*drift.shape, 1))
     # Looks that follow each other closely are replaced by a few with the same mean square.
     n_looks = shots.looks.number
-    n_positions = min(n_looks, DRIFT_POSITIONS_MAX)
+    n_positions = min(n_looks, N_DRIFT_POSITIONS_MAX)
     positions = (np.arange(n_positions) - (n_positions - 1) / 2) * math.sqrt(
         (n_looks**2 - 1) / (n_positions**2 - 1)
     )
@@ -982,14 +984,18 @@ def _compute_equivalent_lines(
         :class:`sweep.model.spectrum.lines.SpectrumLayout`.
     workspace
         :class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`; the lines go to
-        ``field.lines``.
+        ``line_spectrum.lines``.
 
     Returns
     -------
     LineBundle
         Number, extent and weight of the lines.
     """
-    lines, nodes, scratch = workspace.field.lines, workspace.nodes, workspace.field.line_scratch
+    lines, nodes, scratch = (
+        workspace.line_spectrum.lines,
+        workspace.nodes,
+        workspace.line_spectrum.line_scratch,
+    )
     adds_powers = layout.adds_powers
     origin_bin = compute_lines(
         beat,
@@ -1025,7 +1031,7 @@ def _compute_equivalent_lines(
             phase_per_bin = (
                 np.pi * layout.record_length / layout.fft_size * (2.0 if adds_powers else 1.0)
             )
-            n_nodes = count_nodes(phase_per_bin * half_width, error_allowed, phase_limits)
+            n_nodes = n_required_nodes(phase_per_bin * half_width, error_allowed, phase_limits)
             if 4 * n_nodes < 3 * n_lines and n_nodes <= NODES_MAX:
                 middle = 0.5 * (summary.lowest_position + summary.highest_position)
                 n_lines = replace_lines_by_nodes(
@@ -1189,17 +1195,17 @@ def _evaluate_segment(
         parameters.line_error_tolerance[point] * noise_sigma / LINE_APPROXIMATIONS_MAX
     )
     bin_threshold = BinThreshold(
-        parameters.line_noise[point],
+        parameters.line_noise_sigma[point],
         threshold,
         noise_sigma,
-        parameters.side_noise[point],
+        parameters.side_noise_sigma[point],
         PedestalShape(
             parameters.pedestal_reach_bins[point],
             parameters.pedestal_line_width_bins[point],
-            parameters.pedestal_delay[point],
+            parameters.pedestal_delay_times_bin_width[point],
         ),
     )
-    limits = LeakageLimits(
+    inputs = LeakageInputs(
         noise_sigma,
         threshold,
         parameters.leakage_tolerance[point],
@@ -1239,7 +1245,7 @@ def _evaluate_segment(
         detected = detect_with_leakage(
             bundle,
             bin_error_allowed,
-            limits,
+            inputs,
             SPECKLE_POWER_MAX if rule.in_speckle else 1.0,
             lobe_half_width,
             shape,
@@ -1281,17 +1287,17 @@ def _evaluate_segment(
         if rule.in_speckle:
             leakage = false_peak_probability_of_bins_in_speckle(
                 n_bins,
-                limits,
+                inputs,
                 negligible_signal_ratio / math.sqrt(SPECKLE_POWER_MAX),
                 span,
                 speckle_rates,
             )
         else:
             leakage = false_peak_probability_of_bins(
-                n_bins, limits, negligible_signal_ratio, span, crossing_series
+                n_bins, inputs, negligible_signal_ratio, span, crossing_series
             )
             if image_gain > 0.0 and rule.neighbour_crossing_quadrature.sine.size > 0:
-                leakage = any_crossing_of_chain(
+                leakage = any_crossing_probability_in_chain(
                     span.crossing_probability, n_bins, rule.neighbour_crossing_quadrature
                 )
     if layout.spectrum_type == COMPLEX_RECORD:  # no bin of a span is below 0

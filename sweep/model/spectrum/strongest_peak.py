@@ -33,14 +33,14 @@ from sweep.model.detection import bin_noise
 from sweep.model.detection.detection_probability import (
     StrongestPeakProbabilities,
     joint_detection_probability,
-    pd_decrease,
-    strongest_peak_of_segments,
-    strongest_peak_of_shot,
+    pd_decrease_with_threshold,
+    segment_strongest_peak_probabilities,
+    shot_strongest_peak_probabilities,
 )
 from sweep.model.detection.echo_detection import (
     BinThreshold,
-    Detection,
     EchoBins,
+    PdAndMiss,
     bin_speckle_at,
     bin_threshold_at,
     pd_and_miss,
@@ -146,7 +146,7 @@ def strongest_peak_probabilities(
         pd_loss[:, spans.point_numbers] = probabilities.pd_loss
         p_alarm[:, spans.point_numbers] = probabilities.p_alarm
         shared_speckle_gain[spans.point_numbers] = probabilities.shared_speckle_gain
-    segments = strongest_peak_of_segments(pd, miss, pd_loss, p_alarm)
+    segments = segment_strongest_peak_probabilities(pd, miss, pd_loss, p_alarm)
     speckle_covariance = None
     if shots.speckle.segment_correlations is not None:
         speckle_covariance = (
@@ -155,7 +155,7 @@ def strongest_peak_probabilities(
         )
     return StrongestPeakResults(
         segments,
-        strongest_peak_of_shot(
+        shot_strongest_peak_probabilities(
             segments,
             p_alarm,
             shared_speckle_gain=shared_speckle_gain,
@@ -249,8 +249,8 @@ def _noise_exponents(shots: Shots, spans: BinSpans, half_squares: np.ndarray) ->
     same shape.
     """
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)[..., None]
-    if shots.detection_settings.noise_bins == "correlated":
-        n_bins = bin_noise.alarm_equivalent_bins(
+    if shots.detection_settings.noise_bin_model == "correlated":
+        n_bins = bin_noise.n_alarm_equivalent_bins(
             n_bins,
             threshold_ratio=np.sqrt(2 * half_squares),
             correlation=shots.noise_bin_correlation,
@@ -351,7 +351,7 @@ def _evaluate_levels(
             magnitudes = spans.magnitudes[span_begin : span_begin + n_bins]
             is_echo = spans.is_exempt[span_begin : span_begin + n_bins]
             at_threshold, bin_threshold = (
-                Detection(0.0, 1.0),
+                PdAndMiss(0.0, 1.0),
                 bin_threshold_at(bin_thresholds, j),
             )
             for k in range(levels.shape[2]):
@@ -362,23 +362,23 @@ def _evaluate_levels(
                         spans.peak_index[s, j],
                         rule,
                         BinThreshold(
-                            bin_threshold.line_noise,
+                            bin_threshold.line_noise_sigma,
                             level,
-                            bin_threshold.noise_without_pedestal,
-                            bin_threshold.side_noise,
+                            bin_threshold.noise_sigma_without_pedestal,
+                            bin_threshold.side_noise_sigma,
                             bin_threshold.pedestal,
                         ),
                         bin_speckle_at(speckle_table, s, spans.point_numbers[j]),
                     )
                     if k == THRESHOLD_LEVEL_INDEX:
                         at_threshold = at_level
-                    pd_loss[s, j, k] = pd_decrease(at_threshold, at_level)
+                    pd_loss[s, j, k] = pd_decrease_with_threshold(at_threshold, at_level)
                 if includes_leakage:
                     p_leak = span_leakage_probability(
                         magnitudes,
                         is_echo,
                         level,
-                        bin_threshold.noise_without_pedestal,
+                        bin_threshold.noise_sigma_without_pedestal,
                         negligible_signal_ratio[j],
                         levels[s, j, THRESHOLD_LEVEL_INDEX],
                         rule.sidelobe_neighbour_noise_correlation,

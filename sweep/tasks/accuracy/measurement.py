@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from sweep.messages import option_name, option_text
-from sweep.model import VERSION
+from sweep.model import MODEL_VERSION
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
 from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
     REFERENCE_KIND,
-    THESIS_KIND,
+    THESIS_METHOD_KIND,
 )
 from sweep.storage.locations import Location, can_create_store, resolve_links
 from sweep.tasks.accuracy.settings import (
@@ -51,8 +51,8 @@ from sweep.tasks.engine.blocks import ArrayLayout
 from sweep.tasks.engine.interrupts import InterruptHandler
 from sweep.tasks.engine.progress import (
     Progress,
+    RunRequestError,
     StoreError,
-    TaskError,
     make_progress,
     show_activity,
 )
@@ -154,13 +154,13 @@ def measure_accuracy(
     ------
     StoreError
         If a store is in the way or can't be written.
-    TaskError
+    RunRequestError
         If the study draws whole spectra.
     SceneError
         If a file of a scene is missing, changed or invalid.
     """
     if spec.draws.draws_whole_spectra:
-        raise TaskError(
+        raise RunRequestError(
             "this study draws whole spectra, which have no settings to try: "
             "leave out draws.method, detector and estimator"
         )
@@ -196,7 +196,7 @@ def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
         )
     if not overwrite:
         raise StoreError(f"{store_path} is there already: {option_text('overwrite')} measures anew")
-    study_store.refuse_to_replace(store_path)
+    study_store.refuse_irreplaceable_store(store_path)
     study_store.refuse_foreign_files(store_path)
 
 
@@ -208,7 +208,7 @@ def measure_storing_seconds(study: BlockStudy) -> float:
             [region_slice.stop - region_slice.start for region_slice in region],
             study.output_layout_by_name[name].dtype,
         )
-        for name, region in study.chunk_regions(block).items()
+        for name, region in study.chunk_regions_of_block(block).items()
     }
     time_trials = partial(timeit.repeat, timer=process_time, repeat=STORING_TIME_REPEATS, number=1)
     with tempfile.TemporaryDirectory() as folder:
@@ -581,7 +581,7 @@ class AccuracyStoreTemplate:
     @property
     def model_version(self) -> str:
         """Version of the simulation model with which the accuracy was measured."""
-        return VERSION
+        return MODEL_VERSION
 
     @property
     def id(self) -> str:
@@ -597,7 +597,7 @@ class AccuracyStoreTemplate:
         thesis_beamlets = [
             trial.results.n_beamlets
             for setting, trial in settings_and_trials
-            if setting.kind == THESIS_KIND
+            if setting.kind == THESIS_METHOD_KIND
         ]
         attributes: dict[str, Any] = {
             "kind": store_format.ACCURACY_STORE_KIND,

@@ -18,16 +18,16 @@ from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
     AS_WRITTEN_KIND,
+    BEAMLET_LATTICE_KIND,
     BEAMLET_ROW_KIND,
-    BEAMLETS_KIND,
     CLOSED_FORM_KIND,
-    COUNTED_DRAWS_KIND,
-    DRAWS_IN_NOISE_KIND,
+    COUNTED_DETECTIONS_IN_NOISE_KIND,
+    COUNTED_DETECTIONS_KIND,
     FIXED_EFFECTS_KIND,
-    IMPROVED_THESIS_KIND,
-    MEAN_OF_DRAWS_KIND,
+    IMPROVED_THESIS_METHOD_KIND,
+    MEAN_PD_OF_DRAWS_KIND,
     REFERENCE_KIND,
-    THESIS_KIND,
+    THESIS_METHOD_KIND,
 )
 from sweep.tasks.studies.study_loading import AnySpec, apply_changes
 
@@ -118,7 +118,7 @@ class AccuracySetting:
         Such effects move or scale a spectral line as a whole. They do not change it within a
         record.
         """
-        return self.kind in (CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND)
+        return self.kind in (CLOSED_FORM_KIND, THESIS_METHOD_KIND, IMPROVED_THESIS_METHOD_KIND)
 
     @property
     def plans_effects(self) -> bool:
@@ -132,7 +132,7 @@ class AccuracySetting:
     @property
     def counts_detections(self) -> bool:
         """True if pd is the fraction of draws with a detection, not the mean of the draws' pd."""
-        return self.kind in (COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND)
+        return self.kind in (COUNTED_DETECTIONS_KIND, COUNTED_DETECTIONS_IN_NOISE_KIND)
 
     def apply_to(self, spec: AnySpec) -> AnySpec:
         """Return the spec with the setting's values.
@@ -287,7 +287,7 @@ def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
         if not is_flight or n_beamlets <= FIXED_RAYS_PER_SHOT_MAX:
             yield AccuracySetting(
                 name=f"{n_beamlets} beamlets",
-                kind=BEAMLETS_KIND,
+                kind=BEAMLET_LATTICE_KIND,
                 overrides={_BEAMLETS_FIELD: n_beamlets},
             )
     for n_beamlets in () if is_flight else TRIED_LINE_BEAMLET_COUNTS:
@@ -301,15 +301,15 @@ def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterato
     """Yield settings of the thesis's method, of improvements to it, and closed-form equivalents."""
     yield AccuracySetting(name="closed form, as thesis", kind=CLOSED_FORM_KIND, overrides=overrides)
     variants: list[tuple[str, str, int, dict[str, Any]]] = [
-        *((THESIS_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),
+        *((THESIS_METHOD_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),
         *(
-            (IMPROVED_THESIS_KIND, ", real", log2_cells, {"uses_real_transform": True})
+            (IMPROVED_THESIS_METHOD_KIND, ", real", log2_cells, {"uses_real_transform": True})
             for log2_cells in (11, 12)
             if adds_powers
         ),
         *(
             (
-                IMPROVED_THESIS_KIND,
+                IMPROVED_THESIS_METHOD_KIND,
                 ", folded",
                 log2_cells,
                 {"transforms_to_bins_only": True, "uses_real_transform": adds_powers},
@@ -317,7 +317,7 @@ def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterato
             for log2_cells in (11, 12)
         ),
         (
-            IMPROVED_THESIS_KIND,
+            IMPROVED_THESIS_METHOD_KIND,
             ", folded, degree 9",
             12,
             {"transforms_to_bins_only": True, "uses_real_transform": adds_powers, "degree": 9},
@@ -367,13 +367,17 @@ def _build_draw_setting_ladder(spec: GridSpec) -> SettingLadder:
         noise_overrides = draws_overrides | {"draws.method": "noise"}
         settings += [
             AccuracySetting(
-                name=f"{n_draws} draws, mean", kind=MEAN_OF_DRAWS_KIND, overrides=draws_overrides
+                name=f"{n_draws} draws, mean", kind=MEAN_PD_OF_DRAWS_KIND, overrides=draws_overrides
             ),
             AccuracySetting(
-                name=f"{n_draws} draws, counts", kind=COUNTED_DRAWS_KIND, overrides=draws_overrides
+                name=f"{n_draws} draws, counts",
+                kind=COUNTED_DETECTIONS_KIND,
+                overrides=draws_overrides,
             ),
             AccuracySetting(
-                name=f"{n_draws} draws, noise", kind=DRAWS_IN_NOISE_KIND, overrides=noise_overrides
+                name=f"{n_draws} draws, noise",
+                kind=COUNTED_DETECTIONS_IN_NOISE_KIND,
+                overrides=noise_overrides,
             ),
         ]
     reference_overrides = {

@@ -357,8 +357,8 @@ def axis_coordinates(
         for member in axis.parameters:
             name = (
                 member.path.replace(".", "_")
-                if member.coordinate in RESERVED_COORDINATE_NAMES
-                else member.coordinate
+                if member.coordinate_name in RESERVED_COORDINATE_NAMES
+                else member.coordinate_name
             )
             attributes = {"units": member.units, "path": member.path}
             coordinates[name] = np.asarray(member.display_values)[indices], attributes
@@ -468,7 +468,9 @@ class GridSample(StudySample):
         order_positions = np.flatnonzero(point_order_by_geometry == local_index) + np.arange(
             n_points
         )
-        return grid.grid_indices(block, point_order_by_geometry.take(order_positions, mode="wrap"))
+        return grid.point_indices_in_grid(
+            block, point_order_by_geometry.take(order_positions, mode="wrap")
+        )
 
 
 class ShotsOfBlock(NamedTuple):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class PartialResults(NamedTuple):
     """Results of some of a block's points, with the indices of these points."""
 
-    local_indices: np.ndarray  # (m,) int64: indices of the points in C order over the block
+    indices_in_block: np.ndarray  # (m,) int64: indices of the points in C order over the block
     results: Results  # arrays (m, ...) by name
 
 
@@ -52,7 +52,7 @@ def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
         return NO_RESULTS
     names = parts[0].results
     return PartialResults(
-        np.concatenate([part.local_indices for part in parts]),
+        np.concatenate([part.indices_in_block for part in parts]),
         {name: np.concatenate([part.results[name] for part in parts]) for name in names},
     )
 
@@ -70,7 +70,7 @@ class Deadline:
         return self.has_passed
 
 
-class UnfinishedBlock(Exception):
+class UnfinishedBlockException(Exception):
     """Exception raised by a block that stops at its deadline. It holds the results so far.
 
     `n_points` is the number of points done. A point that is computed in part counts as a fraction.
@@ -135,7 +135,7 @@ class BlockStudy(StoreTemplate, ABC):
     * `constant_arrays`: layouts of the arrays whose values are known before any block is computed.
     * `output_layouts`: layouts of the arrays that blocks write.
     * `evaluate` and `compile_kernels`: computation of one block.
-    * `has_checkpoints` and `evaluate_until`, if blocks can stop at a deadline and be continued
+    * `supports_checkpoints` and `evaluate_until`, if blocks can stop at a deadline and be continued
       later.
     * `pop_reused_point_count`, if results of another store are reused.
 
@@ -170,7 +170,7 @@ class BlockStudy(StoreTemplate, ABC):
         """Compile all kernels that `evaluate` needs. Workers load them from the cache on disk."""
 
     @property
-    def has_checkpoints(self) -> bool:
+    def supports_checkpoints(self) -> bool:
         """True if a block may be stopped at a deadline and continued in another task."""
         return False
 
@@ -179,7 +179,7 @@ class BlockStudy(StoreTemplate, ABC):
     ) -> Results:
         """Compute a block from a checkpoint on, with the same results as `evaluate`.
 
-        Raise `UnfinishedBlock` at the deadline. If `has_checkpoints`, this is called
+        Raise `UnfinishedBlockException` at the deadline. If `supports_checkpoints`, this is called
         in place of `evaluate`.
         """
         raise NotImplementedError
@@ -230,7 +230,7 @@ class BlockStudy(StoreTemplate, ABC):
         """Number of blocks in all grids."""
         return sum(grid.n_blocks for grid in self.grids)
 
-    def locate_in_grid(self, block: int) -> GridBlock:
+    def locate_block(self, block: int) -> GridBlock:
         """Return the grid that contains a block, and the number of the block within that grid.
 
         IndexError is raised if there is no such block.
@@ -257,7 +257,7 @@ class BlockStudy(StoreTemplate, ABC):
 
     def count_block_points(self, block: int) -> int:
         """Return the number of points of a block."""
-        grid, block_in_grid = self.locate_in_grid(block)
+        grid, block_in_grid = self.locate_block(block)
         return grid.count_block_points(block_in_grid)
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
@@ -281,14 +281,14 @@ class BlockStudy(StoreTemplate, ABC):
             grid_dims[layout.group_path][name] = grid.grid_dim_indices(layout)
         return grid_dims
 
-    def chunk_positions(self, block: int) -> dict[str, tuple[int, ...]]:
+    def chunk_positions_of_block(self, block: int) -> dict[str, tuple[int, ...]]:
         """Return the position of the chunk that a block writes in each array, by array name.
 
         A position is the index of the chunk along each dimension of the array. If an array lacks a
         dimension of the block grid, only the first block along that dimension writes it, and the
         result for other blocks has no entry for this array.
         """
-        grid, block_in_grid = self.locate_in_grid(block)
+        grid, block_in_grid = self.locate_block(block)
         position = grid.block_position(block_in_grid)
         nonzero_dims = {
             dim for dim, index in enumerate(position) if index
@@ -299,11 +299,11 @@ class BlockStudy(StoreTemplate, ABC):
             if nonzero_dims.issubset(grid_dims)
         }
 
-    def chunk_regions(self, block: int) -> dict[str, tuple[slice, ...]]:
+    def chunk_regions_of_block(self, block: int) -> dict[str, tuple[slice, ...]]:
         """Return the slices of each array that a block writes, by the name of the array."""
         return {
             name: self.output_layout_by_name[name].chunk_region(position)
-            for name, position in self.chunk_positions(block).items()
+            for name, position in self.chunk_positions_of_block(block).items()
         }
 
     def chunk_owner_blocks(self) -> dict[str, np.ndarray]:

@@ -116,7 +116,7 @@ class PointLocations(NamedTuple):
 
     blocks: np.ndarray
     """Number (n,) of the block of each point."""
-    local_indices: np.ndarray
+    indices_in_block: np.ndarray
     """Index (n,) of each point within its block, in C order."""
 
 
@@ -194,32 +194,34 @@ class BlockGrid:
 
         `grid_indices` (n,) are the indices of the points in C order over the whole grid.
         """
-        blocks, local_indices = np.zeros((2, grid_indices.size), np.int64)
+        blocks, indices_in_block = np.zeros((2, grid_indices.size), np.int64)
         index = np.unravel_index(grid_indices, self.shape) if self.shape else ()
         for axis_index, size, chunk, n_blocks_along in zip(
             index, self.shape, self.block_shape, self.blocks_per_dim, strict=True
         ):
             start = axis_index // chunk * chunk
             blocks = blocks * n_blocks_along + axis_index // chunk
-            local_indices = local_indices * np.minimum(chunk, size - start) + axis_index - start
-        return PointLocations(blocks, local_indices)
+            indices_in_block = (
+                indices_in_block * np.minimum(chunk, size - start) + axis_index - start
+            )
+        return PointLocations(blocks, indices_in_block)
 
-    def grid_indices(self, block: int, local_indices: np.ndarray) -> np.ndarray:
+    def point_indices_in_grid(self, block: int, indices_in_block: np.ndarray) -> np.ndarray:
         """Convert indices of points within a block to indices within the whole grid.
 
-        `local_indices` (m,) and the result (m,) count points in C order. This is the inverse of
+        `indices_in_block` (m,) and the result (m,) count points in C order. This is the inverse of
         `locate_points`.
         """
         if not self.shape:
-            return np.zeros(local_indices.size, np.int64)
-        axis_offsets = np.unravel_index(local_indices, self.actual_block_shape(block))
+            return np.zeros(indices_in_block.size, np.int64)
+        axis_offsets = np.unravel_index(indices_in_block, self.actual_block_shape(block))
         axis_indices = [
             offset + block_slice.start
             for offset, block_slice in zip(axis_offsets, self.block_slices(block), strict=True)
         ]
         return np.asarray(np.ravel_multi_index(axis_indices, self.shape))
 
-    def make_layout(
+    def make_output_layout(
         self,
         name: str,
         dtype: str,

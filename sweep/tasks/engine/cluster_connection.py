@@ -36,7 +36,7 @@ class ClusterConnection(NamedTuple):
     """Connection to a Dask cluster: client, number of worker threads, and restart of workers."""
 
     client: Client
-    expected_worker_threads: int  # largest number of worker threads; 0 if unknown
+    n_expected_worker_threads: int  # largest number of worker threads; 0 if unknown
     restart_workers: Callable[[], object] = lambda: None  # replaces lost workers
 
 
@@ -84,13 +84,13 @@ def connect_cluster(
             f": dashboard {local_ssh.dashboard_link(dask_cluster)}" if shows_dashboard else ""
         )
         say(f"{_workers_text(cluster, bounds)}{dashboard_text}")
-        expected_worker_threads = bounds.most * cluster.worker.threads
+        n_expected_worker_threads = bounds.most * cluster.worker.threads
         if isinstance(cluster, LocalClusterConfig):
             yield ClusterConnection(
-                client, expected_worker_threads, lambda: dask_cluster.scale(bounds.least)
+                client, n_expected_worker_threads, lambda: dask_cluster.scale(bounds.least)
             )
         else:  # the cluster itself replaces lost workers, or can't
-            yield ClusterConnection(client, expected_worker_threads)
+            yield ClusterConnection(client, n_expected_worker_threads)
 
 
 def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:

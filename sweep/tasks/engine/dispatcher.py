@@ -71,12 +71,12 @@ _log = logging.getLogger("sweep.dispatcher")
 class ThroughputEstimator:
     """Estimator of a suitable number of blocks per task, from the times of blocks so far."""
 
-    n_blocks: int = 0  # number of blocks that tasks have finished
+    n_finished_blocks: int = 0  # number of blocks that tasks have finished
     work_seconds: float = 0.0  # computing time of these blocks, summed over workers [s]
 
     def add_task_result(self, task_result: TaskResult) -> None:
         """Add the computing times of the blocks that a task has finished."""
-        self.n_blocks += len(task_result.receipts)
+        self.n_finished_blocks += len(task_result.receipts)
         self.work_seconds += sum(receipt.seconds for receipt in task_result.receipts)
 
     def blocks_per_task(self, n_blocks_left: int, n_worker_threads: int) -> int:
@@ -84,19 +84,19 @@ class ThroughputEstimator:
 
         Tasks become smaller near the end, so that all workers end together.
         """
-        if not self.n_blocks:
+        if not self.n_finished_blocks:
             return 1
         task_seconds = max(TARGET_TASK_SECONDS, n_worker_threads / TASKS_PER_SECOND_MAX)
-        n_fitting = int(task_seconds * self.n_blocks / max(self.work_seconds, 1e-9))
+        n_fitting = int(task_seconds * self.n_finished_blocks / max(self.work_seconds, 1e-9))
         return max(1, min(n_fitting, BLOCKS_PER_TASK_MAX, n_blocks_left // (4 * n_worker_threads)))
 
 
 @dataclass
-class WorkerThreadCount:
+class WorkerThreadCounter:
     """Counter of the worker threads of a cluster, updated every few seconds."""
 
     client: Client
-    expected_worker_threads: int = 0  # number expected once all workers run; 0 if unknown
+    n_expected_worker_threads: int = 0  # number expected once all workers run; 0 if unknown
     n_worker_threads: int = 1  # larger of the last count and the expected number, at least 1
     n_threads_by_worker: dict[str, int] = field(default_factory=dict)  # by the worker's address
     last_counted_at: float = -1e9  # time of the last count, by `time.monotonic` [s]
@@ -106,7 +106,7 @@ class WorkerThreadCount:
         if time.monotonic() - self.last_counted_at > WORKER_THREADS_REFRESH_SECONDS:
             self.n_threads_by_worker = dict(self.client.nthreads())
             self.n_worker_threads = max(
-                1, self.expected_worker_threads, sum(self.n_threads_by_worker.values())
+                1, self.n_expected_worker_threads, sum(self.n_threads_by_worker.values())
             )
             self.last_counted_at = time.monotonic()
         return self.n_worker_threads
@@ -136,7 +136,7 @@ class TaskDispatcher:
     def __init__(
         self,
         client: Client,
-        expected_worker_threads: int,
+        n_expected_worker_threads: int,
         settings: TaskSettings,
         block_queue: BlockQueue,
         *,
@@ -148,9 +148,9 @@ class TaskDispatcher:
         self._in_flight: dict[Key, _InFlightTask] = {}
         self._superseded: dict[Key, Future] = {}  # still running, but another worker has finished
         self._finished_futures: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._throughput, self._slots = (
+        self._throughput, self._thread_counter = (
             ThroughputEstimator(),
-            WorkerThreadCount(client, expected_worker_threads),
+            WorkerThreadCounter(client, n_expected_worker_threads),
         )
         self._resend_counts: Counter[int] = (
             Counter()
@@ -205,7 +205,7 @@ class TaskDispatcher:
             f"{len(self._unverified_receipts):,} written but not yet found in the store",
             f"{number_with_noun(len(tasks), 'task')} in flight, "
             f"{len(self._superseded):,} superseded; "
-            f"{number_with_noun(self._throughput.n_blocks, 'block')} came back in "
+            f"{number_with_noun(self._throughput.n_finished_blocks, 'block')} came back in "
             f"{duration_text(self._throughput.work_seconds)} of work",
         ]
         lines += [
@@ -215,7 +215,7 @@ class TaskDispatcher:
             f"{', '.join(sorted({str(future.status) for future in task.futures_by_key.values()}))}"
             for task in sorted(tasks, key=lambda task: task.last_sent_at)[:TASKS_IN_SUMMARY_MAX]
         ]
-        for worker, threads in sorted(self._slots.n_threads_by_worker.items())[
+        for worker, threads in sorted(self._thread_counter.n_threads_by_worker.items())[
             :WORKERS_IN_SUMMARY_MAX
         ]:
             answered_at = self._last_response.get(worker)
@@ -245,7 +245,7 @@ class TaskDispatcher:
         """Return the addresses of connected workers that are not excluded."""
         return [
             worker
-            for worker in self._slots.n_threads_by_worker
+            for worker in self._thread_counter.n_threads_by_worker
             if worker not in self._excluded_workers
         ]
 
@@ -256,7 +256,7 @@ class TaskDispatcher:
 
     def _submit_tasks(self, *, may_submit: bool) -> None:
         """Submit tasks until there are twice as many unfinished tasks as worker threads."""
-        n_worker_threads = self._slots.current_count()
+        n_worker_threads = self._thread_counter.current_count()
         if time.monotonic() - self._duplicated_at > WORKER_THREADS_REFRESH_SECONDS:
             self._duplicated_at = time.monotonic()
             self._duplicate_stragglers()
@@ -336,7 +336,8 @@ class TaskDispatcher:
             worker
             for worker in self._usable_workers()
             if worker not in tasks_by_silent_worker
-            and len(keys_by_worker.get(worker, ())) < self._slots.n_threads_by_worker[worker]
+            and len(keys_by_worker.get(worker, ()))
+            < self._thread_counter.n_threads_by_worker[worker]
         ]
         if not idle_workers:
             return
@@ -371,8 +372,8 @@ class TaskDispatcher:
         """Return the expected duration of a task, from the computing times of blocks so far [s]."""
         throughput = self._throughput
         return (
-            len(task.blocks) * throughput.work_seconds / throughput.n_blocks
-            if throughput.n_blocks
+            len(task.blocks) * throughput.work_seconds / throughput.n_finished_blocks
+            if throughput.n_finished_blocks
             else WORKER_SILENCE_SECONDS
         )
 
@@ -462,10 +463,11 @@ class TaskDispatcher:
         """
         if worker in self._excluded_workers:
             return
-        self._excluded_workers[worker] = self._slots.n_threads_by_worker.get(worker, 1)
+        self._excluded_workers[worker] = self._thread_counter.n_threads_by_worker.get(worker, 1)
         if (
             self._all_workers_excluded
-            and sum(self._excluded_workers.values()) >= self._slots.expected_worker_threads
+            and sum(self._excluded_workers.values())
+            >= self._thread_counter.n_expected_worker_threads
         ):
             if isinstance(error, NotAStoreError):  # the driver itself sees the store
                 raise StoreError(

@@ -62,16 +62,16 @@ from sweep.storage.locations import (
 from sweep.storage.size_checks import ARRAY_FILE_BYTES_MAX
 from sweep.storage.store_format import (
     RECEIPTS_FILE,
-    decode_record,
-    encode_record,
-    iter_lines_and_records,
-    iter_records,
+    decode_log_record,
+    encode_log_record,
+    iter_log_lines,
+    iter_log_records,
     open_log,
     read_receipt_totals,
     verified_line_body,
 )
 from sweep.tasks.engine.block_study import BlockStudy, EarlierResults, PartialResults
-from sweep.tasks.engine.progress import BusyError, StoreError, raise_as_store_error
+from sweep.tasks.engine.progress import StoreBusyError, StoreError, raise_as_store_error
 
 #: Name of the log of blocks that failed permanently.
 FAILURE_LOG_FILE = "failures.jsonl"
@@ -181,13 +181,13 @@ class Journal:
     def _append(self, log_name: str, *records: dict[str, Any]) -> None:
         """Append lines to a log, all or none. OSError is raised if they can't be written."""
         if records:
-            self._logs[log_name].append(b"".join(map(encode_record, records)))
+            self._logs[log_name].append(b"".join(map(encode_log_record, records)))
 
 
 def read_committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
     """Return the digest in the receipt of each block, (blocks,) of bytes; b'' without a receipt."""
     digest_by_block = np.zeros(n_blocks, dtype="S32")
-    for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
+    for record in iter_log_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
         if 0 <= record["block"] < n_blocks:
             digest_by_block[record["block"]] = record.get(
                 "digest", ""
@@ -195,27 +195,27 @@ def read_committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
     return digest_by_block
 
 
-def blocks_with_receipt(store_path: Location, study: BlockStudy) -> np.ndarray:
+def receipted_block_mask(store_path: Location, study: BlockStudy) -> np.ndarray:
     """Return a mask (blocks,) of blocks with a receipt, whether their chunks exist or not."""
     return read_receipt_totals(store_path, study.n_blocks).points_by_block > 0
 
 
-def committed_blocks(store_path: Location, study: BlockStudy) -> np.ndarray:
+def committed_block_mask(store_path: Location, study: BlockStudy) -> np.ndarray:
     """Return a mask (blocks,) of the blocks that are done.
 
     A block is done if it has a receipt and all of its chunks are in the store.
     """
-    return find_complete_blocks(store_path, study, blocks_with_receipt(store_path, study))
+    return find_complete_block_mask(store_path, study, receipted_block_mask(store_path, study))
 
 
 def read_permanent_failures(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
     """Return the last failure record of each block that failed permanently and is not done."""
     last_failures = {
         record["block"]: record
-        for record in iter_records(store_path / JOURNAL_DIR / FAILURE_LOG_FILE)
+        for record in iter_log_records(store_path / JOURNAL_DIR / FAILURE_LOG_FILE)
     }
     if last_failures:
-        for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
+        for record in iter_log_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
             last_failures.pop(record["block"], None)
     return {block: failure for block, failure in last_failures.items() if block < n_blocks}
 
@@ -230,7 +230,7 @@ class LastRun:
 
 def read_last_run(store_path: Location) -> LastRun:
     """Return the start time and the number of threads of the last run of a store."""
-    runs = iter_records(store_path / JOURNAL_DIR / SESSION_LOG_FILE)
+    runs = iter_log_records(store_path / JOURNAL_DIR / SESSION_LOG_FILE)
     starts = [run for run in runs if run.get("event") == "begun"]
     if not starts:
         return LastRun(start_time=np.inf, n_threads=0)
@@ -246,14 +246,12 @@ def write_recipe(store_path: Location, **facts: Any) -> None:
 
     ``facts`` are its entries, such as the folder of the study's files, or the extended store.
     """
-    atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_record(facts))
+    atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_log_record(facts))
 
 
 def read_recipe(store_path: Location) -> dict[str, Any]:
     """Return a store's recipe, the facts about how it is made; empty if missing or damaged."""
-    records = [
-        record for _, record in iter_lines_and_records(store_path / JOURNAL_DIR / RECIPE_FILE)
-    ]
+    records = [record for _, record in iter_log_lines(store_path / JOURNAL_DIR / RECIPE_FILE)]
     return records[0] or {} if len(records) == 1 else {}
 
 
@@ -271,7 +269,7 @@ def remove_predecessors_from_recipe(store_path: Path) -> None:
 def refuse_damaged_recipe(store_path: Location) -> None:
     """Raise a StoreError if the recipe is damaged."""
     recipe_path = store_path / JOURNAL_DIR / RECIPE_FILE
-    if any(record is None for _, record in iter_lines_and_records(recipe_path)):
+    if any(record is None for _, record in iter_log_lines(recipe_path)):
         raise StoreError(
             f"{recipe_path} is damaged, and with it where the files of the study are: "
             f"{suggested_call('resume', store_path, spec=SPEC_PLACEHOLDER)} puts it down anew"
@@ -297,7 +295,7 @@ class ChunkScan:
             """Return the candidate blocks whose chunk of an array is missing."""
             if self._is_stopped:
                 return np.empty(0, np.int64)
-            is_present = find_existing_chunks(store_path / array_name / "c", owner_blocks.shape)
+            is_present = find_existing_chunk_mask(store_path / array_name / "c", owner_blocks.shape)
             return owner_blocks[~is_present & self._candidates[owner_blocks]]
 
         owners_by_array = study.chunk_owner_blocks() if candidates.any() else {}
@@ -310,7 +308,7 @@ class ChunkScan:
         """Wait until the search ends, for at most `timeout` [s]. Return True if it has ended."""
         return not wait(self._array_scans, timeout).not_done
 
-    def complete_blocks(self) -> np.ndarray:
+    def complete_block_mask(self) -> np.ndarray:
         """Return a mask (blocks,) of candidates that lack no chunk in the arrays searched so far.
 
         OSError is raised if the store can't be read.
@@ -327,19 +325,19 @@ class ChunkScan:
         self._executor.shutdown(wait=False)
 
 
-def find_complete_blocks(
+def find_complete_block_mask(
     store_path: Location, study: BlockStudy, candidates: np.ndarray
 ) -> np.ndarray:
     """Return a mask (blocks,) of the candidate blocks whose chunks all exist and are not empty."""
     scan = ChunkScan(store_path, study, candidates)
     try:
         scan.wait()
-        return scan.complete_blocks()
+        return scan.complete_block_mask()
     finally:
         scan.stop()
 
 
-def find_existing_chunks(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
+def find_existing_chunk_mask(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
     """Return a mask, in the shape of an array's grid of chunks, of chunks that are not empty."""
     is_present = np.zeros(shape, bool)
     if isinstance(folder, ObjectPath):
@@ -410,7 +408,7 @@ class Checkpoint(NamedTuple):
     """Saved results of a block that is not complete, with the time and the points done so far."""
 
     results: EarlierResults = EarlierResults()
-    points: float = 0.0  # number of points done; partly computed ones count in part
+    n_points_done: float = 0.0  # number of points done; partly computed ones count in part
     seconds: float = 0.0  # time spent so far [s]
 
 
@@ -421,7 +419,7 @@ def write_checkpoint(
 
     OSError is raised if it can't be written.
     """
-    if read_checkpoint(store_path, study_id, block).points >= checkpoint.points:
+    if read_checkpoint(store_path, study_id, block).n_points_done >= checkpoint.n_points_done:
         return  # written by another worker, which was believed to be lost
     buffer = io.BytesIO()
     np.savez(buffer, **dict(_checkpoint_arrays(checkpoint.results)))
@@ -429,11 +427,11 @@ def write_checkpoint(
     header = {
         "study": study_id,
         "block": block,
-        "points": checkpoint.points,
+        "points": checkpoint.n_points_done,
         "seconds": checkpoint.seconds,
         "digest": _content_digest(content),
     }
-    atomic_write(_block_checkpoint_path(store_path, block), encode_record(header) + content)
+    atomic_write(_block_checkpoint_path(store_path, block), encode_log_record(header) + content)
 
 
 def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoint:
@@ -445,7 +443,7 @@ def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoi
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError, RefusedFileError):
         return Checkpoint()
     line, _, content = file_content.partition(b"\n")
-    header = decode_record(line + b"\n") or {}
+    header = decode_log_record(line + b"\n") or {}
     if (header.get("study"), header.get("block")) != (study_id, block):
         return Checkpoint()
     if header["digest"] != _content_digest(content):
@@ -486,7 +484,7 @@ def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
             yield member.filename.removesuffix(".npy"), np.load(member_file, allow_pickle=False)
 
 
-def read_checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
+def read_checkpoint_point_counts(store_path: Location, study_id: str) -> dict[int, float]:
     """Return the number of points done in the checkpoint of each block that has one."""
     block_names = [
         file.name.removeprefix(CHECKPOINT_FILE_PREFIX)
@@ -498,7 +496,9 @@ def read_checkpoint_points(store_path: Location, study_id: str) -> dict[int, flo
         if block_name.isdecimal()
     }
     return {
-        block: checkpoint.points for block, checkpoint in checkpoints.items() if checkpoint.points
+        block: checkpoint.n_points_done
+        for block, checkpoint in checkpoints.items()
+        if checkpoint.n_points_done
     }
 
 
@@ -719,7 +719,7 @@ class _FileLock:
         """Acquire the lock for a holder. The lock of a dead holder is removed first.
 
         `check_holder` raises an error if the present holder lives. On file systems with flock no
-        other process acquires the lock meanwhile. BusyError is raised if another process was
+        other process acquires the lock meanwhile. StoreBusyError is raised if another process was
         quicker.
         """
         self._lock_path.parent.mkdir(exist_ok=True)
@@ -737,7 +737,7 @@ class _FileLock:
                 if (
                     self.read_holder_json() != holder_json
                 ):  # a file server may have made the link, and lost its response
-                    raise BusyError(
+                    raise StoreBusyError(
                         f"another process was quicker to lock {self._lock_path}"
                     ) from None
             finally:
@@ -998,7 +998,7 @@ def _confirm_heartbeat_stopped(
 class StoreLock:
     """Lock of a store. It is acquired on construction and updated regularly until it is released.
 
-    BusyError is raised if a living process holds the lock, and StoreError if the store can't
+    StoreBusyError is raised if a living process holds the lock, and StoreError if the store can't
     be written. ``say`` gets messages for the user; by default they are warnings.
     """
 
@@ -1021,7 +1021,7 @@ class StoreLock:
         """Watch the heartbeat of the lock's holder, if it is on another machine.
 
         Return the holder and the state of its heartbeat if no new one arrives; None if the lock has
-        no holder on another machine. BusyError is raised if the holder lives.
+        no holder on another machine. StoreBusyError is raised if the holder lives.
         """
         other_holder, heartbeat_version = (
             read_lock_holder(self._store_path),
@@ -1041,7 +1041,7 @@ class StoreLock:
         raise self._make_busy_error(other_holder)
 
     def _refuse_living_holder(self) -> None:
-        """Raise a BusyError if another process holds the lock, and is not known to be dead."""
+        """Raise a StoreBusyError if another process holds the lock, and is not known to be dead."""
         other_holder = read_lock_holder(self._store_path)
         if (
             other_holder is None
@@ -1055,13 +1055,13 @@ class StoreLock:
         ):
             raise self._make_busy_error(other_holder)
 
-    def _make_busy_error(self, other_holder: LockHolder) -> BusyError:
+    def _make_busy_error(self, other_holder: LockHolder) -> StoreBusyError:
         """Return the error to raise if another process holds the lock."""
         holder_text = (
             f"process {escape_to_one_line(other_holder.pid)} on "
             f"{escape_to_one_line(other_holder.host)}"
         )
-        return BusyError(
+        return StoreBusyError(
             f"{self._store_path} is being written by {holder_text}: "
             f"wait for it, or stop it; {suggested_call('status', self._store_path)} shows how far "
             "it is"
@@ -1071,7 +1071,7 @@ class StoreLock:
         """Send heartbeats at intervals until the lock is released."""
         while not self._is_released.wait(HEARTBEAT_INTERVAL_SECONDS):
             try:
-                if self.is_held():
+                if self.is_held_by_this_process():
                     self._lock.send_heartbeat()
             except FileNotFoundError:
                 pass  # the store was removed
@@ -1086,7 +1086,7 @@ class StoreLock:
                         "store there",
                     )
 
-    def is_held(self) -> bool:
+    def is_held_by_this_process(self) -> bool:
         """Return True if this driver still holds the lock."""
         current_holder = read_lock_holder(self._store_path)
         return current_holder is not None and current_holder.token == self._own_holder.token
@@ -1103,6 +1103,6 @@ class StoreLock:
         self._heartbeat_thread.join()
         _released_tokens.add(self._own_holder.token)
         with suppress(OSError):
-            if self.is_held():
+            if self.is_held_by_this_process():
                 self._lock.release()
                 _log.debug("%s: lock released", self._store_path)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from sweep.messages import EscapedTextError, escape_unprintable, number_with_noun
+from sweep.messages import EscapedMessageError, escape_unprintable, number_with_noun
 from sweep.regular_files import RefusedFileError
 from sweep.storage.store_format import StoreError as StoreError
 from sweep.tasks.engine.text_streams import StallTolerantStream, is_terminal
@@ -33,19 +33,19 @@ ACTIVITY_MESSAGE_DELAY_SECONDS = 2.0
 _log = logging.getLogger("sweep")
 
 
-class TaskError(EscapedTextError):
+class RunRequestError(EscapedMessageError):
     """Error of a study that can't be run as requested. The message states reason and remedy."""
 
 
-class BusyError(StoreError):
+class StoreBusyError(StoreError):
     """Error of a store that another process writes to."""
 
 
-class ClusterError(TaskError):
+class ClusterError(RunRequestError):
     """Error of a Dask scheduler or of workers that are not available."""
 
 
-class CodeError(TaskError):
+class CodeError(RunRequestError):
     """Error of a user's Python function: it is not allowed, can't be imported, or fails."""
 
 

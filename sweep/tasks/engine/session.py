@@ -60,9 +60,9 @@ from sweep.tasks.engine.journal import (
 from sweep.tasks.engine.progress import (
     ClusterError,
     Progress,
+    RunRequestError,
     SchedulerLostError,
     StoreError,
-    TaskError,
     duration_text,
     make_progress,
     show_activity,
@@ -181,7 +181,9 @@ class RunOptions:
             )
         timeout = self.block_timeout
         if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
-            raise TaskError(f"block_timeout must be a number of seconds above 0, not {timeout!r}")
+            raise RunRequestError(
+                f"block_timeout must be a number of seconds above 0, not {timeout!r}"
+            )
         if self.allow_code:
             user_code.allow_modules(
                 [self.allow_code] if isinstance(self.allow_code, str) else self.allow_code
@@ -458,11 +460,11 @@ class ComputeBackend(ExitStack):
             return run_in_threads(*in_process, n_threads)
         from sweep.tasks.engine.dispatcher import TaskDispatcher
 
-        client, expected_worker_threads, _ = self.connect()
+        client, n_expected_worker_threads, _ = self.connect()
         _log.info("blocks are computed by the workers of %s", client)
         dispatcher = TaskDispatcher(
             client,
-            expected_worker_threads,
+            n_expected_worker_threads,
             settings,
             block_queue,
             verify_receipt=verify_receipt,
@@ -584,13 +586,15 @@ class Session:
         not empty, no block is computed.
         """
         start_time = time.monotonic()
-        self._checkpoint_points = journal.read_checkpoint_points(self._store_path, self._study.id)
+        self._checkpoint_points = journal.read_checkpoint_point_counts(
+            self._store_path, self._study.id
+        )
         receipts = read_receipt_totals(self._store_path, self._study.n_blocks)
         self._bytes_before = int(receipts.bytes_by_block.sum())
         chunk_scan = ChunkScan(self._store_path, self._study, receipts.points_by_block > 0)
         try:
             chunk_scan.wait(CHUNK_SCAN_TIMEOUT_SECONDS)
-            is_done = chunk_scan.complete_blocks()
+            is_done = chunk_scan.complete_block_mask()
             is_settled = is_done.copy()
             if not self._backend.options.retry_failed:
                 is_settled[list(read_permanent_failures(self._store_path, is_done.size))] = True
@@ -617,7 +621,7 @@ class Session:
                 or self._compute_blocks(is_settled, is_done)
                 or self._finish_chunk_scan(chunk_scan, is_done)
             )
-            is_done &= chunk_scan.complete_blocks()
+            is_done &= chunk_scan.complete_block_mask()
         finally:
             chunk_scan.stop()
         study, totals = self._study, self._receipt_totals
@@ -674,7 +678,7 @@ class Session:
         while not chunk_scan.wait(CHUNK_SCAN_TIMEOUT_SECONDS):
             if self._interrupts.is_stopping:
                 return "interrupted"
-        is_settled = chunk_scan.complete_blocks() | ~is_done
+        is_settled = chunk_scan.complete_block_mask() | ~is_done
         return self._compute_blocks(is_settled, is_settled & is_done)
 
     def _compute_blocks(self, is_settled: np.ndarray, is_done: np.ndarray) -> str:
@@ -738,7 +742,7 @@ class Session:
         """Commit results of tasks as they arrive. Return the reason for stopping early, or ''."""
         no_worker_monitor = NoWorkerMonitor()
         for task_result in task_results:
-            if not self._lock.is_held():
+            if not self._lock.is_held_by_this_process():
                 if not _store_exists(self._store_path):
                     raise FileNotFoundError(self._store_path)
                 return "another process took the store's lock"

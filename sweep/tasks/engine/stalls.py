@@ -119,7 +119,7 @@ class InProcessMonitor:
         self._stall_monitor = StallMonitor(say, self.state_summary)
 
     @contextmanager
-    def list_while_computed(self, block: int) -> Iterator[None]:
+    def mark_in_progress(self, block: int) -> Iterator[None]:
         """Context manager that lists a block as being computed by this thread."""
         thread = threading.current_thread()
         self._in_progress[threading.get_ident()] = BlockInProgress(block, time.time(), thread.name)

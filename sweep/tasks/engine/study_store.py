@@ -42,7 +42,7 @@ from sweep.storage.locations import (
     atomic_write,
     file_sizes_below,
     iter_file_entries_below,
-    iter_names_below,
+    iter_file_names_below,
     map_concurrently,
     os_error_reason,
     parse_location,
@@ -50,7 +50,7 @@ from sweep.storage.locations import (
     remedy_for_write_error,
     remove_atomically,
     staging_path_for,
-    translate_errors,
+    translate_object_store_errors,
     write_path_atomically,
 )
 from sweep.storage.size_checks import SingleWriterLocalStore, compressed_bytes_max
@@ -59,10 +59,10 @@ from sweep.storage.store_format import (
     MANIFEST_FILE,
     ZSTD_LEVEL,
     contents_digest,
-    encode_record,
+    encode_log_record,
     format_software_versions,
-    iter_lines_and_records,
-    iter_records,
+    iter_log_lines,
+    iter_log_records,
     objects_match_digest,
     parse_software_versions,
     read_root_metadata,
@@ -80,7 +80,7 @@ from sweep.tasks.engine.journal import (
     read_recipe,
     write_recipe,
 )
-from sweep.tasks.engine.progress import BusyError, StoreError
+from sweep.tasks.engine.progress import StoreBusyError, StoreError
 
 ROOT_DOCUMENT_FILE = "zarr.json"
 
@@ -135,7 +135,7 @@ def create_store(
                 _upload_store(Path(temporary_folder) / store_path.name, store_path)
     except OSError as error:
         if error.errno in (errno.ENOTEMPTY, errno.EEXIST) and store_path.exists():
-            raise BusyError(
+            raise StoreBusyError(
                 f"{store_path} is there already: another process has made it"
             ) from error
         remedy = remedy_for_write_error(
@@ -234,7 +234,10 @@ def build_template(
     write_manifest(
         store_path,
         attributes,
-        {name: stored_objects_digest(store_path, [name]) for name in iter_names_below(store_path)},
+        {
+            name: stored_objects_digest(store_path, [name])
+            for name in iter_file_names_below(store_path)
+        },
     )
 
 
@@ -254,9 +257,9 @@ def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
     """Write the manifest: root attributes, and digests of all objects that hold no results."""
-    records = [encode_record({"attributes": attributes, "objects": len(digests)})]
+    records = [encode_log_record({"attributes": attributes, "objects": len(digests)})]
     records += [
-        encode_record({"object": name, "digest": object_digest})
+        encode_log_record({"object": name, "digest": object_digest})
         for name, object_digest in sorted(digests.items())
     ]
     atomic_write(store_path / JOURNAL_DIR / MANIFEST_FILE, b"".join(records))
@@ -337,7 +340,7 @@ class BlockWriter:
 
     def write(self, block: int, results: Mapping[str, np.ndarray]) -> BlockDigest:
         """Write all chunks of one block. Raise ValueError if the results don't match its arrays."""
-        positions = self.study.chunk_positions(block)
+        positions = self.study.chunk_positions_of_block(block)
         if results.keys() != positions.keys():
             mismatched_names = sorted(results.keys() ^ positions.keys())
             raise ValueError(
@@ -366,7 +369,7 @@ class BlockWriter:
             return chunk_path, content
 
         started_at = time.monotonic()
-        with translate_errors(self.store_path):
+        with translate_object_store_errors(self.store_path):
             chunk_contents = map_concurrently(self.store_path, write_chunk, positions)
         n_bytes = sum(len(content) for _, content in chunk_contents)
         _log.debug(
@@ -384,7 +387,7 @@ def chunk_names_of_block(study: BlockStudy, block: int) -> list[str]:
     """Return the paths, inside the store, of the chunks of one block."""
     return [
         chunk_name(array_name, position)
-        for array_name, position in study.chunk_positions(block).items()
+        for array_name, position in study.chunk_positions_of_block(block).items()
     ]
 
 
@@ -495,7 +498,7 @@ def read_manifest_digests(store_path: Location) -> dict[str, str]:
     """
     return {
         record["object"]: record["digest"]
-        for record in iter_records(store_path / MANIFEST_PATH)
+        for record in iter_log_records(store_path / MANIFEST_PATH)
         if "object" in record
     }
 
@@ -505,7 +508,7 @@ def find_template_damages(store_path: Location) -> list[Damage]:
 
     The template is everything that the store contained before the first result.
     """
-    records = [record for _, record in iter_lines_and_records(store_path / MANIFEST_PATH)]
+    records = [record for _, record in iter_log_lines(store_path / MANIFEST_PATH)]
     if not records:
         return [Damage(MANIFEST_PATH, "is missing or empty", repaired_by="repair")]
     problems = [
@@ -662,13 +665,13 @@ def processor_description() -> str:
 def refuse_foreign_store(store_path: Location) -> None:
     """Raise a StoreError if sweep did not make what is at a path. Damaged stores are accepted."""
     if not any(
-        any(iter_records(store_path / JOURNAL_DIR / name))
+        any(iter_log_records(store_path / JOURNAL_DIR / name))
         for name in (MANIFEST_FILE, *LOG_FILE_NAMES)
     ):
         store_format.refuse_foreign_store(store_path)
 
 
-def refuse_to_replace(store_path: Location) -> None:
+def refuse_irreplaceable_store(store_path: Location) -> None:
     """Raise a StoreError if sweep did not make what is at a path, or if it can't be renamed."""
     if not isinstance(store_path, Path):
         raise StoreError(

@@ -27,7 +27,12 @@ import numpy as np
 from sweep.storage.locations import parse_location, store_stat_fingerprint
 from sweep.storage.store_format import read_attributes
 from sweep.tasks.engine import journal, study_store, user_code
-from sweep.tasks.engine.block_study import BlockEvaluator, Deadline, StudyReader, UnfinishedBlock
+from sweep.tasks.engine.block_study import (
+    BlockEvaluator,
+    Deadline,
+    StudyReader,
+    UnfinishedBlockException,
+)
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import Checkpoint, Failure, Receipt
 from sweep.tasks.engine.progress import CodeError, StoreError
@@ -226,14 +231,14 @@ def _compute_block(
     evaluate: Callable[[], Results]
     if settings.evaluate:
         evaluate = partial(settings.evaluate, stored_study, block)
-    elif stored_study.has_checkpoints:
+    elif stored_study.supports_checkpoints:
         checkpoint = journal.read_checkpoint(store_path, stored_study.id, block)
         evaluate = partial(stored_study.evaluate_until, block, checkpoint.results, deadline)
     else:
         evaluate = partial(stored_study.evaluate, block)
     try:
         results = run_with_timeout(evaluate, settings.block_timeout, checkpoint.seconds)
-    except UnfinishedBlock as unfinished:
+    except UnfinishedBlockException as unfinished:
         _refuse_replaced_store(str(store_path), stored_study.id)
         seconds_spent = checkpoint.seconds + time.perf_counter() - started_at
         journal.write_checkpoint(
@@ -409,7 +414,7 @@ def run_serial(
     monitor = InProcessMonitor(say, lambda: block_queue.n_unassigned)
     with monitor.watch_in_thread(IDLE_POLL_SECONDS):
         while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
-            with monitor.list_while_computed(task_blocks[0]):
+            with monitor.mark_in_progress(task_blocks[0]):
                 task_result = run_blocks(settings, task_blocks)
             _record_result(monitor, task_result)
             yield _accept_result(task_result, task_blocks, block_queue, verify_receipt)
@@ -456,7 +461,7 @@ def run_in_threads(
     def compute_assigned_blocks() -> None:
         while (task_blocks := assigned_blocks.get()) is not None:
             try:
-                with monitor.list_while_computed(task_blocks[0]):
+                with monitor.mark_in_progress(task_blocks[0]):
                     task_result = run_blocks(settings, task_blocks)
             except BaseException as error:  # else the run would wait for this thread for good
                 task_result = TaskResult(

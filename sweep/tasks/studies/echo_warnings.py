@@ -25,7 +25,7 @@ from sweep.model.link_budget import (
     LinkBudget,
 )
 from sweep.model.preparation import split_by_category
-from sweep.model.shot_settings import CHIRP_PREFIX, RECORD_PATH
+from sweep.model.shot_settings import CHIRP_PREFIX, RECORD_TYPE_PATH
 from sweep.model.window_response import missing_sample_bounds
 from sweep.tasks.studies.flight_study import FlightStudy
 
@@ -75,14 +75,14 @@ ECHO_PARAMETERS = (
     CHIRP_PREFIX + "duration",
     CHIRP_PREFIX + "start_frequency",
     waveform.SEGMENT_ORDER_PATH,
-    waveform.DOPPLER_SEGMENT_SLOPE_PATH,
-    waveform.DOWN_SEGMENT_SLOPE_PATH,
+    waveform.DOPPLER_CHIRP_RATE_RATIO_PATH,
+    waveform.DOWN_CHIRP_RATE_RATIO_PATH,
     PROCESSING_PREFIX + "acquisition_delay",
     PROCESSING_PREFIX + "sample_rate",
     PROCESSING_PREFIX + "fft_size",
     PROCESSING_PREFIX + "window",
     waveform.TWO_BEAT_ASSUMPTION_PATH,
-    RECORD_PATH,
+    RECORD_TYPE_PATH,
     RECEIVER_PREFIX + "architecture",
     LASER_PREFIX + "line_width",
     LASER_PREFIX + "line_shape",
@@ -94,7 +94,7 @@ ECHO_PARAMETERS = (
     beam.WAIST_PATH,
     beam.OSCILLATOR_WAIST_PATH,
     beam.DIVERGENCE_PATH,
-    beam.QUALITY_PATH,
+    beam.BEAM_QUALITY_PATH,
     beam.FOCUS_PATH,
     beam.COUPLING_PATH,
 )
@@ -217,7 +217,7 @@ def diagnose_echoes(
         )
         velocity = np.asarray(velocity)
         diagnosis.is_misread[index] = _is_misread(p, range_, velocity)
-        if str(p[RECORD_PATH]) != "complex":
+        if str(p[RECORD_TYPE_PATH]) != "complex":
             assumption = str(p[waveform.TWO_BEAT_ASSUMPTION_PATH])
             (other_assumption,) = {waveform.FAR_TARGET, waveform.FAST_TARGET} - {assumption}
             is_misread_by = {
@@ -258,7 +258,7 @@ def _crosses_spectrum_edge(
     is_speckled = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
     is_speckled &= str(p[RECEIVER_PREFIX + "architecture"]) != "direct"
     if (
-        str(p[RECORD_PATH]) == "complex"
+        str(p[RECORD_TYPE_PATH]) == "complex"
         or str(p[PROCESSING_PREFIX + "detection"]) != "any_bin"
         or not is_speckled
     ):
@@ -269,7 +269,9 @@ def _crosses_spectrum_edge(
     chirp_rate, record_length = settings.chirp_rate, record.window.length
     bin_width = record.sample_rate / record_length
     crosses = np.zeros(range_.shape, bool)
-    segments = zip(waveform.SEGMENT_NAMES, waveform.chirp_slopes(p), settings.carriers, strict=True)
+    segments = zip(
+        waveform.SEGMENT_NAMES, waveform.chirp_rate_ratios(p), settings.carriers, strict=True
+    )
     for name, slope, carrier in segments:
         if name not in settings.segment_order:
             continue
@@ -298,7 +300,7 @@ def _is_misread(
     target is assumed to be ``far`` or ``fast``.
     """
     budget = LinkBudget(p)
-    settings, record, slopes = budget.waveform, budget.record, waveform.chirp_slopes(p)
+    settings, record, slopes = budget.waveform, budget.record, waveform.chirp_rate_ratios(p)
     carriers, chirp_rate, segment_order = (
         settings.carriers,
         settings.chirp_rate,
@@ -315,7 +317,7 @@ def _is_misread(
         folded_beat = beat - sample_rate * np.floor(beat / sample_rate + 0.5)
         peaks.append((folded_beat if is_signed else np.abs(folded_beat)) + 0 * range_)
     reading_assumption = assumption or str(p[waveform.TWO_BEAT_ASSUMPTION_PATH])
-    if slopes == waveform.DEFAULT_CHIRP_SLOPES:
+    if slopes == waveform.DEFAULT_CHIRP_RATE_RATIOS:
         reading = waveform.resolve_range_velocity(
             up=peaks[0],
             doppler=peaks[1] if "doppler" in segment_order else None,

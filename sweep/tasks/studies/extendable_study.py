@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import VERSION
+from sweep.model import MODEL_VERSION
 from sweep.tasks.engine.block_study import BlockStudy
 
 CHUNK_READ_ERRORS = (OSError, ValueError, RuntimeError)
@@ -22,7 +22,7 @@ class ExtendableStudy(BlockStudy):
     `find_reuse_source` returns the results of a smaller study, or None.
     """
 
-    model_version = VERSION
+    model_version = MODEL_VERSION
 
     def __init__(self, spec: Any) -> None:
         self.spec = spec
@@ -67,6 +67,6 @@ class ExtendableStudy(BlockStudy):
             self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
         )
         return (
-            sum(shared_points.local_indices.size for shared_points in shared_point_groups)
-            * self.locate_in_grid(block).grid.fine_steps
+            sum(shared_points.indices_in_block.size for shared_points in shared_point_groups)
+            * self.locate_block(block).grid.fine_steps
         )

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model import VERSION
+from sweep.model import MODEL_VERSION
 from sweep.model.beamlet_counts import next_ray_counts
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.outputs import (
-    BEAMLET_VARIABLES,
+    BEAMLET_GEOMETRY_VARIABLES,
     BEAMLET_WEIGHT_VARIABLE,
     CYCLE_VARIABLES,
-    SHOT_VARIABLES,
+    SHOT_GEOMETRY_VARIABLES,
 )
 from sweep.storage.store_format import TERRAIN_MAP_GROUP
 from sweep.tasks.engine.block_study import BlockStudy
@@ -52,7 +52,7 @@ RAYS_PER_CAST_MAX = 1 << 18
 SAMPLED_RAYS_MAX = 1 << 19
 """Largest number of beamlets (rays) of the shots that sample a flight before it runs."""
 
-TERRAIN_MAP_NODES_MAX = 256
+TERRAIN_MAP_LONG_SIDE_NODES = 256
 """Number of nodes along the longer side of a scene's map."""
 TERRAIN_MAP_SHORT_SIDE_NODES_MIN = 16
 """Smallest number of nodes along the shorter side of a scene's map."""
@@ -79,7 +79,7 @@ class EyepointStudy(BlockStudy):
     """
 
     points_noun = "shots"
-    model_version = VERSION
+    model_version = MODEL_VERSION
 
     def __init__(
         self,
@@ -159,7 +159,9 @@ class EyepointStudy(BlockStudy):
         sizes = VECTOR_DIM_SIZES | {"beamlet": self.n_beamlets}
         return [
             make_output_layout(self._grid, name, output, output.dims, sizes)
-            for name, output in (SHOT_VARIABLES | BEAMLET_VARIABLES | CYCLE_VARIABLES).items()
+            for name, output in (
+                SHOT_GEOMETRY_VARIABLES | BEAMLET_GEOMETRY_VARIABLES | CYCLE_VARIABLES
+            ).items()
         ]
 
     def evaluate(self, block: int) -> Results:
@@ -281,7 +283,7 @@ class EyepointStudy(BlockStudy):
             "n_beamlets": self.n_beamlets,
             "pattern": self.spec.beamlet_pattern,
             "jitter": self.spec.pointing_jitter(),
-            "footprint_full_angles": self.spec.footprint_full_angles(),
+            "footprint_full_angles": self.spec.footprint_angles_function(),
             "bodies_rotate": self.spec.effect_modes()["rotation"] != "off",
         }
 
@@ -315,7 +317,7 @@ def height_above_surface(
 def below_surface_warning(spec: SceneSpec) -> str:
     """Return a warning if the flight is below its scene at times; '' if it is not."""
     built_scene, flight = get_built_scene(spec), spec.build_flight()
-    time = np.linspace(flight.start, flight.stop, N_SAMPLED_FLIGHT_TIMES)
+    time = np.linspace(flight.start_time, flight.stop_time, N_SAMPLED_FLIGHT_TIMES)
     position = flight.state(time).position
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
     hits_above = built_scene.caster.cast_bundles(position, up, poses=_body_poses(built_scene, time))
@@ -325,7 +327,7 @@ def below_surface_warning(spec: SceneSpec) -> str:
     if not is_low.any():
         return ""
     times_below, depth = time[is_low], np.where(is_low, hits_above.range, 0.0)
-    surface = built_scene.surfaces[hits_above.surface_index[depth.argmax(), 0]].name
+    surface = built_scene.surface_materials[hits_above.surface_index[depth.argmax(), 0]].name
     return (
         f"the platform is beneath {surface} from time {times_below[0]:.4g} to "
         f"{times_below[-1]:.4g} s, by "
@@ -402,7 +404,7 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
     view_points = np.stack(
         [*np.meshgrid(x, y), np.full((len(y), len(x)), view_height)], axis=-1
     ).reshape(-1, 3)
-    depth = height_above_surface(built_scene, view_points, spec.build_flight().start)
+    depth = height_above_surface(built_scene, view_points, spec.build_flight().start_time)
     height = np.where(np.isfinite(depth), view_height - depth, np.nan).reshape(len(y), len(x))
     return [
         ArrayLayout.from_values(
@@ -429,10 +431,10 @@ def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -
         np.unique(np.linspace(0, n_shots - 1, N_SAMPLED_FLIGHT_TIMES).astype(int))
     )
     flight = spec.build_flight()
-    state = flight.state(flight.start + scan.time)
+    state = flight.state(flight.start_time + scan.time)
     direction = rotate(state.attitude, scan.direction)
     # Moving bodies are placed at their position at the start of the flight, as in the map.
-    poses = _body_poses(built_scene, flight.start)
+    poses = _body_poses(built_scene, flight.start_time)
     hits = built_scene.caster.cast_bundles(state.position, direction[:, None], poses=poses)
     hit = np.isfinite(hits.range)
     ground = state.position[hit] + direction[hit] * hits.range[hit, None]
@@ -441,7 +443,7 @@ def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -
 
 def _terrain_map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the x and y coordinates of the nodes of square cells that cover a rectangle [m]."""
-    step = float((high - low).max()) / (TERRAIN_MAP_NODES_MAX - 1)
+    step = float((high - low).max()) / (TERRAIN_MAP_LONG_SIDE_NODES - 1)
     count = np.maximum(
         np.ceil((high - low) / step).astype(int) + 1, TERRAIN_MAP_SHORT_SIDE_NODES_MIN
     )

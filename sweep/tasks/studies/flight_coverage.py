@@ -91,7 +91,7 @@ def sample_coverage(spec: SceneSpec) -> FlightCoverage:
     The result is cached.
     """
     built_scene, flight = get_built_scene(spec), spec.build_flight()
-    times = np.linspace(flight.start, flight.stop, _N_SAMPLED_TIMES)
+    times = np.linspace(flight.start_time, flight.stop_time, _N_SAMPLED_TIMES)
     positions = flight.state(times).position
     scanners = tuple(_sample_scanner_hits(spec, scanner) for scanner in spec.scanners)
     return FlightCoverage(

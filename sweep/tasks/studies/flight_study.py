@@ -23,14 +23,15 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.ground import ray_traced_footprint_extent
 from sweep.model.outputs import (
-    BEAMLET_VARIABLES,
+    BEAMLET_GEOMETRY_VARIABLES,
     CYCLE_VARIABLES,
     EFFECT_VARIABLES,
     NAVIGATION_VARIABLES,
-    POINT_VARIABLES,
+    POINT_CLOUD_VARIABLES,
+    SHOT_GEOMETRY_VARIABLES,
     SHOT_STATISTIC_VARIABLES,
-    SHOT_VARIABLES,
 )
+from sweep.spec.figure_sections import NAVIGATION_SHOTS_PER_CYCLE_MIN
 from sweep.spec.rules import Mistake, SpecError
 from sweep.spec.scene_sections import scene_projection_wkt
 from sweep.storage.locations import Location, eyepoint_store_location
@@ -80,10 +81,7 @@ FLIGHT_RANDOM_KEY_DOMAIN = "sweep.flight"
 The draws are the same at every point of the axes and for every instrument.
 """
 
-NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
-"""Smallest number of shots in a measurement cycle from which a velocity vector is computed."""
-
-GEOMETRY_OUTPUTS = SHOT_VARIABLES | CYCLE_VARIABLES
+GEOMETRY_OUTPUTS = SHOT_GEOMETRY_VARIABLES | CYCLE_VARIABLES
 """Output variables of the geometry of shots and cycles, which do not depend on the axes."""
 
 
@@ -271,7 +269,7 @@ class FlightStudy(ExtendableStudy):
 
         IndexError is raised if there is no such block.
         """
-        grid, block_in_grid = self.locate_in_grid(block)
+        grid, block_in_grid = self.locate_block(block)
         scanner_grid = self.scanner_grids[grid.group]
         return LocatedFlightBlock(scanner_grid, scanner_grid.flight_block(block_in_grid))
 
@@ -280,7 +278,7 @@ class FlightStudy(ExtendableStudy):
 
         It also holds the results that do not depend on draws.
         """
-        grid, block_in_grid = self.locate_in_grid(block)
+        grid, block_in_grid = self.locate_block(block)
         *axis_positions, _, cycle_position = grid.block_position(block_in_grid)
         return block - block_in_grid + grid.block_at((*axis_positions, 0, cycle_position))
 
@@ -307,7 +305,7 @@ class FlightStudy(ExtendableStudy):
     def group_attributes(self) -> dict[str, dict[str, Any]]:
         """Return the attributes of each scanner's group, and of the group of the map."""
         coordinate_names = " ".join(
-            member.coordinate for axis in self.spec.axes for member in axis.parameters
+            member.coordinate_name for axis in self.spec.axes for member in axis.parameters
         )
         return {
             scanner: {
@@ -333,7 +331,10 @@ class FlightStudy(ExtendableStudy):
         layouts = []
         for scanner_grid in self.grids:
             outputs = (
-                GEOMETRY_OUTPUTS | SHOT_STATISTIC_VARIABLES | EFFECT_VARIABLES | POINT_VARIABLES
+                GEOMETRY_OUTPUTS
+                | SHOT_STATISTIC_VARIABLES
+                | EFFECT_VARIABLES
+                | POINT_CLOUD_VARIABLES
             )
             outputs = (
                 outputs | NAVIGATION_VARIABLES if scanner_grid.has_navigation_solution else outputs
@@ -388,7 +389,7 @@ class FlightStudy(ExtendableStudy):
             flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers, reused_cloud
         )
         chunks = {}
-        for name in self.chunk_positions(block):
+        for name in self.chunk_positions_of_block(block):
             values, n_dims = (
                 results[name.rpartition("/")[2]],
                 len(self.output_layout_by_name[name].shape),
@@ -484,14 +485,14 @@ class FlightStudy(ExtendableStudy):
         """Return a cloud without reused results: arrays that contain their fill values."""
         outputs = (
             SHOT_STATISTIC_VARIABLES
-            | POINT_VARIABLES
+            | POINT_CLOUD_VARIABLES
             | (NAVIGATION_VARIABLES if scanner_grid.has_navigation_solution else {})
         )
         sizes = VECTOR_DIM_SIZES | {
             "shot": n_shots, "cycle": n_shots // scanner_grid.shots_per_cycle, "draw": n_draws,
             "return_number": int(self.spec.draws.returns),
         }  # fmt: skip
-        results = {name: output.empty(sizes) for name, output in outputs.items()}
+        results = {name: output.empty_array(sizes) for name, output in outputs.items()}
         return ReusedCloud(np.zeros((n_shots, n_draws), bool), results)
 
     def iter_simulated_groups(
@@ -606,9 +607,9 @@ class FlightStudy(ExtendableStudy):
             {
                 name: values[row_index]
                 for name, values in shot_arrays.items()
-                if name in SHOT_VARIABLES
+                if name in SHOT_GEOMETRY_VARIABLES
             },
-            {name: results[name][row_index, draw_slice] for name in POINT_VARIABLES},
+            {name: results[name][row_index, draw_slice] for name in POINT_CLOUD_VARIABLES},
             shots_per_cycle=shots_per_cycle,
             test_level=self.spec.navigation.test_level,
             ground_slope=self.spec.navigation.ground_slope,
@@ -649,7 +650,7 @@ class FlightStudy(ExtendableStudy):
                 if name not in GEOMETRY_OUTPUTS
             }
             (draw_index, cycle_index), (source_draw, source_cycle) = (
-                np.divmod(shared_points.local_indices, len(flight_block.cycles)),
+                np.divmod(shared_points.indices_in_block, len(flight_block.cycles)),
                 np.divmod(
                     shared_points.source_local_indices,
                     len(source_results["flags"]) // shots_per_cycle,
@@ -669,7 +670,7 @@ class FlightStudy(ExtendableStudy):
             }
             part_results |= {
                 name: source_results[name][source_rows, source_draw_column]
-                for name in POINT_VARIABLES
+                for name in POINT_CLOUD_VARIABLES
             }
             _insert_results(results, shot_rows, draw_column, part_results)
             if scanner_grid.has_navigation_solution:
@@ -721,7 +722,7 @@ class FlightStudy(ExtendableStudy):
     @cached_property
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
         """Materials of the scene's surfaces, in the order of the surface numbers."""
-        return tuple(self.spec.surfaces())
+        return tuple(self.spec.surface_materials())
 
     @cached_property
     def ray_error_budget(self) -> ErrorBudget | None:
@@ -741,7 +742,8 @@ class FlightStudy(ExtendableStudy):
             eyepoint_store_location(self.store_path, self.spec.geometry_id(scanner))
         )
         arrays: dict[str, Any] = {
-            name: group[name] for name in SHOT_VARIABLES | BEAMLET_VARIABLES | CYCLE_VARIABLES
+            name: group[name]
+            for name in SHOT_GEOMETRY_VARIABLES | BEAMLET_GEOMETRY_VARIABLES | CYCLE_VARIABLES
         }
         return arrays | {"weight": np.asarray(group["weight"][...])}  # type: ignore[index]
 
@@ -760,8 +762,8 @@ class FlightStudy(ExtendableStudy):
         """Read the stored geometry of some shots. Return it as arrays and as `Eyepoints`."""
         from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
-        shot_arrays = self._read_eyepoint_arrays(scanner, SHOT_VARIABLES, shot_range)
-        beamlet_arrays = self._read_eyepoint_arrays(scanner, BEAMLET_VARIABLES, shot_range)
+        shot_arrays = self._read_eyepoint_arrays(scanner, SHOT_GEOMETRY_VARIABLES, shot_range)
+        beamlet_arrays = self._read_eyepoint_arrays(scanner, BEAMLET_GEOMETRY_VARIABLES, shot_range)
         return shot_arrays, eyepoints_from_arrays(
             shot_arrays | beamlet_arrays, self._get_eyepoint_arrays(scanner)["weight"]
         )

@@ -24,7 +24,7 @@ from sweep.model.beamlet_counts import (
 )
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH
 from sweep.model.effects.catalogue import (
-    EFFECT_SHARED_PARAMETER_PATHS,
+    EFFECT_CATEGORY_KEY_PATHS,
     PARAMETER_DEFAULTS,
     SEPARATE_BATCHES_MASK,
     effect_flag_attributes,
@@ -42,20 +42,20 @@ from sweep.model.outputs import (
     GRID_OUTPUTS,
     N_RUNNING_SUMS,
     RUNNING_SUM_OUTPUTS,
-    RUNNING_SUMS,
-    SPECTRA_OUTPUTS,
+    RUNNING_SUMS_NAME,
+    SPECTRA_STUDY_OUTPUTS,
     STANDARD_ERROR_OUTPUTS,
     STRONGEST_PEAK_OUTPUTS,
     OutputVariable,
 )
 from sweep.model.unsupported_shot import UnsupportedShotError
-from sweep.model.waveform import PEAKS_PATH
+from sweep.model.waveform import REPORTED_PEAKS_PATH
 from sweep.tasks.engine.block_study import (
     NO_RESULTS,
     Deadline,
     EarlierResults,
     PartialResults,
-    UnfinishedBlock,
+    UnfinishedBlockException,
     concatenate_results,
 )
 from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid, Results
@@ -276,7 +276,7 @@ class TileGrid(BlockGrid):
         return any(
             values.dtype.kind in "UO"
             or path in PARAMETERS_CONSTANT_IN_TILE
-            or path in EFFECT_SHARED_PARAMETER_PATHS
+            or path in EFFECT_CATEGORY_KEY_PATHS
             for path, values in self.grid.values_by_axis[axis].items()
         )
 
@@ -341,19 +341,19 @@ class EffectPlanner:
         self._plan_by_tile: dict[int, tuple[int, float]] = {}
 
     def select_for_block(
-        self, block: int, local_indices: np.ndarray | None = None
+        self, block: int, indices_in_block: np.ndarray | None = None
     ) -> SelectedEffects:
         """Return the effects simulated at a block's points, in C order, or at some of them.
 
-        `local_indices` (m,) are indices of points in the block; by default all. Only their tiles
+        `indices_in_block` (m,) are indices of points in the block; by default all. Only their tiles
         are planned.
         """
         tiles, tile_index = self.tiles.tiles_of_block(block)
         parameters = self.tiles.grid.parameters_of_block(block)
-        if local_indices is not None:
-            needed_tiles, tile_index = np.unique(tile_index[local_indices], return_inverse=True)
+        if indices_in_block is not None:
+            needed_tiles, tile_index = np.unique(tile_index[indices_in_block], return_inverse=True)
             tiles = tiles[needed_tiles]
-            parameters = select_parameters(parameters, local_indices)
+            parameters = select_parameters_of_points(parameters, indices_in_block)
         unplanned_tiles = np.array(
             [
                 tile_number
@@ -414,7 +414,7 @@ class EffectPlanner:
                     plan = self._plan_group(tile_group)
                     is_settled = (
                         np.full(len(tile_group.requested_indices), stride == 1)
-                        | plan.keeps_all_optional
+                        | plan.keeps_all_optional_effects
                     )
                     if is_settled.any():
                         yield TilePlans(
@@ -465,11 +465,11 @@ def block_output_variables(spec: GridSpec) -> dict[str, OutputVariable]:
     if not spec.draws.has_draws:
         outputs |= GRID_OUTPUTS | (STRONGEST_PEAK_OUTPUTS if spec.reports_strongest_peak else {})
     elif spec.draws.draws_whole_spectra:
-        outputs |= SPECTRA_OUTPUTS | draw_outputs
+        outputs |= SPECTRA_STUDY_OUTPUTS | draw_outputs
     else:
         running_outputs = RUNNING_SUM_OUTPUTS if spec.has_random_effects else {}
         outputs |= GRID_OUTPUTS | STANDARD_ERROR_OUTPUTS | draw_outputs | running_outputs
-    extra_dims = {RUNNING_SUMS: ("sum",)}
+    extra_dims = {RUNNING_SUMS_NAME: ("sum",)}
     if not spec.draws.is_adaptive:
         extra_dims |= dict.fromkeys(DRAW_COUNT_OUTPUTS, (DRAW_BATCH_DIM,))
     return {name: replace(outputs[name], dims=extra_dims.get(name, ())) for name in sorted(outputs)}
@@ -498,7 +498,7 @@ class GridStudy(ExtendableStudy):
     def store_attributes(self) -> dict[str, Any]:
         """Return title, question, spec and shape of blocks."""
         coordinate_names = [
-            member.coordinate for axis in self.spec.axes for member in axis.parameters
+            member.coordinate_name for axis in self.spec.axes for member in axis.parameters
         ]
         coordinate_names += ["batch_draws"] if draw_batch_sizes(self.spec) else []
         return {
@@ -557,7 +557,7 @@ class GridStudy(ExtendableStudy):
         """Compute a block. Points that the model does not support get fill values.
 
         Finished points in `checkpoint_results` are not computed again; unfinished points are
-        continued. `UnfinishedBlock` is raised at the deadline.
+        continued. `UnfinishedBlockException` is raised at the deadline.
         """
         selected_effects = self.effect_planner.select_for_block(block)
         reused_results = self._read_reused_results(block, selected_effects)
@@ -579,7 +579,7 @@ class GridStudy(ExtendableStudy):
             checkpoint_results,
             deadline or Deadline(),
         )
-        for local_indices, part_results in (
+        for indices_in_block, part_results in (
             reused_results.finished,
             checkpoint_results.finished,
             *computed,
@@ -587,18 +587,18 @@ class GridStudy(ExtendableStudy):
             for name in (
                 results.keys() & part_results.keys()
             ):  # other results serve to continue draws only
-                results[name][local_indices] = part_results[name]
+                results[name][indices_in_block] = part_results[name]
         return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
 
     @property
-    def has_checkpoints(self) -> bool:
+    def supports_checkpoints(self) -> bool:
         """True if the study makes random draws: a block can stop between two draws."""
         return self.spec.draws.has_draws
 
     def evaluate_until(
         self, block: int, checkpoint_results: EarlierResults, deadline: Deadline
     ) -> Results:
-        """Compute a block from a checkpoint on. `UnfinishedBlock` is raised at the deadline."""
+        """Compute a block from its checkpoint; raise `UnfinishedBlockException` at the deadline."""
         return self.evaluate(block, checkpoint_results, deadline)
 
     def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
@@ -615,7 +615,7 @@ class GridStudy(ExtendableStudy):
             )
             has_same_effects = (
                 source_results[EFFECTS_ARRAY].ravel()[shared_points.source_local_indices]
-                == selected_effects.effect_flags[shared_points.local_indices]
+                == selected_effects.effect_flags[shared_points.indices_in_block]
             )
             results = {
                 name: values.reshape(n_source_points, *values.shape[n_axes:])[
@@ -624,13 +624,13 @@ class GridStudy(ExtendableStudy):
                 for name, values in source_results.items()
                 if name not in (EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY)
             }
-            parts.append(PartialResults(shared_points.local_indices[has_same_effects], results))
-        local_indices, results = concatenate_results(parts)
+            parts.append(PartialResults(shared_points.indices_in_block[has_same_effects], results))
+        indices_in_block, results = concatenate_results(parts)
         reused_results = PartialResults(
-            local_indices, initial_running_sums(self.spec, local_indices.size) | results
+            indices_in_block, initial_running_sums(self.spec, indices_in_block.size) | results
         )
         reuse_source.reused_points_by_block[block] = (
-            local_indices.size if reuse_source.has_final_results else 0
+            indices_in_block.size if reuse_source.has_final_results else 0
         )
         return (
             EarlierResults(finished=reused_results)
@@ -649,7 +649,7 @@ class GridStudy(ExtendableStudy):
                 n_reusable += int(
                     np.sum(
                         flags[shared_points.source_local_indices]
-                        == selected_effects.effect_flags[shared_points.local_indices]
+                        == selected_effects.effect_flags[shared_points.indices_in_block]
                     )
                 )
         return n_reusable
@@ -676,10 +676,12 @@ def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
     """Return the layouts of the coordinate arrays of axes, with values in the units of the spec."""
     return [
         ArrayLayout.from_values(
-            member.coordinate,
+            member.coordinate_name,
             (axis.name,),
             np.asarray(member.display_values),
-            cf_attributes(member.units, member.coordinate.replace("_", " "), name=member.coordinate)
+            cf_attributes(
+                member.units, member.coordinate_name.replace("_", " "), name=member.coordinate_name
+            )
             | {"path": member.path},
         )
         for axis in axes
@@ -698,7 +700,8 @@ DRAW_COUNTS_PER_CALL_MAX = 1 << 19
 """Largest number of stored counts of draws per call of the model: one per point and batch."""
 
 NON_PHYSICAL_PARAMETER_PREFIXES = (
-    "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS_PATH
+    "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.",
+    REPORTED_PEAKS_PATH
 )  # fmt: skip
 """Prefixes of parameters that change how draws are evaluated, but not what is drawn."""
 
@@ -723,59 +726,66 @@ def iter_block_results(
     ``reused_results`` are from another study, ``checkpoint_results`` from an earlier task. Finished
     points in them are not computed again, and unfinished points are continued.
 
-    At the deadline `UnfinishedBlock` is raised, which holds the results so far. A later call that
-    continues from them gives bit for bit the results of a call without a deadline.
+    At the deadline `UnfinishedBlockException` is raised, which holds the results so far. A later
+    call that continues from them gives bit for bit the results of a call without a deadline.
     """
     parameters, order = grid.parameters_of_block(block), grid.point_order_by_geometry(block)
     order = order[
         ~np.isin(
             order,
-            [*reused_results.finished.local_indices, *checkpoint_results.finished.local_indices],
+            [
+                *reused_results.finished.indices_in_block,
+                *checkpoint_results.finished.indices_in_block,
+            ],
         )
     ]
     finished, points_per_call = [checkpoint_results.finished], _points_per_call(spec)
     pending = deque(
-        (effects, local_indices)
+        (effects, indices_in_block)
         for members, effects in selected_effects.subset(order).iter_groups_by_effects()
-        for local_indices in np.split(
+        for indices_in_block in np.split(
             order[members], range(points_per_call, len(members), points_per_call)
         )
     )
     while pending:
-        effects, local_indices = pending.popleft()
+        effects, indices_in_block = pending.popleft()
         if len(finished) > 1 and deadline():
             raise _make_unfinished_block(spec, finished, NO_RESULTS)
-        is_resumed = np.isin(local_indices, checkpoint_results.unfinished.local_indices).any()
+        is_resumed = np.isin(indices_in_block, checkpoint_results.unfinished.indices_in_block).any()
         prior_draws = extract_prior_draws(
-            spec, (checkpoint_results if is_resumed else reused_results).unfinished, local_indices
+            spec,
+            (checkpoint_results if is_resumed else reused_results).unfinished,
+            indices_in_block,
         )
-        subset = select_parameters(parameters, local_indices)
+        subset = select_parameters_of_points(parameters, indices_in_block)
         try:
             results = evaluate_points(
-                spec, subset, len(local_indices), effects, prior_draws, deadline
+                spec, subset, len(indices_in_block), effects, prior_draws, deadline
             )
         except UnsupportedShotError:  # halved until only unsupported points are left out
-            if len(local_indices) > 1:
+            if len(indices_in_block) > 1:
                 pending.extendleft(
-                    (effects, half) for half in np.array_split(local_indices, 2)[::-1]
+                    (effects, half) for half in np.array_split(indices_in_block, 2)[::-1]
                 )
             continue
         if deadline.has_passed:
-            raise _make_unfinished_block(spec, finished, PartialResults(local_indices, results))
-        finished.append(PartialResults(local_indices, results))
+            raise _make_unfinished_block(spec, finished, PartialResults(indices_in_block, results))
+        finished.append(PartialResults(indices_in_block, results))
         yield finished[-1]
 
 
 def _make_unfinished_block(
     spec: GridSpec, finished: list[PartialResults], unfinished: PartialResults
-) -> UnfinishedBlock:
+) -> UnfinishedBlockException:
     """Return the exception of a block that stops at its deadline, with the results so far."""
     results = EarlierResults(
-        concatenate_results([part for part in finished if part.local_indices.size]), unfinished
+        concatenate_results([part for part in finished if part.indices_in_block.size]), unfinished
     )
-    n_draws = unfinished.results["n_draws"].sum() if unfinished.local_indices.size else 0
+    n_draws = unfinished.results["n_draws"].sum() if unfinished.indices_in_block.size else 0
     point_fraction = float(n_draws) / max(spec.draws.number, spec.draws.limit, 1)
-    return UnfinishedBlock(results, results.finished.local_indices.size + point_fraction)
+    return UnfinishedBlockException(
+        results, results.finished.indices_in_block.size + point_fraction
+    )
 
 
 def evaluate_points(
@@ -806,7 +816,7 @@ def evaluate_points(
     return {name: np.broadcast_to(values, (n_points,)) for name, values in outputs.items()}
 
 
-def select_parameters(
+def select_parameters_of_points(
     parameters: Mapping[str, ParameterValue], indices: np.ndarray
 ) -> dict[str, ParameterValue]:
     """Return the parameters of some of the points; scalars stay as they are."""
@@ -849,31 +859,31 @@ def random_keys_of_points(
 
 
 def extract_prior_draws(
-    spec: GridSpec, previous: PartialResults, local_indices: np.ndarray
+    spec: GridSpec, previous: PartialResults, indices_in_block: np.ndarray
 ) -> PriorDraws | None:
     """Return the earlier draws of some points of a block; None if there are none."""
     from sweep.model.sampling.samplers import PriorDraws
 
     _, previous_rows, rows = np.intersect1d(
-        previous.local_indices, local_indices, return_indices=True
+        previous.indices_in_block, indices_in_block, return_indices=True
     )
     if not rows.size:
         return None
 
     def spread_over_points(name: str) -> np.ndarray:
         values = previous.results[name][previous_rows]
-        spread = np.zeros((len(local_indices), *values.shape[1:]), values.dtype)
+        spread = np.zeros((len(indices_in_block), *values.shape[1:]), values.dtype)
         spread[rows] = values
         return spread
 
     counts = np.stack(
-        [spread_over_points(name).reshape(len(local_indices), -1) for name in DRAW_COUNT_OUTPUTS]
+        [spread_over_points(name).reshape(len(indices_in_block), -1) for name in DRAW_COUNT_OUTPUTS]
     )
     n_missing_batches = max(1, len(draw_batch_sizes(spec))) - counts.shape[-1]
     counts = np.pad(counts, ((0, 0), (0, 0), (0, n_missing_batches)))
     means = {
         name: spread_over_points(name)
-        for name in (*GRID_OUTPUTS, RUNNING_SUMS)
+        for name in (*GRID_OUTPUTS, RUNNING_SUMS_NAME)
         if name in previous.results
     }
     return PriorDraws(spread_over_points("n_draws"), counts, means)
@@ -897,7 +907,7 @@ def _simulate_draws(
         "prior_draws": prior_draws,
         "should_stop": should_stop or never_stop,
         "method": draws.method,
-        "error_budget": ErrorBudget.from_parameters(parameters, interval=draws.interval),
+        "error_budget": ErrorBudget.from_parameters(parameters, count_interval_name=draws.interval),
     }
     if draws.is_adaptive:
         keywords |= {"batch": draws.batch, "limit": draws.limit}
@@ -911,7 +921,7 @@ def _simulate_draws(
 def initial_running_sums(spec: GridSpec, n_points: int) -> Results:
     """Return running sums of 0 (n_points, sums); an empty dict if the study stores no sums."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
-    return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
+    return {RUNNING_SUMS_NAME: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:

@@ -49,4 +49,4 @@ def make_output_layout(
     """
     all_attributes = cf_attributes(output.units, output.long_name, output.comment, name)
     all_attributes |= attributes or {}
-    return grid.make_layout(name, output.dtype, dims, sizes, all_attributes)
+    return grid.make_output_layout(name, output.dtype, dims, sizes, all_attributes)

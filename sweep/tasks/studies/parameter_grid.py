@@ -260,7 +260,7 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
     def parameters_of_block(self, block: int) -> dict[str, ParameterValue]:
         """Return the parameters of a block's points by path: scalars, or arrays (n,) in C order."""
         return self.parameters_at(
-            self.grid_indices(block, np.arange(self.count_block_points(block)))
+            self.point_indices_in_grid(block, np.arange(self.count_block_points(block)))
         )
 
     def parameters_at(self, grid_indices: np.ndarray) -> dict[str, ParameterValue]:
@@ -280,7 +280,7 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
         Radiometric axes vary fastest, and velocities slowest, as the change of a spectral line
         within a record depends on velocity.
         """
-        local_indices = np.arange(self.count_block_points(block)).reshape(
+        indices_in_block = np.arange(self.count_block_points(block)).reshape(
             self.actual_block_shape(block)
         )
         is_velocity_axis = ["target.radial_velocity" in values for values in self.values_by_axis]
@@ -288,4 +288,4 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
             range(len(self.shape)),
             key=lambda axis: (not self.is_geometric_axis[axis], not is_velocity_axis[axis], axis),
         )
-        return local_indices.transpose(axes).ravel()
+        return indices_in_block.transpose(axes).ravel()

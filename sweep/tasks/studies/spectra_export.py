@@ -189,7 +189,7 @@ def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarr
     from sweep.model.pointcloud.returns import beamlet_line_positions
 
     line_bins = beamlet_line_positions(shots)[-1, list(shots.has_segment)]
-    scale = np.broadcast_to(shots.echo_scales.beat_amplitude, shots.size)[-1]
+    scale = np.broadcast_to(shots.echo_scales.beat_amplitude_scale, shots.size)[-1]
     return line_bins * bin_width, shots.footprint.relative_amplitude[
         int(shots.footprint.row_of_point[-1])
     ] * scale

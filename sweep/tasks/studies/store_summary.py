@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.outputs import PD_OUTPUTS
+from sweep.model.outputs import PD_OUTPUT_NAMES
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.storage.locations import PACKED_ATTRIBUTE, Location, file_sizes_below, parse_location
 from sweep.storage.store_format import read_receipt_totals
 from sweep.storage.verified_store import open_verified_group
 from sweep.tasks.engine import journal
 from sweep.tasks.engine.block_study import BlockStudy
-from sweep.tasks.engine.journal import blocks_with_receipt, read_checkpoint_points
+from sweep.tasks.engine.journal import read_checkpoint_point_counts, receipted_block_mask
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies import study_loading
 from sweep.tasks.studies.flight_study import FlightStudy
@@ -29,7 +29,7 @@ from sweep.tasks.studies.grid_study import (
     GridStudy,
     evaluate_points,
     limit_draws,
-    select_parameters,
+    select_parameters_of_points,
 )
 from sweep.tasks.studies.parameter_grid import TOLERANCE_PARAMETER
 
@@ -93,7 +93,7 @@ class DetectionSummary(NamedTuple):
     """Name and units of the slowest axis; '' for a grid without axes."""
     rows: list[DetectionRow]
     """A row for each part of this axis, and a last row for the whole grid."""
-    block_fraction: float
+    sampled_block_fraction: float
     """Fraction of the stored blocks that were read."""
 
 
@@ -122,7 +122,7 @@ def detection_summary(store: str | Location) -> DetectionSummary:
     pd_by_part = [np.concatenate(values_of_part, axis=1) for values_of_part in values_by_part]
     total_row = DetectionRow.from_points("all", *np.concatenate(pd_by_part, axis=1))
     if axis is None:
-        return DetectionSummary("", [total_row], sample.block_fraction)
+        return DetectionSummary("", [total_row], sample.sampled_block_fraction)
     labels = [_axis_range_label(axis, first, stop) for first, stop in pairwise(part_edges)]
     rows = [
         DetectionRow.from_points(label, *values)
@@ -130,7 +130,7 @@ def detection_summary(store: str | Location) -> DetectionSummary:
     ]
     units = axis.parameters[0].units if len(axis.parameters) == 1 else ""
     heading = f"{axis.name} [{units}]" if units else axis.name
-    return DetectionSummary(heading, [*rows, total_row], sample.block_fraction)
+    return DetectionSummary(heading, [*rows, total_row], sample.sampled_block_fraction)
 
 
 class UnsupportedPoints(NamedTuple):
@@ -171,7 +171,7 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
         study.effect_planner.select_for_block(block).subset(local_index).iter_groups_by_effects()
     )
     try:
-        parameters = select_parameters(study.grid.parameters_of_block(block), local_index)
+        parameters = select_parameters_of_points(study.grid.parameters_of_block(block), local_index)
         evaluate_points(limit_draws(study.spec, 1), parameters, 1, effects)
     except UnsupportedShotError as error:
         return str(error)
@@ -183,7 +183,7 @@ class _BlockSample(NamedTuple):
 
     block_numbers: np.ndarray
     """Numbers (m,) of the sampled blocks, in rising order."""
-    block_fraction: float
+    sampled_block_fraction: float
     """Fraction of the stored blocks that are in the sample."""
 
 
@@ -195,7 +195,7 @@ def _sample_blocks(
     Equal calls give equal samples.
     """
     done_block_numbers = (
-        np.flatnonzero(blocks_with_receipt(store, study))
+        np.flatnonzero(receipted_block_mask(store, study))
         if done_block_numbers is None
         else done_block_numbers
     )
@@ -240,7 +240,7 @@ def iter_block_values(
     group = open_verified_group(store)
     arrays: list[Any] = [group[array_name] for array_name in array_names]
     for block in blocks:
-        if (region := study.chunk_regions(int(block)).get(array_names[0])) is not None:
+        if (region := study.chunk_regions_of_block(int(block)).get(array_names[0])) is not None:
             yield BlockValues(region, [np.asarray(array[region or ...]) for array in arrays])
 
 
@@ -255,13 +255,13 @@ class ScannerRow:
     """Name of the scanner, and values at the point of the axes, as text."""
     n_shots: int = 0
     """Number of shots times draws."""
-    shots_with_true_return: int = 0
+    n_shots_with_true_return: int = 0
     """Number of shots (times draws) with at least one true return."""
-    false_points: int = 0
+    n_false_points: int = 0
     """Number of points of the clouds that are not true returns."""
     n_cycles: int = 0
     """Number of cycles times draws; 0 if a cycle has too few shots for navigation."""
-    solved_cycles: int = 0
+    n_solved_cycles: int = 0
     """Number of cycles (times draws) with a velocity vector."""
     pd_of_shots_by_block: list[np.ndarray] = field(default_factory=list, repr=False)
     """Probabilities of detection of the shots that hit something, by block."""
@@ -275,12 +275,16 @@ class ScannerRow:
     def add_block(self, block_arrays: Mapping[str, np.ndarray]) -> None:
         """Add a block, given the part of each array that it wrote."""
         from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
-        from sweep.model.pointcloud.pairing import TRUE_FLAG
+        from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
         point_flags = block_arrays["flags"]
         self.n_shots += point_flags[..., 0].size
-        self.shots_with_true_return += int(((point_flags & TRUE_FLAG) > 0).any(axis=-1).sum())
-        self.false_points += int(((point_flags > 0) & ((point_flags & TRUE_FLAG) == 0)).sum())
+        self.n_shots_with_true_return += int(
+            ((point_flags & TRUE_RETURN_FLAG) > 0).any(axis=-1).sum()
+        )
+        self.n_false_points += int(
+            ((point_flags > 0) & ((point_flags & TRUE_RETURN_FLAG) == 0)).sum()
+        )
         if "pd_shot" in block_arrays:  # only blocks of the first draws have it
             self.pd_of_shots_by_block.append(
                 block_arrays["pd_shot"][np.isfinite(block_arrays["pd_shot"])]
@@ -288,7 +292,7 @@ class ScannerRow:
         if "velocity_status" in block_arrays:
             status = block_arrays["velocity_status"]
             self.n_cycles += status.size
-            self.solved_cycles += int((status <= STATUS_EXCLUDED).sum())
+            self.n_solved_cycles += int((status <= STATUS_EXCLUDED).sum())
 
 
 def flight_summary(store: str | Location) -> list[ScannerRow]:
@@ -310,9 +314,9 @@ def flight_summary(store: str | Location) -> list[ScannerRow]:
         for axis_point in (axis_points if is_listed_by_axis_point else [()])
     }
     group: Any = open_verified_group(store_path)
-    for block in np.flatnonzero(blocks_with_receipt(store_path, study)).tolist():
+    for block in np.flatnonzero(receipted_block_mask(store_path, study)).tolist():
         flight_block = study.locate_flight_block(block).flight_block
-        regions = study.chunk_regions(block)
+        regions = study.chunk_regions_of_block(block)
         names = (
             f"{flight_block.scanner}/{name}" for name in ("flags", "pd_shot", "velocity_status")
         )
@@ -333,7 +337,7 @@ def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list
     `axis_point` may have fewer indices than there are axes: the last axes are then left out.
     """
     return [
-        f"{member.coordinate} "
+        f"{member.coordinate_name} "
         f"{_format_value(member.display_values[index])}{' ' * bool(member.units)}{member.units}"
         for axis, index in zip(axes, axis_point, strict=False)
         for member in axis.parameters
@@ -360,15 +364,15 @@ class AccuracyRow:
     """Tolerance at the worst point."""
     worst_point_label: str = ""
     """Values of the axes at the worst point, as text."""
-    samples_at_worst_point: int = 0
+    n_samples_at_worst_point: int = 0
     """Number of draws, or of rays, at the worst point."""
     n_total_samples: int = 0
     """Number of draws, or of rays, at all points together."""
-    samples_max: int = 0
+    n_samples_max: int = 0
     """Largest number of draws, or of rays, at a point."""
     worst_point_index: tuple[int, ...] = ()
     """Index of the worst point in the stored array."""
-    block_fraction: float = 1.0
+    sampled_block_fraction: float = 1.0
     """Fraction of the stored blocks that were read."""
     _worst_excess: float = -math.inf
 
@@ -378,12 +382,12 @@ class AccuracyRow:
         return max(0.0, self.worst_error - self.tolerance_at_worst_point)
 
     @property
-    def mean_samples(self) -> float:
+    def mean_n_samples(self) -> float:
         """Mean number of draws or rays per point."""
         return self.n_total_samples / max(self.n_points, 1)
 
     @property
-    def draws_needed(self) -> float:
+    def n_draws_needed(self) -> float:
         """Approximate number of draws that would meet the tolerance at the worst point.
 
         nan if it is met, inf if no number would meet it.
@@ -393,7 +397,7 @@ class AccuracyRow:
         if not self.tolerance_at_worst_point:
             return math.inf
         return math.ceil(
-            self.samples_at_worst_point * (self.worst_error / self.tolerance_at_worst_point) ** 2
+            self.n_samples_at_worst_point * (self.worst_error / self.tolerance_at_worst_point) ** 2
         )
 
     def add_points(
@@ -414,11 +418,11 @@ class AccuracyRow:
         self.n_points += int(is_known.sum())
         self.n_points_within_tolerance += int((excess <= 0).sum() - (~is_known).sum())
         self.n_total_samples += int(samples.sum())
-        self.samples_max = max(self.samples_max, int(samples.max(initial=0)))
+        self.n_samples_max = max(self.n_samples_max, int(samples.max(initial=0)))
         worst = np.unravel_index(np.argmax(excess), excess.shape)
         if excess[worst] > self._worst_excess:
             self._worst_excess, self.worst_error = float(excess[worst]), float(errors[worst])
-            self.tolerance_at_worst_point, self.samples_at_worst_point = (
+            self.tolerance_at_worst_point, self.n_samples_at_worst_point = (
                 float(tolerances[worst]),
                 int(samples[worst]),
             )
@@ -438,7 +442,7 @@ def accuracy_rows_of_draws(
     study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, GridStudy) or not study.spec.draws.has_draws:
         return []
-    error_arrays = {name: f"{name}_half_width" for name in PD_OUTPUTS}
+    error_arrays = {name: f"{name}_half_width" for name in PD_OUTPUT_NAMES}
     return [
         row
         for row in _accuracy_rows(
@@ -515,7 +519,10 @@ def _accuracy_rows(
     ``samples_array`` holds the numbers of draws or rays.
     """
     sample, axes = _sample_blocks(store_path, study, done_block_numbers), study.spec.axes
-    rows = [AccuracyRow(name, block_fraction=sample.block_fraction) for name in error_arrays]
+    rows = [
+        AccuracyRow(name, sampled_block_fraction=sample.sampled_block_fraction)
+        for name in error_arrays
+    ]
     tolerance = np.broadcast_to(tolerance, study.output_layout_by_name[samples_array].shape)
     for region, (samples, *error_values) in iter_block_values(
         store_path, study, [samples_array, *error_arrays.values()], sample.block_numbers
@@ -627,7 +634,9 @@ def status(store: str | Location) -> Status:
         blocks=study.n_blocks,
         blocks_done=receipts.n_committed_blocks,
         done_block_numbers=np.flatnonzero(receipts.points_by_block),
-        points_in_unfinished_blocks=sum(read_checkpoint_points(store_path, study.id).values()),
+        points_in_unfinished_blocks=sum(
+            read_checkpoint_point_counts(store_path, study.id).values()
+        ),
         failures=journal.read_permanent_failures(store_path, study.n_blocks),
         lock_holder=holder,
         is_lock_holder_alive=holder is not None and journal.is_holder_alive(store_path, holder),
@@ -635,8 +644,8 @@ def status(store: str | Location) -> Status:
         if isinstance(study, GridStudy)
         else 0,
         bytes_stored=packed_bytes or int(receipts.bytes_by_block.sum()),
-        points_per_second=receipts.recent_points / run_seconds
-        if receipts.recent_points and run_seconds > 0
+        points_per_second=receipts.n_recent_points / run_seconds
+        if receipts.n_recent_points and run_seconds > 0
         else 0.0,
         workers_in_last_run=len(receipts.recent_workers),
         threads_in_last_run=last_run.n_threads,

@@ -32,19 +32,19 @@ from sweep.storage.locations import (
     can_create_store,
     eyepoint_store_location,
     file_sizes_below,
-    iter_names_below,
+    iter_file_names_below,
     parse_location,
     read_object,
     recover_interrupted_replace,
     to_zarr_store,
-    translate_errors,
+    translate_object_store_errors,
     write_path_atomically,
 )
 from sweep.storage.store_format import (
     contents_digest,
-    encode_record,
-    iter_lines_and_records,
-    iter_records,
+    encode_log_record,
+    iter_log_lines,
+    iter_log_records,
     objects_match_digest,
     stored_objects_digest,
 )
@@ -56,7 +56,12 @@ from sweep.storage.verified_store import (
 from sweep.tasks.engine import journal, study_store
 from sweep.tasks.engine.block_study import BlockStudy
 from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid
-from sweep.tasks.engine.journal import LOG_FILE_NAMES, RECIPE_FILE, committed_blocks, read_recipe
+from sweep.tasks.engine.journal import (
+    LOG_FILE_NAMES,
+    RECIPE_FILE,
+    committed_block_mask,
+    read_recipe,
+)
 from sweep.tasks.engine.progress import Progress, StoreError, make_progress, raise_as_store_error
 from sweep.tasks.engine.study_store import (
     Damage,
@@ -225,7 +230,7 @@ def _verify_store(
 
 def _count_undamaged_blocks(store_path: Location, study: BlockStudy, damages: list[Damage]) -> int:
     """Count the committed blocks without damage."""
-    is_undamaged = journal.blocks_with_receipt(store_path, study)
+    is_undamaged = journal.receipted_block_mask(store_path, study)
     is_undamaged[[damage.block for damage in damages]] = False
     return int(np.count_nonzero(is_undamaged))
 
@@ -242,7 +247,7 @@ def _find_log_damages(store_path: Location) -> list[Damage]:
         Damage(f"{JOURNAL_DIR}/{name} line {line_number}", "is damaged or cut short")
         for name in (*journal.LOG_FILE_NAMES, RECIPE_FILE)
         for line_number, (line, record) in enumerate(
-            iter_lines_and_records(store_path / JOURNAL_DIR / name), start=1
+            iter_log_lines(store_path / JOURNAL_DIR / name), start=1
         )
         if record is None and not (is_lock_holder_alive and not line.endswith(b"\n"))
     ]
@@ -254,7 +259,7 @@ def _foreign_object_names(store_path: Location) -> list[str]:
         return list_foreign_files(store_path)
     manifest = study_store.read_manifest_digests(store_path)
     names = (
-        name for name in iter_names_below(store_path) if not name.startswith(f"{JOURNAL_DIR}/")
+        name for name in iter_file_names_below(store_path) if not name.startswith(f"{JOURNAL_DIR}/")
     )
     arrays = {name.removesuffix("/zarr.json") for name in manifest}
     return [
@@ -273,7 +278,7 @@ def _iter_surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterat
         if study
         else {}
     )
-    for name in iter_names_below(store_path):
+    for name in iter_file_names_below(store_path):
         if name in manifest or name.startswith(f"{JOURNAL_DIR}/") or name.endswith(DRAFT_SUFFIX):
             continue
         chunk = CHUNK_NAME_PATTERN.fullmatch(name)
@@ -428,7 +433,7 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
         _refuse_unreproducible_template(store_path, template_path)
         template_digests = {
             name: stored_objects_digest(template_path, [name])
-            for name in sorted(iter_names_below(template_path))
+            for name in sorted(iter_file_names_below(template_path))
         }
         altered_names = [
             name
@@ -512,7 +517,7 @@ def pack_store(
     """
     store_path, output = parse_location(store_path).absolute(), parse_location(output).absolute()
     attributes, study = study_loading.read_study_and_check_blocks(store_path)
-    n_missing = study.n_blocks - int(np.count_nonzero(committed_blocks(store_path, study)))
+    n_missing = study.n_blocks - int(np.count_nonzero(committed_block_mask(store_path, study)))
     if attributes.get(PACKED_ATTRIBUTE) or n_missing:
         reason = (
             "is packed already"
@@ -552,7 +557,7 @@ def _write_packed_store(
     progress.begin(points=len(names), done=0, unit="arrays")
     try:
         for name in names:
-            with translate_errors(store_path), translate_errors(output):
+            with translate_object_store_errors(store_path), translate_object_store_errors(output):
                 _pack_array(arrays[name], output / name)
             progress.advance(points=1, failed=0)
     finally:
@@ -560,13 +565,13 @@ def _write_packed_store(
     if study_loading.read_study(store_path).attributes["study_id"] != study.id:
         raise StoreError(f"{store_path} was extended or replaced while it was copied: try again")
     for name in (*LOG_FILE_NAMES, RECIPE_FILE):
-        lines = iter_records(store_path / JOURNAL_DIR / name)
+        lines = iter_log_records(store_path / JOURNAL_DIR / name)
         # without the name of the machine, as copies are given to others
         anonymous_lines = [
             {key: value for key, value in line.items() if key not in ("host", "pid")}
             for line in lines
         ]
-        if content := b"".join(map(encode_record, anonymous_lines)):
+        if content := b"".join(map(encode_log_record, anonymous_lines)):
             atomic_write(output / JOURNAL_DIR / name, content)
     names = [name for name in file_sizes_below(output) if not name.startswith(f"{JOURNAL_DIR}/")]
     digests = {name: stored_objects_digest(output, [name]) for name in names}

@@ -24,7 +24,7 @@ from sweep.messages import (
     shell_command,
     suggested_call,
 )
-from sweep.model import VERSION
+from sweep.model import MODEL_VERSION
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import GridSpec, SceneSpec, SpecError, describe_differences, from_stored
 from sweep.spec.grid_checks import is_detector_or_estimator_parameter
@@ -38,7 +38,7 @@ from sweep.tasks.engine.block_study import StoredStudy
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import (
     EXTENDED_STORE_KEY,
-    committed_blocks,
+    committed_block_mask,
     read_committed_digests,
     read_recipe,
 )
@@ -74,7 +74,9 @@ def _find_reuse_source(
     """Return the results in a store that a study can take over; None if the store is unusable."""
     try:
         attributes = store_format.read_attributes(source_path)
-        study_store.refuse_other_versions(source_path, attributes, VERSION, reader="this machine")
+        study_store.refuse_other_versions(
+            source_path, attributes, MODEL_VERSION, reader="this machine"
+        )
         source_spec = _read_spec(
             source_path, read_recipe(source_path), attributes.get("spec", "{}")
         )
@@ -157,7 +159,7 @@ def refuse_other_study(
     if attributes["study_id"] == requested_spec.id:
         return
     study_store.refuse_other_versions(
-        store_path, attributes, VERSION, reader="this machine"
+        store_path, attributes, MODEL_VERSION, reader="this machine"
     )  # the id depends on the version too
     lines = "\n".join(f"  {line}" for line in describe_differences(stored_spec, requested_spec))
     raise StoreError(
@@ -185,7 +187,7 @@ class SharedPoints(NamedTuple):
 
     source_block: int
     """Block of the smaller study."""
-    local_indices: np.ndarray
+    indices_in_block: np.ndarray
     """Indices (m,) int64 of the points in the larger study's block, in C order."""
     source_local_indices: np.ndarray
     """Indices (m,) int64 of the same points in `source_block`, in C order."""
@@ -222,7 +224,7 @@ class ReuseSource:
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
         """Yield the points of a block that are also in committed blocks of the smaller study."""
-        target_grid, block_in_grid = self._target_study.locate_in_grid(block)
+        target_grid, block_in_grid = self._target_study.locate_block(block)
         source_grids = {grid.group: grid for grid in self.source_study.grids}
         if (
             not (self.has_final_results or self.has_first_draws)
@@ -241,9 +243,9 @@ class ReuseSource:
             is_reusable = is_reusable & ~np.asarray(
                 self._target_study.has_numerics_set_by_tolerance(block)
             )
-        local_indices = np.flatnonzero(is_reusable)
+        indices_in_block = np.flatnonzero(is_reusable)
         source_blocks, source_local_indices = source_grid.locate_points(
-            source_grid_indices[local_indices]
+            source_grid_indices[indices_in_block]
         )
         for source_block in np.unique(source_blocks).tolist():
             if (
@@ -255,7 +257,7 @@ class ReuseSource:
                 is_in_block = source_blocks == source_block
                 yield SharedPoints(
                     first_source_block + source_block,
-                    local_indices[is_in_block],
+                    indices_in_block[is_in_block],
                     source_local_indices[is_in_block],
                 )
 
@@ -285,7 +287,7 @@ class ReuseSource:
                 return None
             return {
                 name: self.read_chunk(name, source_block)
-                for name in self.source_study.chunk_positions(source_block)
+                for name in self.source_study.chunk_positions_of_block(source_block)
             }
         except CHUNK_READ_ERRORS:
             return None
@@ -293,7 +295,9 @@ class ReuseSource:
     def read_chunk(self, name: str, source_block: int) -> np.ndarray:
         """Return a chunk of a block of the smaller study, without checking its digest."""
         return np.asarray(
-            self._source_arrays[name].blocks[self.source_study.chunk_positions(source_block)[name]]
+            self._source_arrays[name].blocks[
+                self.source_study.chunk_positions_of_block(source_block)[name]
+            ]
         )
 
     @cached_property
@@ -327,7 +331,7 @@ class ReuseSource:
 
 def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
     """Return a message on how many points are done, in this store or in the one it extends."""
-    is_done = committed_blocks(store_path, study)
+    is_done = committed_block_mask(store_path, study)
     n_points_there, remark = study.count_points_in_blocks(is_done), ""
     if study.reuse_source is not None:
         n_points_there += sum(
@@ -424,7 +428,7 @@ def apply_changes(spec: AnySpec, changes: Mapping[str, Any]) -> AnySpec:
             parent = ".".join(sections)
             raise SpecError([Mistake(path, f"is no field: {parent} holds none", str(value))])
         section[field_name] = value
-    base = spec.base if isinstance(spec, SceneSpec) else "."
+    base = spec.base_folder if isinstance(spec, SceneSpec) else "."
     return type(spec).from_mapping(mapping, base=base)
 
 

@@ -29,7 +29,7 @@ from sweep.tasks.studies.grid_study import (
     GridStudy,
     evaluate_points,
     limit_draws,
-    select_parameters,
+    select_parameters_of_points,
 )
 from sweep.tasks.studies.memory_limits import (
     block_peak_bytes,
@@ -143,7 +143,7 @@ class ScannerPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class StudyPlan:
-    """Plan of a study; `scanners` and `scene_reports` are empty for a grid."""
+    """Plan of a study; `scanners` and `mesh_reports` are empty for a grid."""
 
     n_points: int
     n_blocks: int
@@ -154,12 +154,14 @@ class StudyPlan:
     has_workers: bool  # True if worker processes compute, False if threads do
     seconds_per_point: float  # measured time of a point on one core [s]
     time_parts: tuple[TimePart, ...]  # parts of the time of the run
-    busy_ratio: float  # wall time over processor time of this process as it planned, at least 1
+    wall_to_cpu_time_ratio: (
+        float  # wall time over processor time of this process as it planned, at least 1
+    )
     memory_bytes: (
         int  # estimated memory of each worker, or of this process with its threads [bytes]
     )
     scanners: tuple[ScannerPlan, ...] = ()
-    scene_reports: tuple[str, ...] = ()  # repairs of meshes when the scene was loaded
+    mesh_reports: tuple[str, ...] = ()  # repairs of meshes when the scene was loaded
 
     @property
     def cpu_seconds(self) -> float:
@@ -170,7 +172,7 @@ class StudyPlan:
     def wall_seconds(self) -> float:
         """Estimated wall time of the run, with the processors as busy as now [s]."""
         start_seconds = WORKER_START_SECONDS if self.has_workers else 0.0
-        return start_seconds + self.busy_ratio * sum(
+        return start_seconds + self.wall_to_cpu_time_ratio * sum(
             part.cpu_seconds / part.n_parallel for part in self.time_parts
         )
 
@@ -217,10 +219,10 @@ def plan_study(
     n_workers = n_workers or spec.execution.workers or options.n_threads(SpecWorkload(spec))
     n_parallel = min(n_workers, study.n_blocks)
     scanners: tuple[ScannerPlan, ...] = ()
-    scene_reports: tuple[str, ...] = ()
+    mesh_reports: tuple[str, ...] = ()
     block_shape = {}
     if isinstance(study, FlightStudy):
-        scanners, parts, scene_reports = _plan_flight(study, n_workers)
+        scanners, parts, mesh_reports = _plan_flight(study, n_workers)
         seconds_per_point = sum(
             part.cpu_seconds for part in parts if part.name in ("rays", "shots")
         ) / (study.n_points)
@@ -249,12 +251,14 @@ def plan_study(
         has_workers=has_workers,
         seconds_per_point=seconds_per_point,
         time_parts=(start_part, *parts, writing_part),
-        busy_ratio=min(max(wall_seconds / cpu_seconds, 1.0), WALL_TO_CPU_TIME_RATIO_MAX),
+        wall_to_cpu_time_ratio=min(
+            max(wall_seconds / cpu_seconds, 1.0), WALL_TO_CPU_TIME_RATIO_MAX
+        ),
         # with the model loaded, and for each block at work its results and their encoded copy
         memory_bytes=psutil.Process().memory_info().rss
         + (1 if has_workers else n_parallel) * block_peak_bytes(study),
         scanners=scanners,
-        scene_reports=scene_reports,
+        mesh_reports=mesh_reports,
     )
 
 
@@ -411,17 +415,17 @@ def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tu
     Return the number of points, and the estimated time of draws that were left out [s].
     """
     spec, extrapolated_seconds = study.spec, 0.0
-    local_indices = _sampled_indices_of_block(study, block, n_geometries)
+    indices_in_block = _sampled_indices_of_block(study, block, n_geometries)
     parameters = study.grid.parameters_of_block(block)
     for members, effects in study.effect_planner.select_for_block(
-        block, local_indices
+        block, indices_in_block
     ).iter_groups_by_effects():
-        group_parameters = select_parameters(parameters, local_indices[members])
+        group_parameters = select_parameters_of_points(parameters, indices_in_block[members])
         draws_max = TIMED_SPECTRA_MAX if spec.draws.draws_whole_spectra else TIMED_DRAWS_MAX
         extrapolated_seconds += time_points(
             spec, group_parameters, len(members), effects, draws_max=draws_max
         ).extrapolated_seconds
-    return len(local_indices), extrapolated_seconds
+    return len(indices_in_block), extrapolated_seconds
 
 
 class PointTimes(NamedTuple):
@@ -667,7 +671,7 @@ class EffectsTable:
     """Tolerance of the study."""
     error_bound: float
     """Upper bound of the change by all omitted effects together, at any point."""
-    tile_fraction: float
+    planned_tile_fraction: float
     """Fraction of the tiles that were planned."""
 
     def warnings(self) -> Iterator[str]:
@@ -745,7 +749,7 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
             if costs
             else math.nan
         ),
-        tile_fraction=len(tiles) / n_tiles,
+        planned_tile_fraction=len(tiles) / n_tiles,
     )
 
 
@@ -787,7 +791,9 @@ def _flight_effects_table(study: FlightStudy) -> EffectsTable:
                 tile_times.append(sample_eyepoints.time[shot_plan.hitting_shots][first_shots])
     if not tile_effects:
         tolerance = float(study.spec.accuracy.tolerance)
-        return EffectsTable(rows=(), tolerance=tolerance, error_bound=0.0, tile_fraction=1.0)
+        return EffectsTable(
+            rows=(), tolerance=tolerance, error_bound=0.0, planned_tile_fraction=1.0
+        )
     time_of_tile = np.concatenate(tile_times)
     return _make_effects_table(
         study.spec,
@@ -797,7 +803,7 @@ def _flight_effects_table(study: FlightStudy) -> EffectsTable:
         n_points=n_shots,
         region_text=lambda is_in_region: _time_range_text(time_of_tile[is_in_region]),
         effect_cost=lambda name, is_in_region: math.nan,
-        tile_fraction=n_shots * study.spec.draws.number / study.n_points,
+        planned_tile_fraction=n_shots * study.spec.draws.number / study.n_points,
     )
 
 
@@ -819,7 +825,7 @@ def _make_effects_table(
     n_points: int,
     region_text: Callable[[np.ndarray], str],
     effect_cost: Callable[[str, np.ndarray], float],
-    tile_fraction: float,
+    planned_tile_fraction: float,
 ) -> EffectsTable:
     """Return the table of effects, given the simulated and omitted effects of each tile."""
     effect_modes = spec.effect_modes()
@@ -841,7 +847,10 @@ def _make_effects_table(
     )
     tolerance, error_bound = float(spec.accuracy.tolerance), float(tile_effects.error_bounds.max())
     return EffectsTable(
-        rows=rows, tolerance=tolerance, error_bound=error_bound, tile_fraction=tile_fraction
+        rows=rows,
+        tolerance=tolerance,
+        error_bound=error_bound,
+        planned_tile_fraction=planned_tile_fraction,
     )
 
 
@@ -867,11 +876,11 @@ def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarra
             values = list(dict.fromkeys(member.display_values[first:stop].tolist()))
             unit = f" {member.units}" if member.units else ""
             if isinstance(values[0], str):
-                words.append(f"{member.coordinate} {', '.join(values)}")
+                words.append(f"{member.coordinate_name} {', '.join(values)}")
             elif len(values) == 1:
-                words.append(f"{member.coordinate} {values[0]:g}{unit}")
+                words.append(f"{member.coordinate_name} {values[0]:g}{unit}")
             else:
-                words.append(f"{member.coordinate} {min(values):g}..{max(values):g}{unit}")
+                words.append(f"{member.coordinate_name} {min(values):g}..{max(values):g}{unit}")
     return ", ".join(words) or "the point"
 
 
@@ -995,4 +1004,4 @@ def _tile_grid_indices(
     """
     tile_size = effect_planner.tiles.count_block_points(tile)
     local_indices = np.unique(np.linspace(0, tile_size - 1, n_max or tile_size).astype(np.int64))
-    return effect_planner.tiles.grid_indices(tile, local_indices)
+    return effect_planner.tiles.point_indices_in_grid(tile, local_indices)

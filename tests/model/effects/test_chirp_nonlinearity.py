@@ -76,7 +76,9 @@ def test_a_quadratic_error_in_a_table_is_the_quadratic_law(sign, range_, velocit
     x, names = np.linspace(-1, 1, 9), ("sign", "chirp_duration", "start", "duration")
     table = fit_sweep_frequency_error(text)
     assert table.chebyshev_coefficients.size == 3
-    phase = phase_errors.error_table_phase(x, table=table, **place, **{n: scene[n] for n in names})
+    phase = phase_errors.sweep_error_table_phase(
+        x, table=table, **place, **{n: scene[n] for n in names}
+    )
     expected = phase_errors.chirp_nonlinearity_phase(x, **scene)
     np.testing.assert_allclose(phase, expected, rtol=1e-11, atol=1e-13)
 
@@ -140,12 +142,12 @@ def test_a_tables_size_covers_what_it_does_to_the_record(table_4_1):
         planner_inputs(p | {phase_errors.ERROR_TABLE_PATH: text})
     )
     x, t = np.linspace(-1, 1, 4001), 2**17 / 6e8
-    psi = phase_errors.error_table_phase(
+    psi = phase_errors.sweep_error_table_phase(
         x, table=fit_sweep_frequency_error(text), sign=1, chirp_duration=CHIRP,
         range=np.array([100.0, 3000.0]), radial_velocity=np.array([30.0, 30.0]), start=0.0,
         duration=t,
     )  # fmt: skip
-    error_max = (smear.constant + smear.non_polynomial + smear.coefficients[0])[0]
+    error_max = (smear.mid_record_phase + smear.non_polynomial_phase + smear.coefficients[0])[0]
     slope = 2 * np.abs(np.gradient(psi, x, axis=1)).max(axis=1)  # bins of fs/L
     assert (np.abs(psi).max(axis=1) <= error_max).all()
     assert (np.abs(psi).max(axis=1) > 0.8 * error_max).all()

@@ -6,7 +6,7 @@ import pytest
 from sweep.model import laser_line
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.evaluation import evaluate, prepare_shots
-from sweep.model.time_domain_truth import analytic_record
+from sweep.model.time_domain_truth import beamlet_analytic_signal
 from sweep.model.window import direct_transform, get_window, window_samples
 
 WINDOWS = ("rectangular", "hann", "hamming", "flattop", "kaiser(8.6)")
@@ -32,9 +32,7 @@ def gaussian_power(name, y, fwhm):
         fwhm=np.array([fwhm]), duration=np.array([DURATION])
     )
     form = get_window(name, LENGTH)
-    powers = (
-        np.abs(direct_transform(form, (y[:, None] - shifts.offset_window_bins[0]).ravel())) ** 2
-    )
+    powers = np.abs(direct_transform(form, (y[:, None] - shifts.shift_window_bins[0]).ravel())) ** 2
     return powers.reshape(y.size, -1) @ shifts.weight[0]
 
 
@@ -119,10 +117,10 @@ def test_the_line_is_seen_without_the_phase_of_all_the_record(name, delays, g):
 def test_the_walk_of_a_phase_has_the_lag_and_the_growth_of_a_wiener_process(delay):
     """Of what differs by u samples the variance is 2 Gamma min(u, tau), to 5 sigma."""
     rng, per_sample, number = np.random.default_rng(5), 1e-3, 2000
-    steps = laser_line.n_phase_walk_steps(delay=delay, length=LENGTH)
+    steps = laser_line.n_beat_phase_noise_steps(delay=delay, length=LENGTH)
     phases = np.array(
         [
-            laser_line.phase_walk(
+            laser_line.beat_phase_noise(
                 rng.standard_normal(steps), variance_per_sample=per_sample, delay=delay
             )
             for _ in range(number)
@@ -146,7 +144,7 @@ def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1
         "footprint.beamlets": 1,
     }
     ((_, shots),) = prepare_shots(point, ("doppler",))
-    record = window_samples("hamming", length) * analytic_record(shots, 0, 0, 0) / 2
+    record = window_samples("hamming", length) * beamlet_analytic_signal(shots, 0, 0, 0) / 2
     peak = np.abs(np.fft.fft(record)).argmax()
     record *= np.exp(-2j * np.pi * peak * np.arange(length) / length)
     walk = rng.standard_normal((number, length + delay)).cumsum(axis=1) * np.sqrt(g / delay)

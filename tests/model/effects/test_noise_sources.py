@@ -7,8 +7,8 @@ from random_planner_points import planner_inputs
 from sweep.model import evaluation, window
 from sweep.model.effects.noise_sources import (
     intensity_noise_current_variance,
-    signal_shot_noise_bound,
-    solar_background_bound,
+    signal_shot_noise_error_bound,
+    solar_background_error_bound,
 )
 from sweep.model.receiver_chain import bin_noise_sigma
 
@@ -43,7 +43,7 @@ def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
         solar_irradiance=2.6e8, reflectance=1.0, range=1000.0, beam_divergence=1e-3, fft_size=1024,
         optical_efficiency=0.8,
     )  # fmt: skip
-    bound = solar_background_bound(planner_inputs(scene))
+    bound = solar_background_error_bound(planner_inputs(scene))
     assert bound.threshold_follows_noise
     assert bound.noise_variance_change == pytest.approx(0.8 * 1.125e-19 / OTHERS, rel=1e-3)
 
@@ -55,7 +55,7 @@ def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
     """
     distance = np.array([1.0, 2.0, 5.0, 20.0])
     parameters = table_4_1(range=distance, fft_size=1024, radial_velocity=10.0)
-    bound = signal_shot_noise_bound(planner_inputs(parameters))
+    bound = signal_shot_noise_error_bound(planner_inputs(parameters))
     share = 1.40992e-13 / OTHERS * 1.953125e-12 * (2000.0 / distance) ** 2 / 1e-3
     np.testing.assert_allclose(bound.noise_variance_change, share, rtol=1e-4)
     assert not bound.threshold_follows_noise

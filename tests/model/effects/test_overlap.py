@@ -8,10 +8,10 @@ from sweep.model import evaluation, time_domain_truth
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import overlap
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
-from sweep.model.effects.phase_errors import chirp_drift_time
+from sweep.model.effects.phase_errors import slope_of_squared_time
 from sweep.model.sampling import samplers
 from sweep.model.sampling.philox import point_keys
-from sweep.model.shot_settings import RECORD_PATH
+from sweep.model.shot_settings import RECORD_TYPE_PATH
 from sweep.model.spectrum import segment_spectra
 from sweep.model.spectrum.line_shape import COSINE_SUM_COEFFICIENTS
 from sweep.model.window import get_window, zero_first_samples
@@ -37,7 +37,7 @@ def difference(shots, i, segment, **keywords):
         exact = np.roll(exact, -(shots.fft_size // 2))[bins % shots.fft_size]
     scale = (
         shots.window.sum
-        * float(np.broadcast_to(shots.echo_scales.beat_amplitude, shots.size)[i])
+        * float(np.broadcast_to(shots.echo_scales.beat_amplitude_scale, shots.size)[i])
         / 2
     )
     return np.abs(fast - exact).max() / (scale * np.sqrt(shots.total_relative_echo[i]))
@@ -61,13 +61,13 @@ def drawn_scene(table, number):
         range=SPEED_OF_LIGHT / 2 * (start + late * record),
         radial_velocity=float(rng.choice([0.0, 30.0, -300.0])),
         bandwidth=1e9 * duration / 500e-6,
-    ) | ({RECORD_PATH: "complex"} if number % 4 == 1 else {})  # fmt: skip
+    ) | ({RECORD_TYPE_PATH: "complex"} if number % 4 == 1 else {})  # fmt: skip
 
 
 @pytest.mark.parametrize("number", range(44))
 def test_lines_are_those_of_the_samples_that_the_echo_has(table_4_1, number):
     scene = drawn_scene(table_4_1, number)
-    if scene.get(RECORD_PATH) == "complex":
+    if scene.get(RECORD_TYPE_PATH) == "complex":
         scene["instrument.receiver.architecture"] = "homodyne"
     moving = () if number % 3 else ("range_walk", "segment_motion")
     shots = shots_of(scene, *moving)
@@ -104,9 +104,9 @@ def test_lines_with_a_phase_error_are_those_of_the_samples_that_the_echo_has(
     )
     length = 2**16 - first
     values = error.select_arguments(0, np.array([0]))
-    psi = error.phase(2 * np.arange(length) / length - 1, sign=1, **values)[0]
+    psi = error.phase_function(2 * np.arange(length) / length - 1, sign=1, **values)[0]
     steady_shots = shots_of(bent)
-    record = time_domain_truth.analytic_record(steady_shots, 0, 0, 0, with_range_walk=False)
+    record = time_domain_truth.beamlet_analytic_signal(steady_shots, 0, 0, 0, with_range_walk=False)
     record[first:] *= np.exp(2j * np.pi * psi)
     exact = np.abs(np.fft.rfft(get_window(name, 2**16).samples() * record.real))
     _, fast = segment_spectra.segment_spectrum(complete_shots, 0, 0)
@@ -260,7 +260,7 @@ def test_what_beamlets_at_other_ranges_leave_is_bounded(table_4_1):
         time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False),
     )
     plan = plan_points(planner_inputs(scene), {}, 0.0)
-    left = overlap.residual_bound(planner_inputs(scene))
+    left = overlap.residual_magnitude_bound(planner_inputs(scene))
     assert (left > 0).any() and (plan.total_error > 0).any()
     error = abs(fast.magnitude - exact.magnitude) / np.maximum(
         exact.magnitude, shots.bin_noise_sigma
@@ -286,7 +286,10 @@ def test_one_number_of_samples_for_all_beamlets_is_within_its_bound(table_4_1, n
         sample_rate=rate, duration=duration, reflectance_law="lambert",
         bandwidth=10 ** rng.uniform(7, 8), power=1.0, tnr=5.0, radial_velocity=0.0,
     )  # fmt: skip
-    shots, bound = shots_of(scene), np.atleast_2d(overlap.residual_bound(planner_inputs(scene)))
+    shots, bound = (
+        shots_of(scene),
+        np.atleast_2d(overlap.residual_magnitude_bound(planner_inputs(scene))),
+    )
     for i in range(shots.size):
         for row, segment in enumerate(np.flatnonzero(shots.has_segment).tolist()):
             error = difference(shots, i, segment, with_range_walk=False)
@@ -301,7 +304,7 @@ def test_looks_that_begin_before_the_middle_one_are_within_its_bound(table_4_1):
         radial_velocity=3000.0,
     ) | {"instrument.looks.number": 16}  # fmt: skip
     ((_, shots),) = evaluation.prepare_shots(scene, (*WITH_OVERLAP, "segment_motion"))
-    bound = float(np.ravel(overlap.residual_bound(planner_inputs(scene)))[0])
+    bound = float(np.ravel(overlap.residual_magnitude_bound(planner_inputs(scene)))[0])
     first = shots.split_by_look()[0]
     assert 0 < bound < 0.05
     assert difference(first, 0, 0, with_range_walk=False) <= bound + AGREEMENT
@@ -358,7 +361,8 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
     shots, steady_shots = shots_of(scene, "line_width"), shots_of(scene)
     first = int(shots.echo_record.n_samples_before_echo[0, 0])
     share = float(
-        (shots.echo_scales.beat_amplitude / steady_shots.echo_scales.beat_amplitude)[0] ** 2
+        (shots.echo_scales.beat_amplitude_scale / steady_shots.echo_scales.beat_amplitude_scale)[0]
+        ** 2
     )
     rng = np.random.default_rng(3)
     delay, rate = 2 * far / SPEED_OF_LIGHT, 600e6
@@ -372,7 +376,7 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
     line = (w * (n >= first)).sum() ** 2
     pedestal = float(np.ravel(shots.laser_line.pedestal_variance_under_line)[0])
     amplitude = (
-        float(np.ravel(steady_shots.echo_scales.beat_amplitude)[0]) ** 2
+        float(np.ravel(steady_shots.echo_scales.beat_amplitude_scale)[0]) ** 2
         * steady_shots.total_relative_echo[0]
         / 4
     )
@@ -411,11 +415,13 @@ def test_range_walk_is_put_right_for_the_part_of_the_record_that_the_echo_has(ta
         w = get_window("hann", without_walk.window.length).samples()
         place = []
         for walk in (False, True):
-            record = time_domain_truth.analytic_record(without_walk, 0, 0, 0, with_range_walk=walk)
+            record = time_domain_truth.beamlet_analytic_signal(
+                without_walk, 0, 0, 0, with_range_walk=walk
+            )
             place.append(np.argmax(abs(np.fft.fft(w * record, padded))) * 300e6 / padded)
         drift = (place[1] - place[0] + 150e6) % 300e6 - 150e6
         per_second = float(without_walk.waveform.chirp_rate) * 2 * velocity / SPEED_OF_LIGHT
-        expected = np.ravel(chirp_drift_time(walking))[0]
+        expected = np.ravel(slope_of_squared_time(walking))[0]
         assert drift / per_second == pytest.approx(expected, abs=3 * 300e6 / padded / per_second)
 
 
@@ -424,7 +430,7 @@ def test_beats_that_fold_are_flagged_as_misread(table_4_1, record):
     """Beats of Table 4.1 lie within half the sample rate up to 22.5 km."""
     ranges = np.linspace(1e3, 60e3, 60)
     scene = table_4_1(range=ranges, radial_velocity=0.0, beamlets=1, duration=500e-6)
-    scene |= {RECORD_PATH: record, "footprint.speckle": "none"}
+    scene |= {RECORD_TYPE_PATH: record, "footprint.speckle": "none"}
     outputs = evaluation.evaluate(scene, DEFAULT_EFFECTS)
     rate = 1e9 / 500e-6 * 2 / SPEED_OF_LIGHT  # Hz a metre
     wrong = ranges * rate > 300e6

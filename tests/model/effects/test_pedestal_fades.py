@@ -60,7 +60,7 @@ def drawn_spectra(shots, steady_shots, draws=DRAWS, seed=1):
     """
     rng, length, w = np.random.default_rng(seed), shots.window.length, shots.window.samples()
     rate, delay = float(shots.sample_rate[0]), 2 * float(shots.range[0]) / SPEED_OF_LIGHT
-    per_step = 2 * np.pi * float(shots.laser_line.lorentzian_width[0]) / (FINER * rate)
+    per_step = 2 * np.pi * float(shots.laser_line.lorentzian_fwhm[0]) / (FINER * rate)
     later, size = round(delay * rate * FINER), shots.fft_size
     beat = float(steady_shots.beat_frequencies[0][0]) / rate
     beat = beat if shots.complex_record else abs(beat)

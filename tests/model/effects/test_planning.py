@@ -26,13 +26,15 @@ TILES = 40
 class GivenInputs:
     """What criteria need of points, given outright."""
 
-    ndim, existing_chirp_rates, looks = 1, np.array([[1.0], [0.0], [-1.0]]), SINGLE_LOOK
-    noise_maximum_ratio = None
+    ndim, existing_chirp_slopes, looks = 1, np.array([[1.0], [0.0], [-1.0]]), SINGLE_LOOK
+    noise_maximum_over_sigma = None
 
-    def __init__(self, peak_ratio, threshold_ratio):
-        self.peak_ratio = np.broadcast_to(peak_ratio, (3, np.shape(peak_ratio)[-1]))
+    def __init__(self, peak_magnitude_over_sigma, threshold_ratio):
+        self.peak_magnitude_over_sigma = np.broadcast_to(
+            peak_magnitude_over_sigma, (3, np.shape(peak_magnitude_over_sigma)[-1])
+        )
         self.threshold_ratio = np.asarray(threshold_ratio, float)
-        self.number = self.peak_ratio.shape[1]
+        self.number = self.peak_magnitude_over_sigma.shape[1]
 
 
 def plan_of_tiles(points, modes, tolerance, effects):
@@ -240,7 +242,7 @@ def test_a_tighter_tolerance_keeps_all_that_a_looser_one_does(table_4_1, seed, e
 def test_an_echo_that_has_to_be_the_strongest_counts_at_any_level_of_noise(signal, least, decades):
     """Its pd is a mean of chances to cross levels from the threshold up to the largest noise."""
     points, share = GivenInputs([[signal]], [least]), 10.0**decades
-    points.noise_maximum_ratio = 6.0
+    points.noise_maximum_over_sigma = 6.0
     (change,) = omission_errors(
         {"one": ErrorBound(magnitude_change=np.array([share]))}, points
     ).values()

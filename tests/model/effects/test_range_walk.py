@@ -9,7 +9,7 @@ from sweep.model.effects import phase_errors
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import prepare_shots
 from sweep.model.spectrum.segment_spectra import segment_spectrum
-from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
+from sweep.model.waveform import DEFAULT_CHIRP_RATE_RATIOS
 
 WINDOWS = (
     "rectangular", "hann", "hamming", "blackman", "nuttall", "blackmanharris", "flattop",
@@ -31,7 +31,7 @@ def motion(shots, segment):
     """What range walk needs to know of point 0."""
     rate = float(shots.sample_rate[0])
     return {
-        "sign": DEFAULT_CHIRP_SLOPES[segment],
+        "sign": DEFAULT_CHIRP_RATE_RATIOS[segment],
         "chirp_rate": np.array([float(shots.waveform.chirp_rate)]),
         "radial_velocity": shots.target.radial_velocity[:1],
         "start": np.array([float(shots.record.acquisition_delay)]),
@@ -50,7 +50,7 @@ def test_the_phase_is_what_the_truth_keeps_beyond_the_line(table_4_1, segment, v
         )
     )  # fmt: skip
     with_walk, dropped = (
-        time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=walk)
+        time_domain_truth.beamlet_analytic_signal(shots, 0, segment, 0, with_range_walk=walk)
         for walk in (True, False)
     )
     x = 2 * np.arange(with_walk.size) / with_walk.size - 1
@@ -93,7 +93,7 @@ def test_the_phase_of_the_beams_axis_serves_all_beamlets(table_4_1):
     factor = np.exp(2j * np.pi * phase_errors.range_walk_phase(x, **motion(shots, 0))[0])
     for beamlet in (0, 50, 108):
         with_walk, dropped = (
-            time_domain_truth.analytic_record(shots, 0, 0, beamlet, with_range_walk=walk)
+            time_domain_truth.beamlet_analytic_signal(shots, 0, 0, beamlet, with_range_walk=walk)
             for walk in (True, False)
         )
         assert np.abs(with_walk - dropped * factor).max() < 5e-6 * np.abs(with_walk).max()

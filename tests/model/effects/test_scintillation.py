@@ -88,8 +88,8 @@ def test_weak_twinkling_through_an_aperture_is_the_integral_over_kolmogorovs_spe
     total = np.trapezoid(q[:, 0] ** (-8 / 3) * inner * q[:, 0], np.log(q[:, 0]))
     exact = 8 * np.pi**2 * k**2 * 0.033e-17 * length * total
     rytov = rytov_variance(
-        wave, TurbulenceProfile(uniform=1e-17), wavelength=1.55e-6, range=length, start_height=0.0,
-        end_height=0.0,
+        wave, TurbulenceProfile(uniform_strength=1e-17), wavelength=1.55e-6, range=length,
+        start_height=0.0, end_height=0.0,
     )  # fmt: skip
     scintillation_index = index(
         [log_irradiance_variances(wave, rytov_variance=rytov, wavelength=1.55e-6, range=length,

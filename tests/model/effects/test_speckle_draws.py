@@ -37,7 +37,7 @@ def factors(draws, beamlets, share=0.0, random_phases=False, seeded=None):
     """Factors g of draws of a point, (draws, beamlets)."""
     chosen = np.repeat(make_point_keys(1) if seeded is None else seeded, draws, axis=0)
     magnitude, cycles = speckle.draw_speckle_factors(
-        DrawAddresses(chosen, np.arange(draws), are_grouped=True), n_beamlets=beamlets,
+        DrawAddresses(chosen, np.arange(draws), draws_are_grouped=True), n_beamlets=beamlets,
         coherent_fraction=np.full(draws, share), random_phases=random_phases,
     )  # fmt: skip
     return magnitude * np.exp(2j * np.pi * cycles)
@@ -49,7 +49,10 @@ def true_spectra(shots, segment):
     half = np.arange(shots.fft_size // 2 + 1)
     both = [
         np.fft.fft(
-            w * time_domain_truth.analytic_record(shots, 0, segment, b, with_range_walk=False),
+            w
+            * time_domain_truth.beamlet_analytic_signal(
+                shots, 0, segment, b, with_range_walk=False
+            ),
             shots.fft_size,
         )
         for b in range(shots.footprint.n_beamlets)

@@ -176,7 +176,7 @@ def test_a_tree_is_built_in_little_memory(n, monkeypatch):
     """
     monkeypatch.setattr(bvh, "_TRIANGLES_PER_BATCH", 4096)
     terrain = Terrain(np.random.default_rng(3).random((n, n)), (1.0, 1.0), np.zeros(3))
-    mesh, _ = terrain.to_facets().to_mesh()
+    mesh, _ = terrain.to_facets().to_cleaned_mesh()
     build_tree(mesh.vertices, mesh.faces)
     tracemalloc.start()
     tree = build_tree(mesh.vertices, mesh.faces)

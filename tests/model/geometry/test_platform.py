@@ -39,7 +39,7 @@ def differentiated(path, t, step=STEP):
 
 @pytest.mark.parametrize("path", [CURVE, BURN, Waypoints(TIMES, PLACES, is_smooth=False)])
 def test_velocity_and_acceleration_are_the_derivatives_of_the_position(path):
-    t = np.linspace(path.start + 0.01, path.stop - 0.01, 57)
+    t = np.linspace(path.start_time + 0.01, path.stop_time - 0.01, 57)
     t = t[np.abs(t[:, None] - TIMES).min(axis=1) > 2 * STEP]  # straight legs have corners
     velocity, acceleration = differentiated(path, t)
     motion = path.motion(t)
@@ -56,7 +56,7 @@ def test_a_descent_begins_and_ends_at_the_stated_heights_and_speeds(high, low, f
     descent = straight_trajectory(
         start_point=(5, 6, high), end_point=(5, 6, low), initial_speed=fast, final_speed=slow
     )
-    first, last = (descent.motion(np.array([t])) for t in (descent.start, descent.stop))
+    first, last = (descent.motion(np.array([t])) for t in (descent.start_time, descent.stop_time))
     np.testing.assert_allclose(first.position[0], [5, 6, high])
     np.testing.assert_allclose(last.position[0], [5, 6, low], atol=1e-9)
     np.testing.assert_allclose(first.velocity[0], [0, 0, -fast])
@@ -68,7 +68,7 @@ def test_a_descent_begins_and_ends_at_the_stated_heights_and_speeds(high, low, f
 
 def test_a_straight_path_at_one_speed_has_no_acceleration():
     way = straight_trajectory(start_point=(0, 0, 500), end_point=(300, 0, 100), initial_speed=25.0)
-    assert way.stop == pytest.approx(20.0)
+    assert way.stop_time == pytest.approx(20.0)
     motion = way.motion(np.linspace(0, 20, 5))
     assert not motion.acceleration.any()
     np.testing.assert_allclose(motion.velocity, [[15, 0, -20]] * 5)
@@ -78,7 +78,7 @@ def test_a_straight_path_at_one_speed_has_no_acceleration():
 def test_waypoints_are_passed_at_their_times(smooth):
     path = Waypoints(TIMES, PLACES, is_smooth=smooth)
     np.testing.assert_allclose(path.motion(TIMES).position, PLACES, atol=1e-10)
-    assert (path.start, path.stop) == (0.0, 11.0)
+    assert (path.start_time, path.stop_time) == (0.0, 11.0)
 
 
 def test_a_spline_through_points_of_a_cubic_is_that_cubic():

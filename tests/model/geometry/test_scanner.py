@@ -41,7 +41,7 @@ def test_the_four_corners_draw_a_square_on_level_ground(angle):
 
 
 def test_stacked_elements_reach_the_four_angles_of_the_steerer():
-    reached = np.degrees(scanner.stacked_angles([15 * DEGREE, 7.5 * DEGREE]))
+    reached = np.degrees(scanner.stacked_deflections([15 * DEGREE, 7.5 * DEGREE]))
     np.testing.assert_allclose(reached, [-22.5, -7.5, 7.5, 22.5])
 
 

@@ -108,7 +108,7 @@ def start_batch_cluster(cluster: BatchClusterConfig, bounds: WorkerBounds) -> An
     cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
     dask_cluster = cluster_class(**jobqueue_options(cluster))
     try:
-        dask_cluster.sync(_submit_jobs, dask_cluster, count_jobs(cluster, bounds.least))
+        dask_cluster.sync(_submit_jobs, dask_cluster, jobs_needed(cluster, bounds.least))
     except BaseException:
         dask_cluster.close()
         raise
@@ -119,7 +119,7 @@ def keep_workers_in_bounds(
     dask_cluster: Any, cluster: BatchClusterConfig, bounds: WorkerBounds
 ) -> None:
     """Have Dask replace jobs that end, and adapt the number of jobs to the work within bounds."""
-    jobs_min, jobs_max = (count_jobs(cluster, n_workers) for n_workers in bounds)
+    jobs_min, jobs_max = (jobs_needed(cluster, n_workers) for n_workers in bounds)
     dask_cluster.adapt(
         minimum_jobs=jobs_min,
         maximum_jobs=jobs_max,
@@ -134,7 +134,7 @@ async def _submit_jobs(dask_cluster: Any, n_jobs: int) -> None:
     await dask_cluster
 
 
-def count_jobs(cluster: BatchClusterConfig, n_workers: int) -> int:
+def jobs_needed(cluster: BatchClusterConfig, n_workers: int) -> int:
     """Return the number of batch jobs that are needed for `n_workers` workers."""
     return -(-n_workers // cluster.job.workers)
 
