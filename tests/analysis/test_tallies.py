@@ -63,4 +63,4 @@ def test_groups_hold_their_own_points_whatever_the_pieces(chunks, seed):
         rounding = 1e-14 * np.nanmean(np.abs(kind_values))  # a mean may be near 0
         assert statistics.mean == pytest.approx(np.nanmean(kind_values), rel=0, abs=rounding)
         assert statistics.median == np.nanmedian(kind_values)
-        assert part.size == 9 * (along == kind).sum()
+        assert part.n_points == 9 * (along == kind).sum()

@@ -280,7 +280,7 @@ def test_groups_are_those_of_every_bin(table_4_1, spread):
             list_bin_groups(shots, groups_max=6),
             list_bin_groups(shots, groups_max=6, every_bin=True),
         )
-        for name in ("strongest_bin", "first_bin", "last_bin", "n_exempt"):
+        for name in ("strongest_bin", "first_bin", "last_bin", "n_exempt_bins"):
             np.testing.assert_array_equal(getattr(fast, name), getattr(slow, name))
         np.testing.assert_allclose(fast.neighbour_magnitudes, slow.neighbour_magnitudes, rtol=1e-7)
         n_groups += (slow.strongest_bin >= 0).sum(axis=-1).max()

@@ -155,7 +155,7 @@ def _spectra_dataset(
         "noise_power": ((), float(shots.window.energy * shots.noise_variance[-1])),
         "threshold": ((), float(shots.threshold[-1])),
         "window": (("sample",), cached_window_samples(shots.window)),
-        "true_frequency": (signal_dims, signal_values("frequency") * bin_width),
+        "true_frequency": (signal_dims, signal_values("frequency_bins") * bin_width),
         "first_bin": (signal_dims, signal_values("first_bin")),
         "last_bin": (signal_dims, signal_values("last_bin")),
         "cnr": (signal_dims, signal_values("cnr")),
