@@ -235,7 +235,20 @@ def crossing_rate(probability):
 
 @njit(cache=True, error_model="numpy")
 def weighted_crossing_rate(probabilities, weights):
-    """Return the weighted sum over bins of -ln(1 - p), where p is a bin's crossing probability."""
+    """Return the weighted sum over bins of -ln(1 - p), where p is a bin's crossing probability.
+
+    Parameters
+    ----------
+    probabilities : ndarray (n,)
+        Crossing probability p of each bin, 0..1.
+    weights : ndarray
+        Weight w of each bin, of either sign; at least n elements.
+
+    Returns
+    -------
+    float
+        -sum_i w_i ln(1 - p_i), by :func:`crossing_rate`.
+    """
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     i = 0
     while i + 3 < probabilities.size:  # four sums, as each addition depends on the one before

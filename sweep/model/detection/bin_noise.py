@@ -44,7 +44,21 @@ quadratures have equal variances."""
 
 @lru_cache(maxsize=64)
 def neighbour_noise_correlation(window: Window, fft_size: int) -> float:
-    """Return the modulus of the noise correlation of adjacent bins of the FFT, 0..1."""
+    """Return the modulus of the noise correlation of adjacent bins of the FFT, 0..1.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    float
+        rho = |W2(L/N)| / W2(0), with the transform W2 of the squared window. The argument of W2 is
+        a frequency over the sample rate divided by L; L/N is one bin of the FFT.
+    """
     return float(_noise_correlations_at(window, fft_size, np.array([1]))[0])
 
 
@@ -52,12 +66,25 @@ def neighbour_noise_correlation(window: Window, fft_size: int) -> float:
 def first_circular_bin(window: Window, fft_size: int) -> int:
     """Return the least distance [bins] from DC and Nyquist at which noise counts as circular; >= 1.
 
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    int
+        Distance [bins of the FFT] from the nearer of DC and Nyquist.
+
     Notes
     -----
     Circular noise has equal variances in both quadratures. In a real record, the noise k bins from
     DC or Nyquist has the variances sigma^2 (1 +- |W2(2k)| / W2(0)), with their mean sigma^2 and the
     transform W2 of the squared window. The noise counts as circular if the ratio is at most
-    :data:`CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX` in this bin and in all bins farther away.
+    :data:`CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX` in this bin and in all bins farther away. Distances
+    below 8 N/L bins are tested. For N >= 32 L only every floor(N / (16 L))-th of them is tested.
     """
     padding_factor = fft_size / window.length
     step = max(int(padding_factor / 16), 1)

@@ -175,7 +175,21 @@ def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
 
 
 def exceeds_fixed_threshold(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Detect bins at or above the fixed threshold; a :data:`Detector`."""
+    """Detect bins at or above the fixed threshold; a :data:`Detector`.
+
+    Parameters
+    ----------
+    power : ndarray (m, bins)
+        |X|^2 [V^2] of m spectra. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for complex
+        records, with the FFT size N.
+    settings : SpectrumSettings
+        Threshold on |X| [V].
+
+    Returns
+    -------
+    ndarray (m, bins) bool
+        True in bins whose |X|^2 is at least the squared threshold.
+    """
     return power >= settings.threshold**2
 
 
@@ -183,6 +197,24 @@ def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """Detect bins by cell averaging: the threshold follows from the mean of all training cells.
 
     This is a :data:`Detector`.
+
+    Parameters
+    ----------
+    power : ndarray (m, bins)
+        |X|^2 [V^2] of m spectra. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for complex
+        records, with the FFT size N.
+    settings : SpectrumSettings
+        Number M of training cells, guard cells, and design probability of a false alarm.
+
+    Returns
+    -------
+    ndarray (m, bins) bool
+        True in detected bins. Bins at DC and Nyquist of a real record are False.
+
+    Notes
+    -----
+    A bin is detected if |X|^2 >= alpha / M times the sum of the training cells' powers [Finn and
+    Johnson, RCA Review 29, 414, 1968]. alpha is the factor of :func:`cfar_factor`.
     """
     below, above = _training_power_sums(power, settings)
     return _exceeds_cfar_threshold(
@@ -194,6 +226,25 @@ def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """Detect bins by the larger of the mean powers of the training cells below and above them.
 
     This is a :data:`Detector`.
+
+    Parameters
+    ----------
+    power : ndarray (m, bins)
+        |X|^2 [V^2] of m spectra. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for complex
+        records, with the FFT size N.
+    settings : SpectrumSettings
+        Number M of training cells, guard cells, and design probability of a false alarm.
+
+    Returns
+    -------
+    ndarray (m, bins) bool
+        True in detected bins. Bins at DC and Nyquist of a real record are False.
+
+    Notes
+    -----
+    A bin is detected if |X|^2 >= alpha max(mean below, mean above), with the mean powers of the M/2
+    training cells on either side [Hansen, IEE Conf. Radar, 325, 1973]. alpha is the factor of
+    :func:`cfar_factor`.
     """
     level = np.maximum(*_training_power_sums(power, settings)) / (settings.training // 2)
     return _exceeds_cfar_threshold(power, level, GOCA_CFAR, settings)
@@ -202,8 +253,25 @@ def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
     """Detect bins by the training cell of a given rank in power; a :data:`Detector`.
 
-    A bin is detected if at least ``settings.rank`` training cells have at most the bin's power
-    divided by the threshold factor.
+    Parameters
+    ----------
+    power : ndarray (m, bins)
+        |X|^2 [V^2] of m spectra. Bins are 0 .. N/2 for real and -N/2 .. N/2 - 1 for complex
+        records, with the FFT size N.
+    settings : SpectrumSettings
+        Number of training cells, guard cells, rank, and design probability of a false alarm.
+
+    Returns
+    -------
+    ndarray (m, bins) bool
+        True in detected bins. Bins at DC and Nyquist of a real record are False.
+
+    Notes
+    -----
+    A bin is detected if |X|^2 >= alpha P_k, with the power P_k of the k-th weakest training cell
+    and the factor alpha of :func:`cfar_factor` [Rohling, IEEE Trans. Aerosp. Electron. Syst. 19,
+    608, 1983]. Without sorting: a bin is detected if at least k training cells have at most the
+    power |X|^2 / alpha. The rank k is ``settings.rank``.
     """
     circular_bins = _power_in_circular_bins(power, settings)
     level_max, n_below = (

@@ -303,7 +303,21 @@ class SpeckleTable(NamedTuple):
     (:attr:`sweep.model.detection.pseudo_variance.SignalPseudoVariance.relative_power_by_phase`)."""
 
     def select(self, segment: int, points: np.ndarray) -> "SpeckleTable":
-        """Return the table of one segment of some points, given by their indices."""
+        """Return the table of one segment at selected points.
+
+        Parameters
+        ----------
+        segment : int
+            Index of the segment, the row of the arrays (segments, n).
+        points : ndarray (m,) int64
+            Indices of the points.
+
+        Returns
+        -------
+        SpeckleTable
+            Table of one segment and m points. ``pseudo_variance_ratio`` and
+            ``relative_power_by_phase`` keep all their rows.
+        """
         line_deviation_bins, pseudo_variance_row = (
             values[[segment]][:, points]
             for values in (self.line_deviation_bins, self.pseudo_variance_row)
@@ -318,7 +332,20 @@ class SpeckleTable(NamedTuple):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def bin_threshold_at(bin_thresholds, point):
-    """Return the :class:`BinThreshold` of point number ``point`` of :class:`BinThresholds`."""
+    """Return the threshold and the noise of one point.
+
+    Parameters
+    ----------
+    bin_thresholds : BinThresholds
+        Threshold and noise of n points [V, summed over the record].
+    point : int
+        Index of the point, 0 .. n - 1.
+
+    Returns
+    -------
+    BinThreshold
+        Threshold and noise of the point [V, summed over the record], and shape of its pedestal.
+    """
     return BinThreshold(
         bin_thresholds.line_noise_sigma[point],
         bin_thresholds.threshold[point],
@@ -336,8 +363,18 @@ def bin_threshold_at(bin_thresholds, point):
 def echo_half_width(rule, pedestal_reach_bins):
     """Return the half-width [bins] by which an echo extends on either side of its lines.
 
-    The half-width is the larger of the half-widths of the main lobe and of the phase-noise
-    pedestal. ``rule`` is a :class:`DetectionRule`.
+    Parameters
+    ----------
+    rule : DetectionRule
+        Rule of detection; its ``lobe_half_width`` is the half-width of the main lobe [FFT bins].
+    pedestal_reach_bins : float
+        Distance from a line [FFT bins], >= 0, up to which bins of the phase-noise pedestal belong
+        to the echo (:attr:`PedestalShape.reach_bins`).
+
+    Returns
+    -------
+    int
+        Larger of the two half-widths.
     """
     return max(rule.lobe_half_width, int(pedestal_reach_bins))
 
@@ -346,7 +383,29 @@ def echo_half_width(rule, pedestal_reach_bins):
 def pedestal_power_ratio(pedestal, distance):
     """Return the power density of a phase-noise pedestal, over its density under the line.
 
-    ``pedestal`` is a :class:`PedestalShape`; ``distance`` is that from the line [bins].
+    Parameters
+    ----------
+    pedestal : PedestalShape
+        Width of the laser's line, and delay of the echo.
+    distance : float
+        Distance from the line [FFT bins], >= 0.
+
+    Returns
+    -------
+    float
+        Ratio of the densities. It is 1 on the line.
+
+    Notes
+    -----
+    Let Gamma be 2 pi times the line width (FWHM), tau the delay, and omega 2 pi times the distance.
+    With C = e^(-Gamma tau) the ratio is
+
+        [1 - C (cos omega tau + Gamma / omega sin omega tau)]
+        / [(1 - C (1 + Gamma tau)) (1 + omega^2 / Gamma^2)].
+
+    This is the density of :class:`PedestalShape` [Richter et al., IEEE J. Quantum Electron. 22,
+    2070, 1986], divided by its limit at omega = 0. For Gamma tau <= 1e-5 the ratio is set to 1: the
+    phase noise of the echo then almost cancels that of the local oscillator.
     """
     gamma, delay = 2.0 * math.pi * pedestal.line_width_bins, pedestal.delay_times_bin_width
     coherence, omega = math.exp(-gamma * delay), 2.0 * math.pi * distance
@@ -721,10 +780,21 @@ pd_of_one_independent_bin_kernel = njit(cache=True, error_model="numpy", borrows
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pd_of_any_independent_bin(bin_pd, n_bins):
-    """Return the probability 1 - (1 - q)^M that any of M independent bins is detected.
+    """Return the probability that any of M equal and independent bins is detected.
 
-    The inverse of :func:`pd_of_one_independent_bin`. ``bin_pd`` is q, and ``n_bins`` is M,
-    not necessarily an integer.
+    This is the inverse of :func:`pd_of_one_independent_bin`.
+
+    Parameters
+    ----------
+    bin_pd : float
+        Probability q that one bin is detected, 0..1.
+    n_bins : float
+        Number M >= 0 of bins, not necessarily an integer.
+
+    Returns
+    -------
+    float
+        1 - (1 - q)^M, precise also where it is small.
     """
     return -math.expm1(n_bins * math.log1p(-bin_pd))
 
@@ -916,7 +986,35 @@ def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
 def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_speckle):
     """Return the :class:`PdAndMiss` by one bin in developed speckle, without laser phase noise.
 
-    ``magnitude`` is the root mean square |X| of the bin's signal [V], ``bin_`` its number.
+    Parameters
+    ----------
+    magnitude : float
+        Root mean square |X| of the bin's signal [V, summed over the record].
+    bin_ : int
+        Number of the bin in the spectrum.
+    rule : DetectionRule
+        Rule of detection.
+    bin_threshold : BinThreshold
+        Threshold Th on |X|, and noise per quadrature [V, summed over the record].
+    bin_speckle : BinSpeckle
+        Speckle parameters of the echo.
+
+    Returns
+    -------
+    PdAndMiss
+        Probabilities that |X| with noise is at or above Th, and that it is below.
+
+    Notes
+    -----
+    The mean of |X|^2 is P = S + 2 sigma^2, with the signal's mean power S = ``magnitude``^2 and the
+    noise sigma per quadrature. Far from DC and Nyquist, X is a circular complex Gaussian number,
+    and
+
+        pd = exp(-Th^2 / P)
+
+    as for a Swerling 1 target. Near them in a real record, X has the pseudo-variance ratio
+    q = (S q_s + 2 sigma^2 q_n) / P, with those of the signal and of the noise, q_s and q_n. |X|
+    then has a Hoyt distribution (:func:`sweep.model.detection.hoyt.hoyt_tails`).
     """
     signal_power = magnitude * magnitude
     noise_power = 2.0 * bin_threshold.line_noise_sigma * bin_threshold.line_noise_sigma
@@ -938,8 +1036,33 @@ def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_sp
 def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_speckle):
     """Return the :class:`PdAndMiss` by one bin in developed speckle, with laser phase noise.
 
-    The phase noise leaves a pedestal around the line, which fades with it. ``magnitude`` is the
-    root mean square |X| of the bin's signal [V], ``bin_`` its number.
+    The phase noise leaves a pedestal around the line, which fades with it.
+
+    Parameters
+    ----------
+    magnitude : float
+        Root mean square |X| of the bin's signal [V, summed over the record].
+    bin_ : int
+        Number of the bin in the spectrum.
+    rule : DetectionRule
+        Rule of detection.
+    bin_threshold : BinThreshold
+        Threshold Th on |X|, and noise per quadrature [V, summed over the record].
+    bin_speckle : BinSpeckle
+        Speckle parameters of the echo.
+
+    Returns
+    -------
+    PdAndMiss
+        Probabilities that |X| with noise is at or above Th, and that it is below.
+
+    Notes
+    -----
+    Let z be the amplitude of the speckle, E|z|^2 = 1, and sigma_0 the noise per quadrature without
+    the pedestal. Given z, the bin has the steady signal |z| ``magnitude`` in noise of the variance
+    sigma_0^2 + |z|^2 (sigma^2 - sigma_0^2) per quadrature. sigma is
+    :attr:`BinThreshold.line_noise_sigma`. The result is the mean over |z|^2, which is exponential.
+    Near DC and Nyquist of a real record it is also the mean over the phase of z.
     """
     noise = bin_threshold.noise_sigma_without_pedestal
     bins_given_mode = _zero_bins_given_mode(INTEGER_ONE)
@@ -1218,8 +1341,33 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_N_GAUSS_NODES)
 def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_speckle):
     """Return the :class:`PdAndMiss` of a run of bins of an echo in developed speckle.
 
-    The adjacent bins of the run fade together (:func:`pd_and_miss_in_speckle`). They are bins begin
-    .. end - 1 of ``echo``.
+    The adjacent bins of the run fade together.
+
+    Parameters
+    ----------
+    echo : EchoBins
+        Root mean square |X| without noise [V, summed over the record] of adjacent bins.
+    begin, end : int
+        Indices in ``echo`` of the run's first bin, and of the bin after its last. Bins at both ends
+        of the run that do not belong to the echo are left out.
+    rule : DetectionRule
+        Rule of detection, with the table of the strongest speckle mode.
+    bin_threshold : BinThreshold
+        Threshold on |X|, and noise per quadrature [V, summed over the record].
+    bin_speckle : BinSpeckle
+        Speckle parameters of the echo.
+
+    Returns
+    -------
+    PdAndMiss
+        Probabilities that any bin of the run crosses the threshold, and that none does.
+
+    Notes
+    -----
+    Given the amplitude z of the strongest speckle mode, bin k has the steady signal u_k z. The
+    other modes add to its noise (:func:`pd_and_miss_in_speckle`). A bin's fraction of power in the
+    strongest mode is interpolated in ``rule.mode_table``. If the echo has a phase-noise pedestal,
+    bins outside the main lobe of the strongest bin have the fraction of the strongest bin.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     nyquist_bin = rule.fft_size // 2 if rule.is_real_record_in_speckle else 0

@@ -436,8 +436,27 @@ def _tone_offsets_and_bins(window: Window, fft_size: int) -> tuple[np.ndarray, n
 def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
     """Return the sign and the factor of Jacobsen's estimator for a window and an FFT size.
 
-    The sign is that of the two neighbours in the denominator of his ratio. The factor turns the
-    ratio into an offset [bins].
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    sign : int
+        Sign s of the two neighbours in the denominator of Jacobsen's ratio, -1 or 1.
+    factor : float
+        Offset of the tone from the peak bin over the ratio [bins].
+
+    Notes
+    -----
+    The ratio is r = Re[(Z_+ - Z_-) / (2 Z_0 + s (Z_- + Z_+))], with the complex peak bin Z_0 and
+    its neighbours Z_- below and Z_+ above [Jacobsen and Kootsookos, IEEE Signal Process. Mag.
+    24(3), 123, 2007]. If the neighbours of a tone on a bin vanish, as for an unpadded rectangular
+    window, sign and factor are 1, and r is the offset. Otherwise the sign is -1. The factor is then
+    sum(r d) / sum(r^2), by least squares over tones at the offsets d in -1/2 .. 1/2 bin.
     """
     offset, tone_bins = _tone_offsets_and_bins(window, fft_size)
     _, centre, above = tone_bins[_TONE_STEPS_PER_BIN]

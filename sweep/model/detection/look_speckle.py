@@ -101,7 +101,35 @@ class LookSpeckle(NamedTuple):
     ) -> "LookSpeckle":
         """Compute the eigenvalues and the effective number of looks from correlations and powers.
 
-        The arguments are fields of the result.
+        Parameters
+        ----------
+        correlation_by_lag : ndarray (3, n, N) complex
+            Correlation mu of the speckle of two looks, by segment, point, and distance of
+            0 .. N - 1 looks.
+        look_power : ndarray (3, n, N)
+            Power of each look in the echo's strongest bin, over the mean of all looks.
+        segment_correlation : ndarray (3, n)
+            Square root of the correlation of two segments' mean powers, for the pairs
+            (up, Doppler), (up, down) and (Doppler, down).
+
+        Returns
+        -------
+        LookSpeckle
+            The arguments, the eigenvalues and their multiplicities, and the effective number of
+            looks.
+
+        Notes
+        -----
+        Let x_k be the looks' relative powers. The eigenvalues c_j of sqrt(x_k x_l) mu(l - k) are
+        scaled to the sum N. The effective number of looks is
+
+            M = N^2 / sum c_j^2.
+
+        More than MATRIX_LOOKS_MAX looks are represented by that number of looks at a larger
+        spacing. If M exceeds GAMMA_SHAPE_MIN there, one eigenvalue N/M of multiplicity M replaces
+        all [Goodman, Speckle Phenomena in Optics, 2007, 4.6]. M is then computed from the
+        correlations of all N looks, as of looks of equal power: M = N^2 / sum_kl |mu(l - k)|^2, but
+        at least GAMMA_SHAPE_MIN.
         """
         n_looks = correlation_by_lag.shape[2]
         eigenvalue = np.maximum(
@@ -139,6 +167,24 @@ class LookSpeckle(NamedTuple):
 
         A^H is the conjugate transpose. For a vector z of independent circular complex Gaussian
         numbers of power 1, A z are speckle amplitudes of the N looks.
+
+        Parameters
+        ----------
+        segment : int
+            Index of the segment: 0 up, 1 Doppler, 2 down.
+        point : int
+            Index of the point.
+
+        Returns
+        -------
+        ndarray (N, N) complex
+            A. Its columns are eigenvectors of the covariance, each times the root of its
+            eigenvalue, from the largest eigenvalue to the smallest.
+
+        Notes
+        -----
+        The covariance of looks k and l is sqrt(x_k x_l) mu(l - k), with the looks' relative powers
+        x of mean 1, and the correlation mu (:func:`look_covariances`).
         """
         correlation_by_lag = self.correlation_by_lag[segment, point]
         covariance = look_covariances(
@@ -202,8 +248,23 @@ def look_covariances(
 def representative_look_positions(n_looks: int, looks_max: int = MATRIX_LOOKS_MAX) -> np.ndarray:
     """Return the positions, in the sequence of looks, of the looks that represent all, (k,).
 
-    k is at most ``looks_max``. Positions count looks from 0 and need not be integers. They have the
-    variance of the positions of all ``n_looks`` looks.
+    Parameters
+    ----------
+    n_looks : int
+        Number N of looks.
+    looks_max : int
+        Largest number of positions, at least 2.
+
+    Returns
+    -------
+    ndarray (k,)
+        Positions, k = min(N, ``looks_max``). They count looks from 0, rise evenly, and need not be
+        integers.
+
+    Notes
+    -----
+    The spacing is sqrt((N^2 - 1) / (k^2 - 1)). The k positions then have the variance of the
+    positions of all N looks.
     """
     n_kept = min(n_looks, looks_max)
     position_step = math.sqrt((n_looks**2 - 1) / (n_kept**2 - 1)) if n_kept < n_looks else 1.0

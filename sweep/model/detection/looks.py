@@ -848,7 +848,24 @@ class Looks(NamedTuple):
     def vote_probabilities(self, p_cross: np.ndarray, p_stay: np.ndarray) -> PdAndMissArrays:
         """Return the probabilities that ``votes_needed`` or more records cross, and that fewer do.
 
-        ``p_cross`` and ``p_stay`` are the probabilities that one record crosses and does not.
+        Records cross the threshold independently of each other.
+
+        Parameters
+        ----------
+        p_cross, p_stay : ndarray (...)
+            Probabilities that one record crosses and does not, 0..1. They are separate arguments to
+            keep precision in both tails.
+
+        Returns
+        -------
+        PdAndMissArrays
+            Both probabilities, (...).
+
+        Notes
+        -----
+        The number of crossings is binomial. For M votes out of N records, at least M cross with the
+        probability I_p(M, N - M + 1), and fewer with I_(1 - p)(N - M + 1, M). p is ``p_cross``, and
+        I is the regularised incomplete beta function.
         """
         votes_needed, misses_needed = self.votes_needed, self.number - self.votes_needed + 1
         return PdAndMissArrays(
@@ -973,9 +990,24 @@ def solve_threshold_ratio(
 ) -> np.ndarray:
     """Return the threshold (n,) at which noise is detected with a given probability pfa.
 
-    The threshold is found by bisection, in units of the noise per quadrature.
-    ``log_pfa_of_threshold`` is the decreasing function from the threshold to ln(pfa). ``log_pfa``
-    (n,) are the given ln(pfa).
+    Parameters
+    ----------
+    log_pfa : ndarray (n,)
+        ln(pfa) <= 0.
+    log_pfa_of_threshold : callable
+        Decreasing function. It takes thresholds (n,) over the noise per quadrature, and returns
+        ln(pfa) of each, (n,).
+
+    Returns
+    -------
+    ndarray (n,)
+        Threshold over the noise per quadrature, 0 .. sqrt(2 (100 - ln(pfa))).
+
+    Notes
+    -----
+    The threshold is found by bisection. A single bin of one record is detected with
+    ln(pfa) = -b^2 / 2 at the threshold b. With n bins ln(pfa) is larger by at most ln(n). The upper
+    end of the interval is thus high enough for e^100 bins.
     """
     # n bins raise an alarm at least as often as one, and at most n times as often.
     low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))

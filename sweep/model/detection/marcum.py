@@ -222,8 +222,17 @@ def marcum_q1_excess(a, b):
 def at_least_one_probability(p: ArrayLike, n: ArrayLike) -> np.ndarray:
     """Return the probability 1 - (1-p)^n of at least one success in n independent trials [T 3.7].
 
-    `n` >= 0 need not be an integer (a mean number of independent bins). The relative error is at
-    most 1e-15.
+    Parameters
+    ----------
+    p : array_like
+        Probability of success in one trial, 0..1.
+    n : array_like
+        Number of trials, >= 0. It need not be an integer (a mean number of independent bins).
+
+    Returns
+    -------
+    ndarray
+        Probability, of the broadcast shape; 0 for n = 0. The relative error is at most 1e-15.
     """
     p, n = np.asarray(p, float), np.asarray(n, float)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -262,8 +271,15 @@ def log_at_least_one_probability(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
 def log_either_probability(log_p_first: np.ndarray, log_p_second: np.ndarray) -> np.ndarray:
     """Return the natural logarithm of the probability of at least one of two independent events.
 
-    The result is ln(p + q (1 - p)), with p and q given as ``log_p_first`` = ln p and
-    ``log_p_second`` = ln q. It is -inf where both probabilities are 0.
+    Parameters
+    ----------
+    log_p_first, log_p_second : ndarray
+        ln p and ln q of the two events' probabilities p and q, <= 0.
+
+    Returns
+    -------
+    ndarray
+        ln(p + q (1 - p)), of the broadcast shape; -inf where both probabilities are 0.
     """
     with np.errstate(divide="ignore"):
         return np.minimum(

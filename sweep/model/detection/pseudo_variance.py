@@ -192,7 +192,26 @@ def lines_overlap_images(shots: Any) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def n_tabulated_bins(window: Window, fft_size: int) -> int:
-    """Return the number of bins next to DC or Nyquist with a tabulated pseudo-variance."""
+    """Return the number of bins next to DC or Nyquist with a tabulated pseudo-variance.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    int
+        Number of bins, including the one at DC or Nyquist; at most floor(N/4) + 1.
+
+    Notes
+    -----
+    The bins reach to r + h + 1 from DC, in units of the sample rate over L. r is the distance of a
+    line from DC beyond which its image is negligible. h is the half-width of the window's main
+    lobe.
+    """
     last_bin = (_image_reach(window) + main_lobe_half_width(window) + 1) * fft_size / window.length
     return min(math.ceil(last_bin) + 1, fft_size // 4 + 1)
 
@@ -201,8 +220,23 @@ def n_tabulated_bins(window: Window, fft_size: int) -> int:
 def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
     """Return the pseudo-variance ratio E[n^2] / E[|n|^2] of white noise n by bin, (bins,).
 
-    The ratio is W2(2k) / W2(0) for bins k = 0, 1, .. from DC, with the transform W2 of the squared
-    window.
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    ndarray (bins,)
+        Ratio, -1..1, in bins k = 0, 1, .. from DC or Nyquist. The number of bins is that of
+        :func:`n_tabulated_bins`.
+
+    Notes
+    -----
+    The ratio is W2(2k) / W2(0), with the transform W2 of the squared window about the middle of the
+    record. Ratios up to 1e-12 in modulus are set to 0.
     """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
@@ -304,7 +338,17 @@ def multilook_pd_and_miss_near_ends(
         def mean_vote_probability(amplitudes: np.ndarray, bin_index: int = bin_index) -> float:
             """Return the probability that enough looks cross, averaged over m speckle draws.
 
-            The echo amplitudes of the k looks in these draws are (m, k).
+            Parameters
+            ----------
+            amplitudes : ndarray (m, k) complex
+                Echo amplitudes of the k looks in these draws, of mean power 1.
+            bin_index : int
+                Index of the echo, 0 .. number of echoes - 1.
+
+            Returns
+            -------
+            float
+                Mean probability that at least ``looks.votes_needed`` looks cross the threshold.
             """
             magnitudes = np.hypot(
                 math.sqrt(1 + signal_pseudo_variance[bin_index]) * amplitudes.real,

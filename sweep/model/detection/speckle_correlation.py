@@ -121,9 +121,30 @@ class LinePairGradients(NamedTuple):
 def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
     """Return the correlation of the speckle in the strongest bins of two segments, (n,) complex.
 
-    The correlation is mu of equation (3) of the module's description. If the phase varies too fast
-    across the beam for the quadrature, the result is |mu| for a Gaussian window transform of the
-    same half-width, which is close to 0.
+    Parameters
+    ----------
+    window : Window
+        Window of the record (:class:`sweep.model.window.Window`).
+    gradients : LinePairGradients
+        Position of the strongest bins, and gradients of the lines across the beam, of n points.
+
+    Returns
+    -------
+    ndarray (n,) complex
+        Correlation mu, 0 <= |mu| <= 1.
+
+    Notes
+    -----
+    mu is equation (3) of the module's description,
+
+        mu = int p G(k_1 - nu_1) G(k_2 - nu_2) e^(i t y) dy / sqrt(S_1 S_2),
+        S_i = int p G(k_i - nu_i)^2 dy,
+
+    with the window's transform G, the strongest bins k_i, the places nu_i(y) of the lines and the
+    phase difference t per unit of y. The power density p is a Gaussian times max(1 + g y, 0), with
+    the relative power gradient g. y is in standard deviations of the beam. If the phase varies too
+    fast across the beam for the quadrature, the result is |mu| for a Gaussian window transform of
+    the same half-width and g = 0, which is close to 0.
     """
     from sweep.model.detection.speckle_correlation_integral import (
         fill_peak_bin_correlation,  # a compiler is slow to import
@@ -189,9 +210,21 @@ def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.nd
 def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     """Return the normalised window transform G, G(0) = 1, about the record's middle; it is real.
 
-    ``distance`` is in units of the sample rate over the window's number of samples. G is set to 0
-    beyond 2 TRANSFORM_REACH_CELLS.
+    Parameters
+    ----------
+    window : Window
+        Window of L samples (:class:`sweep.model.window.Window`).
+    distance : ndarray
+        Distance from the centre, of either sign, in units of the sample rate over L.
 
+    Returns
+    -------
+    ndarray
+        G at each distance, interpolated linearly in :func:`transform_table`. G is set to 0 beyond
+        2 TRANSFORM_REACH_CELLS.
+
+    Examples
+    --------
     >>> from sweep.model.window import get_window
     >>> float(np.round(window_transform(get_window("hann", 1024), np.array([1.0]))[0], 3))
     0.5

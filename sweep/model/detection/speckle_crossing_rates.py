@@ -249,9 +249,19 @@ def fill_rate_table(threshold_ratio, crossing_series, arrays):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def rate_table(grid, arrays):
-    """Return the :class:`SpeckleCrossingRates` that :func:`fill_rate_table` has put into arrays.
+    """Return the table of crossing rates that :func:`fill_rate_table` has put into arrays.
 
-    ``grid`` is the result of that function.
+    Parameters
+    ----------
+    grid : RateTableGrid
+        Grid of the table, the result of :func:`fill_rate_table`.
+    arrays : RateTableArrays
+        Arrays that :func:`fill_rate_table` has filled. The table refers to their memory.
+
+    Returns
+    -------
+    SpeckleCrossingRates
+        Table of the relative rates of threshold crossings.
     """
     return SpeckleCrossingRates(
         grid.log_amplitude_first,
@@ -425,7 +435,18 @@ def rate_at_brightest_speckle(squared_ratio, rate_table):
 
     c is the probability that leaked signal makes the bin cross the threshold.
 
-    ``squared_ratio`` and ``rate_table`` are as in :func:`add_rates_by_speckle_power`.
+    Parameters
+    ----------
+    squared_ratio : float
+        Squared amplitude a^2 of the leaked signal over sigma^2, at mean speckle power, > 0. sigma
+        is the noise of a bin per quadrature.
+    rate_table : SpeckleCrossingRates
+        Table of relative rates rho at the threshold.
+
+    Returns
+    -------
+    float
+        r = a^2 u rho(ln a + ln(u) / 2), with the speckle power u = SPECKLE_POWER_MAX.
     """
     table_position = (
         0.5 * math.log(squared_ratio)

@@ -95,7 +95,33 @@ class ModeTableCell(NamedTuple):
 
 @lru_cache(maxsize=32)
 def mode_table(record_window: Window, fft_size: int) -> ModeTable:
-    """Tabulate the strongest speckle mode for a window and an FFT size (cached)."""
+    """Tabulate the strongest speckle mode for a window and an FFT size (cached).
+
+    Parameters
+    ----------
+    record_window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    ModeTable
+        Power fraction of the strongest mode, and correlation of neighbouring bins, over the
+        standard deviation of the lines and the position of their centre.
+
+    Notes
+    -----
+    The amplitudes of bins k and l have the covariance
+
+        C(k, l) = int p(nu) G(k - nu) G(l - nu) dnu,
+
+    with the window's transform G and a Gaussian density p of the lines. The strongest mode is the
+    eigenvector u of the largest eigenvalue m [Goodman, Speckle Phenomena in Optics, 2007, 3.3]. It
+    has the fraction m u(k)^2 / C(k, k) of the power of bin k. The correlation of neighbours is
+    C(k, k - 1) / sqrt(C(k, k) C(k - 1, k - 1)). Cosine-sum windows of more than 1024 samples are
+    represented by a window of 1024 samples.
+    """
     padding_factor, lobe_half_width = (
         fft_size / record_window.length,
         main_lobe_half_width(record_window),

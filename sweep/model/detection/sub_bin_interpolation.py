@@ -134,6 +134,22 @@ def in_phase_noise_correlations(window: Window, fft_size: int) -> tuple[float, f
     """Return the noise correlations of two bins that are one bin apart, and two bins apart.
 
     The correlations are those of the noise components in phase with the main lobe of a tone.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    correlation_1, correlation_2 : float
+        Correlation, -1..1, of bins that are d = 1 and d = 2 bins apart.
+
+    Notes
+    -----
+    sum_n w_n^2 cos(2 pi d (n - L/2) / N) / sum_n w_n^2, with the samples w_n of the window.
     """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
@@ -146,7 +162,22 @@ def in_phase_noise_correlations(window: Window, fft_size: int) -> tuple[float, f
 def sidelobe_neighbour_noise_correlation(window: Window, fft_size: int) -> float:
     """Return the correlation of adjacent bins' noise components in phase with a tone's sidelobes.
 
-    See :attr:`Interpolator.sidelobe_neighbour_noise_correlation`.
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    float
+        Correlation, -1..1: the first of :func:`in_phase_noise_correlations` times 1 - 2 L/N.
+
+    Notes
+    -----
+    Of N successive sidelobe bins, L change sign from one to the next. Hence the mean of the sign is
+    1 - 2 L/N.
     """
     correlation_1, _ = in_phase_noise_correlations(window, fft_size)
     return correlation_1 * (1.0 - 2.0 * window.length / fft_size)
@@ -156,9 +187,28 @@ def sidelobe_neighbour_noise_correlation(window: Window, fft_size: int) -> float
 def interpolator(window: Window, fft_size: int) -> Interpolator:
     """Return the tables that give a peak's position from three magnitudes (cached).
 
-    The tables hold for records with this window that are padded to `fft_size` samples. For a
-    flat-top window in a padded FFT, no ratio of the magnitudes rises with the offset of the tone
-    from the centre bin. The offset is then given as 0, with an error of half a bin.
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    Interpolator
+        Tables over the magnitude ratio, and over the tone's offset of 0 .. 1 bin.
+
+    Notes
+    -----
+    Let below, centre and above be |X| of the three bins. The magnitude ratio is
+
+        (above - below) / (below + 2 centre + above),
+
+    or above / (centre + above) if the neighbours of a tone on a bin vanish. For a flat-top window
+    in a padded FFT, no ratio of the magnitudes rises with the offset of the tone from the centre
+    bin. The offset is then given as 0, with an error that :func:`sub_bin_standard_error` limits to
+    half a bin.
     """
     offset = np.arange(_N_TABLE_INTERVALS + 1) / _N_TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
@@ -194,9 +244,19 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
 
 
 def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
-    """Return exp(-2 pi i cycles n) for n = 0 .. ``n_values`` - 1.
+    """Return exp(-2 pi i c n) for n = 0 .. ``n_values`` - 1.
 
-    The exponentials are products of about 2 sqrt(n_values) exponentials.
+    Parameters
+    ----------
+    cycles : float
+        Phase c from one value to the next [cycles].
+    n_values : int
+        Number of values.
+
+    Returns
+    -------
+    ndarray (n_values,) complex
+        Exponentials, as products of about 2 sqrt(n_values) exponentials.
     """
     step = math.isqrt(n_values) + 1
     angle = -2j * np.pi * cycles * np.arange(step)
@@ -207,9 +267,29 @@ def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
 def tone_spectrum_function(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function that gives the complex value of a bin at -2 .. 2 bins from a tone.
 
-    The linear phase of half a record is removed, so that the value is real for a symmetric window.
-    The remaining phase changes by at most one cycle. A polynomial thus represents the value to
-    1e-14 of the largest bin.
+    Parameters
+    ----------
+    window : Window
+        Window of the record, of L samples (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N >= L.
+
+    Returns
+    -------
+    callable
+        Function from the distances d of bins from the tone [bins] to the bins' complex values, of
+        the same shape. d is positive for bins above the tone.
+
+    Notes
+    -----
+    For a complex tone of amplitude 1 the value is
+
+        sum_n w_n exp(-2 pi i d (n - L/2) / N),
+
+    with the samples w_n of the window. The linear phase of half a record is removed, so that the
+    value is real for a symmetric window. Only the first sample, which has no counterpart at n = L,
+    leaves an imaginary part. The remaining phase changes by at most one cycle. A polynomial thus
+    represents the value to 1e-14 of the largest bin.
     """
     w, record_middle = window_samples(window.name, window.length), window.length / 2
 
