@@ -203,6 +203,21 @@ def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) 
     """Return the number of rays of each shot of a flight in the first of several casts.
 
     This number is used for flights whose number of rays follows from the tolerance.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path; all points share text parameters.
+    error_budget : ErrorBudget
+        Accuracy of the study (:class:`sweep.model.error_budget.ErrorBudget`), with one tolerance
+        for all points.
+
+    Returns
+    -------
+    int
+        Number of rays from `ErrorBudget.min_rays_by_tolerance`. It is
+        `ErrorBudget.thesis_beamlet_count` if errors do not fall to 0 as the number of beamlets
+        increases.
     """
     if not beamlets_converge(parameters):
         return error_budget.thesis_beamlet_count
@@ -248,7 +263,19 @@ def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -
 def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
     """Return the tolerated error of probabilities due to effects that are not simulated.
 
-    `n_beamlets` is the stated number of beamlets, 0 if it follows from the tolerance.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path; all points share text parameters and the tolerance.
+    n_beamlets : int
+        Stated number of beamlets, or of rays of a shot; 0 if it follows from the tolerance.
+
+    Returns
+    -------
+    float
+        (`ErrorBudget.effects_fraction` - b) times the tolerance. b is
+        `ErrorBudget.beamlets_fraction` if the number of beamlets follows from the tolerance, else
+        0.
     """
     counts_beamlets = n_beamlets == 0 and beamlets_converge(parameters)
     return float(

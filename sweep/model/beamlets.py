@@ -91,7 +91,8 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
     Parameters
     ----------
     n_beamlets : int
-        Number of beamlets; the square root of the number per side for a square.
+        Number of beamlets: for ``square`` the square of the number per side, which is at least 2;
+        for parallel lines a multiple of the number of lines.
     pattern : str
         One of :data:`BEAMLET_PATTERNS`, or ``3 lines`` for that many parallel lines.
 
@@ -295,7 +296,17 @@ ZERO_OFFSET_MOMENTS = OffsetMoments(0.0, 0.0, 0.0)
 def pattern_radius(n_beamlets: int, pattern: str) -> float:
     """Return the largest angle between a beamlet and the axis [standard deviations of the beam].
 
-    `n_beamlets` and `pattern` are as in :func:`place_beamlets`.
+    Parameters
+    ----------
+    n_beamlets : int
+        Number of beamlets.
+    pattern : str
+        Pattern of the beamlets, as in :func:`place_beamlets`.
+
+    Returns
+    -------
+    float
+        Angle in standard deviations of the beam, Theta/4 with the full divergence Theta.
     """
     directions, _ = place_beamlets(n_beamlets, pattern)
     return float(np.sqrt((directions**2).sum(axis=0)).max())

@@ -83,7 +83,19 @@ def product_cycle_fraction(high, low, x):
 
 @njit(inline="always")
 def double_double_quotient(numerator, denominator):
-    """Return the quotient of two doubles as the sum of two doubles, high and low."""
+    """Compute the quotient of two doubles as the sum of two doubles.
+
+    Parameters
+    ----------
+    numerator, denominator : float
+        Dividend and divisor; the divisor is not 0. The divisor and the quotient are below 1e300 in
+        modulus.
+
+    Returns
+    -------
+    high, low : float
+        Rounded quotient, and its rounding error, rounded to a double.
+    """
     high = numerator / denominator
     product, remainder = exact_product(high, denominator)
     return high, ((numerator - product) - remainder) / denominator

@@ -180,7 +180,18 @@ class ErrorBudget:
     def select_points(self, point_indices: np.ndarray, n_points: int) -> "ErrorBudget":
         """Return the budget of selected points; tolerance and confidence have one value for each.
 
-        `point_indices` select from `n_points` points.
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the selected points.
+        n_points : int
+            Number of points from which they are selected.
+
+        Returns
+        -------
+        ErrorBudget
+            Budget whose tolerance and confidence are arrays (m,). All other fields are unchanged,
+            even if they have one value for each point.
         """
         tolerance, confidence = (
             np.broadcast_to(values, (n_points,))[point_indices]

@@ -231,7 +231,21 @@ class EchoScales(NamedTuple):
     def scale_echo(
         self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
     ) -> "EchoScales":
-        """Return these scales with factors on the echo's power and on the beat's amplitude."""
+        """Return these scales with factors on the echo's power and on the beat's amplitude.
+
+        Parameters
+        ----------
+        power_factor : ndarray or float
+            Factor on the echo power, >= 0.
+        amplitude_factor : ndarray or float
+            Factor on the amplitude of the beat, >= 0.
+
+        Returns
+        -------
+        EchoScales
+            Scaled echo power [W] and beat amplitude [V]; the transmission of light from the ground
+            is unchanged.
+        """
         return self._replace(
             echo_power_scale=self.echo_power_scale * power_factor,
             beat_amplitude_scale=self.beat_amplitude_scale * amplitude_factor,
@@ -362,18 +376,33 @@ def echo_power_and_beat_current(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the echo power [W] and the beat photocurrent [A] for a backscatter of 1/sr.
 
+    Parameters
+    ----------
+    architecture : str
+        Receiver architecture: ``homodyne``, ``heterodyne`` or ``direct``.
+    parameters : mapping
+        Parameters of laser, telescope, receiver and target by dotted path, as arrays that broadcast
+        against each other.
+
     Returns
     -------
     echo_power : ndarray
         Echo power [W] with the full beam at ``target.range``.
     beat_current : ndarray
-        Amplitude of its beat photocurrent [A].
+        Amplitude of its beat photocurrent [A], by :func:`beat_current`.
 
     Notes
     -----
-    The law is [T 4.4] without its factor 1/(2 pi), which belongs to the reflectance law. A
-    beamlet's echo is this power times its power fraction and its backscatter [1/sr], divided by the
-    range loss of :func:`sweep.model.beam.range_loss_coefficients`.
+    The echo power is
+
+        P = P_tx A tau_o rho / R^2
+
+    with the transmitted power P_tx, the area A of
+    :func:`sweep.model.beam.effective_collecting_area`, the optical efficiency tau_o, the
+    reflectance rho and the range R. The law is [T 4.4] without its factor 1/(2 pi), which belongs
+    to the reflectance law, and without the atmosphere's transmission, which is an effect. A
+    beamlet's echo is this power times its power fraction and its backscatter [1/sr] for a
+    reflectance of 1, divided by the range loss of :func:`sweep.model.beam.range_loss_coefficients`.
     """
     power_times_area = (
         parameters[LASER_PREFIX + "power"]

@@ -832,7 +832,20 @@ def split_by_category(
 
 
 def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...]) -> np.ndarray:
-    """Return values, each broadcast to ``shape``, as the rows of one array."""
+    """Return values, each broadcast to a shape, as the rows of one array.
+
+    Parameters
+    ----------
+    values : sequence of ndarray or float
+        Values of r rows, in any unit; each broadcasts to ``shape``.
+    shape : tuple of int
+        Shape of a row.
+
+    Returns
+    -------
+    ndarray (r, ...) float64
+        Rows, of the shape ``shape`` each.
+    """
     rows = np.empty((len(values), *shape))
     for row, value in zip(rows, values, strict=True):
         row[...] = value

@@ -142,7 +142,22 @@ class SpectrumTolerances(NamedTuple):
     def from_parameters(
         cls, parameters: Mapping[str, np.ndarray], looks: "Looks"
     ) -> "SpectrumTolerances":
-        """Return the tolerances for parameters by dotted path, and for the looks of a shot."""
+        """Return the tolerances for parameters by dotted path, and for the looks of a shot.
+
+        Parameters
+        ----------
+        parameters : mapping
+            Parameters by dotted path, of which those under ``accuracy.`` are used.
+        looks : Looks
+            Number of records of each segment, and how they are combined
+            (:class:`sweep.model.detection.looks.Looks`).
+
+        Returns
+        -------
+        SpectrumTolerances
+            Tolerances as scalars or (n,) arrays, like the parameters. If the powers of N looks are
+            averaged, ``line_error`` is sqrt(N) times smaller than for one look.
+        """
         budget = ErrorBudget.from_parameters(parameters)
         return cls(
             line_error=budget.allowed_line_error / math.sqrt(looks.n_power_averaged),

@@ -275,10 +275,21 @@ class RecordSettings:
         return self.window.length / self.sample_rate
 
     def bin_noise_sigma(self, noise_variance: np.ndarray, looks: Looks) -> np.ndarray:
-        """Return the noise standard deviation per quadrature of an FFT bin [V].
+        """Return the noise standard deviation per quadrature of an FFT bin [V], [T 3.2].
 
-        ``noise_variance`` is the variance of a sample at the ADC [V^2]. Records of several looks
-        that are added in amplitude are averaged, and have the variance of their mean.
+        Parameters
+        ----------
+        noise_variance : ndarray
+            Variance sigma_x^2 of a sample at the ADC [V^2].
+        looks : Looks
+            Number of records of each segment, and how they are combined
+            (:class:`sweep.model.detection.looks.Looks`).
+
+        Returns
+        -------
+        ndarray
+            sqrt(E_w sigma_x^2 / (2 n)) [V, summed over the record], with the sum E_w of the squared
+            window. n is the number of looks that are averaged in amplitude (``coherent``), else 1.
         """
         return receiver_chain.bin_noise_sigma(
             noise_variance=noise_variance / looks.n_coherent,

@@ -326,7 +326,17 @@ def count_samples_before_echo(
 def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
     """Return the frequency at which a real record shows a signal, 0 to half the sample rate.
 
-    `frequency`, of either sign, and `sample_rate` are in the same unit.
+    Parameters
+    ----------
+    frequency : ndarray
+        Frequency f of the signal, of either sign, in any unit.
+    sample_rate : ndarray
+        Sample rate f_s, in the same unit.
+
+    Returns
+    -------
+    ndarray
+        |f - f_s rint(f / f_s)|, in the same unit; rint rounds to the nearest integer.
     """
     return np.abs(frequency - sample_rate * np.rint(frequency / sample_rate))
 

@@ -174,7 +174,25 @@ def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def get_window(name: str, length: int) -> Window:
-    """Return the :class:`Window` of a name and a number of samples; it is cached."""
+    """Return the :class:`Window` of a name and a number of samples; it is cached.
+
+    Parameters
+    ----------
+    name : str
+        Name of the window, as in :func:`window_samples`.
+    length : int
+        Number of samples L.
+
+    Returns
+    -------
+    Window
+        Window, with its sums and the envelope of its transform.
+
+    Raises
+    ------
+    ValueError
+        If scipy does not know the window or rejects its parameters.
+    """
     name = canonical_window_name(name)
     if name in COSINE_SUM_COEFFICIENTS and length >= _CLOSED_FORM_LENGTH_MIN:
         return _cosine_sum_window(name, length)
