@@ -45,7 +45,34 @@ class NadirAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return the attitudes and angular velocities of a level body.
+
+        Parameters
+        ----------
+        times : ndarray (n,)
+            Times [s]; only their number n is used.
+        velocity, acceleration : ndarray (n, 3)
+            Velocities [m/s] and accelerations [m/s^2] of the body in the world's frame. They are
+            used only if the heading follows the velocity.
+
+        Returns
+        -------
+        attitude : ndarray (n, 4)
+            Unit quaternions (w, x, y, z) from body to world.
+        angular_velocity : ndarray (n, 3)
+            Angular velocities in the world's frame [rad/s].
+
+        Raises
+        ------
+        ValueError
+            If the heading follows the velocity, and a velocity is vertical or 0.
+
+        Notes
+        -----
+        The attitude is a rotation about z by the heading h. The angular velocity is (0, 0, dh/dt).
+        With a constant heading, dh/dt is 0. Else h = atan2(v_y, v_x) and dh/dt = (v_x a_y - v_y
+        a_x) / (v_x^2 + v_y^2), with the velocity v and the acceleration a.
+        """
         if self.heading is not None:
             return np.tile(quat.from_axis_angle(2, self.heading), (len(times), 1)), np.zeros(
                 (len(times), 3)
@@ -67,7 +94,37 @@ class AlongTrackAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return the attitudes and angular velocities of a body that points along its velocity.
+
+        Parameters
+        ----------
+        times : ndarray (n,)
+            Times [s]; only their number n is used.
+        velocity, acceleration : ndarray (n, 3)
+            Velocities [m/s] and accelerations [m/s^2] of the body in the world's frame.
+
+        Returns
+        -------
+        attitude : ndarray (n, 4)
+            Unit quaternions (w, x, y, z) from body to world.
+        angular_velocity : ndarray (n, 3)
+            Angular velocities in the world's frame [rad/s].
+
+        Raises
+        ------
+        ValueError
+            If a velocity is vertical or 0.
+
+        Notes
+        -----
+        With the velocity v, the acceleration a and the horizontal speed s = hypot(v_x, v_y),
+        heading and pitch are h = atan2(v_y, v_x) and p = atan2(v_z, s). Let l = (-sin h, cos h, 0)
+        be the horizontal axis to the left. The angular velocity is (dh/dt) z - (dp/dt) l, because
+        the roll is constant:
+
+            dh/dt = (v_x a_y - v_y a_x) / s^2
+            dp/dt = (a_z s - v_z (v_x a_x + v_y a_y) / s) / |v|^2
+        """
         heading, yaw_rate = _heading_and_rate(velocity, acceleration)
         horizontal_speed = np.hypot(velocity[:, 0], velocity[:, 1])
         pitch = np.arctan2(velocity[:, 2], horizontal_speed)
@@ -118,7 +175,26 @@ class FixedAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return the constant attitude and the angular velocity 0, for each time.
+
+        Parameters
+        ----------
+        times : ndarray (n,)
+            Times [s]; only their number n is used.
+        velocity, acceleration : ndarray (n, 3)
+            Not used: the attitude does not depend on the body's motion.
+
+        Returns
+        -------
+        attitude : ndarray (n, 4)
+            Unit quaternions (w, x, y, z) from body to world.
+        angular_velocity : ndarray (n, 3)
+            Angular velocities in the world's frame [rad/s].
+
+        Notes
+        -----
+        The quaternion is normalised to length 1.
+        """
         q = quat.normalise(np.asarray(self.quaternion, float))
         return np.tile(q, (len(times), 1)), np.zeros((len(times), 3))
 
@@ -137,7 +213,27 @@ class SpinningAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return the attitudes of a body that rotates at a constant rate, and its angular velocity.
+
+        Parameters
+        ----------
+        times : ndarray (n,)
+            Times [s].
+        velocity, acceleration : ndarray (n, 3)
+            Not used: the attitude does not depend on the body's motion.
+
+        Returns
+        -------
+        attitude : ndarray (n, 4)
+            Unit quaternions (w, x, y, z) from body to world.
+        angular_velocity : ndarray (n, 3)
+            Angular velocities in the world's frame [rad/s].
+
+        Notes
+        -----
+        The attitude at the time t is exp(omega (t - t_0)) q_0, with the angular velocity omega and
+        the attitude q_0 at the time t_0. Here exp(r) is the quaternion of the rotation vector r.
+        """
         angular_velocity = np.asarray(self.angular_velocity, float)
         rotation = quat.from_rotation_vector(
             (times - self.initial_time)[:, None] * angular_velocity
@@ -182,7 +278,29 @@ class AttitudeTrack:
     def attitude_and_rate(
         self, query_times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Interpolate the attitudes between the given ones, and return the angular velocities.
+
+        Parameters
+        ----------
+        query_times : ndarray (n,)
+            Times at which the attitude is computed [s].
+        velocity, acceleration : ndarray (n, 3)
+            Not used: the attitude does not depend on the body's motion.
+
+        Returns
+        -------
+        attitude : ndarray (n, 4)
+            Unit quaternions (w, x, y, z) from body to world.
+        angular_velocity : ndarray (n, 3)
+            Angular velocities in the world's frame [rad/s].
+
+        Notes
+        -----
+        Between the times t_k and t_(k+1), the attitude is q_k exp(s_k (t - t_k) / (t_(k+1) - t_k)).
+        The rotation vector s_k is that from the attitude q_k to the next one, and exp(r) is the
+        quaternion of the rotation vector r. The angular velocity is s_k / (t_(k+1) - t_k), rotated
+        to the world's frame. It is 0 before the first and after the last given time.
+        """
         times, quaternions = np.asarray(self.times), np.asarray(self.quaternions)
         interval = np.clip(np.searchsorted(times, query_times, side="right") - 1, 0, len(times) - 2)
         interval_duration = np.diff(times)[interval]
@@ -210,7 +328,28 @@ class MountedAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return the attitudes of the mounted instrument, and the vehicle's angular velocities.
+
+        Parameters
+        ----------
+        times : ndarray (n,)
+            Times [s].
+        velocity, acceleration : ndarray (n, 3)
+            Velocities [m/s] and accelerations [m/s^2] of the vehicle in the world's frame, which
+            its attitude law may use.
+
+        Returns
+        -------
+        attitude : ndarray (n, 4)
+            Unit quaternions (w, x, y, z) from the instrument's frame to the world's.
+        angular_velocity : ndarray (n, 3)
+            Angular velocities in the world's frame [rad/s].
+
+        Notes
+        -----
+        The attitude is q m, with the attitude q of the vehicle and the rotation m from the
+        instrument's frame to the vehicle's.
+        """
         q, angular_velocity = self.vehicle_attitude.attitude_and_rate(times, velocity, acceleration)
         return quat.multiply(q, quat.normalise(np.asarray(self.mounting, float))), angular_velocity
 

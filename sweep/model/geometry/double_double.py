@@ -45,7 +45,16 @@ def _two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
 def quick_two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
     """Return the rounded sum of float64 numbers and its exact rounding error.
 
-    The result is valid only if abs(a) >= abs(b).
+    Parameters
+    ----------
+    a, b : ndarray
+        Float64 numbers with abs(a) >= abs(b). The error is not exact otherwise.
+
+    Returns
+    -------
+    DoubleDouble
+        The rounded sum s = fl(a + b), and its error b - (s - a), after Dekker (module's
+        References).
     """
     total = a + b
     return DoubleDouble(total, b - (total - a))
@@ -59,7 +68,19 @@ def _split_digits(a: np.ndarray) -> DoubleDouble:
 
 
 def multiply(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the product of two double-doubles."""
+    """Return the product of two double-doubles.
+
+    Parameters
+    ----------
+    a, b : DoubleDouble
+        Factors, which broadcast against each other.
+
+    Returns
+    -------
+    DoubleDouble
+        Product a b. The exact product of the high parts is that of Dekker (module's References).
+        The product of the low parts is neglected.
+    """
     high_product = a.high * b.high
     a_half, b_half = _split_digits(a.high), _split_digits(b.high)
     low_product = (
@@ -71,21 +92,53 @@ def multiply(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def add(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the sum of two double-doubles, accurate even if the high parts cancel."""
+    """Return the sum of two double-doubles, accurate even if the high parts cancel.
+
+    Parameters
+    ----------
+    a, b : DoubleDouble
+        Summands, which broadcast against each other.
+
+    Returns
+    -------
+    DoubleDouble
+        Sum a + b. High and low parts are each added without an error, after Knuth (module's
+        References).
+    """
     high_sum, low_sum = _two_sum(a.high, b.high), _two_sum(a.low, b.low)
     total = quick_two_sum(high_sum.high, high_sum.low + low_sum.high)
     return quick_two_sum(total.high, total.low + low_sum.low)
 
 
 def subtract(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the difference a - b of two double-doubles."""
+    """Return the difference of two double-doubles.
+
+    Parameters
+    ----------
+    a, b : DoubleDouble
+        Numbers, which broadcast against each other.
+
+    Returns
+    -------
+    DoubleDouble
+        Difference a - b, computed by :func:`add`.
+    """
     return add(a, DoubleDouble(-b.high, -b.low))
 
 
 def dot(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the scalar product of two vectors (3, n).
+    """Return the scalar product of two vectors, or the product of a vector and a matrix.
 
-    A vector (3, 1, n) times a matrix (3, 3, n) gives a vector (3, n).
+    Parameters
+    ----------
+    a, b : DoubleDouble
+        n vectors, (3, n) each. The product of a vector and a matrix takes a vector (3, 1, n) and a
+        matrix (3, 3, n).
+
+    Returns
+    -------
+    DoubleDouble
+        sum_i a_i b_i over the first axis, (n,); or sum_i a_i b_ij of a matrix b, (3, n).
     """
     product = multiply(a, b)
     x, y, z = (DoubleDouble(high, low) for high, low in zip(product.high, product.low, strict=True))
@@ -93,10 +146,33 @@ def dot(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def cross(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the vector product of two vectors (3, n)."""
+    """Return the vector product of two vectors.
+
+    Parameters
+    ----------
+    a, b : DoubleDouble (3, n)
+        Components x, y, z of n vectors.
+
+    Returns
+    -------
+    DoubleDouble (3, n)
+        a x b = (a_y b_z - a_z b_y, a_z b_x - a_x b_z, a_x b_y - a_y b_x).
+    """
 
     def permute(vector: DoubleDouble, axes: list[int]) -> DoubleDouble:
-        """Return the vector with its components in the order of ``axes``."""
+        """Return a vector with its components in another order.
+
+        Parameters
+        ----------
+        vector : DoubleDouble (3, n)
+            Components x, y, z of n vectors.
+        axes : list of int
+            Index of the component, 0..2 for x, y, z, that comes first, second and third.
+
+        Returns
+        -------
+        DoubleDouble (3, n)
+        """
         return DoubleDouble(vector.high[axes], vector.low[axes])
 
     yzx, zxy = [1, 2, 0], [2, 0, 1]

@@ -13,7 +13,19 @@ accurate to 1e-18."""
 
 
 def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the Hamilton product p q, (..., 4): the rotation by q first, then by p."""
+    """Return the Hamilton product p q of quaternions: the rotation by q first, then by p.
+
+    Parameters
+    ----------
+    p, q : ndarray (..., 4)
+        Quaternions (w, x, y, z).
+
+    Returns
+    -------
+    ndarray (..., 4)
+        With the scalar part w and the vector part v, p q has the scalar part p_w q_w - p_v . q_v
+        and the vector part p_w q_v + q_w p_v + p_v x q_v.
+    """
     pw, px, py, pz = np.moveaxis(np.asarray(p, float), -1, 0)
     qw, qx, qy, qz = np.moveaxis(np.asarray(q, float), -1, 0)
     return np.stack(
@@ -48,7 +60,21 @@ def normalise(q: np.ndarray) -> np.ndarray:
 
 
 def rotate(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Rotate vectors (..., 3) by unit quaternions q (..., 4), from body to world."""
+    """Rotate vectors from the body's frame to the world's.
+
+    Parameters
+    ----------
+    q : ndarray (..., 4)
+        Unit quaternions (w, x, y, z) from body to world; their length is not checked.
+    vector : ndarray (..., 3)
+        Vectors v in the body's frame, in any unit.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        v + 2 w (u x v) + 2 u x (u x v) in the unit of `vector`, with the vector part u = (x, y, z)
+        of the quaternion.
+    """
     q, vector = np.asarray(q, float), np.asarray(vector, float)
     doubled_cross = 2 * np.cross(q[..., 1:], vector)
     return np.asarray(vector + q[..., :1] * doubled_cross + np.cross(q[..., 1:], doubled_cross))
@@ -84,9 +110,19 @@ def to_rotation_vector(q: np.ndarray) -> np.ndarray:
 
 
 def from_axis_angle(axis: int, angle: np.ndarray | float) -> np.ndarray:
-    """Return the right-handed rotation by an angle [rad] about one axis, (..., 4).
+    """Return the quaternions of right-handed rotations about a coordinate axis.
 
-    `axis` is 0, 1 or 2 for x, y or z.
+    Parameters
+    ----------
+    axis : int
+        Axis of the rotation: 0, 1 or 2 for x, y or z.
+    angle : ndarray or float
+        Angle of the rotation [rad], of any shape.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions (w, x, y, z): w = cos(angle / 2), and sin(angle / 2) along the axis.
     """
     half_angle = 0.5 * np.asarray(angle, float)
     q = np.zeros((*half_angle.shape, 4))
@@ -101,7 +137,7 @@ def from_heading(
     pitch: np.ndarray | float = 0.0,
     roll: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Return the attitude of a body (x forward, y left, z up) from three angles, (..., 4).
+    """Return the attitude of a body (x forward, y left, z up) from three angles.
 
     Parameters
     ----------
@@ -111,6 +147,11 @@ def from_heading(
         Angle by which the nose is then raised [rad], a right-handed rotation about -y.
     roll : ndarray or float
         Angle by which the left side is raised last [rad], a right-handed rotation about x.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions (w, x, y, z) from body to world: R_z(heading) R_y(-pitch) R_x(roll).
     """
     heading_and_pitch = multiply(
         from_axis_angle(2, heading), from_axis_angle(1, -np.asarray(pitch, float))

@@ -322,9 +322,19 @@ class _MeshFrame(NamedTuple):
         return subtract(self._rotate_to_body(from_body, ray_rows), mesh_origin)
 
     def directions_in_mesh_frame(self, directions, ray_rows):
-        """Rotate directions (m, 3) to the mesh's frame; return a DoubleDouble (3, m).
+        """Rotate directions of m rays to the mesh's frame.
 
-        `ray_rows` are as in :meth:`origins_in_mesh_frame`.
+        Parameters
+        ----------
+        directions : ndarray (m, 3)
+            Directions in the world's frame.
+        ray_rows : ndarray (m,) int
+            Row of each ray in `rotation`.
+
+        Returns
+        -------
+        DoubleDouble (3, m)
+            Directions R^T d, with the rotation R from the body's frame to the world's.
         """
         world_direction = DoubleDouble.from_float64(directions.T)
         return (
@@ -343,7 +353,23 @@ class _MeshFrame(NamedTuple):
         return dot(vector_column, DoubleDouble.from_float64(rotations))
 
     def rays_in_mesh_frame(self, origins, directions):
-        """Transform origins (n, 3) and directions (n, b, 3) to the mesh's frame, as float64."""
+        """Transform bundles of rays to the mesh's frame.
+
+        Parameters
+        ----------
+        origins : ndarray (n, 3)
+            Origin of each bundle in the world's frame [m].
+        directions : ndarray (n, b, 3)
+            Directions of the rays in the world's frame.
+
+        Returns
+        -------
+        origins : ndarray (n, 3)
+            R^T (o - p) - m for the origin o [m], rounded to float64. R is the rotation from the
+            body's frame to the world's, p the body's position, and m the mesh's origin.
+        directions : ndarray (n, b, 3)
+            R^T d for the direction d, rounded to float64; a read-only array.
+        """
         n_bundles, n_beamlets = directions.shape[:2]
         mesh_origins = self.origins_in_mesh_frame(origins, np.arange(n_bundles)).high.T
         if self.rotation is not None:
@@ -365,9 +391,19 @@ class _MeshFrame(NamedTuple):
         return np.ascontiguousarray(mesh_origins), directions
 
     def rotate_to_world(self, vector, ray_rows):
-        """Rotate vectors (3, m) from the body's frame to the world's.
+        """Rotate vectors from the body's frame to the world's.
 
-        ``ray_rows`` (m,) is the row of each vector in ``rotation``.
+        Parameters
+        ----------
+        vector : ndarray (3, m)
+            Components x, y, z in the body's frame, of m vectors in any unit.
+        ray_rows : ndarray (m,) int
+            Row of each vector in `rotation`.
+
+        Returns
+        -------
+        ndarray (3, m)
+            Components in the world's frame, in the same unit.
         """
         if self.rotation is None:
             return vector
