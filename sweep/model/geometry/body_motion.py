@@ -463,6 +463,12 @@ def straight_trajectory(
     initial_speed, final_speed : float
         Speeds [m/s], >= 0 and not both 0; by default the final speed is the initial one.
 
+    Returns
+    -------
+    ConstantAcceleration
+        Trajectory of the length L between the points, from speed v_0 to v_1. It lasts
+        2 L / (v_0 + v_1) [s], with the acceleration (v_1^2 - v_0^2) / (2 L) [m/s^2] along it.
+
     Raises
     ------
     ValueError

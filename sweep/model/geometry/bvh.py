@@ -128,6 +128,10 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
         Finite vertices [m], best centred about 0.
     faces : ndarray (m, 3) int
         Vertices of each triangle, m >= 1.
+
+    Returns
+    -------
+    BoxTree
     """
     leaves = _order_into_leaves(_doubled_triangle_centres(vertices, faces))
     bounds, children = _build_nodes(vertices, faces, leaves)
@@ -414,6 +418,12 @@ def _traverse_tree(
         Number of triangles after which the traversal is aborted.
     distance_min : float
         Smallest distance of a hit, in lengths of the direction.
+
+    Returns
+    -------
+    bool
+        True if all boxes that a ray may enter have been visited. False after an abort, or without
+        an axis that all directions share (:func:`_prepare_bundle`).
     """
     bounds, children, tree_faces, vertices = tree.bounds, tree.children, tree.faces, tree.vertices
     shears, child_entry_distance = scratch.shears, scratch.child_entry_distance
@@ -495,6 +505,11 @@ def _prepare_bundle(directions, shears, box_test_constants):
     box_test_constants : ndarray (6, 3)
         The result for boxes: constants for each coordinate axis, for all directions between `low`
         and `high` along it.
+
+    Returns
+    -------
+    int
+        Index of the axis, 0, 1 or 2 for x, y or z; -1 if the axis differs between directions.
 
     Notes
     -----

@@ -22,7 +22,7 @@ of the same seed."""
 
 
 def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
-    """Return unit vectors of beams evenly spaced on a cone around nadir, (n_beams, 3).
+    """Return unit vectors of beams evenly spaced on a cone around nadir.
 
     The vectors are in the body frame.
 
@@ -34,6 +34,11 @@ def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) ->
         Angle of each beam from nadir [rad].
     azimuth : float
         Angle of the first beam about the vertical, from forward towards the left [rad].
+
+    Returns
+    -------
+    ndarray (n_beams, 3)
+        Unit vectors.
     """
     azimuths = azimuth + 2 * math.pi * np.arange(n_beams) / n_beams
     horizontal = math.sin(half_angle)
@@ -42,12 +47,17 @@ def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) ->
 
 
 def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
-    """Return unit vectors of beams steered about two axes, in the body frame, (..., 3).
+    """Return unit vectors of beams steered about two axes, in the body frame.
 
     Parameters
     ----------
     angle_x, angle_y : ndarray
         Angles of the beam from nadir towards forward and towards the left [rad], below 90 deg.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        Unit vectors, in the shape to which the angles broadcast.
 
     Notes
     -----
@@ -251,6 +261,10 @@ def fixed_beams(
     interval : float, optional
         Time from one beam to the next [s]; 0 fires all at once, None spaces them evenly over the
         cycle.
+
+    Returns
+    -------
+    BeamCycle
     """
     return BeamCycle(directions, [list(range(len(directions)))], rate, interval)
 
@@ -278,6 +292,11 @@ def raster_scan(
         Frames per second [Hz].
     both_ways : bool
         True if every other row is scanned backwards; False if each row starts at the right.
+
+    Returns
+    -------
+    BeamCycle
+        Cycle of columns * rows shots, spaced evenly over 1 / rate [s].
     """
     half_angle_across, half_angle_along = half_angles
     angles_across = half_angle_across * np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)
@@ -393,7 +412,7 @@ def beamlet_rays(
     tangent_along: np.ndarray,
     sigma: float | np.ndarray,
 ) -> np.ndarray:
-    """Return unit vectors of all beamlets (rays that sample a beam) in the world frame, (n, b, 3).
+    """Return unit vectors of all beamlets (rays that sample a beam) in the world frame.
 
     Parameters
     ----------
@@ -406,6 +425,13 @@ def beamlet_rays(
         vector of :func:`transverse_axes`.
     sigma : float or ndarray (n, 1)
         Standard deviation of the beam on each axis [rad].
+
+    Returns
+    -------
+    ndarray (n, b, 3)
+        Unit vectors along a + sigma (x e_1 + y e_2). a is the direction of the beam, x and y are
+        the tangents across and along, and e_1 and e_2 the vectors of :func:`transverse_axes`. All
+        vectors are in the world frame.
     """
     axes = rotate(attitude[:, None], np.stack([*transverse_axes(axis), axis], axis=1))
     first, second, axis_vector = np.moveaxis(axes, 0, 2)[..., None]
