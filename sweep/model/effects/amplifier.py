@@ -124,9 +124,24 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Add the beat noise of spontaneous emission; direct detection has none.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameters of amplifier, laser and receiver; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the noise source ``spontaneous_emission`` [V^2], or unchanged with direct
+        detection.
+
     Notes
     -----
-    The current variance is that of :func:`emission_beat_current_variance`.
+    The current variance [A^2] is that of :func:`emission_beat_current_variance`. It is multiplied
+    by the noise at the ADC per squared current [V^2/A^2].
     """
     if shots.waveform.architecture == "direct":
         return shots

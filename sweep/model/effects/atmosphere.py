@@ -18,8 +18,8 @@ Sources of the tables:
 
 References
 ----------
-The factor T^2 of transmission T is [T 4.4], which leaves the atmosphere's profile open. Backscatter
-is the single-scattering lidar equation (:func:`backscatter_integral`).
+The factor T^2 of transmission T is that of PHYSICS section 3; the range equation [T 4.4] leaves the
+air out. Backscatter is the single-scattering lidar equation (:func:`backscatter_integral`).
 """
 
 import itertools
@@ -213,7 +213,24 @@ def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfil
 def path_end_heights(
     parameters: Mapping[str, np.ndarray], range: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights of lidar and target above the ground [m], (n,) each."""
+    """Return the heights of lidar and target above the ground.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, (n,) or scalar: kind of the path, height of the target [m], and
+        elevation of the beam (its angle below the horizon [rad]). Without an elevation the target's
+        grazing angle [rad] stands for it.
+    range : ndarray (n,)
+        Range of the target [m].
+
+    Returns
+    -------
+    lidar_height : ndarray (n,)
+        Target's height plus range * sin(elevation) [m]; the target's height on a level path.
+    target_height : ndarray (n,)
+        Height of the target [m].
+    """
     target_height = np.asarray(parameters["atmosphere.target_height"], float) + np.zeros_like(range)
     if str(parameters["atmosphere.path"]) == "level":
         return target_height, target_height
@@ -232,11 +249,24 @@ def _path_geometry(
 def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
     """Attenuate echoes and light from the ground by the transmission of the air.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameters of atmosphere and beam; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with attenuated echoes and ground light, or unchanged without an atmosphere.
+
     Notes
     -----
-    With the one-way transmission T = exp(-optical depth), echo power is multiplied by T^2 [T 4.4],
-    and light from the ground, such as sunlight, by T. The beat's amplitude is multiplied by T, or
-    with direct detection by T^2.
+    With the one-way transmission T = exp(-optical depth), echo power is multiplied by T^2 (PHYSICS
+    section 3), and light from the ground, such as sunlight, by T. The beat's amplitude is
+    multiplied by T, or with direct detection by T^2.
     """
     profile = extinction_profile(context.parameters)
     if profile is None:
@@ -449,9 +479,28 @@ def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndar
 def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     """Add the shot noise of backscattered light.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameters of atmosphere, laser and telescope; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the noise source ``backscatter_shot`` [V^2], or unchanged without an atmosphere.
+
+    Notes
+    -----
+    The current variance is 2 q M^2 F Re P B_e, with the elementary charge q, the detector's gain M,
+    excess noise factor F and responsivity Re, and the electrical bandwidth B_e. The power P [W] is
+    P_tx A tau_o / S times the integral of :func:`backscatter_integral`.
+
     The beat of this light with the local oscillator is neglected. This light comes from grains that
-    change all the time, and is spread over the bins from the nearest range to the target's. [T
-    3.3.1] counts backscatter as noise as well.
+    change all the time, and is spread over the bins from the nearest range to the target's.
+    [T 3.3.2] counts backscatter as noise as well.
     """
     parameters = context.parameters
     profile = extinction_profile(parameters)

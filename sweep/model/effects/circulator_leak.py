@@ -142,7 +142,22 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Return the shots with the noise sources and the permanent line of the leaked light added.
+    """Add the noise sources and the permanent line of the leaked light to shots.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameters of laser, telescope and receiver; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the noise sources ``leak_shot`` and ``leak_excess`` [V^2], and with the line of
+        the leaked light: its amplitude at the ADC [V], before the receiver's poles, and its delay
+        [s].
 
     Notes
     -----

@@ -16,7 +16,7 @@ the lines, and its component across the beam spreads them.
 
 References
 ----------
-The shift is [T 2.8]. Spread and rotation are derived here; docs/physics.md, *Beats*, has the beat
+The shift is [T 3.1]. Spread and rotation are derived here; docs/physics.md, *Beats*, has the beat
 with all its terms.
 """
 
@@ -96,10 +96,23 @@ def line_shift_error_bound(points: PlannerInputs, shift_bins: np.ndarray) -> Err
 def apply_doppler(shots: Shots, context: EffectContext) -> Shots:
     """Shift all lines by the radial velocity on the beam's axis.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the Doppler ratio of the target in their record ``motion``.
+
     Notes
     -----
     The Doppler ratio of the line on the axis becomes 2 v_r / c, to first order in v_r / c, with the
-    radial velocity v_r.
+    radial velocity v_r. It is positive when the range shrinks. The line shifts by 2 v_r / lambda at
+    the wavelength lambda [T 3.1].
     """
     return replace(shots, motion=shots.motion._replace(doppler_ratio=shots.target.doppler_ratio))
 
@@ -145,10 +158,25 @@ def doppler_spread_error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply_doppler_spread(shots: Shots, context: EffectContext) -> Shots:
     """Give beamlets their own radial velocities, if the footprint has beamlets.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Ground with the beamlets' Doppler ratios, and mask of the effect
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with Doppler ratios (rows, beamlets) relative to the axis, or unchanged if the
+        footprint is one line on the axis.
+
     Notes
     -----
-    Beamlet b gets the Doppler ratio 2 V.d / c in place of that of the axis. V is the velocity of
-    the instrument relative to the ground, and d the direction of the beamlet.
+    The Doppler ratio of beamlet b minus that on the axis becomes 2 V.(d_b - d_0) / c. V is the
+    velocity of the instrument relative to the ground, d_b the direction of the beamlet, and d_0
+    that of the axis.
     """
     doppler_ratios = context.ground.beamlets.doppler_ratio_offset
     if shots.footprint.doppler_ratio_offset.shape != doppler_ratios.shape:

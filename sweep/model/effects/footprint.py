@@ -68,10 +68,24 @@ def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
     Beamlets on other surfaces keep the axis's range, and all keep its velocity: those are separate
     effects.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Ground with the beamlets' ranges and echoes
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with relative ranges and amplitudes of beamlets, (rows, beamlets) each.
+
     Notes
     -----
     Beamlet b has the range R_0 (1 + r_b). R_0 is the range of the axis, and r_b the relative offset
-    of the ground (:mod:`sweep.model.ground`). Its amplitude is the square root of its echo power.
+    of the ground (:mod:`sweep.model.ground`). Its amplitude is the square root of its relative echo
+    [1/sr], or with direct detection that echo itself.
     """
     row, range_offset, _, echo = context.ground.beamlets
     if context.ground.is_on_other_surface is not None:
@@ -134,6 +148,19 @@ def apply_footprint_phase(shots: Shots, context: EffectContext) -> Shots:
 
     This applies if the spec states that the optical phases follow the surface. Otherwise the shots
     are returned unchanged.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameter ``footprint.phases``; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots whose beamlets add as amplitudes, or unchanged.
 
     Notes
     -----
@@ -209,6 +236,20 @@ def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
     """Give beamlets on other surfaces than the axis's their own ranges, if there are any.
 
     Without the effect they return their power from the axis's range.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Ground with the beamlets' ranges and surfaces, and mask of the effect
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with relative ranges (rows, beamlets) of all beamlets, or unchanged if all beamlets
+        are on the surface that the axis meets.
     """
     range_offset = context.ground.beamlets.relative_range_offset
     if (

@@ -194,10 +194,22 @@ def _image_log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
 def apply_image(shots: Shots, context: EffectContext) -> Shots:
     """Sum images with the lines, if the record is real.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots whose images are summed with the lines if their record is real.
+
     Notes
     -----
     Bin k is X[k] = W(k - nu) a / 2 + (W(k + nu) a / 2)^*, for a line of amplitude a at the position
-    nu [bins]. W is the window's transform, and ^* the complex conjugate.
+    nu [bins] (PHYSICS section 5). W is the window's transform, and ^* the complex conjugate.
     """
     return replace(
         shots, line_images=shots.line_images._replace(are_summed=not shots.complex_record)
@@ -393,6 +405,18 @@ def _added_crossing_probability(
 
 def apply_leakage(shots: Shots, context: EffectContext) -> Shots:
     """Evaluate the leaked signal in bins on either side of the detection.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots whose detection includes leakage.
 
     Notes
     -----

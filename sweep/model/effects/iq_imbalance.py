@@ -77,6 +77,20 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Add images of the lines at their negative frequencies, if the record is complex.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Power ratio of Q and I, and departure of their phase from 90 degrees [rad]
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the amplitude of images relative to their lines, 0..1, or unchanged if the record
+        is real.
+
     Notes
     -----
     The image has |1 - g e^(i p)| / |1 + g e^(i p)| of the line's amplitude, with the ratio g of the

@@ -46,11 +46,24 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Reduce echoes by the offset between the axes of transmitted and received beam.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameters of both beams; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with reduced echoes, or unchanged if all light in the aperture mixes.
+
     Notes
     -----
     The echo's power is multiplied by exp(-2 d^2 / (w_T^2 + w_L^2)), with the distance d of the axes
-    and the beam radii w_T and w_L at the target. The beat's amplitude is multiplied by the square
-    root of that.
+    and the beam radii w_T and w_L at the target (antenna theorem, Siegman 1966). The beat's
+    amplitude is multiplied by the square root of that.
     """
     if not beam.is_single_mode(context.parameters):
         return shots

@@ -173,18 +173,32 @@ def _line_fraction_and_pedestal(
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Apply the laser's line: a Gaussian shape, or a weaker pure line and a pedestal of noise.
 
-    Notes
-    -----
-    Gaussian: |X|^2 is averaged over frequencies of the given FWHM. Lorentzian of width dnu: the
-    pure line keeps exp(-2 pi dnu tau) of its power, for the delay tau or the record's length if
-    that is shorter, and the rest is a pedestal of noise
-    (:func:`sweep.model.laser_line.apparent_line_and_pedestal`).
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Full width at half maximum of the line [Hz], and its shape
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the Gaussian width; or with amplitudes reduced to those of the pure line, and
+        with the pedestal as noise variances [V^2] under and beside the line.
 
     Raises
     ------
     UnsupportedShotError
         For coherently added looks of a Lorentzian laser, if an echo returns after the record's
         length.
+
+    Notes
+    -----
+    Gaussian: |X|^2 is averaged over frequencies of the given FWHM. Lorentzian of width dnu: the
+    pure line keeps exp(-2 pi dnu tau) of its power, for the delay tau or the record's length if
+    that is shorter, and the rest is a pedestal of noise
+    (:func:`sweep.model.laser_line.apparent_line_and_pedestal`).
     """
     line_width = np.asarray(context.parameters[_WIDTH_PATH], float)
     if str(context.parameters[_SHAPE_PATH]) == "gaussian":

@@ -6,7 +6,7 @@ excess noise factor F and responsivity Re, the optical power P, and the electric
 
 References
 ----------
-Shot noise is [T 2.22, 2.23] for any light P, in :mod:`sweep.model.receiver_chain`. That of the
+Shot noise is that of [T 2.23] for any light P, in :mod:`sweep.model.receiver_chain`. That of the
 echo raises false alarms at short range [T 4.2]. Sunlight is Planck's law for the temperature of the
 sun, and rounding is Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9.
 """
@@ -52,10 +52,25 @@ def signal_shot_noise_error_bound(points: PlannerInputs) -> ErrorBound:
 
 
 def apply_signal_shot_noise(shots: Shots, context: EffectContext) -> Shots:
-    """Add the shot noise of the total echo, of the current variance 2 q M^2 F Re P B_e.
+    """Add the shot noise of the total echo.
 
-    q is the elementary charge, M the detector's gain, F its excess noise factor, Re its
-    responsivity, P the echo's power and B_e the electrical bandwidth.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Mask of the effect (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the noise source ``signal_shot`` [V^2], 0 for points without the effect.
+
+    Notes
+    -----
+    The current variance is 2 q M^2 F Re P B_e. q is the elementary charge, M the detector's gain, F
+    its excess noise factor, Re its responsivity, P the echo's power and B_e the electrical
+    bandwidth.
     """
     variance = (
         shots.receiver_noise.shot_noise_variance_per_watt
@@ -159,6 +174,19 @@ def solar_background_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
     """Add the shot noise of sunlight, attenuated by the air between target and receiver.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameters of sun, target and receiver, and mask of the effect
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the noise source ``solar_shot`` [V^2], 0 for points without the effect.
 
     Notes
     -----
@@ -274,9 +302,24 @@ def relative_intensity_noise_error_bound(points: PlannerInputs) -> ErrorBound | 
 def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shots:
     """Add the intensity noise of the local oscillator; direct detection has none.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameters of laser and receiver; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the noise source ``relative_intensity`` [V^2], or unchanged with direct
+        detection.
+
     Notes
     -----
-    The current variance is that of :func:`intensity_noise_current_variance`.
+    The current variance [A^2] is that of :func:`intensity_noise_current_variance`. It is multiplied
+    by the noise at the ADC per squared current [V^2/A^2].
     """
     if shots.waveform.architecture == "direct":
         return shots
@@ -342,11 +385,23 @@ def quantisation_error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
     """Add the ADC's rounding noise, if a number of bits is stated.
 
-    The noise is white, of the variance lsb^2/12 for steps of lsb [V].
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Full scale [V] and number of bits of the ADC; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the noise source ``quantisation`` [V^2]; it is 0 if the number of bits is 0.
 
     Notes
     -----
-    :func:`sweep.model.receiver_chain.quantisation_variance` computes it and cites the source.
+    The noise is white. Its variance is lsb^2/12 for steps of lsb [V], or twice that with I and Q
+    (:func:`sweep.model.receiver_chain.quantisation_variance`, which cites the source).
     """
     return add_noise_sources(shots, **{ADC_NOISE_SOURCE: adc_noise_variance(context.parameters)})
 

@@ -161,6 +161,19 @@ def residual_magnitude_bound(points: PlannerInputs) -> np.ndarray:
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Leave out the echo in the first samples of each record, before the echo arrives.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the number of samples before the echo, (3, n) by segment, or unchanged if all
+        echoes fill their records.
+
     Notes
     -----
     Of L samples, the first n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s) lack the echo, limited to

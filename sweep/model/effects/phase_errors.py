@@ -219,8 +219,30 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
 def coherent_sum_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
     """Return a bound on the change by a phase error if amplitudes of lines and images add.
 
-    The bound is an :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters
-    to lines next to their images, and to a line to which a distant image is added.
+    The phase in the record's middle matters to lines next to their images, and to a line to which a
+    distant image is added.
+
+    Parameters
+    ----------
+    points : PlannerInputs
+        Points that are planned together
+        (:class:`sweep.model.effects.planner_inputs.PlannerInputs`).
+    phase_bound : PhaseErrorBound
+        Bound of the phase error phi (:class:`sweep.model.effects.error_bounds.PhaseErrorBound`).
+
+    Returns
+    -------
+    ndarray (segments, n)
+        Bound >= 0, relative to the sum of all amplitudes in phase
+        (:attr:`sweep.model.effects.error_bounds.ErrorBound.coherent_sum_change`).
+
+    Notes
+    -----
+    Let p = min(max |phi|, 2) [rad], and let g be the smallest |X| of a line between two bins,
+    relative to that on a bin. For lines near their images, the bound is 2 p sum |w| / (g sum w),
+    with the window w. Where the amplitudes of beamlets may nearly cancel, it is 2 <|phi|> / g, with
+    the mean < > of :func:`mean_phase_bound`. Otherwise it is p times the largest |X| of images over
+    that of all lines in phase.
     """
     moments = window_moments(points.window)
     phase_anywhere = np.minimum(
@@ -441,10 +463,24 @@ def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
     """Make the beats of the two chirps drift over the record, as the range falls.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the phase error of :func:`range_walk_phase`, and with the time to which their
+        measured range refers.
+
     Notes
     -----
-    The beat at t is that of the range R - 2 v_r t: half of the drift comes from the range, half
-    from the chirp's rising Doppler shift.
+    The phase is s S (beta (1 + beta / 2) + (u - v_r) / c) t^2 [cycles], as the module's description
+    states. The beat at t is that of the range R - 2 v_r t: half of the drift comes from the range,
+    half from the chirp's rising Doppler shift.
     """
     velocity, slide = (
         shots.range_and_velocity_by_segment["radial_velocity"],
@@ -592,6 +628,24 @@ def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
     """Make the Doppler frequency drift over all records, as the target accelerates.
 
     The loss that it causes in looks that are added in amplitude is included.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the phase error of :func:`acceleration_phase`, and with the time to which their
+        measured velocity refers.
+
+    Notes
+    -----
+    The phase is alpha t^2 (f_seg + s S (-tau_0 + (1 + beta) t + alpha t^2 / 2)) [cycles], as the
+    module's description states. That time is the middle of the record.
     """
     if shots.looks.n_coherent > 1:
         up_carrier, _, _ = shots.waveform.carriers
@@ -868,6 +922,20 @@ def _polynomial_product(
 
 def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
     """Add the phase of the sweep's frequency error to the records of the two chirps.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Peaks of the error [Hz], periods of its sine, and table of a measured error. The ground is
+        not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the phase errors of :func:`chirp_nonlinearity_phase`, and of
+        :func:`sweep_error_table_phase` if a table is given.
 
     Notes
     -----

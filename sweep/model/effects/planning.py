@@ -150,6 +150,20 @@ def error_bounds(
     """Return the error bounds of the effects that are present, by name.
 
     Bounds of phase errors come first, then those of noise, on which other bounds depend.
+
+    Parameters
+    ----------
+    points : PlannerInputs
+        Points of all tiles (:class:`sweep.model.effects.planner_inputs.PlannerInputs`). Their
+        `phase_error_bounds` and `noise_bounds` are set here.
+    effects : sequence of Effect
+        Effects whose bounds are computed (:class:`sweep.model.effects.effect.Effect`).
+
+    Returns
+    -------
+    dict of str to ErrorBound
+        Bounds (:class:`sweep.model.effects.error_bounds.ErrorBound`). An effect is left out if it
+        is absent, or if it is off and ``off`` is a rule of the scene.
     """
     points.phase_error_bounds = {
         effect.name: phase_bound
@@ -333,8 +347,33 @@ def residual_errors(
 ) -> dict[str, np.ndarray]:
     """Return bounds on the error of pd or relative |X| that simulated effects leave, by name.
 
-    The names are those of effects. pd is the probability of detection. Effects without such an
-    error are left out.
+    pd is the probability of detection. Effects without such an error are left out.
+
+    Parameters
+    ----------
+    bounds : mapping
+        Error bounds by name of the effect (:class:`sweep.model.effects.error_bounds.ErrorBound`).
+    points : PlannerInputs
+        Points of all tiles (:class:`sweep.model.effects.planner_inputs.PlannerInputs`).
+
+    Returns
+    -------
+    dict of str to ndarray
+        Error over the points, 0..1, by name of the effect: the larger of those of pd and of |X|.
+
+    Notes
+    -----
+    Let m be the residual error of |X| relative to |X|. Let r be that relative to the line on the
+    beam's axis, if that line lay on a bin. With the signal a of that line and the threshold b, pd
+    changes in a segment by at most
+
+        min(m sqrt(x b / (2 pi)), r a / 2) e^{-(x - b)^2 / 2}
+
+    at the signal x where pd is steepest, between the bounds of :func:`signal_ratio_bounds`. All
+    signals are over the noise per quadrature. The changes of all segments are summed. The error of
+    |X| is relative to |X|, or to sigma where |X| is smaller, and the largest of all segments
+    counts. Several looks count as one record with a gain and a threshold of its own
+    (:meth:`sweep.model.detection.looks.Looks.equivalent_threshold_ratio`).
     """
     residuals = {
         name: bound.residual_magnitude_change
@@ -380,6 +419,30 @@ def signal_ratio_bounds(
     """Return a lower and an upper bound of |X| in the largest bin over the noise per quadrature.
 
     The bounds hold whichever of the effects are simulated.
+
+    Parameters
+    ----------
+    bounds : mapping
+        Error bounds by name of the effect (:class:`sweep.model.effects.error_bounds.ErrorBound`).
+    points : PlannerInputs
+        Points of all tiles (:class:`sweep.model.effects.planner_inputs.PlannerInputs`).
+
+    Returns
+    -------
+    ratio_min, ratio_max : ndarray (segments, ...)
+        Bounds >= 0, by segment and point.
+
+    Notes
+    -----
+    Effect i changes |X| by at most the fraction m_i of |X|, and by the fraction c_i of the sum of
+    all amplitudes in phase. It changes the noise variance by the fraction v_i. Let x be |X| over
+    the noise per quadrature of the line on the beam's axis, times the gain of combining looks. With
+    C = sum_i c_i,
+
+        high = x prod_i (1 + m_i) / min(sqrt(1 + v_i), 1),  at most 1e12
+        low = x prod_i max(1 - m_i, 0) / max(sqrt(1 + v_i), 1)
+        ratio_max = high (1 + C)
+        ratio_min = max(low - C high, 0)
     """
     signal_ratio_min = signal_ratio_max = (
         points.peak_magnitude_over_sigma * points.looks.amplitude_gain_max

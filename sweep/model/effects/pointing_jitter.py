@@ -56,7 +56,21 @@ class PerturbedGeometry(NamedTuple):
 
 
 def draw_jitter_angles(draw_addresses: DrawAddresses, sigma: np.ndarray) -> np.ndarray:
-    """Draw deflection angles (a, b) of beams, (n, 2) [rad], of standard deviation ``sigma``."""
+    """Draw the random deflection angles of beams.
+
+    Parameters
+    ----------
+    draw_addresses : DrawAddresses
+        Random key (n, 2) and draw number (n,) of each point
+        (:class:`sweep.model.effects.effect.DrawAddresses`).
+    sigma : ndarray
+        Standard deviation of each angle [rad], (n,) or scalar.
+
+    Returns
+    -------
+    ndarray (n, 2)
+        Independent normal angles [rad]: a in the plane of incidence, and b across it.
+    """
     from sweep.model.sampling.philox import STREAM_POINTING_JITTER, to_normals_by_row
 
     uniform_draws = draw_addresses.uniforms(STREAM_POINTING_JITTER, 2, are_polar=True)
@@ -191,10 +205,26 @@ def perturb_parameters(
 ) -> dict[str, np.ndarray]:
     """Draw range, grazing angle and velocity of deflected beams; no echo if they miss the plane.
 
+    Parameters
+    ----------
+    parameters : dict of str to ndarray
+        Parameters of n points by dotted path.
+    draw_addresses : DrawAddresses
+        Random key (n, 2) and draw number (n,) of each point
+        (:class:`sweep.model.effects.effect.DrawAddresses`).
+
+    Returns
+    -------
+    dict of str to ndarray
+        Parameters with changed range [m], grazing angle [rad] and radial velocity [m/s]. Beams that
+        miss the plane get a reflectance of 0, the range 1 m and the grazing angle pi/2.
+
     Notes
     -----
     sin(grazing') = sin(grazing) cos(t) - a cos(grazing) sin(t)/t for normal deflections a and b,
-    t^2 = a^2 + b^2; range' = range sin(grazing) / sin(grazing').
+    t^2 = a^2 + b^2; range' = range sin(grazing) / sin(grazing'). The radial velocity becomes
+    v_r cos(t) - v_p a sin(t)/t, with the transverse velocity v_p towards the near side of the
+    footprint.
     """
     jitter_angles = draw_jitter_angles(draw_addresses, parameters[_JITTER_PATH])
     transverse_velocity = np.zeros_like(jitter_angles)

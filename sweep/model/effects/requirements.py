@@ -59,7 +59,21 @@ def exceeds_one(values: np.ndarray) -> np.ndarray:
 def positive_value_requirement(
     other_path: str, applies_to: ValueCondition | None = None
 ) -> ParameterRequirement:
-    """Return the requirement that another parameter is not 0."""
+    """Return the requirement that another parameter is not 0.
+
+    Parameters
+    ----------
+    other_path : str
+        Dotted path of the other parameter.
+    applies_to : callable, optional
+        Condition on the values (n,) of the parameter that has the requirement, which returns True
+        (n,) where the requirement applies. By default it applies to all values but the parameter's
+        default.
+
+    Returns
+    -------
+    ParameterRequirement
+    """
     return ParameterRequirement(
         other_path,
         is_zero,

@@ -155,6 +155,20 @@ digits as the ratio has."""
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Reduce line and noise by clipping at the ADC's full scale.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Full scale of the ADC [V], 0 for no limit; the ground is not used
+        (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the gains of clipping on the amplitude of lines and on the noise variance, or
+        unchanged if no point has a limit.
+
     Raises
     ------
     UnsupportedShotError
@@ -163,7 +177,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     Notes
     -----
     The record is taken as one sine with the power of all lines, and :func:`clipping_gains` gives
-    the gains of line and noise.
+    the gains of line and noise. In a complex record I and Q have half of the sine's amplitude and
+    half of the noise variance each.
     """
     full_scale = np.asarray(context.parameters[_FULL_SCALE_PATH], float)
     is_limited = full_scale > 0

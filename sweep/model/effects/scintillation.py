@@ -417,8 +417,9 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
 
     Notes
     -----
-    The factor multiplies the echo's power, its shot noise and the pedestal of phase noise. Its
-    square root multiplies the beat's amplitude, or with direct detection the factor itself.
+    The factor multiplies the echo's power and its shot noise. Its square root multiplies the beat's
+    amplitude, or with direct detection the factor itself. The square of that multiplies the
+    pedestal of phase noise.
     """
     parameters = context.parameters
     turbulence = turbulence_profile(parameters)

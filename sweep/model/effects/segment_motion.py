@@ -110,12 +110,30 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Start the segments one after the other, while the target moves.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Not used (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with times, velocity bias and drift of lines in their record ``motion``.
+
+    Raises
+    ------
+    UnsupportedShotError
+        If lines drift from look to look too far to be modelled (:func:`line_drift_per_look`).
+
     Notes
     -----
     The effect sets the start of each segment; with several looks it is that of the middle look. It
     adds the mean start t_m of up- and down-chirp to the range walk's time. It also sets the
     fraction S t_d / 2 of the optical frequency at mid-chirp by which the beats underestimate the
-    radial velocity, and the drift of lines per look.
+    radial velocity, and the drift of lines per look. S is the chirp rate, and t_d the time from up-
+    to down-chirp.
     """
     waveform, motion, looks = shots.waveform, shots.motion, shots.looks
     starts = waveform.segment_starts

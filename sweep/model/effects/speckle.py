@@ -290,6 +290,21 @@ def fading_error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply_fading(shots: Shots, context: EffectContext) -> Shots:
     """Set up detection in developed speckle, if the spec selects it and beamlets add as powers.
 
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    context : EffectContext
+        Parameter ``footprint.speckle``, and ground with the changes of range and velocity over the
+        beam (:class:`sweep.model.effects.effect.EffectContext`).
+
+    Returns
+    -------
+    Shots
+        Shots with the speckle's correlations between segments, and the spread of lines [bins].
+        Looks that are added in amplitude get a smaller amplitude. Shots without developed speckle
+        are unchanged.
+
     Notes
     -----
     The amplitude of a bin is circular complex normal. With noise of sigma per quadrature, the mean
