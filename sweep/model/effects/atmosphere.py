@@ -68,6 +68,10 @@ def exponential_profile(*, surface_extinction: float, scale_height: float) -> Ex
         Extinction coefficient at the ground [1/m].
     scale_height : float
         Height [m] over which the extinction falls by the factor e.
+
+    Returns
+    -------
+    ExtinctionProfile
     """
     top_scale_heights = 40.0
     return ExtinctionProfile(
@@ -85,6 +89,10 @@ def layer_profile(*, optical_depth: float, depth: float) -> ExtinctionProfile:
         Vertical optical depth of the layer.
     depth : float
         Height of the layer [m].
+
+    Returns
+    -------
+    ExtinctionProfile
     """
     return ExtinctionProfile((0.0, depth), (optical_depth / depth, optical_depth / depth))
 
@@ -157,6 +165,11 @@ def optical_depth(
         Heights of the path's ends [m].
     range : array_like
         Length of the path [m].
+
+    Returns
+    -------
+    ndarray
+        Optical depth >= 0, in the shape to which the arguments broadcast.
     """
     end_heights = np.broadcast_arrays(
         np.asarray(start_height, float), np.asarray(end_height, float)

@@ -66,7 +66,7 @@ def leak_beat_current_variance(
     line_shape: str,
     electrical_bandwidth: np.ndarray,
 ) -> np.ndarray:
-    """Compute the variance [A^2] of the noise current from the beat of the leaked light.
+    """Compute the variance of the noise current from the beat of the leaked light.
 
     Parameters
     ----------
@@ -78,6 +78,11 @@ def leak_beat_current_variance(
         Shape of the laser's line; only ``lorentzian`` has phase noise.
     electrical_bandwidth : ndarray
         Electrical bandwidth B_e of the receiver [Hz].
+
+    Returns
+    -------
+    ndarray
+        Variance [A^2], >= 0; 0 with direct detection.
 
     Notes
     -----

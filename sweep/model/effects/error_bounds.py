@@ -39,8 +39,9 @@ class ErrorBound(NamedTuple):
     residual_magnitude_change: ArrayOrFloat = 0.0
     """Relative error of |X| in the largest bin that remains although the effect is simulated."""
     residual_coherent_sum_change: ArrayOrFloat = 0.0
-    """Error of |X| in the largest bin that remains although the effect is simulated, as a fraction
-    of the sum of all amplitudes in phase. The smaller of the two residual errors counts."""
+    """Error of |X| in the largest bin that remains although the effect is simulated. It is a
+    fraction of |X| of the line on the beam's axis, if that line lay on a bin. The smaller of the
+    two residual errors counts."""
 
 
 class PhaseErrorBound(NamedTuple):

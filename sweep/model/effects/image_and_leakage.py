@@ -294,6 +294,11 @@ def _leakage_probability_bound(
         Magnitude of all lines together over the threshold.
     reach_bins : ndarray
         Distance by which light may be shifted [bins].
+
+    Returns
+    -------
+    ndarray
+        Sum of the bounds of all segments, by point, >= 0.
     """
     threshold_ratio, row = (
         points.threshold_ratio,

@@ -36,7 +36,7 @@ GAIN_IMBALANCE_PATH, PHASE_IMBALANCE_PATH = (
 
 
 def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
-    """Return the amplitude of the image over that of the line, 0..1.
+    """Return the amplitude of the image over that of the line.
 
     Parameters
     ----------
@@ -44,6 +44,11 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
         Power of Q over that of I; g is the square root of it.
     phase : array_like
         Departure p of their phase from 90 degrees [rad].
+
+    Returns
+    -------
+    ndarray
+        Ratio of amplitudes, 0..1, in the shape to which the arguments broadcast.
 
     Notes
     -----

@@ -178,7 +178,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     shots : Shots
         Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
     context : EffectContext
-        Full width at half maximum of the line [Hz], and its shape
+        Shape of the line, and its full width at half maximum [Hz]: that of the beat if the shape is
+        Gaussian, that of the laser if it is Lorentzian
         (:class:`sweep.model.effects.effect.EffectContext`).
 
     Returns

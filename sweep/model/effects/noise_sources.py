@@ -255,7 +255,7 @@ _RIN_PATH, _REJECTION_PATH = (
 def intensity_noise_current_variance(
     parameters: Mapping[str, np.ndarray], electrical_bandwidth: np.ndarray
 ) -> np.ndarray:
-    """Compute the current variance [A^2] due to intensity noise of the local oscillator.
+    """Compute the current variance due to intensity noise of the local oscillator.
 
     Parameters
     ----------
@@ -263,6 +263,11 @@ def intensity_noise_current_variance(
         Parameters by dotted path.
     electrical_bandwidth : ndarray
         Electrical bandwidth B_e of the receiver [Hz].
+
+    Returns
+    -------
+    ndarray
+        Variance [A^2], >= 0.
 
     Notes
     -----

@@ -645,7 +645,7 @@ def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
     Notes
     -----
     The phase is alpha t^2 (f_seg + s S (-tau_0 + (1 + beta) t + alpha t^2 / 2)) [cycles], as the
-    module's description states. That time is the middle of the record.
+    module's description states. The measured velocity refers to the middle of the record.
     """
     if shots.looks.n_coherent > 1:
         up_carrier, _, _ = shots.waveform.carriers

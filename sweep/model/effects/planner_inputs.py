@@ -565,6 +565,11 @@ class PlannerInputs(LinkBudget):
         shift_bins : ndarray or float
             Common shift of all lines [bins].
 
+        Returns
+        -------
+        ndarray (segments, ...)
+            Bound >= 0, relative to the power of the largest bin, by segment and point.
+
         Notes
         -----
         Bin k has the power P_k = sum_b p_b F(k - x_b), with the power p_b of beamlet b, and the

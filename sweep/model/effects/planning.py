@@ -100,6 +100,10 @@ def plan_effects(
     effects : sequence of Effect
         Effects to choose from.
 
+    Returns
+    -------
+    EffectPlan
+
     Raises
     ------
     ValueError

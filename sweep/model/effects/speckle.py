@@ -71,7 +71,7 @@ in one of a million draws."""
 
 
 def coherent_echo_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
-    """Return the fraction kappa of the mean echo power that keeps its phase, 0 .. 1.
+    """Return the fraction kappa of the mean echo power that keeps its phase.
 
     Parameters
     ----------
@@ -81,6 +81,11 @@ def coherent_echo_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np
         It is infinite for developed speckle.
     wavelength : array_like
         Wavelength lambda [m].
+
+    Returns
+    -------
+    ndarray
+        kappa, 0..1, in the shape to which the arguments broadcast.
 
     Notes
     -----

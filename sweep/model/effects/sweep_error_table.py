@@ -33,12 +33,17 @@ class SweepFrequencyError(NamedTuple):
         return np.asarray(np.polynomial.chebyshev.chebval(position, self.chebyshev_coefficients))
 
     def integrate_error(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the integral of the frequency error between two times [cycles].
+        """Return the integral of the frequency error between two times.
 
         Parameters
         ----------
         start, end : ndarray
             Times in the up-chirp [s]; beyond the table's ends the error is constant.
+
+        Returns
+        -------
+        ndarray
+            Integral [cycles], in the shape to which the times broadcast.
 
         Notes
         -----
@@ -72,6 +77,10 @@ def fit_sweep_frequency_error(table_text: str) -> SweepFrequencyError:
     ----------
     table_text : str
         Rows ``time error`` [s, Hz], separated by commas.
+
+    Returns
+    -------
+    SweepFrequencyError
 
     Raises
     ------
