@@ -109,16 +109,16 @@ def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.nda
     patterns : ndarray (4^n / 4, 4) int64
         Indices of the four directions of each square.
 
+    Raises
+    ------
+    ValueError
+        If the elements do not reach distinct angles, or reach nadir.
+
     Notes
     -----
     A square consists of one pair of angles and its quarter turns about nadir. The widest square
     comes first and the narrowest last, each counter-clockwise. For the two elements of [T Fig. 5.2]
     these are the corners at 22.5 deg, the two oblique squares, and the corners at 7.5 deg.
-
-    Raises
-    ------
-    ValueError
-        If the elements do not reach distinct angles, or reach nadir.
     """
     angles = stacked_deflections(element_angles)
     if angles.min() >= 0 or len(np.unique(np.round(angles, 12))) < len(angles) or 0 in angles:
