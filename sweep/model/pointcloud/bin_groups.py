@@ -109,7 +109,20 @@ def list_bin_groups(
 
 
 def allocate_bin_groups(n_points: int, groups_max: int) -> BinGroups:
-    """Return arrays for at most ``groups_max`` groups of each segment, without any group."""
+    """Return arrays for the groups of bins of n points, without any group.
+
+    Parameters
+    ----------
+    n_points : int
+        Number n of points.
+    groups_max : int
+        Largest number of groups of a segment.
+
+    Returns
+    -------
+    BinGroups
+        Arrays (n, 3, ``groups_max``), with bins -1 and other values nan.
+    """
     shape = n_points, 3, groups_max
     return BinGroups(
         strongest_bin=np.full(shape, -1, np.int64),
@@ -298,10 +311,30 @@ def _magnitude_of_bin_or_mirror(magnitude, first_bin, index, nyquist_bin):
 def _list_strongest_groups(magnitude, is_echo, peak_index, threshold, bounds):
     """List the strongest groups of adjacent bins at or above the threshold; return their number.
 
-    The result is written into ``bounds``, a :class:`GroupBinIndices` of indices in ``magnitude``.
-    Groups whose strongest bin is no bin of an echo (``is_echo``) are leaked signal, and omitted. If
-    ``is_echo`` is empty, none is omitted. If the bin ``peak_index`` is below the threshold, it is
-    listed alone.
+    Groups whose strongest bin is no bin of an echo are leaked signal, and omitted. A group whose
+    strongest bin is the span's largest bin is always listed. If the largest bin is below the
+    threshold, it is listed alone.
+
+    Parameters
+    ----------
+    magnitude : ndarray (bins,)
+        |X| of a span's bins without noise [V, summed over the record]. A nan counts as below the
+        threshold.
+    is_echo : ndarray (bins,) bool
+        True in bins of an echo. If the array is empty, no group is omitted.
+    peak_index : int
+        Index of the largest bin.
+    threshold : float
+        Threshold on |X| [V, summed over the record].
+    bounds : GroupBinIndices
+        Results: indices in ``magnitude`` of each group's strongest, first and last bin, strongest
+        group first. If there are more groups than elements, the weakest are omitted
+        (:class:`GroupBinIndices`).
+
+    Returns
+    -------
+    int
+        Number of listed groups, at least 1.
     """
     if not magnitude[peak_index] >= threshold:
         bounds.strongest[0] = bounds.first[0] = bounds.last[0] = peak_index

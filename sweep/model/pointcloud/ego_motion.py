@@ -168,7 +168,22 @@ def ego_motion_of_eyepoints(
 ) -> EgoMotion:
     """Return the motion along the commanded beams of n shots, as an instrument knows it.
 
-    The ground is assumed to be level and at rest.
+    The instrument assumes that the ground is level and at rest. Beams that do not point down are
+    assumed to meet a surface that faces them.
+
+    Parameters
+    ----------
+    eyepoints : Eyepoints
+        Geometry of the shots (:class:`sweep.model.pointcloud.eyepoints.Eyepoints`). Directions,
+        their rates, and the instrument's velocity and acceleration are used; what the beams hit is
+        not.
+    priors : MotionPriors
+        Prior standard deviations of the slope and motion of surfaces.
+
+    Returns
+    -------
+    EgoMotion
+        Arrays (n,), by the equations of :func:`assumed_motion_along_beams`.
     """
     return assumed_motion_along_beams(
         eyepoints.direction, eyepoints.velocity, eyepoints.direction_rate,

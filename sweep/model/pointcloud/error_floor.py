@@ -77,9 +77,25 @@ class ErrorFloor(NamedTuple):
     def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
         """Return the standard errors of radial velocities [m/s] due to the instrument's errors.
 
-        `radial_velocity` is the measured radial velocity, and `speed_across` the instrument's speed
-        across the beam [m/s].
+        The squared error is
 
+            v_r^2 (clock^2 + wavelength^2) + |v_perp|^2 pointing^2 + vibration^2.
+
+        Parameters
+        ----------
+        radial_velocity : ndarray
+            Measured radial velocity v_r [m/s]. Its sign does not matter.
+        speed_across : ndarray
+            Speed |v_perp| of the instrument across the beam [m/s], not negative. Both arrays
+            broadcast.
+
+        Returns
+        -------
+        ndarray
+            Standard errors [m/s].
+
+        Examples
+        --------
         >>> ErrorFloor(pointing=1e-3, vibration=0.03).velocity_error(0.0, 40.0).round(12).item()
         0.05
         """

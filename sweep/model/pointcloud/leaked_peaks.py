@@ -301,6 +301,19 @@ def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
     """Return indices of points with a notable probability of a false peak by leaked signal.
 
     The probability exceeds LEAKAGE_PROBABILITY_MIN in at least one segment.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`); not used.
+    groups : BinGroups
+        Groups of bins of the same points, with the probability of leakage in each segment
+        (:class:`sweep.model.pointcloud.bin_groups.BinGroups`).
+
+    Returns
+    -------
+    ndarray (m,) int64
+        Indices of the points, in rising order.
     """
     return np.flatnonzero((groups.leakage_probability > LEAKAGE_PROBABILITY_MIN).any(axis=1))
 
@@ -418,10 +431,25 @@ def find_groups_and_leakage_bins(
 ) -> tuple[BinGroups, list[tuple[np.ndarray, LeakageBins]]]:
     """Find groups of bins and bins of leaked signal together, for echoes in developed speckle.
 
-    The field ``leakage_probability`` of the groups is a mean over speckle. Shots with a search
-    band or a line of leaked light need two separate searches instead
+    Shots with a search band or a line of leaked light need two separate searches instead
     (:func:`sweep.model.pointcloud.bin_groups.list_bin_groups`, :func:`iter_leakage_bins`).
-    The second result is a list of pairs, as :func:`iter_leakage_bins` yields them.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    groups_max : int
+        Largest number of groups that are listed for a segment.
+
+    Returns
+    -------
+    groups : BinGroups
+        Groups of adjacent bins above the threshold, without noise, of all points
+        (:class:`sweep.model.pointcloud.bin_groups.BinGroups`). The field ``leakage_probability`` is
+        a mean over speckle.
+    leakage_bins_by_part : list of tuple
+        Pairs of point indices (k,) and :class:`LeakageBins`, as :func:`iter_leakage_bins` yields
+        them.
     """
     groups = allocate_bin_groups(shots.size, groups_max)
     leakage_bins_by_part = []

@@ -183,7 +183,26 @@ def solve_velocity(
     )
 
     def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FittedCycles:
-        """Fit the velocities of cycles with indices (k,), by the beams of a mask (k, b)."""
+        """Fit the velocities of k cycles by weighted least squares.
+
+        The velocity V minimises the sum over beams of ((u . V - v) / e)^2, with the direction u,
+        the measured radial velocity v and its standard error e. The covariance is the inverse of
+        the sum of u u^T / e^2. It is scaled where residuals contradict the stated errors
+        (:func:`_covariance_scale`).
+
+        Parameters
+        ----------
+        cycles : ndarray (k,) int64
+            Indices of the cycles.
+        is_used : ndarray (k, b) bool
+            True for beams whose measurements are used.
+
+        Returns
+        -------
+        FittedCycles
+            Velocities, covariances and chi-squares. The chi-square is nan in a cycle with fewer
+            than three beams, or with nearly coplanar ones.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             design = np.where(is_used[..., None], u[cycles] / error[cycles, :, None], 0.0)
             residual = np.where(is_used, closing_speed[cycles] / error[cycles], 0.0)
@@ -257,7 +276,26 @@ def solve_altitude(
     )
 
     def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FittedCycles:
-        """Fit the altitudes of cycles with indices (k,), by the beams of a mask (k, b)."""
+        """Fit the altitudes of k cycles by weighted least squares.
+
+        The plane is fitted twice, because the weights of the points depend on its gradient. The
+        first fit takes the weights of level ground. The variance is larger where residuals
+        contradict the stated errors.
+
+        Parameters
+        ----------
+        cycles : ndarray (k,) int64
+            Indices of the cycles.
+        is_used : ndarray (k, b) bool
+            True for beams whose ground points are used.
+
+        Returns
+        -------
+        FittedCycles
+            Altitudes, variances and chi-squares. The number of degrees of freedom is the number of
+            beams minus 1: the prior of two slopes counts as two observations, and on level
+            ground the altitude alone is unknown. The chi-square is nan in a cycle without beams.
+        """
         is_used_by_beam = np.ascontiguousarray(is_used.T)
         plane_arguments = (
             np.where(is_used_by_beam, ground_points[..., cycles], 0.0),

@@ -637,7 +637,20 @@ class DrawWorkspace(NamedTuple):
 
     @classmethod
     def allocate(cls, n_bins: int, groups_max: int) -> "DrawWorkspace":
-        """Allocate arrays for echoes of ``n_bins`` bins and ``groups_max`` echoes of a segment."""
+        """Allocate arrays for a largest number of bins of an echo, and of echoes of a segment.
+
+        Parameters
+        ----------
+        n_bins : int
+            Largest number of bins of an echo.
+        groups_max : int
+            Largest number of echoes of a segment.
+
+        Returns
+        -------
+        DrawWorkspace
+            Arrays whose values are undefined, except ``all_bins_are_echo``.
+        """
         return cls(
             NoiseScratch.allocate(n_bins),
             np.empty(n_bins),
@@ -672,7 +685,21 @@ class DrawnPeaks(NamedTuple):
 
     @classmethod
     def empty(cls, bin_groups: BinGroups, draws: int) -> "DrawnPeaks":
-        """Return arrays without returns, for ``draws`` draws of shots with these groups of bins."""
+        """Return the drawn peaks of n shots without any return (measured point).
+
+        Parameters
+        ----------
+        bin_groups : BinGroups
+            Groups of bins of n shots (:class:`sweep.model.pointcloud.bin_groups.BinGroups`). The
+            number of groups for which there is room is the largest number of returns.
+        draws : int
+            Number of draws of each shot.
+
+        Returns
+        -------
+        DrawnPeaks
+            Arrays (n, draws, returns, ..), with the values that mark no return.
+        """
         n, _, groups_max = bin_groups.strongest_bin.shape
         return cls(
             Peaks.empty((n, draws, groups_max, 3)),
@@ -1425,7 +1452,22 @@ def _measure_by_fit(
     is_finite = np.isfinite(position_error)
 
     def deviations_by_errors(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
-        """Return the standard deviations of range and velocity by errors (3, m) of beats [bins]."""
+        """Return the standard deviations of range and velocity by the errors of beats.
+
+        Parameters
+        ----------
+        errors : ndarray (3, m)
+            Standard error of each segment's beat [bins], in the order up, Doppler, down; inf for a
+            beat that is not used.
+        points : ndarray (m,) int64
+            Index of the point to which each column belongs.
+
+        Returns
+        -------
+        RangeVelocityDeviation
+            (m,) in each field: standard deviations of range [m] and radial velocity [m/s], by
+            :func:`sweep.model.detection.estimators.range_velocity_deviation`.
+        """
         up, doppler, down = errors * bin_width[points]
         return range_velocity_deviation(
             up=up,
@@ -1439,7 +1481,22 @@ def _measure_by_fit(
         )
 
     def fit_peak_positions(peak_positions: np.ndarray, rounding_variance: float) -> MeasuredValues:
-        """Fit range and velocity to the peaks of returns, at ``peak_positions`` (m, 3) [bins]."""
+        """Fit range and velocity to the peaks of returns, with weights 1 over the squared errors.
+
+        Parameters
+        ----------
+        peak_positions : ndarray (m, 3)
+            Positions of the up, Doppler and down peak [bins].
+        rounding_variance : float
+            Variance of the rounding of positions to whole bins [bins^2]; 0 for positions between
+            bins. It is added to the squared standard error of each position.
+
+        Returns
+        -------
+        MeasuredValues
+            (m,) in each field: range [m] and radial velocity [m/s] at the shot's start, with
+            standard errors. The errors include the wander of beats by speckle, if there is any.
+        """
         errors = np.where(is_finite, position_error, np.inf)
         errors = np.hypot(errors, math.sqrt(rounding_variance))
         fitted = fit_range_velocity_to_peaks(
