@@ -92,9 +92,27 @@ def grouped_uniforms(
 
 @njit(cache=True, nogil=True)
 def _fill_grouped_uniforms(keys, draw_numbers, stream, are_polar, cells, uniform_numbers):
-    """Fill the rows of ``uniform_numbers`` (m, count) as :func:`grouped_uniforms` returns them.
+    """Fill an array with uniform numbers that are spread evenly over each group of draws.
 
-    The count is a multiple of 4. ``cells`` is scratch memory (numbers, GROUP_SIZE) uint64.
+    The upper bits of a number are its cell, and the lower bits its random place in the cell.
+
+    Parameters
+    ----------
+    keys : ndarray (m, 2) uint64
+        Random key of each row.
+    draw_numbers : ndarray (m,) int64
+        Number of the draw of each row. Consecutive rows of one key and group share their cells,
+        which are then drawn once.
+    stream : int
+        Number of the stream: the physical cause.
+    are_polar : bool
+        True if the second number of each pair is an angle in cycles, as in
+        :func:`grouped_uniforms`.
+    cells : ndarray (numbers, GROUP_SIZE) uint64
+        Scratch: cell of each number in each draw of a group. Only the first ``numbers`` of a row
+        are spread evenly; the others are independent.
+    uniform_numbers : ndarray (m, count)
+        Result: uniform numbers in (0, 1). The count is a multiple of 4.
     """
     words = np.empty((4, uniform_numbers.shape[1] // 4), np.uint64)
     for i in range(draw_numbers.size):
@@ -228,9 +246,19 @@ class GroupMeans:
         )
 
     def statistics(self, point_indices: np.ndarray, n_values: np.ndarray) -> GroupStatistics:
-        """Return the statistics of selected points.
+        """Return the number of whole groups, and the variance of their means, of selected points.
 
-        ``n_values`` (names, points) are the numbers of values that were added, without nan.
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        n_values : ndarray (names, m) int64
+            Numbers of values that were added to these points, without nan.
+
+        Returns
+        -------
+        GroupStatistics
+            Arrays (names, m).
         """
         n_groups = n_values // GROUP_SIZE
         with np.errstate(divide="ignore", invalid="ignore"):

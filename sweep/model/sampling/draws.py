@@ -1001,9 +1001,22 @@ def _mark_random_events(
 ):
     """Mark draws in which a random number is below the probability of an event.
 
-    `address` is that of the first of `n_draws` draws. The probability is
-    `probability_if_condition` in draws in which `condition` (draws,) is True, else
-    `probability_otherwise`. `condition` may be the same array as `is_marked`.
+    Parameters
+    ----------
+    address : DrawAddress
+        Address of the first draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    n_draws : int
+        Number of consecutive draws.
+    stream : int
+        Number of the stream, of which the first number of each draw is compared.
+    probability_otherwise, probability_if_condition : float
+        Probability of the event in draws in which the condition is False, and True.
+    condition : ndarray (draws,) bool
+        The condition; it may be the same array as ``is_marked``.
+    random_words : ndarray (4, >= n_draws) uint64
+        Scratch.
+    is_marked : ndarray (draws,) bool
+        Result: set to True in draws with the event, unchanged in others.
     """
     philox.fill_words(
         address,
@@ -1032,13 +1045,36 @@ def _first_and_last_echo_index(point, segment, spectra):
 
 @njit(cache=True, error_model="numpy")
 def _draw_echo_amplitudes(address, n_draws, row, spectra, line_grid, line_centres, segment_factors):
-    """Draw the complex factors (3, draws, bins) of developed speckle on an echo's bins.
+    """Draw the complex factors by developed speckle on the bins of a point's echo.
 
-    The first axis is the segment. The factors have mean power 1 and follow from the lines of the
-    footprint. Bins that no line reaches have the factor of the strongest bin. ``segment_factors``
-    (3, draws) is set to the magnitude of the strongest bin's factor. ``address`` is that of the
-    first of ``n_draws`` draws. ``line_grid`` and ``line_centres`` are those of
-    :class:`DrawCountInputs`.
+    The factors have mean power 1, and follow from the lines of the footprint
+    (:func:`sweep.model.sampling.speckle_lines.draw_bin_amplitudes`). Bins that no line reaches have
+    the factor of the strongest bin.
+
+    Parameters
+    ----------
+    address : DrawAddress
+        Address of the first draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    n_draws : int
+        Number of consecutive draws.
+    row : int
+        Index of the point in ``spectra``, ``line_grid`` and ``line_centres``.
+    spectra : NoiselessSpectra
+        Spectra without noise, with the bins of each echo (:class:`NoiselessSpectra`).
+    line_grid : SpeckleLineGrid
+        Lines that represent the footprints
+        (:class:`sweep.model.sampling.speckle_lines.SpeckleLineGrid`).
+    line_centres : ndarray (m, 3)
+        Mean position of the lines of each segment's echo [bins].
+    segment_factors : ndarray (3, draws)
+        Result: magnitude of the factor of the strongest bin. It is unchanged for a segment without
+        an echo.
+
+    Returns
+    -------
+    ndarray (3, draws, bins) complex
+        Factors by segment (up, Doppler, down), draw, and bin from the first bin of the echo on. The
+        number of bins is that of the widest of the three echoes. A segment without an echo has 0.
     """
     line_centre = line_centres[row].copy()
     first_bin, n_bins_max = np.zeros(3, np.int64), 0
@@ -1111,10 +1147,36 @@ def _mark_any_bin_crossings(
 ):
     """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
 
-    ``address`` is that of the first of ``n_draws`` draws, and ``bin_threshold`` the
-    :class:`sweep.model.detection.echo_detection.BinThreshold` of the point. ``echo_amplitudes``
-    (draws, bins) are the complex amplitudes of the echo's bins, with no bins if the echo does not
-    fade. The phase-noise pedestal fades with the echo's bins.
+    A bin reaches the threshold t if
+
+        |r A + (1 + p |A|^2)^(1/2) n| >= t
+
+    with its noiseless magnitude r, factor A by speckle, complex noise n, and power p of the
+    phase-noise pedestal, which fades with the echo's bin. r, t and n are over sigma, the receiver's
+    noise of a bin per quadrature. p is over the receiver's noise power.
+
+    Parameters
+    ----------
+    address : DrawAddress
+        Address of the first draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    n_draws : int
+        Number of consecutive draws.
+    point, segment : int
+        Index of the point in ``spectra``, and of the segment: 0 up, 1 Doppler, 2 down.
+    spectra : NoiselessSpectra
+        Spectra without noise (:class:`NoiselessSpectra`).
+    filter_rule : NoiseFilter
+        Filter that makes the correlated noise of at least as many bins as the echo has
+        (:class:`NoiseFilter`).
+    bin_threshold : BinThreshold
+        Threshold and noise of the point
+        (:class:`sweep.model.detection.echo_detection.BinThreshold`).
+    echo_amplitudes : ndarray (draws, bins) complex
+        Factors A of the bins, from the first bin of the echo on; no bins if the echo does not fade.
+    noise : NoiseScratch
+        Scratch for the noise of the echo's bins (:class:`NoiseScratch`).
+    is_marked : ndarray (draws,) bool
+        Result: set to True in draws with a crossing, unchanged in others.
     """
     begin, n_bins = spectra.bins_start[point, segment], spectra.n_bins[point, segment]
     bin_magnitude_ratios, is_echo = (
@@ -1250,8 +1312,26 @@ def draw_bin_noise_by_root(address, stream, first_index, n_bins, root, noise):
 def _mark_crossings(address, n_draws, stream, pair_index, bin_in_noise, random_words, is_marked):
     """Mark the draws in which signal plus noise of one bin reaches the threshold.
 
-    ``address`` is that of the first of ``n_draws`` draws. ``pair_index`` is the stream index of the
-    pair of numbers that make the noise. ``bin_in_noise`` is a :class:`BinInNoise`.
+    The bin reaches the threshold t if (r a + s_i n_i)^2 + (r b + s_q n_q)^2 >= t^2, with its
+    noiseless magnitude r, factor a + i b by speckle, standard deviations s_i and s_q of the noise,
+    and independent standard normal numbers n_i and n_q.
+
+    Parameters
+    ----------
+    address : DrawAddress
+        Address of the first draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    n_draws : int
+        Number of consecutive draws.
+    stream : int
+        Number of the stream of the noise.
+    pair_index : int
+        Index in the stream of the pair of numbers that make the noise.
+    bin_in_noise : BinInNoise
+        Signal, noise and threshold of the bin (:class:`BinInNoise`).
+    random_words : ndarray (4, >= n_draws) uint64
+        Scratch.
+    is_marked : ndarray (draws,) bool
+        Result: set to True in draws with a crossing, unchanged in others.
     """
     philox.fill_words(
         address, stream, pair_index >> 1, philox.DRAW_INCREMENTS, n_draws, random_words
@@ -1295,10 +1375,24 @@ def largest_noise_magnitude(n_bins, probability, n_looks):
 
 @njit(cache=True, error_model="numpy")
 def gamma_upper_quantile(order, probability):
-    """Return the x that a Gamma variable exceeds with a given probability.
+    """Return the x that a Gamma variable of scale 1 exceeds with a given probability.
 
-    The quantile x solves Q(n, x) = ``probability``, with the regularised upper incomplete Gamma
-    function Q. The order n is an integer; the scale is 1.
+    The quantile x solves Q(n, x) = p by bisection. Q is the regularised upper incomplete Gamma
+    function of the integer order n,
+
+        Q(n, x) = exp(-x) sum_{k < n} x^k / k!.
+
+    Parameters
+    ----------
+    order : int
+        Order n, at least 1.
+    probability : float
+        Probability p, 0..1. Values below 1e-300 count as 1e-300.
+
+    Returns
+    -------
+    float
+        Quantile x.
     """
     low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(probability, 1e-300)))
     for _ in range(60):

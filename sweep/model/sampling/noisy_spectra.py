@@ -372,7 +372,21 @@ def zero_frequency_index(shots: Shots) -> int:
 
 
 def centring_shift(shots: Shots, middle_index: int) -> int:
-    """Return the number of bins by which :func:`rotate_to_centre` moves a given bin upwards."""
+    """Return the number of bins by which :func:`rotate_to_centre` moves a given bin upwards.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots (:class:`sweep.model.preparation.Shots`).
+    middle_index : int
+        Index of the bin in a spectrum.
+
+    Returns
+    -------
+    int
+        1 + N/2 - ``middle_index`` for a complex record, with the FFT size N. The 1 is for the
+        element that is added at the lower end. 0 for a real record.
+    """
     return 1 + shots.fft_size // 2 - middle_index if shots.complex_record else 0
 
 
@@ -434,7 +448,24 @@ def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray
 
 
 def transform_record(shots: Shots, record: np.ndarray) -> np.ndarray:
-    """Transform a windowed record (L,), padded to the FFT size, to a complex spectrum (bins,)."""
+    """Transform a windowed record to a complex spectrum.
+
+    The spectrum is X[k] = sum_n x[n] exp(-2 pi i k n / N), without a factor 1/N, with the FFT size
+    N. The record x of L samples is padded with zeros to N.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots, for FFT size and type of record (:class:`sweep.model.preparation.Shots`).
+    record : ndarray (L,)
+        Samples times the window, such as voltages [V]. They are real for a real record.
+
+    Returns
+    -------
+    ndarray (bins,) complex
+        Spectrum, in the unit of the samples summed over the record: bins 0..N/2 of a real record,
+        or all N bins of a complex record, lowest frequency first.
+    """
     if shots.complex_record:
         return np.asarray(fft.fftshift(fft.fft(record, shots.fft_size)))
     return np.asarray(fft.rfft(record, shots.fft_size))
@@ -861,7 +892,20 @@ class PointSpectra(NamedTuple):
     def get_signal_in_look(self, segment: int, look: int) -> SegmentSignal:
         """Return the noiseless signal of a segment at the time of a look.
 
-        A look is one record of the segment. The target moves between looks.
+        A look is one record of the segment. The target moves between looks. A signal that is
+        computed is kept in ``signal_cache``.
+
+        Parameters
+        ----------
+        segment : int
+            Index of the segment: 0 up, 1 Doppler, 2 down.
+        look : int
+            Index of the look in ``look_shots``.
+
+        Returns
+        -------
+        SegmentSignal
+            The signal (:class:`SegmentSignal`).
         """
         shots, signal = self.look_shots[look], self.signals[segment]
         if shots is self.shots and signal is not None:

@@ -381,7 +381,37 @@ class _DrawnFootprints(NamedTuple):
         tone_position_max: float,
         bins: np.ndarray,
     ) -> "_DrawnFootprints":
-        """Draw footprints of a spread [bins], with tones at most ``tone_position_max`` from 0."""
+        """Draw the echo and noise of m footprints about tones at random positions.
+
+        The tone of each footprint is at a position x, uniform between the limits. The echo in bin k
+        is
+
+            sum_j a_j z_j G(k - x - b y_j)
+
+        with the window's transform G, 1 at distance 0, the spread b of the lines, and for line j
+        its relative offset y_j, weight a_j and complex Gaussian amplitude z_j of mean power 1.
+        Noise is independent from bin to bin.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of the random numbers.
+        window : Window
+            Window of the record (:class:`sweep.model.window.Window`).
+        padding : float
+            FFT size over the number of samples in the record.
+        spread : float
+            Spread b: standard deviation of the lines' positions [bins].
+        tone_position_max : float
+            Largest distance of a tone from bin 0 [bins].
+        bins : ndarray (bins,) int64
+            Numbers of the bins.
+
+        Returns
+        -------
+        _DrawnFootprints
+            ``_TWO_BIN_DRAWS_PER_ENTRY`` footprints.
+        """
         n_samples = min(window.length, _SHAPE_SAMPLES_MAX)
         window_values = window_samples(window.name, n_samples)
         sample_phase = 2 * np.pi * (np.arange(n_samples) / n_samples - 0.5) / padding

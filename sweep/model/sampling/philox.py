@@ -103,10 +103,32 @@ BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
 
 @njit(cache=True)
 def _philox_round(x0, x1, x2, x3, key0, key1):
-    """Apply one of the ten rounds of Philox to the four words of a counter, and return them.
+    """Apply one of the ten rounds of Philox4x64 to the four words of a counter [1]_.
 
+    With the constants M_0 and M_1, and the high and low 64 bits of a product, the new words are
+
+        high(M_1 x2) ^ x1 ^ key0,    low(M_1 x2),    high(M_0 x0) ^ x3 ^ key1,    low(M_0 x0).
+
+    Parameters
+    ----------
+    x0, x1, x2, x3 : uint64
+        Words of the counter.
+    key0, key1 : uint64
+        Key of the round.
+
+    Returns
+    -------
+    tuple of four uint64
+        New words.
+
+    Notes
+    -----
     The high words of 128-bit products are computed from 32-bit halves, because vector registers
     lack such a product. The processor then computes several counters at once.
+
+    References
+    ----------
+    .. [1] Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3, SC 2011.
     """
     low, high = x0 & _LOW_HALF_MASK, x0 >> _SHIFT_32
     middle = _MULTIPLIER_0_LOW * high + (_MULTIPLIER_0_LOW * low >> _SHIFT_32)
@@ -206,7 +228,21 @@ def to_uniform(word):
 def to_normals(word0, word1):
     """Convert two random words to two independent standard normal numbers, by Box and Muller.
 
+    With the uniform numbers u and w of the words (:func:`to_uniform`), the numbers are
+
+        sqrt(-2 ln u) cos(2 pi w),    sqrt(-2 ln u) sin(2 pi w).
+
     The root of the sum of their squares is at most sqrt(2 ln 2^53) = 8.57.
+
+    Parameters
+    ----------
+    word0, word1 : uint64
+        Random words: the first gives the radius, the second the angle.
+
+    Returns
+    -------
+    tuple of two float
+        Normal numbers of mean 0 and variance 1.
     """
     radius, angle = math.sqrt(-2.0 * math.log(to_uniform(word0))), 2.0 * math.pi * to_uniform(word1)
     return radius * math.cos(angle), radius * math.sin(angle)

@@ -153,9 +153,14 @@ class Sampler(ABC):
         """
 
     def draw(self, point_indices: np.ndarray, n_draws: int) -> None:
-        """Add ``n_draws`` draws to each selected point.
+        """Add draws to selected points.
 
-        All selected points must have the same number of draws so far.
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points, at least one. All must have the same number of draws so far.
+        n_draws : int
+            Number of draws that are added to each point.
         """
         first_draw = self.batch_edges[0] + self.n_draws[point_indices[0]]
         counts = np.zeros(
@@ -185,8 +190,19 @@ class Sampler(ABC):
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        The result is (4, points), in the order of PD_OUTPUT_NAMES; nan for a segment that does not
-        exist. ``error_budget`` states the confidence.
+        A half-width is the distance from the estimate to the farther end of its interval.
+
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        error_budget : ErrorBudget
+            Confidence (:class:`sweep.model.error_budget.ErrorBudget`).
+
+        Returns
+        -------
+        ndarray (4, m)
+            Half-widths in the order of PD_OUTPUT_NAMES; nan for a segment that does not exist.
         """
 
     @abstractmethod
@@ -209,10 +225,22 @@ class Sampler(ABC):
         return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
 
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return half-widths of the confidence intervals of fractions of detections, (4, points).
+        """Return the half-widths of the confidence intervals of fractions of detections.
 
-        The half-widths follow from the counts of draws alone. Rows are in the order of
-        PD_OUTPUT_NAMES.
+        The half-widths follow from the counts of draws alone. The kind of interval is
+        ``error_budget.count_interval_name``.
+
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        error_budget : ErrorBudget
+            Confidence and kind of interval (:class:`sweep.model.error_budget.ErrorBudget`).
+
+        Returns
+        -------
+        ndarray (4, m)
+            Half-widths in the order of PD_OUTPUT_NAMES.
         """
         counts, n = self.n_detected()[:, point_indices], self.n_draws[point_indices]
         confidence = error_budget.select_points(point_indices, self.n_draws.size).confidence
@@ -222,9 +250,21 @@ class Sampler(ABC):
         return interval_half_width(counts / n, interval)
 
     def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return each point's largest half-width minus the tolerance, but at least 0, (points,).
+        """Return each point's largest half-width minus the tolerance, but at least 0.
 
         The half-widths are those of the confidence intervals of detection probabilities.
+
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        error_budget : ErrorBudget
+            Tolerance and confidence (:class:`sweep.model.error_budget.ErrorBudget`).
+
+        Returns
+        -------
+        ndarray (m,)
+            Excess of the largest half-width. Segments that do not exist are left out.
         """
         widths = self.half_widths(point_indices, error_budget)
         excess = widths - error_budget.select_points(point_indices, self.n_draws.size).tolerance
@@ -455,11 +495,18 @@ class DetectionSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make draws of points and count their events.
+        """Make draws of points, and count their events.
 
         If effects are random, statistics of each draw are added to running means.
 
-        The arguments are those of :meth:`Sampler.count_draws`.
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        first_draw, end_draw : int
+            Number of the first draw, and number after the last one.
+        counts : ndarray (names, m, batches) int64
+            Numbers of events, in the order of DRAW_COUNT_OUTPUTS. Those of the new draws are added.
         """
         point_parameters, keys = self.select_parameters(point_indices), self.keys[point_indices]
         if self._running_means is not None:
@@ -496,7 +543,21 @@ class DetectionSampler(Sampler):
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        The result is (4, points), in the order of PD_OUTPUT_NAMES.
+        With random effects the intervals are those of means over the draws. Without random effects
+        they are those of counted detections in drawn noise, or 0, because a probability is then
+        exact.
+
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        error_budget : ErrorBudget
+            Confidence (:class:`sweep.model.error_budget.ErrorBudget`).
+
+        Returns
+        -------
+        ndarray (4, m)
+            Half-widths in the order of PD_OUTPUT_NAMES; nan for a segment that does not exist.
         """
         confidence = error_budget.select_points(point_indices, self.n_draws.size).confidence
         if self._running_means is not None:
@@ -607,9 +668,16 @@ class SpectraSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make draws of points and count their events; add measured values to the means.
+        """Make draws of points, and count their events; add measured values to the means.
 
-        The arguments are those of :meth:`Sampler.count_draws`.
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        first_draw, end_draw : int
+            Number of the first draw, and number after the last one.
+        counts : ndarray (names, m, batches) int64
+            Numbers of events, in the order of DRAW_COUNT_OUTPUTS. Those of the new draws are added.
         """
         for column, point in enumerate(point_indices):
             for point_spectra, draws in self._iter_point_spectra(
@@ -672,7 +740,19 @@ class SpectraSampler(Sampler):
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        The result is (4, points), in the order of PD_OUTPUT_NAMES.
+        The intervals are those of counted detections.
+
+        Parameters
+        ----------
+        point_indices : ndarray (m,) int64
+            Indices of the points.
+        error_budget : ErrorBudget
+            Confidence (:class:`sweep.model.error_budget.ErrorBudget`).
+
+        Returns
+        -------
+        ndarray (4, m)
+            Half-widths in the order of PD_OUTPUT_NAMES; nan for a segment that does not exist.
         """
         return (
             self.count_half_widths(point_indices, error_budget)

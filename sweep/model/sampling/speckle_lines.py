@@ -268,9 +268,20 @@ def folding_signs(shots: "Shots") -> np.ndarray:
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def interpolate_transform(distance, grid):
-    """Interpolate the window's transform at a distance from a line [bins of fs/N].
+    """Interpolate the window's transform linearly at a distance from a line.
 
-    fs is the sampling rate and N the FFT size. ``grid`` is a :class:`SpeckleLineGrid`.
+    Parameters
+    ----------
+    distance : float
+        Distance [bins of fs/N], with the sampling rate fs and the FFT size N. Its sign does not
+        matter.
+    grid : SpeckleLineGrid
+        Lines of footprints, with the table of the transform (:class:`SpeckleLineGrid`).
+
+    Returns
+    -------
+    float
+        Transform, 1 at distance 0; 0 beyond the table.
     """
     table_position = abs(distance) * grid.samples_per_bin
     k = int(table_position)
@@ -283,9 +294,21 @@ def interpolate_transform(distance, grid):
 
 @njit(cache=True, error_model="numpy")
 def nearest_image_position(position, nyquist_bin):
-    """Return the position [bins] of a line's mirror image at frequency 0 or Nyquist.
+    """Return the position of a line's mirror image at frequency 0 or Nyquist.
 
     The image is the one at whichever of the two is nearer.
+
+    Parameters
+    ----------
+    position : float
+        Position x of the line [bins].
+    nyquist_bin : int
+        Half of the FFT size, N/2.
+
+    Returns
+    -------
+    float
+        -x if x is below N/4, else N - x [bins].
     """
     return -position if position < 0.5 * nyquist_bin else 2.0 * nyquist_bin - position
 
