@@ -383,9 +383,21 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, line_spectrum):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _spread_line_over_cells(cell_position, re, im, cell_re, cell_im):
-    """Add a line of complex weight ``re`` + i ``im`` to N_KERNEL_CELLS cells around its position.
+    """Add a line to the N_KERNEL_CELLS table cells around its position.
 
-    ``cell_position`` is the line's position in cells from the first cell.
+    At a distance of z cells the weight is I_0(b sqrt(1 - (2 z / N_KERNEL_CELLS)^2)) / I_0(b), with
+    b = KERNEL_BETA (Kaiser-Bessel kernel [Fessler and Sutton 2003]). A polynomial approximates it.
+
+    Parameters
+    ----------
+    cell_position : float
+        Position of the line [cells] from the first bin of its interval, not negative. A line at 0
+        is centred on the array element N_KERNEL_CELLS / 2 - 1.
+    re, im : float
+        Complex weight of the line [V]; squared magnitude and 0 if powers add.
+    cell_re, cell_im : ndarray (cells,)
+        Results: complex weights of the cells, to which those of the line are added. The next
+        N_ZERO_WEIGHT_CELLS cells receive 0.
     """
     cell = np.uint64(math.floor(cell_position))
     cell_coordinate = 2.0 * (cell_position - math.floor(cell_position)) - 1.0
@@ -431,7 +443,28 @@ def _add_spectrum_of_cells(
 ):
     """Add the spectrum of the cells of one interval of lines to ``line_spectrum``.
 
-    The first cell lies N_KERNEL_CELLS / 2 - 1 cells below ``batch_bin``, the interval's first bin.
+    The spectrum in bin k is (-1)^(p L) sum_c w_c G(k - p N - x_c). Cell c has the weight w_c and
+    the position x_c, and G is the line-shape table. N is the FFT size, L the number of samples. The
+    spectrum is shifted by p FFT lengths. If powers add, the sign is always positive.
+
+    Parameters
+    ----------
+    first_bin, n_bins : int
+        First bin of the result, counted from the lines' origin, and number of bins.
+    batch_bin : int
+        First bin of the interval, counted from the lines' origin. The first cell lies
+        N_KERNEL_CELLS / 2 - 1 cells below it.
+    n_cells : int
+        Number of cells with weights.
+    n_periods : int
+        Number p of FFT lengths by which the periodic spectrum is shifted.
+    shape : LineShape
+        Shape of the lines, with its table (:class:`sweep.model.spectrum.line_shape.LineShape`).
+    layout : SpectrumLayout
+        Sizes of spectrum and tables (:class:`sweep.model.spectrum.lines.SpectrumLayout`).
+    line_spectrum : LineSpectrumWorkspace
+        Weights of the cells in ``cell_re`` and ``cell_im``. The spectrum is added to ``re`` and
+        ``im`` [V], or ``re`` [V^2] if powers add (:class:`LineSpectrumWorkspace`).
     """
     cells_per_bin, adds_powers = layout.cells_per_bin, layout.adds_powers
     n_columns = shape.table_re.size // cells_per_bin
@@ -844,10 +877,20 @@ def bins_to_nearest_line(first_bin, n_bins, lowest_position, highest_position, f
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def envelope_index(distance, envelope):
-    """Return the index of the largest tabulated distance that does not exceed ``distance``.
+    """Return the index of the largest tabulated distance that does not exceed a given one.
 
-    ``distance`` is from a line [bins]. ``envelope`` is the
-    :class:`sweep.model.spectrum.line_shape.LineEnvelope` with the tabulated distances.
+    Parameters
+    ----------
+    distance : float
+        Distance from a line [bins of fs/N], with the sample rate fs and the FFT size N.
+    envelope : LineEnvelope
+        Envelope with m tabulated distances in rising order
+        (:class:`sweep.model.spectrum.line_shape.LineEnvelope`).
+
+    Returns
+    -------
+    int
+        Index, 0 .. m - 1; 0 also for a distance below all of them.
     """
     low, high = 0, envelope.distance.size
     while low < high:

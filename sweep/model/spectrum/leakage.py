@@ -567,9 +567,27 @@ def _mean_leakage_over_speckle(
 def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates):
     """Set the crossing probability of bins that may join an echo to 1, and of all others to 0.
 
-    A bin joins an echo if it crosses the threshold next to the echo. The result is an upper bound
-    of the number of bins to be listed one by one: marked bins, the echo's bins next to them, and
-    one for each gap between them.
+    A bin joins an echo if it crosses the threshold next to the echo.
+
+    Parameters
+    ----------
+    first_index, end_index : int
+        First bin of the span that counts, and the bin after the last.
+    noise_sigma : float
+        Noise standard deviation per quadrature in a bin [V, summed over the record].
+    span : SpanArrays
+        Magnitudes, and which bins belong to an echo
+        (:class:`sweep.model.spectrum.bin_spectrum.SpanArrays`). The result is
+        ``crossing_probability``, 1 in bins that may join an echo, else 0.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates at the threshold over sigma, by speckle power
+        (:class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates`).
+
+    Returns
+    -------
+    int
+        Upper bound of the number of bins to be listed one by one: marked bins, the echo's bins next
+        to them, and one for each gap between them.
     """
     n_listed_max, gap_end = 0, first_index
     for i in range(first_index, end_index):
@@ -594,8 +612,31 @@ def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates)
 def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, speckle_rates):
     """Mark consecutive bins as long as all of them may cross the threshold; return their number.
 
-    The bins are ``n_bins`` from ``first_index`` on, upwards if ``step`` is 1, downwards if it is
-    -1.
+    The first bin is always marked. The probability that all bins from the second on cross is
+    computed for the brightest speckle. Marking ends after the bin at which it falls to
+    ALL_JOIN_PROBABILITY_MIN.
+
+    Parameters
+    ----------
+    first_index : int
+        Index of the first bin in the span, the one next to the echo.
+    step : int
+        1 to continue upwards, -1 downwards.
+    n_bins : int
+        Number of bins that may be marked.
+    noise_sigma : float
+        Noise standard deviation per quadrature in a bin [V, summed over the record].
+    span : SpanArrays
+        Magnitudes (:class:`sweep.model.spectrum.bin_spectrum.SpanArrays`). The result is
+        ``crossing_probability``, set to 1 in marked bins.
+    speckle_rates : SpeckleCrossingRates
+        Crossing rates at the threshold over sigma
+        (:class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates`).
+
+    Returns
+    -------
+    int
+        Number of marked bins.
     """
     n_marked, p_all_cross = 0, 1.0
     while n_marked < n_bins and p_all_cross > ALL_JOIN_PROBABILITY_MIN:

@@ -387,10 +387,23 @@ def line_shape_tables(
 
 
 def late_echo_length_classes(window: Window, length_min: np.ndarray) -> np.ndarray:
-    """Return the length classes, (n,) int64, of late echoes of ``length_min`` samples.
+    """Return the length classes of late echoes, which fill only the last samples of their records.
 
-    Late echoes of one class share a table. With a record of L samples, those of class c have at
-    most L / :data:`ECHO_LENGTH_CLASS_RATIO` ** (c - 1) samples.
+    Late echoes of one class share a table. With a record of L samples, an echo of L' samples has
+    the class ceil(ln(L / L') / ln(:data:`ECHO_LENGTH_CLASS_RATIO`)). Echoes of class c have at most
+    L / :data:`ECHO_LENGTH_CLASS_RATIO` ** (c - 1) samples.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record (:class:`sweep.model.window.Window`).
+    length_min : ndarray (n,) int64
+        Number L' of samples of each echo, the least of its segments. Numbers below 1 count as 1.
+
+    Returns
+    -------
+    ndarray (n,) int64
+        Length class, 0 for an echo that fills the record.
     """
     ratio = window.length / np.maximum(length_min, 1)
     return np.ceil(np.log(ratio) / math.log(ECHO_LENGTH_CLASS_RATIO) - 1e-9).astype(np.int64)
@@ -546,9 +559,22 @@ def _late_mode_transforms(tier: int) -> LateModeTransforms:
 
 
 def window_has_modes(window: Window, fft_size: int) -> bool:
-    """Return true if line shapes of this window may be sums of Chebyshev modes.
+    """Return True if line shapes of this window may be sums of Chebyshev modes.
 
-    Otherwise the line-shape tables hold all bins.
+    They may if the window is a sum of cosines, the record is long enough, and the padding is small
+    enough. Otherwise the line-shape tables hold all bins.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record (:class:`sweep.model.window.Window`).
+    fft_size : int
+        FFT size N.
+
+    Returns
+    -------
+    bool
+        True for sums of modes.
     """
     is_long_enough = (
         window.length >= _RECORD_LENGTH_MIN and window.length * _PADDING_MAX >= fft_size
@@ -704,7 +730,21 @@ def table_size(layout: SpectrumLayout) -> int:
 
 
 def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
-    """Allocate the line shapes of all segments, (segments, ...), with the envelope's distances."""
+    """Allocate the line shapes of all segments of a point.
+
+    Parameters
+    ----------
+    tables : LineShapeTables
+        Tables of the window, for the sizes and the envelope's distances (:class:`LineShapeTables`).
+    segments : int
+        Number of segments.
+
+    Returns
+    -------
+    LineShape
+        Arrays with a leading dimension of segments. The values of the tables are undefined. The
+        envelopes' magnitudes and integrals, and the end polynomials, are 0.
+    """
     distance, n_cells = tables.envelope_distance, table_size(tables.layout)
     return LineShape(
         np.empty((segments, n_cells)),
@@ -718,7 +758,20 @@ def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def select_segment(shapes, segment):
-    """Return the :class:`LineShape` of one segment; its arrays are views of ``shapes``."""
+    """Return the line shape of one segment.
+
+    Parameters
+    ----------
+    shapes : LineShape
+        Line shapes of all segments, with a leading dimension (:class:`LineShape`).
+    segment : int
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+
+    Returns
+    -------
+    LineShape
+        Line shape whose arrays are views of those of ``shapes``.
+    """
     envelope, ends = shapes.envelope, shapes.end_polynomials
     return LineShape(
         shapes.table_re[segment],

@@ -265,7 +265,24 @@ class BeatParameters(NamedTuple):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def beat_parameters_at(point_parameters, segment_parameters, segment, point):
-    """Return the :class:`BeatParameters` of one segment of one point."""
+    """Return the parameters of one segment of one point from which its beats are computed.
+
+    Parameters
+    ----------
+    point_parameters : PointParameters
+        Parameters of n points that all segments share (:class:`PointParameters`).
+    segment_parameters : SegmentParameters
+        Parameters (segments, n) of the points' segments (:class:`SegmentParameters`).
+    segment : int
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    point : int
+        Index of the point.
+
+    Returns
+    -------
+    BeatParameters
+        Parameters; the amplitude [V] is the beat's at the ADC times the whitening gain.
+    """
     return BeatParameters(
         point_parameters.range[point],
         segment_parameters.range_decrease_since_shot_start[segment, point],
@@ -454,7 +471,26 @@ def compute_lines(
 def add_image_lines(lines, n_lines, origin_bin, image_gain, adds_powers):
     """Append images of lines at the opposite frequencies; return the number of lines and images.
 
-    ``image_gain`` is the amplitude of an image over that of its line.
+    A line at the frequency f with the weight C has an image at -f with the weight g conj(C), for
+    the image gain g. If powers add, the weight |C|^2 becomes g^2 |C|^2.
+
+    Parameters
+    ----------
+    lines : LineArrays
+        Lines, in arrays with room for twice as many (:class:`LineArrays`). Images follow the lines.
+    n_lines : int
+        Number of lines.
+    origin_bin : int
+        Bin from which positions are counted, -N/2 .. N/2 with the FFT size N.
+    image_gain : float
+        Amplitude g of an image over that of its line.
+    adds_powers : bool
+        True if powers of lines add, False if amplitudes do.
+
+    Returns
+    -------
+    int
+        Number of lines and images, 2 ``n_lines``.
     """
     for line in range(n_lines):
         lines.position[n_lines + line] = -2.0 * origin_bin - lines.position[line]
@@ -467,7 +503,20 @@ def add_image_lines(lines, n_lines, origin_bin, image_gain, adds_powers):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fold_lines(lines, n_lines, layout):
-    """Shift lines by whole FFT lengths, to positions within half an FFT length of the origin."""
+    """Shift lines by whole FFT lengths, to positions within half an FFT length of the origin.
+
+    Phases refer to the middle of the record. A shift by p FFT lengths therefore multiplies the
+    weight by (-1)^(p L), with L samples in the record, unless powers add.
+
+    Parameters
+    ----------
+    lines : LineArrays
+        Lines, which are changed (:class:`LineArrays`).
+    n_lines : int
+        Number of lines.
+    layout : SpectrumLayout
+        Sizes of the spectrum (:class:`SpectrumLayout`).
+    """
     for line in range(n_lines):
         n_folds = math.floor(lines.position[line] / layout.fft_size + 0.5)
         lines.position[line] -= n_folds * layout.fft_size
@@ -478,10 +527,28 @@ def fold_lines(lines, n_lines, layout):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def summarise_lines(lines, n_lines, adds_powers, batch):
-    """Compute the :class:`LineSummary` of lines.
+    """Compute sums of the lines' weights, and their lowest and highest frequency.
 
-    If amplitudes add, ``magnitude_sum`` is its upper bound by Cauchy and Schwarz,
-    sqrt(n sum |C_b|^2). ``batch`` is the scratch array of :class:`LineScratch`.
+    If amplitudes add, ``magnitude_sum`` is an upper bound by Cauchy and Schwarz of the sum of |C_b|
+    over the n lines b of weights C_b: sqrt(n sum |C_b|^2). Where the sum of squares is below
+    1e-250, it is another bound, the sum of |Re C_b| + |Im C_b|.
+
+    Parameters
+    ----------
+    lines : LineArrays
+        Lines (:class:`LineArrays`).
+    n_lines : int
+        Number n of lines, at least 1.
+    adds_powers : bool
+        True if powers of lines add, False if amplitudes do.
+    batch : ndarray (BATCH_SCRATCH_SIZE,)
+        Scratch, :attr:`LineScratch.batch`.
+
+    Returns
+    -------
+    LineSummary
+        Sums [V, V^2], or of powers and their squares [V^2, V^4] if powers add, and frequencies
+        [bins].
     """
     lowest_position, highest_position = lines.position[0], lines.position[0]
     magnitude_sum, power_sum = 0.0, 0.0
@@ -562,10 +629,21 @@ def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_
 def n_required_nodes(phase_span, tolerance, phase_limits):
     """Return the number of equivalent lines that represent a group of lines to a tolerance.
 
-    ``phase_span`` is pi h [rad] of lines within +-h bins of fs/L; 2 pi h if powers add.
-    ``phase_limits`` is the table of :func:`node_phase_limits`. If all its tolerances are larger
-    than ``tolerance``, its smallest one is used. If no number is sufficient, the result is
-    NODES_MAX + 1.
+    Parameters
+    ----------
+    phase_span : float
+        Phase of the outermost line at the record's end [rad]: pi h for lines within +-h bins of
+        fs/L, with the sample rate fs and L samples; 2 pi h if powers add.
+    tolerance : float
+        Error of the sum over lines, relative to the sum of their magnitudes.
+    phase_limits : ndarray (tolerances, NODES_MAX + 1)
+        Table of :func:`node_phase_limits`. The row of the largest tolerance up to ``tolerance`` is
+        used, or the first row if there is none.
+
+    Returns
+    -------
+    int
+        Number of equivalent lines, 1 .. NODES_MAX, or NODES_MAX + 1 if no number is sufficient.
     """
     limit_row = phase_limits.shape[0] - 1
     while limit_row > 0 and phase_limits[limit_row, 0] > tolerance:

@@ -134,10 +134,28 @@ def find_peaks_on_grid(
 
 
 def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray:
-    """Return the number of grid cells of each point, (n,) int64, a power of two.
+    """Return the number of grid cells of each point, a power of two.
 
-    The lines are in the middle of the grid. On each side there are `CLEARANCE_BINS` and as many
-    bins as the lines cover.
+    The lines are within about b bins of the middle of the grid. On each side of the middle there
+    are at least 2 (b + CLEARANCE_BINS) bins, with
+
+        b = (N / fs) [(2 |S| R / c) (max |dR| / R + max |dbeta|) + f max |dbeta|].
+
+    dR and dbeta are a beamlet's offsets of range and Doppler ratio from the beam's axis at the
+    range R. S is the chirp rate, f the highest carrier of any segment and point, N the FFT size,
+    and fs the sample rate.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points (:class:`sweep.model.preparation.Shots`).
+    cells_min : int
+        Least number of cells, a power of two.
+
+    Returns
+    -------
+    ndarray (n,) int64
+        Number of cells.
     """
     beat_per_ratio = 2 * np.abs(shots.waveform.chirp_rate) * shots.range / SPEED_OF_LIGHT
     carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.waveform.carriers])
@@ -362,7 +380,25 @@ def _deposit_lines(
 
 @njit(cache=True, error_model="numpy")
 def _deposit_line(cells, cell_position, re, im, node_weights, cell_weights):
-    """Add a line to the nearest cell, or spread it over several cells by Lagrange interpolation."""
+    """Add a line to the nearest cell, or spread it over several cells by Lagrange interpolation.
+
+    At the offset x from the first of the cells, cell j receives the fraction
+    (g_j / (x - j)) / sum_k (g_k / (x - k)) of the line, with the barycentric weights g.
+
+    Parameters
+    ----------
+    cells : ndarray (cells, 2 or 1)
+        Result: real and imaginary parts, or powers, to which those of the line are added.
+    cell_position : float
+        Position of the line [cells] from the first cell of the grid.
+    re, im : float
+        Complex weight of the line [V]; squared magnitude [V^2] and 0 if powers add.
+    node_weights : ndarray (nodes,)
+        Barycentric weights g. One weight puts the line into the nearest cell. Otherwise the first
+        cell is four below that of the line, which is right for ten weights.
+    cell_weights : ndarray (nodes,)
+        Scratch.
+    """
     first_cell = (
         int(np.rint(cell_position)) if node_weights.size == 1 else int(np.floor(cell_position)) - 4
     )

@@ -172,9 +172,19 @@ class BinSpans(NamedTuple):
     """
 
     def span_magnitudes(self, segment: int, column: int) -> np.ndarray:
-        """Return the magnitudes without noise around one segment's lines, (bins,) [V].
+        """Return the magnitudes without noise of the bins around one segment's lines.
 
-        The point is ``point_numbers[column]``.
+        Parameters
+        ----------
+        segment : int
+            Index of the segment: 0 up, 1 Doppler, 2 down.
+        column : int
+            Index of the point in ``point_numbers``.
+
+        Returns
+        -------
+        ndarray (bins,)
+            |X| of the span's bins, first bin first [V, summed over the record].
         """
         span_begin = self.span_start[segment, column]
         return self.magnitudes[span_begin : span_begin + self.n_bins[segment, column]]
@@ -1047,11 +1057,26 @@ def _compute_equivalent_lines(
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
 def _store_span(start, n_bins, span, magnitudes, is_exempt):
-    """Append a span to the spans of earlier points at index ``start``; return the next index.
+    """Append a span, the computed bins around a segment's lines, to the spans of earlier points.
 
-    A span is the computed bins around a segment's lines. ``span`` is its
-    :class:`sweep.model.spectrum.bin_spectrum.SpanArrays`. ``magnitudes`` and ``is_exempt`` hold all
-    spans.
+    Parameters
+    ----------
+    start : int
+        Index in the arrays of all spans at which the span begins.
+    n_bins : int
+        Number of bins of the span.
+    span : SpanArrays
+        Magnitudes of the span's bins, and which of them belong to an echo
+        (:class:`sweep.model.spectrum.bin_spectrum.SpanArrays`).
+    magnitudes : ndarray (bins,)
+        Result: |X| without noise of all spans [V, summed over the record].
+    is_exempt : ndarray (bins,) bool
+        Result: True in bins of an echo, of all spans.
+
+    Returns
+    -------
+    int
+        Index after the span, at which the next one begins.
     """
     for k in range(n_bins):
         magnitudes[start + k], is_exempt[start + k] = span.magnitude[k], span.is_exempt[k]
@@ -1093,10 +1118,25 @@ def _layout_of_late_echo(layout, n_samples):
 
 @njit(cache=True, error_model="numpy")
 def _build_line_shapes(line_shape_index, built_index, modes, tables, segment_exists, shapes):
-    """Compute the line shapes of all segments of a point into ``shapes``.
+    """Compute the line shapes of all segments of a point.
 
-    ``line_shape_index`` is the index of the line shape in ``modes``. ``built_index`` is that of the
-    line shape that is in ``shapes`` already, or -1.
+    Parameters
+    ----------
+    line_shape_index : int
+        Index of the line shape in ``modes``.
+    built_index : int
+        Index of the line shape that is in ``shapes`` already, or -1; not used for late echoes.
+    modes : PhaseErrorModes
+        Chebyshev modes of the phase errors
+        (:class:`sweep.model.spectrum.line_shape.PhaseErrorModes`).
+    tables : LineShapeTables
+        Tables of the window and FFT size
+        (:class:`sweep.model.spectrum.line_shape.LineShapeTables`).
+    segment_exists : ndarray (segments,) bool
+        True for the segments that exist. Others are left out.
+    shapes : LineShape
+        Result: line shapes of the segments, with a leading dimension
+        (:class:`sweep.model.spectrum.line_shape.LineShape`).
     """
     is_late = tables.echo_lengths.size > 0
     for s in range(segment_exists.size):
