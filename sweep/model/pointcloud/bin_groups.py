@@ -44,6 +44,10 @@ class BinGroups(NamedTuple):
     leakage_probability: np.ndarray
     """(n, 3): probability of a false peak raised by leaked signal (echo power far from its line),
     in addition to false peaks of noise alone."""
+    raised_bin_probability_max: np.ndarray
+    """(n, 3): upper bound on the probability that leaked signal raises any bin above the threshold,
+    one that joins an echo included; 1 where it is not computed
+    (:class:`sweep.model.spectrum.segment_spectra.BinSpans`)."""
 
     @property
     def magnitude(self) -> np.ndarray:
@@ -103,7 +107,9 @@ def list_bin_groups(
         False to skip the probability of leakage, which is then 0.
     """
     bin_groups = allocate_bin_groups(shots.size, groups_max)
-    for spans in iter_spans(shots, bin_by_bin=every_bin, leakage=with_leakage, computes_pd=False):
+    for spans in iter_spans(
+        shots, bin_by_bin=every_bin, leakage=with_leakage, doppler_leakage=True, computes_pd=False
+    ):
         find_groups_in_spans(shots, spans, bin_groups)
     return bin_groups
 
@@ -132,6 +138,7 @@ def allocate_bin_groups(n_points: int, groups_max: int) -> BinGroups:
         pd=np.full(shape, np.nan),
         n_exempt_bins=np.full((n_points, 3), np.nan),
         leakage_probability=np.full((n_points, 3), np.nan),
+        raised_bin_probability_max=np.ones((n_points, 3)),
     )
 
 
@@ -191,6 +198,7 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
         n_exempt_or_nan.T,
         spans.leakage.T,
     )
+    bin_groups.raised_bin_probability_max[spans.point_numbers] = spans.raised_bin_probability_max.T
 
 
 def _zero_leakage_of_unsearched_echoes(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:

@@ -74,6 +74,10 @@ LEAKAGE_PROBABILITY_MIN = 1e-9
 """Smallest probability of a false peak by leaked signal in a segment for which such peaks are
 drawn."""
 
+RAISED_BIN_RATE_MARGIN = 1.01
+"""Factor on the sum of the rates of all bins, as an integral over far bins gives it, to bound the
+sum over listed bins. The integral is accurate to 1e-3."""
+
 PERMANENT_LINE_FIRST_RANDOM_INDEX = np.int64(1 << 24)
 """Index of the first random number used for the line of leaked light. Lower indices of the same
 stream are used for signal leaked from echoes."""
@@ -297,7 +301,7 @@ class _LeakedBinLocations(NamedTuple):
     """(bins,) int64: 0 up, 1 Doppler, 2 down."""
 
 
-def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
+def find_leaking_points(groups: BinGroups) -> np.ndarray:
     """Return indices of points with a notable probability of a false peak by leaked signal.
 
     The probability exceeds LEAKAGE_PROBABILITY_MIN in at least one segment.
@@ -316,6 +320,67 @@ def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
         Indices of the points, in rising order.
     """
     return np.flatnonzero((groups.leakage_probability > LEAKAGE_PROBABILITY_MIN).any(axis=1))
+
+
+def find_segments_with_raised_bins(
+    groups: BinGroups, points: np.ndarray, keys: np.ndarray, first_draw: int, draws: int
+) -> np.ndarray:
+    """Return in which segments leaked signal may raise a bin in at least one draw, (n, 3) bool.
+
+    In all other segments the first random number of :func:`draw_leaked_peaks` exceeds the sum of
+    the bins' rates in every draw, so that their bins need not be listed.
+
+    Parameters
+    ----------
+    groups : BinGroups
+        Groups of adjacent bins above the threshold of n points, with bounds on raised bins.
+    points : ndarray (m,) int64
+        Indices of the points that may leak; in others no segment is marked.
+    keys : ndarray (n, 2) uint64
+        Random key of each point.
+    first_draw, draws : int
+        Number of the first draw, and number of draws.
+    """
+    with np.errstate(divide="ignore"):  # a certain crossing has an infinite rate
+        rate_sums = -np.log1p(-groups.raised_bin_probability_max[points])
+    rate_sum_max = RAISED_BIN_RATE_MARGIN * rate_sums
+    has_raised_bin = np.zeros((keys.shape[0], 3), np.bool_)
+    has_raised_bin_at_points = np.zeros((points.size, 3), np.bool_)
+    _mark_segments_with_raised_bins(
+        np.ascontiguousarray(keys[points]),
+        rate_sum_max,
+        int(first_draw),
+        draws,
+        has_raised_bin_at_points,
+    )
+    has_raised_bin[points] = has_raised_bin_at_points
+    return has_raised_bin
+
+
+@njit(cache=True, nogil=True, error_model="numpy", borrows=True)
+def _mark_segments_with_raised_bins(keys, rate_sum_max, first_draw, n_draws, has_raised_bin):
+    """Mark the segments of m points in which leaked signal may raise a bin in any of some draws.
+
+    Parameters
+    ----------
+    keys
+        (m, 2) uint64: random keys.
+    rate_sum_max
+        (m, 3): upper bounds on the sums of the bins' rates -ln(1 - c), with c the probability that
+        signal lifts a bin above the threshold.
+    first_draw, n_draws
+        Number of the first draw, and number of draws.
+    has_raised_bin
+        (m, 3) bool: True is written where a bin may be raised.
+    """
+    for i in range(has_raised_bin.shape[0]):
+        for segment in range(has_raised_bin.shape[1]):
+            for draw in range(first_draw, first_draw + n_draws):
+                probability = philox.uniform(
+                    keys[i, 0], keys[i, 1], draw, philox.STREAM_LEAKAGE[segment], INTEGER_ZERO
+                )
+                if -math.log1p(-probability) <= rate_sum_max[i, segment]:
+                    has_raised_bin[i, segment] = True
 
 
 def fading_group_of_bins(
@@ -381,7 +446,10 @@ def bins_without_noise_peaks(
 
 
 def iter_leakage_bins(
-    shots: Shots, groups: BinGroups, points: np.ndarray
+    shots: Shots,
+    groups: BinGroups,
+    points: np.ndarray,
+    has_raised_bin: np.ndarray | None = None,
 ) -> Iterator[tuple[np.ndarray, LeakageBins]]:
     """Yield points in batches, with the bins in which leaked signal may raise peaks.
 
@@ -393,6 +461,9 @@ def iter_leakage_bins(
         Groups of adjacent bins above the threshold, without noise: the echoes.
     points : ndarray (m,) int64
         Indices of the points that may have such bins (:func:`find_leaking_points`).
+    has_raised_bin : ndarray (n, 3) bool, optional
+        Segments in which all such bins are listed; in others those above the threshold suffice. By
+        default they are all segments. With a permanent line they are all in any case.
 
     Yields
     ------
@@ -402,7 +473,7 @@ def iter_leakage_bins(
         Their bins of leaked signal.
     """
     if shots.permanent_line is None:
-        for spans in _iter_leaking_spans(shots, points):
+        for spans in _iter_leaking_spans(shots, points, has_raised_bin):
             yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
         return
     echoes_alone = replace(shots, permanent_line=None)
@@ -461,11 +532,18 @@ def find_groups_and_leakage_bins(
     return groups, leakage_bins_by_part
 
 
-def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[BinSpans]:
-    """Yield adjacent bins (spans) of points, down to a negligible magnitude of leaked signal."""
+def _iter_leaking_spans(
+    shots: Shots, point_indices: np.ndarray, has_raised_bin: np.ndarray | None = None
+) -> Iterator[BinSpans]:
+    """Yield adjacent bins (spans) of points, down to a negligible magnitude of leaked signal.
+
+    In segments that are not marked in ``has_raised_bin`` (n, 3) they end at the threshold.
+    """
     magnitude_min = np.minimum(
         shots.threshold, _leaking_signal_ratio_min(shots) * shots.bin_noise_sigma
     )
+    if has_raised_bin is not None:
+        magnitude_min = np.where(has_raised_bin.T, magnitude_min, shots.threshold)
     return iter_spans(
         shots, points=point_indices, level_min=magnitude_min, leakage=False, computes_pd=False
     )

@@ -92,6 +92,7 @@ from sweep.model.pointcloud.leaked_peaks import (
     bins_without_noise_peaks,
     draw_leaked_peaks,
     find_leaking_points,
+    find_segments_with_raised_bins,
     insert_peak,
     iter_leakage_bins,
 )
@@ -327,7 +328,12 @@ def draw_returns(
     _, _, groups_max = bin_groups.strongest_bin.shape
     noise_roots: dict[int, np.ndarray] = {}
     for indices, spectra, part_leakage_bins in _iter_spectra(
-        shots, bin_groups, adds_noise, known_leakage_bins
+        shots,
+        bin_groups,
+        adds_noise,
+        known_leakage_bins,
+        keys,
+        range(first_draw, first_draw + draws),
     ):
         part_inputs = inputs.select(indices)
         part_inputs = part_inputs._replace(
@@ -390,18 +396,29 @@ def _iter_spectra(
     bin_groups: BinGroups,
     adds_noise: bool,
     known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None,
+    keys: np.ndarray,
+    draw_range: range,
 ) -> Iterator[tuple[np.ndarray, NoiselessSpectra, LeakageBins]]:
-    """Yield indices of points in parts, with their noiseless spectra and bins of leaked signal."""
+    """Yield indices of points in parts, with their noiseless spectra and bins of leaked signal.
+
+    The arguments are those of :func:`draw_returns`, and the numbers of the draws.
+    """
     if adds_noise:
         for indices, spectra in iter_noiseless_spectra(shots):
             yield indices, spectra, bins_without_noise_peaks(shots, bin_groups, indices, spectra)
         return
     n_noise_bins = np.nan_to_num(shots.n_alarm_equivalent_bins(bin_groups.n_exempt_bins.T).T)
-    leaking_indices = find_leaking_points(shots, bin_groups)
+    leaking_indices = find_leaking_points(bin_groups)
+    has_raised_bin = None
+    if known_leakage_bins is None:
+        has_raised_bin = find_segments_with_raised_bins(
+            bin_groups, leaking_indices, keys, draw_range.start, len(draw_range)
+        )
+        leaking_indices = np.flatnonzero(has_raised_bin.any(axis=1))
     is_leaking_point = np.zeros(shots.size, bool)
     is_leaking_point[leaking_indices] = True
     leakage_bins_by_part: Iterable[tuple[np.ndarray, LeakageBins]] = iter_leakage_bins(
-        shots, bin_groups, leaking_indices
+        shots, bin_groups, leaking_indices, has_raised_bin
     )
     if known_leakage_bins is not None:
         leakage_bins_by_part = (

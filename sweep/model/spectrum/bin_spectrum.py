@@ -130,6 +130,10 @@ class DetectedSpan(NamedTuple):
     """Probability that the echo's signal far from its lines raises at least one false alarm. The
     value is 0 if it is not computed.
     """
+    raised_bin_probability_max: float
+    """Upper bound on the probability that this signal raises any bin above the threshold, one that
+    joins the echo included. The value is 1 if it is not computed.
+    """
 
 
 class AveragingShifts(NamedTuple):
@@ -1236,10 +1240,10 @@ def detect_in_span(
         )
         largest = span.magnitude[peak_index]
         if largest >= lowest_level or n_bins >= n_bins_max:
-            return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0)
+            return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0, 1.0)
         margin_needed = falloff_distance_with_images(
             largest, weight_sum, folded_range, shape.envelope, layout
         )
         if margin_needed <= margin_bins:
-            return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0)
+            return DetectedSpan(bins.first_bin, n_bins, peak_index, n_exempt, 0.0, 1.0)
         margin_bins = margin_needed

@@ -145,6 +145,17 @@ class LeakageInputs(NamedTuple):
     """Correlation coefficient of the noise of adjacent bins, in phase with a line's sidelobes."""
 
 
+class FalsePeakProbability(NamedTuple):
+    """Probabilities that leaked signal raises bins of a segment above the threshold."""
+
+    leakage: float
+    """Probability of at least one false peak apart from the echo. In developed speckle it is the
+    mean over the speckle."""
+    raised_bin_probability_max: float
+    """Upper bound on the probability that any bin is raised, one that joins the echo included. It
+    is 1 in developed speckle."""
+
+
 class LeakageResult(NamedTuple):
     """Leakage of the computed bins around the lines and of all bins beyond them.
 
@@ -153,6 +164,8 @@ class LeakageResult(NamedTuple):
 
     leakage: float
     """Probability that the echo's signal far from its lines raises at least one false alarm."""
+    raised_bin_probability_max: float
+    """Upper bound on the probability that any bin is raised, one that joins the echo included."""
     is_valid: bool
     """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
 
@@ -331,17 +344,21 @@ def detect_with_leakage(
             span.magnitude, n_bins, inputs.threshold, span.is_exempt, lobe_half_width
         )
         if is_integral_negligible:
-            leakage = 0.0
+            leakage, raised_bin_probability_max = 0.0, inputs.tolerance
             if not (
                 tolerance_left > 0.0
                 and _leakage_bound_of_span(n_bins, brightest_inputs, span) <= tolerance_left
             ):
-                leakage = _leakage_of_span(
+                probability = _leakage_of_span(
                     n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
                 )
-            return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, leakage)
+                leakage = probability.leakage
+                raised_bin_probability_max += probability.raised_bin_probability_max
+            return DetectedSpan(
+                first_bin, n_bins, peak_index, n_exempt, leakage, raised_bin_probability_max
+            )
         result = _leakage_of_all_bins(
-            DetectedSpan(first_bin, n_bins, peak_index, n_exempt, 0.0),
+            DetectedSpan(first_bin, n_bins, peak_index, n_exempt, 0.0, 1.0),
             bundle,
             folded_range,
             inputs,
@@ -354,15 +371,22 @@ def detect_with_leakage(
             speckle_rates,
         )
         if result.is_valid:
-            return DetectedSpan(first_bin, n_bins, peak_index, n_exempt, result.leakage)
+            return DetectedSpan(
+                first_bin,
+                n_bins,
+                peak_index,
+                n_exempt,
+                result.leakage,
+                result.raised_bin_probability_max,
+            )
         extra_bins *= 2
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_of_span(n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates):
-    """Return the leakage of the computed bins around the lines, or its mean over speckle.
+    """Return the probabilities that leaked signal raises computed bins around the lines.
 
-    Leakage is the probability of false alarms due to the echo's signal.
+    They are a :class:`FalsePeakProbability`.
 
     Parameters
     ----------
@@ -381,13 +405,15 @@ def _leakage_of_span(n_bins, inputs, speckle_power_max, span, crossing_series, s
         Crossing rates at the same threshold, used in developed speckle.
     """
     if speckle_power_max > 1.0:
-        return _false_peak_probability_averaged_over_speckle(n_bins, inputs, span, speckle_rates)
+        return FalsePeakProbability(
+            _false_peak_probability_averaged_over_speckle(n_bins, inputs, span, speckle_rates), 1.0
+        )
     return _false_peak_probability(n_bins, inputs, span, crossing_series)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def false_peak_probability_of_bins(n_bins, inputs, negligible_signal_ratio, span, crossing_series):
-    """Return the probability of a false peak that leaked signal raises in the bins of a span.
+    """Return the :class:`FalsePeakProbability` of leaked signal in the bins of a span.
 
     A span is the computed bins around a segment's lines. Magnitudes below
     ``negligible_signal_ratio`` times the noise sigma are set to 0, except those of the echo.
@@ -414,7 +440,7 @@ def false_peak_probability_of_bins(n_bins, inputs, negligible_signal_ratio, span
 def false_peak_probability_of_bins_in_speckle(
     n_bins, inputs, negligible_signal_ratio, span, speckle_rates
 ):
-    """Return the mean of :func:`false_peak_probability_of_bins` over developed speckle.
+    """Return the mean leakage of :func:`false_peak_probability_of_bins` over developed speckle.
 
     Parameters
     ----------
@@ -447,12 +473,15 @@ def _clear_negligible_bins(n_bins, noise_sigma, negligible_signal_ratio, span):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _false_peak_probability(n_bins, inputs, span, crossing_series):
-    """Return the probability that leaked signal raises a false peak apart from the echo.
+    """Return the :class:`FalsePeakProbability` of leaked signal in the computed bins.
 
     A false peak is a group of adjacent bins above the threshold. The crossing probabilities of the
     bins go to ``span.crossing_probability``.
     """
     _fill_crossing_probabilities(n_bins, inputs, span, crossing_series)
+    raised_bin_probability = any_crossing_probability(
+        span.crossing_probability, INTEGER_ZERO, n_bins
+    )
     exclude_crossings_joining_echo(
         span.crossing_probability,
         INTEGER_ZERO,
@@ -463,7 +492,10 @@ def _false_peak_probability(n_bins, inputs, span, crossing_series):
         inputs.threshold,
         inputs.sidelobe_neighbour_noise_correlation,
     )
-    return any_crossing_probability(span.crossing_probability, INTEGER_ZERO, n_bins)
+    return FalsePeakProbability(
+        any_crossing_probability(span.crossing_probability, INTEGER_ZERO, n_bins),
+        raised_bin_probability,
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -958,12 +990,10 @@ def _leakage_of_all_bins(
     threshold_ratio, scale = threshold / noise_sigma, 0.5 / (noise_sigma * noise_sigma)
     goes_on_below, goes_on_above = first_bin > 0, first_bin + n_bins - 1 < nyquist_bin
     if not goes_on_below and not goes_on_above:
-        return LeakageResult(
-            _leakage_of_span(
-                n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
-            ),
-            True,
+        probability = _leakage_of_span(
+            n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
         )
+        return LeakageResult(probability.leakage, probability.raised_bin_probability_max, True)
     _fill_crossing_probabilities(n_bins, inputs, span, crossing_series)
     centre_bin = abs(
         math.floor(0.5 * (folded_range.lowest_position + folded_range.highest_position) + 0.5)
@@ -975,7 +1005,7 @@ def _leakage_of_all_bins(
             continue
         near_end = _near_end_correction(side, n_bins, span)
         if not near_end.exists:
-            return LeakageResult(0.0, False)
+            return LeakageResult(0.0, 1.0, False)
         far_rate += near_end.correction
         last_terms += near_end.last_term
         end_distance = (
@@ -998,6 +1028,7 @@ def _leakage_of_all_bins(
         INTEGRAL_END_CORRECTION_BINS if goes_on_below else INTEGER_ZERO,
         n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
+    raised_in_span = any_crossing_probability(span.crossing_probability, first_index, end_index)
     exclude_crossings_joining_echo(
         span.crossing_probability,
         first_index,
@@ -1047,7 +1078,7 @@ def _leakage_of_all_bins(
         largest_far_half_square <= half_square_max
         and last_terms <= LAST_END_CORRECTION_FRACTION_MAX * (span_leakage + far_rate)
     ):
-        return LeakageResult(0.0, False)
+        return LeakageResult(0.0, 1.0, False)
     if speckle_power_max > 1.0:
         return LeakageResult(
             _mean_leakage_of_all_bins(
@@ -1060,9 +1091,15 @@ def _leakage_of_all_bins(
                 integral,
                 speckle_rates,
             ),
+            1.0,
             True,
         )
-    return LeakageResult(span_leakage - (1.0 - span_leakage) * math.expm1(-far_rate), True)
+    any_far_probability = -math.expm1(-far_rate)
+    return LeakageResult(
+        span_leakage + (1.0 - span_leakage) * any_far_probability,
+        raised_in_span + (1.0 - raised_in_span) * any_far_probability,
+        True,
+    )
 
 
 @njit(cache=True, error_model="numpy")

@@ -156,6 +156,11 @@ class BinSpans(NamedTuple):
     """Probability that leaked signal raises at least one extra false peak, over noise alone. A
     false peak is a group of adjacent bins above the threshold.
     """
+    raised_bin_probability_max: np.ndarray
+    """Upper bound on the probability that leaked signal raises any bin above the threshold, one
+    that joins the echo included. It is 1 where it is not computed: in developed speckle, with
+    several looks, and with a permanent line. It is 0 in segments that do not exist.
+    """
     span_start: np.ndarray
     """Index in ``magnitudes`` and ``is_exempt`` of the first bin of each segment and point."""
     magnitudes: np.ndarray
@@ -288,6 +293,7 @@ def iter_spans(
     points: np.ndarray | None = None,
     level_min: np.ndarray | None = None,
     leakage: bool = True,
+    doppler_leakage: bool = False,
     bin_by_bin: bool = False,
     ignores_band: bool = False,
     computes_pd: bool = True,
@@ -302,10 +308,14 @@ def iter_spans(
         n prepared shots.
     points : ndarray (m,), optional
         Indices of the points; by default all.
-    level_min : ndarray (n,), optional
-        |X| [V, summed over the record] below which bins may be left out; by default the threshold.
+    level_min : ndarray (n,) or (3, n), optional
+        |X| [V, summed over the record] below which bins may be left out, of all segments or of each
+        one; by default the threshold.
     leakage : bool
         True to compute leakage.
+    doppler_leakage : bool
+        True to compute leakage also in the Doppler segment, whose false peaks alone are no false
+        points.
     bin_by_bin : bool
         True to compute the leakage of each bin, even if an integral over bins is accurate.
     ignores_band : bool
@@ -319,9 +329,8 @@ def iter_spans(
         Spans of some points.
     """
     parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()
-    point_levels = (
-        parameters.threshold if level_min is None else np.broadcast_to(level_min, shots.size)
-    )
+    level_min = parameters.threshold if level_min is None else level_min
+    levels_shape = len(shots.waveform_segments), shots.size
     chosen_points = np.arange(shots.size) if points is None else points
     for group in _iter_line_shape_groups(shots, chosen_points):
         leakage_method = _leakage_method(shots, group, bin_by_bin) if leakage else NO_LEAKAGE
@@ -332,7 +341,10 @@ def iter_spans(
         )
         if shots.speckle.segment_correlations is not None:  # faint leakage of bright speckle counts
             negligible_magnitude = negligible_magnitude / math.sqrt(SPECKLE_POWER_MAX)
-        lowest_levels, n_done = np.minimum(point_levels, negligible_magnitude), 0
+        lowest_levels = np.ascontiguousarray(
+            np.broadcast_to(np.minimum(level_min, negligible_magnitude), levels_shape)
+        )
+        n_done = 0
         while n_done < group.point_numbers.size:
             spans = _evaluate_batch(
                 shots,
@@ -340,7 +352,11 @@ def iter_spans(
                 parameters_by_segment,
                 lowest_levels,
                 group,
-                leakage_method,
+                leakage_method
+                * (
+                    np.array([s.evaluates_leakage for s in shots.waveform_segments])
+                    | doppler_leakage
+                ),
                 n_done,
             )
             n_done += spans.point_numbers.size
@@ -349,6 +365,10 @@ def iter_spans(
                 if ignores_band
                 else restrict_to_band(shots, _clear_spans_without_echo(shots, spans))
             )
+            if shots.looks.is_noncoherent or shots.permanent_line is not None:
+                spans = spans._replace(
+                    raised_bin_probability_max=np.ones_like(spans.raised_bin_probability_max)
+                )
             if shots.looks.is_noncoherent and leakage_method:
                 spans = _apply_looks_to_leakage(shots, spans)
             if shots.permanent_line is not None:
@@ -788,7 +808,7 @@ def _evaluate_batch(
     parameters_by_segment: SegmentParameters,
     lowest_levels: np.ndarray,
     group: LineShapeGroup,
-    leakage_method: int,
+    leakage_methods: np.ndarray,
     batch_begin: int,
 ) -> BinSpans:
     """Compute the spectra around the lines for the next batch of points of a group.
@@ -796,7 +816,8 @@ def _evaluate_batch(
     The batch begins with the group's point number ``batch_begin``. It has as many points as fit
     into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
     shapes. ``parameters`` and ``parameters_by_segment`` are those of all n points.
-    ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be left out.
+    ``lowest_levels`` (3, n) are the magnitudes [V] below which bins may be left out, and
+    ``leakage_methods`` (3,) the methods for the leakage of the segments.
     """
     points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
     segments, n_points = len(shots.waveform_segments), points.size
@@ -815,6 +836,7 @@ def _evaluate_batch(
         miss=np.full(shape, np.nan),
         peak_magnitude=np.full(shape, np.nan),
         leakage=np.full(shape, np.nan),
+        raised_bin_probability_max=np.repeat(1.0 * shots.has_segment[:, None], n_points, axis=1),
         span_start=np.zeros(shape, np.int64),
         magnitudes=np.empty(n_kept),
         is_exempt=np.empty(n_kept, np.bool_),
@@ -833,9 +855,7 @@ def _evaluate_batch(
         tables._replace(layout=tables.layout._replace(spectrum_type=spectrum_type(shots))),
         EvaluationSettings(
             segment_exists=shots.has_segment,
-            leakage_methods=np.array(
-                [leakage_method * segment.evaluates_leakage for segment in shots.waveform_segments]
-            ),
+            leakage_methods=leakage_methods,
             window_sum=shots.window.sum,
             detection_rule=shots.detection_rule,
             node_phase_limits=_node_phase_limits_of_group(shots, group),
@@ -846,7 +866,7 @@ def _evaluate_batch(
         np.empty(SERIES_TERMS_MAX),
         allocate_rate_table(
             _rounded_threshold_ratios(parameters.threshold[points], parameters.noise_sigma[points])
-            if shots.detection_rule.in_speckle and leakage_method != NO_LEAKAGE
+            if shots.detection_rule.in_speckle and leakage_methods.any()
             else np.empty(0)
         ),
         spans,
@@ -1191,7 +1211,7 @@ def _evaluate_segment(
     parameters_by_segment : SegmentParameters
         Parameters (segments, n) of all points
         (:class:`sweep.model.spectrum.lines.SegmentParameters`).
-    lowest_levels : ndarray (n,)
+    lowest_levels : ndarray (3, n)
         |X| [V, summed over the record] below which bins may be left out.
     beamlets : BeamletArrays
         Beamlets of all footprints (:class:`sweep.model.spectrum.lines.BeamletArrays`).
@@ -1301,7 +1321,7 @@ def _evaluate_segment(
             bundle,
             bin_error_allowed,
             threshold,
-            lowest_levels[point],
+            lowest_levels[s, point],
             lobe_half_width,
             AveragingShifts(shifts.offset[:n_averaged], shifts.weight[:n_averaged]),
             shape,
@@ -1311,6 +1331,7 @@ def _evaluate_segment(
         )
     first_bin, n_bins = detected.first_bin, detected.n_bins
     n_exempt, leakage = detected.n_exempt, detected.leakage
+    raised_bin_probability_max = detected.raised_bin_probability_max
     if image_gain > 0.0:
         n_exempt = clear_image_exemptions(
             span.magnitude[:n_bins],
@@ -1333,9 +1354,11 @@ def _evaluate_segment(
                 speckle_rates,
             )
         else:
-            leakage = false_peak_probability_of_bins(
+            probability = false_peak_probability_of_bins(
                 n_bins, inputs, negligible_signal_ratio, span, crossing_series
             )
+            leakage = probability.leakage
+            raised_bin_probability_max = probability.raised_bin_probability_max
             if image_gain > 0.0 and rule.neighbour_crossing_quadrature.sine.size > 0:
                 leakage = any_crossing_probability_in_chain(
                     span.crossing_probability, n_bins, rule.neighbour_crossing_quadrature
@@ -1346,6 +1369,7 @@ def _evaluate_segment(
     spans.peak_index[s, i], spans.n_exempt[s, i] = detected.peak_index, n_exempt
     spans.peak_magnitude[s, i] = span.magnitude[detected.peak_index]
     spans.leakage[s, i] = leakage
+    spans.raised_bin_probability_max[s, i] = raised_bin_probability_max
     return next_start
 
 
