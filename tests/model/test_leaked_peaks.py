@@ -20,6 +20,7 @@ from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.effects.circulator_leak import ISOLATION_PATH, LEAK_LENGTH_PATH
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.pointcloud import leaked_peaks as leaked
+from sweep.model.pointcloud import returns
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
@@ -326,6 +327,29 @@ def _faint_shots(table_4_1, power, record="real"):
     return prepare_single_category(
         PARAMETER_DEFAULTS | law | further_parameters, (*DEFAULT_EFFECTS, "fading")
     )
+
+
+@pytest.mark.parametrize(
+    "scene", ["strong ground and a dim roof", "near ground", "skirts of an uneven chirp"]
+)
+def test_segments_without_a_raised_bin_need_no_list_of_bins(scene, table_4_1, monkeypatch):
+    find, marked = leaked.find_segments_with_raised_bins, []
+
+    def record_marked(*arguments):
+        marked.append(find(*arguments))
+        return marked[-1]
+
+    monkeypatch.setattr(returns, "find_segments_with_raised_bins", record_marked)
+    clouds = [_flown(table_4_1, "probabilities", scene, draws=1, first=n)[0] for n in range(60)]
+    is_marked = np.concatenate(marked)
+    assert 0.05 < is_marked.mean() < 0.95
+    monkeypatch.setattr(
+        returns, "find_segments_with_raised_bins", lambda groups, points, keys, *_: keys[:, :1] >= 0
+    )
+    for n, cloud in enumerate(clouds):
+        with_all_bins, _ = _flown(table_4_1, "probabilities", scene, draws=1, first=n)
+        for name, values in cloud.items():
+            np.testing.assert_array_equal(values, with_all_bins[name], err_msg=name)
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
