@@ -16,7 +16,7 @@ import numpy as np
 from sweep.model import waveform
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.link_budget import PROCESSING_PREFIX, LinkBudget
-from sweep.model.spectrum.search_band import search_band_start_and_size
+from sweep.model.spectrum.search_band import SearchBand, search_band_of_points
 
 if TYPE_CHECKING:
     from sweep.model.detection.echo_detection import SegmentCorrelations
@@ -92,10 +92,8 @@ class DetectionSettings(NamedTuple):
     """Bins that count for false alarms: ``half``, those of a real spectrum, or ``all`` N bins of
     the FFT.
     """
-    search_band: np.ndarray | None = None
-    """(3, 2, n) int64: first bin and number of bins of the search band, by segment. It is None if
-    all bins are searched.
-    """
+    search_band: SearchBand | None = None
+    """Bins that are searched, (3, n) by segment. It is None if all bins are searched."""
     includes_leakage: bool = False
     """True if the echo's signal far from its lines (leakage) can raise false alarms."""
 
@@ -119,9 +117,7 @@ class DetectionSettings(NamedTuple):
             two_beat_assumption=str(parameters[waveform.TWO_BEAT_ASSUMPTION_PATH]),
             noise_bin_model=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
             counted_bins_rule=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
-            search_band=search_band_start_and_size(
-                parameters, budget.waveform, budget.record, n_points
-            ),
+            search_band=search_band_of_points(parameters, budget.waveform, budget.record, n_points),
         )
 
 

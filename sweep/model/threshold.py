@@ -24,7 +24,7 @@ import numpy as np
 from sweep.model.detection.bin_noise import SearchedBins
 from sweep.model.detection.looks import Looks, solve_threshold_ratio
 from sweep.model.shot_settings import PROCESSING_PREFIX, RecordSettings, WaveformSettings
-from sweep.model.spectrum.search_band import search_band_start_and_size
+from sweep.model.spectrum.search_band import search_band_of_points
 from sweep.model.waveform import SEGMENT_NAMES
 
 (
@@ -175,5 +175,5 @@ def _searched_bins(parameters: Mapping[str, Any]) -> SearchedBins:
         record,
         noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
         bins_counted=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
-        search_band=search_band_start_and_size(parameters, waveform, record),
+        search_band=search_band_of_points(parameters, waveform, record),
     )

@@ -19,7 +19,8 @@ from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.pointcloud.bin_groups import GroupBinIndices, _list_strongest_groups
 from sweep.model.pointcloud.eyepoints import HIT_RANGE_MIN, prepare_eyepoint_shots
 from sweep.model.preparation import require_finite
-from sweep.model.spectrum.search_restriction import SearchBand, _mark_searched_echoes
+from sweep.model.spectrum.search_band import SearchBand
+from sweep.model.spectrum.search_restriction import _mark_searched_echoes
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.scenes.meshes import clean_mesh
 

@@ -20,7 +20,7 @@ from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.model.pointcloud.returns import draw_false_peak_bin, draw_returns
 from sweep.model.sampling.samplers import simulate_draws
-from sweep.model.spectrum.search_band import search_band_start_and_size
+from sweep.model.spectrum.search_band import search_band_of_points
 from sweep.model.threshold import DESIGN_PFA_SEGMENT_PATH, DESIGN_PFA_SHOT_PATH, TNR_PATH
 from sweep.model.waveform import SEARCH_BAND_PATHS
 from sweep.model.window import window_samples
@@ -53,11 +53,9 @@ def test_bins_are_those_nearest_to_any_beat(table_4_1, near, deep, slow, spread,
     # Twice as close as bins, in range and in velocity; from edge to edge.
     far, fast = np.linspace(near, near + deep, 6000), np.linspace(slow, slow + spread, 2000)
     beta, budget = 2 * fast / 299792458, LinkBudget(scene)
-    for band, sign, extra in zip(
-        search_band_start_and_size(scene, budget.waveform, budget.record),
-        (1, 0, -1),
-        (0, 0, 1e9),
-        strict=True,
+    searched = search_band_of_points(scene, budget.waveform, budget.record)
+    for first_bin, n_bins, sign, extra in zip(
+        searched.first_bin, searched.n_bins, (1, 0, -1), (0, 0, 1e9), strict=True
     ):
         carrier = 299792458 / 1550e-9 + extra
         beats = [
@@ -69,11 +67,11 @@ def test_bins_are_those_nearest_to_any_beat(table_4_1, near, deep, slow, spread,
         turns = np.array(place) / SIZE
         turns = turns - np.rint(turns)
         expected = np.unique(np.floor((turns if record == "complex" else abs(turns)) * SIZE + 0.5))
-        bins = band[0] + np.arange(band[1])
+        bins = first_bin + np.arange(n_bins)
         if record == "complex":
             bins, expected = bins % SIZE, expected % SIZE
         assert np.array_equal(np.unique(bins), np.unique(expected))
-        assert np.unique(bins).size == band[1]
+        assert np.unique(bins).size == n_bins
 
 
 def noisy_spectra(shots, segment, rng):
@@ -101,7 +99,8 @@ def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table
     end = 220.0 + offset * metre
     scene = scene_of(table_4_1, (end - 60 * metre, end, 3.0, 3.0), record)
     shots, outputs = prepare_single_category(scene), evaluate(scene)
-    first, number = shots.detection_settings.search_band[0, :, 0]
+    band = shots.detection_settings.search_band
+    first, number = band.first_bin[0, 0], band.n_bins[0, 0]
     inside = np.isin(place % SIZE, (first + np.arange(number)) % SIZE)
     assert inside == (offset >= 0) and abs(number - 61) <= 1
     magnitude = noisy_spectra(shots, 0, np.random.default_rng(50 + offset))

@@ -63,9 +63,9 @@ def reported(shots, segment, echo, rng):
     if not shots.complex_record:
         first = bin_noise.first_circular_bin(shots.window, SIZE)
         searched = (bins >= first) & (bins <= SIZE // 2 - first)
-    if shots.detection_settings.search_band is not None:
-        first, number = shots.detection_settings.search_band[segment, :, 0]
-        searched &= (bins - first) % SIZE < number
+    band = shots.detection_settings.search_band
+    if band is not None:
+        searched &= (bins - band.first_bin[segment, 0]) % SIZE < band.n_bins[segment, 0]
     if shots.detection_settings.echo_bin_rule == "peak_bin":
         echo_magnitude = magnitude[:, int(np.rint(place)) % SIZE]
     else:

@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 
 from sweep.model.detection.looks import SINGLE_LOOK, Looks
 from sweep.model.shot_settings import RecordSettings
-from sweep.model.spectrum.search_band import n_alarm_bins
+from sweep.model.spectrum.search_band import SearchBand, n_alarm_bins
 from sweep.model.window import Window, centred_transform, window_samples
 
 CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX = 0.01
@@ -191,7 +191,7 @@ class SearchedBins(NamedTuple):
         *,
         noise_bins: str,
         bins_counted: str,
-        search_band: np.ndarray | None,
+        search_band: SearchBand | None,
     ) -> "SearchedBins":
         """Return the searched bins of a record's spectra.
 
@@ -204,8 +204,8 @@ class SearchedBins(NamedTuple):
         bins_counted : str
             ``half``, the bins of a real spectrum, or ``all`` N bins of the FFT. A search band has
             its own bins in either case.
-        search_band : ndarray (3, 2, ...) or None
-            Result of :func:`sweep.model.spectrum.search_band.search_band_start_and_size`.
+        search_band : SearchBand or None
+            Searched bins of each segment; None if all bins are searched.
 
         Examples
         --------
@@ -225,7 +225,7 @@ class SearchedBins(NamedTuple):
         first_bin = first_circular_bin(record.window, fft_size) if has_real_ends else 1
         n_bins: float | np.ndarray
         if search_band is not None:
-            n_bins = n_alarm_bins(search_band, fft_size, first_bin, is_signed=record.is_complex)
+            n_bins = n_alarm_bins(search_band, fft_size, first_bin)
         elif record.is_complex or bins_counted == "all":
             n_bins = float(fft_size)
         elif has_real_ends:

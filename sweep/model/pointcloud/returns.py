@@ -953,16 +953,14 @@ def _searched_bins(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
     first_bins[:], last_bins[:] = (
         (0, shots.fft_size - 1) if shots.complex_record else (first_searched, last_searched)
     )
-    if shots.detection_settings.search_band is not None:
-        first, number = (
-            shots.detection_settings.search_band[:, 0].T,
-            shots.detection_settings.search_band[:, 1].T,
-        )
+    band = shots.detection_settings.search_band
+    if band is not None:
+        band_first_bin, band_last_bin = band.first_bin.T, (band.first_bin + band.n_bins - 1).T
         if shots.complex_record:
-            first_bins[:], last_bins[:] = first, first + number - 1
+            first_bins[:], last_bins[:] = band_first_bin, band_last_bin
         else:
-            first_bins[:] = np.maximum(first, first_searched)
-            last_bins[:] = np.minimum(first + number - 1, nyquist_bin - first_searched)
+            first_bins[:] = np.maximum(band_first_bin, first_searched)
+            last_bins[:] = np.minimum(band_last_bin, nyquist_bin - first_searched)
     return first_bins, last_bins
 
 

@@ -13,7 +13,7 @@ searched bins is leakage.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,13 +28,43 @@ from sweep.model.waveform import (
 )
 
 
-def search_band_start_and_size(
+class SearchBand(NamedTuple):
+    """Bins that are searched for echoes, by segment and point: (3, n) arrays.
+
+    Compiled functions take the band of one segment of one point, of which all fields are scalars.
+    """
+
+    first_bin: Any
+    """(3, n) int64: number of the first searched bin, 0 .. N/2, or -N/2 .. N/2 - 1 of a complex
+    record. N is the FFT size."""
+    n_bins: Any
+    """(3, n) int64: number of searched bins."""
+    period_bins: int
+    """FFT size N of a complex record, whose spectrum is periodic; 0 of a real record."""
+
+    def select_points(self, point_indices: np.ndarray) -> "SearchBand":
+        """Return the band of some points (m,), in arrays (3, m) in C order."""
+        first_bin, n_bins = (
+            np.ascontiguousarray(values[:, point_indices])
+            for values in (self.first_bin, self.n_bins)
+        )
+        return SearchBand(first_bin, n_bins, self.period_bins)
+
+    def contains(self, bins: np.ndarray) -> np.ndarray:
+        """Return whether bins, whose numbers broadcast against the fields, are searched."""
+        distance = bins - self.first_bin
+        if self.period_bins:
+            distance %= self.period_bins
+        return np.asarray((distance >= 0) & (distance < self.n_bins))
+
+
+def search_band_of_points(
     parameters: Mapping[str, Any],
     waveform: WaveformSettings,
     record: RecordSettings,
     n_points: int | None = None,
-) -> np.ndarray | None:
-    """Return the first bin and the number of bins that are searched, or None if all bins are.
+) -> SearchBand | None:
+    """Return the bins that are searched at each point, or None if all bins are.
 
     Parameters
     ----------
@@ -49,9 +79,8 @@ def search_band_start_and_size(
 
     Returns
     -------
-    numpy.ndarray
-        (3, 2, n_points) int64: by segment (up, Doppler, down), first bin and number of bins. Bins
-        are 0 .. N/2, or -N/2 .. N/2 - 1 of a complex record. Without ``n_points``, the last
+    SearchBand or None
+        (3, n_points) in each array, by segment (up, Doppler, down). Without ``n_points``, the last
         dimensions are those of the parameters.
     """
     if SEARCH_RANGE_LIMIT_PATHS[0] not in parameters:
@@ -70,33 +99,42 @@ def search_band_start_and_size(
         for velocity_path in SEARCH_VELOCITY_LIMIT_PATHS
     ]
     beats_by_segment = np.split(np.array(np.broadcast_arrays(*beats)), len(SEGMENT_NAMES))
-    band_bins = np.array(
-        [
-            _bins_of_beat_interval(
-                corner_beats.min(axis=0), corner_beats.max(axis=0), record.fft_size,
-                record.is_complex,
-            )
-            for corner_beats in beats_by_segment
-        ]
-    )  # fmt: skip
-    return band_bins if n_points is None else np.broadcast_to(band_bins.T, (n_points, 2, 3)).T
+    band_by_segment = [
+        _bins_of_beat_interval(
+            corner_beats.min(axis=0), corner_beats.max(axis=0), record.fft_size, record.is_complex
+        )
+        for corner_beats in beats_by_segment
+    ]
+    first_bin, n_bins = (
+        np.array(values, np.int64)
+        for values in (
+            [band.first_bin for band in band_by_segment],
+            [band.n_bins for band in band_by_segment],
+        )
+    )
+    if n_points is not None:
+        first_bin, n_bins = (
+            np.broadcast_to(values.T, (n_points, len(SEGMENT_NAMES))).T
+            for values in (first_bin, n_bins)
+        )
+    return SearchBand(first_bin, n_bins, record.fft_size if record.is_complex else 0)
 
 
 def _bins_of_beat_interval(
-    beat_min: np.ndarray, beat_max: np.ndarray, fft_size: int, is_signed: bool
-) -> np.ndarray:
-    """Return the first bin and the number of bins nearest to beats in an interval, (2, ...).
+    beat_min: np.ndarray, beat_max: np.ndarray, fft_size: int, is_complex: bool
+) -> SearchBand:
+    """Return the bins nearest to beats in an interval, as whole floating-point numbers.
 
-    The interval is ``beat_min`` to ``beat_max`` [bins]. ``is_signed`` is true for complex records,
+    The interval is ``beat_min`` to ``beat_max`` [bins]. ``is_complex`` is true for complex records,
     whose bins have signed frequencies.
     """
-    if is_signed:
+    if is_complex:
         first_bin, last_bin = np.floor(beat_min + 0.5), np.floor(beat_max + 0.5)
         first_bin, n_bins = (
             (first_bin + fft_size // 2) % fft_size - fft_size // 2,
             np.minimum(last_bin - first_bin + 1, fft_size),
         )
-        return np.array([first_bin, n_bins], np.int64)
+        return SearchBand(first_bin, n_bins, fft_size)
     folded_ends = fold_frequency(np.array([beat_min, beat_max]), np.asarray(float(fft_size)))
     bin_min = np.where(
         np.floor(beat_max / fft_size) * fft_size >= beat_min, 0.0, folded_ends.min(axis=0)
@@ -106,35 +144,32 @@ def _bins_of_beat_interval(
     first_bin, last_bin = (
         np.minimum(np.floor(value + 0.5), fft_size // 2) for value in (bin_min, bin_max)
     )
-    return np.array([first_bin, last_bin - first_bin + 1], np.int64)
+    return SearchBand(first_bin, last_bin - first_bin + 1, 0)
 
 
-def n_alarm_bins(
-    band_bins: np.ndarray, fft_size: int, first_alarm_bin: int, *, is_signed: bool
-) -> np.ndarray:
+def n_alarm_bins(search_band: SearchBand, fft_size: int, first_alarm_bin: int) -> np.ndarray:
     """Return the number of bins of a search band that may raise a false alarm, by segment.
 
     Parameters
     ----------
-    band_bins : ndarray (3, 2, ...) int64
-        First bin and number of bins of each segment (:func:`search_band_start_and_size`).
+    search_band : SearchBand
+        Searched bins of each segment.
     fft_size : int
         FFT size.
     first_alarm_bin : int
         Distance from DC and from Nyquist from which on bins of a real record raise alarms [bins].
-    is_signed : bool
-        True for complex records, in which all bins may raise alarms.
+        All bins of a complex record may raise alarms.
 
     Returns
     -------
     ndarray (3, ...)
         Number of bins, 0 or more.
     """
-    if is_signed:
-        return band_bins[:, 1].astype(float)
-    first_bin, last_bin = (
-        np.maximum(band_bins[:, 0], first_alarm_bin),
-        np.minimum(band_bins.sum(axis=1) - 1, fft_size // 2 - first_alarm_bin),
+    if search_band.period_bins:
+        return np.asarray(search_band.n_bins.astype(float))
+    first_bin = np.maximum(search_band.first_bin, first_alarm_bin)
+    last_bin = np.minimum(
+        search_band.first_bin + search_band.n_bins - 1, fft_size // 2 - first_alarm_bin
     )
     return np.maximum(last_bin - first_bin + 1.0, 0.0)
 
@@ -156,10 +191,10 @@ def is_searched(shots: Any, segment: int, point: int, bins: ArrayLike) -> np.nda
     ndarray of bool
         True for searched bins. Without a search band all bins are searched.
     """
-    if shots.detection_settings.search_band is None:
+    band = shots.detection_settings.search_band
+    if band is None:
         return np.ones(np.shape(bins), bool)
-    first_bin, n_bins = shots.detection_settings.search_band[segment, :, point]
-    distance = np.asarray(bins) - first_bin
-    if shots.complex_record:
-        distance %= shots.fft_size
-    return np.asarray((distance >= 0) & (distance < n_bins))
+    point_band = SearchBand(
+        band.first_bin[segment, point], band.n_bins[segment, point], band.period_bins
+    )
+    return point_band.contains(np.asarray(bins))

@@ -5,7 +5,7 @@ the band.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,18 +22,7 @@ from sweep.model.detection.echo_detection import (
     echo_half_width,
 )
 from sweep.model.detection.marcum import marcum_q1_excess
-
-
-class SearchBand(NamedTuple):
-    """Bins that are searched for echoes: scalars for one segment, or arrays (segments, m)."""
-
-    first_bin: Any
-    """FFT bin number of the first searched bin: 0 .. N/2, or -N/2 .. N/2 - 1 of a complex record.
-    """
-    n_bins: Any
-    """Number of searched bins."""
-    period_bins: int
-    """FFT size N of a complex record, whose spectrum is periodic; 0 of a real record."""
+from sweep.model.spectrum.search_band import SearchBand
 
 
 def restrict_to_band(shots: Any, spans: Any) -> Any:
@@ -71,14 +60,8 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
         )
     )
     leakage = np.array(spans.leakage)
-    period_bins = shots.fft_size if shots.complex_record else 0
-    band_first_bin, band_n_bins = (
-        np.ascontiguousarray(shots.detection_settings.search_band[:, row][:, points])
-        for row in range(2)
-    )
-    peak_distance = spans.first_bin + spans.peak_index - band_first_bin
-    peak_distance = peak_distance % period_bins if period_bins else peak_distance
-    peak_is_searched = (spans.n_bins == 0) | ((peak_distance >= 0) & (peak_distance < band_n_bins))
+    bands = shots.detection_settings.search_band.select_points(points)
+    peak_is_searched = (spans.n_bins == 0) | bands.contains(spans.first_bin + spans.peak_index)
     line_positions = (
         np.empty((points.size, 3, 0))
         if peak_is_searched.all()
@@ -92,7 +75,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     )
     _restrict_spans(
         EchoSpans(first_bin, n_bins, peak_index, span_start, spans.magnitudes, spans.is_exempt),
-        SearchBand(band_first_bin, band_n_bins, period_bins),
+        bands,
         peak_is_searched,
         line_positions,
         shots.bin_thresholds.select(points),
