@@ -394,13 +394,13 @@ def fit_range_velocity_to_peaks(
     point_indices : ndarray (m,) or slice
         Points to which the columns belong.
     """
-    carriers, chirp_rates = shots.beat_coefficients
+    coefficients = shots.beat_coefficients.select_points(point_indices)
     sample_rate = np.broadcast_to(shots.sample_rate, (shots.size,))[point_indices]
     return waveform.fit_range_velocity(
         peak_frequencies,
         weights=weights,
-        carriers=carriers[:, point_indices],
-        chirp_rates=chirp_rates[:, point_indices],
+        carriers=coefficients.carrier,
+        chirp_rates=coefficients.chirp_rate,
         sample_rate=sample_rate,
         bin_width=sample_rate / shots.fft_size,
         has_signs=shots.complex_record,

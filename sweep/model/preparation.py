@@ -88,6 +88,22 @@ class _PedestalShapes(NamedTuple):
     rate]."""
 
 
+class BeatCoefficients(NamedTuple):
+    """Coefficients of the linear equation of n points' beats, (3, n) each, by segment.
+
+    A beat [Hz] is the carrier times the Doppler ratio, minus the chirp rate times the delay 2R/c.
+    """
+
+    carrier: np.ndarray
+    """(3, n): optical frequency of the segment at the time to which the beat refers [Hz]."""
+    chirp_rate: np.ndarray
+    """(3, n): signed chirp rate of the segment [Hz/s]."""
+
+    def select_points(self, point_indices: np.ndarray | slice) -> "BeatCoefficients":
+        """Return the coefficients of some points, (m,) indices or a slice."""
+        return BeatCoefficients(self.carrier[:, point_indices], self.chirp_rate[:, point_indices])
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shots:
     """Prepared shots of points of one category: all that their spectra depend on, as records.
@@ -538,13 +554,13 @@ class Shots:
         )
 
     @property
-    def beat_coefficients(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies [Hz] and chirp rates [Hz/s] of the beats' linear equation, (3, n) each.
+    def beat_coefficients(self) -> BeatCoefficients:
+        """Coefficients of the linear equation of the beats.
 
-        A beat is the frequency times the Doppler ratio, minus the chirp rate times the delay 2R/c.
-        Both refer to the shot's start and to a target at constant speed. The phase is quadratic in
-        the delay, so that a beat at the time t in a segment depends on the delay at 2 t. The time
-        from a segment's start to the middle of its record therefore counts twice.
+        Delay and Doppler ratio are those at the shot's start, of a target at constant speed. The
+        phase is quadratic in the delay, so that a beat at the time t in a segment depends on the
+        delay at 2 t. The time from a segment's start to the middle of its record therefore counts
+        twice.
         """
         starts, chirp_rate_ratios, carriers, walk_time, chirp_rate = (
             np.array([np.broadcast_to(v, self.size) for v in values])
@@ -557,9 +573,9 @@ class Shots:
             )
         )
         delay_times = starts + walk_time - (starts[0] + starts[2]) / 2
-        return (
-            carriers + chirp_rate_ratios * chirp_rate * delay_times,
-            chirp_rate_ratios * chirp_rate,
+        return BeatCoefficients(
+            carrier=carriers + chirp_rate_ratios * chirp_rate * delay_times,
+            chirp_rate=chirp_rate_ratios * chirp_rate,
         )
 
     def split_by_look(self) -> "list[Shots]":

@@ -1336,7 +1336,7 @@ def _response_to_motion(
     The first shifts are by an acceleration of 1 m/s^2, the second by a slip of 1 m/s. The slip is
     the radial velocity minus the speed at which the range falls.
     """
-    carriers, chirp_rates = shots.beat_coefficients
+    coefficients = shots.beat_coefficients
     by_acceleration, by_slip = _beat_change_by_motion(shots)
     point = listed_returns.point
     point_index: np.ndarray | slice = point
@@ -1344,10 +1344,11 @@ def _response_to_motion(
         shots.waveform.chirp_rate_ratios == waveform.DEFAULT_CHIRP_RATE_RATIOS
     ):  # half sum and half difference of up and down beat, which all returns of a point share
         point_index = slice(None)
-        weights = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates
+        weights = np.array([[1.0], [0.0], [1.0]]) + 0 * coefficients.chirp_rate
     else:
         peak_errors = listed_returns.peaks.position_error.T
         weights = np.where(np.isfinite(peak_errors), 1 / peak_errors**2, 0.0)
+    coefficients = coefficients.select_points(point_index)
     per_acceleration, per_slip = (
         ShiftsByMotion(
             *(
@@ -1355,8 +1356,8 @@ def _response_to_motion(
                 for responses in waveform.range_velocity_response(
                     beats[:, point_index],
                     weights=weights,
-                    carriers=carriers[:, point_index],
-                    chirp_rates=chirp_rates[:, point_index],
+                    carriers=coefficients.carrier,
+                    chirp_rates=coefficients.chirp_rate,
                 )
             )
         )
@@ -1370,7 +1371,7 @@ def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
 
     The slip is the radial velocity minus the speed at which the range falls.
     """
-    _, chirp_rates = shots.beat_coefficients
+    chirp_rates = shots.beat_coefficients.chirp_rate
     starts = np.array([np.broadcast_to(start, shots.size) for start in shots.motion.segment_starts])
     middle_time = shots.record_middle_time
     two_over_c = 2 / SPEED_OF_LIGHT
@@ -1549,7 +1550,7 @@ def _add_wander_covariance(
 
     ``beat_covariance`` (m, 3, 3) [Hz^2] is the covariance of the beats by speckle.
     """
-    carriers, chirp_rates = shots.beat_coefficients
+    coefficients = shots.beat_coefficients.select_points(point_index)
     responses = []
     for unit in np.eye(3):
         beats = unit[:, None] + np.zeros(point_index.size)
@@ -1557,8 +1558,8 @@ def _add_wander_covariance(
             waveform.range_velocity_response(
                 beats,
                 weights=weights,
-                carriers=carriers[:, point_index],
-                chirp_rates=chirp_rates[:, point_index],
+                carriers=coefficients.carrier,
+                chirp_rates=coefficients.chirp_rate,
             )
         )
     response_by_beat = np.array(responses)  # (beat, range or velocity, return)

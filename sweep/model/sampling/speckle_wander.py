@@ -64,11 +64,11 @@ def range_velocity_wander_variance(
             True,
         ]
     )
-    carriers, chirp_rates = (values[:, point_indices] for values in shots.beat_coefficients)
+    coefficients = shots.beat_coefficients.select_points(point_indices)
     response_arguments = {
         "weights": 1.0 * (is_detected & is_resolved[:, None]),
-        "carriers": carriers,
-        "chirp_rates": chirp_rates,
+        "carriers": coefficients.carrier,
+        "chirp_rates": coefficients.chirp_rate,
     }
     bin_width = np.broadcast_to(shots.sample_rate, shots.size)[point_indices] / shots.fft_size
     response_per_bin = np.array(
