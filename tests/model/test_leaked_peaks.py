@@ -301,7 +301,10 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     bins = leaks.permanent_line_bins[
         leaks.permanent_line_begin[0, 0] : leaks.permanent_line_end[0, 0]
     ]
-    one, other = scale / shots.bin_noise_sigma[0] * line.transforms[:, bins]
+    one, other = (
+        scale / shots.bin_noise_sigma[0] * transform[bins]
+        for transform in (line.transform, line.image_transform)
+    )
     turn = np.exp(2j * np.pi * random.random(draws))[:, None]
     noise = random.standard_normal((draws, 2 * bins.size)).view(complex)
     places, _ = _largest(bins, np.abs(one * turn + other * turn.conj() + noise), level)

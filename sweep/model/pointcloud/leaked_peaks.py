@@ -850,8 +850,13 @@ def _remove_bins_masked_by_leaked_light(
             ]
             raised_bins.append(np.flatnonzero(may_raise))
             masked_bins.append(np.flatnonzero(is_masked))
-            term, image_term = (line_scale / deviation) * line.transforms[:, raised_bins[-1]]
-            line_amplitudes.append(np.abs(term * phase_factors + image_term * phase_factors.conj()))
+            line_term, image_term = (
+                (line_scale / deviation) * transform[raised_bins[-1]]
+                for transform in (line.transform, line.image_transform)
+            )
+            line_amplitudes.append(
+                np.abs(line_term * phase_factors + image_term * phase_factors.conj())
+            )
             n_kept[j, s] = is_kept[leaked].sum()
             n_raised[j, s], n_masked[j, s] = raised_bins[-1].size, masked_bins[-1].size
     kept_end, raised_end, masked_end = (

@@ -44,9 +44,11 @@ class LineTransforms(NamedTuple):
     Bins are 0 .. N/2 of a real record, 0 .. N - 1 of a complex one, N being the FFT size.
     """
 
-    transforms: np.ndarray
-    """(2, bins) complex: transform of the line at its own frequency, and at the negative frequency.
-    """
+    transform: np.ndarray
+    """(bins,) complex: transform of the line at its own frequency."""
+    image_transform: np.ndarray
+    """(bins,) complex: transform of the line's image at the negative frequency; 0 in a complex
+    record."""
     magnitude_max: np.ndarray
     """(bins,): magnitude of the line's spectrum at the phase where it is largest."""
     magnitude_rms: np.ndarray
@@ -71,7 +73,13 @@ def _line_transforms(
         else [spectrum[real_bins], spectrum[-real_bins].conj()]
     )
     transforms = np.array(transform_rows)
-    return LineTransforms(transforms, np.abs(transforms).sum(axis=0), np.hypot(*np.abs(transforms)))
+    magnitudes = np.abs(transforms)
+    return LineTransforms(
+        transform=transforms[0],
+        image_transform=transforms[1],
+        magnitude_max=magnitudes.sum(axis=0),
+        magnitude_rms=np.hypot(*magnitudes),
+    )
 
 
 def line_of_point(
@@ -164,13 +172,14 @@ def line_alarm_probability(
     amplitude_ratio, threshold_ratio : float
         Half of the line's amplitude, and the threshold, over the noise sigma.
     """
-    positive_term, negative_term = amplitude_ratio * line.transforms[:, bins]
+    line_term = amplitude_ratio * line.transform[bins]
+    image_term = amplitude_ratio * line.image_transform[bins]
     phases = np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES  # period of the magnitude
     log_no_alarm = [
         np.log1p(
             -np.minimum(
                 looks.added_crossing_probability(
-                    np.abs(positive_term * phasor + negative_term * phasor.conjugate()),
+                    np.abs(line_term * phasor + image_term * phasor.conjugate()),
                     threshold_ratio,
                 ),
                 1.0,
