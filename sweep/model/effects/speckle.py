@@ -561,10 +561,14 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
     else:
         row, offset, doppler, echo = ground.beamlets
         moments = _moments_about_surface_means(
-            echo, np.array([doppler, offset]), ground.is_on_other_surface, row
+            power=echo,
+            doppler_ratio=doppler,
+            relative_range=offset,
+            is_on_other_surface=ground.is_on_other_surface,
+            row_of_point=row,
         )
         beam_gradients = _ray_traced_gradients(moments)
-        variance_across = moments.covariance[0, 0] - beam_gradients.doppler_ratio**2
+        variance_across = moments.doppler_ratio_variance - beam_gradients.doppler_ratio**2
         doppler_across = np.sqrt(np.maximum(variance_across, 0.0))
     bin_width = shots.record.bin_width
     line_shift = np.zeros((3, 2, shots.size))
@@ -751,6 +755,21 @@ class BeamletMoments(NamedTuple):
     """(2, 2, n): covariance matrix of the Doppler ratio and the relative range, about the mean of
     each surface."""
 
+    @property
+    def doppler_ratio_variance(self) -> np.ndarray:
+        """(n,): variance of the Doppler ratio."""
+        return np.asarray(self.covariance[0, 0])
+
+    @property
+    def relative_range_variance(self) -> np.ndarray:
+        """(n,): variance of the relative range."""
+        return np.asarray(self.covariance[1, 1])
+
+    @property
+    def doppler_range_covariance(self) -> np.ndarray:
+        """(n,): covariance of the Doppler ratio with the relative range."""
+        return np.asarray(self.covariance[0, 1])
+
 
 def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     """Return the beamlets' moments of Doppler ratio and relative range.
@@ -758,23 +777,29 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     The covariance is about the mean of each surface. Surfaces at different ranges, such as a roof
     and the ground below, are separate echoes, which fade independently.
     """
-    values = np.array([shots.footprint.doppler_ratio_offset, shots.footprint.relative_range_offset])
     return _moments_about_surface_means(
-        shots.footprint.relative_amplitude**2,
-        values,
-        ground.is_on_other_surface,
-        shots.footprint.row_of_point,
+        power=shots.footprint.relative_amplitude**2,
+        doppler_ratio=shots.footprint.doppler_ratio_offset,
+        relative_range=shots.footprint.relative_range_offset,
+        is_on_other_surface=ground.is_on_other_surface,
+        row_of_point=shots.footprint.row_of_point,
     )
 
 
 def _moments_about_surface_means(
-    power: np.ndarray, values: np.ndarray, is_on_other_surface: np.ndarray | None, row: np.ndarray
+    *,
+    power: np.ndarray,
+    doppler_ratio: np.ndarray,
+    relative_range: np.ndarray,
+    is_on_other_surface: np.ndarray | None,
+    row_of_point: np.ndarray,
 ) -> BeamletMoments:
-    """Return power-weighted moments of values (2, rows, beamlets), for points with the given rows.
+    """Return power-weighted moments of beamlets (rows, beamlets), for points with the given rows.
 
     ``is_on_other_surface`` (rows, beamlets) bool marks beamlets on another surface than the axis's;
     it may be None.
     """
+    values = np.array([doppler_ratio, relative_range])
     power_fraction = power / np.maximum(power.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)[:, None]
     mean = (power_fraction * values).sum(axis=-1)
     centred = values - mean[:, :, None]
@@ -785,7 +810,7 @@ def _moments_about_surface_means(
             surface_mean = (weight * values).sum(axis=-1) / surface_power
             centred = np.where(surface, values - surface_mean[:, :, None], centred)
     covariance = (power_fraction * centred[:, None] * centred[None]).sum(axis=-1)
-    return BeamletMoments(mean[:, row], covariance[:, :, row])
+    return BeamletMoments(mean[:, row_of_point], covariance[:, :, row_of_point])
 
 
 def _phase_moments(
@@ -813,8 +838,10 @@ def _phase_moments(
 
 def _ray_traced_gradients(moments: BeamletMoments) -> BeamGradients:
     """Return the gradients of ray-traced ground in the direction of steepest range, (n,) each."""
-    deviation = np.sqrt(moments.covariance[1, 1])
-    doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _ZERO_DIVISOR_SUBSTITUTE)
+    deviation = np.sqrt(moments.relative_range_variance)
+    doppler_along = moments.doppler_range_covariance / np.maximum(
+        deviation, _ZERO_DIVISOR_SUBSTITUTE
+    )
     return BeamGradients(doppler_along, deviation, np.zeros(deviation.shape))
 
 
