@@ -378,7 +378,7 @@ class Shots:
         from sweep.model.detection.echo_detection import pedestal_reach_bins
 
         line_width_bins = self.laser_line.lorentzian_fwhm * self.fft_size / self.sample_rate
-        delay = np.minimum(2 * self.range / SPEED_OF_LIGHT, self.record.duration)
+        delay = np.minimum(waveform.round_trip_delay(self.range), self.record.duration)
         delay = delay * self.sample_rate / self.fft_size
         power_ratio = self.laser_line.pedestal_variance_beside_line / self.noise_variance
         power_ratio, line_width_bins, delay = broadcast_rows(

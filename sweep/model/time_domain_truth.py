@@ -19,7 +19,7 @@ from sweep.model.detection.detection_probability import pd_and_miss_in_looks
 from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import SegmentResults, allocate_segment_results
-from sweep.model.waveform import TIME_TOLERANCE_SAMPLES
+from sweep.model.waveform import TIME_TOLERANCE_SAMPLES, round_trip_delay
 
 
 def time_domain_spectrum(
@@ -203,7 +203,7 @@ def beamlet_analytic_signal(
     t = float(_value_of_point(shots.record.acquisition_delay, point)) + np.arange(
         shots.window.length
     ) / float(shots.sample_rate[point])
-    start_delay = 2 * (axis_range - range_decrease_since_shot_start + range_offset) / SPEED_OF_LIGHT
+    start_delay = round_trip_delay(axis_range - range_decrease_since_shot_start + range_offset)
     delay_change = -doppler_ratio * t - with_acceleration * alpha * t**2  # tau(t) - tau_0
     chirp_phase = delay_change * (2 * start_delay + delay_change) / 2 - t * (
         start_delay + delay_change

@@ -24,12 +24,14 @@ keep the sign of each beat.
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
+
+_FloatOrArray = TypeVar("_FloatOrArray", float, np.ndarray)
 
 SEGMENT_NAMES = ("up", "doppler", "down")
 """Names of the segments, in the order of the rows of arrays by segment."""
@@ -267,9 +269,20 @@ def beat_frequency(
     f_seg beta - s S (2 R / c) (1 + beta), beta = 2 v_r / c.
     """
     doppler_ratio = 2 * radial_velocity / SPEED_OF_LIGHT
-    return carrier * doppler_ratio - chirp_rate_ratio * chirp_rate * (
-        2 * range / SPEED_OF_LIGHT
-    ) * (1 + doppler_ratio)
+    beat_of_delay = chirp_rate_ratio * chirp_rate * round_trip_delay(range) * (1 + doppler_ratio)
+    return carrier * doppler_ratio - beat_of_delay
+
+
+def round_trip_delay(range: _FloatOrArray) -> _FloatOrArray:
+    """Return the delay 2 R / c [s] of an echo from a range R [m].
+
+    Notes
+    -----
+    The quotient is rounded once. :meth:`WaveformSegment.delay` and
+    :attr:`sweep.model.shot_settings.TargetState.delay` multiply by 2 / c, which is rounded before,
+    and may differ in the last bit.
+    """
+    return 2 * range / SPEED_OF_LIGHT
 
 
 TIME_TOLERANCE_SAMPLES = 1e-6

@@ -15,7 +15,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, EffectContext, Parameter
 from sweep.model.effects.error_bounds import (
     ErrorBound,
@@ -35,6 +34,7 @@ from sweep.model.laser_line import (
 from sweep.model.link_budget import LASER_PREFIX
 from sweep.model.preparation import Shots, window_energy_from_sample
 from sweep.model.unsupported_shot import UnsupportedShotError
+from sweep.model.waveform import round_trip_delay
 from sweep.model.window import zero_first_samples
 
 _LINE_REACH_DEVIATIONS = 6.0
@@ -204,7 +204,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     line_width = np.asarray(context.parameters[_WIDTH_PATH], float)
     if str(context.parameters[_SHAPE_PATH]) == "gaussian":
         return replace(shots, laser_line=LaserLine(gaussian_fwhm=line_width + np.zeros(shots.size)))
-    delay = 2 * shots.range / SPEED_OF_LIGHT
+    delay = round_trip_delay(shots.range)
     line_width = line_width + np.zeros(shots.size)
     timing = {"line_width": line_width, "delay": delay, "duration": shots.record.duration}
     if shots.looks.n_coherent > 1 and np.any(delay > shots.record.duration):

@@ -83,6 +83,7 @@ from sweep.model.effects.sweep_error_table import SweepFrequencyError, fit_sweep
 from sweep.model.preparation import Shots
 from sweep.model.shot_records import PhaseError
 from sweep.model.shot_settings import CHIRP_PREFIX
+from sweep.model.waveform import round_trip_delay
 from sweep.model.window import Window, window_samples
 
 _N_WINDOW_NODES = 256
@@ -586,7 +587,7 @@ def acceleration_phase(
     """
     alpha = _as_column(np.asarray(acceleration) / SPEED_OF_LIGHT)
     beta = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
-    delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT)
+    delay = _as_column(round_trip_delay(np.asarray(range)))
     t = times_in_record(position, start=start, duration=duration)
     chirp_term = -delay + (1 + beta) * t + alpha * t**2 / 2
     signed_chirp_rate = _as_column(sign * np.asarray(chirp_rate))
@@ -735,7 +736,7 @@ def sweep_error_table_phase(
         return np.zeros((np.size(range), np.size(position)))
     t = times_in_record(position, start=start, duration=duration)
     doppler_ratio = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
-    delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT) - doppler_ratio * t
+    delay = _as_column(round_trip_delay(np.asarray(range))) - doppler_ratio * t
     sweep_time = t if sign > 0 else _as_column(chirp_duration) - t  # time in the up-chirp
     return -sign * table.integrate_error(sweep_time - sign * delay, sweep_time)
 
@@ -784,7 +785,7 @@ def chirp_nonlinearity_phase(
         return np.zeros((np.size(range), np.size(position)))
     t = times_in_record(position, start=start, duration=duration)
     doppler_ratio = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
-    delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT)
+    delay = _as_column(round_trip_delay(np.asarray(range)))
     sweep_duration, periods = _as_column(chirp_duration), _as_column(periods)
     u = sign * (2 * t / sweep_duration - 1)
     h = -sign * 2 * (delay - doppler_ratio * t) / sweep_duration

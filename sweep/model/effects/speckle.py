@@ -45,7 +45,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.beam import ARCHITECTURE_PATH
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.speckle_correlation import (
     LINE_SHIFT_MIN_CELLS,
     SEGMENT_PAIRS,
@@ -62,6 +61,7 @@ from sweep.model.effects.requirements import ParameterRequirement, condition_equ
 from sweep.model.ground import BeamGradients, FlatGround, Ground, RayTracedGround
 from sweep.model.preparation import Shots
 from sweep.model.shot_records import EchoSpeckle
+from sweep.model.waveform import round_trip_delay
 
 _ROUGHNESS_PATH = "target.roughness"
 _SPECKLE_PATH = "footprint.speckle"
@@ -349,7 +349,7 @@ def _line_deviation_bins(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
     Bins are those of the FFT.
     """
     bins_per_hertz = shots.fft_size / shots.sample_rate
-    delay = 2 * shots.range / SPEED_OF_LIGHT
+    delay = round_trip_delay(shots.range)
     weights = np.array(
         [
             [
@@ -622,7 +622,7 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
     Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
     echo_frequencies, record_middles = _mid_record_frequencies_and_times(shots)
-    delay = 2 * shots.range / SPEED_OF_LIGHT
+    delay = round_trip_delay(shots.range)
     phase_cycles = [
         frequency * (start + middle)
         for frequency, start, middle in zip(
@@ -644,7 +644,7 @@ def _mid_record_frequencies_and_times(shots: Shots) -> tuple[list[np.ndarray], n
     The time is the centroid of the window over the samples that hold the echo. At this time the
     phase of a bin is that of the line, to first order in their distance.
     """
-    delay = 2 * shots.range / SPEED_OF_LIGHT
+    delay = round_trip_delay(shots.range)
     middle_shift = (
         0.0
         if shots.echo_record.n_samples_before_echo is None

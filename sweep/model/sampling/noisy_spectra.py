@@ -42,7 +42,6 @@ import numpy as np
 from scipy import fft
 
 from sweep.model import waveform
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.detectors import (
     DETECTORS,
     FIXED_THRESHOLD_KIND,
@@ -479,7 +478,7 @@ def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
     """
     return {
         "line_width": _value_at(shots.laser_line.lorentzian_fwhm, point),
-        "delay": 2 * _value_at(shots.range, point) / SPEED_OF_LIGHT,
+        "delay": waveform.round_trip_delay(_value_at(shots.range, point)),
         "duration": _value_at(shots.record.duration, point),
     }
 

@@ -201,13 +201,13 @@ def diagnose_echoes(
     relevant |= {"footprint.beamlets": 1}
     diagnosis = EchoDiagnosis(*np.zeros((2, n_points)), *np.zeros((5, n_points), bool))
     for index, p in split_by_category(relevant):
-        record = LinkBudget(p).record
+        budget = LinkBudget(p)
+        record, delay = budget.record, budget.target.delay
         record_window = record.window
         range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
         first_echo_sample = waveform.count_samples_before_echo(
-            delay=2 / SPEED_OF_LIGHT * range_, doppler_ratio=0.0,
-            record_start=record.acquisition_delay, sample_rate=record.sample_rate,
-            length=record_window.length,
+            delay=delay, doppler_ratio=0.0, record_start=record.acquisition_delay,
+            sample_rate=record.sample_rate, length=record_window.length,
         )  # fmt: skip
         diagnosis.range[index] = range_
         diagnosis.window_fraction_lost[index] = np.where(
@@ -237,7 +237,7 @@ def diagnose_echoes(
             None if footprint is None else footprint.select(index),
         )
         if str(p[LASER_PREFIX + "line_shape"]) == "lorentzian":
-            delay, duration = 2 / SPEED_OF_LIGHT * range_, record.duration
+            duration = record.duration
             variance = 2 * np.pi * p[LASER_PREFIX + "line_width"] * np.minimum(delay, duration)
             diagnosis.has_large_phase_walk[index] = (
                 delay > PHASE_WALK_DELAY_RATIO_MIN * duration
