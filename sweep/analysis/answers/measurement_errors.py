@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-import pandas
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
@@ -17,7 +18,7 @@ from sweep.analysis.answers.dataset_lookup import (
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import estimators
-from sweep.model.detection.looks import COMBINE_COHERENT
+from sweep.model.detection.looks import LOOKS_COMBINE_PATH, LOOKS_NUMBER_PATH, Looks
 from sweep.model.effects.catalogue import (
     EFFECT_NAMES,
     EFFECTS,
@@ -25,38 +26,63 @@ from sweep.model.effects.catalogue import (
     unpack_effect_flags,
 )
 from sweep.model.evaluation import prepare_shots
+from sweep.model.preparation import split_by_category
 from sweep.model.sampling.speckle_wander import mean_range_velocity_wander_variance
+from sweep.model.shot_settings import (
+    CHIRP_PREFIX,
+    LASER_PREFIX,
+    PROCESSING_PREFIX,
+    RECEIVER_PREFIX,
+    LineMotion,
+    RecordSettings,
+    TargetState,
+    WaveformSettings,
+)
 from sweep.model.waveform import SEGMENT_NAMES
 from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
 
-_INSTRUMENT_PATH_PREFIX = "instrument."
-"""Beginning of the dotted paths of all instrument parameters."""
-_PATH_BY_PARAMETER = {
-    "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
-    "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
-    "duration": "chirp.duration", "segments": "chirp.segments", "gap": "chirp.gap",
-    "doppler_slope": "chirp.doppler_slope", "down_slope": "chirp.down_slope",
-    "sample_rate": "processing.sample_rate",
-    "fft_size": "processing.fft_size", "window": "processing.window",
-    "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
-    "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
-}  # fmt: skip
-"""Dotted paths, without `instrument.`, of the parameters on which Cramer-Rao bounds depend."""
+_Flags = TypeVar("_Flags", np.ndarray, xr.DataArray)
+
+_PARAMETER_PATHS = (
+    RECEIVER_PREFIX + "architecture",
+    LASER_PREFIX + "wavelength",
+    LASER_PREFIX + "line_width",
+    LASER_PREFIX + "line_shape",
+    CHIRP_PREFIX + "bandwidth",
+    CHIRP_PREFIX + "start_frequency",
+    CHIRP_PREFIX + "duration",
+    waveform.SEGMENT_ORDER_PATH,
+    waveform.SEGMENT_GAP_PATH,
+    waveform.DOPPLER_CHIRP_RATE_RATIO_PATH,
+    waveform.DOWN_CHIRP_RATE_RATIO_PATH,
+    PROCESSING_PREFIX + "sample_rate",
+    PROCESSING_PREFIX + "fft_size",
+    PROCESSING_PREFIX + "window",
+    PROCESSING_PREFIX + "acquisition_delay",
+    LOOKS_NUMBER_PATH,
+    LOOKS_COMBINE_PATH,
+    "target.range",
+    "target.radial_velocity",
+)
+"""Dotted paths of the parameters on which Cramer-Rao bounds depend."""
 
 _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
 """Names of the effects that are simulated by random draws."""
 
-_GROUPING_PARAMETERS = (
-    "architecture",
-    "segments",
-    "window",
-    "fft_size",
-    "duration",
-    "delay",
-    "sample_rate",
-)
-"""Parameters that are equal at points whose Cramer-Rao bounds are computed together."""
+
+class _LineEffects(NamedTuple):
+    """Flags (n,) of simulated effects on which the bound for a given SNR depends.
+
+    Fields have the names of the effects.
+    """
+
+    range_walk: np.ndarray
+    """True if beats drift within the record."""
+    segment_motion: np.ndarray
+    """True if the target moves between segments."""
+    overlap: np.ndarray
+    """True if echoes lack the samples that precede their arrival."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -111,38 +137,44 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     spec = grid_spec_of_dataset(dataset)
     snr_names = [f"snr_{name}" for name in SEGMENT_NAMES]
     require_variables(dataset, *snr_names, "effects", f"{quantity}_error")
-    parameters = {
-        n: parameter_in_si(dataset, _INSTRUMENT_PATH_PREFIX + p, spec)
-        for n, p in _PATH_BY_PARAMETER.items()
-    }
-    parameters |= {
-        name: parameter_in_si(dataset, f"target.{name}", spec)
-        for name in ("range", "radial_velocity")
-    }
-    effect_by_flag = {"walks": "range_walk", "moves": "segment_motion", "late": "overlap"}
-    for name, effect in effect_by_flag.items():
-        parameters[name] = (dataset["effects"] & (1 << EFFECT_NAMES.index(effect))) > 0
+    parameters = {path: parameter_in_si(dataset, path, spec) for path in _PARAMETER_PATHS}
     snr = [dataset[name] for name in snr_names]
 
     def point_bounds(
-        up: np.ndarray, doppler: np.ndarray, down: np.ndarray, *parameter_values: np.ndarray
+        up: np.ndarray,
+        doppler: np.ndarray,
+        down: np.ndarray,
+        effect_flags: np.ndarray,
+        *parameter_values: np.ndarray,
     ) -> np.ndarray:
+        line_effects = _LineEffects(
+            *(_is_simulated(effect, effect_flags) for effect in _LineEffects._fields)
+        )
         point_parameters = dict(zip(parameters, parameter_values, strict=True))
         quantity_bound: np.ndarray = getattr(
-            _cramer_rao_bounds((up, doppler, down), point_parameters), quantity
+            _cramer_rao_bounds((up, doppler, down), line_effects, point_parameters), quantity
         )
         return quantity_bound
 
     bounds = xr.apply_ufunc(
-        point_bounds, *snr, *parameters.values(), dask="parallelized", output_dtypes=[float]
+        point_bounds,
+        *snr,
+        dataset["effects"],
+        *parameters.values(),
+        dask="parallelized",
+        output_dtypes=[float],
     ).transpose(*snr[0].dims)
     bounds = np.hypot(bounds, _speckle_standard_deviation(dataset, quantity, spec))
-    bin_frequency = parameters["sample_rate"] / parameters["fft_size"]
-    bin_size = (
-        SPEED_OF_LIGHT / 2 * parameters["duration"] / parameters["bandwidth"] * bin_frequency
-        if quantity == "range"
-        else parameters["wavelength"] / 2 * bin_frequency
+    bin_width = (
+        parameters[PROCESSING_PREFIX + "sample_rate"] / (parameters[PROCESSING_PREFIX + "fft_size"])
     )
+    bin_size = (
+        SPEED_OF_LIGHT / 2
+        * parameters[CHIRP_PREFIX + "duration"] / parameters[CHIRP_PREFIX + "bandwidth"]
+        * bin_width
+        if quantity == "range"
+        else parameters[LASER_PREFIX + "wavelength"] / 2 * bin_width
+    )  # fmt: skip
     # Range and velocity are half the sum and half the difference of two peak positions. Each
     # position has a standard deviation of a bin over sqrt(12).
     result = xr.Dataset({
@@ -167,7 +199,7 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
 
     `quantity` is ``range`` or ``radial_velocity``.
     """
-    is_fading = (dataset["effects"] & (1 << EFFECT_NAMES.index("fading"))) > 0
+    is_fading = _is_simulated("fading", dataset["effects"])
     if (
         spec.effect_modes()["fading"] == "off"
         or spec.parameters()["footprint.speckle"] != "developed"
@@ -219,8 +251,13 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
     )
 
 
+def _is_simulated(effect: str, effect_flags: _Flags) -> _Flags:
+    """Return whether an effect is simulated at points with the given flags of effects."""
+    return (effect_flags & (1 << EFFECT_NAMES.index(effect))) > 0
+
+
 def _cramer_rao_bounds(
-    snr: tuple[np.ndarray, ...], parameters: dict[str, np.ndarray]
+    snr: tuple[np.ndarray, ...], effects: _LineEffects, parameters: dict[str, np.ndarray]
 ) -> estimators.RangeVelocityDeviation:
     """Return the Cramer-Rao bounds of range and radial velocity at each point.
 
@@ -228,132 +265,99 @@ def _cramer_rao_bounds(
     ----------
     snr
         Signal-to-noise ratios of the three segments.
+    effects
+        Flags of the simulated effects that change lines.
     parameters
-        SI values at each point of the parameters in `_PATH_BY_PARAMETER` and of the target. Also
-        three flags of simulated effects: ``walks`` (range walk), ``moves`` (motion between
-        segments) and ``late`` (echoes after the start of their record).
+        SI values at each point of the parameters in `_PARAMETER_PATHS`.
     """
-    shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *parameters.values())))
-    flat_parameters = {name: np.broadcast_to(a, shape).ravel() for name, a in parameters.items()}
-    flat_snr = [np.broadcast_to(a, shape).ravel() for a in snr]
-    grouping_frame = pandas.DataFrame(
-        {name: flat_parameters[name] for name in _GROUPING_PARAMETERS}
+    shape = np.broadcast_shapes(
+        *(np.shape(values) for values in (*snr, *effects, *parameters.values()))
     )
-    deviations = np.empty((2, len(grouping_frame)))
-    for rows in grouping_frame.groupby(
-        list(grouping_frame), sort=False, dropna=False
-    ).indices.values():
-        group_parameters = {name: a[rows] for name, a in flat_parameters.items()}
-        deviations[:, rows] = _cramer_rao_bounds_of_group(
-            [s[rows] for s in flat_snr], group_parameters
+    flat_snr, flat_effects, flat_parameters = (
+        [np.broadcast_to(values, shape).ravel() for values in arrays]
+        for arrays in (snr, effects, parameters.values())
+    )
+    deviations = np.empty((2, math.prod(shape)))
+    categories = (
+        split_by_category(dict(zip(parameters, flat_parameters, strict=True)))
+        if deviations.size
+        else ()
+    )
+    for rows, category_parameters in categories:
+        deviations[:, rows] = _cramer_rao_bounds_of_category(
+            [values[rows] for values in flat_snr],
+            _LineEffects(*(flags[rows] for flags in flat_effects)),
+            category_parameters,
         )
     return estimators.RangeVelocityDeviation(*deviations.reshape(2, *shape))
 
 
-def _cramer_rao_bounds_of_group(
-    snr: list[np.ndarray], parameters: dict[str, np.ndarray]
+def _cramer_rao_bounds_of_category(
+    snr: list[np.ndarray], effects: _LineEffects, parameters: dict[str, np.ndarray]
 ) -> estimators.RangeVelocityDeviation:
-    """Return the Cramer-Rao bounds of points that share all parameters in `_GROUPING_PARAMETERS`.
+    """Return the Cramer-Rao bounds of points that share text parameters and sizes.
 
     The CNR of each segment follows from the stored SNR, after removal of the scalloping loss and of
     the loss of a late echo. The CNR gives the bound of the beat frequency, to which the laser's
     phase noise is added in quadrature. The bounds of the three beat frequencies combine to those of
-    range and radial velocity.
+    range and radial velocity. For the scalloping loss the target has a constant speed along the
+    beam: its acceleration and the slip of the beam over sloping ground are neglected.
     """
-    fft_size, sample_rate = int(parameters["fft_size"][0]), float(parameters["sample_rate"][0])
-    record_parameters = {
-        "fft_size": fft_size,
-        "sample_rate": sample_rate,
-        "acquisition_delay": parameters["delay"][0],
-    }
-    record_parameters = {
-        f"instrument.processing.{name}": value for name, value in record_parameters.items()
-    }
-    record_length = int(
-        waveform.n_record_samples(
-            record_parameters | {"instrument.chirp.duration": parameters["duration"][0]}
+    waveform_settings = WaveformSettings.from_parameters(parameters)
+    record = RecordSettings.from_parameters(parameters)
+    looks = Looks.from_parameters(parameters)
+    taper, sample_rate = record.window, record.sample_rate
+    radial_velocity = parameters["target.radial_velocity"]
+    target = TargetState(
+        range=parameters["target.range"],
+        radial_velocity=radial_velocity,
+        acceleration=np.zeros(()),
+        approach_speed=radial_velocity,
+    )
+    motion = LineMotion(
+        segment_starts=tuple(
+            np.where(effects.segment_motion, start, 0.0)
+            for start in waveform_settings.middle_look_starts(looks)
         )
     )
-    taper = get_window(str(parameters["window"][0]), record_length)
-    slopes = (
-        np.ones_like(parameters["down_slope"]),
-        parameters["doppler_slope"],
-        parameters["down_slope"],
+    line_width = (
+        parameters[LASER_PREFIX + "line_width"]
+        if str(parameters[LASER_PREFIX + "line_shape"]) == "lorentzian"
+        else 0.0
     )
-    carriers = waveform.carrier_frequencies(
-        str(parameters["architecture"][0]),
-        wavelength=parameters["wavelength"],
-        start_frequency=parameters["start_frequency"],
-        bandwidth=parameters["bandwidth"],
-        chirp_rate_ratios=slopes,
-    )
-    chirp_rate = parameters["bandwidth"] / parameters["duration"]
+    remaining_sum, relative_width = window_tail_sums_and_widths(taper)
     deviations = []
-    segment_order = waveform.existing_segments(
-        str(parameters["architecture"][0]), str(parameters["segments"][0])
-    )
-    segment_starts = waveform.segment_starts(
-        segment_order, duration=parameters["duration"], gap=parameters["gap"]
-    )
-    middle_look_time = (
-        0.5
-        * (parameters["looks"] - 1)
-        * len(segment_order)
-        * (parameters["duration"] + parameters["gap"])
-    )
-    for segment, slope in enumerate(slopes):
-        carrier, segment_snr = carriers[segment], snr[segment]
-        distance_moved = np.where(
-            parameters["moves"],
-            (segment_starts[segment] + middle_look_time) * parameters["radial_velocity"],
-            0.0,
-        )
+    for segment, segment_snr in zip(waveform_settings.segments(target, motion), snr, strict=True):
         beat_frequency = waveform.beat_frequency(
-            slope,
-            carrier=carrier,
-            chirp_rate=chirp_rate,
-            range=parameters["range"] - distance_moved,
-            radial_velocity=parameters["radial_velocity"],
+            segment.chirp_rate_ratio,
+            carrier=segment.carrier,
+            chirp_rate=waveform_settings.chirp_rate,
+            range=target.range - segment.range_decrease_since_shot_start,
+            radial_velocity=target.radial_velocity,
         )
         # The beat frequency drifts at a rate of 2 s S beta: up to the middle of the record it
         # shifts by the rate times half the record's duration.
-        walk_frequency = (
-            slope
-            * chirp_rate
-            * (2 * parameters["radial_velocity"] / SPEED_OF_LIGHT)
-            * record_length
-            / sample_rate
-        )
+        walk_frequency = segment.chirp_rate * target.doppler_ratio * record.duration
         beat_frequency = np.where(
-            parameters["walks"], beat_frequency + walk_frequency, beat_frequency
+            effects.range_walk, beat_frequency + walk_frequency, beat_frequency
         )
         beat_bin = (
-            waveform.fold_frequency(beat_frequency, parameters["sample_rate"])
-            / sample_rate
-            * fft_size
+            waveform.fold_frequency(beat_frequency, sample_rate) / sample_rate * record.fft_size
         )
-        # Offsets are in bins of fs/L, because a zero-padded FFT has finer bins than the window.
-        missing_samples = waveform.count_samples_before_echo(
-            delay=2 / SPEED_OF_LIGHT * (parameters["range"] - distance_moved),
-            doppler_ratio=0.0,
-            record_start=parameters["delay"],
-            sample_rate=parameters["sample_rate"],
-            length=record_length,
-        )
-        remaining_samples = record_length - np.where(
-            parameters["late"], missing_samples, 0
+        remaining_samples = taper.length - np.where(
+            effects.overlap, record.count_samples_before_echo(segment, target.range), 0
         )  # samples of the record that contain the echo
-        remaining_sum, relative_width = window_tail_sums_and_widths(taper)
+        # Offsets are in bins of fs/L, because a zero-padded FFT has finer bins than the window.
         bin_offset = (
             (beat_bin - np.rint(beat_bin))
             * relative_width[remaining_samples]
-            * record_length
-            / fft_size
+            * taper.length
+            / record.fft_size
         )
         # A late echo fills only a part of the window: its line is lower, while the noise is that
         # of the whole window.
         amplitude_loss = (
-            main_lobe_spline(taper.name, record_length)(np.abs(bin_offset))
+            main_lobe_spline(taper.name, taper.length)(np.abs(bin_offset))
             * remaining_sum[remaining_samples]
         )
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -364,23 +368,25 @@ def _cramer_rao_bounds_of_group(
                 cnr=cnr, n_samples=remaining_samples, sample_rate=sample_rate
             )
         phase_noise_beat_deviation = estimators.phase_noise_beat_deviation(
-            line_width=np.where(
-                parameters["line_shape"] == "lorentzian", parameters["line_width"], 0.0
-            ),
-            delay=2 * parameters["range"] / SPEED_OF_LIGHT,
+            line_width=line_width,
+            delay=waveform.round_trip_delay(target.range),
             duration=np.maximum(remaining_samples, 1) / sample_rate,
         )
         # The stored SNR is that of the coherent sum of looks, or otherwise that of a single look.
-        deviation = deviation / np.sqrt(
-            np.where(parameters["combine"] == COMBINE_COHERENT, 1.0, parameters["looks"])
-        )
-        deviation = np.hypot(deviation, phase_noise_beat_deviation / np.sqrt(parameters["looks"]))
+        deviation = deviation / np.sqrt(looks.number / looks.n_coherent)
+        deviation = np.hypot(deviation, phase_noise_beat_deviation / np.sqrt(looks.number))
         deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
     up, doppler, down = deviations
     resolved = estimators.range_velocity_deviation(
-        up=up, doppler=doppler, down=down, carriers=carriers, chirp_rate=chirp_rate,
-        range=parameters["range"], radial_velocity=parameters["radial_velocity"], slopes=slopes,
-    )  # fmt: skip
+        up=up,
+        doppler=doppler,
+        down=down,
+        carriers=waveform_settings.carriers,
+        chirp_rate=waveform_settings.chirp_rate,
+        range=target.range,
+        radial_velocity=target.radial_velocity,
+        slopes=waveform_settings.chirp_rate_ratios,
+    )
     has_no_echo = np.isnan(snr[0]) | np.isnan(snr[2])
     return estimators.RangeVelocityDeviation(*(np.where(has_no_echo, np.nan, b) for b in resolved))
 
