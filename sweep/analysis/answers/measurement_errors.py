@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -16,7 +16,6 @@ from sweep.analysis.answers.dataset_lookup import (
     require_variables,
 )
 from sweep.model import waveform
-from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import estimators
 from sweep.model.detection.looks import LOOKS_COMBINE_PATH, LOOKS_NUMBER_PATH, Looks
 from sweep.model.effects.catalogue import (
@@ -104,9 +103,11 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
 
     Notes
     -----
-    A peak in a whole bin has a standard deviation of a bin over sqrt(12). The range is half the sum
-    of two peaks, which gives a bin over sqrt(24). Below the threshold, noise is mistaken for
-    signal, and no estimate comes near the bound.
+    A peak in a whole bin has a standard deviation of a bin over sqrt(12). With equal and opposite
+    chirps the range is half the sum of two peaks, which gives a bin over sqrt(24). With other chirp
+    rates it is a fit to all peaks, here of equal weight; weights by power lower the deviation by up
+    to 10 %. Below the threshold, noise is mistaken for signal, and no estimate comes near the
+    bound.
 
     References
     ----------
@@ -146,40 +147,29 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
         down: np.ndarray,
         effect_flags: np.ndarray,
         *parameter_values: np.ndarray,
-    ) -> np.ndarray:
+    ) -> tuple[np.ndarray, np.ndarray]:
         line_effects = _LineEffects(
             *(_is_simulated(effect, effect_flags) for effect in _LineEffects._fields)
         )
         point_parameters = dict(zip(parameters, parameter_values, strict=True))
-        quantity_bound: np.ndarray = getattr(
-            _cramer_rao_bounds((up, doppler, down), line_effects, point_parameters), quantity
-        )
-        return quantity_bound
+        deviations = _point_deviations((up, doppler, down), line_effects, point_parameters)
+        return getattr(deviations.bound, quantity), getattr(deviations.whole_bins, quantity)
 
-    bounds = xr.apply_ufunc(
+    bounds, resolution = xr.apply_ufunc(
         point_bounds,
         *snr,
         dataset["effects"],
         *parameters.values(),
         dask="parallelized",
-        output_dtypes=[float],
-    ).transpose(*snr[0].dims)
-    bounds = np.hypot(bounds, _speckle_standard_deviation(dataset, quantity, spec))
-    bin_width = (
-        parameters[PROCESSING_PREFIX + "sample_rate"] / (parameters[PROCESSING_PREFIX + "fft_size"])
+        output_core_dims=[[], []],
+        output_dtypes=[float, float],
     )
-    bin_size = (
-        SPEED_OF_LIGHT / 2
-        * parameters[CHIRP_PREFIX + "duration"] / parameters[CHIRP_PREFIX + "bandwidth"]
-        * bin_width
-        if quantity == "range"
-        else parameters[LASER_PREFIX + "wavelength"] / 2 * bin_width
-    )  # fmt: skip
-    # Range and velocity are half the sum and half the difference of two peak positions. Each
-    # position has a standard deviation of a bin over sqrt(12).
+    bounds = np.hypot(
+        bounds.transpose(*snr[0].dims), _speckle_standard_deviation(dataset, quantity, spec)
+    )
     result = xr.Dataset({
         "reported": dataset[f"{quantity}_error"],
-        "resolution": bin_size / np.sqrt(24.0) + xr.zeros_like(bounds),
+        "resolution": resolution.transpose(*snr[0].dims),
         "bound": bounds,
     })  # fmt: skip
     units, quantity_words = (
@@ -256,10 +246,19 @@ def _is_simulated(effect: str, effect_flags: _Flags) -> _Flags:
     return (effect_flags & (1 << EFFECT_NAMES.index(effect))) > 0
 
 
-def _cramer_rao_bounds(
+class _PointDeviations(NamedTuple):
+    """Standard deviations of range and radial velocity at points, by their cause."""
+
+    bound: estimators.RangeVelocityDeviation
+    """Cramer-Rao bounds; nan without an echo."""
+    whole_bins: estimators.RangeVelocityDeviation
+    """Deviations of values that are read from whole bins of equal weight."""
+
+
+def _point_deviations(
     snr: tuple[np.ndarray, ...], effects: _LineEffects, parameters: dict[str, np.ndarray]
-) -> estimators.RangeVelocityDeviation:
-    """Return the Cramer-Rao bounds of range and radial velocity at each point.
+) -> _PointDeviations:
+    """Return the Cramer-Rao bounds and the deviations by whole bins at each point.
 
     Parameters
     ----------
@@ -277,25 +276,30 @@ def _cramer_rao_bounds(
         [np.broadcast_to(values, shape).ravel() for values in arrays]
         for arrays in (snr, effects, parameters.values())
     )
-    deviations = np.empty((2, math.prod(shape)))
+    deviations = np.empty((2, 2, math.prod(shape)))
     categories = (
         split_by_category(dict(zip(parameters, flat_parameters, strict=True)))
         if deviations.size
         else ()
     )
     for rows, category_parameters in categories:
-        deviations[:, rows] = _cramer_rao_bounds_of_category(
+        deviations[:, :, rows] = _deviations_of_category(
             [values[rows] for values in flat_snr],
             _LineEffects(*(flags[rows] for flags in flat_effects)),
             category_parameters,
         )
-    return estimators.RangeVelocityDeviation(*deviations.reshape(2, *shape))
+    return _PointDeviations(
+        *(
+            estimators.RangeVelocityDeviation(*by_cause.reshape(2, *shape))
+            for by_cause in deviations
+        )
+    )
 
 
-def _cramer_rao_bounds_of_category(
+def _deviations_of_category(
     snr: list[np.ndarray], effects: _LineEffects, parameters: dict[str, np.ndarray]
-) -> estimators.RangeVelocityDeviation:
-    """Return the Cramer-Rao bounds of points that share text parameters and sizes.
+) -> _PointDeviations:
+    """Return the deviations of points that share text parameters and sizes.
 
     The CNR of each segment follows from the stored SNR, after removal of the scalloping loss and of
     the loss of a late echo. The CNR gives the bound of the beat frequency, to which the laser's
@@ -377,18 +381,28 @@ def _cramer_rao_bounds_of_category(
         deviation = np.hypot(deviation, phase_noise_beat_deviation / np.sqrt(looks.number))
         deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
     up, doppler, down = deviations
-    resolved = estimators.range_velocity_deviation(
-        up=up,
-        doppler=doppler,
-        down=down,
+    resolve = partial(
+        estimators.range_velocity_deviation,
         carriers=waveform_settings.carriers,
         chirp_rate=waveform_settings.chirp_rate,
         range=target.range,
         radial_velocity=target.radial_velocity,
         slopes=waveform_settings.chirp_rate_ratios,
     )
+    bound = resolve(up=up, doppler=doppler, down=down)
+    # A place within a bin is uniform: its standard deviation is a bin over the root of 12.
+    whole_bin_deviation = sample_rate / record.fft_size / np.sqrt(12.0)
+    # Without equal and opposite chirps the Doppler peak takes part in a fit.
+    _, doppler_ratio, down_ratio = waveform_settings.chirp_rate_ratios
+    is_fitted = (np.not_equal(doppler_ratio, 0.0) | np.not_equal(down_ratio, -1.0)) & np.isfinite(
+        doppler
+    )
+    doppler_deviation = np.where(is_fitted, whole_bin_deviation, np.inf)
     has_no_echo = np.isnan(snr[0]) | np.isnan(snr[2])
-    return estimators.RangeVelocityDeviation(*(np.where(has_no_echo, np.nan, b) for b in resolved))
+    return _PointDeviations(
+        estimators.RangeVelocityDeviation(*(np.where(has_no_echo, np.nan, b) for b in bound)),
+        resolve(up=whole_bin_deviation, doppler=doppler_deviation, down=whole_bin_deviation),
+    )
 
 
 @lru_cache(maxsize=8)
