@@ -28,7 +28,8 @@ from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
 from sweep.model.kernel_integers import INTEGER_ZERO, STEP_DOWN, STEP_UP
 
 BINS_PER_BATCH = 256
-"""Number of bins for which one call evaluates the crossing series."""
+"""Largest number of bins for which the crossing series is evaluated at once. The series is the
+probability that leaked signal makes a bin cross the threshold where noise alone does not."""
 
 SERIES_HALF_SQUARED_THRESHOLD_MAX = 450.0
 """Largest y = b^2/2 for which the crossing series is used; b is the threshold over the noise per
@@ -38,12 +39,12 @@ SERIES_TERMS_MAX = 800
 """Size of the array of coefficients of the crossing series, and so the largest number of terms."""
 
 ALL_JOIN_PROBABILITY_MIN = 1e-9
-"""Limit on the probability that all bins from an echo up to some bin cross the threshold. Bins
-beyond hardly ever join the echo and are not counted among those that may."""
+"""Probability that all bins from an echo to a given bin cross the threshold, below which bins
+beyond the given one are taken never to join the echo."""
 
 ECHO_EDGE_NOISE_DEVIATION_MIN = 0.01
-"""Lower limit, in units of the noise per quadrature, of the noise deviation of an echo's outermost
-bin, given that its neighbour crosses. The limit avoids a division by zero."""
+"""Smallest value used for the standard deviation of the noise in an echo's outermost bin, given
+that its neighbour crosses. It avoids a division by zero. The unit is the noise per quadrature."""
 
 _EXPONENTIAL_COEFFICIENTS = tuple((-1) ** n / math.factorial(n) for n in range(12))
 """Taylor coefficients (-1)^n / n! of e^-z, n = 0 .. 11. Their sum errs by 1e-16 for z <= 1/4."""
@@ -91,7 +92,7 @@ def _n_series_terms(x, y):
 
 @njit(cache=True, error_model="numpy")
 def fill_added_crossing_probabilities(half_squares, n_bins, threshold_ratio, series, probabilities):
-    """Fill ``probabilities`` with those that signal makes a bin cross where noise alone does not.
+    """Fill in each bin's probability that its signal makes it cross where noise alone does not.
 
     The probability of a bin is (Q_1(a, b) - e^-y) / (1 - e^-y), 0..1, with Marcum's Q_1.
 
@@ -162,7 +163,8 @@ def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, 
     n_terms
         Number of terms.
     scale, halvings
-        2^-halvings, and halvings: e^-x is computed from e^(-x scale) by repeated squaring.
+        Number of halvings of x, and scale = 2^-halvings. e^(-x scale) is squared ``halvings`` times
+        to give e^-x.
     probabilities
         Result: probability that the signal makes each bin cross the threshold.
     """
@@ -267,9 +269,9 @@ def weighted_crossing_rate(probabilities, weights):
 def echo_edge_crossing_probability(
     edge_ratio, neighbour_ratio, threshold_ratio, sidelobe_neighbour_noise_correlation
 ):
-    """Return the probability that an echo's outermost bin crosses, given that the next bin does.
+    """Return the probability that an echo's outermost bin crosses, given that its neighbour does.
 
-    The next bin is the neighbour outside the echo.
+    The neighbour is the adjacent bin outside the echo.
 
     Parameters
     ----------
@@ -331,10 +333,10 @@ def exclude_crossings_joining_echo(
 ):
     """Remove crossings that join an echo from the bins' crossing probabilities, in place.
 
-    Adjacent bins above the threshold count as one group. A bin next to an echo may thus join the
-    echo's group, and is no false peak then. All bins that may join an echo are replaced by one
-    probability: that they hold a group separate from the echo. It is stored in the bin next to the
-    echo. The probabilities of the others become 0.
+    Adjacent bins above the threshold count as one group. A bin next to an echo that crosses may
+    thus belong to the echo's group, and is then no false peak. For all bins that may join an echo,
+    one probability is stored in the bin next to the echo: that these bins hold a group separate
+    from the echo. Their other elements become 0.
 
     Parameters
     ----------
@@ -396,8 +398,9 @@ def _count_joining_bins(probabilities, first_index, step, n_bins):
     """Return the number of bins next to an echo that may join the echo, 1 .. ``n_bins``.
 
     A bin joins the echo if it crosses the threshold together with all bins between it and the echo.
-    The bins start at ``first_index`` and go on by ``step``, 1 or -1. The count ends where all of
-    them cross with a probability of at most :data:`ALL_JOIN_PROBABILITY_MIN`.
+    The first bin is ``first_index``, and ``step``, 1 or -1, leads to the next one. The count ends
+    at the first bin for which the probability that all bins so far cross is at most
+    :data:`ALL_JOIN_PROBABILITY_MIN`.
     """
     n_joining, p_all_cross = 1, 1.0
     while n_joining < n_bins and p_all_cross > ALL_JOIN_PROBABILITY_MIN:

@@ -37,9 +37,8 @@ from sweep.model.spectrum.search_band import SearchBand, n_alarm_bins
 from sweep.model.window import Window, centred_transform, window_samples
 
 CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX = 0.01
-"""Largest pseudo-variance ratio at which a bin's noise counts as circular. The ratio is the
-difference of a quadrature's variance from the mean of both, over that mean. It is 0 if both
-quadratures have equal variances."""
+"""Largest pseudo-variance ratio at which a bin's noise counts as circular. The ratio is (v1 - v2) /
+(v1 + v2), with the larger variance v1 and the smaller variance v2 of the two quadratures."""
 
 
 @lru_cache(maxsize=64)
@@ -133,10 +132,11 @@ def n_alarm_equivalent_bins(
 def _equivalent_bins_per_bin(
     threshold_ratio: np.ndarray, correlation: float, looks: Looks
 ) -> np.ndarray:
-    """Return the number of independent bins, 0..1, that one more adjacent bin is equivalent to.
+    """Return the number of independent bins, 0..1, that raise alarms as often as one more bin does.
 
-    The number is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and the crossing
-    probability h of a bin whose neighbour does not cross.
+    The added bin is adjacent to those already counted. The number is ln(1 - h) / ln(1 - p), by
+    ``threshold_ratio``. A bin crosses with the probability p, and a bin whose neighbour does not
+    cross with the probability h.
     """
     from sweep.model.detection.marcum import marcum_q1
 
@@ -173,8 +173,9 @@ class SearchedBins(NamedTuple):
     """
 
     n_bins: float | np.ndarray
-    """Number of bins: one number for all segments and points. With a search band it is (segments,
-    n), in the order up, Doppler, down, or (n,) after :meth:`select_segment`."""
+    """Number of bins. Without a search band it is one number for all segments and points. With a
+    search band it is an array (3, n) for the segments up, Doppler, down of n points, or (n,) after
+    :meth:`select_segment`."""
     first_bin: int
     """Distance of the first searched bin from DC and from Nyquist [bins]. It is above 1 in a real
     record whose noise is correlated, since the noise of nearer bins is not circular."""
@@ -182,7 +183,7 @@ class SearchedBins(NamedTuple):
     """Correlation coefficient of the noise of adjacent bins, 0..1; 0 if bins count as
     independent."""
     includes_echo: bool
-    """True if the bins of a detected echo count as well, as in [T]."""
+    """True if noise may raise false alarms in the bins of a detected echo as well, as in [T]."""
 
     @classmethod
     def from_record(
@@ -242,19 +243,19 @@ class SearchedBins(NamedTuple):
         )
 
     def select_segment(self, segment: int) -> "SearchedBins":
-        """Return the bins of one segment, by its index in the order up, Doppler, down."""
+        """Return the searched bins of one segment: 0 up, 1 Doppler, 2 down."""
         if not np.ndim(self.n_bins):
             return self
         return self._replace(n_bins=np.asarray(self.n_bins)[segment])
 
     def select_points(self, point_indices: np.ndarray | slice) -> "SearchedBins":
-        """Return the bins of all segments of some points, (m,) indices or a slice."""
+        """Return the searched bins of the points at the given indices (m,) or slice."""
         if not np.ndim(self.n_bins):
             return self
         return self._replace(n_bins=np.asarray(self.n_bins)[:, point_indices])
 
     def n_bins_outside_echo(self, n_exempt: np.ndarray) -> np.ndarray:
-        """Return the number of bins in which noise may raise false alarms after a detection.
+        """Return the number of bins outside a detected echo in which noise may raise false alarms.
 
         Parameters
         ----------
@@ -271,7 +272,7 @@ class SearchedBins(NamedTuple):
         return np.asarray(np.maximum(self.n_bins - n_exempt, 0.0))
 
     def n_alarm_equivalent_bins(self, threshold_ratio: ArrayLike, looks: Looks) -> np.ndarray:
-        """Return the number of independent bins with these bins' false-alarm probability.
+        """Return the number of independent bins that raise a false alarm as often as these bins.
 
         Parameters
         ----------
@@ -294,7 +295,7 @@ N_NOISE_FILTER_TAPS = 17
 
 @lru_cache(maxsize=16)
 def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights that turn independent normal numbers into the correlated noise of bins.
+    """Return the weights of independent normal numbers whose sums are the noise of adjacent bins.
 
     Parameters
     ----------
@@ -306,10 +307,10 @@ def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray
     Returns
     -------
     weights
-        (n_bins, N_NOISE_FILTER_TAPS): weights of the numbers in each bin. The squares of a bin's
-        weights have the sum 1.
+        (n_bins, N_NOISE_FILTER_TAPS): row k weights successive normal numbers; their weighted sum
+        is the noise of bin k. The squares of a row have the sum 1.
     first_number_index
-        (n_bins,): index of the first number in each bin.
+        (n_bins,): index of the normal number to which the first weight of each row applies.
 
     Notes
     -----

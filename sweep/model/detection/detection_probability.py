@@ -440,15 +440,16 @@ def _joint_pd_in_looks(
 ) -> np.ndarray:
     """Compute :func:`joint_detection_probability` of several looks in speckle.
 
-    ``correlation`` (n,) is the magnitude of the correlation of the two segments' speckle. If the
-    looks are partially correlated, that of the look speckle is used instead.
+    ``correlation`` (n,) is the magnitude of the correlation of the two segments' speckle. It is not
+    used if the speckle of the looks is partially correlated; then ``segment_correlation`` of their
+    :class:`.LookSpeckle` is used.
 
     Notes
     -----
     Far from DC and Nyquist the law is that of
-    :meth:`sweep.model.detection.looks.Looks.joint_pd_in_speckle`. Near them, the joint probability
-    exceeds the product of both pd by a fraction of the largest possible excess. The fraction is the
-    same as far from DC and Nyquist.
+    :meth:`sweep.model.detection.looks.Looks.joint_pd_in_speckle`. Near DC and Nyquist, the joint
+    probability exceeds the product of both pd by a fraction of the largest possible excess. This
+    fraction is computed as if DC and Nyquist were far away.
     """
     threshold_ratio = shots.threshold / shots.line_noise_sigma
     signal_up, signal_down = (magnitude / shots.line_noise_sigma for magnitude in magnitudes)
@@ -500,9 +501,9 @@ def mean_n_detection_equivalent_bins(
 ) -> np.ndarray | float:
     """Return the number of independent bins that are detected as often as an echo's bins.
 
-    It is the geometric mean over the given segments of
-    :func:`sweep.model.detection.echo_detection.n_detection_equivalent_bins`, and 1 if only the
-    strongest bin detects.
+    The number is the geometric mean over the given segments of
+    :func:`sweep.model.detection.echo_detection.n_detection_equivalent_bins`. It is 1 if an echo is
+    detected by its strongest bin alone.
 
     Parameters
     ----------
@@ -595,7 +596,7 @@ def _pd_and_miss_any_two(
 
 
 class StrongestPeakProbabilities(NamedTuple):
-    """Probabilities that a strongest peak is the echo's, or another one, if only it is reported.
+    """Probabilities of a right and of a wrong peak, if only the strongest peak is reported.
 
     Arrays are (3, n) by segment, or (n,) of the shot.
     """
@@ -605,8 +606,9 @@ class StrongestPeakProbabilities(NamedTuple):
     miss: np.ndarray
     """Probability 1 - pd, precise where pd is near 1."""
     p_wrong_range: np.ndarray
-    """Probability that another peak is reported. A shot reports a wrong range if both chirps report
-    a peak, but not both the echo's, or if the two peaks are resolved to another range."""
+    """Probability that a peak other than the echo's is reported. For a shot, probability of a wrong
+    range: both chirps report a peak, and one of them is not the echo's, or the two peaks are
+    resolved to a wrong range."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -630,7 +632,7 @@ def pd_decrease_with_threshold(at_threshold, at_level):
 def segment_strongest_peak_probabilities(
     pd: np.ndarray, miss: np.ndarray, pd_loss: np.ndarray, p_alarm: np.ndarray
 ) -> StrongestPeakProbabilities:
-    """Return the probabilities that a segment's strongest peak is the echo's, or another one.
+    """Return the probabilities that a segment's strongest peak is the echo's, or a wrong one.
 
     Parameters
     ----------
@@ -660,7 +662,7 @@ def shot_strongest_peak_probabilities(
     speckle_covariance: np.ndarray | None,
     is_range_misread: np.ndarray,
 ) -> StrongestPeakProbabilities:
-    """Return the probabilities that both chirps report the echo's peak, or the shot a wrong range.
+    """Return the probabilities that a shot reports the echo's range, a wrong range, or none.
 
     Parameters
     ----------
@@ -669,8 +671,8 @@ def shot_strongest_peak_probabilities(
     p_alarm : ndarray (3, n)
         Probability that any bin outside the echo crosses the threshold.
     shared_speckle_gain : ndarray (n,)
-        Increase of the probability that both are right, due to speckle that both chirps share, in
-        cases where bins outside the echo cross the threshold.
+        Increase, due to speckle that both chirps share, of the probability that both report the
+        echo's peak. Only cases count in which bins outside the echo cross the threshold.
     speckle_covariance : ndarray (n,) or None
         Probability that the echo is detected in both chirps, minus the product of the two chirps'
         probabilities; None without developed speckle.
@@ -709,9 +711,9 @@ class ConditionalPd(NamedTuple):
     """Probabilities of detection in a segment, given the result in other segments of the shot."""
 
     pd_if_condition_fails: np.ndarray
-    """(...): probability if the condition does not hold."""
+    """(...): probability of detection in the segment if the condition does not hold."""
     pd_if_condition_holds: np.ndarray
-    """(...): probability if the condition holds."""
+    """(...): probability of detection in the segment if the condition holds."""
 
 
 def down_pd_given_up_result(

@@ -50,10 +50,10 @@ def cached_window_samples(window: Window) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def main_lobe_half_width(window: Window) -> float:
-    """Return the distance of the first minimum of |W| from the centre, to 1/8 bin.
+    """Return the distance [bins] from the centre of |W| to its first minimum, a multiple of 1/8.
 
-    W is the window's transform. Only minima below half its maximum count. The unit, a bin here, is
-    the sample rate over the number of samples in the window.
+    W is the window's transform. Only minima below half of the maximum of |W| count. A bin is the
+    sample rate over the number of samples in the window.
     """
     magnitude = np.abs(np.fft.rfft(cached_window_samples(window), 8 * window.length))
     is_below_half = magnitude[:-1] < 0.5 * magnitude[0]  # flattop windows have minima above it
@@ -80,8 +80,7 @@ class SpectrumSettings:
     guard: int
     """Number of guard cells (bins left out next to the tested bin) on either side."""
     rank: int
-    """Rank of the training cell, sorted by power, whose power is the noise level of ``os_cfar``.
-    Rank 1 is the weakest cell."""
+    """Rank k: ``os_cfar`` takes the power of the k-th weakest training cell as the noise level."""
     pfa: float
     """Design probability of a false alarm in a bin of noise alone."""
     complex_record: bool = False
@@ -223,7 +222,7 @@ def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
 
 def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Detect bins by the larger of the mean powers of the training cells below and above them.
+    """Detect bins by the larger of two noise levels, one from each side of the bin.
 
     This is a :data:`Detector`.
 
@@ -251,7 +250,7 @@ def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
 
 def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Detect bins by the training cell of a given rank in power; a :data:`Detector`.
+    """Detect bins by the power of the training cell of a given rank; a :data:`Detector`.
 
     Parameters
     ----------
@@ -301,22 +300,23 @@ def _cfar_factor_of_settings(kind: str, settings: SpectrumSettings) -> float:
 
 
 def _power_in_circular_bins(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the power in bins of circular noise: all, except DC and Nyquist of a real record."""
+    """Return the columns of ``power`` without DC and Nyquist of a real record."""
     return power if settings.complex_record else power[:, 1:-1]
 
 
 def _pad_to_all_bins(flags: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Extend detections to all bins of a spectrum: False at DC and Nyquist of a real record."""
+    """Return ``flags`` with columns of False added for DC and Nyquist of a real record."""
     return flags if settings.complex_record else np.pad(flags, ((0, 0), (1, 1)))
 
 
 def _iter_training_pairs(
     power: np.ndarray, settings: SpectrumSettings
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the power of training cells, in pairs: one below and one above each bin.
+    """Yield pairs of arrays: power of one training cell below each bin, and of one above it.
 
-    Each array has the shape of ``power``, but for DC and Nyquist of real records. Cells wrap around
-    the ends of the spectrum.
+    There is a pair for each training cell of one side. Both arrays have the shape of ``power``
+    without the columns of DC and Nyquist of real records. Cells wrap around the ends of the
+    spectrum.
     """
     circular_bins, half_cells = _power_in_circular_bins(power, settings), settings.training // 2
     n_bins, reach_cells = circular_bins.shape[1], half_cells + settings.guard

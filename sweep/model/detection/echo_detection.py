@@ -104,7 +104,8 @@ class DetectionRule(NamedTuple):
     """Rule of detection from the bins of an echo in one record; common to all points."""
 
     detects_by_any_bin: bool
-    """True if any bin of an echo may detect it, False if only its strongest bin."""
+    """True if an echo is detected once any of its bins crosses the threshold; False if only its
+    strongest bin counts."""
     lobe_half_width: int
     """Half-width of the window's main lobe [FFT bins], rounded up. 0 unless
     ``detects_by_any_bin`` is true."""
@@ -180,8 +181,9 @@ class BinsGivenMode(NamedTuple):
     """(bins,): mean power of the laser's phase-noise pedestal over the noise power. Only the part
     that fades with the strongest speckle mode counts."""
     other_modes_noise_fraction: np.ndarray
-    """(bins,): fraction, 0..1, of the noise power that is due to the other speckle modes. Near DC
-    and Nyquist that part of the noise changes with the phase of the strongest mode."""
+    """(bins,): fraction, 0..1, of the noise power that is due to all speckle modes but the
+    strongest. Near DC and Nyquist this part of the noise changes with the phase of the strongest
+    mode."""
 
 
 class PdAndMiss(NamedTuple):
@@ -715,9 +717,9 @@ N_INDEPENDENT_BINS_MAX = 1e3
 def n_detection_equivalent_bins(
     pd: np.ndarray, peak_ratio: np.ndarray, threshold_ratio: np.ndarray
 ) -> np.ndarray:
-    """Return the number M of independent bins that are together detected as often as an echo.
+    """Return the number M of independent bins of which any is detected as often as an echo.
 
-    Each of them has the magnitude of the echo's strongest bin.
+    Each of the M bins has the magnitude of the echo's strongest bin.
 
     Parameters
     ----------
@@ -825,7 +827,7 @@ def at_least_two_of_three_probability(
 def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
     """Find the strongest of adjacent bins, and mark the bins that belong to an echo.
 
-    Such bins are called exempt: they cannot raise a false alarm.
+    Bins of an echo are exempt: they cannot raise a false alarm.
 
     Parameters
     ----------
@@ -848,8 +850,8 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
     Notes
     -----
     Adjacent bins at or above the threshold form a group. Three kinds of bins are exempt: those of
-    each group and the two next to it; the strongest bin and its two neighbours; and bins within
-    ``lobe_half_width`` of a bin of at least half the largest magnitude.
+    each group and one more on either side; the strongest bin and its two neighbours; and bins
+    within ``lobe_half_width`` of a bin of at least half the largest magnitude.
     """
     largest, n_above = _largest_and_n_above(magnitude[:n_bins], threshold)
     peak = 0
@@ -1613,8 +1615,8 @@ def _negligible_squared_distance(
 
     The threshold b and signals are in units of sigma, the noise per quadrature. A bin of signal a <
     b adds at most e^(-(b - a)^2 / 2) times the miss probability of the strongest bin to pd. If the
-    strongest bin's signal A exceeds b, its miss probability is less than e^(-(A - b)^2 / 2), or the
-    root of that for real noise.
+    strongest bin's signal A exceeds b, its miss probability is less than e^(-(A - b)^2 / 2), or for
+    real noise less than the square root of this.
 
     Parameters
     ----------
@@ -1714,8 +1716,8 @@ def _pd_and_miss_given_mode(
 def _upper_normal_quantile_of_tails(tails):
     """Return the number that a standard normal variable exceeds with the probability ``above``.
 
-    ``above`` is a field of ``tails``, a :class:`.Tails`. Its smaller probability is used for
-    precision.
+    ``above`` is a field of ``tails``, a :class:`.Tails`. The result is computed from the smaller of
+    the two tails, for precision.
     """
     if tails.above < tails.below:
         return _upper_normal_quantile(tails.above)
@@ -1801,7 +1803,7 @@ def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _largest_and_n_above(magnitude, threshold):
-    """Return the largest |X| of bins, and the number of bins whose |X| reaches the threshold."""
+    """Return the largest |X| of the bins, and the number of bins at or above the threshold."""
     largest, n_above = magnitude[0], 0
     for i in range(magnitude.size):
         largest = magnitude[i] if magnitude[i] > largest else largest
@@ -1811,7 +1813,7 @@ def _largest_and_n_above(magnitude, threshold):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_group_exempt(first, last, n_bins, is_exempt):
-    """Mark the bins first .. last and the two next to them as exempt; return their number.
+    """Mark the bins first - 1 .. last + 1 as exempt, clipped to the array; return their number.
 
     Exempt bins belong to an echo and raise no false alarm. ``n_bins`` is the number of all bins.
     """
@@ -1834,8 +1836,8 @@ class SpectrumDetections(NamedTuple):
     n_exempt: np.ndarray
     """(m,): number of bins that belong to the echo and so can raise no false alarm."""
     leakage: np.ndarray
-    """(m,): zeros, as the probability of a false peak due to leaked signal is not evaluated
-    here."""
+    """(m,): zeros. The probability of a false peak due to leaked signal is not evaluated for these
+    spectra."""
 
 
 @njit(cache=True, error_model="numpy")

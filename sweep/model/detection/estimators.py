@@ -96,20 +96,20 @@ SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
 _TONE_STEPS_PER_BIN = 512
 """Number of steps per bin in tables over the offset, -1..1 bin, of a tone from a bin."""
 _NEIGHBOUR_MAGNITUDE_RATIO_MIN = 0.25
-"""Limit on |X| of a neighbouring bin, over |X| of the bin on which a tone lies. Below it the
-neighbours count as vanishing."""
+"""Ratio below which the two neighbours of a bin on which a tone lies count as 0: |X| of a neighbour
+over |X| of that bin."""
 _CENTROID_REACH_CELLS = 2
 """Number of resolution cells on either side of the peak over which the centroid is taken. A cell is
 the sample rate over the number of samples in the record."""
 _ZOOM_POINTS_PER_BIN = 32
 """Number of frequencies per FFT bin at which the chirp-z transform is evaluated."""
 _WINDOW_VALUE_FRACTION_MIN = 1e-3
-"""Limit on the window value, over its maximum, of samples that are divided by the window. Samples
-with smaller values are left out."""
+"""Smallest window value, over the window's maximum, by which a sample is divided to undo the
+window. Samples with a smaller window value are left out."""
 _NEWTON_STEPS_MAX = 6
 """Largest number of steps of Newton's method in the maximum-likelihood estimate."""
 _NEWTON_REACH_BINS = 0.5
-"""Largest distance [FFT bins] by which Newton's method may depart from its starting frequency."""
+"""Largest distance [FFT bins] of the result of Newton's method from its starting frequency."""
 
 
 def peak_bin(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
@@ -197,7 +197,7 @@ def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
     peak : ndarray (m,) int64
         Index of the peak's bin in each spectrum.
     settings : SpectrumSettings
-        Window and FFT size, on which sign and factor depend.
+        Window and FFT size, on which the sign in the ratio and the factor depend.
 
     Returns
     -------
@@ -214,7 +214,7 @@ def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
 
 
 def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the frequency of a tone with the same Jacobsen ratio; an :data:`Estimator`.
+    """Return the frequency of the tone with the peak's Jacobsen ratio; an :data:`Estimator`.
 
     Parameters
     ----------
@@ -469,7 +469,7 @@ def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
 
 @lru_cache(maxsize=4)
 def _zoom_transform(length: int, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the chirp-z transform of records of a given length, from -1 to 1 FFT bin."""
+    """Return a function that transforms records (m, length) to their spectra at -1 .. 1 FFT bin."""
     from scipy import signal  # slow to import
 
     edge = 1.0 / fft_size
@@ -652,7 +652,7 @@ def position_error_at_unit_signal(
 ) -> np.ndarray | None:
     """Return the standard error [bins] of an estimator's position of a tone in noise, (m,).
 
-    It holds if |X| of the peak bin equals the noise per quadrature, and falls as 1/|X|.
+    The error is that at |X| of the peak bin equal to the noise per quadrature. It falls as 1/|X|.
 
     Parameters
     ----------
@@ -664,9 +664,9 @@ def position_error_at_unit_signal(
     Returns
     -------
     numpy.ndarray or None
-        The error at m evenly spaced distances, 0..1 bin, of the tone from the peak bin. m is the
-        size of :attr:`.sub_bin_interpolation.Interpolator.error_at_unit_signal`. None for
-        estimators whose error has no known law.
+        The error at m evenly spaced distances, 0..1 bin, of the tone from the peak bin; m is the
+        size of :attr:`.sub_bin_interpolation.Interpolator.error_at_unit_signal`. The result is None
+        for estimators whose error has no known law.
 
     Notes
     -----
@@ -727,7 +727,7 @@ def range_velocity_deviation(
     radial_velocity: ArrayLike,
     slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_RATE_RATIOS,
 ) -> RangeVelocityDeviation:
-    """Return the least deviations of range and radial velocity from the deviations of the beats.
+    """Return the least standard deviations of range and radial velocity from those of the beats.
 
     Parameters
     ----------
@@ -747,7 +747,8 @@ def range_velocity_deviation(
     Returns
     -------
     RangeVelocityDeviation
-        Both standard deviations; inf where the used beats do not determine range and velocity.
+        Both least standard deviations; inf where the used beats do not determine range and
+        velocity.
     """
     two_over_c = 2 / SPEED_OF_LIGHT
     delay, beta = two_over_c * np.asarray(range, float), two_over_c * np.asarray(radial_velocity)

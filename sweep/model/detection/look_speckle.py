@@ -60,11 +60,11 @@ SPECKLE_LATTICE_SIZE = 2048
 the threshold is averaged over them."""
 
 _N_CONTOUR_NODES = 40
-"""Number of quadrature nodes on the upper half of the parabola in the complex plane along which
-equation (1) of this module is integrated."""
+"""Number of quadrature nodes of the contour integral for tail probabilities of the looks' mean
+power. The nodes lie on the upper half of a parabola in the complex plane."""
 _CONTOUR_END = 4.6
-"""End of the integration along the parabola of equation (1): largest asinh(Im s / scale), with the
-integration variable s and the scale of the integrand's peak."""
+"""Largest asinh(Im s / c) on the contour of the integral over s for tail probabilities of the
+looks' mean power. c is the width of the integrand's peak."""
 _BISECTION_STEPS = 60
 _CROSSING_TABLE_STEPS = 512
 """Number of steps in the table of a look's crossing probability over the magnitude of speckle."""
@@ -159,11 +159,11 @@ class LookSpeckle(NamedTuple):
         )
 
     def select(self, points: np.ndarray | slice) -> "LookSpeckle":
-        """Return the correlations of some points, given by their indices."""
+        """Return the :class:`LookSpeckle` of some points, given by their indices."""
         return LookSpeckle(*(column[:, points] for column in self))
 
     def covariance_root(self, segment: int, point: int) -> np.ndarray:
-        """Return a matrix A (N, N) with A A^H = the covariance of the looks' speckle amplitudes.
+        """Return a matrix A (N, N) whose product A A^H is the covariance of the looks' speckle.
 
         A^H is the conjugate transpose. For a vector z of independent circular complex Gaussian
         numbers of power 1, A z are speckle amplitudes of the N looks.
@@ -196,8 +196,8 @@ class LookSpeckle(NamedTuple):
     def covariance_roots(self) -> np.ndarray:
         """Return :meth:`covariance_root` of all segments and points, (3, n, N, k).
 
-        Only the first k columns are kept. The others have less than the fraction
-        :data:`_EIGENVALUE_FRACTION_MIN` of the power at all points.
+        Only the first k columns are kept. Each column after them has, at all points, less than the
+        fraction :data:`_EIGENVALUE_FRACTION_MIN` of the power.
         """
         n_looks = self.correlation_by_lag.shape[2]
         eigenvalues, eigenvectors = np.linalg.eigh(
@@ -295,7 +295,8 @@ def mean_power_tails(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the probabilities that the sum of the looks' powers is above and below a threshold.
 
-    The probability above is equation (1) of the module's description.
+    The probabilities are two arrays (..., 3, n). That above the threshold is equation (1) of the
+    module's description.
 
     Parameters
     ----------
@@ -370,7 +371,7 @@ def _saddle_point(
     scaled_threshold: np.ndarray,
     is_rare: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the saddle point of a tail integral, and two derivatives of the integrand's logarithm.
+    """Return the saddle point of a tail integral, and derivatives of the integrand's logarithm.
 
     The integral is equation (1) of the module's description.
 
@@ -407,7 +408,7 @@ def _saddle_point(
 
 @lru_cache(maxsize=8)
 def speckle_lattice_amplitudes(n_looks: int) -> np.ndarray:
-    """Return fixed realisations of the speckle amplitudes of N looks of independent speckle.
+    """Return fixed realisations of the amplitudes of N looks whose speckle is independent.
 
     The realisations are (SPECKLE_LATTICE_SIZE, N) complex. A Kronecker lattice of the roots of
     primes is transformed to circular Gaussian numbers. These are standardised to mean 0 and the

@@ -61,8 +61,8 @@ LOOKS_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
 }
 
 N_DRIFT_POSITIONS_MAX = 64
-"""Largest number of line positions that are evaluated where a line moves from look to look. More
-looks are represented by this number."""
+"""Largest number of looks at which the position of a line that moves from look to look is
+evaluated. More looks are represented by this number of looks."""
 
 _CERTAIN_MARGIN_SIGMA = 40.0
 """Distance of a bin's |X| from the threshold beyond which a crossing counts as certain or
@@ -109,7 +109,7 @@ class Looks(NamedTuple):
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "Looks":
-        """Return the looks that a spec states, from its parameters by dotted path.
+        """Return the looks that a spec states; ``parameters`` maps dotted paths to values.
 
         The default is a single look.
         """
@@ -146,10 +146,9 @@ class Looks(NamedTuple):
 
     @property
     def amplitude_gain_max(self) -> float:
-        """Upper bound of the gain in signal over noise by combining the looks.
+        """Upper bound of the gain in amplitude over noise by combining the looks.
 
-        The gain is one of amplitude: sqrt(N) for N looks whose powers or crossings are combined,
-        else 1.
+        The bound is sqrt(N) for N looks whose powers or crossings are combined, else 1.
         """
         return math.sqrt(self.number) if self.is_noncoherent else 1.0
 
@@ -226,7 +225,7 @@ class Looks(NamedTuple):
             Root mean square |X| without noise, and threshold, over the noise per quadrature of one
             record.
         look_speckle
-            Correlation of the looks' speckle if it is partial. Signals are (..., 3, n) then.
+            Correlation of the looks' speckle if it is partial, for signals (..., 3, n); else None.
 
         Returns
         -------
@@ -349,7 +348,7 @@ class Looks(NamedTuple):
         threshold_ratio
             (..., n): threshold over the noise per quadrature.
         look_speckle
-            Correlation of the looks' speckle if it is partial.
+            Correlation of the looks' speckle if it is partial, else None.
 
         Returns
         -------
@@ -409,7 +408,7 @@ class Looks(NamedTuple):
         correlation
             (n,): modulus of the correlation of the segments' signal amplitudes.
         look_speckle
-            Correlation of the looks' speckle if it is partial.
+            Correlation of the looks' speckle if it is partial, else None.
 
         Returns
         -------
@@ -516,9 +515,9 @@ class Looks(NamedTuple):
         correlation: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> np.ndarray:
-        """Return the covariance of two segments' detections over that for equal speckle, 0..1.
+        """Return the covariance of two segments' detections over its value for equal speckle.
 
-        The fraction is 1 if both segments have the same speckle, and 0 if their speckle is
+        The result, 0..1, is 1 if both segments have the same speckle, and 0 if their speckle is
         independent.
 
         Parameters
@@ -528,7 +527,7 @@ class Looks(NamedTuple):
         correlation
             Modulus of the correlation of the segments' signal amplitudes.
         look_speckle
-            Correlation of the looks' speckle if it is partial.
+            Correlation of the looks' speckle if it is partial, else None.
         """
         from sweep.model.detection.echo_detection import joint_pd_in_speckle
 
@@ -559,7 +558,7 @@ class Looks(NamedTuple):
         pd: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
     ) -> PdAndMissArrays:
-        """Return the probabilities that two or more, or fewer, of three segments are detected.
+        """Return the probabilities that at least two of three segments are detected, or fewer.
 
         Parameters
         ----------
@@ -573,7 +572,7 @@ class Looks(NamedTuple):
         pd
             (3, n): probability of detection of each segment.
         look_speckle
-            Correlation of the looks' speckle if it is partial; None otherwise.
+            Correlation of the looks' speckle if it is partial, else None.
 
         Returns
         -------
@@ -876,15 +875,16 @@ class Looks(NamedTuple):
     def speckle_power_quadrature(
         self, look_speckle: "LookSpeckle | None", segment: int, point: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes and weights of a mean over the speckle power, averaged over all looks.
+        """Return quadrature nodes and weights for a mean over the speckle power of a shot.
 
-        The power, of mean 1, is treated as a gamma variable. Its shape is the number of looks of
-        independent speckle that are equivalent to these looks. Weights have the sum 1.
+        The speckle power of a shot is the mean of that of its looks. It has the mean 1 and is
+        treated as a gamma variable, whose shape is the effective number of looks of independent
+        speckle. Nodes and weights are two arrays (k,); weights have the sum 1.
 
         Parameters
         ----------
         look_speckle
-            Correlation of the looks' speckle if it is partial.
+            Correlation of the looks' speckle if it is partial, else None.
         segment, point
             Indices in ``look_speckle``.
         """
@@ -902,7 +902,7 @@ class Looks(NamedTuple):
         *signals: np.ndarray,
         gamma_shape: np.ndarray | float = 1.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes and weights (..., k) of a mean over the magnitude of speckle.
+        """Return quadrature nodes and weights (..., k) for a mean over the magnitude of speckle.
 
         Nodes are dense where the signals cross the threshold.
 
@@ -1021,7 +1021,7 @@ def solve_threshold_ratio(
 def pd_and_miss_any_two_in_speckle(
     pd: np.ndarray, miss: np.ndarray, threshold_ratio: np.ndarray, correlations: np.ndarray
 ) -> PdAndMissArrays:
-    """Return the probabilities that at least two of three segments in speckle are detected, or not.
+    """Return the probabilities that at least two of three segments in speckle detect, or fewer.
 
     Parameters
     ----------

@@ -36,8 +36,8 @@ _MIDPOINT_WEIGHTS = tuple(
     _MIDPOINT_STEP / math.pi * math.exp(-0.5 * v) for v in _SQUARED_MIDPOINT_NODES
 )
 _POLE_DECAY_RATE = 2.0 * math.pi / _MIDPOINT_STEP
-"""Decay rate c of the midpoint rule's correction for the integrand's pole. At the distance
-d = |a - b| the correction is 1 / (1 + exp(c d)). It is neglected from d = c on."""
+"""Decay rate c of the midpoint rule's correction for the pole of the integrand of Marcum's Q_1(a,
+b). At the distance d = |a - b| the correction is 1 / (1 + exp(c d)). It is neglected for d >= c."""
 
 _SQUARED_DISTANCE_MAX = 1500.0
 """Limit of (a - b)^2 above which the smaller tail of Marcum's Q_1(a, b) is 0 in float64. The tail
@@ -51,8 +51,8 @@ _INVERSE_SQUARES = (0.0, *(1.0 / m**2 for m in range(1, _EXCESS_TERMS_MAX + 1)))
 
 _LN2 = math.log(2.0)
 _LOG_P_LINEAR_MAX = -600.0
-"""Limit on ln p of a trial's success probability p. Below it, 1-(1-p)^n and n p are the same double
-for any number of trials n up to 1e240."""
+"""Value of ln p, for the success probability p of a trial, below which 1-(1-p)^n and n p are the
+same float64 number for any number of trials n up to 1e240."""
 
 
 class Tails(NamedTuple):

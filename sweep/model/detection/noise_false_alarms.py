@@ -100,7 +100,7 @@ def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:
 
 
 def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
-    """Return the relative excess e of the noise variance that explains a bin's false alarms.
+    """Return the relative excess e of the noise variance that explains false alarms in a bin.
 
     Parameters
     ----------

@@ -42,8 +42,8 @@ from sweep.model.spectrum.search_restriction import axis_line_positions, beamlet
 from sweep.model.window import Window, window_samples
 
 PSEUDO_VARIANCE_RATIO_MIN = 0.05
-"""Limit on |E[X^2]| / E[|X|^2] of a bin X in speckle, below which X is treated as circular. The
-probability of detection errs by less than 2e-4."""
+"""Value of |E[X^2]| / E[|X|^2] of a bin X in speckle below which X is treated as circular. The
+probability of detection then errs by less than 2e-4."""
 
 
 class SignalPseudoVariance(NamedTuple):
@@ -65,7 +65,7 @@ class SignalPseudoVariance(NamedTuple):
 
 
 def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
-    """Compute the pseudo-variance ratios of echoes near DC and Nyquist of real records."""
+    """Compute the pseudo-variance ratios of the echoes of prepared shots with real records."""
     fft_size, padding_factor = shots.fft_size, shots.fft_size / shots.window.length
     n_bins = n_tabulated_bins(shots.window, fft_size)
     pseudo_variance_row = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
@@ -130,7 +130,8 @@ def mean_joint_pd_over_phases(
     pd_by_segment
         (..., n) for each segment: probability that it is detected.
     joint_pd_function
-        Function from the segments' probabilities to arrays (..., n), for circular echoes.
+        Function of the segments' probabilities, one argument (..., n) each, for circular echoes. It
+        returns a tuple of arrays (..., n).
 
     Returns
     -------
@@ -208,9 +209,9 @@ def n_tabulated_bins(window: Window, fft_size: int) -> int:
 
     Notes
     -----
-    The bins reach to r + h + 1 from DC, in units of the sample rate over L. r is the distance of a
-    line from DC beyond which its image is negligible. h is the half-width of the window's main
-    lobe.
+    The farthest bin is r + h + 1 from DC, in units of the sample rate over L. r is the distance of
+    a line from DC beyond which the line's image is negligible. h is the half-width of the window's
+    main lobe.
     """
     last_bin = (_image_reach(window) + main_lobe_half_width(window) + 1) * fft_size / window.length
     return min(math.ceil(last_bin) + 1, fft_size // 4 + 1)

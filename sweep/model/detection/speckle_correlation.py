@@ -42,13 +42,14 @@ SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
 """Pairs of segment indices (0 up, 1 Doppler, 2 down), in the order of arrays over pairs."""
 
 LINE_SHIFT_MIN_CELLS = 0.01
-"""Limit on the line shift per standard deviation of the beam. Below it all lines of a footprint
-count as lying in one bin. The unit is a resolution cell, the sample rate over the number of samples
-in the record."""
+"""Shift of the spectral line, per standard deviation of the beam, below which all lines of a
+footprint count as lying in one bin. The unit is a resolution cell, the sample rate over the number
+of samples in the record."""
 
 TRANSFORM_REACH_CELLS = 6.0
-"""Distance from its centre up to which the window's transform counts in correlation integrals. The
-unit is a resolution cell, the sample rate over the number of samples in the record."""
+"""Distance from the centre of the window's transform beyond which the transform is neglected in
+correlation integrals. The unit is a resolution cell, the sample rate over the number of samples in
+the record."""
 
 TRANSFORM_SAMPLES_PER_CELL = 64
 """Number of samples of the tabulated window transform per resolution cell. A cell is the sample
@@ -73,7 +74,7 @@ class LineGradients(NamedTuple):
     [rad]. The axes are point, segment and coordinate."""
 
     def select(self, points: np.ndarray) -> "LineGradients":
-        """Return the gradients of some points, given by their indices."""
+        """Return the gradients of the points with the given indices."""
         return LineGradients(self.line_shift[points], self.phase[points])
 
 
@@ -105,7 +106,7 @@ class LinePairGradients(NamedTuple):
         return np.maximum(np.abs(self.line_shift[0]), np.abs(self.line_shift[1]))
 
     def select(self, points: np.ndarray) -> "LinePairGradients":
-        """Return the gradients of some points, given by their indices."""
+        """Return the gradients of the points with the given indices."""
         (distance_first, distance_second), (shift_first, shift_second) = (
             self.strongest_bin_offset,
             self.line_shift,
@@ -173,7 +174,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
 
 
 def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
-    """Return the modulus of the speckle correlation (3) for a Gaussian window transform, (n,).
+    """Return the modulus of :func:`peak_bin_correlation` for a Gaussian window transform, (n,).
 
     The transform is exp(-x^2 / (4 v)). The variance v is chosen so that the transform falls to 1/2
     at the same distance as that of the window. All factors of the integrals are then Gaussian.
@@ -235,10 +236,9 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def late_echo_centroid_shift(window: Window) -> np.ndarray:
-    """Return the shift [samples] of a window's centroid if k samples are missing, (L + 1,).
+    """Return the shift [samples] of a window's centroid if its first k samples are missing.
 
-    Element k is the shift without the first k samples, k = 0 .. L. L is the window's number of
-    samples.
+    The result is (L + 1,) for a window of L samples: element k is the shift for k = 0 .. L.
     """
     w, n = window_samples(window.name, window.length), np.arange(window.length)
     sum_from = np.cumsum(w[::-1])[::-1]

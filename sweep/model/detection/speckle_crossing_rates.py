@@ -33,8 +33,8 @@ POWERS_PER_OCTAVE_MAX = 2
 computed."""
 
 N_SPECKLE_POWERS = POWERS_PER_OCTAVE_MAX * N_SPECKLE_OCTAVES + 2
-"""Number of tabulated speckle powers: those of the octaves, and a fainter one that completes whole
-SIMD vectors."""
+"""Number of tabulated speckle powers: POWERS_PER_OCTAVE_MAX for each octave, the one at the end of
+the last octave, and a fainter one that fills the last SIMD vector."""
 
 TABULATED_SPECKLE_POWERS = SPECKLE_POWER_MAX * 2.0 ** (
     -np.arange(N_SPECKLE_POWERS - 1, -1, -1) / POWERS_PER_OCTAVE_MAX
@@ -55,8 +55,9 @@ _LOG_AMPLITUDE_AT_FAINTEST_POWER = (
     0.5 * math.log(SPECKLE_POWER_MAX) - (N_SPECKLE_POWERS - 1) * _LOG_AMPLITUDE_PER_POWER
 )
 _CONSTANT_RATE_PRODUCT_MAX = 0.01
-"""Limit on signal times threshold, each over the noise per quadrature, at the largest speckle
-power. Below it the rate is taken as proportional to power, with a relative error of 1.3e-5."""
+"""Product of signal and threshold, each over the noise per quadrature, below which the crossing
+rate is taken as proportional to power. The signal is that at the largest speckle power. The
+relative error is 1.3e-5."""
 _LOG_RATE_STEP_MAX = 0.3
 """Largest change of ln(rho) between two table entries of the relative crossing rate rho. The
 interpolated rho then has a relative error of 4e-6."""
@@ -86,28 +87,29 @@ class SpeckleCrossingRates(NamedTuple):
     """Largest table position (fractional entry number) of a bin's amplitude at the faintest speckle
     power. From larger positions the rate at the brightest speckle would lie outside the table."""
     entries_per_power: int
-    """Number p of entries between two successive speckle powers."""
+    """Number p of steps in the table from the amplitude at one speckle power to that at the
+    next."""
     relative_rates: np.ndarray
     """(p + 5 or more, columns): relative rates. Entry number p c + r is in row r and column c. The
-    powers of a bin are thus adjacent in a row, and the six entries of an interpolation are in six
-    successive rows."""
+    entries of a bin at successive speckle powers are thus adjacent in a row, and the six entries of
+    an interpolation are in six successive rows."""
 
 
 class RateTableGrid(NamedTuple):
-    """Amplitudes of a table's entries, and the size of the table."""
+    """Amplitudes of the entries of a table of crossing rates, and the size of the table."""
 
     log_amplitude_first: float
     """ln(amplitude) of the first entry; amplitudes are over the noise per quadrature."""
     log_amplitude_step: float
     """Difference of ln(amplitude) between successive entries."""
     entries_per_power: int
-    """Number of entries between two successive speckle powers."""
+    """Number of steps in the table from the amplitude at one speckle power to that at the next."""
     n_columns: int
-    """Number of columns of the table; it has ``entries_per_power`` entries per column."""
+    """Number of columns of the table, with ``entries_per_power`` entries each."""
 
 
 class RateTableArrays(NamedTuple):
-    """Memory for the table of one threshold, and for its computation."""
+    """Arrays for the table of crossing rates at one threshold, and for its computation."""
 
     squared_amplitudes: np.ndarray
     """(entries,): squared amplitude of each entry, over the noise power per quadrature."""
@@ -116,7 +118,8 @@ class RateTableArrays(NamedTuple):
     relative_rate_by_entry: np.ndarray
     """(entries + 8,): relative rate of the entries, in the order of their amplitudes."""
     relative_rates: np.ndarray
-    """(rows, columns): the table."""
+    """(rows, columns): relative crossing rates, as in
+    :attr:`SpeckleCrossingRates.relative_rates`."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -273,12 +276,12 @@ def rate_table(grid, arrays):
 
 
 class RateTablePlace(NamedTuple):
-    """Place of a bin in the table, at the faintest speckle power."""
+    """Position in a table of crossing rates of a bin's amplitude at the faintest speckle."""
 
     first_entry: int
-    """Number of the first of the six entries from which its rate is interpolated."""
+    """Number of the first of the six entries from which the bin's rate is interpolated."""
     fraction: float
-    """Position between the third entry and the fourth, 0 to 1."""
+    """Position of the bin's amplitude between the third and the fourth of the six entries, 0..1."""
 
 
 class InterpolationWeights(NamedTuple):

@@ -51,8 +51,8 @@ _NODE_DEVIATIONS_MAX = 4.5
 """Distance from the centre of the outermost line that represents a Gaussian density, in standard
 deviations of the density."""
 _FULL_REACH_LINE_DEVIATION_MAX = 3.0
-"""Largest standard deviation for which tables reach two deviations beyond the main lobe, in the
-unit of LINE_DEVIATIONS."""
+"""Largest standard deviation of the lines' density for which tables of speckle modes include bins
+up to two deviations beyond the main lobe. The unit is that of LINE_DEVIATIONS."""
 
 
 class ModeTable(NamedTuple):
@@ -90,7 +90,7 @@ class ModeTableCell(NamedTuple):
     offset_index: int
     """Index in the table of the position of the echo's centre at the lower end of the cell."""
     offset_weight: float
-    """Interpolation weight, 0..1, of the next position of the echo's centre."""
+    """Interpolation weight, 0..1, of the table's next position of the echo's centre."""
 
 
 @lru_cache(maxsize=32)
@@ -252,7 +252,7 @@ def locate_in_mode_table(table, line_deviation_bins, asymmetry):
     table
         :class:`ModeTable`.
     line_deviation_bins
-        Standard deviation of the lines' positions [bins of fs/N].
+        Standard deviation of the lines' positions [FFT bins].
     asymmetry
         Result of :func:`power_asymmetry`, -1..1.
     """

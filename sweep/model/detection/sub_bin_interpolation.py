@@ -53,8 +53,8 @@ _TONE_POLYNOMIAL_DEGREE = 32
 """Degree of the polynomial that gives a bin's complex value at -2 .. 2 bins from a tone."""
 
 _NEIGHBOUR_MAGNITUDE_RATIO_MIN = 0.25
-"""Limit on |X| of a neighbouring bin, over |X| of the bin on which a tone lies. Below it positions
-are estimated by TWO_BINS."""
+"""Ratio below which a tone's position is estimated from TWO_BINS: |X| of the neighbour of a bin on
+which a tone lies over |X| of that bin."""
 
 THREE_BINS, TWO_BINS = 0, 1
 """Kinds of magnitude ratio from which a tone's position between bins is estimated. THREE_BINS uses
@@ -119,7 +119,7 @@ class Interpolator(NamedTuple):
     """(m,): standard error of the position [bins], by the tone's distance from the centre bin. It
     holds if the centre bin's |X| equals the noise per quadrature, and falls as 1/|X|."""
     noise_mixing: NoiseMixing
-    """Factors that make the noise of three adjacent bins from independent normal numbers."""
+    """Factors on independent normal numbers whose sums are the noise of three adjacent bins."""
     sidelobe_neighbour_noise_correlation: float
     """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Of N
     successive sidelobe bins, L change sign from one to the next. N is the FFT size, L the number of
@@ -321,9 +321,9 @@ def _least_squares_weights(
     *,
     two_bins: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights that give a tone's position from three bins with the smallest standard error.
+    """Return the weights of three bins that give a tone's position with the least standard error.
 
-    The standard error is returned too.
+    The least standard error is returned as well.
 
     Parameters
     ----------
@@ -506,9 +506,9 @@ def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size:
 
 
 _DRIFTS_BINS = np.array([0.5, 1.0, 2.0, 4.0])
+"""Tabulated changes of a tone's position over the record [bins]."""
 _DRIFT_POSITIONS_BINS = np.linspace(0.0, 1.0, 17)
-"""Tabulated drifts [bins] of a tone over the record, and tabulated positions [bins] of the tone in
-the middle of the record."""
+"""Tabulated positions of a drifting tone in the middle of the record, relative to a bin [bins]."""
 
 
 @lru_cache(maxsize=32)
@@ -662,8 +662,8 @@ def line_spread_error(offset, line_deviation_bins, adds_powers, interpolation):
     line_deviation_bins : float
         Standard deviation of the lines' positions [bins].
     adds_powers : bool
-        True if the lines add as powers. If they add as amplitudes they may cancel, and the error is
-        the whole spread.
+        True if the lines add as powers. If False, they add as amplitudes and may cancel, and the
+        error returned is ``line_deviation_bins``.
     interpolation : Interpolator
         Interpolator of the window; its ``spread_error_factor`` is a table over the offset.
     """
