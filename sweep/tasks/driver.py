@@ -85,7 +85,8 @@ from sweep.tasks.studies.user_function_names import iter_user_functions, user_mo
 from sweep.tasks.studies.workload import SpecWorkload
 
 EYEPOINT_LOCK_POLL_SECONDS = 0.5
-"""Interval at which a run checks whether another run has cast the rays that both need [s]."""
+"""Interval [s] at which a run checks if another run still holds the lock of an eyepoint store. The
+store holds the geometry of shots that both runs need."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +100,7 @@ class Outcome(SessionOutcome):
     def from_session_outcome(
         cls, outcome: SessionOutcome, rays_by_scanner: Mapping[str, int] | None = None
     ) -> Outcome:
-        """Return the outcome of a run from that of its last session and the rays cast before it."""
+        """Return the outcome of a run, given that of its last session and the rays it has cast."""
         return cls(**vars(outcome), rays_by_scanner=rays_by_scanner or {})
 
 
@@ -251,9 +252,9 @@ def extend(
 ) -> Outcome:
     """Turn a store into the store of a larger study, and compute only the new points.
 
-    The larger study has further values on its axes, further axes, more draws or a tighter
-    tolerance. It is computed in the same folder and replaces the store when it is complete. Its
-    bytes are the same as if the larger study were run at once.
+    The larger study has more values on its axes, more axes, more draws or a tighter tolerance. It
+    is computed in the same folder and replaces the store when it is complete. Its bytes are the
+    same as if the larger study were run at once.
 
     Parameters
     ----------
@@ -550,7 +551,8 @@ def _warn_of_changed_user_code(
 ) -> None:
     """Print a message for each user module whose file has changed since the store was begun.
 
-    If the store extends another one, the file is compared with its state at the start of the other.
+    If the store extends another store, the file is compared with its state at the start of the
+    other store.
     """
     modules = user_module_names(spec)
     if not modules:
@@ -588,7 +590,7 @@ def _compute_missing_blocks(
     """Lock a store and compute its missing blocks.
 
     In a flight the missing geometry of shots (eyepoints) is computed first. `prepare` creates the
-    store if needed. It is called before the store is locked.
+    store if needed. ``prepare`` is called before the store is locked.
     """
     backend.max_workers = study.n_blocks
     backend.check_memory = partial(refuse_too_large_study, study)

@@ -18,10 +18,10 @@ from sweep.model.geometry import quaternion as quat
 from sweep.model.geometry.quaternion import rotate
 
 _HORIZONTAL_SPEED_FRACTION_MIN = 1e-9
-"""Smallest ratio of horizontal speed to total speed at which the direction of motion has a heading.
+"""Ratio of horizontal to total speed below which motion counts as vertical, without a heading.
 """
 _HORIZONTAL_SPEED_MIN = 1e-100
-"""Smallest horizontal speed [m/s] at which the direction of motion has a heading."""
+"""Horizontal speed [m/s] below which motion has no heading."""
 
 FloatSequence = Sequence[float] | np.ndarray
 """Sequence or array of real numbers (type of an argument)."""
@@ -255,8 +255,8 @@ class AttitudeTrack:
     quaternions: Sequence[Sequence[float]] | np.ndarray
     """(n, 4): attitudes at ``times``, as quaternions (w, x, y, z) from body to world."""
     _rotation_steps: np.ndarray = field(init=False, repr=False)
-    """(n - 1, 3): rotation vectors from each of the given attitudes to the next [rad]. A rotation
-    vector points along the axis and has the length of the angle."""
+    """(n - 1, 3): rotation vectors from each attitude of ``quaternions`` to the next [rad]. A
+    rotation vector points along the axis of the rotation; its length is the angle."""
 
     def __post_init__(self) -> None:
         times, quaternions = require_rising_times(self.times), np.asarray(self.quaternions, float)
@@ -278,12 +278,12 @@ class AttitudeTrack:
     def attitude_and_rate(
         self, query_times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Interpolate the attitudes between the given ones, and return the angular velocities.
+        """Return attitudes interpolated between those of the track, and angular velocities.
 
         Parameters
         ----------
         query_times : ndarray (n,)
-            Times at which the attitude is computed [s].
+            Times for which attitudes are returned [s].
         velocity, acceleration : ndarray (n, 3)
             Not used: the attitude does not depend on the body's motion.
 
@@ -355,8 +355,8 @@ class MountedAttitude:
 
 
 _TIME_TOLERANCE_FRACTION = 1e-9
-"""Largest distance of a time from the trajectory's interval that counts as rounding. It is a
-fraction of the trajectory's duration, or of 1 s if that is longer."""
+"""Largest excess of a time over the start or stop of a trajectory that counts as rounding. The unit
+is the larger of the trajectory's duration and 1 s."""
 
 
 AttitudeLaw = (
@@ -367,7 +367,8 @@ AttitudeLaw = (
     | AttitudeTrack
     | MountedAttitude
 )
-"""Attitude of a body over time: an instance of a class with a method ``attitude_and_rate``."""
+"""Attitude of a body over time (type of an argument): an instance of any attitude class of this
+module, with a method ``attitude_and_rate``."""
 
 
 class Motion(NamedTuple):
@@ -416,7 +417,7 @@ def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class ConstantAcceleration:
-    """Trajectory of a point under constant acceleration; a straight line if that is 0."""
+    """Trajectory of a point under constant acceleration, which may be 0."""
 
     initial_position: FloatSequence
     """(3,): position of the point at time 0 [m], in the world's frame."""
@@ -439,7 +440,7 @@ class ConstantAcceleration:
         return self.duration
 
     def motion(self, times: np.ndarray) -> Motion:
-        """Return position, velocity and acceleration at times (n,) [s] from start to stop."""
+        """Return the :class:`Motion` of the point at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, 0.0, self.duration)[:, None]
         x0, v0, a = np.array(
             [self.initial_position, self.initial_velocity, self.acceleration], float
@@ -538,7 +539,7 @@ class Waypoints:
         return float(self._interpolant.x[-1])
 
     def motion(self, times: np.ndarray) -> Motion:
-        """Return position, velocity and acceleration at times (n,) [s] from start to stop."""
+        """Return the :class:`Motion` of the point at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, self.start_time, self.stop_time)
         return Motion(
             self._interpolant(times) + self._origin,
@@ -567,8 +568,8 @@ def require_rising_times(time: FloatSequence) -> np.ndarray:
 
 
 Trajectory = ConstantAcceleration | Waypoints
-"""Motion of a point over time, from ``start_time`` to ``stop_time`` [s]: an instance of a
-trajectory class."""
+"""Motion of a point over time, from ``start_time`` to ``stop_time`` [s] (type of an argument): an
+instance of any trajectory class of this module."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -593,7 +594,7 @@ class MovingBody:
         return self.trajectory.stop_time
 
     def state(self, times: np.ndarray) -> BodyState:
-        """Return position, attitude and motion of the instrument at times (n,) [s].
+        """Return the :class:`BodyState` of the instrument at times (n,) [s].
 
         Times are from ``start_time`` to ``stop_time``.
 

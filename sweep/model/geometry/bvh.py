@@ -37,8 +37,8 @@ above the rounding of a hit's position across the ray (some 1e-15 of the range, 
 times the mesh's size), and below the resolution of float32."""
 
 _EMPTY_BOX_BOUND = np.float32(3e38)
-"""Lower bound of an empty box along each axis [m]. Its upper bound is minus this value, so that no
-ray enters the box."""
+"""Lower bound of an empty box along each axis [m]. The box's upper bound is minus this value, so
+that no ray enters the box."""
 
 _TRIANGLES_PER_BATCH = 1 << 20
 """Number of triangles whose bounding boxes are computed in one step, which limits memory."""
@@ -48,22 +48,22 @@ _STACK_SIZE = 8 * 16
 entries per level."""
 
 _DIRECTION_COMPONENT_MIN = 1e-200
-"""Smallest size of a direction's component in reciprocals. Smaller components are replaced by it,
-so that reciprocals are finite."""
+"""Modulus that replaces smaller components of a ray's direction before their reciprocals are
+computed, so that reciprocals are finite."""
 
 _EXIT_DISTANCE_FACTOR = 1.0 + 1e-14
-"""Factor on the distance at which a ray leaves a box. Its excess over 1 is larger than the rounding
-error of this distance (5e-16)."""
+"""Factor, slightly above 1, by which the distance at which a ray leaves a box is enlarged. It
+covers the rounding error of this distance (5e-16)."""
 
 _TIE_DISTANCE_FACTOR = 1.0 + 1e-12
-"""Factor on the distance of the nearest hit beyond which boxes are skipped. With it, rounding skips
-no box that holds an equally near triangle."""
+"""Factor, slightly above 1, on the distance of the nearest hit. Boxes beyond the product are
+skipped. Because of the factor, rounding skips no box that holds an equally near triangle."""
 
 _BUNDLE_TESTS_MAX = np.int64(128)
-"""Largest number of triangles that are tested against a whole bundle of rays. Beyond it each ray of
-the bundle traverses the tree alone."""
+"""Largest number of triangles that are tested against a whole bundle of rays. If more tests are
+needed, each ray of the bundle traverses the tree alone."""
 _UNLIMITED_TESTS = np.int64(1 << 62)
-"""Number of triangle tests that no traversal reaches, which stands for no limit."""
+"""Number of triangle tests passed for a traversal without a limit; no traversal reaches it."""
 
 _X, _Y, _Z = range(3)
 """Indices of the coordinate axes."""
@@ -157,8 +157,8 @@ def _doubled_triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.nda
 def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> np.ndarray:
     """Return the bounding box of each leaf, (n, 6) float32 [m].
 
-    A box has its lower bounds along x, y, z, and then its upper bounds negated. ``leaves`` is the
-    result of :func:`_order_into_leaves`.
+    A row holds the lower bounds of the box along x, y, z, and the negative of its upper bounds.
+    ``leaves`` is the result of :func:`_order_into_leaves`.
     """
     slack = _BOX_MARGIN_FRACTION * float(max(vertices.max(), -vertices.min()))
     boxes = np.empty((leaves.size // LEAF_TRIANGLES_MAX, 6), np.float32)
@@ -334,7 +334,7 @@ def _smaller_of_two(a, b):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_nearest_triangles(tree, origins, directions, distance, face_index, distance_min=0.0):
-    """Find the nearest triangle that each ray hits, if it is nearer than the known distance.
+    """Find the nearest triangle that each ray hits within its known distance, in place.
 
     Rays come in bundles of one origin.
 
@@ -397,7 +397,7 @@ def find_nearest_triangles(tree, origins, directions, distance, face_index, dist
 def _traverse_tree(
     tree, origin, directions, distance, face_index, scratch, tests_max, distance_min
 ):
-    """Find the nearest triangles that the rays of a bundle hit; return False if aborted.
+    """Find the nearest triangles that a bundle of rays hits, in place; return False if aborted.
 
     All rays traverse the tree together.
 
@@ -490,10 +490,9 @@ def _traverse_tree(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _prepare_bundle(directions, shears, box_test_constants):
-    """Compute the constants of a bundle's box and triangle tests, and return its axis.
+    """Compute constants of a bundle's box and triangle tests; return the index of its main axis.
 
-    The axis (0, 1 or 2) is that along which the component of every direction is largest; -1 if this
-    axis differs between directions.
+    The main axis is that along which the component of every direction is largest.
 
     Parameters
     ----------
@@ -509,7 +508,7 @@ def _prepare_bundle(directions, shears, box_test_constants):
     Returns
     -------
     int
-        Index of the axis, 0, 1 or 2 for x, y or z; -1 if the axis differs between directions.
+        Index of the main axis, 0, 1 or 2 for x, y or z; -1 if it differs between directions.
 
     Notes
     -----
@@ -625,7 +624,7 @@ def _box_entry_distances(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_triangle(a, b, c, index, shears, distance_min, distance, face_index):
-    """Intersect one triangle with all rays of a bundle, and keep hits nearer than those known.
+    """Intersect one triangle with all rays of a bundle; replace known hits by nearer ones.
 
     Parameters
     ----------

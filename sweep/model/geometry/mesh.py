@@ -71,7 +71,7 @@ class Mesh:
 
 
 def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
-    """Merge meshes whose coordinates are in one frame into one mesh, in the order given."""
+    """Return one mesh of all triangles of meshes in the same frame, in the order of the meshes."""
     corners = [
         mesh.origin + corner_function(mesh.vertices, axis=0)
         for mesh in meshes
@@ -142,8 +142,8 @@ def rounded_centre(vertices: np.ndarray) -> np.ndarray:
 
 
 _GRAZING_SINE_MAX = 1e-6
-"""Largest sine of the angle between a ray and a facet at which rounding may make the ray lie in the
-facet's plane."""
+"""Sine of the angle between a ray and a facet's plane, up to which rounding may make the ray lie in
+the plane."""
 
 
 def facet_normals(corners: np.ndarray) -> DoubleDouble:

@@ -144,9 +144,11 @@ def from_heading(
     heading : ndarray or float
         Angle of the forward axis from the world's x, counter-clockwise from above [rad].
     pitch : ndarray or float
-        Angle by which the nose is then raised [rad], a right-handed rotation about -y.
+        Angle by which the nose is raised after the rotation by the heading [rad], a right-handed
+        rotation about -y.
     roll : ndarray or float
-        Angle by which the left side is raised last [rad], a right-handed rotation about x.
+        Angle by which the left side is raised after both other rotations [rad], a right-handed
+        rotation about x.
 
     Returns
     -------

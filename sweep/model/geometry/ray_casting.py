@@ -60,7 +60,8 @@ class BundleHits(NamedTuple):
     cos_incidence: np.ndarray
     """(n, b) float64: cosine of the angle of incidence, 0..1; nan for a beamlet that misses."""
     surface_index: np.ndarray
-    """(n, b) int16: index of the surface material that is hit; -1 for a beamlet that misses."""
+    """(n, b) int16: index in the scene of the surface material that the beamlet hits; -1 for a
+    beamlet that misses."""
     face_index: np.ndarray
     """(n, b) int64: index, in the body's mesh, of the triangle that is hit; -1 for a beamlet that
     misses."""
@@ -83,7 +84,7 @@ class RayCaster:
 
     @property
     def nbytes(self) -> int:
-        """Memory that triangles and box trees of the bodies occupy [bytes]."""
+        """Memory occupied by the triangles and box trees of all bodies [bytes]."""
         mesh_bytes = sum(
             mesh.vertices.nbytes + mesh.faces.nbytes + mesh.surface_index.nbytes
             for mesh in self.meshes
@@ -186,7 +187,7 @@ class RayCaster:
     def _first_hits(self, frames, origins, directions, range_min):
         """Return the indices of the triangle and the body that each beamlet hits first.
 
-        Both are (n, b); -1 for a miss.
+        Both arrays are (n, b). Elements of a beamlet that misses are -1.
         """
         shape = directions.shape[:2]
         distance, face_index = np.full(shape, np.inf), np.full(shape, -1)
@@ -238,7 +239,7 @@ class RayCaster:
         return intersections
 
     def _mesh_frames(self, poses, n_bundles):
-        """Return the transformation from the world to each body's mesh, at the body's pose.
+        """Return the :class:`_MeshFrame` of each body, at the body's pose.
 
         The pose of a body at rest in the world's frame is None.
         """
@@ -413,7 +414,7 @@ class _MeshFrame(NamedTuple):
 
 
 def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
-    """Intersect m rays with the planes of the facets (triangles) of one mesh that they hit.
+    """Intersect m rays with the planes of the facets (triangles) that they hit in one mesh.
 
     Parameters
     ----------

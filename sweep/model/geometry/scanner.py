@@ -17,8 +17,8 @@ import numpy as np
 from sweep.model.geometry.quaternion import from_rotation_vector, multiply, rotate
 
 JITTER_KEY_DOMAIN = "sweep.jitter"
-"""Text that is hashed into the random key of pointing jitter, so that the key differs from others
-of the same seed."""
+"""Text that is hashed into the random key of pointing jitter, so that the key differs from other
+keys made from the same seed."""
 
 
 def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
@@ -158,7 +158,7 @@ class BeamCycle:
     rate: float
     """Number of measurement cycles per second [Hz], > 0."""
     interval: float | None = None
-    """Time from one shot to the next of a measurement cycle [s]. With 0 all beams fire at once
+    """Time from one shot to the next within a measurement cycle [s]. With 0 all beams fire at once
     (several telescopes). With None the shots are spaced evenly over the cycle (one steered beam).
     """
     _unit_directions: np.ndarray = field(init=False, repr=False)
@@ -197,20 +197,20 @@ class BeamCycle:
 
     @property
     def n_beams(self) -> int:
-        """Number of distinct beams."""
+        """Number of beams with distinct directions."""
         return len(self._unit_directions)
 
     @property
     def shots_per_cycle(self) -> int:
-        """Number of shots of a measurement cycle."""
+        """Number of shots in a measurement cycle, one per beam of a pattern."""
         return int(self._pattern_table.shape[1])
 
     def count_shots(self, duration: float) -> int:
-        """Return the number of shots that begin within a duration [s], including its end."""
+        """Return the number of shots that begin at times 0 .. ``duration`` [s], ends included."""
         return _count_begun_shots(duration, self.rate, self.shots_per_cycle, self._shot_interval)
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
-        """Return times and directions of the shots with given numbers (n,), counted from 0."""
+        """Return the :class:`ScanShots` with the given shot numbers (n,), counted from 0."""
         patterns = self._pattern_table
         cycle_number, shot_in_cycle = np.divmod(
             np.asarray(shot_numbers, np.int64), self.shots_per_cycle
@@ -259,8 +259,8 @@ def fixed_beams(
     rate : float
         Measurement cycles per second [Hz].
     interval : float, optional
-        Time from one beam to the next [s]; 0 fires all at once, None spaces them evenly over the
-        cycle.
+        Time from one beam to the next [s]. 0 fires all beams at once, None spaces them evenly over
+        the cycle.
 
     Returns
     -------
@@ -325,7 +325,8 @@ class LineScan:
     """Shape of the sweep angle over time: ``triangle`` for a constant rate, ``sine`` for a resonant
     mirror."""
     interval: float = 0.0
-    """Time from one beam to the next of a measurement cycle [s]. With 0 all beams fire at once."""
+    """Time from one beam's shot to the next beam's in a measurement cycle [s]. With 0 all beams
+    fire at once."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.half_angle < math.pi / 2 and self.along):
@@ -339,15 +340,15 @@ class LineScan:
 
     @property
     def n_beams(self) -> int:
-        """Number of distinct beams."""
+        """Number of beams with distinct directions."""
         return len(self.along)
 
     def count_shots(self, duration: float) -> int:
-        """Return the number of shots that begin within a duration [s], including its end."""
+        """Return the number of shots that begin at times 0 .. ``duration`` [s], ends included."""
         return _count_begun_shots(duration, self.rate, self.n_beams, self.interval)
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
-        """Return times and directions of the shots with given numbers (n,), counted from 0.
+        """Return the :class:`ScanShots` with the given shot numbers (n,), counted from 0.
 
         A measurement cycle is one shot of each beam.
         """
@@ -453,8 +454,8 @@ def transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors perpendicular to each direction and to each other, (n, 3) each.
 
     First, second and `direction` (n, 3) form a right-handed system. For a beam near -z the first
-    vector lies near x. Both are smooth functions of the direction except near x and -x, where no
-    beam of a downward-looking instrument points.
+    vector lies near x. Both vectors are smooth functions of the direction except near x and -x,
+    where no beam of a downward-looking instrument points.
     """
     second = np.cross(direction, [1.0, 0.0, 0.0])
     length = _vector_length(second)

@@ -73,7 +73,7 @@ TRIAL_TIME_FRACTION = 0.003
 """Target duration of one trial of a setting, as a fraction of the measurement's time limit."""
 
 TIMED_SEQUENCE_TIME_FACTOR = 2
-"""Target duration of the sequence of points on which a setting is timed.
+"""Target duration of computing the sequence of points on which a setting is timed.
 
 The unit is the target duration of a trial.
 """
@@ -93,7 +93,7 @@ The first is for the first round of trials, the second for the comparison with t
 TIME_DOMAIN_POINTS_MIN, TIME_DOMAIN_POINTS_MAX = 3, 500
 """Least and largest number of points that are also simulated in the time domain.
 
-The least number is simulated even if the time limit is exceeded.
+The least number of points is simulated even if the time limit is exceeded.
 """
 
 TIME_DOMAIN_BEAMLET_COUNT = 109
@@ -109,7 +109,8 @@ REPEATED_TRIAL_SECONDS_MAX = 1.0
 FIXED_EFFECTS_TOLERANCES = (1e-1, 1e-3, 1e-6)
 """Tolerances from which settings with fixed effects are made.
 
-Such a setting simulates at every point each effect that the tolerance needs at any point.
+A setting with fixed effects simulates, at every point, all effects that the tolerance requires at
+any point of the sample.
 """
 
 STORING_TIME_REPEATS = 3
@@ -187,7 +188,7 @@ def measure_accuracy(
 
 
 def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
-    """Raise a StoreError if the path holds something that may not be overwritten."""
+    """Raise a StoreError unless the path is free or holds an accuracy store to overwrite."""
     if can_create_store(store_path):
         return
     if store_format.read_attributes(store_path)["kind"] != store_format.ACCURACY_STORE_KIND:
@@ -532,7 +533,7 @@ def result_differences(results: SampleResults, reference: SampleResults) -> tupl
 
 
 def _probability_differences(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the absolute differences of two arrays of probabilities.
+    """Return the absolute differences of two arrays of probabilities, as an array of their shape.
 
     A single nan counts as a probability of 0. The difference is nan where both are nan.
     """
@@ -541,7 +542,7 @@ def _probability_differences(first: np.ndarray, second: np.ndarray) -> np.ndarra
 
 
 class StopReason(StrEnum):
-    """Reason why a measurement of accuracy has only a part of its sample, as stores state it."""
+    """Reason why an accuracy measurement covers only a part of its sample."""
 
     NONE = ""
     """The sample is complete."""
@@ -561,22 +562,23 @@ class AccuracyStoreTemplate:
     sample: StudySample
     """Sample of the study's points."""
     setting_ladder: SettingLadder
-    """All settings, the reference last."""
+    """All settings that are compared; the reference, the most accurate one, is last."""
     sample_rows: np.ndarray
     """Indices, in the sample, of the points on which all settings were tried."""
     trials_by_round: list[list[Trial]]
-    """Trials on all these points, by round and setting."""
+    """Trials of the settings on the points of ``sample_rows``, by round and setting."""
     n_timed_points: np.ndarray
-    """(settings,): number of points that are timed together."""
+    """(settings,): number of points on which each setting is timed in one trial."""
     time_domain_differences: dict[int, np.ndarray]
     """Differences between the reference and the time domain, by :func:`result_differences`, at
     points given by their indices in the sample."""
     n_time_domain_beamlets: int
-    """Number of beamlets in this comparison; 0 for that of the reference setting."""
+    """Number of beamlets in the comparison with the time domain; 0 stands for the number of the
+    reference setting."""
     stop_reason: StopReason
-    """Reason why the sample is incomplete, if it is."""
+    """Reason why not all points of the sample are complete; NONE if all are."""
     storing_seconds: float = math.nan
-    """Processor time of storing the study [s]."""
+    """Processor time of creating the study's store and writing its blocks [s]."""
 
     @property
     def model_version(self) -> str:

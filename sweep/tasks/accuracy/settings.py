@@ -82,7 +82,8 @@ REFERENCE_DRAWS_FACTOR = 10
 """Number of draws of the reference, as a multiple of the largest number of draws that is tried."""
 
 TRIED_DRAW_TOLERANCES = (1e-1, 3e-2, 1e-2)
-"""Tried tolerances of pd: a point is drawn until the statistical error of its pd is below it."""
+"""Tolerances of pd that are tried. Draws are made at a point until the statistical error of its pd
+is below the tolerance."""
 
 _TOLERANCE_FIELD, _DRAWS_FIELD, _DRAWS_LIMIT_FIELD = (
     "accuracy.tolerance",
@@ -115,14 +116,14 @@ class AccuracySetting:
     def has_line_effects_only(self) -> bool:
         """True if the setting simulates only effects that the thesis's method can simulate.
 
-        Such effects move or scale a spectral line as a whole. They do not change it within a
-        record.
+        Effects of this kind move or scale a spectral line as a whole. They do not change the line
+        within a record.
         """
         return self.kind in (CLOSED_FORM_KIND, THESIS_METHOD_KIND, IMPROVED_THESIS_METHOD_KIND)
 
     @property
     def plans_effects(self) -> bool:
-        """True if the setting chooses effects point by point. The time of choosing then counts."""
+        """True if the setting chooses effects point by point, which counts as computing time."""
         return not self.has_line_effects_only and self.kind not in (
             FIXED_EFFECTS_KIND,
             ALL_EFFECTS_KIND,
@@ -135,7 +136,7 @@ class AccuracySetting:
         return self.kind in (COUNTED_DETECTIONS_KIND, COUNTED_DETECTIONS_IN_NOISE_KIND)
 
     def apply_to(self, spec: AnySpec) -> AnySpec:
-        """Return the spec with the setting's values.
+        """Return a copy of a spec with the setting's values.
 
         SpecError is raised if the result is invalid.
         """
@@ -261,7 +262,7 @@ def add_settings_for_effect_sets(
 
 
 def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
-    """Return the field values that set the number of beamlets in settings with fixed effects.
+    """Return the spec fields, by dotted path, that set the beamlets in settings with fixed effects.
 
     The result is empty if the scene sets the number of beamlets.
     """
@@ -398,7 +399,7 @@ def _build_draw_setting_ladder(spec: GridSpec) -> SettingLadder:
 
 
 def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
-    """Return the field values that enable all effects.
+    """Return the spec fields, by dotted path, whose values enable all effects.
 
     An effect whose absence is a rule of the scene, such as segment motion, stays off if the spec
     disables it. Random effects are enabled only if probabilities are means over draws, which they

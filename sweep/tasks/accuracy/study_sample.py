@@ -50,7 +50,8 @@ PeakFinder = Callable[[Shots], SegmentResults]
 """Function that finds the largest bins in the spectrum of each segment (chirp) of some shots."""
 
 PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
-"""Coordinates that identify sampled points: by name, the values at the points, and the attributes.
+"""Coordinates that identify sampled points: a mapping from the name of a coordinate to its values
+at the points and its attributes.
 """
 
 
@@ -263,9 +264,9 @@ class StudySample(ABC):
         return TimeDomainComparison(time_domain, simulated)
 
     def clear_caches(self) -> None:  # noqa: B027
-        """Drop results that several trials of one part share.
+        """Drop cached results that several trials of one part share.
 
-        The time to compute them counts in each of these trials.
+        Each of these trials is then timed with the computation of these results included.
         """
 
     @abstractmethod
@@ -282,7 +283,7 @@ class StudySample(ABC):
         effect_flags: np.ndarray,
         find_peaks: PeakFinder | None,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Yield indices of some points and the model's outputs there, until all points are done.
+        """Yield rows of ``point_indices`` and the model's outputs at these points, group by group.
 
         ``find_peaks`` replaces the model's search for peaks.
         """
@@ -314,7 +315,7 @@ class StudySample(ABC):
         n_points: int,
         outputs_by_rows: Iterable[tuple[np.ndarray, Results]],
     ) -> SampleResults:
-        """Return the results of all points, joined from outputs that cover some points each."""
+        """Return the results at all points, joined from outputs for groups of points."""
         n_counted_draws = (
             int(self.study_with_setting(setting).spec.draws.number)
             if setting.counts_detections
@@ -571,7 +572,7 @@ class FlightSample(StudySample):
         } | axis_coordinates(self.spec.axes, tuple(axis_indices[self._part_of_row].T))
 
     def clear_caches(self) -> None:
-        """Drop the cast rays that settings with the same geometry share."""
+        """Drop the cached geometry of cast rays that settings with the same geometry share."""
         self._cast_eyepoints.clear()
 
     def extend_to_complete_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
@@ -692,9 +693,9 @@ class FlightSample(StudySample):
 
 
 def rows_of_complete_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
-    """Return the rows of all shots in the tiles of some rows, and in the tiles that follow.
+    """Return the rows of all shots in the tiles of the given rows, and in enough following tiles.
 
-    The first tile follows the last. ``tile_of_row`` (n,) is the number of each row's tile, in
+    After the last tile comes the first. ``tile_of_row`` (n,) is the number of each row's tile, in
     rising order. Tiles are added until the tiles from the first one on have at least `n_shots`
     shots.
     """
