@@ -277,7 +277,7 @@ def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
         circular_bins / _cfar_factor_of_settings(OS_CFAR, settings),
         np.zeros(circular_bins.shape, np.int64),
     )
-    for below, above in _iter_training_pairs(power, settings):
+    for below, above in _iter_training_cell_pairs(power, settings):
         n_below += below <= level_max
         n_below += above <= level_max
     return _pad_to_all_bins(n_below >= settings.rank, settings)
@@ -309,7 +309,7 @@ def _pad_to_all_bins(flags: np.ndarray, settings: SpectrumSettings) -> np.ndarra
     return flags if settings.complex_record else np.pad(flags, ((0, 0), (1, 1)))
 
 
-def _iter_training_pairs(
+def _iter_training_cell_pairs(
     power: np.ndarray, settings: SpectrumSettings
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield pairs of arrays: power of one training cell below each bin, and of one above it.
@@ -331,7 +331,7 @@ def _training_power_sums(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the summed power of the training cells below each bin, and of those above it."""
     below, above = np.zeros((2, *_power_in_circular_bins(power, settings).shape))
-    for cells_below, cells_above in _iter_training_pairs(power, settings):
+    for cells_below, cells_above in _iter_training_cell_pairs(power, settings):
         below += cells_below
         above += cells_above
     return below, above

@@ -1067,7 +1067,7 @@ def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_s
     Near DC and Nyquist of a real record it is also the mean over the phase of z.
     """
     noise = bin_threshold.noise_sigma_without_pedestal
-    bins_given_mode = _zero_bins_given_mode(INTEGER_ONE)
+    bins_given_mode = _allocate_bins_given_mode(INTEGER_ONE)
     bins_given_mode.signal_ratio[:] = magnitude / noise
     bins_given_mode.threshold_ratio[:] = bin_threshold.threshold / noise
     bins_given_mode.pedestal_power_ratio[:] = (bin_threshold.line_noise_sigma / noise) ** 2 - 1.0
@@ -1124,7 +1124,7 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
         tails = bin_crossing_tails(magnitude[i] / noise, threshold / noise, is_real)
         if not tails.below > 0.0:
             return PdAndMiss(1.0, 0.0)
-        given_neighbour, quantile = _crossing_given_neighbour_below(
+        given_neighbour, quantile = _crossing_given_previous_bin_stays(
             tails, previous_p_stay, previous_quantile, rule.neighbour_crossing_quadrature
         )
         pd += miss * given_neighbour.above
@@ -1141,7 +1141,7 @@ def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
     pedestal. :func:`fill_pedestal_ratios` gives the power that it adds to the noise of each bin.
     """
     n_bins = echo.magnitude.size
-    pedestal_ratios, bins_given_mode = np.empty(n_bins), _zero_bins_given_mode(n_bins)
+    pedestal_ratios, bins_given_mode = np.empty(n_bins), _allocate_bins_given_mode(n_bins)
     fill_pedestal_ratios(echo.magnitude, echo.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
         noise = bin_threshold.noise_sigma_without_pedestal * math.sqrt(1.0 + pedestal_ratios[k])
@@ -1154,7 +1154,7 @@ def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
 
 
 @njit(cache=True, error_model="numpy")
-def _zero_bins_given_mode(n_bins):
+def _allocate_bins_given_mode(n_bins):
     """Return a :class:`BinsGivenMode` for ``n_bins`` bins, all of whose fields are zero."""
     rows = np.zeros((5, n_bins))  # one allocation instead of five
     return BinsGivenMode(
@@ -1167,7 +1167,7 @@ def _zero_bins_given_mode(n_bins):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _crossing_given_neighbour_below(
+def _crossing_given_previous_bin_stays(
     tails, previous_p_stay, previous_quantile, neighbour_crossing_quadrature
 ):
     """Return a bin's crossing probability given that the bin below does not cross.
@@ -1222,7 +1222,7 @@ def any_crossing_probability_in_chain(probabilities, n_bins, neighbour_crossing_
         if p_cross < 1e-4:
             p_any, p_none, previous_p_stay = p_any + p_none * p_cross, p_none * p_stay, -1.0
             continue
-        given_neighbour, quantile = _crossing_given_neighbour_below(
+        given_neighbour, quantile = _crossing_given_previous_bin_stays(
             Tails(p_cross, p_stay),
             previous_p_stay,
             previous_quantile,
@@ -1397,7 +1397,7 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
     )
     n_bins = end - begin
     bin_run = EchoBins(magnitude[begin:end], is_echo[begin:end], echo.first_bin + begin)
-    # Not by _zero_bins_given_mode: a call and zeros cost 6 % of the time of an echo.
+    # Not by _allocate_bins_given_mode: a call and zeros cost 6 % of the time of an echo.
     rows, pedestal_ratios = np.empty((5, n_bins)), np.empty(n_bins)
     bins_given_mode = BinsGivenMode(
         signal_ratio=rows[0],

@@ -210,7 +210,9 @@ def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
     Signal Process. Mag. 24(3), 123, 2007].
     """
     sign, factor = jacobsen_coefficients(settings.window, settings.fft_size)
-    return peak + factor * _jacobsen_ratio(_three_bins_about_middle(spectrum, peak, settings), sign)
+    return peak + factor * _jacobsen_ratio(
+        _three_bins_with_centred_phase(spectrum, peak, settings), sign
+    )
 
 
 def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
@@ -240,7 +242,9 @@ def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -
     offset, tone_bins = _tone_offsets_and_bins(settings.window, settings.fft_size)
     tone_ratios = np.maximum.accumulate(_jacobsen_ratio(tone_bins, 1))
     return peak + np.interp(
-        _jacobsen_ratio(_three_bins_about_middle(spectrum, peak, settings), 1), tone_ratios, offset
+        _jacobsen_ratio(_three_bins_with_centred_phase(spectrum, peak, settings), 1),
+        tone_ratios,
+        offset,
     )
 
 
@@ -304,7 +308,7 @@ def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) 
     and Rader, Bell Syst. Tech. J. 48, 1249, 1969]. A parabola refines the maximum.
     """
     zoom, positions = (
-        _zoom_transform(settings.window.length, settings.fft_size),
+        _make_zoom_transform(settings.window.length, settings.fft_size),
         np.empty(peak.size),
     )
     zoom_grid = np.arange(2 * _ZOOM_POINTS_PER_BIN + 1)
@@ -386,7 +390,7 @@ def _three_bins(spectrum: np.ndarray, peak: np.ndarray) -> np.ndarray:
     return np.take_along_axis(spectrum, bins, axis=1)
 
 
-def _three_bins_about_middle(
+def _three_bins_with_centred_phase(
     spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings
 ) -> np.ndarray:
     """Return the three bins about each peak with phases relative to the record's middle, (m, 3)."""
@@ -468,7 +472,7 @@ def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
 
 
 @lru_cache(maxsize=4)
-def _zoom_transform(length: int, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
+def _make_zoom_transform(length: int, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that transforms records (m, length) to their spectra at -1 .. 1 FFT bin."""
     from scipy import signal  # slow to import
 

@@ -62,7 +62,7 @@ the threshold is averaged over them."""
 _N_CONTOUR_NODES = 40
 """Number of quadrature nodes of the contour integral for tail probabilities of the looks' mean
 power. The nodes lie on the upper half of a parabola in the complex plane."""
-_CONTOUR_END = 4.6
+_CONTOUR_ASINH_MAX = 4.6
 """Largest asinh(Im s / c) on the contour of the integral over s for tail probabilities of the
 looks' mean power. c is the width of the integrand's peak."""
 _BISECTION_STEPS = 60
@@ -343,7 +343,7 @@ def gamma_sum_tails(
     contour_curvature = np.clip(
         third_derivative / (6 * second_derivative), 0.05 / contour_scale, 2 / contour_scale
     )[..., None]
-    step = _CONTOUR_END / _N_CONTOUR_NODES
+    step = _CONTOUR_ASINH_MAX / _N_CONTOUR_NODES
     node = (np.arange(_N_CONTOUR_NODES) + 0.5) * step
     imaginary_part = contour_scale[..., None] * np.sinh(node)
     s = (

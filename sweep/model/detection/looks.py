@@ -64,11 +64,11 @@ N_DRIFT_POSITIONS_MAX = 64
 """Largest number of looks at which the position of a line that moves from look to look is
 evaluated. More looks are represented by this number of looks."""
 
-_CERTAIN_MARGIN_SIGMA = 40.0
+_CERTAIN_CROSSING_MARGIN_SIGMA = 40.0
 """Distance of a bin's |X| from the threshold beyond which a crossing counts as certain or
 impossible, in units of the noise per quadrature."""
 _BISECTION_STEPS = 60
-_LOG_POWER_GRID = -5.0, math.log(16.0), 64
+_LOG_SPECKLE_POWER_GRID = -5.0, math.log(16.0), 64
 """Grid of the quadrature over the speckle's power (mean 1): ln(power) of the first and of the last
 node, and number of nodes."""
 _N_GAUSS_NODES = 24
@@ -197,8 +197,8 @@ class Looks(NamedTuple):
         a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, threshold_ratio))
         pd, miss = np.where(a > b, 1.0, 0.0), np.where(a > b, 0.0, 1.0)
         near = np.asarray(
-            (a - b < _CERTAIN_MARGIN_SIGMA)
-            & (b - a < _CERTAIN_MARGIN_SIGMA + math.sqrt(2 * self.number))
+            (a - b < _CERTAIN_CROSSING_MARGIN_SIGMA)
+            & (b - a < _CERTAIN_CROSSING_MARGIN_SIGMA + math.sqrt(2 * self.number))
         )
         degrees_of_freedom, noise_fraction = (
             np.where(is_real, n, 2 * n)[near] for n in (self.number, 1.0)
@@ -477,7 +477,9 @@ class Looks(NamedTuple):
                 np.exp(-y), np.exp(-z), infinite_threshold, squared_correlation**0.5
             )
             return np.where(
-                is_defined, p - self.p_votes_first_only(np.exp(-y), np.exp(-z), p_both), np.nan
+                is_defined,
+                p - self.p_enough_votes_in_first_bin_only(np.exp(-y), np.exp(-z), p_both),
+                np.nan,
             )
         n, inverse_remainder = self.number, 1 / (1 - squared_correlation)
         with np.errstate(divide="ignore"):
@@ -722,12 +724,14 @@ class Looks(NamedTuple):
                 p_first_only - marcum_q1(scaled_threshold, correlation * scaled_threshold).p
             )
             p = np.exp(-y)
-            p_votes_first_only = self.p_votes_first_only(
+            p_enough_votes_in_first_bin_only = self.p_enough_votes_in_first_bin_only(
                 p, p, p * np.maximum(1 - p_first_only, 0.0)
             )
             log_p_cross = self.log_pfa(threshold_ratio)
             return np.where(
-                log_p_cross > -600, p_votes_first_only / np.exp(np.maximum(log_p_cross, -600)), 1.0
+                log_p_cross > -600,
+                p_enough_votes_in_first_bin_only / np.exp(np.maximum(log_p_cross, -600)),
+                1.0,
             )
         p, gamma_threshold = np.exp(self.log_pfa(threshold_ratio)), n * y / (1 - r)
         p_both, j, is_unfinished = np.zeros_like(y), np.arange(256), np.ones(y.shape, bool)
@@ -746,7 +750,7 @@ class Looks(NamedTuple):
                 return np.clip(1 - p_both / np.maximum(p, 1e-300), 0.0, 1.0)
             j = j + j.size
 
-    def p_votes_first_only(
+    def p_enough_votes_in_first_bin_only(
         self, p_first: np.ndarray, p_second: np.ndarray, p_both: np.ndarray
     ) -> np.ndarray:
         """Return the probability that enough records cross in the first bin, but not in the second.
@@ -891,7 +895,7 @@ class Looks(NamedTuple):
         gamma_shape = float(self.number if self.has_independent_speckle else 1)
         if look_speckle is not None:
             gamma_shape = float(look_speckle.n_effective_looks[segment, point])
-        log_power = np.linspace(*_LOG_POWER_GRID)
+        log_power = np.linspace(*_LOG_SPECKLE_POWER_GRID)
         log_density = gamma_shape * (log_power - np.exp(log_power))
         weights = np.exp(log_density - log_density.max())
         return np.exp(log_power), weights / weights.sum()

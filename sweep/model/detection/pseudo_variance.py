@@ -67,7 +67,7 @@ class SignalPseudoVariance(NamedTuple):
 def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
     """Compute the pseudo-variance ratios of the echoes of prepared shots with real records."""
     fft_size, padding_factor = shots.fft_size, shots.fft_size / shots.window.length
-    n_bins = n_tabulated_bins(shots.window, fft_size)
+    n_bins = n_pseudo_variance_bins(shots.window, fft_size)
     pseudo_variance_row = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     ratio_rows, factor_rows = [np.zeros((1, n_bins))], [np.ones((1, N_PHASE_NODES))]
     near_end = lines_overlap_images(shots)
@@ -192,7 +192,7 @@ def lines_overlap_images(shots: Any) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def n_tabulated_bins(window: Window, fft_size: int) -> int:
+def n_pseudo_variance_bins(window: Window, fft_size: int) -> int:
     """Return the number of bins next to DC or Nyquist with a tabulated pseudo-variance.
 
     Parameters
@@ -232,7 +232,7 @@ def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
     -------
     ndarray (bins,)
         Ratio, -1..1, in bins k = 0, 1, .. from DC or Nyquist. The number of bins is that of
-        :func:`n_tabulated_bins`.
+        :func:`n_pseudo_variance_bins`.
 
     Notes
     -----
@@ -241,7 +241,7 @@ def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
     """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
-    bin_numbers = np.arange(n_tabulated_bins(window, fft_size))
+    bin_numbers = np.arange(n_pseudo_variance_bins(window, fft_size))
     ratios = [
         (squared_window * np.cos(4 * np.pi * k * record_position)).sum() / squared_window.sum()
         for k in bin_numbers

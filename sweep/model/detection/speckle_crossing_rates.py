@@ -49,10 +49,10 @@ CERTAIN_CROSSING_RATE = 40.0
 """Rate -ln(1 - c), with a bin's crossing probability c, above which it counts as certain to cross
 the threshold."""
 
-_LOG_AMPLITUDE_PER_POWER = 0.5 * math.log(2.0) / POWERS_PER_OCTAVE_MAX
+_LOG_AMPLITUDE_STEP_BETWEEN_POWERS = 0.5 * math.log(2.0) / POWERS_PER_OCTAVE_MAX
 """Natural logarithm of the ratio of the amplitudes at two successive tabulated speckle powers."""
 _LOG_AMPLITUDE_AT_FAINTEST_POWER = (
-    0.5 * math.log(SPECKLE_POWER_MAX) - (N_SPECKLE_POWERS - 1) * _LOG_AMPLITUDE_PER_POWER
+    0.5 * math.log(SPECKLE_POWER_MAX) - (N_SPECKLE_POWERS - 1) * _LOG_AMPLITUDE_STEP_BETWEEN_POWERS
 )
 _CONSTANT_RATE_PRODUCT_MAX = 0.01
 """Product of signal and threshold, each over the noise per quadrature, below which the crossing
@@ -61,7 +61,7 @@ relative error is 1.3e-5."""
 _LOG_RATE_STEP_MAX = 0.3
 """Largest change of ln(rho) between two table entries of the relative crossing rate rho. The
 interpolated rho then has a relative error of 4e-6."""
-_CERTAIN_MARGIN_SIGMA = 9.0
+_CERTAIN_CROSSING_MARGIN_SIGMA = 9.0
 """Excess of amplitude over threshold beyond which a bin's rate is set to CERTAIN_CROSSING_RATE, in
 units of the noise per quadrature."""
 _TABULATED_THRESHOLD_RATIO_MIN = 1e-3
@@ -127,18 +127,18 @@ def _rate_table_grid(threshold_ratio):
     """Return the :class:`RateTableGrid` for a threshold over the noise per quadrature."""
     # The slope of ln(rate) over ln(a) is a (b - a), and rates below e^-30 are negligible.
     steepness = min(0.25 * threshold_ratio * threshold_ratio, 7.7 * threshold_ratio) + 1.0
-    entries_per_power = int(_LOG_AMPLITUDE_PER_POWER * steepness / _LOG_RATE_STEP_MAX) + 1
+    entries_per_power = int(_LOG_AMPLITUDE_STEP_BETWEEN_POWERS * steepness / _LOG_RATE_STEP_MAX) + 1
     entries_per_power = min(max(entries_per_power, _ENTRIES_PER_POWER_MIN), _ENTRIES_PER_POWER_MAX)
-    log_amplitude_step = _LOG_AMPLITUDE_PER_POWER / entries_per_power
+    log_amplitude_step = _LOG_AMPLITUDE_STEP_BETWEEN_POWERS / entries_per_power
     log_amplitude_first = (
         math.log(_CONSTANT_RATE_PRODUCT_MAX / threshold_ratio)
         - 2.0 * log_amplitude_step
-        - (N_SPECKLE_POWERS - 1) * _LOG_AMPLITUDE_PER_POWER
+        - (N_SPECKLE_POWERS - 1) * _LOG_AMPLITUDE_STEP_BETWEEN_POWERS
     )
     log_amplitude_span = max(
-        math.log(threshold_ratio + _CERTAIN_MARGIN_SIGMA) - log_amplitude_first, 0.0
+        math.log(threshold_ratio + _CERTAIN_CROSSING_MARGIN_SIGMA) - log_amplitude_first, 0.0
     )
-    n_columns = int(log_amplitude_span / _LOG_AMPLITUDE_PER_POWER) + N_SPECKLE_POWERS + 3
+    n_columns = int(log_amplitude_span / _LOG_AMPLITUDE_STEP_BETWEEN_POWERS) + N_SPECKLE_POWERS + 3
     return RateTableGrid(log_amplitude_first, log_amplitude_step, entries_per_power, n_columns)
 
 
@@ -233,8 +233,8 @@ def fill_rate_table(threshold_ratio, crossing_series, arrays):
         rate = CERTAIN_CROSSING_RATE
         if k < n_below_threshold:
             rate = crossing_rate(rates[k])
-        elif squared_amplitudes[k] < (threshold_ratio + _CERTAIN_MARGIN_SIGMA) * (
-            threshold_ratio + _CERTAIN_MARGIN_SIGMA
+        elif squared_amplitudes[k] < (threshold_ratio + _CERTAIN_CROSSING_MARGIN_SIGMA) * (
+            threshold_ratio + _CERTAIN_CROSSING_MARGIN_SIGMA
         ):
             p_signal_stay = (
                 marcum_q1_tails(math.sqrt(squared_amplitudes[k]), threshold_ratio).below

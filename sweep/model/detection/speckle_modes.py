@@ -37,7 +37,7 @@ N_CENTRE_OFFSETS = 9
 """Number of tabulated positions of an echo's centre relative to the nearest bin. They are evenly
 spaced over -1/2 .. 1/2 FFT bin."""
 
-_TABLE_WINDOW_SAMPLES = 1024
+_N_TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the window with which tables are computed in place of longer windows of the
 same shape."""
 _POWER_ITERATIONS_MAX = 80
@@ -128,7 +128,7 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
     )
     if record_window.name in COSINE_SUM_COEFFICIENTS:
         record_window = get_window(
-            record_window.name, min(record_window.length, _TABLE_WINDOW_SAMPLES)
+            record_window.name, min(record_window.length, _N_TABLE_WINDOW_SAMPLES)
         )
     deviations = LINE_DEVIATIONS * max(1.0, lobe_half_width / 2)
     half_bins = math.ceil(
@@ -152,7 +152,7 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
             power = np.maximum((weight * bin_transforms**2).sum(axis=1), 1e-300)
             neighbour_product = (weight * bin_transforms[1:] * bin_transforms[:-1]).sum(axis=1)
             amplitude = np.sqrt(power)
-            mode = _strongest_mode(bin_transforms, weight, amplitude)
+            mode = _strongest_mode_amplitudes(bin_transforms, weight, amplitude)
             power_fraction[s, d] = np.minimum(mode**2 / power, 1.0)
             asymmetry[s, d] = power_asymmetry(*amplitude[half_bins - 1 : half_bins + 2])
             neighbour_correlation[s, d, 1:] = neighbour_product / (amplitude[1:] * amplitude[:-1])
@@ -181,7 +181,7 @@ def _gaussian_nodes(deviation: float) -> tuple[np.ndarray, np.ndarray]:
     return node, weight / weight.sum()
 
 
-def _strongest_mode(
+def _strongest_mode_amplitudes(
     bin_transforms: np.ndarray, line_weights: np.ndarray, mode: np.ndarray
 ) -> np.ndarray:
     """Return the leading eigenvector of a covariance matrix times the root of its eigenvalue.

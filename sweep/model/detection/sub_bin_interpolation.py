@@ -64,12 +64,13 @@ the |X| of three bins, TWO_BINS that of the centre bin and its larger neighbour.
 class NoiseMixing(NamedTuple):
     """Cholesky factors of the noise covariance of three adjacent bins.
 
-    Let z0, z1, z2 be independent standard normal numbers. The noise in one quadrature is z0 in the
-    centre bin, ``from_centre`` z0 + ``above_from_independent`` z1 in the bin above, and
-    ``from_centre`` z0 + ``below_from_above`` z1 + ``below_from_independent`` z2 in the bin below.
+    Let z0, z1, z2 be independent standard normal numbers. The noise in one quadrature is the sum of
+    ``neighbours_from_centre`` z0 and ``above_from_independent`` z1 in the bin above, z0 in the
+    centre bin, and the sum of ``neighbours_from_centre`` z0, ``below_from_above`` z1 and
+    ``below_from_independent`` z2 in the bin below.
     """
 
-    from_centre: float
+    neighbours_from_centre: float
     """Factor on z0, the number of the centre bin, in the noise of both neighbours."""
     above_from_independent: float
     """Factor on z1 in the noise of the bin above: the part independent of the centre bin's noise.
@@ -113,7 +114,7 @@ class Interpolator(NamedTuple):
     offset: np.ndarray
     """(m,): distance of the tone from the centre bin [bins], 0 .. 1. The magnitude ratio
     rises from ``magnitude_ratio_at_centre`` by ``magnitude_ratio_step``."""
-    weights: NeighbourWeights
+    neighbour_weights: NeighbourWeights
     """(m,) in each field: weights by which the |X| of the three bins correct the position."""
     error_at_unit_signal: np.ndarray
     """(m,): standard error of the position [bins], by the tone's distance from the centre bin. It
@@ -232,7 +233,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         magnitude_ratio_at_centre=float(magnitude_ratios[0]),
         magnitude_ratio_step=max(float(even_ratios[1] - even_ratios[0]), 1e-12),
         offset=np.interp(even_ratios, magnitude_ratios, offset),
-        weights=NeighbourWeights(*(0 * weight if neighbours_vanish else weight)),
+        neighbour_weights=NeighbourWeights(*(0 * weight if neighbours_vanish else weight)),
         error_at_unit_signal=error,
         noise_mixing=_noise_mixing(correlation_1, correlation_2),
         sidelobe_neighbour_noise_correlation=sidelobe_neighbour_noise_correlation(window, fft_size),
@@ -403,7 +404,7 @@ def _noise_mixing(correlation_1: float, correlation_2: float) -> NoiseMixing:
         else 0.0
     )
     return NoiseMixing(
-        from_centre=correlation_1,
+        neighbours_from_centre=correlation_1,
         above_from_independent=above_from_independent,
         below_from_above=below_from_above,
         below_from_independent=math.sqrt(max(1 - correlation_1**2 - below_from_above**2, 0.0)),
@@ -436,7 +437,7 @@ def estimate_sub_bin_offset(below, centre, above, interpolation):
     )
     if interpolation.magnitude_ratio_kind == THREE_BINS and centre > 0.0:
         table_index = offset * (offsets.size - 1)
-        weights = interpolation.weights
+        weights = interpolation.neighbour_weights
         correction = smaller * _interpolate_table(
             weights.smaller, table_index
         ) + larger * _interpolate_table(weights.larger, table_index)
@@ -536,10 +537,10 @@ def _drift_error_table(window: Window, fft_size: int) -> np.ndarray:
     return error_factor
 
 
-_N_LATE_POSITIONS = 65
+_N_LATE_ECHO_POSITIONS = 65
 """Number of tone positions, 0 .. 1 bin, in the tables for echoes that arrive after the record has
 begun."""
-_MISSING_FRACTIONS = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
+_MISSING_RECORD_FRACTIONS = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
 """Tabulated fractions of the record that pass before the echo arrives."""
 _ESTIMATE_SLOPE_MIN = 0.05
 """Lower limit of the derivative of the estimated position by the true one. Errors are divided by
@@ -581,7 +582,7 @@ def late_echo_correction(
     """
     missing_fraction = np.asarray(n_missing) / window.length
     shift_at, factor_at = interpolate_tables(
-        (_MISSING_FRACTIONS, np.linspace(0.0, 1.0, _N_LATE_POSITIONS)),
+        (_MISSING_RECORD_FRACTIONS, np.linspace(0.0, 1.0, _N_LATE_ECHO_POSITIONS)),
         _late_echo_tables(window, fft_size),
         (missing_fraction, np.abs(offset)),
     )
@@ -595,8 +596,8 @@ def late_echo_correction(
 def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
     """Tabulate the fields of :class:`LateEchoCorrection`, (missing fractions, positions) each."""
     w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
-    first_sample = np.minimum(np.rint(_MISSING_FRACTIONS * w.size).astype(int), w.size - 2)
-    positions = np.linspace(0.0, 1.0, _N_LATE_POSITIONS)
+    first_sample = np.minimum(np.rint(_MISSING_RECORD_FRACTIONS * w.size).astype(int), w.size - 2)
+    positions = np.linspace(0.0, 1.0, _N_LATE_ECHO_POSITIONS)
     tone_bins = np.empty((first_sample.size, positions.size, 3), complex)
     for j, position in enumerate(positions):
         for k in (-1, 0, 1):

@@ -400,7 +400,7 @@ class BodyState(NamedTuple):
     """(n, 3): acceleration of the instrument [m/s^2]. The angular velocity is taken as constant."""
 
 
-def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarray:
+def _clip_times_to_interval(times: np.ndarray, start: float, stop: float) -> np.ndarray:
     """Return times (n,) [s], clipped to the trajectory's interval if rounding put them outside.
 
     Raises
@@ -441,7 +441,7 @@ class ConstantAcceleration:
 
     def motion(self, times: np.ndarray) -> Motion:
         """Return the :class:`Motion` of the point at times (n,) [s] from start to stop."""
-        times = _clip_to_duration(times, 0.0, self.duration)[:, None]
+        times = _clip_times_to_interval(times, 0.0, self.duration)[:, None]
         x0, v0, a = np.array(
             [self.initial_position, self.initial_velocity, self.acceleration], float
         )
@@ -540,7 +540,7 @@ class Waypoints:
 
     def motion(self, times: np.ndarray) -> Motion:
         """Return the :class:`Motion` of the point at times (n,) [s] from start to stop."""
-        times = _clip_to_duration(times, self.start_time, self.stop_time)
+        times = _clip_times_to_interval(times, self.start_time, self.stop_time)
         return Motion(
             self._interpolant(times) + self._origin,
             self._interpolant(times, 1),
@@ -604,7 +604,7 @@ class MovingBody:
             For a time outside the trajectory, or a heading that the velocity leaves undefined.
         """
         motion = self.trajectory.motion(times)
-        clipped_times = _clip_to_duration(times, self.start_time, self.stop_time)
+        clipped_times = _clip_times_to_interval(times, self.start_time, self.stop_time)
         attitude, angular_velocity = self.attitude_law.attitude_and_rate(
             clipped_times, motion.velocity, motion.acceleration
         )

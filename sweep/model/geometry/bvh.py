@@ -59,10 +59,10 @@ _TIE_DISTANCE_FACTOR = 1.0 + 1e-12
 """Factor, slightly above 1, on the distance of the nearest hit. Boxes beyond the product are
 skipped. Because of the factor, rounding skips no box that holds an equally near triangle."""
 
-_BUNDLE_TESTS_MAX = np.int64(128)
+_BUNDLE_TRIANGLE_TESTS_MAX = np.int64(128)
 """Largest number of triangles that are tested against a whole bundle of rays. If more tests are
 needed, each ray of the bundle traverses the tree alone."""
-_UNLIMITED_TESTS = np.int64(1 << 62)
+_UNLIMITED_TRIANGLE_TESTS = np.int64(1 << 62)
 """Number of triangle tests passed for a traversal without a limit; no traversal reaches it."""
 
 _X, _Y, _Z = range(3)
@@ -101,10 +101,10 @@ class _Scratch(NamedTuple):
     """Arrays that a traversal of the tree uses for intermediate results."""
 
     shears: np.ndarray
-    """(3, b): constants of the triangle tests of each ray (:func:`_prepare_bundle`)."""
+    """(3, b): constants of the triangle tests of each ray (:func:`_prepare_bundle_tests`)."""
     box_test_constants: np.ndarray
     """(6, 3): constants of the box tests of a bundle of rays, for each coordinate axis
-    (:func:`_prepare_bundle`)."""
+    (:func:`_prepare_bundle_tests`)."""
     child_entry_distance: np.ndarray
     """(8,): smallest distance at which a ray of the bundle may enter each child's box, in units of
     the length of the direction vector; inf if no ray can."""
@@ -376,7 +376,7 @@ def find_nearest_triangles(tree, origins, directions, distance, face_index, dist
             distance[i],
             face_index[i],
             scratch,
-            _BUNDLE_TESTS_MAX,
+            _BUNDLE_TRIANGLE_TESTS_MAX,
             distance_min,
         ):
             for beamlet in range(bundle_directions.shape[0]):
@@ -388,7 +388,7 @@ def find_nearest_triangles(tree, origins, directions, distance, face_index, dist
                     distance[i, ray_slice],
                     face_index[i, ray_slice],
                     scratch,
-                    _UNLIMITED_TESTS,
+                    _UNLIMITED_TRIANGLE_TESTS,
                     distance_min,
                 )
 
@@ -423,13 +423,13 @@ def _traverse_tree(
     -------
     bool
         True if all boxes that a ray may enter have been visited. False after an abort, or without
-        an axis that all directions share (:func:`_prepare_bundle`).
+        an axis that all directions share (:func:`_prepare_bundle_tests`).
     """
     bounds, children, tree_faces, vertices = tree.bounds, tree.children, tree.faces, tree.vertices
     shears, child_entry_distance = scratch.shears, scratch.child_entry_distance
     node_stack, entry_distance_stack = scratch.node_stack, scratch.entry_distance_stack
     tests_left = tests_max
-    axis = _prepare_bundle(directions, shears, scratch.box_test_constants)
+    axis = _prepare_bundle_tests(directions, shears, scratch.box_test_constants)
     if axis < 0:
         return False
     kx, ky = (axis + 1) % 3, (axis + 2) % 3
@@ -489,7 +489,7 @@ def _traverse_tree(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _prepare_bundle(directions, shears, box_test_constants):
+def _prepare_bundle_tests(directions, shears, box_test_constants):
     """Compute constants of a bundle's box and triangle tests; return the index of its main axis.
 
     The main axis is that along which the component of every direction is largest.
@@ -567,7 +567,7 @@ def _box_entry_distances(
     ox, oy, oz : float
         Origin of the rays [m].
     box_test_constants : ndarray (6, 3)
-        Result of :func:`_prepare_bundle`.
+        Result of :func:`_prepare_bundle_tests`.
     distance_max : float
         Boxes at larger distances are not entered.
     child_entry_distance : ndarray (8,)
@@ -634,7 +634,7 @@ def _intersect_triangle(a, b, c, index, shears, distance_min, distance, face_ind
     index : int
         Index of the triangle in the mesh.
     shears : ndarray (3, b)
-        Result of :func:`_prepare_bundle`.
+        Result of :func:`_prepare_bundle_tests`.
     distance_min : float
         Smallest distance of a hit.
     distance, face_index : ndarray (b,)

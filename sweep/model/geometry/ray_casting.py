@@ -121,7 +121,7 @@ class RayCaster:
             np.ascontiguousarray(rays, np.float64) for rays in (origins, directions)
         )
         frames = self._mesh_frames(poses, len(origin))
-        face_index, body_index = self._first_hits(frames, origin, direction, range_min)
+        face_index, body_index = self._find_first_hits(frames, origin, direction, range_min)
         is_hit = face_index >= 0
         reference_beamlet = np.where(is_hit.any(axis=1), is_hit.argmax(axis=1), -1)
         n_bundles, hit_bundles = len(origin), np.flatnonzero(reference_beamlet >= 0)
@@ -138,7 +138,9 @@ class RayCaster:
         range_rounded[hit_bundles] = reference_hits.range_rounded
         range_remainder[hit_bundles] = reference_hits.range_remainder
         normal[hit_bundles] = reference_hits.normal.T
-        normal[hit_bundles[reference_hits.cosine > 0]] *= -1.0  # towards the ray's origin
+        normal[
+            hit_bundles[reference_hits.ray_normal_cosine > 0]
+        ] *= -1.0  # towards the ray's origin
         # On one facet t_b - t_0 = -t_0 n.delta / (n.d_b), delta = d_b - d_0, without cancellation.
         all_bundles, (range_offset, cos_incidence) = (
             np.arange(n_bundles),
@@ -167,7 +169,7 @@ class RayCaster:
         range_offset[other_rays] = (other_hits.range_rounded - range_rounded[other_rays.bundle]) + (
             other_hits.range_remainder - range_remainder[other_rays.bundle]
         )
-        cos_incidence[other_rays] = other_hits.cosine
+        cos_incidence[other_rays] = other_hits.ray_normal_cosine
         surface_index = np.full(face_index.shape, -1, dtype=np.int16)
         for body_number, mesh in enumerate(self.meshes):
             is_body = body_index == body_number
@@ -184,7 +186,7 @@ class RayCaster:
             body_index,
         )
 
-    def _first_hits(self, frames, origins, directions, range_min):
+    def _find_first_hits(self, frames, origins, directions, range_min):
         """Return the indices of the triangle and the body that each beamlet hits first.
 
         Both arrays are (n, b). Elements of a beamlet that misses are -1.
@@ -280,7 +282,7 @@ class _FacetIntersections(NamedTuple):
     """(m,): exact range minus ``range_rounded`` [m]."""
     normal: np.ndarray
     """(3, m): unit normal of the facet in the world's frame, oriented by its winding."""
-    cosine: np.ndarray
+    ray_normal_cosine: np.ndarray
     """(m,): cosine, -1..1, of the angle between the ray's direction and ``normal``."""
 
     @classmethod

@@ -458,7 +458,7 @@ class AccuracyMeasurement:
             ):
                 break
             comparison = self._sample.compare_with_time_domain(reference_setting, sample_row)
-            if np.isfinite(comparison.time_domain.pd).any():
+            if np.isfinite(comparison.time_domain_results.pd).any():
                 differences[sample_row] = np.concatenate(result_differences(*comparison))
         self._sample.clear_caches()
         return differences, n_beamlets

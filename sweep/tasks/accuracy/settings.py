@@ -171,7 +171,7 @@ def build_setting_ladder(spec: AnySpec) -> SettingLadder:
     settings = [AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)]
     why_beamlets_are_fixed = _fixed_beamlets_reason(spec)
     adaptive_beamlets: dict[str, Any] = {} if why_beamlets_are_fixed else {_BEAMLETS_FIELD: "auto"}
-    if _is_on_axis(spec, _TOLERANCE_FIELD):
+    if _is_varied_by_axis(spec, _TOLERANCE_FIELD):
         notes.append("accuracy.tolerance is on an axis: left as it is")
     else:
         settings += [
@@ -414,7 +414,7 @@ def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
     }
 
 
-def _is_on_axis(spec: AnySpec, path: str) -> bool:
+def _is_varied_by_axis(spec: AnySpec, path: str) -> bool:
     """Return True if an axis of the spec varies the parameter at a dotted path."""
     return any(member.path == path for axis in spec.axes for member in axis.parameters)
 
@@ -426,7 +426,8 @@ def _fixed_beamlets_reason(spec: AnySpec) -> str:
     if spec.instrument.receiver.architecture == "direct":
         return "in direct detection beamlets add as amplitudes, and are part of the scene"
     if any(
-        _is_on_axis(spec, path) for path in (_BEAMLETS_FIELD, _PATTERN_FIELD, "footprint.phases")
+        _is_varied_by_axis(spec, path)
+        for path in (_BEAMLETS_FIELD, _PATTERN_FIELD, "footprint.phases")
     ):
         return "it is on an axis"
     return ""

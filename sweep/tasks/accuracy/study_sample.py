@@ -177,7 +177,7 @@ def merge_trials(trials: Sequence[Trial]) -> Trial:
 class TimeDomainComparison(NamedTuple):
     """Results of one point from time-domain records, and by the model."""
 
-    time_domain: SampleResults
+    time_domain_results: SampleResults
     """Results from simulated time-domain records."""
     model_results: SampleResults
     """Results of the model, with the same effects."""
@@ -252,16 +252,18 @@ class StudySample(ABC):
         planned_flags = self._plan_effect_flags(setting, point_index).effect_flags
         effect_flags = planned_flags & TIME_DOMAIN_EFFECT_MASK
         # Records contain range walk, whatever effects are named.
-        time_domain, simulated = (
+        time_domain_results, simulated = (
             self._collect_results(
-                setting, 1, self._iter_outputs(setting, point_index, effect_flags, find_peaks)
+                setting,
+                1,
+                self._iter_results_by_effects(setting, point_index, effect_flags, find_peaks),
             )
             for find_peaks in (
                 time_domain_truth.evaluate_segments_in_time_domain,
                 evaluation.evaluate_segments,
             )
         )
-        return TimeDomainComparison(time_domain, simulated)
+        return TimeDomainComparison(time_domain_results, simulated)
 
     def clear_caches(self) -> None:  # noqa: B027
         """Drop cached results that several trials of one part share.
@@ -276,7 +278,7 @@ class StudySample(ABC):
         """Choose the effects at each of n points."""
 
     @abstractmethod
-    def _iter_outputs(
+    def _iter_results_by_effects(
         self,
         setting: AccuracySetting,
         point_indices: np.ndarray,
@@ -304,7 +306,9 @@ class StudySample(ABC):
             else None
         )
         start = thread_time()
-        outputs = list(self._iter_outputs(setting, point_indices, effect_flags, find_peaks))
+        outputs = list(
+            self._iter_results_by_effects(setting, point_indices, effect_flags, find_peaks)
+        )
         seconds = thread_time() - start
         results = self._collect_results(setting, point_indices.size, outputs)
         return Trial(results, seconds / point_indices.size + planning_seconds, planning_seconds)
@@ -434,7 +438,7 @@ class GridSample(StudySample):
         n_tile_points = sum(map(effect_planner.tiles.count_block_points, tiles.tolist()))
         return PlannedEffectFlags(effect_flags[tile_of_point], seconds / n_tile_points)
 
-    def _iter_outputs(
+    def _iter_results_by_effects(
         self,
         setting: AccuracySetting,
         point_indices: np.ndarray,
@@ -614,7 +618,7 @@ class FlightSample(StudySample):
             effect_flags[np.searchsorted(tile_rows, point_indices)], seconds / tile_rows.size
         )
 
-    def _iter_outputs(
+    def _iter_results_by_effects(
         self,
         setting: AccuracySetting,
         point_indices: np.ndarray,
