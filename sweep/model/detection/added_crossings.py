@@ -334,9 +334,9 @@ def exclude_crossings_joining_echo(
     """Remove crossings that join an echo from the bins' crossing probabilities, in place.
 
     Adjacent bins above the threshold count as one group. A bin next to an echo that crosses may
-    thus belong to the echo's group, and is then no false peak. For all bins that may join an echo,
-    one probability is stored in the bin next to the echo: that these bins hold a group separate
-    from the echo. Their other elements become 0.
+    thus belong to the echo's group and be no false peak. Bins that may join an echo are therefore
+    treated together. The element of the bin next to the echo becomes the probability that these
+    bins hold a group separate from the echo. The elements of the other bins become 0.
 
     Parameters
     ----------

@@ -662,7 +662,7 @@ def shot_strongest_peak_probabilities(
     speckle_covariance: np.ndarray | None,
     is_range_misread: np.ndarray,
 ) -> StrongestPeakProbabilities:
-    """Return the probabilities that a shot reports the echo's range, a wrong range, or none.
+    """Return the probabilities that a shot reports the echo's peaks, or a wrong range.
 
     Parameters
     ----------
@@ -678,6 +678,12 @@ def shot_strongest_peak_probabilities(
         probabilities; None without developed speckle.
     is_range_misread : ndarray (n,) bool
         True where the peaks of the echo itself are resolved to a wrong range.
+
+    Returns
+    -------
+    StrongestPeakProbabilities
+        (n,): ``pd``, that both chirps report the echo's peak; its complement ``miss``; and
+        ``p_wrong_range``, that the shot reports a wrong range.
 
     Notes
     -----

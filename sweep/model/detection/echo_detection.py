@@ -87,7 +87,7 @@ def negligible_signal_ratio(
         x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
 
     to the probability of a false peak due to leaked signal (:mod:`sweep.model.spectrum.leakage`).
-    The last factor is taken at a b = 1, the largest product for amplitudes that are returned.
+    The last factor is set to its value at a b = 1, and no amplitude above 1/b is returned.
     """
     y = 0.5 * np.square(threshold_ratio)
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
@@ -901,7 +901,7 @@ def bin_crossing_tails(signal_ratio, threshold_ratio, is_real):
     Parameters
     ----------
     signal_ratio, threshold_ratio
-        |X| without noise a, and threshold b, over the noise per quadrature sigma.
+        |X| without noise, a, and threshold, b, both over the noise per quadrature sigma.
     is_real
         True if the noise n is real. It then has the variance 2 sigma^2.
 
@@ -1282,11 +1282,12 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     Notes
     -----
     The strongest speckle mode (:mod:`sweep.model.detection.speckle_modes`) is one complex Gaussian
-    number z for all bins. Given z, bin k has the steady signal u_k z. The other modes add to its
-    noise, with their own variance and correlation. The result is the mean over |z|^2, which is
-    exponential. A single line has all its power in this mode, and its sidelobes fade with it. Near
-    DC and Nyquist the mode's power depends on the phase of z as 1 + q_k cos t, with the
-    pseudo-variance ratio q_k of bin k and t uniform (:mod:`sweep.model.detection.pseudo_variance`).
+    number z for all bins. Given z, bin k has the steady signal u_k z, where u_k is the root mean
+    square |X| of the mode in bin k. The other modes add to the noise of the bin, with their own
+    variance and correlation. The result is the mean over |z|^2, which is exponential. A single line
+    has all its power in the strongest mode, and the line's sidelobes fade with it. Near DC and
+    Nyquist the mode's power depends on the phase of z as 1 + q_k cos t, with the pseudo-variance
+    ratio q_k of bin k and t uniform (:mod:`sweep.model.detection.pseudo_variance`).
 
     Runs of adjacent echo bins fade independently of each other if they hold a bin of at least half
     the largest magnitude. A weaker run fades with the strong run below it. docs/physics.md states
@@ -1366,10 +1367,11 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
 
     Notes
     -----
-    Given the amplitude z of the strongest speckle mode, bin k has the steady signal u_k z. The
-    other modes add to its noise (:func:`pd_and_miss_in_speckle`). A bin's fraction of power in the
-    strongest mode is interpolated in ``rule.mode_table``. If the echo has a phase-noise pedestal,
-    bins outside the main lobe of the strongest bin have the fraction of the strongest bin.
+    Given the amplitude z of the strongest speckle mode, E|z|^2 = 1, bin k has the steady signal u_k
+    z, where u_k is the root mean square |X| of the mode in bin k. The other modes add to the noise
+    of the bin (:func:`pd_and_miss_in_speckle`). A bin's fraction of power in the strongest mode is
+    interpolated in ``rule.mode_table``. If the echo has a phase-noise pedestal, bins outside the
+    main lobe of the strongest bin have the fraction of the strongest bin.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     nyquist_bin = rule.fft_size // 2 if rule.is_real_record_in_speckle else 0
@@ -1728,7 +1730,7 @@ def _upper_normal_quantile_of_tails(tails):
 def _upper_normal_quantile(probability):
     """Return the number that a standard normal variable exceeds with a probability <= 1/2.
 
-    The error of the returned number is about 1e-4.
+    The returned number errs by about 1e-4.
     """
     if probability < 1e-300:
         return 37.0

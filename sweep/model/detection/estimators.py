@@ -628,7 +628,8 @@ def windowed_peak_frequency_deviation(
 
     Notes
     -----
-    To first order in the noise, with m = n minus the centroid of the window [1]_,
+    To first order in the noise, with m the number of a sample minus the centroid of the window
+    [1]_,
 
         var(f) = sum(w^2 m^2) / (cnr sum(w m^2)^2) (fs / 2 pi)^2.
 
@@ -674,14 +675,16 @@ def position_error_at_unit_signal(
 
     Notes
     -----
-    Errors are those to first order in white noise. Let rho be |X| of the peak bin over the noise
-    per quadrature, W the window's transform at the tone's distance, and E = sum(w^2). The tone's
-    power over the noise power before the FFT is then cnr = rho^2 E / W^2. ``maximum_likelihood``
-    has the Cramer-Rao bound of the samples that it uses, ``chirp_z`` the error of
-    :func:`windowed_peak_frequency_deviation`. ``candan`` has R = Re[N / D] with N = Z_+ - Z_- and
-    D = 2 Z_0 + Z_- + Z_+. Noise in phase with the tone changes R by the sum of g_j times the noise
-    of the bins, with g_+- = +-1 / D - R / D and g_0 = -2 R / D. With the covariance C of the noise
-    of three bins, the variance is g' C g / (dR / d delta)^2.
+    Errors are to first order in white noise. Let rho be |X| of the peak bin over the noise per
+    quadrature, W the transform of the window w at the tone's distance, and E = sum(w^2). The tone's
+    power over the noise power before the FFT is then cnr = rho^2 E / W^2.
+
+    ``maximum_likelihood`` has the Cramer-Rao bound of the samples that it uses. ``chirp_z`` has the
+    error of :func:`windowed_peak_frequency_deviation`. ``candan`` uses the ratio R = Re[N / D] with
+    N = Z_+ - Z_- and D = 2 Z_0 + Z_- + Z_+, where Z_-, Z_0 and Z_+ are the bins below, at and above
+    the peak. Noise n_j in phase with the tone in bin j changes R by sum_j g_j n_j, with
+    g_+- = +-1 / D - R / D and g_0 = -2 R / D. If C is the covariance matrix of the n_j and delta
+    the tone's distance, the variance of the position is g^T C g / (dR / d delta)^2.
     """
     from sweep.model.detection.sub_bin_interpolation import (
         in_phase_noise_correlations,

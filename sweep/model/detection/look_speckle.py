@@ -126,10 +126,10 @@ class LookSpeckle(NamedTuple):
             M = N^2 / sum c_j^2.
 
         More than MATRIX_LOOKS_MAX looks are represented by that number of looks at a larger
-        spacing. If M exceeds GAMMA_SHAPE_MIN there, one eigenvalue N/M of multiplicity M replaces
-        all [Goodman, Speckle Phenomena in Optics, 2007, 4.6]. M is then computed from the
-        correlations of all N looks, as of looks of equal power: M = N^2 / sum_kl |mu(l - k)|^2, but
-        at least GAMMA_SHAPE_MIN.
+        spacing. If M of these looks exceeds GAMMA_SHAPE_MIN, one eigenvalue N/M of multiplicity M
+        replaces all [Goodman, Speckle Phenomena in Optics, 2007, 4.6]. M is then computed anew from
+        the correlations of all N looks, with equal powers: M = N^2 / sum_kl |mu(l - k)|^2, but at
+        least GAMMA_SHAPE_MIN.
         """
         n_looks = correlation_by_lag.shape[2]
         eigenvalue = np.maximum(

@@ -1056,10 +1056,11 @@ def pd_and_miss_any_two_in_speckle(
     the amplitude of that segment. The other two have a remaining covariance
     kappa = rho_ij - rho_ik rho_jk, which adds to their joint probability
 
-        kappa P_i' P_j' / 2 + kappa^2 (A_i A_j + B_i B_j) / 16,    A, B = P'' +- P' / r
+        kappa P_i' P_j' / 2 + kappa^2 (U_i U_j + V_i V_j) / 16,
+        U = P'' + P' / r,    V = P'' - P' / r.
 
-    with derivatives by r, the mean given z. This is Mehler's series to its second term, within
-    0.002 of drawn amplitudes.
+    Primes are derivatives of P by r = l sqrt(u), the modulus of the mean amplitude given z. The sum
+    is Mehler's series to its second term, within 0.002 of the result of drawn amplitudes.
     """
     from sweep.model.detection.echo_detection import at_least_two_of_three_probability
     from sweep.model.detection.marcum import marcum_q1

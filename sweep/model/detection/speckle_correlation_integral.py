@@ -33,7 +33,8 @@ def fill_peak_bin_correlation(
     point_indices
         Indices of the points.
     half_interval
-        (n,): half-width of the integration interval of y [standard deviations of the beam].
+        (n,): half-width of the interval across the beam that is integrated over [standard
+        deviations of the beam].
     strongest_bin_offset, line_shift, phase_difference, relative_power_gradient
         Fields of :class:`sweep.model.detection.speckle_correlation.LinePairGradients`; the first
         two are stacked to (2, n).
@@ -41,7 +42,7 @@ def fill_peak_bin_correlation(
         Tabulated G of :func:`sweep.model.detection.speckle_correlation.transform_table`, and its
         number of samples per bin.
     nodes, weights
-        Quadrature on -1 .. 1.
+        Nodes and weights of a quadrature on -1 .. 1.
     correlation
         (n,) complex: output array.
     """

@@ -339,7 +339,8 @@ def add_rates_by_speckle_power(squared_ratio, weight, rate_table, rate_sums):
     Parameters
     ----------
     squared_ratio
-        Squared amplitude of the leaked signal over sigma^2, at mean speckle power.
+        Squared amplitude of the leaked signal over the noise variance per quadrature, at mean speckle
+        power.
     weight
         Weight of the bin.
     rate_table

@@ -122,9 +122,9 @@ class Interpolator(NamedTuple):
     noise_mixing: NoiseMixing
     """Factors on independent normal numbers whose sums are the noise of three adjacent bins."""
     sidelobe_neighbour_noise_correlation: float
-    """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Of N
-    successive sidelobe bins, L change sign from one to the next. N is the FFT size, L the number of
-    samples in the record."""
+    """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Among N
+    successive bins of sidelobes, L have the opposite sign of the bin below. N is the FFT size, L
+    the number of samples in the record."""
     spread_error_factor: np.ndarray
     """(m,): error of the position [bins] over the variance [bins^2] of lines that add as powers. It
     is tabulated over the tone's distance from the centre bin."""
@@ -177,8 +177,8 @@ def sidelobe_neighbour_noise_correlation(window: Window, fft_size: int) -> float
 
     Notes
     -----
-    Of N successive sidelobe bins, L change sign from one to the next. Hence the mean of the sign is
-    1 - 2 L/N.
+    Among N successive bins of sidelobes, L have the opposite sign of the bin below. The mean
+    product of the signs of two adjacent bins is thus 1 - 2 L/N.
     """
     correlation_1, _ = in_phase_noise_correlations(window, fft_size)
     return correlation_1 * (1.0 - 2.0 * window.length / fft_size)
