@@ -252,9 +252,9 @@ def extend(
 ) -> Outcome:
     """Turn a store into the store of a larger study, and compute only the new points.
 
-    The larger study has more values on its axes, more axes, more draws or a tighter tolerance. It
-    is computed in the same folder and replaces the store when it is complete. Its bytes are the
-    same as if the larger study were run at once.
+    The larger study has more values on its axes, more axes, more draws or a tighter tolerance. The
+    larger store is computed in the same folder and replaces the store when complete. The bytes of
+    the result are the same as if the larger study were run at once.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def _compute_into_path(
     """Compute a study into a store at ``final_path``.
 
     If a store at that path is to be replaced, the new store is built at a temporary path, the
-    staging path. It replaces the old store when it is complete.
+    staging path. The new store replaces the old one when complete.
     """
     recover_interrupted_replace(final_path)
     working_path, recipe, durable = final_path, _spec_folder_entry(spec), backend.options.durable
@@ -533,7 +533,8 @@ def _eyepoint_stores_exist(store_path: Location, study: GridStudy | FlightStudy)
 def _spec_folder_entry(spec: AnySpec) -> dict[str, str]:
     """Return the entry of a store's recipe that names the folder of a flight's files.
 
-    It is empty for a grid. The recipe is the part of the journal about how the store is made.
+    The entry is empty for a grid. The recipe is the part of the journal about how the store is
+    made.
     """
     return {"base": str(spec.base_folder.absolute())} if isinstance(spec, SceneSpec) else {}
 
@@ -702,10 +703,10 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
 def _acquire_eyepoint_lock(
     eyepoint_store_path: Location, eyepoints: EyepointStudy, backend: ComputeBackend
 ) -> StoreLock | None:
-    """Wait until no other run holds the lock of an eyepoint store, and lock it.
+    """Wait until no other run holds the lock of an eyepoint store, and return the store's lock.
 
-    The store, which holds the geometry of shots, is created if needed. Return None if the run is
-    interrupted meanwhile.
+    The store, which holds the geometry of shots, is created if needed. None is returned if the run
+    is interrupted while waiting.
     """
     has_announced_wait = False
     while not backend.interrupts.is_stopping:

@@ -56,9 +56,9 @@ _HIGHEST_ORDER_COEFFICIENT = _EXPONENTIAL_COEFFICIENTS[-1]
 def fill_crossing_series(threshold_ratio, series):
     """Fill ``series`` with the coefficients of the crossing series of one threshold b.
 
-    Element n is c_n y^n / n! / (1 - e^-y), with c_n = e^-y sum_{j=1..n} y^j / j! and y = b^2/2.
-    Terms are filled as far as amplitudes below the threshold need them. Nothing is filled for y
-    above :data:`SERIES_HALF_SQUARED_THRESHOLD_MAX`.
+    Element n is c_n y^n / n! / (1 - e^-y), with c_n = e^-y sum_{j=1..n} y^j / j! and y = b^2/2. As
+    many terms are filled as the series needs for amplitudes up to the threshold. Nothing is filled
+    for y above :data:`SERIES_HALF_SQUARED_THRESHOLD_MAX`.
 
     Parameters
     ----------
@@ -413,10 +413,10 @@ def _count_joining_bins(probabilities, first_index, step, n_bins):
 def _fill_separate_group_probability(
     probabilities, first_index, step, n_bins, p_join_first, p_join_last
 ):
-    """Set the first bin's probability to that of a group of crossing bins separate from the echo.
+    """Store in the first bin the probability that bins next to an echo hold a separate group.
 
-    A group is a run of adjacent bins that cross the threshold. The probabilities of the other
-    ``n_bins - 1`` bins become 0.
+    A group is a run of adjacent bins that cross the threshold. It is separate if it does not touch
+    the echo's group. The probabilities of the other ``n_bins - 1`` bins become 0.
 
     Parameters
     ----------

@@ -177,8 +177,9 @@ class SearchedBins(NamedTuple):
     search band it is an array (3, n) for the segments up, Doppler, down of n points, or (n,) after
     :meth:`select_segment`."""
     first_bin: int
-    """Distance of the first searched bin from DC and from Nyquist [bins]. It is above 1 in a real
-    record whose noise is correlated, since the noise of nearer bins is not circular."""
+    """Distance of the first searched bin from DC and from Nyquist [bins]. The distance is above 1
+    in a real record whose noise is correlated, since the noise of bins nearer to DC and Nyquist is
+    not circular."""
     neighbour_noise_correlation: float
     """Correlation coefficient of the noise of adjacent bins, 0..1; 0 if bins count as
     independent."""

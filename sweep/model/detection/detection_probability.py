@@ -289,9 +289,9 @@ def _pd_and_miss_in_looks_and_speckle(
     bins: np.ndarray,
     point_indices: np.ndarray | slice,
 ) -> PdAndMissArrays:
-    """Compute :func:`pd_and_miss_in_looks` of bins in developed speckle.
+    """Compute :func:`pd_and_miss_in_looks` of bins in developed speckle, from several looks.
 
-    Signal and threshold are relative to the noise sigma.
+    ``signal_ratio`` and ``threshold_ratio`` are over sigma, the noise per quadrature.
     """
     look_speckle = (
         None
@@ -382,8 +382,8 @@ def joint_detection_probability(
     Returns
     -------
     ndarray (..., n)
-        The product of the two without speckle. In developed speckle the segments are correlated and
-        the probability is larger.
+        Without speckle, the product of ``pd_up`` and ``pd_down``. In developed speckle the segments
+        are correlated and the probability is larger.
     """
     if shots.speckle.segment_correlations is None:
         return pd_up * pd_down
@@ -483,7 +483,7 @@ def _pd_in_looks_far_from_ends(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pd of up and down segment over several looks, as if DC and Nyquist were far away.
 
-    Signals and threshold are relative to the noise sigma.
+    Signals (root mean square |X|) and threshold are over sigma, the noise per quadrature.
     """
     signals = np.nan_to_num(np.stack([signal_up, 0 * signal_up, signal_down], axis=-2))
     pd_up, _, pd_down = np.moveaxis(
@@ -543,8 +543,8 @@ def shot_pd_and_miss(
     Returns
     -------
     PdAndMissArrays
-        (n,): probabilities pd that a shot is detected, and miss that it is not. miss is not
-        computed as 1 - pd, so that both keep their precision.
+        (n,): probability ``pd`` that a shot is detected, and its complement ``miss``. ``miss`` is
+        not computed as 1 - ``pd``, so that both keep their precision.
     """
     if shots.detects_by_any_two_segments:
         return _pd_and_miss_any_two(shots, pd, miss, magnitudes)
@@ -615,7 +615,7 @@ class StrongestPeakProbabilities(NamedTuple):
 def pd_decrease_with_threshold(at_threshold, at_level):
     """Return the decrease of pd from the threshold b to a higher level z, P_b - P_z >= 0.
 
-    It is computed from miss instead of pd where that is more precise.
+    The decrease is computed from ``miss`` instead of ``pd`` where the former is more precise.
 
     Parameters
     ----------
@@ -755,8 +755,8 @@ def doppler_pd_given_chirps(
 ) -> ConditionalPd:
     """Return the probability of detection in the Doppler segment, given the results of both chirps.
 
-    The condition is that exactly one of the two chirps detects. The Doppler segment then decides on
-    the shot, if detections in any two of three segments suffice.
+    The condition is that exactly one of the two chirps detects. If it holds, and detections in any
+    two of three segments suffice, the Doppler segment decides on the shot.
 
     Parameters
     ----------

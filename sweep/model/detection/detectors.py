@@ -69,14 +69,15 @@ class SpectrumSettings:
     sample_rate: float
     """Sample rate [Hz]; a bin is ``sample_rate / fft_size`` wide."""
     window: Window
-    """Window of the record. Its length L <= N is that of the record, which is zero-padded to N."""
+    """Window of the record. Window and record have L <= N samples; the record is zero-padded to
+    N."""
     noise_power: float
     """Mean power |X|^2 of a bin of noise alone [V^2], from the receiver's noise sources."""
     threshold: float
     """Fixed threshold on |X| [V]."""
     training: int
-    """Number of training cells (bins from which a CFAR detector estimates the noise level). It is
-    even; half of them lie on either side of the tested bin."""
+    """Number of training cells (bins from which a CFAR detector estimates the noise level). The
+    number is even; half of the cells lie on either side of the tested bin."""
     guard: int
     """Number of guard cells (bins left out next to the tested bin) on either side."""
     rank: int
@@ -329,7 +330,7 @@ def _iter_training_cell_pairs(
 def _training_power_sums(
     power: np.ndarray, settings: SpectrumSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the summed power of the training cells below each bin, and of those above it."""
+    """Return two arrays: summed power of the training cells below each bin, and above it."""
     below, above = np.zeros((2, *_power_in_circular_bins(power, settings).shape))
     for cells_below, cells_above in _iter_training_cell_pairs(power, settings):
         below += cells_below
@@ -340,7 +341,7 @@ def _training_power_sums(
 def _exceeds_cfar_threshold(
     power: np.ndarray, level: np.ndarray, kind: str, settings: SpectrumSettings
 ) -> np.ndarray:
-    """Test if the power of bins is at or above the CFAR factor times their noise level."""
+    """Return a bool array, True in bins whose power is at least the CFAR factor times ``level``."""
     return _pad_to_all_bins(
         _power_in_circular_bins(power, settings)
         >= _cfar_factor_of_settings(kind, settings) * level,

@@ -215,9 +215,8 @@ class PedestalShape(NamedTuple):
     """
 
     reach_bins: float
-    """Distance [bins] from a line up to which bins belong to the echo. In the last of them the
-    pedestal has at least the power of the noise. 0 if this distance does not exceed the half-width
-    of the main lobe."""
+    """Distance [bins] from a line up to which the pedestal has at least the power of the noise, and
+    bins belong to the echo. 0 if this distance does not exceed the half-width of the main lobe."""
     line_width_bins: float
     """Width (FWHM) of the laser's line [FFT bins]."""
     delay_times_bin_width: float
@@ -457,8 +456,9 @@ def pedestal_reach_bins(pedestal_to_noise, line_width_bins, delay, reach_max):
 def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
     """Fill ``pedestal_ratios`` with the phase-noise pedestal's power over the receiver noise power.
 
-    Bins of at least half the largest magnitude count as bins with lines. Bins with lines have only
-    the part of the pedestal that changes |X|, all others the whole pedestal.
+    Bins of at least half the largest magnitude count as bins with lines. The power in bins with
+    lines is only that of the part of the pedestal that changes |X|. In all other bins it is that of
+    the whole pedestal.
 
     Parameters
     ----------
@@ -523,8 +523,8 @@ class SpeckleMixing(NamedTuple):
         A_down    = down_from_up z_0 + down_from_doppler z_1 + down_from_independent z_2
 
     The coefficients are the Cholesky factor of the correlation matrix of the amplitudes. Fields are
-    (n,) for n points, or scalars in kernels (:func:`speckle_mixing_at`). They are (0,) or zeros
-    without speckle.
+    (n,) for n points, or scalars in kernels (:func:`speckle_mixing_at`). Without speckle, fields
+    are (0,) or zero.
     """
 
     doppler_from_up: np.ndarray
@@ -1014,9 +1014,9 @@ def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_sp
 
         pd = exp(-Th^2 / P)
 
-    as for a Swerling 1 target. Near them in a real record, X has the pseudo-variance ratio
-    q = (S q_s + 2 sigma^2 q_n) / P, with those of the signal and of the noise, q_s and q_n. |X|
-    then has a Hoyt distribution (:func:`sweep.model.detection.hoyt.hoyt_tails`).
+    as for a Swerling 1 target. Near DC and Nyquist of a real record, X has the pseudo-variance
+    ratio q = (S q_s + 2 sigma^2 q_n) / P, with the ratios q_s of the signal and q_n of the noise,
+    and |X| has a Hoyt distribution (:func:`sweep.model.detection.hoyt.hoyt_tails`).
     """
     signal_power = magnitude * magnitude
     noise_power = 2.0 * bin_threshold.line_noise_sigma * bin_threshold.line_noise_sigma
@@ -1784,8 +1784,8 @@ def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
 
     Notes
     -----
-    The echo extends over adjacent bins of at least half the group's largest magnitude, and then by
-    ``lobe_half_width`` on either side. It ends at the next group.
+    The echo has the adjacent bins of at least half the group's largest magnitude, and on either
+    side ``lobe_half_width`` more bins, but no bin of another group.
     """
     if lobe_half_width == 0:
         return first, last

@@ -53,11 +53,11 @@ number of looks at a larger spacing."""
 
 GAMMA_SHAPE_MIN = 32.0
 """Effective number of looks of independent speckle above which the looks' mean power is treated as
-a gamma variable. This applies only to more than MATRIX_LOOKS_MAX looks."""
+a gamma variable. Up to MATRIX_LOOKS_MAX looks are never treated in this way."""
 
 SPECKLE_LATTICE_SIZE = 2048
 """Number of fixed realisations of the speckle of all looks. The probability that enough looks cross
-the threshold is averaged over them."""
+the threshold is averaged over these realisations."""
 
 _N_CONTOUR_NODES = 40
 """Number of quadrature nodes of the contour integral for tail probabilities of the looks' mean
@@ -258,8 +258,8 @@ def representative_look_positions(n_looks: int, looks_max: int = MATRIX_LOOKS_MA
     Returns
     -------
     ndarray (k,)
-        Positions, k = min(N, ``looks_max``). They count looks from 0, rise evenly, and need not be
-        integers.
+        Positions, k = min(N, ``looks_max``). Positions count looks from 0, rise evenly, and need
+        not be integers.
 
     Notes
     -----
@@ -411,8 +411,8 @@ def speckle_lattice_amplitudes(n_looks: int) -> np.ndarray:
     """Return fixed realisations of the amplitudes of N looks whose speckle is independent.
 
     The realisations are (SPECKLE_LATTICE_SIZE, N) complex. A Kronecker lattice of the roots of
-    primes is transformed to circular Gaussian numbers. These are standardised to mean 0 and the
-    unit covariance matrix.
+    primes is transformed to circular Gaussian numbers. The numbers are standardised to mean 0 and
+    the unit covariance matrix.
     """
     primes = [2]
     while len(primes) < 2 * n_looks:

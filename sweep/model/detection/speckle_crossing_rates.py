@@ -299,7 +299,8 @@ class InterpolationWeights(NamedTuple):
 def _rate_table_place(squared_ratio, rate_table):
     """Return the :class:`RateTablePlace` of a bin.
 
-    Arguments are as in :func:`add_rates_by_speckle_power`.
+    ``squared_ratio`` is the squared amplitude of the leaked signal over the noise variance per
+    quadrature, at mean speckle power. ``rate_table`` is a :class:`SpeckleCrossingRates`.
     """
     table_position = (
         0.5 * math.log(squared_ratio)
@@ -339,8 +340,8 @@ def add_rates_by_speckle_power(squared_ratio, weight, rate_table, rate_sums):
     Parameters
     ----------
     squared_ratio
-        Squared amplitude of the leaked signal over the noise variance per quadrature, at mean speckle
-        power.
+        Squared amplitude of the leaked signal at mean speckle power, over the noise variance per
+        quadrature.
     weight
         Weight of the bin.
     rate_table

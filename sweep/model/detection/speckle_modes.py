@@ -73,7 +73,8 @@ class ModeTable(NamedTuple):
     -1..1."""
     power_asymmetry: np.ndarray
     """(s, N_CENTRE_OFFSETS): :func:`power_asymmetry` of the bin nearest to the echo's centre and
-    its two neighbours. It rises with the centre's offset from that bin."""
+    its two neighbours. The asymmetry rises with the offset of the echo's centre from the nearest
+    bin."""
 
 
 NO_MODES = ModeTable(np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))

@@ -43,7 +43,7 @@ from sweep.model.window import Window, window_samples
 
 _N_TABLE_INTERVALS = 2048
 """Number of intervals in the tables that turn magnitudes into an offset of a tone from a bin.
-Linear interpolation in them errs by about 1e-7 bins."""
+Linear interpolation in these tables errs by about 1e-7 bins."""
 
 _N_SPREAD_POSITIONS, _SPREAD_BINS = 129, 0.05
 """Number of positions between bins at which ``spread_error_factor`` is evaluated, and standard
@@ -85,8 +85,8 @@ class NoiseMixing(NamedTuple):
 class NeighbourWeights(NamedTuple):
     """Least-squares weights of the |X| of three bins in the position of a tone.
 
-    They are tabulated over the tone's distance from the centre bin, (m,) each. All |X| are relative
-    to that of the centre bin. If only two bins give the position, all weights are 0.
+    Weights are tabulated over the tone's distance from the centre bin, (m,) each. They apply to |X|
+    over the |X| of the centre bin. If only two bins give the position, all weights are 0.
     """
 
     smaller: np.ndarray
@@ -117,8 +117,8 @@ class Interpolator(NamedTuple):
     neighbour_weights: NeighbourWeights
     """(m,) in each field: weights by which the |X| of the three bins correct the position."""
     error_at_unit_signal: np.ndarray
-    """(m,): standard error of the position [bins], by the tone's distance from the centre bin. It
-    holds if the centre bin's |X| equals the noise per quadrature, and falls as 1/|X|."""
+    """(m,): standard error of the position [bins] if the centre bin's |X| equals the noise per
+    quadrature, by the tone's distance from the centre bin. The error falls as 1/|X|."""
     noise_mixing: NoiseMixing
     """Factors on independent normal numbers whose sums are the noise of three adjacent bins."""
     sidelobe_neighbour_noise_correlation: float

@@ -27,10 +27,8 @@ FloatSequence = Sequence[float] | np.ndarray
 """Sequence or array of real numbers (type of an argument)."""
 
 AttitudeAndRate = tuple[np.ndarray, np.ndarray]
-"""Quaternions (n, 4), body to world, and angular velocities (n, 3) [rad/s] in the world's frame.
-
-``attitude_and_rate`` of an attitude law returns them for times (n,) [s] and for the velocities
-[m/s] and accelerations [m/s^2] of the body, (n, 3) each.
+"""Pair of arrays that ``attitude_and_rate`` of an attitude law returns for n times: quaternions (n,
+4), body to world, and angular velocities (n, 3) [rad/s] in the world's frame.
 """
 
 
@@ -244,7 +242,7 @@ class SpinningAttitude:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeTrack:
-    """Attitudes at given times, with rotations at a constant rate between them (slerp).
+    """Attitudes at given times, and between these times rotations at a constant rate (slerp).
 
     Of the two rotations from one attitude to the next, the shorter is taken. Before the first and
     after the last time the attitude is constant.
@@ -297,9 +295,10 @@ class AttitudeTrack:
         Notes
         -----
         Between the times t_k and t_(k+1), the attitude is q_k exp(s_k (t - t_k) / (t_(k+1) - t_k)).
-        The rotation vector s_k is that from the attitude q_k to the next one, and exp(r) is the
-        quaternion of the rotation vector r. The angular velocity is s_k / (t_(k+1) - t_k), rotated
-        to the world's frame. It is 0 before the first and after the last given time.
+        The rotation vector s_k turns the attitude q_k to the next one, and exp(r) is the quaternion
+        of the rotation vector r. The angular velocity is s_k / (t_(k+1) - t_k), rotated to the
+        world's frame. Before the first and after the last time of the track, the angular velocity
+        is 0.
         """
         times, quaternions = np.asarray(self.times), np.asarray(self.quaternions)
         interval = np.clip(np.searchsorted(times, query_times, side="right") - 1, 0, len(times) - 2)
@@ -467,8 +466,8 @@ def straight_trajectory(
     Returns
     -------
     ConstantAcceleration
-        Trajectory of the length L between the points, from speed v_0 to v_1. It lasts
-        2 L / (v_0 + v_1) [s], with the acceleration (v_1^2 - v_0^2) / (2 L) [m/s^2] along it.
+        Trajectory of the length L between the points, from speed v_0 to v_1. Its duration is 2 L /
+        (v_0 + v_1) [s], and its acceleration (v_1^2 - v_0^2) / (2 L) [m/s^2] towards the end point.
 
     Raises
     ------

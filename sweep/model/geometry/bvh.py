@@ -32,9 +32,9 @@ LEAF_TRIANGLES_MAX = 2
 number of triangles fit one integer (:attr:`BoxTree.children`)."""
 
 _BOX_MARGIN_FRACTION = 2.0**-30
-"""Distance by which boxes are widened, as a fraction of the mesh's largest coordinate. It is far
-above the rounding of a hit's position across the ray (some 1e-15 of the range, for ranges up to 1e5
-times the mesh's size), and below the resolution of float32."""
+"""Distance by which boxes are widened, as a fraction of the mesh's largest coordinate. The fraction
+is far above the rounding of a hit's position across the ray (some 1e-15 of the range, for ranges up
+to 1e5 times the mesh's size), and below the resolution of float32."""
 
 _EMPTY_BOX_BOUND = np.float32(3e38)
 """Lower bound of an empty box along each axis [m]. The box's upper bound is minus this value, so
@@ -109,7 +109,7 @@ class _Scratch(NamedTuple):
     """(8,): smallest distance at which a ray of the bundle may enter each child's box, in units of
     the length of the direction vector; inf if no ray can."""
     node_stack: np.ndarray
-    """(_STACK_SIZE,) int64: nodes and leaves still to be visited, encoded as in
+    """(_STACK_SIZE,) int64: nodes and leaves that are still to be visited, with the encoding of
     :attr:`BoxTree.children`."""
     entry_distance_stack: np.ndarray
     """(_STACK_SIZE,): smallest distance at which a ray of the bundle may enter the box of each
@@ -183,8 +183,8 @@ def _build_nodes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Build all nodes of the tree; return :attr:`BoxTree.bounds` and :attr:`BoxTree.children`.
 
-    Nodes are in the order of their levels, from those above the leaves to the root. ``leaves`` is
-    the result of :func:`_order_into_leaves`.
+    Nodes are in the order of their levels: first the parents of leaves, last the root. ``leaves``
+    is the result of :func:`_order_into_leaves`.
     """
     boxes = _leaf_boxes(vertices, faces, leaves)
     triangle_count = (

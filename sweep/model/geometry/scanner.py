@@ -70,9 +70,9 @@ def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
 
 
 def corner_directions(angle: float) -> np.ndarray:
-    """Return the directions of four beams, steered by +-`angle` [rad] from nadir about both axes.
+    """Return the directions of four beams, each steered by +-`angle` [rad] towards x and y.
 
-    The steerer is that of :func:`steered_directions`.
+    The angles are those of :func:`steered_directions`.
 
     Returns
     -------

@@ -99,8 +99,8 @@ The least number of points is simulated even if the time limit is exceeded.
 TIME_DOMAIN_BEAMLET_COUNT = 109
 """Number of beamlets (rays of a beam) in the time-domain simulation.
 
-It replaces the reference setting's number, if that setting states one. It is small, because each
-beamlet needs a time-domain record of its own.
+It replaces the number that the reference setting states, if any. The number is small because each
+beamlet needs a separate time-domain record.
 """
 
 REPEATED_TRIAL_SECONDS_MAX = 1.0
@@ -435,9 +435,9 @@ class AccuracyMeasurement:
     ) -> tuple[dict[int, np.ndarray], int]:
         """Compare the most accurate setting, the reference, with time-domain records.
 
-        The records are made at some of the points, as time allows. Return the differences at each
-        point, by :func:`result_differences`, and the number of beamlets with which both were
-        computed. 0 stands for the reference setting's own number.
+        The records are made at some of the points, as time allows. Return a mapping from the
+        point's row in the sample to its differences, by :func:`result_differences`, and the number
+        of beamlets used for both; 0 stands for the number that the reference setting states.
         """
         reference_setting, beamlets_field = self._setting_ladder.reference, "footprint.beamlets"
         differences: dict[int, np.ndarray] = {}
@@ -508,9 +508,9 @@ N_ERRORS_BOUNDED_BY_TOLERANCE = 3
 def result_differences(results: SampleResults, reference: SampleResults) -> tuple[np.ndarray, ...]:
     """Return the largest differences, (n,) each, between two results at n points.
 
-    These are the differences of pd, log10 pfa, magnitudes of bins, and probability of leakage
-    peaks. Differences of magnitudes are relative to the reference's magnitude, or to the noise's
-    standard deviation if that is larger.
+    The four arrays are for pd, log10 pfa, magnitudes of bins, and the probability of leakage peaks.
+    Differences of magnitudes are relative to the reference's magnitude, or to the noise's standard
+    deviation if that is larger.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log10_pfa_difference = np.abs(results.log10_pfa - reference.log10_pfa)

@@ -59,7 +59,7 @@ finite number of rays; a shot with a larger error gets more rays.
 FIXED_RAYS_PER_SHOT_MAX = 223
 """Largest fixed number of rays per shot that is tried.
 
-Larger numbers would take as much time as all other trials together.
+With a larger number, one trial would take as much time as the trials of all other settings.
 """
 
 FIXED_RAYS_PER_SHOT_MIN, RAYS_TIMES_TOLERANCE = 19, 0.1
@@ -164,7 +164,7 @@ class SettingLadder:
 
 
 def build_setting_ladder(spec: AnySpec) -> SettingLadder:
-    """Return the accuracy settings to compare for a study, without those that fix the effects."""
+    """Return the accuracy settings to compare for a study, without settings with fixed effects."""
     if isinstance(spec, GridSpec) and spec.draws.has_draws:
         return _build_draw_setting_ladder(spec)
     notes: list[str] = []
@@ -226,8 +226,8 @@ def add_settings_for_effect_sets(
 ) -> SettingLadder:
     """Add settings that simulate the same effects at every point.
 
-    A set of effects holds those that one tolerance needs at any point. Each set is tried with all
-    ``tolerances`` for lines and leakage, by default with the tolerances of all sets.
+    A set of effects holds all effects that one tolerance requires at any point. Each set is tried
+    with all ``tolerances`` for lines and leakage, by default with the tolerances of all sets.
     """
     tolerance_by_effects: dict[frozenset[str], float] = {}
     for tolerance, effect_names in effects_by_tolerance.items():

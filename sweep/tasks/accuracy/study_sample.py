@@ -65,7 +65,7 @@ THESIS_EFFECT_MASK = _effect_mask_of_names(
 )
 """Effects that the thesis's method can simulate, one bit each.
 
-They move or scale a spectral line as a whole.
+Effects of this kind move or scale a spectral line as a whole.
 """
 
 TIME_DOMAIN_EFFECT_MASK = ~_effect_mask_of_names(
@@ -82,7 +82,7 @@ AXIS_POINTS_PER_SCANNER = 2
 RESERVED_COORDINATE_NAMES = ("number", "kind", "tolerance")
 """Names that the store uses for its own coordinates.
 
-The coordinate of a parameter with such a name is called by the parameter's full dotted path.
+If a parameter has one of these names, its coordinate is named by the parameter's dotted path.
 """
 
 AS_WRITTEN_SETTING = AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
@@ -225,7 +225,8 @@ class StudySample(ABC):
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
         """Compute a part of the sample with one setting, and time it.
 
-        `n_timed_points` is the number of points that are timed. It may exceed the size of the part.
+        `n_timed_points` is the number of points that are timed. This number may exceed the size of
+        the part.
         """
 
     @abstractmethod
@@ -721,7 +722,7 @@ def _simulate_shot_statistics(
 ) -> Results:
     """Return statistics of shots computed from the peaks that ``find_peaks`` finds.
 
-    They are nan for shots without a hit.
+    The statistics are nan for shots without a hit.
     """
     hitting_shots, n_rays = eyepoints.has_target.nonzero()[0], eyepoints.weight.size
     shot_parameters, ground = parameters_and_ground_of_eyepoints(
