@@ -523,8 +523,8 @@ class SpeckleMixing(NamedTuple):
         A_down    = down_from_up z_0 + down_from_doppler z_1 + down_from_independent z_2
 
     The coefficients are the Cholesky factor of the correlation matrix of the amplitudes. Fields are
-    (n,) for n points, or scalars in kernels (:func:`speckle_mixing_at`). Without speckle, fields
-    are (0,) or zero.
+    (n,) for n points. In kernels they are scalars (:func:`speckle_mixing_at`).
+    Without speckle, fields are (0,) or zero.
     """
 
     doppler_from_up: np.ndarray

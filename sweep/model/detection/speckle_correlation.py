@@ -221,7 +221,7 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray
-        G at each distance, interpolated linearly in :func:`transform_table`. G is set to 0 beyond
+        G at each distance, by linear interpolation in :func:`transform_table`. G is 0 beyond
         2 TRANSFORM_REACH_CELLS.
 
     Examples

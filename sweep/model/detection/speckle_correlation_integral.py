@@ -39,8 +39,9 @@ def fill_peak_bin_correlation(
         Fields of :class:`sweep.model.detection.speckle_correlation.LinePairGradients`; the first
         two are stacked to (2, n).
     transform, samples_per_bin
-        Tabulated G of :func:`sweep.model.detection.speckle_correlation.transform_table`, and its
-        number of samples per bin.
+        Tabulated G, the result of
+        :func:`sweep.model.detection.speckle_correlation.transform_table`, and its number of
+        samples per bin.
     nodes, weights
         Nodes and weights of a quadrature on -1 .. 1.
     correlation
