@@ -157,7 +157,7 @@ class BeamCycle:
     of one pattern in their order. The next cycle fires the next pattern."""
     rate: float
     """Number of measurement cycles per second [Hz], > 0."""
-    interval: float | None = None
+    shot_interval: float | None = None
     """Time from one shot to the next within a measurement cycle [s]. With 0 all beams fire at once
     (several telescopes). With None the shots are spaced evenly over the cycle (one steered beam).
     """
@@ -165,9 +165,9 @@ class BeamCycle:
     """(b, 3): unit vectors along `directions`."""
     _pattern_table: np.ndarray = field(init=False, repr=False)
     """(p, k) int64: indices of the k beams in each of p patterns, as an array."""
-    _shot_interval: float = field(init=False, repr=False)
-    """Time from one shot to the next of a measurement cycle [s]: ``interval``, or the even spacing
-    if that is None."""
+    _resolved_shot_interval: float = field(init=False, repr=False)
+    """Time from one shot to the next within a measurement cycle [s]: ``shot_interval``, or the even
+    spacing over the cycle if ``shot_interval`` is None."""
 
     def __post_init__(self) -> None:
         directions, patterns = np.asarray(self.directions, float), np.asarray(self.patterns)
@@ -186,14 +186,16 @@ class BeamCycle:
         if not (self.rate > 0 and math.isfinite(self.rate)):
             raise ValueError(f"the measurement rate must be positive, not {self.rate}")
         shots_per_cycle = patterns.shape[1]
-        interval = 1 / (shots_per_cycle * self.rate) if self.interval is None else self.interval
+        interval = (
+            1 / (shots_per_cycle * self.rate) if self.shot_interval is None else self.shot_interval
+        )
         if not 0 <= interval * shots_per_cycle * self.rate <= 1 + 1e-9:
             raise ValueError(
                 f"{shots_per_cycle} beams {interval:g} s apart do not fit in 1/{self.rate:g} s"
             )
         object.__setattr__(self, "_unit_directions", directions / length)
         object.__setattr__(self, "_pattern_table", patterns.astype(np.int64))
-        object.__setattr__(self, "_shot_interval", interval)
+        object.__setattr__(self, "_resolved_shot_interval", interval)
 
     @property
     def n_beams(self) -> int:
@@ -207,7 +209,9 @@ class BeamCycle:
 
     def count_shots(self, duration: float) -> int:
         """Return the number of shots that begin at times 0 .. ``duration`` [s], ends included."""
-        return _count_begun_shots(duration, self.rate, self.shots_per_cycle, self._shot_interval)
+        return _count_begun_shots(
+            duration, self.rate, self.shots_per_cycle, self._resolved_shot_interval
+        )
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
         """Return the :class:`ScanShots` with the given shot numbers (n,), counted from 0."""
@@ -218,7 +222,7 @@ class BeamCycle:
         beam_number = patterns[cycle_number % len(patterns), shot_in_cycle]
         zero_rate = np.zeros((beam_number.size, 3))
         return ScanShots(
-            cycle_number / self.rate + shot_in_cycle * self._shot_interval,
+            cycle_number / self.rate + shot_in_cycle * self._resolved_shot_interval,
             beam_number,
             cycle_number,
             self._unit_directions[beam_number],
