@@ -70,8 +70,8 @@ class LineGradients(NamedTuple):
     """(n, 3, 2): shift of the line per standard deviation of the beam [FFT bins], by point, segment
     and coordinate. It is positive towards higher beat frequency."""
     phase: np.ndarray
-    """(n, 3, 2): phase of the line per standard deviation of the beam, less that in the up segment
-    [rad]. The axes are point, segment and coordinate."""
+    """(n, 3, 2): change of the line's phase per standard deviation of the beam, minus that in the
+    up segment [rad]. The axes are point, segment and coordinate."""
 
     def select(self, points: np.ndarray) -> "LineGradients":
         """Return the gradients of the points with the given indices."""
