@@ -1072,7 +1072,7 @@ def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_s
     bins_given_mode.threshold_ratio[:] = bin_threshold.threshold / noise
     bins_given_mode.pedestal_power_ratio[:] = (bin_threshold.line_noise_sigma / noise) ** 2 - 1.0
     echo = EchoBins(np.full(1, magnitude), np.ones(1, np.bool_), bin_)
-    return _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle)
+    return _mean_pd_and_miss_over_mode_phase(bins_given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1450,11 +1450,11 @@ def _pd_and_miss_of_adjacent_bins(echo, begin, end, rule, bin_threshold, bin_spe
             bins_given_mode.other_modes_noise_fraction[k] = other_modes_power / (
                 other_modes_power + noise_power
             )
-    return _mean_over_mode_phase(bins_given_mode, bin_run, rule, bin_speckle)
+    return _mean_pd_and_miss_over_mode_phase(bins_given_mode, bin_run, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle):
+def _mean_pd_and_miss_over_mode_phase(bins_given_mode, echo, rule, bin_speckle):
     """Return the mean :class:`PdAndMiss` over the power of the strongest speckle mode.
 
     Near DC and Nyquist of a real record it is also the mean over the mode's phase.
@@ -1463,11 +1463,11 @@ def _mean_over_mode_phase(bins_given_mode, echo, rule, bin_speckle):
         return _mean_over_mode_power(
             bins_given_mode, echo, rule.has_real_noise_at_ends, rule.fft_size
         )
-    return _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle)
+    return _mean_pd_and_miss_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
+def _mean_pd_and_miss_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle):
     """Return the mean :class:`PdAndMiss` over power and phase t of the strongest speckle mode.
 
     The result applies to bins near DC and Nyquist. Let q be the ratio E[X^2] / E[|X|^2] of a bin X.

@@ -361,12 +361,12 @@ def maximum_likelihood(
     fft_size, n_used, frequencies = float(settings.fft_size), float(is_used.sum()), start.copy()
     for row in range(peak.size):
         record = _record_from_spectrum(spectrum[row], settings) * weight
-        frequencies[row] = _refine_maximum(record, start[row], fft_size)
+        frequencies[row] = _refine_peak_frequency(record, start[row], fft_size)
         if not settings.complex_record:
             tone = complex_exponentials(frequencies[row] / fft_size, record.size)
             image = ((record * tone).sum() / n_used).conjugate() * tone
             # Samples in which the window was not undone hold no tone.
-            frequencies[row] = _refine_maximum(
+            frequencies[row] = _refine_peak_frequency(
                 np.where(is_used, record - image, 0.0), start[row], fft_size
             )
     return frequencies
@@ -499,7 +499,7 @@ def _shift_bin_to_zero(record: np.ndarray, bin_: int, settings: SpectrumSettings
     return np.asarray(record * np.exp(-2j * np.pi * cycles))
 
 
-def _refine_maximum(record: np.ndarray, start: float, fft_size: float) -> float:
+def _refine_peak_frequency(record: np.ndarray, start: float, fft_size: float) -> float:
     """Return the frequency [FFT bins] of the periodogram's maximum next to a starting frequency.
 
     The periodogram is |sum_n x_n e^{-2 pi i n f / N}|^2 of the record x, with the FFT size N. The

@@ -68,7 +68,7 @@ looks' mean power. c is the width of the integrand's peak."""
 _BISECTION_STEPS = 60
 _CROSSING_TABLE_STEPS = 512
 """Number of steps in the table of a look's crossing probability over the magnitude of speckle."""
-_TABULATED_MAGNITUDE_MAX = 5.0
+_TABULATED_SPECKLE_MAGNITUDE_MAX = 5.0
 """Largest tabulated speckle magnitude, in units of its root mean square."""
 
 
@@ -475,7 +475,7 @@ def vote_probability_given_speckle(signal, threshold_ratio, votes_needed, magnit
     distribution, which is built up look by look.
     """
     crossing_table = np.empty(_CROSSING_TABLE_STEPS + 1)
-    step = _TABULATED_MAGNITUDE_MAX / _CROSSING_TABLE_STEPS
+    step = _TABULATED_SPECKLE_MAGNITUDE_MAX / _CROSSING_TABLE_STEPS
     for k in range(_CROSSING_TABLE_STEPS + 1):
         faded_signal = signal * k * step
         if is_real:

@@ -35,7 +35,7 @@ _SQUARED_MIDPOINT_NODES = tuple((_MIDPOINT_STEP * (k + 0.5)) ** 2 for k in range
 _MIDPOINT_WEIGHTS = tuple(
     _MIDPOINT_STEP / math.pi * math.exp(-0.5 * v) for v in _SQUARED_MIDPOINT_NODES
 )
-_POLE_DECAY_RATE = 2.0 * math.pi / _MIDPOINT_STEP
+_POLE_CORRECTION_DECAY_RATE = 2.0 * math.pi / _MIDPOINT_STEP
 """Decay rate c of the midpoint rule's correction for the pole of the integrand of Marcum's Q_1(a,
 b). At the distance d = |a - b| the correction is 1 / (1 + exp(c d)). It is neglected for d >= c."""
 
@@ -43,11 +43,11 @@ _SQUARED_DISTANCE_MAX = 1500.0
 """Limit of (a - b)^2 above which the smaller tail of Marcum's Q_1(a, b) is 0 in float64. The tail
 is about exp(-(a - b)^2 / 2)."""
 
-_EXCESS_TERMS_MAX = 24
+_EXCESS_SERIES_TERMS_MAX = 24
 """Largest number of terms of the series in :func:`marcum_q1_excess`."""
 # 1/(m+1) and 1/m^2 by m, so that no step of the series divides.
-_INVERSE_NEXT_INTEGERS = tuple(1.0 / (m + 1) for m in range(_EXCESS_TERMS_MAX + 1))
-_INVERSE_SQUARES = (0.0, *(1.0 / m**2 for m in range(1, _EXCESS_TERMS_MAX + 1)))
+_INVERSE_NEXT_INTEGERS = tuple(1.0 / (m + 1) for m in range(_EXCESS_SERIES_TERMS_MAX + 1))
+_INVERSE_SQUARES = (0.0, *(1.0 / m**2 for m in range(1, _EXCESS_SERIES_TERMS_MAX + 1)))
 
 _LN2 = math.log(2.0)
 _LOG_P_LINEAR_MAX = -600.0
@@ -165,7 +165,11 @@ def marcum_q1_tails(a, b):
             total += (_MIDPOINT_WEIGHTS[k] * (shift + half_step * v)) / (
                 (d_square + v) * math.sqrt(1.0 - quarter * v)
             )
-        pole = 1.0 / (1.0 + math.exp(_POLE_DECAY_RATE * d)) if d < _POLE_DECAY_RATE else 0.0
+        pole = (
+            1.0 / (1.0 + math.exp(_POLE_CORRECTION_DECAY_RATE * d))
+            if d < _POLE_CORRECTION_DECAY_RATE
+            else 0.0
+        )
         tail = total * decay + pole
     return Tails(1.0 - tail, tail) if is_p else Tails(tail, 1.0 - tail)
 
@@ -197,7 +201,7 @@ def marcum_q1_excess(a, b):
     high = 0.5 * b * b
     low = exact_product(0.5 * b, b)[1] if high < 1e3 else 0.0
     if x <= 2.0 and w <= 16.0:
-        terms = _EXCESS_TERMS_MAX
+        terms = _EXCESS_SERIES_TERMS_MAX
         if x <= 1e-2 and w <= 2.6e-2:
             terms = 6
         elif x <= 0.125 and w <= 0.7:

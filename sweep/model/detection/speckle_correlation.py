@@ -55,7 +55,7 @@ TRANSFORM_SAMPLES_PER_CELL = 64
 """Number of samples of the tabulated window transform per resolution cell. A cell is the sample
 rate over the number of samples in the record."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(48)
-_BEAM_DEVIATIONS_MAX = 5.0
+_INTEGRATED_BEAM_DEVIATIONS_MAX = 5.0
 """Largest half-width of the interval across the beam over which the correlation is integrated, in
 standard deviations of the beam's power."""
 _RESOLVED_PHASE_MAX = 40.0
@@ -152,7 +152,8 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
     )
 
     half_interval = np.minimum(
-        _BEAM_DEVIATIONS_MAX, TRANSFORM_REACH_CELLS / np.maximum(gradients.line_shift_max, 1e-300)
+        _INTEGRATED_BEAM_DEVIATIONS_MAX,
+        TRANSFORM_REACH_CELLS / np.maximum(gradients.line_shift_max, 1e-300),
     )
     is_resolved = np.abs(gradients.phase_difference) * half_interval <= _RESOLVED_PHASE_MAX
     correlation = _gaussian_correlation(window, gradients).astype(complex)
