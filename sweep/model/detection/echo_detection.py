@@ -300,7 +300,8 @@ class SpeckleTable(NamedTuple):
     """(rows, bins): ratio E[X^2] / E[|X|^2] of the signal X, by distance [bins] from the nearer of
     DC and Nyquist."""
     relative_power_by_phase: np.ndarray
-    """(rows, phases): power of the echo's strongest bin at each phase of the speckle, over its mean
+    """(rows, phases): power of the echo's strongest bin at each phase of the speckle, over the mean
+    over phases
     (:attr:`sweep.model.detection.pseudo_variance.SignalPseudoVariance.relative_power_by_phase`)."""
 
     def select(self, segment: int, points: np.ndarray) -> "SpeckleTable":

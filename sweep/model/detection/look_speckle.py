@@ -209,8 +209,8 @@ class LookSpeckle(NamedTuple):
 
 
 _EIGENVALUE_FRACTION_MIN = 1e-7
-"""Smallest fraction of all looks' power for which an eigenvalue of the covariance of their speckle
-is kept."""
+"""Fraction of the total power of all looks below which an eigenvalue of the covariance of the
+looks' speckle is dropped."""
 
 
 def look_covariances(

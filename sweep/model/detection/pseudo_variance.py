@@ -262,8 +262,8 @@ def _image_reach(window: Window) -> float:
 
 
 _EIGENVALUE_FRACTION_MIN = 1e-7
-"""Smallest fraction of all looks' power for which an eigenvalue of the covariance of their echo
-amplitudes is kept."""
+"""Fraction of the total power of all looks below which an eigenvalue of the covariance of the
+looks' echo amplitudes is dropped."""
 
 
 def multilook_pd_and_miss_near_ends(

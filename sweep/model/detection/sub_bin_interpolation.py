@@ -514,9 +514,10 @@ _DRIFT_POSITIONS_BINS = np.linspace(0.0, 1.0, 17)
 
 @lru_cache(maxsize=32)
 def _drift_error_table(window: Window, fft_size: int) -> np.ndarray:
-    """Tabulate the error of a drifting tone's position over its squared drift [1/bins].
+    """Tabulate the position error of a drifting tone, divided by its squared drift [1/bins].
 
-    The shape is (drifts, positions), for drifts over the record and positions in its middle.
+    The table is (drifts, positions), for drifts over the record and positions in the middle of the
+    record.
     """
     w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
     record_position = np.arange(w.size) / w.size - 0.5

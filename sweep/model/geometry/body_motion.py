@@ -400,12 +400,12 @@ class BodyState(NamedTuple):
 
 
 def _clip_times_to_interval(times: np.ndarray, start: float, stop: float) -> np.ndarray:
-    """Return times (n,) [s], clipped to the trajectory's interval if rounding put them outside.
+    """Return times (n,) [s], clipped to ``start`` .. ``stop`` where rounding put them outside.
 
     Raises
     ------
     ValueError
-        If a time lies outside the interval by more than rounding.
+        If a time lies outside ``start`` .. ``stop`` by more than rounding.
     """
     times = np.atleast_1d(np.asarray(times, float))
     tolerance = _TIME_TOLERANCE_FRACTION * max(stop - start, 1.0)

@@ -299,7 +299,8 @@ def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
 
 
 def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterator[AccuracySetting]:
-    """Yield settings of the thesis's method, of improvements to it, and closed-form equivalents."""
+    """Yield settings of the thesis's method, of its improved versions and closed-form
+    equivalents."""
     yield AccuracySetting(name="closed form, as thesis", kind=CLOSED_FORM_KIND, overrides=overrides)
     variants: list[tuple[str, str, int, dict[str, Any]]] = [
         *((THESIS_METHOD_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),

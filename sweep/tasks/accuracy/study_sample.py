@@ -392,7 +392,7 @@ class GridSample(StudySample):
         self.timed_points_max = min(TIMED_POINTS_MAX, self._block_points)
 
     def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
-        """Divide the sample into parts, each of which is spread evenly over the grid."""
+        """Return the sample's rows divided into parts, each spread evenly over the grid."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points_per_part)))
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
@@ -526,7 +526,7 @@ class FlightSample(StudySample):
         )
 
     def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
-        """Divide the sample into parts of complete tiles.
+        """Return the sample's rows divided into parts of complete tiles.
 
         Each part has shots of one scanner at one point of the axes. Scanners and points take turns.
         """
