@@ -586,8 +586,8 @@ class SegmentCorrelations(NamedTuple):
 
         Notes
         -----
-        They are the Cholesky factor of the segments' correlation matrix. Phases that do not change
-        the joint law of the magnitudes are removed.
+        The coefficients are the Cholesky factor of the segments' correlation matrix. Phases that do
+        not change the joint law of the magnitudes are removed.
         """
         up_doppler, up_down, doppler_down = (
             np.minimum(np.abs(correlation), 1.0) for correlation in self

@@ -71,7 +71,7 @@ class NoiseMixing(NamedTuple):
     """
 
     neighbours_from_centre: float
-    """Factor on z0, the number of the centre bin, in the noise of both neighbours."""
+    """Factor on z0, the noise of the centre bin, in the noise of both neighbouring bins."""
     above_from_independent: float
     """Factor on z1 in the noise of the bin above: the part independent of the centre bin's noise.
     """
@@ -373,11 +373,11 @@ def _least_squares_weights(
 
 
 def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpolator) -> np.ndarray:
-    """Return the error of a position over the variance of the lines' narrow Gaussian spread, (m,).
+    """Return a position's error per variance of the lines' narrow Gaussian spread, (m,) [1/bins].
 
-    The error is tabulated over the distance of the lines' mean from the centre bin [1/bins]. Three
-    lines of weights 1/6, 2/3, 1/6 represent the spread. Their moments up to the fifth are those of
-    a Gaussian.
+    The ratio is tabulated over the distance, 0 .. 1 bin, of the lines' mean from the centre bin.
+    Three lines of weights 1/6, 2/3, 1/6 represent the spread, with the moments of a Gaussian up to
+    the fifth.
     """
     positions = np.linspace(0.0, 1.0, _N_SPREAD_POSITIONS)
     power = np.zeros((3, _N_SPREAD_POSITIONS))

@@ -123,7 +123,7 @@ class AccuracySetting:
 
     @property
     def plans_effects(self) -> bool:
-        """True if the setting chooses effects point by point, which counts as computing time."""
+        """True if the setting chooses effects point by point; its time includes the choice."""
         return not self.has_line_effects_only and self.kind not in (
             FIXED_EFFECTS_KIND,
             ALL_EFFECTS_KIND,
@@ -299,8 +299,7 @@ def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
 
 
 def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterator[AccuracySetting]:
-    """Yield settings of the thesis's method, of its improved versions and closed-form
-    equivalents."""
+    """Yield settings of the thesis's method, its improved versions and closed-form equivalents."""
     yield AccuracySetting(name="closed form, as thesis", kind=CLOSED_FORM_KIND, overrides=overrides)
     variants: list[tuple[str, str, int, dict[str, Any]]] = [
         *((THESIS_METHOD_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),

@@ -200,7 +200,7 @@ class StudySample(ABC):
     spec: AnySpec
     """Spec of the study."""
     study_with_setting: Callable[[AccuracySetting], Any]
-    """Function that returns the study with an accuracy setting."""
+    """Function from an accuracy setting to the study with this setting."""
     point_indices: np.ndarray
     """(size,): indices of the sampled points in the study. In a flight they count the sampled
     shots."""
@@ -583,7 +583,8 @@ class FlightSample(StudySample):
     def extend_to_complete_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
         """Return the sample indices of all shots in the tiles of some shots, and in the next tiles.
 
-        Tiles are added until the tiles from the first one on have at least `n_shots` shots.
+        Following tiles are added until the tiles from the first one on have at least `n_shots`
+        shots together.
         """
         rows_of_block = np.flatnonzero(self._part_of_row == self._part_of_row[point_indices[0]])
         return rows_of_block[
@@ -701,8 +702,8 @@ def rows_of_complete_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: i
     """Return the rows of all shots in the tiles of the given rows, and in enough following tiles.
 
     After the last tile comes the first. ``tile_of_row`` (n,) is the number of each row's tile, in
-    rising order. Tiles are added until the tiles from the first one on have at least `n_shots`
-    shots.
+    rising order. Following tiles are added until the tiles from the first one on have at least
+    `n_shots` shots together.
     """
     tiles, counts = np.unique(tile_of_row, return_counts=True)
     own_tiles = np.unique(tile_of_row[rows])
