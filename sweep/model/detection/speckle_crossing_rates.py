@@ -90,9 +90,10 @@ class SpeckleCrossingRates(NamedTuple):
     """Number p of steps in the table from the amplitude at one speckle power to that at the
     next."""
     relative_rates: np.ndarray
-    """(p + 5 or more, columns): relative rates. Entry number p c + r is in row r and column c. The
-    entries of a bin at successive speckle powers are thus adjacent in a row, and the six entries of
-    an interpolation are in six successive rows."""
+    """(rows, columns): relative rates of the table's entries. With p ``entries_per_power`` there
+    are p + 5 rows or more, and entry number p c + r is in row r and column c. The entries of a bin
+    at successive speckle powers are thus adjacent in a row, and the six entries of an interpolation
+    are in six successive rows."""
 
 
 class RateTableGrid(NamedTuple):

@@ -467,7 +467,7 @@ class AccuracyMeasurement:
 def add_settings_with_fixed_effects(
     setting_ladder: SettingLadder, sample: StudySample, tolerances: Iterable[float] = ()
 ) -> SettingLadder:
-    """Add settings that simulate the same effects at every point; return all settings.
+    """Return the ladder with added settings that simulate the same effects at every point.
 
     One set of effects is added for each tolerance in `FIXED_EFFECTS_TOLERANCES`.
     """

@@ -224,7 +224,7 @@ def add_settings_for_effect_sets(
     effects_by_tolerance: Mapping[float, frozenset[str]],
     tolerances: Iterable[float] = (),
 ) -> SettingLadder:
-    """Add settings that simulate the same effects at every point.
+    """Return the ladder with added settings that simulate the same effects at every point.
 
     A set of effects holds all effects that one tolerance requires at any point. Each set is tried
     with all ``tolerances`` for lines and leakage, by default with the tolerances of all sets.

@@ -158,13 +158,14 @@ class Trial(NamedTuple):
     results: SampleResults
     """Results of the setting at the points."""
     seconds_per_point: float
-    """Processor time per point of this process [s], including the time to plan its effects."""
+    """Processor time of this process per point [s], including the time to plan the point's
+    effects."""
     planning_seconds_per_point: float
-    """Processor time per point to plan the effects [s]."""
+    """Part of ``seconds_per_point`` that planning the effects takes [s]."""
 
 
 def merge_trials(trials: Sequence[Trial]) -> Trial:
-    """Merge the trials of one setting on several parts of a sample into one."""
+    """Return one trial that joins the trials of one setting on several parts of a sample."""
     weights = np.array([trial.results.noise_sigma.size for trial in trials], float)
     weights /= weights.sum()
     return Trial(
