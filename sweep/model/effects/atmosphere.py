@@ -114,8 +114,9 @@ def extinction_from_visibility(*, visibility: ArrayLike, wavelength: ArrayLike) 
 
     Notes
     -----
-    3.912/V (wavelength / 0.55 um)^-q with q = 1.6 above 50 km, 1.3 above 6 km, 0.16 V + 0.34 above
-    1 km, V - 0.5 above 0.5 km (V in km), 0 in fog. The module's description has the sources.
+    The coefficient is 3.912/V (wavelength / 0.55 um)^-q. The exponent q depends on the visibility V
+    [km]: 1.6 above 50 km, 1.3 above 6 km, 0.16 V + 0.34 above 1 km, V - 0.5 above 0.5 km, and 0 in
+    fog. The module's description has the sources.
     """
     visibility_m = np.asarray(visibility, float)
     visibility_km = visibility_m / 1e3
@@ -195,7 +196,11 @@ def optical_depth(
 def _mean_extinction(
     start: np.ndarray, end: np.ndarray, z0: float, z1: float, a0: float, a1: float
 ) -> np.ndarray | float:
-    """Return the mean extinction [1/m] over heights that lie between two rows of a profile."""
+    """Return the mean extinction [1/m] over the heights from ``start`` to ``end``.
+
+    The heights lie between two rows of a profile: extinction ``a0`` at the height ``z0``, and
+    ``a1`` at ``z1``. Between them extinction is exponential, or linear if ``a0`` or ``a1`` is 0.
+    """
     if a0 == a1 or z0 == z1 or not math.isfinite(z0):
         return a0
     if a0 > 0 and a1 > 0:
@@ -207,9 +212,9 @@ def _mean_extinction(
 
 
 def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:
-    """Return the extinction profile of points that share all text parameters.
+    """Return the extinction profile that all points share, or None without an atmosphere.
 
-    The result is None without an atmosphere.
+    ``parameters`` are those of the points by dotted path; text parameters are equal in all points.
     """
     name = str(parameters["atmosphere.profile"])
     surface_extinction, depth = (
@@ -380,8 +385,8 @@ EXTINCTION = Effect(
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(16)
 _INTEGRAL_SPLIT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
-"""Positions between two rows of the extinction table at which the backscatter integral is split.
-The unit is one e-folding of the extinction."""
+"""Distances from the denser of two rows of an extinction profile at which the backscatter integral
+is split, in e-foldings of the extinction."""
 _INTEGRAL_SPLIT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
 """Ranges at which the backscatter integral splits the path, in units of the near range (aperture
 diameter over full angle of the field of view)."""
@@ -461,7 +466,8 @@ def backscatter_integral(
 def _integral_split_heights(profile: ExtinctionProfile) -> np.ndarray:
     """Return the heights [m] at which the backscatter integral is split.
 
-    Between two of them extinction is smooth and falls by at most a few factors of e.
+    They are the heights of the profile's rows, and heights between rows at multiples of an e-folding
+    of the extinction (``_INTEGRAL_SPLIT_E_FOLDINGS``).
     """
     cuts = [profile.height[0]]
     rows = [*zip(profile.height, profile.extinction, strict=True)]

@@ -95,12 +95,16 @@ lines and their noise."""
 SEPARATE_BATCHES_MASK = np.uint32(
     sum(1 << k for k, effect in enumerate(EFFECTS) if effect.needs_separate_batches)
 )
-"""Mask of effect flags (bit i for effect i). Points with and without one of these effects are
-computed separately."""
+"""Bit mask of the effects that need separate batches (bit i for effect number i). Points with such
+an effect and points without it are computed separately."""
 
 
 def pack_effect_flags(is_kept: np.ndarray) -> np.ndarray:
-    """Pack enabled effects, (effects, m) bool in the order of EFFECTS, as bit masks (m,) uint32."""
+    """Return the bit masks (m,) uint32 of the effects that are kept at m points or tiles.
+
+    ``is_kept`` (effects, m) is True for kept effects, in the order of EFFECTS. Effect number i has
+    bit i.
+    """
     flag_masks = np.uint32(1) << np.arange(is_kept.shape[0], dtype=np.uint32)
     return np.bitwise_or.reduce(np.where(is_kept, flag_masks[:, None], np.uint32(0)), axis=0)
 
@@ -111,7 +115,7 @@ def unpack_effect_flags(flags: int) -> tuple[str, ...]:
 
 
 def effect_flag_attributes() -> dict[str, Any]:
-    """Return attributes of a store's variable that name the bits of effect flags.
+    """Return the attributes of a store's variable of effect flags, which name the flags' bits.
 
     The attributes follow the CF conventions.
     """

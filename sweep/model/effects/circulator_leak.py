@@ -86,7 +86,8 @@ def leak_beat_current_variance(
 
     Notes
     -----
-    It is the sum of the intensity noise and phase noise of the module's description.
+    The variance is the sum of intensity noise and phase noise, whose equations are in the module's
+    description.
     """
     if architecture == "direct":
         return np.zeros(())
@@ -118,9 +119,10 @@ def leak_beat_current_variance(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the noise of the leaked light, and an error of 1 that keeps the effect.
+    """Return the relative noise variance of the leaked light, and a probability change of 1.
 
-    The noise is exact, not a bound. The line of the leaked light may hide any echo.
+    The noise variance is exact, not a bound. The probability change of 1 keeps the effect, because
+    the line of the leaked light may hide any echo. The result is None without leaked light.
     """
     if not points.any_nonzero(LEAK_LENGTH_PATH):
         return None

@@ -40,9 +40,9 @@ def doppler_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Notes
     -----
-    The shift is 2 v_r / lambda, with the radial velocity v_r and the wavelength lambda. It changes
-    the receiver's gain and the line's position between two bins. The shift in bins counts as well,
-    because the velocity is measured by the shift. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is
+    The shift is 2 v_r / lambda, with the radial velocity v_r and the wavelength lambda. The shift
+    changes the receiver's gain and the line's position between two bins. The shift in bins is an
+    error too, because the shift is the measure of velocity. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is
     never skipped.
     """
     if not points.any_nonzero("target.radial_velocity"):
@@ -215,10 +215,9 @@ DOPPLER_SPREAD = Effect(
 
 
 def rotation_error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1 if any body of the scene rotates, else None.
+    """Return a probability change of 1 if any body of the scene rotates, else None.
 
-    The effect is thus kept wherever it is present. The velocities of rotating surfaces are part of
-    the scene.
+    A change of 1 keeps the effect. The velocities of rotating surfaces are part of the scene.
     """
     return ErrorBound(probability_change=1.0) if points.has_rotating_body else None
 

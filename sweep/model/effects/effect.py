@@ -218,7 +218,7 @@ class Effect:
         return self.perturb_parameters is not None or self.perturb_shots is not None
 
     def is_absent(self, parameters: Parameters) -> np.ndarray:
-        """Return True for points whose parameters disable the effect; (n,) or scalar."""
+        """Return bool, (n,) or scalar: True for points whose parameters disable the effect."""
         enabling_parameters = [
             parameter for parameter in self.parameters if parameter.enables_effect
         ]
@@ -229,7 +229,7 @@ class Effect:
 
 
 def add_noise_sources(shots: Shots, **variances: np.ndarray) -> Shots:
-    """Return shots with additional noise sources.
+    """Return a copy of shots with additional noise sources.
 
     ``variances`` are noise variances at the ADC [V^2], by name of the source.
     """

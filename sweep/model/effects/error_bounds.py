@@ -17,12 +17,13 @@ class ErrorBound(NamedTuple):
     """Relative change of |X| in the largest bin, if the effect is omitted. 1 or more means that
     nothing is known of |X|."""
     coherent_sum_change: ArrayOrFloat = 0.0
-    """Further change of |X| in the largest bin, as a fraction of the sum of all amplitudes in
-    phase. It is for amplitudes that may cancel, whose sum has no bounded relative change."""
+    """Change of |X| in the largest bin in addition to ``magnitude_change``, as a fraction of the sum
+    of all amplitudes in phase. This field bounds sums of amplitudes that may cancel, because their
+    relative change has no bound."""
     noise_variance_change: ArrayOrFloat = 0.0
     """Relative change of a bin's noise variance if the effect is omitted."""
     threshold_follows_noise: bool = True
-    """True if the threshold is set on noise that includes this effect's, as for noise that is
+    """True if the threshold is set on noise that includes the noise of this effect, which is then
     always present. False for noise that comes with the signal."""
     shift_bins: ArrayOrFloat = 0.0
     """Shift of measured frequencies [FFT bins] if the effect is omitted. One bin counts as much as
@@ -31,8 +32,8 @@ class ErrorBound(NamedTuple):
     """Change of log10 of a shot's false-alarm probability if the effect is omitted. It is due to
     bins that the effect moves across the threshold."""
     leaking_bin_change_sigma: ArrayOrFloat = 0.0
-    """Further change of |X| in bins with leaked signal (from sidelobes), in units of the noise per
-    quadrature. It is added to the change that these bins share with the largest bin."""
+    """Change of |X| that only bins with leaked signal (from sidelobes) have, in units of the noise
+    per quadrature. The change that these bins share with the largest bin is not included."""
     probability_change: ArrayOrFloat = 0.0
     """Change of a probability (of detection or false alarm) if the effect is omitted, 0..1. Values
     by segment are summed."""
@@ -61,7 +62,7 @@ class PhaseErrorBound(NamedTuple):
     """Largest magnitude of the phase error in the record's middle [cycles]. It only matters to
     lines near their images."""
     extra_shift_window_bins: np.ndarray | float = 0.0
-    """Further shift of a line's light in frequency, in addition to that by the polynomial's slopes.
+    """Shift of a line's light in frequency that is not due to the slopes of the polynomial.
     The unit is the sample rate over the number of samples in the record."""
 
     @property

@@ -65,8 +65,8 @@ def footprint_error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
     """Give beamlets their own ranges and echoes.
 
-    Beamlets on other surfaces keep the axis's range, and all keep its velocity: those are separate
-    effects.
+    Two things are left to separate effects. Beamlets on surfaces that the axis does not meet keep
+    the axis's range, and all beamlets keep the axis's velocity.
 
     Parameters
     ----------
@@ -129,12 +129,12 @@ def coherent_footprint_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Notes
     -----
-    The round trip to beamlet b differs by 4 pi/lambda (R_b - R_0) in phase. If that is not small
-    against 1, the magnitude of the sum of N beamlets may be anything from 0 to sqrt(N) times
-    (Cauchy and Schwarz) the root of the sum of their powers. If it is small, beamlets of the
-    amplitudes a_b add in phase to sum a_b / sqrt(sum a_b^2) times that root, which is as large a
-    change. So the effect is kept wherever there are several beamlets. The line of a single beamlet
-    adds to its own image.
+    The round trip to beamlet b differs by 4 pi/lambda (R_b - R_0) in phase from that on the axis.
+    Without the effect, the sum of N beamlets of amplitudes a_b has the magnitude
+    A = sqrt(sum a_b^2). With large phase differences the magnitude is between 0 and sqrt(N) A
+    (Cauchy and Schwarz). With small ones it is sum a_b, which may be as large. The effect is
+    therefore kept wherever there are several beamlets. The line of a single beamlet adds to its own
+    image.
     """
     if not points.adds_field_amplitudes:
         return None
@@ -194,9 +194,9 @@ def several_returns_error_bound(points: PlannerInputs) -> ErrorBound | None:
     -----
     Let a fraction f of the power be off the axis's surface, and let the lines of the axis's surface
     have the power a in their largest bin. With the effect the largest bin holds at least a, and no
-    bin holds more than a + f. Without it the power f lies at the range of the axis, so the largest
-    bin holds at most a plus the peak power of a line of power f there. If amplitudes add, the only
-    bound is their sum in phase.
+    bin holds more than a + f. Without the effect the power f lies at the range of the axis, so the
+    largest bin holds at most a plus the peak power of a line of power f. If amplitudes add, the
+    only bound is their sum in phase.
     """
     other_surface_echo_fraction = np.minimum(
         points.footprint_extent.other_surface_echo_fraction, 1.0
@@ -233,9 +233,9 @@ def several_returns_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
-    """Give beamlets on other surfaces than the axis's their own ranges, if there are any.
+    """Give beamlets on surfaces that the axis does not meet their own ranges.
 
-    Without the effect they return their power from the axis's range.
+    Without the effect these beamlets return their power from the axis's range.
 
     Parameters
     ----------
@@ -275,4 +275,4 @@ SEVERAL_RETURNS = Effect(
     parent="footprint",
     needs_separate_batches=False,
 )
-"""Effect that gives beamlets on other surfaces than the axis's their own ranges."""
+"""Effect that gives beamlets on surfaces that the axis does not meet their own ranges."""

@@ -57,10 +57,10 @@ from sweep.model.window_response import window_response
 
 _LN_10 = math.log(10)
 _SIGNAL_RATIO_MAX = 1e12
-"""Upper limit of signals over the noise per quadrature, which avoids overflow."""
+"""Value to which ratios of signal to noise per quadrature are limited to avoid overflow."""
 _EXPECTED_MOVED_BINS_MIN = 1e-4
-"""Limit on the expected number of a shot's bins that images may move across the threshold. Fewer
-bins are neglected."""
+"""Expected number of a shot's bins that images may move across the threshold, below which such bins
+are neglected."""
 
 
 def image_error_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -112,11 +112,13 @@ def image_error_bound(points: PlannerInputs) -> ErrorBound | None:
 def _image_leaking_bin_change(points: PlannerInputs) -> np.ndarray:
     """Return a bound on the change of |X| due to images in bins with leaked signal [noise sigma].
 
-    Lines add as powers. The bound is the larger of two: the change of one bin at the threshold, and
-    a change of one bin that stands for those of all bins. For small amplitudes a, bins cross with
-    probabilities of y e^-y a^2 / 2, with y = b^2 / 2 and the threshold b, all over the noise per
-    quadrature. Let d be ``bins_from_light_to_edge``. Beyond d, images fall at least as the inverse
-    distance. All bins together thus have d times the a^2 of the nearest.
+    The bound is for lines that add as powers, and is the larger of two. The first is the change of
+    a single bin at the threshold. The second is a change of a single bin that has the effect of the
+    changes of all bins. Let a be the image's magnitude in a bin, and b the threshold, both over the
+    noise per quadrature, and y = b^2 / 2. A small a raises the probability that the bin crosses the
+    threshold by y e^-y a^2 / 2. Let d be ``bins_from_light_to_edge``. At distances beyond d the
+    magnitude a falls at least as the inverse distance. The sum of a^2 over all bins is therefore at
+    most d times the largest a^2.
     """
     image_ratio = (
         points.line_magnitude_over_sigma
@@ -138,7 +140,7 @@ def _image_leaking_bin_change(points: PlannerInputs) -> np.ndarray:
 def _image_log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     """Return a bound on the change of log10 of a shot's false-alarm probability due to images.
 
-    Images move bins across the threshold, which then count as part of an echo or no longer do. The
+    Images move bins across the threshold, so that these bins begin or cease to count as an echo. The
     bound counts the expected number of such bins, but at least one bin. It is 0 if fewer than
     ``_EXPECTED_MOVED_BINS_MIN`` bins are expected.
     """
@@ -239,15 +241,15 @@ _SINGLE_BINS, _FAR_STRETCHES = 48, 24
 """Number of bins near the line that count singly in the bound of leakage, and number of intervals
 that hold all bins farther away."""
 _DISTANT_IMAGE_FACTOR = 1.1
-"""Factor on sidelobes far from DC and Nyquist, which allows for the images that add to them. Near
-DC and Nyquist the factor is 2."""
+"""Factor on the magnitude of sidelobes that allows for images adding to them, far from DC and
+Nyquist. Near DC and Nyquist the factor is 2."""
 
 
 def leakage_error_bound(points: PlannerInputs) -> ErrorBound:
-    """Return a bound on the probability that leaked signal raises an additional group.
+    """Return a bound on the probability that leaked signal raises a false peak in any segment.
 
-    The group may be in any segment. A group is a run of adjacent bins above the threshold. Leaked
-    signal is the signal in bins that stay below the threshold without noise.
+    A false peak is a group of adjacent bins above the threshold, apart from the echo. Leaked signal
+    is the signal in bins that stay below the threshold without noise.
     """
     threshold_ratio, is_near_image = points.threshold_ratio, points.is_near_image
     ratio_to_threshold = (
@@ -352,8 +354,9 @@ def leakage_bound_table(
     Returns
     -------
     ndarray (reaches + 1, rows)
-        Bounds, 0..1. The first axis is the shift of light from its line; its last element is
-        Parseval's bound. The second is the magnitude of all lines over the threshold.
+        Bounds, 0..1. Rows of the first axis are shifts of light from its line
+        (``_TABULATED_LIGHT_SHIFTS_BINS``); the last row is Parseval's bound, for any shift. The
+        second axis is the magnitude of all lines together over the threshold, in logarithmic steps.
     """
     response, n_rows = (
         window_response(window_name, length, fft_size),

@@ -65,9 +65,9 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1 where I and Q are unequal, so that the effect is simulated.
+    """Return a magnitude change of 1 where I and Q are unequal, 0 elsewhere; None if all are equal.
 
-    An image at a line's negative frequency may be a peak of its own.
+    A change of 1 keeps the effect, because the image of a line may be a peak of its own.
     """
     image_amplitude = image_gain(
         gain=points[GAIN_IMBALANCE_PATH], phase=points[PHASE_IMBALANCE_PATH]

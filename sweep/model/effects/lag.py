@@ -26,9 +26,10 @@ from sweep.model.preparation import Shots
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the changes of the echo and of its shot noise if the offset of the axes is omitted.
+    """Return the changes of the echo and of its shot noise if the beams' offset is omitted.
 
-    The result is None if the axes of transmitted and received beam coincide, or if all light in the
+    The offset is the distance between the axes of transmitted and received beam at the target. The
+    changes are exact, not bounds. The result is None if the axes of transmitted and received beam coincide, or if all light in the
     aperture mixes.
     """
     paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH
@@ -63,7 +64,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     -----
     The echo's power is multiplied by exp(-2 d^2 / (w_T^2 + w_L^2)), with the distance d of the axes
     and the beam radii w_T and w_L at the target (antenna theorem, Siegman 1966). The beat's
-    amplitude is multiplied by the square root of that.
+    amplitude is multiplied by the square root of that factor.
     """
     if not beam.is_single_mode(context.parameters):
         return shots

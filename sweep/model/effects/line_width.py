@@ -49,18 +49,18 @@ _WIDTH_PATH, _SHAPE_PATH = LASER_PREFIX + "line_width", LASER_PREFIX + "line_sha
 
 
 def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
-    """Return the standard deviation of a Gaussian laser line.
+    """Return the standard deviation of a Gaussian laser line, in bins of fs/L.
 
-    The unit is the sample rate over the number of samples in the record.
+    fs is the sample rate, and L the number of samples in the record.
     """
     return DEVIATION_PER_FWHM * points[_WIDTH_PATH] * points.record.duration
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the distance over which a Gaussian laser line spreads light from its centre.
+    """Return a bound whose shift is the distance to which a Gaussian laser line spreads light.
 
-    The distance is the shift of a :class:`PhaseErrorBound`. The result is None for other line
-    shapes.
+    The distance is _LINE_REACH_DEVIATIONS standard deviations of the line. The result is None for
+    line shapes that are not Gaussian, and for lines without width.
     """
     if not points.any_nonzero(_WIDTH_PATH) or points.shared_option(_SHAPE_PATH) != "gaussian":
         return None
@@ -147,9 +147,10 @@ def _lorentzian_error_bound(points: PlannerInputs) -> ErrorBound:
 def _line_fraction_and_pedestal(
     shots: Shots, timing: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power fraction that a laser's pure line keeps, and the pedestal of phase noise.
+    """Return two results of :func:`sweep.model.laser_line.apparent_line_and_pedestal`, (n,) each.
 
-    Both, (n,), refer to the samples of the record that hold the echo.
+    The first is the fraction of power that a laser's pure line keeps. The second is the pedestal of
+    phase noise. Both are for the samples of the record that hold the echo.
     """
     looks = shots.looks.n_coherent
     if shots.echo_record.n_samples_before_echo is None:

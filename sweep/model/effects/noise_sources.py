@@ -44,7 +44,7 @@ from sweep.model.preparation import Shots
 def signal_shot_noise_error_bound(points: PlannerInputs) -> ErrorBound:
     """Return the variance of the echo's shot noise over that of the receiver's noise.
 
-    The threshold is set without it, because it comes with the echo.
+    The threshold is set on noise without this shot noise, which comes with the echo.
     """
     return ErrorBound(
         noise_variance_change=points.echo_shot_noise_ratio, threshold_follows_noise=False
@@ -275,8 +275,8 @@ def intensity_noise_current_variance(
     local oscillator, RIN the relative intensity noise [1/Hz] and B_e the electrical bandwidth. The
     two diodes of a balanced receiver see the same fluctuation and subtract it, except for their
     mismatch. The common-mode rejection (in dB 20 log10 of the ratio of their currents) divides the
-    variance. Both are assumed to be constant over the electrical bandwidth. The echo's own
-    intensity noise is neglected: it is smaller by P / P_lo.
+    variance. RIN and rejection are assumed to be constant over the electrical bandwidth. The echo's
+    own intensity noise is neglected: it is smaller by P / P_lo, with the echo's power P.
     """
     current = (
         parameters[RECEIVER_PREFIX + "apd_gain"] * parameters[RECEIVER_PREFIX + "responsivity"]
@@ -370,8 +370,8 @@ def quantisation_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Rounding noise is white, and is compared with the density of the receiver's noise at the line.
     The threshold is set on noise that includes this source. In a whitened spectrum lines are
-    divided by the root of the noise density. With the effect it is the density of both noises,
-    without it that of the receiver's alone.
+    divided by the root of the noise density. This density includes rounding noise only with the
+    effect.
     """
     if not points.any_nonzero(_BITS_PATH):
         return None

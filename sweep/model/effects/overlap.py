@@ -50,8 +50,8 @@ from sweep.model.preparation import Shots
 from sweep.model.window_response import window_max_near
 
 _REMAINING_AMPLITUDE_WITH_IMAGE_MIN = 0.9
-"""Smallest fraction of a line's amplitude that remains when the sidelobes of its image, at the
-opposite frequency far away, are added to it."""
+"""Lower bound on the amplitude of a line to which sidelobes of its distant image add, as a fraction
+of the amplitude without the image."""
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:

@@ -91,8 +91,8 @@ _N_WINDOW_NODES = 256
 _RADIANS_PER_CYCLE = 2 * math.pi
 """Factor 2 pi that converts a phase from cycles to radians."""
 _REMAINING_AMPLITUDE_WITH_IMAGE_MIN = 0.9
-"""Smallest fraction of a line's amplitude that remains when the sidelobes of its image, at the
-opposite frequency far away, are added to it."""
+"""Lower bound on the amplitude of a line to which sidelobes of its distant image add, as a fraction
+of the amplitude without the image."""
 
 
 class MomentsByExponent(NamedTuple):
@@ -121,8 +121,8 @@ class WindowMoments(NamedTuple):
     """Root mean squares of x^k about its mean for k = 2, 4, and 0 for k = 1, 3. x is the position
     in the record, -1..1; means are weighted by the window."""
     fitted_slopes: MomentsByExponent
-    """Slopes of the best straight line to x^k, k = 1 .. 4, with the position x in the record,
-    -1..1. They are 0 for even k."""
+    """Slopes of the best straight lines to x^k, k = 1 .. 4, over the position x in the record,
+    -1..1. The slopes are 0 for even k."""
     fitted_slope_max: float
     """Largest slope of the best straight line to any function of x with values in -1..1."""
     magnitude_sum_ratio: float
@@ -220,8 +220,7 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
 def coherent_sum_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
     """Return a bound on the change by a phase error if amplitudes of lines and images add.
 
-    The phase in the record's middle matters to lines next to their images, and to a line to which a
-    distant image is added.
+    The phase in the record's middle changes the sum of a line and its image, near or distant.
 
     Parameters
     ----------
@@ -441,9 +440,9 @@ def range_walk_phase(
 
 
 def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the bound of the phase that range walk adds over the record.
+    """Return the bound of the phase that range walk adds over the record; None if it is absent.
 
-    Range walk is the drift of the beat as the range changes. The result is None without it.
+    Range walk is the drift of the beat as the range changes.
     """
     doppler_ratio_growth = points.stack_segments(
         *(
@@ -502,8 +501,8 @@ def slope_of_squared_time(shots: Shots) -> np.ndarray:
     """Return the mean slope of t^2 over the records of both chirps [s], (n,) or scalar.
 
     t is the time since the segment's start. The slope is that of the best straight line, weighted
-    by the window, over the samples that hold the echo. For a full record it is twice the time of
-    the middle.
+    by the window, over the samples that hold the echo. If the echo fills the record, the slope is
+    twice the time at the record's middle.
     """
     drift_time = 2 * shots.record.acquisition_delay + shots.record.duration
     if shots.echo_record.n_samples_before_echo is None:
@@ -516,10 +515,10 @@ def slope_of_squared_time(shots: Shots) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _squared_position_slopes(window: Window) -> np.ndarray:
-    """Return the slope of the best straight line to x^2 without the first k samples, (L + 1,).
+    """Return slopes (L + 1,) of the best straight line to x^2 over the last samples of a record.
 
-    x is the position in the record, -1..1, and element k = 0 .. L of the result is for the samples
-    from k on. Samples are weighted by the window. The slope over all samples is 0.
+    x is the position in the record of L samples, -1..1. Element k = 0 .. L is the slope over the
+    samples k .. L - 1, weighted by the window. Element 0, the slope over all samples, is 0.
     """
     position = 2 * np.arange(window.length) / window.length - 1
     powers = (window.samples() * position**exponent for exponent in range(4))
@@ -628,7 +627,7 @@ def acceleration_error_bound(points: PlannerInputs) -> ErrorBound | None:
 def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
     """Make the Doppler frequency drift over all records, as the target accelerates.
 
-    The loss that it causes in looks that are added in amplitude is included.
+    Looks that are added in amplitude lose signal by the drift; this loss is included.
 
     Parameters
     ----------
@@ -805,9 +804,9 @@ def chirp_nonlinearity_phase(
 def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Return the bound of the phase that the sweep's frequency error adds over the record.
 
-    Quadratic and cubic errors are polynomials in the position in the record. A sine, and a table's
-    departure from the middle of its range of values, are bounded by their largest values. The
-    result is None without an error.
+    Quadratic and cubic errors give polynomials in the position in the record. The phase of a sine
+    is bounded by its largest value, as is that of a table's departure from the mean of its largest
+    and smallest value. The result is None without a frequency error.
     """
     table_text = points.shared_option(ERROR_TABLE_PATH)
     if not points.any_nonzero(*_SWEEP_ERROR_PEAK_PATHS):
@@ -880,8 +879,9 @@ def _sweep_error_table_phase_bound(
 ) -> PhaseErrorBound:
     """Return a bound on the phase that a measured error of the sweep adds over the record.
 
-    The phase is about minus the echo's delay times the error. It is bounded by the middle of the
-    error's range of values, the largest departure from it, and the error's derivative.
+    The phase is about minus the echo's delay times the frequency error. The bound follows from the
+    mean of the error's largest and smallest value, the largest departure from this mean, and the
+    error's derivative.
     """
     position = np.cos(np.linspace(0, np.pi, 16 * table.chebyshev_coefficients.size + 1))
     errors, slope_coefficients = (

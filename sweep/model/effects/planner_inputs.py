@@ -43,12 +43,12 @@ from sweep.model.window_response import (
 )
 
 _CHEBYSHEV_INEQUALITY_DEVIATIONS = (1.4, 2.5, 8.0)
-"""Half-widths, in standard deviations of the lines' positions, for which Chebyshev's inequality
-bounds the power of the largest bin. The best of these bounds is taken."""
+"""Half-widths of intervals, in standard deviations of the lines' positions. For each interval,
+Chebyshev's inequality bounds the power of the largest bin; the best bound is taken."""
 _NEAR_IMAGE_WINDOW_BINS = 8.0
-"""Distance of a line from its image beyond which they cannot add up or cancel. The unit is the
-sample rate over the number of samples. The power of the image's sidelobes is below 0.4 % there, and
-its derivatives are below 5 %."""
+"""Distance of a line from its image beyond which the two cannot add up or cancel. The unit is the
+sample rate over the number of samples. Beyond this distance the power of the image's sidelobes is
+below 0.4 %, and its derivatives are below 5 %."""
 
 
 class PeakPowerBounds(NamedTuple):
@@ -58,9 +58,11 @@ class PeakPowerBounds(NamedTuple):
     """
 
     power_min: np.ndarray
-    """(segments, n): lower bound, without images."""
+    """(segments, n): lower bound of the largest bin's power without images, relative to the power
+    that all lines would have on one bin."""
     power_max: np.ndarray
-    """(segments, n): upper bound, with images."""
+    """(segments, n): upper bound of the largest bin's power with images, relative to the power that
+    all lines would have on one bin."""
 
 
 class PlannerInputs(LinkBudget):
@@ -134,12 +136,12 @@ class PlannerInputs(LinkBudget):
         return any(bool(self.parameters[path].any()) for path in paths)
 
     def _select_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
-        """Select the values of existing segments from values of up, Doppler and down."""
+        """Return the values of the segments that exist, from the values of up, Doppler and down."""
         named_values = zip(waveform.SEGMENT_NAMES, values_by_segment, strict=True)
         return [value for name, value in named_values if name in self.waveform.segment_order]
 
     def stack_segments(self, *values: np.ndarray | float) -> np.ndarray:
-        """Stack arrays of the segments along a new first axis, after broadcasting them."""
+        """Return an array (segments, ...) of one value or array per segment, after broadcasting."""
         template = np.zeros((1,) * self.ndim)
         return np.stack(np.broadcast_arrays(template, *values)[1:]).astype(float)
 
@@ -172,15 +174,15 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def carriers(self) -> np.ndarray:
-        """Frequency [Hz], by segment, that turns the echo's delay into a phase of the beat."""
+        """Carrier frequency [Hz], by segment: times the echo's delay, the beat's phase [cycles]."""
         return self.stack_segments(*self._select_existing_segments(self.waveform.carriers))
 
     @property
     def noise_maximum_over_sigma(self) -> float | None:
-        """Level of |X| over the noise per quadrature that the noise in any bin hardly ever exceeds.
+        """Level that the largest |X| of noise hardly ever exceeds, over the noise per quadrature.
 
-        The probability that noise exceeds it in any bin is at most 0.001. The result is None if
-        segments report all peaks that cross the threshold.
+        The probability that the noise of any bin exceeds the level is at most 0.001. The result is
+        None if segments report all peaks that cross the threshold.
         """
         if self.shared_option(waveform.REPORTED_PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
@@ -347,25 +349,25 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def bin_offset(self) -> np.ndarray:
-        """Distance of the line from the nearest bin [bins], 0..1/2."""
+        """Distance of the line on the axis from the nearest bin [bins], 0..1/2, by segment."""
         bin_position = self.beat_frequency / self.record.bin_width
         return np.abs(bin_position - np.rint(bin_position))
 
     @cached_property
     def bins_from_line_to_edge(self) -> np.ndarray:
-        """Distance of the line from the nearer of DC and Nyquist [FFT bins], after aliasing."""
+        """Distance [FFT bins] of the aliased line on the axis from the nearer of DC and Nyquist."""
         nyquist_bin = self.fft_size / 2
         nyquist_position = self.beat_frequency / (self.record.bin_width * nyquist_bin)
         return np.abs(nyquist_position - np.rint(nyquist_position)) * nyquist_bin
 
     @cached_property
     def transfer_gain(self) -> np.ndarray:
-        """Amplitude gain of the receiver at the line's frequency, relative to that at DC."""
+        """Amplitude gain of the receiver at the beat of the line on the axis, relative to DC."""
         return self.receiver_filter.amplitude_gain(self.beat_frequency)
 
     @cached_property
     def gain_slope_max(self) -> np.ndarray:
-        """Bound on the relative change of the receiver's power gain per FFT bin [1/bin]."""
+        """Upper bound on the relative change of the receiver's power gain per FFT bin [1/bin]."""
         receiver_filter = self.receiver_filter
         bandwidths = receiver_filter.detector_bandwidth, receiver_filter.amplifier_bandwidth
         return np.asarray(sum(1 / bandwidth for bandwidth in bandwidths) * self.record.bin_width)
@@ -416,12 +418,15 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def line_spread_by_range(self) -> OffsetMoments:
-        """Moments of the offsets [FFT bins] of beamlets' lines from the axis's, due to range."""
+        """Moments of the offsets [FFT bins] of beamlets' lines from the line on the axis.
+
+        These offsets are due to the beamlets' ranges.
+        """
         return self.footprint_extent.range_offset_moments.scaled_by(self.bins_per_relative_range)
 
     @cached_property
     def line_spread_by_velocity(self) -> OffsetMoments:
-        """Mean, rms and extreme of the offsets [FFT bins] of beamlets' lines from the axis's.
+        """Moments of the offsets [FFT bins] of beamlets' lines from the line on the axis.
 
         These offsets are due to the beamlets' radial velocities.
         """
@@ -429,9 +434,9 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def line_spread(self) -> OffsetMoments:
-        """Bounds of the moments of offsets [FFT bins] of beamlets' lines from the axis's.
+        """Bounds on the moments of the offsets [FFT bins] of beamlets' lines from that on the axis.
 
-        The bounds include offsets due to both range and radial velocity.
+        The offsets are sums of those due to range and those due to radial velocity.
         """
         return self.line_spread_by_range.bound_on_summed_offsets(self.line_spread_by_velocity)
 
@@ -445,12 +450,16 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def phase_error_shift_bins(self) -> np.ndarray | float:
-        """Largest frequency shift of light from its line that phase errors cause [bins]."""
+        """Largest distance [FFT bins] by which phase errors shift light from its line."""
         return self.total_phase_error_bound.shift_window_bins * self.padding_factor
 
     @cached_property
     def bins_from_light_to_edge(self) -> np.ndarray:
-        """Distance of the nearest light of any line from DC or Nyquist [FFT bins]."""
+        """Smallest distance [FFT bins] between the light of any line and DC or Nyquist.
+
+        Light lies off the line on the axis by the beamlets' line offsets and by phase errors. A
+        negative distance means that light may lie beyond DC or Nyquist.
+        """
         return (
             self.bins_from_line_to_edge
             - self.line_spread.largest_magnitude
@@ -574,12 +583,12 @@ class PlannerInputs(LinkBudget):
         -----
         Bin k has the power P_k = sum_b p_b F(k - x_b), with the power p_b of beamlet b, and the
         power F of a line by distance. F1 and F2 are bounds on |F'| and |F''|. Added offsets X_b
-        change it by
+        change P_k by
 
             |P_k(with) - P_k(without)| <= F1 |m| + F2 (S s + s^2 / 2) + c s
 
-        for the mean m and the rms s of X, added to lines of rms S. c is due to the slope of the
-        receiver's gain.
+        Here m and s are the mean and the rms of X, and S is the rms of x. The factor c is due to
+        the slope of the receiver's gain.
         """
         response, power_min = (
             self.window_response,

@@ -35,9 +35,9 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 
 _LN_10 = math.log(10.0)
 _RELATIVE_CHANGE_MAX = 1e12
-"""Upper limit of relative changes and of signals over noise, which avoids overflow."""
+"""Value to which relative changes, and ratios of signal to noise, are limited to avoid overflow."""
 _RELATIVE_LOSS_MAX = 1.0 - 1e-12
-"""Upper limit of relative losses of magnitude, whose logarithm stays finite."""
+"""Value to which relative losses of magnitude are limited, so that log(1 - loss) stays finite."""
 _LIGHT_MOVING_STAGES = ("lines", "record", "spectrum")
 """Stages whose effects move light from bin to bin of the spectrum."""
 
@@ -50,8 +50,8 @@ class EffectPlan(NamedTuple):
     is_kept: np.ndarray
     """(effects, tiles) bool: True if the effect is simulated."""
     omission_error: np.ndarray
-    """(effects, tiles): change if the effect is omitted, 0..1. The largest change of pd, log10
-    pfa or the relative |X| at any point of the tile, as in :func:`omission_errors`."""
+    """(effects, tiles): error if the effect is omitted, 0..1. The error is the largest change of pd,
+    log10 pfa or relative |X| at any point of the tile (:func:`omission_errors`)."""
     total_error: np.ndarray
     """(tiles,): sum of the changes due to omitted effects, plus :attr:`residual_error`. Only the
     residual error, and effects that are off, can make the sum exceed the tolerance."""
@@ -197,8 +197,8 @@ def error_bounds(
 def _forced_modes(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[str, str]:
     """Return ``on`` or ``off`` by name of each effect that is not planned by its error bound.
 
-    The mode is the effect's own in the spec, or follows from the mode of its parent or child. A
-    child is an effect that is part of another, the parent.
+    The mode is stated in the spec for the effect, or follows from that of its parent or child. A
+    child is an effect that is part of its parent. Effects that are planned have no entry.
     """
     forced_modes = {name: mode for name, mode in modes.items() if mode != "auto"}
     for name, parent in _child_parent_pairs(effects):
@@ -213,9 +213,9 @@ def _forced_modes(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[s
 
 
 def _child_parent_pairs(effects: Sequence[Effect]) -> list[tuple[str, str]]:
-    """Return pairs of names: an effect that is part of another, and that other effect.
+    """Return pairs (child, parent) of names of effects, in the order of ``effects``.
 
-    A parent precedes its children in the catalogue.
+    A child is an effect that is part of its parent. A parent precedes its children.
     """
     effect_names = {effect.name for effect in effects}
     return [(effect.name, effect.parent) for effect in effects if effect.parent in effect_names]
@@ -473,17 +473,21 @@ def signal_ratio_bounds(
 
 
 def _may_be_nonzero(value: np.ndarray | float) -> bool:
-    """Return False for the number 0; an array counts as nonzero."""
+    """Return False for the number 0, and True for any other number and for any array."""
     return isinstance(value, np.ndarray) or value != 0.0
 
 
 def _sum_over_segments(value: np.ndarray | float, points: PlannerInputs) -> np.ndarray | float:
-    """Return the sum over the segments; values without an axis of segments are equal in all."""
+    """Return the sum of a value over the segments.
+
+    A value (segments, ...) is summed over its first axis. An array without an axis of segments is
+    multiplied by the number of segments. A number is returned as it is.
+    """
     if np.ndim(value) <= points.ndim:
         return value * (len(points.existing_chirp_slopes) if np.ndim(value) else 1)
     return np.asarray(value).sum(axis=0)
 
 
 def _max_over_segments(value: np.ndarray | float, points: PlannerInputs) -> np.ndarray | float:
-    """Return the largest value of any segment."""
+    """Return the largest value of any segment; a value without an axis of segments is unchanged."""
     return np.asarray(value).max(axis=0) if np.ndim(value) > points.ndim else value

@@ -123,8 +123,8 @@ def perturb_geometry(
 def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest relative change of range, and shift of lines [bins], by beam deflections.
 
-    Both hold in all draws but a fraction :data:`RARE_DRAW_PROBABILITY`, and for the lowest beamlets
-    too. The change of range is infinite if a beamlet may pass over the horizon.
+    Both hold for all beamlets, in all draws except a fraction :data:`RARE_DRAW_PROBABILITY`. The
+    change of range is infinite if a beamlet may pass over the horizon.
     """
     turn_max = points[_JITTER_PATH] * math.sqrt(2 * math.log(1 / RARE_DRAW_PROBABILITY))
     rim_angle: np.ndarray | float = 0.0
@@ -156,9 +156,9 @@ def _largest_range_change_and_line_shift(points: PlannerInputs) -> tuple[np.ndar
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the distance by which random deflections of the beam shift lines; None without them.
+    """Return a bound whose shift is that of lines by random deflections of the beam.
 
-    The distance is the shift of a :class:`PhaseErrorBound`.
+    The result is None without random deflections.
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None

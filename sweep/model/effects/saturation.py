@@ -91,7 +91,11 @@ def clipping_gains(
 
 
 def _phase_quadrature(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return phases in a quarter period and weights whose sum is 1, (n, nodes) each."""
+    """Return quadrature phases [rad] in a quarter period of a sine, and weights of sum 1.
+
+    Both are (n, nodes). The arguments, (n, 1) each, are the amplitude ``a`` of the sine, the noise
+    sigma ``s`` and the full scale ``v`` [V].
+    """
     split_phases = np.arcsin(np.clip((v + _INTEGRAL_SPLIT_DEVIATIONS * s) / a, 0.0, 1.0))
     zeros = np.zeros(a.shape)
     cuts = np.concatenate([zeros, split_phases, zeros + math.pi / 2], axis=-1)
@@ -148,8 +152,8 @@ def _clipping_loss_and_variance(
 _FULL_SCALE_PATH = PROCESSING_PREFIX + "full_scale"
 
 FULL_SCALE_EXCESS_MAX = 1e6
-"""Largest allowed ratio of the signal or noise to the ADC's full scale. The result loses as many
-digits as the ratio has."""
+"""Largest allowed ratio of signal or noise to the ADC's full scale. The gains of clipping lose as
+many significant digits as the ratio has."""
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
@@ -234,7 +238,7 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of results if clipping is omitted.
 
-    The bound holds whatever else adds noise or attenuates the echo.
+    The bound holds whichever of the effects are simulated.
 
     Notes
     -----

@@ -254,8 +254,8 @@ def draw_scintillation_factors(
 
     Notes
     -----
-    Numbers 2 i and 2 i + 1 of the stream are leg i's large and small eddies. The inverse of their
-    distribution turns them into factors.
+    Random numbers 2 i and 2 i + 1 of the stream are for the large and small eddies of leg i. The
+    inverse of the eddies' distribution turns the numbers into factors.
     """
     from sweep.model.sampling import philox
 
@@ -271,12 +271,12 @@ def draw_scintillation_factors(
 def _log_amplitude_moments(
     distribution: str, legs: Sequence[LogIrradianceVariances]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return |E L| and E L^2, or upper bounds of them, for scintillation.
+    """Return |E[L]| and E[L^2] of scintillation, or upper bounds of them, (n,) each.
 
-    L is half the logarithm of the total factor on the echo's power, and E the mean. Let a gamma
-    variable of mean 1 have the shape 1/s. Its logarithm has a mean above -(s/2 + s^2/12) and a
-    variance below s + s^2/2 + s^3/6, by the enveloping series of the digamma function and its
-    derivative.
+    L is half the logarithm of the factor on the echo's power, and E[] the mean over draws. The
+    gamma-gamma distribution has upper bounds. The logarithm of a gamma variable of mean 1 and
+    variance s has a mean above -(s/2 + s^2/12) and a variance below s + s^2/2 + s^3/6. They follow
+    from the enveloping series of the digamma function and its derivative.
     """
     variances = [np.asarray(v, float) for leg in legs for v in leg]
     if distribution == "log_normal":
@@ -292,11 +292,11 @@ def _log_amplitude_moments(
 def _irradiance_quantile(
     distribution: str, probability: np.ndarray, variance: np.ndarray
 ) -> np.ndarray:
-    """Return the quantile of a factor of unit mean and a given log variance.
+    """Return the quantile at ``probability`` of a factor of mean 1 and log variance ``variance``.
 
-    A gamma distribution of shape a has the variance 1/a = exp(log variance) - 1. Shapes beyond 1e5,
-    for which the library's inverse can be wrong, use Wilson and Hilferty's cube of a normal number,
-    accurate there to 1e-3 standard deviations.
+    A gamma distribution of shape a has the variance 1/a = exp(log variance) - 1. For shapes beyond
+    1e5 the library's inverse can be wrong. Wilson and Hilferty's cube of a normal number replaces
+    it, accurate to 1e-3 standard deviations.
     """
     normal_quantile = special.ndtri(probability)
     if distribution == "log_normal":
@@ -374,9 +374,10 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Notes
     -----
-    Let L be half the logarithm of the factor I, E I = 1, and h the probability over the logarithm
-    of the amplitude. Then |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2. In a product
-    over segments, which share one factor, the suprema of two slopes times E L^2 are added.
+    The echo's power is multiplied by a random factor of mean 1. Let L be half the factor's
+    logarithm, E[] the mean over draws, and h(x) the probability at the logarithm x of the
+    amplitude. Then |E[h(x + L)] - h(x)| <= sup h' |E[L]| + sup |h''| E[L^2] / 2. All segments share
+    one factor. For their product, the suprema of two slopes times E[L^2] are added.
     """
     if (
         points.shared_option(_TURBULENCE_PATH) == "none"

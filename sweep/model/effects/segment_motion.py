@@ -47,7 +47,7 @@ sample rate over the number of samples in the record. The error is 1 % of the po
 
 
 def range_drift_max(points: PlannerInputs) -> np.ndarray:
-    """Return an upper bound [m] of the change of range from the shot's to each segment's start."""
+    """Return an upper bound [m], by segment, of the change of range since the shot's start."""
     end_time = points.segment_starts + points.middle_look_delay
     target = points.target
     return np.asarray(
@@ -56,9 +56,9 @@ def range_drift_max(points: PlannerInputs) -> np.ndarray:
 
 
 def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
-    """Return an upper bound [bins] of the line's shift from the shot's to each segment's start.
+    """Return an upper bound [bins], by segment, of the shift of the line since the shot's start.
 
-    The line shifts because the range and velocity of the target change.
+    The line shifts because range and velocity of the target change until the segment starts.
     """
     target = points.target
     velocity_change = np.abs(target.acceleration) * (
@@ -75,10 +75,11 @@ def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return a bound on the change of the largest bin if segments share range and velocity.
+    """Return a bound on the change of the largest bin if all segments start with the shot.
 
-    The bound includes phases of lines that add. The phase between a line and its image changes with
-    the line's position, and that between beamlets of different velocities with time.
+    All segments then have the range and velocity at the shot's start. The bound includes changes of
+    phase if amplitudes add. The phase between a line and its image changes with the line's
+    position. The phase between beamlets of different velocities changes with time.
     """
     if not any(
         np.any(speed)

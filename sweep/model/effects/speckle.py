@@ -66,8 +66,8 @@ from sweep.model.waveform import round_trip_delay
 _ROUGHNESS_PATH = "target.roughness"
 _SPECKLE_PATH = "footprint.speckle"
 _DIFFUSE_AMPLITUDE_RATIO_MAX = 5.0
-"""Bound on the ratio of a bin's diffuse (random) amplitude to its root mean square. It is exceeded
-in one of a million draws."""
+"""Bound on the ratio of a bin's diffuse (random) amplitude to its root mean square. One of a million
+draws exceeds the bound."""
 
 
 def coherent_echo_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
@@ -190,8 +190,8 @@ def speckle_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 _DECORRELATED_COHERENT_FRACTION_MAX = 1e-6
-"""Limit on the fraction of the echo's power that keeps its phase, for footprints whose beamlets add
-as amplitudes. Below it the speckle may differ from segment to segment."""
+"""Fraction of the echo's power that keeps its phase, below which the speckle may differ from segment
+to segment. The limit is for footprints whose beamlets add as amplitudes."""
 _ZERO_DIVISOR_SUBSTITUTE = 1e-300
 """Positive number that replaces a divisor of 0, such as the power of no light."""
 
@@ -279,10 +279,10 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
 
 
 def fading_error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1 where developed speckle is selected, so that fading is simulated.
+    """Return a magnitude change of 1 if developed speckle is selected; None if fading is absent.
 
-    Without the effect, the probability of detection would be that of a steady echo of the mean
-    power. None if fading is absent.
+    A change of 1 keeps the effect. Without the effect, the probability of detection would be that
+    of a steady echo of the mean power.
     """
     is_smooth = points.adds_field_amplitudes or points.waveform.architecture == "direct"
     return (
@@ -461,7 +461,9 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
 
 
 def _look_powers(shots: Shots, beam_gradients: BeamGradients) -> np.ndarray:
-    """Return each look's power in the strongest bin over the mean of looks, (3, n, looks).
+    """Return the power of each look in the strongest bin, over the mean of all looks.
+
+    The result is (3, n, looks), and 1 if lines do not drift.
 
     The power differs between looks because lines drift out of the bin.
     """
@@ -605,7 +607,7 @@ class PhaseDifference(NamedTuple):
     """Decrease of the phase difference between two segments [cycles] per unit of relative range."""
 
     def phase_per_deviation(self, beam_gradients: BeamGradients) -> np.ndarray:
-        """Return the phase difference per standard deviation of the beam [rad], (n,)."""
+        """Return the change of the phase difference [rad], (n,), over a beam's standard deviation."""
         return (
             2
             * np.pi
@@ -617,9 +619,9 @@ class PhaseDifference(NamedTuple):
 
 
 def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
-    """Return the phase differences of the pairs in SEGMENT_PAIRS, second segment less first.
+    """Return the phase difference of each pair in SEGMENT_PAIRS, second segment less first.
 
-    Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
+    The result follows equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
     echo_frequencies, record_middles = _mid_record_frequencies_and_times(shots)
     delay = round_trip_delay(shots.range)
@@ -639,10 +641,11 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
 
 
 def _mid_record_frequencies_and_times(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the echo's optical frequency F at mid-record of each segment, and mid-record's time.
+    """Return the echo's optical frequency [Hz] at mid-record, and the time of mid-record [s].
 
-    The time is the centroid of the window over the samples that hold the echo. At this time the
-    phase of a bin is that of the line, to first order in their distance.
+    Both are by segment; the time counts from the segment's start. Mid-record is the centroid of the
+    window over the samples that hold the echo. At this time the phase of a bin equals that of the
+    line, to first order in the distance between bin and line.
     """
     delay = round_trip_delay(shots.range)
     middle_shift = (
@@ -666,7 +669,10 @@ def _mid_record_frequencies_and_times(shots: Shots) -> tuple[list[np.ndarray], n
 def _line_pair_gradients(
     shots: Shots, pair: tuple[int, int], phase: PhaseDifference, beam_gradients: BeamGradients
 ) -> LinePairGradients:
-    """Return the gradients of two segments' lines, and the distance of their strongest bins."""
+    """Return the gradients of a pair of segments' lines, and the distance of each strongest bin.
+
+    The distance is that of the segment's strongest bin from the line on the beam's axis.
+    """
     window_bin_width = shots.sample_rate / shots.window.length
     padding_factor = shots.fft_size / shots.window.length
     distances, line_shifts = [], []
@@ -698,19 +704,19 @@ def _line_pair_gradients(
 
 
 _IMAGE_REACH_FACTOR = 2.0
-"""Factor of the distance from DC or Nyquist within which the image of an echo may make another bin
-the strongest. The distance is this factor times the sum of padding factor and standard deviation of
-the lines [FFT bins]."""
+"""Reach of an echo's image [sum of padding factor and standard deviation of the lines, FFT bins].
+The image of a line within this distance of DC or Nyquist may change which bin is the strongest."""
 
 
 def _strongest_bins_with_images(
     shots: Shots, line_positions: np.ndarray, line_deviation_bins: np.ndarray
 ) -> np.ndarray:
-    """Return the strongest bins of echoes at given positions, signed and unfolded [bins], (n,).
+    """Return the strongest bins of echoes at ``line_positions``, signed and unfolded [bins], (n,).
 
-    The strongest bin is the nearest bin, unless a line near DC or Nyquist of a real record overlaps
-    with its image: of bins 0 and 1, bin 0 then has the light of both. ``line_deviation_bins`` is
-    the standard deviation of the lines.
+    The strongest bin is the one nearest to the line, with one exception: in a real record, a line
+    near DC or Nyquist overlaps with its image. Near DC, for example, bin 0 holds light of the line
+    and of the image, and may be stronger than a nearer bin 1. ``line_deviation_bins`` is the
+    standard deviation of the lines.
     """
     nearest_bins = np.rint(line_positions)
     if not shots.real_ends_fft_size or not shots.line_images.are_summed:
@@ -796,8 +802,9 @@ def _moments_about_surface_means(
 ) -> BeamletMoments:
     """Return power-weighted moments of beamlets (rows, beamlets), for points with the given rows.
 
-    ``is_on_other_surface`` (rows, beamlets) bool marks beamlets on another surface than the axis's;
-    it may be None.
+    ``power`` is (rows, beamlets), ``values`` (2, rows, beamlets), and ``row`` (n,) the row of each
+    point's footprint. ``is_on_other_surface`` (rows, beamlets) bool marks beamlets on a surface
+    that the axis does not meet; None if there are none.
     """
     values = np.array([doppler_ratio, relative_range])
     power_fraction = power / np.maximum(power.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)[:, None]
@@ -819,8 +826,7 @@ def _phase_moments(
     """Return mean [rad] and variance [rad^2] of the phase differences over ray-traced beamlets.
 
     Both are (len(phases), n). Ranges and Doppler ratios change linearly across a Gaussian beam, so
-    the phase is normal. A sum of phasors over few rays would be periodic where their phases differ
-    by whole cycles.
+    the phase has a normal distribution, which mean and variance describe.
     """
     weights = (
         2
