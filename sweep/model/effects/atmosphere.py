@@ -466,8 +466,8 @@ def backscatter_integral(
 def _integral_split_heights(profile: ExtinctionProfile) -> np.ndarray:
     """Return the heights [m] at which the backscatter integral is split.
 
-    They are the heights of the profile's rows, and heights between rows at multiples of an e-folding
-    of the extinction (``_INTEGRAL_SPLIT_E_FOLDINGS``).
+    They are the heights of the profile's rows, and heights between rows
+    (``_INTEGRAL_SPLIT_E_FOLDINGS``).
     """
     cuts = [profile.height[0]]
     rows = [*zip(profile.height, profile.extinction, strict=True)]

@@ -42,8 +42,8 @@ def doppler_error_bound(points: PlannerInputs) -> ErrorBound | None:
     -----
     The shift is 2 v_r / lambda, with the radial velocity v_r and the wavelength lambda. The shift
     changes the receiver's gain and the line's position between two bins. The shift in bins is an
-    error too, because the shift is the measure of velocity. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is
-    never skipped.
+    error too, because the shift is the measure of velocity. The effect is never skipped if the
+    shift is above :data:`OMITTED_SHIFT_MAX_BINS`.
     """
     if not points.any_nonzero("target.radial_velocity"):
         return None

@@ -17,8 +17,8 @@ class ErrorBound(NamedTuple):
     """Relative change of |X| in the largest bin, if the effect is omitted. 1 or more means that
     nothing is known of |X|."""
     coherent_sum_change: ArrayOrFloat = 0.0
-    """Change of |X| in the largest bin in addition to ``magnitude_change``, as a fraction of the sum
-    of all amplitudes in phase. This field bounds sums of amplitudes that may cancel, because their
+    """Change of |X| in the largest bin in addition to ``magnitude_change``. The unit is the sum of
+    all amplitudes in phase. This field bounds sums of amplitudes that may cancel, because their
     relative change has no bound."""
     noise_variance_change: ArrayOrFloat = 0.0
     """Relative change of a bin's noise variance if the effect is omitted."""

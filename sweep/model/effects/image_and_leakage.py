@@ -140,7 +140,7 @@ def _image_leaking_bin_change(points: PlannerInputs) -> np.ndarray:
 def _image_log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     """Return a bound on the change of log10 of a shot's false-alarm probability due to images.
 
-    Images move bins across the threshold, so that these bins begin or cease to count as an echo. The
+    Images move bins across the threshold, so that the bins begin or cease to count as an echo. The
     bound counts the expected number of such bins, but at least one bin. It is 0 if fewer than
     ``_EXPECTED_MOVED_BINS_MIN`` bins are expected.
     """

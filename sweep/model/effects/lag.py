@@ -29,7 +29,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the changes of the echo and of its shot noise if the beams' offset is omitted.
 
     The offset is the distance between the axes of transmitted and received beam at the target. The
-    changes are exact, not bounds. The result is None if the axes of transmitted and received beam coincide, or if all light in the
+    changes are exact, not bounds. The result is None if the axes coincide, or if all light in the
     aperture mixes.
     """
     paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH

@@ -50,8 +50,8 @@ class EffectPlan(NamedTuple):
     is_kept: np.ndarray
     """(effects, tiles) bool: True if the effect is simulated."""
     omission_error: np.ndarray
-    """(effects, tiles): error if the effect is omitted, 0..1. The error is the largest change of pd,
-    log10 pfa or relative |X| at any point of the tile (:func:`omission_errors`)."""
+    """(effects, tiles): error if the effect is omitted, 0..1. It is the largest change of pd, log10
+    pfa or relative |X| at any point of the tile (:func:`omission_errors`)."""
     total_error: np.ndarray
     """(tiles,): sum of the changes due to omitted effects, plus :attr:`residual_error`. Only the
     residual error, and effects that are off, can make the sum exceed the tolerance."""

@@ -66,7 +66,7 @@ from sweep.model.waveform import round_trip_delay
 _ROUGHNESS_PATH = "target.roughness"
 _SPECKLE_PATH = "footprint.speckle"
 _DIFFUSE_AMPLITUDE_RATIO_MAX = 5.0
-"""Bound on the ratio of a bin's diffuse (random) amplitude to its root mean square. One of a million
+"""Bound on the ratio of a bin's diffuse (random) amplitude to its root mean square. One of 1e6
 draws exceeds the bound."""
 
 
@@ -190,8 +190,8 @@ def speckle_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 _DECORRELATED_COHERENT_FRACTION_MAX = 1e-6
-"""Fraction of the echo's power that keeps its phase, below which the speckle may differ from segment
-to segment. The limit is for footprints whose beamlets add as amplitudes."""
+"""Fraction of the echo's power that keeps its phase, below which the speckle may differ between
+segments. The limit is for footprints whose beamlets add as amplitudes."""
 _ZERO_DIVISOR_SUBSTITUTE = 1e-300
 """Positive number that replaces a divisor of 0, such as the power of no light."""
 
@@ -607,7 +607,10 @@ class PhaseDifference(NamedTuple):
     """Decrease of the phase difference between two segments [cycles] per unit of relative range."""
 
     def phase_per_deviation(self, beam_gradients: BeamGradients) -> np.ndarray:
-        """Return the change of the phase difference [rad], (n,), over a beam's standard deviation."""
+        """Return the change of the phase difference [rad], (n,), over one beam deviation.
+
+        A beam deviation is the standard deviation of the beam's profile.
+        """
         return (
             2
             * np.pi

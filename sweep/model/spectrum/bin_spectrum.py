@@ -48,8 +48,8 @@ FAR_BINS_PER_BATCH = 128
 """Number of frequency bins per pass of the calculation far from the lines."""
 
 FAR_LINE_LOG_ACCURACY = 28.0
-"""-ln of the largest relative error of F when equivalent lines replace a segment's lines. F is the
-lines' spectrum. The value includes a margin for windows with poles."""
+"""Accuracy of the far spectrum of lines that equivalent lines replace: -ln of its largest relative
+error. The value includes a margin for windows with poles."""
 
 FAR_LINE_EXTRA_LOG_ACCURACY = 11.0
 """Extra accuracy of the polynomials A and B, added to -ln of the equivalent lines' relative error.
@@ -60,8 +60,8 @@ LINE_BATCH_WIDTH_BINS = 8
 is computed from the table only if the table of every line in the interval contains it."""
 
 LINE_BATCH_EDGE_BINS = N_KERNEL_CELLS // 2 // min(TABLE_CELLS_PER_BIN) + 1
-"""Greatest distance [bins] outside an interval of LINE_BATCH_WIDTH_BINS at which its lines occupy
-cells."""
+"""Greatest distance [bins] from an interval of LINE_BATCH_WIDTH_BINS at which the interval's lines
+occupy table cells."""
 
 LINE_BATCH_CELLS_MAX = (
     LINE_BATCH_WIDTH_BINS * max(TABLE_CELLS_PER_BIN) + N_KERNEL_CELLS + N_ZERO_WEIGHT_CELLS
@@ -95,7 +95,7 @@ class LineBundle(NamedTuple):
 
 
 class FoldedLineRange(NamedTuple):
-    """Lowest and highest bin of lines in a spectrum, after negative frequencies are folded at DC.
+    """Lowest and highest frequency of lines [bins], after negative ones are folded at DC.
 
     In a spectrum that is not folded, negative frequencies remain negative.
     """
@@ -131,8 +131,8 @@ class DetectedSpan(NamedTuple):
     value is 0 if it is not computed.
     """
     raised_bin_probability_max: float
-    """Upper bound on the probability that this signal raises any bin above the threshold, one that
-    joins the echo included. The value is 1 if it is not computed.
+    """Upper bound on the probability that the echo's signal far from its lines raises any bin above
+    the threshold, including bins that join the echo. The value is 1 if it is not computed.
     """
 
 
@@ -226,12 +226,11 @@ class SpanArrays(NamedTuple):
     half_square: np.ndarray
     """Scratch: squared magnitude over twice the noise variance per quadrature."""
     crossing_probability: np.ndarray
-    """Increase of a bin's probability of crossing the threshold, due to signal, over noise alone.
-    """
+    """Probability that a bin crosses the threshold with signal, minus that with noise alone."""
 
 
 class LeakageQuadrature(NamedTuple):
-    """Quadrature points of an integral over bins far from the lines, which gives their leakage.
+    """Quadrature points of the integral over bins far from the lines that gives leakage.
 
     Leakage is the probability of false alarms due to the echo's signal.
     """
@@ -273,7 +272,7 @@ class SpectrumWorkspace(NamedTuple):
     span: SpanArrays
     """Magnitudes and crossing probabilities in the computed bins around the lines."""
     leakage_quadrature: LeakageQuadrature
-    """Quadrature points of the integral over bins outside ``span``, which gives their leakage."""
+    """Quadrature points of the integral that gives the leakage of bins outside ``span``."""
 
 
 _SCRATCH_BYTES_KEPT_MAX = 1 << 28
@@ -285,8 +284,8 @@ _thread_scratch = threading.local()
 def _reused_scratch_array(width: int) -> np.ndarray:
     """Return a scratch array (_N_SCRATCH_ROWS, width), reused in all batches of a thread.
 
-    The operating system has to clear every page of a new array that a batch writes. With wide
-    spectra this takes an eighth of a flight's run time, because each row uses few elements.
+    For a new array, the operating system would clear every page that a batch writes. With wide
+    spectra this would take an eighth of a flight's run time, because each row uses few elements.
     """
     rows: np.ndarray | None = getattr(_thread_scratch, "rows", None)
     if rows is None or rows.shape[1] != width:
@@ -417,9 +416,10 @@ def _spread_line_over_cells(cell_position, re, im, cell_re, cell_im):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def _first_bin_in_table(batch_bin, n_periods, layout):
-    """Return the first bin that the tables of all lines in the interval at ``batch_bin`` contain.
+    """Return the first bin that the tables of all lines in an interval contain.
 
-    ``n_periods`` is the number of FFT lengths by which the periodic spectrum is shifted.
+    ``batch_bin`` is the first bin of the interval. ``n_periods`` is the number of FFT lengths by
+    which the periodic spectrum is shifted.
     """
     return (
         batch_bin + n_periods * layout.fft_size + LINE_BATCH_WIDTH_BINS + LINE_BATCH_EDGE_BINS
@@ -660,7 +660,7 @@ def add_line_by_record_ends(
     begin_offset, end_offset
         First bin, and the bin after the last, in the batch ``line_spectrum.far_bins``.
     spectrum_offset
-        Index in F of the first bin.
+        Index of the first bin in ``re`` and ``im`` of ``line_spectrum``, the spectrum F.
     strengths
         :class:`RecordEndAmplitudes` of lines or sources.
     line
@@ -744,7 +744,7 @@ def add_line_by_record_ends(
 def compute_line_spectrum(
     first_bin, n_bins, bundle, negligible_ratio, shape, layout, bin_tangents, line_spectrum
 ):
-    """Compute the lines' spectrum F in ``n_bins`` bins: ``re`` and ``im`` of ``line_spectrum``.
+    """Fill ``re`` and ``im`` of ``line_spectrum`` with the lines' spectrum F in ``n_bins`` bins.
 
     Parameters
     ----------
@@ -1178,7 +1178,7 @@ def detect_in_span(
     Returns
     -------
     DetectedSpan
-        Without leakage.
+        Bins around the lines, and detection; ``leakage`` is 0 and ``raised_bin_probability_max`` 1.
     """
     span, weight_sum = workspace.span, bundle.weight_sum
     is_complex = layout.spectrum_type == COMPLEX_RECORD

@@ -76,8 +76,8 @@ from sweep.model.spectrum.bin_spectrum import (
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
 INTEGRAL_END_CORRECTION_BINS = 3
-"""Number of bins that correct an integral over bins at its end near the lines. They are on each
-side of that end."""
+"""Number of bins on each side of the leakage integral's end near the lines, from which the
+correction of that end is computed."""
 
 LAST_END_CORRECTION_FRACTION_MAX = 1e-7
 """Largest accepted value of the last end correction of the integral over bins, relative to the
@@ -93,8 +93,8 @@ AT_BIN, HALF_BIN_BEYOND = np.bool_(False), np.bool_(True)
 are NumPy booleans, because numba would compile the function anew for Python's."""
 
 OCTAVE_STEP_LEAKAGE_MAX = 0.5
-"""Leakage of the brightest speckle up to which one speckle power per octave is enough. Leakage is
-the probability of false alarms due to the echo's signal far from its lines."""
+"""Leakage in the brightest speckle up to which a mean over speckle uses one speckle power per
+octave. Leakage is the probability of false alarms due to the echo's signal far from its lines."""
 LEAKAGE_RATE_MIN = 1e-30
 """Lower limit of the bins' summed rate of false alarms due to leaked signal. Smaller sums count as
 this value. The probability of at least one false alarm is 1 - exp(-sum)."""
@@ -152,8 +152,8 @@ class FalsePeakProbability(NamedTuple):
     """Probability of at least one false peak apart from the echo. In developed speckle it is the
     mean over the speckle."""
     raised_bin_probability_max: float
-    """Upper bound on the probability that any bin is raised, one that joins the echo included. It
-    is 1 in developed speckle."""
+    """Upper bound on the probability that leaked signal raises any bin above the threshold,
+    including bins that join the echo. It is 1 in developed speckle."""
 
 
 class LeakageResult(NamedTuple):
@@ -165,18 +165,20 @@ class LeakageResult(NamedTuple):
     leakage: float
     """Probability that the echo's signal far from its lines raises at least one false alarm."""
     raised_bin_probability_max: float
-    """Upper bound on the probability that any bin is raised, one that joins the echo included."""
+    """Upper bound on the probability that leaked signal raises any bin above the threshold,
+    including bins that join the echo."""
     is_valid: bool
     """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
 
 
 class EnvelopeTail(NamedTuple):
-    """Bounds on a line's spectrum at all distances above a given one. The line has amplitude 1."""
+    """Bounds on the spectrum of a line of amplitude 1, at a given distance or farther."""
 
     magnitude: float
-    """Largest magnitude of the line's spectrum."""
+    """Largest magnitude of the line's spectrum at the given distance or farther."""
     square_sum: float
-    """Upper bound of the sum of the squared magnitudes over the bins on one side of the line."""
+    """Upper bound of the sum of squared magnitudes, over bins at the given distance or farther on
+    one side of the line."""
 
 
 class NearEndCorrection(NamedTuple):
@@ -384,9 +386,9 @@ def detect_with_leakage(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_of_span(n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates):
-    """Return the probabilities that leaked signal raises computed bins around the lines.
+    """Return the :class:`FalsePeakProbability` of leaked signal in the computed bins.
 
-    They are a :class:`FalsePeakProbability`.
+    The computed bins are those of a span around the lines.
 
     Parameters
     ----------
@@ -644,9 +646,9 @@ def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates)
 def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, speckle_rates):
     """Mark consecutive bins as long as all of them may cross the threshold; return their number.
 
-    The first bin is always marked. The probability that all bins from the second on cross is
-    computed for the brightest speckle. Marking ends after the bin at which it falls to
-    ALL_JOIN_PROBABILITY_MIN.
+    The first bin is always marked. For each next bin, the probability that all bins from the second
+    to this one cross is computed for the brightest speckle. Marking ends after the bin at which
+    this probability falls to ALL_JOIN_PROBABILITY_MIN.
 
     Parameters
     ----------
@@ -687,9 +689,9 @@ def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, 
 def _n_powers_per_octave(rate_at_brightest):
     """Return the number of speckle powers per octave at which leakage is computed.
 
-    ``rate_at_brightest`` is the summed rate of false alarms in the brightest speckle. If bins join
-    the echo in bright speckle, leakage does not increase with the power. The powers are then closer
-    together.
+    ``rate_at_brightest`` is the summed rate of false alarms in the brightest speckle. A high rate
+    needs powers that are closer together, because leakage falls as the power rises where bins join
+    the echo.
     """
     return POWERS_PER_OCTAVE_MAX if -math.expm1(-rate_at_brightest) > OCTAVE_STEP_LEAKAGE_MAX else 1
 
@@ -716,8 +718,8 @@ def mean_leakage_from_log_rates(log_rates, powers_per_octave):
 
     Notes
     -----
-    Below the smallest of these powers R is proportional to u. Powers above SPECKLE_POWER_MAX are
-    left out.
+    R is taken as proportional to u below the smallest tabulated power. Powers above
+    SPECKLE_POWER_MAX are left out.
     """
     last_index, mean, interval = log_rates.size - 1, 0.0, -1
     slope_at_start, slope_at_end, slope = 0.0, 0.0, 0.0
@@ -813,7 +815,7 @@ def _far_leakage_bound(weight_sum, distance_min, image_distance, inputs, envelop
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _envelope_tail(distance_min, envelope):
-    """Return bounds on a line's spectrum at ``distance_min`` bins or farther, `EnvelopeTail`."""
+    """Return the :class:`EnvelopeTail` of a line at ``distance_min`` [bins] or farther."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
     return EnvelopeTail(magnitude, magnitude * magnitude + envelope.square_integral[index])
@@ -900,7 +902,7 @@ def _fill_crossing_probabilities(n_bins, inputs, span, crossing_series):
 def _extra_bins_min(weight_sum, line_extent, inputs, crossing_distance, envelope, layout):
     """Return the number of bins to compute one by one beyond the clearance from the lines.
 
-    The leakage integral covers the bins beyond them. The number is a heuristic, and a multiple of
+    The leakage integral covers the bins beyond these. The number is a heuristic, and a multiple of
     8. :func:`detect_with_leakage` doubles it until :func:`_leakage_of_all_bins` is accurate.
 
     Parameters
@@ -1303,15 +1305,16 @@ def _append_gauss_points(
 ):
     """Append the quadrature points of the leakage integral on one side of the lines.
 
-    The integral is over bins far from the lines. The result is the number of all points.
+    The integral is over bins far from the lines. The result is the number of points with those
+    appended.
 
     Parameters
     ----------
     side
         -1 below the lines, 1 above.
     last_distance
-        Distance of the last bin before the integral from ``centre_bin`` [bins]. The integral begins
-        half a bin beyond.
+        Distance [bins] from ``centre_bin`` to the last bin before the integral. The integral begins
+        half a bin beyond this distance.
     centre_bin
         Bin in the middle of the lines, 0 .. N/2.
     steepness
@@ -1328,8 +1331,9 @@ def _append_gauss_points(
 
     Notes
     -----
-    With images the spectrum is even about DC and Nyquist. Without them it continues there. Then the
-    integral extends half a bin beyond the last bin, and is corrected by the first difference.
+    With images the spectrum is even about DC and Nyquist. Without images the spectrum continues
+    beyond DC and Nyquist: the integral extends half a bin beyond the last bin, and is corrected by
+    the first difference.
     """
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     far_bin = 0 if side < 0 else nyquist_bin
@@ -1372,10 +1376,10 @@ def _append_gauss_points(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _bin_cotangent(distance, half_bin_beyond, fft_size, bin_tangents):
-    """Return cot(pi q / N) for q bins, with the FFT size N and 0 < q <= N/2.
+    """Return cot(pi q / N) at the distance q [bins], with the FFT size N and 0 < q <= N/2.
 
-    q is ``distance``, or half a bin more if ``half_bin_beyond``. ``bin_tangents`` holds tan(pi k /
-    N) of bins k = 0 .. N/2.
+    q is ``distance``, or ``distance`` + 1/2 if ``half_bin_beyond``. ``bin_tangents`` holds
+    tan(pi k / N) of bins k = 0 .. N/2.
     """
     tangent_at_bin = bin_tangents[distance]
     if not half_bin_beyond:

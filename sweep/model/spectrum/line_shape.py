@@ -48,8 +48,8 @@ from sweep.model.spectrum.lines import SpectrumLayout
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, Window, window_samples
 
 TABLE_CELLS_PER_BIN = (2, 4)
-"""Number of table cells in a bin of width fs/N: if amplitudes add, and if powers add. fs is the
-sample rate, N the FFT size."""
+"""Numbers of table cells per bin of width fs/N, with the sample rate fs and the FFT size N. The
+first is for lines whose amplitudes add, the second for lines whose powers add."""
 
 N_KERNEL_CELLS = 14
 """Number of table cells over which a line is spread: cells -6 .. 7 for a line between cells 0 and
@@ -101,8 +101,8 @@ END_DERIVATIVE_ORDER_MAX = 12
 line is computed."""
 
 N_END_COEFFICIENTS = END_DERIVATIVE_ORDER_MAX + 2
-"""Number of coefficients of each of the two polynomials, one of the record's start and one of its
-end, that give a line's spectrum far from the line."""
+"""Number of coefficients of an end polynomial. Two end polynomials, one of the record's start and
+one of its end, give a line's spectrum far from the line."""
 
 MODE_COEFFICIENT_MIN = 1e-13
 """Smallest Chebyshev coefficient of a phase error's phasor that counts as a mode. The last modes
@@ -134,21 +134,21 @@ ECHO_LENGTH_CLASS_RATIO = math.sqrt(2.0)
 late echo fills only the last samples of its record."""
 
 _LATE_SAMPLES_PER_BIN_MIN = 16
-"""Least number of samples of a late echo per bin of its table. A bin is fs/L' wide, L' being the
-echo's number of samples. Sums over samples are then integrals with six Euler-Maclaurin corrections.
-"""
+"""Least number of samples of a late echo per bin of its table, whose bins are fs/L' wide for the
+echo's L' samples. With so many samples, a sum over samples is an integral with six Euler-Maclaurin
+corrections."""
 
 _LATE_TABLE_MARGIN_BINS = 16
-"""Extra bins in the table of a late echo, for lines that are spread together. A bin is fs/L' wide,
-L' being the echo's number of samples. They are added to the distance beyond which the record's ends
-determine the shape."""
+"""Number of extra bins in the table of a late echo, for lines that are spread together. The bins
+are fs/L' wide for the echo's L' samples. The extra bins follow the distance beyond which the
+record's ends determine the shape."""
 
 _LATE_PADDING_MAX = 16
 """Largest ratio of FFT size to a late echo's samples at which its line shape is a sum of modes."""
 
 _LATE_VALUES_PER_BIN = 2
-"""Number of tabulated values of a late echo's line shape in a bin. A bin is fs/L' wide, L' being
-the echo's number of samples."""
+"""Number of tabulated values of a late echo's line shape per bin. Bins are fs/L' wide for the
+echo's L' samples."""
 
 EULER_MACLAURIN_COEFFICIENTS = {
     1: 1 / 12, 3: -1 / 720, 5: 1 / 30240, 7: -1 / 1209600, 9: 1 / 47900160,
@@ -255,8 +255,8 @@ class LineShapeTables(NamedTuple):
     ends of the record count half. It is real for even modes; for odd modes it is the imaginary
     part.
 
-    Places are the table's cells, at :func:`_cell_distances`. If amplitudes add, further places hold
-    each mode's part of :attr:`LineShape.table_re`. For late echoes, the array is that of
+    Places are the table's cells, at :func:`_cell_distances`. If amplitudes add, additional places
+    hold each mode's part of :attr:`LineShape.table_re`. For late echoes, the array is that of
     :class:`LateModeTransforms`.
     """
     first_sample_cosine: np.ndarray
@@ -537,7 +537,7 @@ class LateModeTransforms(NamedTuple):
 
 @lru_cache(maxsize=len(LINE_SHAPE_TIERS))
 def _late_mode_transforms(tier: int) -> LateModeTransforms:
-    """Compute the :class:`LateModeTransforms` for an index ``tier`` in :data:`LINE_SHAPE_TIERS`."""
+    """Compute the :class:`LateModeTransforms` of a tier, an index in :data:`LINE_SHAPE_TIERS`."""
     n_modes, clearance_bins, _ = LINE_SHAPE_TIERS[tier]
     half_count = math.ceil(
         (1.02 * ECHO_LENGTH_CLASS_RATIO * (clearance_bins + _LATE_TABLE_MARGIN_BINS) + 14)
@@ -561,8 +561,8 @@ def _late_mode_transforms(tier: int) -> LateModeTransforms:
 def window_has_modes(window: Window, fft_size: int) -> bool:
     """Return True if line shapes of this window may be sums of Chebyshev modes.
 
-    They may if the window is a sum of cosines, the record is long enough, and the padding is small
-    enough. Otherwise the line-shape tables hold all bins.
+    The window has to be a sum of cosines, the record long enough, and the padding small enough. If
+    any of these fails, line-shape tables hold all bins.
 
     Parameters
     ----------
@@ -671,9 +671,9 @@ def _fill_full_line_envelope(
     envelope_magnitude: np.ndarray,
     square_integral: np.ndarray,
 ) -> None:
-    """Fill the arrays (m,) of a :class:`LineEnvelope` from a line's squared spectrum.
+    """Fill two arrays (m,) of a :class:`LineEnvelope` from a line's squared magnitudes.
 
-    ``squared_magnitude`` is given at all cells of the periodic spectrum.
+    ``squared_magnitude`` holds those of all cells of the periodic spectrum.
     """
     paired = squared_magnitude + np.maximum(
         np.roll(squared_magnitude, cells_per_bin // 2),
@@ -840,9 +840,9 @@ def chebyshev_coefficient_matrix(n_nodes: int) -> np.ndarray:
 
 
 def _cell_distances(table_half_width_bins: int, adds_powers: bool) -> np.ndarray:
-    """Return the distances from the line [bins of fs/N] of a table's cells, in steps of one cell.
+    """Return the distances of a table's cells from the line [bins of fs/N], in rising order.
 
-    Cells that the filter DECONVOLUTION_TAPS needs on each side are included.
+    They include those of the extra cells on each side that the filter DECONVOLUTION_TAPS needs.
     """
     cells_per_bin = TABLE_CELLS_PER_BIN[adds_powers]
     return (
@@ -855,9 +855,10 @@ def _cell_distances(table_half_width_bins: int, adds_powers: bool) -> np.ndarray
 
 
 def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
-    """Divide a table by the spreading kernel's transform, then sort it by cell of a bin and by bin.
+    """Return a line's table divided by the transform of the spreading kernel, and sorted.
 
-    ``values`` (..., places) are at the distances of :func:`_cell_distances`.
+    ``values`` (..., places) is the table at the distances of :func:`_cell_distances`. The result,
+    (..., cells * columns), is sorted by cell within a bin, then by bin.
     """
     n_inner = values.shape[-1] - 2 * _TAP_REACH_CELLS
     filtered = DECONVOLUTION_TAPS[0] * values[..., _TAP_REACH_CELLS : _TAP_REACH_CELLS + n_inner]
@@ -871,7 +872,7 @@ def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
 def _envelope_distances(table_half_width_bins: int, fft_size: int) -> np.ndarray:
     """Return the distances from the line at which envelopes are tabulated [bins of fs/N].
 
-    There is one distance per bin of the table. A geometric progression up to N/2 follows, N being
+    The distances are one per bin of the table, followed by a geometric progression up to N/2. N is
     the FFT size.
     """
     far_distances = np.geomspace(
@@ -970,10 +971,10 @@ def _euler_maclaurin_corrections(
 
 
 def _power_sum_polynomials() -> np.ndarray:
-    """Return the coefficients of sum_n n^j e^{-i theta n} as a polynomial in cot(theta / 2).
+    """Return sum_n n^j e^{-i theta n} over n = 0, 1, 2, .. as polynomials in cot(theta / 2).
 
-    The result is (END_DERIVATIVE_ORDER_MAX + 1, N_END_COEFFICIENTS), by j and by power of the
-    cotangent.
+    The result holds coefficients, (END_DERIVATIVE_ORDER_MAX + 1, N_END_COEFFICIENTS), by j and by
+    power of the cotangent.
     """
     n_coefficients = N_END_COEFFICIENTS
     sums = np.zeros((END_DERIVATIVE_ORDER_MAX + 1, n_coefficients), complex)
@@ -994,9 +995,9 @@ _POWER_SUM_POLYNOMIALS_RE, _POWER_SUM_POLYNOMIALS_IM = (
 _EULER_MACLAURIN_FACTORS = np.zeros(
     (_EULER_MACLAURIN_ORDER_MAX + 1, _EULER_MACLAURIN_ORDER_MAX + 1)
 )
-"""Matrix (d, i) of the Euler-Maclaurin correction for one end of the record. It turns the Taylor
-coefficients i of the phasor there into the coefficients d of the correction, a polynomial in
--i theta. theta is the phase per sample [rad]."""
+"""Matrix of the Euler-Maclaurin correction for one end of the record. Column i is for the Taylor
+coefficient i of the phasor at this end. Row d is for the coefficient d of the correction, a
+polynomial in -i theta with the phase theta per sample [rad]."""
 
 for _m, _coefficient in EULER_MACLAURIN_COEFFICIENTS.items():
     for _i in range(_m + 1):
@@ -1188,9 +1189,10 @@ def _zero_end_polynomials(ends):
 def first_segment_of_same_line_shape(
     segment, line_shape_index, modes, echo_lengths, segment_exists
 ):
-    """Return the first of the segments before a given one that has the same line shape.
+    """Return the index of the first earlier segment that has the line shape of a given segment.
 
-    Two shapes are the same if their modes and their numbers of samples are equal.
+    Two shapes are the same if their modes and their numbers of samples are equal. The result is -1
+    without an earlier segment of the same shape.
 
     Parameters
     ----------
@@ -1208,7 +1210,7 @@ def first_segment_of_same_line_shape(
     Returns
     -------
     int
-        Index of the segment; -1 if there is none.
+        Index of the segment, or -1.
     """
     n_modes = modes.n_modes[segment, line_shape_index]
     for s in range(segment):
@@ -1357,9 +1359,10 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
 
 @njit(cache=True, error_model="numpy")
 def _fill_line_shape_table(values, layout, table):
-    """Divide a table by the spreading kernel's transform, then sort it by cell of a bin and by bin.
+    """Fill ``table`` with values divided by the transform of the spreading kernel, and sorted.
 
-    ``values`` are at the distances of :func:`_cell_distances`. The result goes to ``table``.
+    ``values`` are at the distances of :func:`_cell_distances`. The table is sorted by cell within a
+    bin, then by bin.
     """
     cells_per_bin, columns = layout.cells_per_bin, 2 * layout.table_half_width_bins + 1
     n_values = np.uint64(cells_per_bin * columns)

@@ -31,15 +31,15 @@ AMPLITUDE_TOLERANCES = (
     1e-13, 3e-13, 1e-12, 3e-12, 1e-11, 3e-11, 1e-10, 3e-10, 1e-9, 3e-9, 1e-8, 3e-8, 1e-7, 3e-7,
     1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2,
 )  # fmt: skip
-"""Tabulated errors of a summed amplitude when few equivalent lines replace all lines. They are
-relative to the sum of the lines' amplitudes."""
+"""Errors for which the necessary number of equivalent lines is tabulated, if amplitudes add. Each
+is the error of the lines' summed amplitude, relative to the sum of their magnitudes."""
 
 POWER_TOLERANCES = (
     1e-18, 1e-15, 1e-13, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3
 )  # fmt: skip
-"""Tabulated errors of a summed power when few equivalent lines replace all lines. They are relative
-to the sum of the lines' powers. Where the magnitude should be zero, its error is the square root of
-the power's error."""
+"""Errors for which the necessary number of equivalent lines is tabulated, if powers add. Each is
+the error of the lines' summed power, relative to the sum of their powers. Where the magnitude
+should be zero, its error is the square root of the power's error."""
 
 NODES_MAX = 128
 """Maximum number of equivalent lines that replace all lines. Lines that would need more are kept.
@@ -198,8 +198,8 @@ class PointParameters(NamedTuple):
     leakage_tolerance: np.ndarray
     """Leakage that may be neglected [probability of at least one false alarm]."""
     line_error_tolerance: np.ndarray
-    """Error of a bin's magnitude over ``noise_sigma`` that approximations of the lines may cause.
-    """
+    """Largest allowed error of a bin's magnitude due to approximations of lines, over
+    ``noise_sigma``."""
     image_gain: np.ndarray
     """Amplitude of the image that I/Q imbalance makes of a line, over that of the line; 0 if there
     is no image."""
@@ -214,7 +214,8 @@ class PointParameters(NamedTuple):
     pedestal_line_width_bins: np.ndarray
     """Line width of the laser [FFT bins]."""
     pedestal_delay_times_bin_width: np.ndarray
-    """Delay of the echo, at most the duration of the record [N/fs, FFT size over sample rate]."""
+    """Delay of the echo times the bin width fs/N, with the sample rate fs and the FFT size N.
+    Delays longer than the record count as its duration."""
 
 
 class SegmentParameters(NamedTuple):
@@ -331,12 +332,13 @@ def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...])
 def _chebyshev_truncation_bound(
     log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
-    """Return a bound on the remainder of a Chebyshev series after J terms, (tolerances, J).
+    """Return a bound on the remainder of a Chebyshev series of exp(i z x t) after J terms.
 
-    The bound holds for ln z < ln 2 J. The series represents exp(i z x t) at the position x of a
-    line, -1 .. 1, and the time t in the record. J_m is the Bessel function. The remainder is the
-    weighted mean over t of 2 sum_{m >= J} |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m!
-    exp(-x^2 / (4 m + 4)).
+    x is the position of a line, -1 .. 1, and t the time in the record, 0 .. 1. The arguments are
+    ``log_z`` = ln z, below ln 2 J, ``n_terms`` = J, and the weights of equidistant times. With the
+    Bessel function J_m, the remainder is the weighted mean over t of 2 sum_{m >= J} |J_m(z t)|. Its
+    bound follows from J_m(x) <= (x/2)^m / m! exp(-x^2 / (4 m + 4)). The result has the shape to
+    which ``log_z`` and ``n_terms`` broadcast.
     """
     phase_span, weighted_sum = np.exp(log_z), np.zeros(log_z.shape)
     for record_position, weight in zip(np.linspace(0, 1, weights.size), weights, strict=True):

@@ -48,7 +48,8 @@ GRID_CELLS_MIN = 1 << 12
 """
 
 CLEARANCE_BINS = 16
-"""Number of bins on each side of the lines that the circular convolution must not wrap into."""
+"""Number of bins on each side of the lines that stay free of light wrapped around by the circular
+convolution."""
 
 _SPECTRA_PER_TRANSFORM = 32
 """Number of spectra per call of the FFT, so that they fit into the processor's cache."""
@@ -281,9 +282,10 @@ def _window_transform(
     adds_powers: bool,
     uses_real_transform: bool,
 ) -> np.ndarray:
-    """Return the FFT, over the grid's cells, of the window's spectrum with phase 0 at mid-record.
+    """Return the FFT over the grid's cells of the window's spectrum, for a convolution by FFT.
 
-    The window's spectrum is an FFT of its samples. If `adds_powers`, its squared magnitude is used.
+    The window's spectrum is the FFT of its samples with phase 0 at mid-record, or its squared
+    magnitude if `adds_powers`.
     """
     cell_offsets = np.concatenate([np.arange(n_cells // 2), np.arange(-n_cells // 2, 0)])
     transform = fft.fft(windows.window_samples(window_name, length), GRID_CELLS_PER_BIN * fft_size)[

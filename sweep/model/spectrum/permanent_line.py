@@ -32,8 +32,8 @@ from sweep.model.waveform import count_samples_before_echo
 from sweep.model.window import Window, window_samples
 
 MASK_THRESHOLD_FRACTION = 0.5
-"""Fraction of the threshold from which on a permanent line masks a bin. A masked bin raises no
-alarm; a smaller line raises few alarms."""
+"""Magnitude of a permanent line in a bin, over the threshold, from which on the line masks the bin.
+A masked bin raises no alarm. Smaller lines raise few alarms."""
 N_PHASES = 16
 """Number of phases of the permanent line over which its false alarms are averaged."""
 
@@ -59,7 +59,10 @@ class LineTransforms(NamedTuple):
 def _line_transforms(
     window: Window, fft_size: int, line_bin: float, is_complex: bool, n_missing: int = 0
 ) -> LineTransforms:
-    """Return the spectrum of a line at ``line_bin`` [bins] without `n_missing` first samples."""
+    """Return the :class:`LineTransforms` of a line at ``line_bin`` [bins].
+
+    The line is absent from the first ``n_missing`` samples of the record.
+    """
     cycles = line_bin * np.arange(window.length) / fft_size
     record = window_samples(window.name, window.length) * np.exp(
         2j * np.pi * (cycles - np.rint(cycles))
@@ -243,7 +246,7 @@ def echo_magnitude_with_line(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return the |X| of a lone echo that crosses the threshold as often as the echo with the line.
+    """Return the |X| that an echo alone needs to cross the threshold as often as with the line.
 
     Parameters
     ----------
@@ -258,8 +261,9 @@ def echo_magnitude_with_line(
 
     Notes
     -----
-    Without speckle powers add. In speckle the echo crosses with Q_1(L / s, Th / s), s^2 = sigma^2 +
-    |X|^2 / 2.
+    Without speckle the powers of echo and line add. In speckle, echo and line cross the threshold
+    Th with the probability Q_1(L / s, Th / s), Marcum's function, with the line's rms magnitude L
+    and s^2 = sigma^2 + |X|^2 / 2. The result is the |X| of a fading echo of the same probability.
     """
     from sweep.model.detection.marcum import marcum_q1  # imports the compiler
 

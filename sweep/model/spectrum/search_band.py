@@ -175,7 +175,7 @@ def n_alarm_bins(search_band: SearchBand, fft_size: int, first_alarm_bin: int) -
 
 
 def is_searched(shots: Any, segment: int, point: int, bins: ArrayLike) -> np.ndarray:
-    """Return whether bins are in the search band of one segment of one point.
+    """Return True for bins that are in the search band of one segment of one point.
 
     Parameters
     ----------

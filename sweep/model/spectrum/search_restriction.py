@@ -29,9 +29,10 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     """Restrict spans, adjacent bins around the lines, to the bins of the search band.
 
     Bins outside the band neither detect nor raise a false alarm. If the strongest bin of an echo is
-    outside, the echo is not detected. Its only bins that then remain exempt from false alarms are
-    groups of adjacent bins above the threshold that hold a line of the footprint and have their
-    strongest bin in the band. The peak magnitude stays that of the strongest bin of all.
+    outside, the echo is not detected, and fewer of its bins are exempt from false alarms. Exempt
+    are then groups of adjacent bins above the threshold that hold a line of the footprint and have
+    their strongest bin in the band. The peak magnitude is that of the strongest bin, in the band or
+    not.
 
     Parameters
     ----------

@@ -227,9 +227,10 @@ class DistinctLineShapes(NamedTuple):
     """One point for each line shape that occurs in a batch of points."""
 
     point_numbers: np.ndarray
-    """(shapes,): index in the shots of one point with each line shape."""
+    """(shapes,): index in the shots of one point per line shape."""
     line_shape_index: np.ndarray
-    """(m,): index of each point's line shape in ``point_numbers``."""
+    """(m,): index in ``point_numbers`` of the point that has the line shape of each point of the
+    batch."""
 
 
 class EvaluationSettings(NamedTuple):
@@ -314,8 +315,8 @@ def iter_spans(
     leakage : bool
         True to compute leakage.
     doppler_leakage : bool
-        True to compute leakage also in the Doppler segment, whose false peaks alone are no false
-        points.
+        True to compute leakage also in the Doppler segment. A false peak in that segment alone
+        makes no false point.
     bin_by_bin : bool
         True to compute the leakage of each bin, even if an integral over bins is accurate.
     ignores_band : bool
@@ -377,9 +378,9 @@ def iter_spans(
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
-    """Remove all bins of segments whose echo arrives after the record.
+    """Return spans without the bins of segments whose echo arrives after the record.
 
-    No bin of these segments is searched for the echo.
+    The number of bins and the leakage of these segments are 0, and no peak is searched.
     """
     if shots.echo_record.n_samples_before_echo is None:
         return spans
@@ -398,9 +399,9 @@ def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
 
 
 def _apply_looks_to_leakage(shots: Shots, spans: BinSpans) -> BinSpans:
-    """Convert the spans' leakage from that of one record to that of several looks.
+    """Return spans with the leakage of all looks of a shot in place of that of one record.
 
-    A look is one of several records of the same shot. Leakage is a probability of false alarm.
+    A look is one of several records of the same segment. Leakage is a probability of false alarm.
     """
     negligible_signal_ratio, noise_sigma, threshold = (
         np.broadcast_to(value, shots.size)[spans.point_numbers]
@@ -631,7 +632,7 @@ _NO_WINDOW = np.empty((0, 0, 0))
 
 
 def _unused_phase_error_modes(segments: int) -> PhaseErrorModes:
-    """Return one Chebyshev mode of amplitude 0, for line shapes that are not sums of modes."""
+    """Return :class:`PhaseErrorModes` of one mode of amplitude 0, for shapes without modes."""
     modes = line_shape.zero_phase_error_modes(segments, 1, 1)
     modes.n_modes[:] = 1
     return modes
@@ -721,7 +722,7 @@ def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[L
 def _tables_without_phase_error(
     window: Window, fft_size: int, adds_powers: bool, segments: int
 ) -> LineShapeTables:
-    """Return the line-shape tables, which hold all bins, of records without a phase error."""
+    """Return line-shape tables that hold all bins, for records without a phase error."""
     return line_shape.full_line_shape_tables(
         window, fft_size, adds_powers, np.zeros((segments, window.length))
     )
@@ -902,10 +903,11 @@ def bin_tangents(fft_size: int) -> np.ndarray:
 
 
 def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
-    """Return the frequency shifts over which power spectra are averaged.
+    """Return the :class:`AveragingShifts` over which power spectra are averaged.
 
-    The shape is (points, segments, shifts). Shifts result from the laser's line width, and from the
-    drift of lines over looks. Shifts of weight 0 are the last ones.
+    The arrays are (points, segments, shifts), without shifts if there is no average. Shifts result
+    from the laser's line width, and from the drift of lines over looks. Shifts of weight 0 are the
+    last ones.
     """
     segments = len(shots.waveform_segments)
     if shots.laser_line.gaussian_fwhm is None:
@@ -1375,15 +1377,16 @@ def _evaluate_segment(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _rounded_threshold_ratio(threshold_ratio):
-    """Round a threshold over the noise, so that one table serves thresholds that hardly differ.
+    """Return a threshold over the noise, rounded to a multiple of THRESHOLD_RATIO_STEP.
 
-    Shot noise of the echo's light makes them differ.
+    Shot noise of echoes makes thresholds over the noise differ slightly. One table serves all
+    thresholds that are equal after rounding.
     """
     return math.floor(threshold_ratio / THRESHOLD_RATIO_STEP + 0.5) * THRESHOLD_RATIO_STEP
 
 
 def _rounded_threshold_ratios(threshold: np.ndarray, noise_sigma: np.ndarray) -> np.ndarray:
-    """Return the thresholds over the noise, (n,), as :func:`_evaluate_points` rounds them."""
+    """Return thresholds over the noise, (n,), rounded to multiples of THRESHOLD_RATIO_STEP."""
     return np.floor(threshold / noise_sigma / THRESHOLD_RATIO_STEP + 0.5) * THRESHOLD_RATIO_STEP
 
 
@@ -1407,7 +1410,7 @@ def _evaluate_points(
 ):
     """Compute the bins around the lines of m points (spans), as many as fit into memory.
 
-    The result is the number of points that fit.
+    The result is the number of points whose bins fit.
 
     Parameters
     ----------

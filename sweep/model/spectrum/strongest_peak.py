@@ -53,9 +53,9 @@ from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 GAUSS_ORDER = 4
 """Number of Gauss quadrature points in each interval of QUADRATURE_INTERVAL_EDGES."""
 QUADRATURE_INTERVAL_EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7.5, 9.5, 12, 15, 19, 24, 30, 37.0])
-"""Edges of the quadrature intervals, as increases of u = z^2 / (2 sigma^2) above the lower limit; z
-is the magnitude, sigma the noise per quadrature. The lower limit is the threshold's u, or ln n - 4
-if that is larger: the largest of n bins of noise is almost certainly above ln n - 4."""
+"""Edges of the quadrature intervals of u = z^2 / (2 sigma^2), less the lower limit of u. z is the
+magnitude, and sigma the noise per quadrature. The lower limit is the larger of the threshold's u
+and ln n - 4. The u of the largest of n bins of noise is almost certainly above ln n - 4."""
 UP, DOPPLER, DOWN = range(3)
 """Indices of the segments in arrays by segment."""
 THRESHOLD_LEVEL_INDEX = 0
@@ -80,35 +80,32 @@ class SpanProbabilities(NamedTuple):
     p_alarm: np.ndarray
     """(segments, m): probability that any bin outside the echo crosses the threshold."""
     shared_speckle_gain: np.ndarray
-    """(m,): increase of the probability that both chirps report the echo's peak, due to the speckle
-    that they share. It includes only cases in which bins outside the echo cross the threshold too.
-    """
+    """(m,): increase, due to shared speckle, of the probability that both chirps report the echo's
+    peak. It is for cases in which bins outside the echo cross the threshold too."""
 
 
 class LevelProbabilities(NamedTuple):
     """Probabilities at the magnitude levels that an echo may have to exceed in one segment.
 
-    Arrays are (m, levels), the threshold first. The level to exceed is the threshold, or the
-    largest other bin if that is larger.
-    """
+    Arrays are (m, levels), the threshold first. To be reported, the echo has to exceed the
+    threshold and the largest bin outside the echo."""
 
     level_probability: np.ndarray
     """Probability that the echo has to exceed this level."""
     exceedance_exponent: np.ndarray
     """-ln of the probability that the echo exceeds this level."""
     echo_power_fraction: np.ndarray
-    """Echo's share of the mean power, noise included, of a bin equivalent to the echo. The bin
-    exceeds this level as often as the whole echo.
-    """
+    """Echo power over the mean power of echo and noise, in an equivalent bin. The equivalent bin is
+    a single bin that exceeds this level as often as the echo with all its bins."""
 
 
 class StrongestPeakResults(NamedTuple):
     """Probabilities of the segments and of the shot if only the strongest peak is reported."""
 
     segments: StrongestPeakProbabilities
-    """(3, n), by segment."""
+    """(3, n): probabilities of each segment: up, Doppler, down."""
     shot: StrongestPeakProbabilities
-    """(n,), of the shot."""
+    """(n,): probabilities of the shot."""
 
 
 def strongest_peak_probabilities(
@@ -265,9 +262,9 @@ def _noise_exponents(shots: Shots, spans: BinSpans, half_squares: np.ndarray) ->
 def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
     """Return the probability that the largest bin outside the echo is at each Gauss point's level.
 
-    Their sum is ``p_alarm`` (3, m), the probability that any bin outside the echo crosses the
-    threshold. ``exponents`` (3, m, points) is -ln of the probability that none exceeds the point's
-    level. The result has the same shape.
+    ``exponents`` (3, m, points) is -ln of the probability that no bin outside the echo exceeds the
+    Gauss point's level. ``p_alarm`` (3, m) is the probability that any bin outside the echo crosses
+    the threshold. The result, (3, m, points), has the sum ``p_alarm``.
     """
     by_interval = exponents.reshape(*exponents.shape[:2], -1, GAUSS_ORDER)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -338,9 +335,11 @@ def _evaluate_levels(
     speckle_table
         :class:`sweep.model.detection.echo_detection.SpeckleTable` of all points.
     pd_loss
-        (segments, m, levels): output array, P_b - P_z.
+        (segments, m, levels): output array, the probability that the echo exceeds the threshold
+        minus the probability that it exceeds the level z.
     exponents
-        (segments, m, levels): -ln P(Z < z) of noise alone, to which that of leaked signal is added.
+        (segments, m, levels): -ln of the probability that no bin outside the echo exceeds z by
+        noise alone; changed to that by noise and leaked signal.
     """
     for s in range(spans.first_bin.shape[0]):
         for j in range(spans.first_bin.shape[1]):
@@ -391,7 +390,8 @@ def _evaluate_levels(
 def _fill_joint_probability_increase(up, down, squared_correlation, joint_excess):
     """Compute the increase, due to shared speckle, of the probability that both peaks are right.
 
-    Only combinations of levels count in which bins without the echo cross in either segment.
+    A combination of a level of the up and one of the down segment counts if either is above the
+    threshold, so that a bin without the echo has crossed.
 
     Parameters
     ----------
