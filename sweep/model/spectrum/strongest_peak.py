@@ -88,7 +88,8 @@ class LevelProbabilities(NamedTuple):
     """Probabilities at the magnitude levels that an echo may have to exceed in one segment.
 
     Arrays are (m, levels), the threshold first. To be reported, the echo has to exceed the
-    threshold and the largest bin outside the echo."""
+    threshold and the largest bin outside the echo.
+    """
 
     level_probability: np.ndarray
     """Probability that the echo has to exceed this level."""
