@@ -689,9 +689,9 @@ def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, 
 def _n_powers_per_octave(rate_at_brightest):
     """Return the number of speckle powers per octave at which leakage is computed.
 
-    ``rate_at_brightest`` is the summed rate of false alarms in the brightest speckle. At a high rate
-    the powers are closer together, because leakage may fall as the power rises: bins may join the
-    echo in bright speckle.
+    ``rate_at_brightest`` is the summed rate of false alarms in the brightest speckle. At a high
+    rate the powers are closer together, because leakage may fall as the power rises: bins may join
+    the echo in bright speckle.
     """
     return POWERS_PER_OCTAVE_MAX if -math.expm1(-rate_at_brightest) > OCTAVE_STEP_LEAKAGE_MAX else 1
 
