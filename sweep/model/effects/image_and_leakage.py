@@ -364,7 +364,7 @@ def leakage_bound_table(
     )
     total_ratio = threshold_ratio * 2.0 ** (np.arange(n_rows) / _ROWS_PER_OCTAVE + _OCTAVE_MIN)
     noise_crossing = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio])).pd[0]
-    crossing_of_total = _added_crossing_probability(
+    crossing_of_total = _crossing_probability_added_by_signal(
         np.minimum(total_ratio, threshold_ratio), threshold_ratio, noise_crossing, looks
     )
     energy_bins = (
@@ -382,7 +382,7 @@ def leakage_bound_table(
     bound_by_reach = [
         2
         * (
-            _added_crossing_probability(
+            _crossing_probability_added_by_signal(
                 np.minimum(
                     total_ratio[:, None]
                     * response.magnitude_max_beyond(distance - 0.5 - reach_bins),
@@ -399,7 +399,7 @@ def leakage_bound_table(
     return np.minimum(np.minimum([*bound_by_reach, parseval_bound], parseval_bound), 1.0)
 
 
-def _added_crossing_probability(
+def _crossing_probability_added_by_signal(
     signal: np.ndarray, threshold_ratio: float, noise_crossing: float, looks: Looks
 ) -> np.ndarray:
     """Return the probability that signal makes a bin cross the threshold where noise does not.

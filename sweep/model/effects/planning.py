@@ -307,7 +307,7 @@ def omission_errors(
     errors_by_effect = {}
     for name, bound in bounds.items():
         pd_change, other_change = 0.0, np.maximum(bound.shift_bins, bound.log10_pfa_change)
-        if _may_be_nonzero(bound.magnitude_change):
+        if _is_array_or_nonzero(bound.magnitude_change):
             relative_change = np.minimum(bound.magnitude_change, _RELATIVE_CHANGE_MAX)
             # The slope is that over ln |X|, which falls by -ln(1 - d) where |X| falls by d.
             log_change = np.maximum(
@@ -317,13 +317,13 @@ def omission_errors(
                 pd_change + log_change * slope,
                 np.maximum(other_change, relative_change * relative_weight),
             )
-        if _may_be_nonzero(bound.coherent_sum_change):
+        if _is_array_or_nonzero(bound.coherent_sum_change):
             added_signal = bound.coherent_sum_change * signal_ratio_max
             pd_change = pd_change + 0.5 * near_threshold * added_signal
             other_change = np.maximum(
                 other_change, added_signal / np.maximum(signal_ratio_min, 1.0)
             )
-        if _may_be_nonzero(bound.noise_variance_change):
+        if _is_array_or_nonzero(bound.noise_variance_change):
             noise_change = np.abs(bound.noise_variance_change)
             pd_change = pd_change + 0.5 * noise_change * slope
             other_change = np.maximum(other_change, 0.5 * noise_change * relative_weight)
@@ -382,7 +382,7 @@ def residual_errors(
     residuals = {
         name: bound.residual_magnitude_change
         for name, bound in bounds.items()
-        if _may_be_nonzero(bound.residual_magnitude_change)
+        if _is_array_or_nonzero(bound.residual_magnitude_change)
     }
     if not residuals:
         return {}
@@ -453,13 +453,13 @@ def signal_ratio_bounds(
     )
     coherent_change: np.ndarray | float = 0.0
     for bound in bounds.values():
-        if _may_be_nonzero(bound.magnitude_change):
+        if _is_array_or_nonzero(bound.magnitude_change):
             relative_change = np.minimum(bound.magnitude_change, _RELATIVE_CHANGE_MAX)
             signal_ratio_min, signal_ratio_max = (
                 signal_ratio_min * np.maximum(1 - relative_change, 0.0),
                 signal_ratio_max * (1 + relative_change),
             )
-        if _may_be_nonzero(bound.noise_variance_change):
+        if _is_array_or_nonzero(bound.noise_variance_change):
             noise_factor = np.sqrt(1 + np.maximum(bound.noise_variance_change, -1 + 1e-9))
             signal_ratio_min, signal_ratio_max = (
                 signal_ratio_min / np.maximum(noise_factor, 1.0),
@@ -472,7 +472,7 @@ def signal_ratio_bounds(
     ), signal_ratio_max * (1 + coherent_change)
 
 
-def _may_be_nonzero(value: np.ndarray | float) -> bool:
+def _is_array_or_nonzero(value: np.ndarray | float) -> bool:
     """Return False for the number 0, and True for any other number and for any array."""
     return isinstance(value, np.ndarray) or value != 0.0
 

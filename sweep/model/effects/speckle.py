@@ -325,7 +325,7 @@ def apply_fading(shots: Shots, context: EffectContext) -> Shots:
         or not shots.footprint.adds_powers
     ):
         return shots
-    beam_spread = _beam_spread(shots, context.ground)
+    beam_spread = _make_beam_spread(shots, context.ground)
     line_deviation = _line_deviation_bins(shots, beam_spread.beamlet_moments)
     correlations = [
         beam_spread.speckle_correlation(shots, pair, phase)
@@ -406,7 +406,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
         )
         gain = np.sqrt(np.maximum(n_looks + squared_sum, 0.0)) / n_looks
         return replace(shots, echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gain))
-    look_power = _look_powers(shots, beam_spread.beam_gradients)
+    look_power = _relative_look_powers(shots, beam_spread.beam_gradients)
     if (
         np.abs(correlation_by_lag - 1).max() < _LOOK_DECORRELATION_MIN
         and np.abs(look_power - 1).max() < _LOOK_DECORRELATION_MIN
@@ -460,7 +460,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     return replace(shots, speckle=shots.speckle._replace(look_speckle=look_speckle))
 
 
-def _look_powers(shots: Shots, beam_gradients: BeamGradients) -> np.ndarray:
+def _relative_look_powers(shots: Shots, beam_gradients: BeamGradients) -> np.ndarray:
     """Return the power of each look in the strongest bin, over the mean of all looks.
 
     The result is (3, n, looks), and 1 if lines do not drift.
@@ -544,7 +544,7 @@ class BeamSpread(NamedTuple):
         return correlations
 
 
-def _beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
+def _make_beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
     """Return the spread of ranges and Doppler ratios over the beam, on a plane or ray-traced."""
     moments = _beamlet_moments(shots, ground)
     if isinstance(ground, FlatGround):

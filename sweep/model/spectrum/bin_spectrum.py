@@ -30,7 +30,7 @@ from sweep.model.kernel_integers import INTEGER_ZERO
 from sweep.model.spectrum.line_shape import (
     KERNEL_POLYNOMIAL_DEGREE,
     KERNEL_POLYNOMIALS,
-    N_END_COEFFICIENTS,
+    N_END_POLYNOMIAL_COEFFICIENTS,
     N_KERNEL_CELLS,
     N_ZERO_WEIGHT_CELLS,
     TABLE_CELLS_PER_BIN,
@@ -204,7 +204,7 @@ class LineSpectrumWorkspace(NamedTuple):
     """Real part of the weights in the table cells over which lines are spread."""
     cell_im: np.ndarray
     """Imaginary part of the weights in the table cells over which lines are spread."""
-    line_ends: RecordEndAmplitudes
+    record_end_amplitudes: RecordEndAmplitudes
     """Amplitudes of the segment's lines at the record's start and end."""
     far_equivalent_lines: RecordEndAmplitudes
     """Equivalent lines (sources), which replace the segment's lines in bins far away."""
@@ -312,7 +312,7 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
         line_scratch=LineScratch(*next_rows(3)),
         cell_re=next(rows),
         cell_im=next(rows),
-        line_ends=RecordEndAmplitudes(lines.position, *next_rows(4)),
+        record_end_amplitudes=RecordEndAmplitudes(lines.position, *next_rows(4)),
         far_equivalent_lines=RecordEndAmplitudes(*next_rows(5)),
         far_bins=FarBins(*next_rows(8)),
         re=next(rows),
@@ -516,7 +516,7 @@ def compute_end_amplitudes_and_far_lines(bundle, distance_min, log_accuracy, lay
     layout
         :class:`SpectrumLayout`.
     line_spectrum
-        :class:`LineSpectrumWorkspace`. Results are ``line_ends``, and the sources in
+        :class:`LineSpectrumWorkspace`. Results are ``record_end_amplitudes``, and the sources in
         ``far_equivalent_lines``.
 
     Returns
@@ -526,9 +526,9 @@ def compute_end_amplitudes_and_far_lines(bundle, distance_min, log_accuracy, lay
     """
     adds_powers = layout.adds_powers
     half_record_ratio = 0.5 * layout.record_length / layout.fft_size
-    lines, line_ends, sources = (
+    lines, record_end_amplitudes, sources = (
         line_spectrum.lines,
-        line_spectrum.line_ends,
+        line_spectrum.record_end_amplitudes,
         line_spectrum.far_equivalent_lines,
     )
     for line in range(bundle.n_lines):
@@ -536,10 +536,10 @@ def compute_end_amplitudes_and_far_lines(bundle, distance_min, log_accuracy, lay
             (2.0 if adds_powers else 1.0) * half_record_ratio * lines.position[line]
         )
         re, im = lines.re[line], lines.im[line]
-        line_ends.start_re[line] = re if adds_powers else re * cosine + im * sine
-        line_ends.start_im[line] = 0.0 if adds_powers else im * cosine - re * sine
-        line_ends.end_re[line] = re * cosine if adds_powers else re * cosine - im * sine
-        line_ends.end_im[line] = -re * sine if adds_powers else im * cosine + re * sine
+        record_end_amplitudes.start_re[line] = re if adds_powers else re * cosine + im * sine
+        record_end_amplitudes.start_im[line] = 0.0 if adds_powers else im * cosine - re * sine
+        record_end_amplitudes.end_re[line] = re * cosine if adds_powers else re * cosine - im * sine
+        record_end_amplitudes.end_im[line] = -re * sine if adds_powers else im * cosine + re * sine
     middle = 0.5 * (bundle.lowest_position + bundle.highest_position)
     half_width = 0.5 * (bundle.highest_position - bundle.lowest_position)
     n_sources = bundle.n_lines
@@ -549,7 +549,11 @@ def compute_end_amplitudes_and_far_lines(bundle, distance_min, log_accuracy, lay
     elif bundle.n_lines > 1:
         n_sources = 1
     replace_lines_by_nodes(
-        LineArrays(line_ends.position, line_ends.start_re, line_ends.start_im),
+        LineArrays(
+            record_end_amplitudes.position,
+            record_end_amplitudes.start_re,
+            record_end_amplitudes.start_im,
+        ),
         bundle.n_lines,
         n_sources,
         middle,
@@ -558,7 +562,11 @@ def compute_end_amplitudes_and_far_lines(bundle, distance_min, log_accuracy, lay
         LineArrays(sources.position, sources.start_re, sources.start_im),
     )
     return replace_lines_by_nodes(
-        LineArrays(line_ends.position, line_ends.end_re, line_ends.end_im),
+        LineArrays(
+            record_end_amplitudes.position,
+            record_end_amplitudes.end_re,
+            record_end_amplitudes.end_im,
+        ),
         bundle.n_lines,
         n_sources,
         middle,
@@ -697,7 +705,7 @@ def add_line_by_record_ends(
     for i in range(begin, stop):
         cotangent_max = max(cotangent_max, abs(far_bins.cotangent[i]))
     degree, factor, term_max = 0, 1.0, 0.0
-    for d in range(N_END_COEFFICIENTS):
+    for d in range(N_END_POLYNOMIAL_COEFFICIENTS):
         term = factor * (
             abs(ends.start_re[d])
             + abs(ends.start_im[d])
@@ -843,7 +851,7 @@ def compute_line_spectrum(
                             start - current,
                             until - current,
                             start - first_bin,
-                            line_spectrum.line_ends,
+                            line_spectrum.record_end_amplitudes,
                             line,
                             polynomial_log_accuracy,
                             shape.end_polynomials,

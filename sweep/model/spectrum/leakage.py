@@ -98,7 +98,7 @@ octave. Leakage is the probability of false alarms due to the echo's signal far 
 LEAKAGE_RATE_MIN = 1e-30
 """Lower limit of the bins' summed rate of false alarms due to leaked signal. Smaller sums count as
 this value. The probability of at least one false alarm is 1 - exp(-sum)."""
-CERTAIN_LEAKAGE_RATE = 34.5
+LEAKAGE_RATE_MAX = 34.5
 """Upper limit of the bins' summed rate of false alarms due to leaked signal. Larger sums count as
 this value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
 
@@ -313,7 +313,7 @@ def detect_with_leakage(
     )
     extra_bins = INTEGER_ZERO
     if not is_integral_negligible:
-        extra_bins = _extra_bins_min(
+        extra_bins = _n_extra_bins_min(
             far_weight,
             bundle.highest_position - bundle.lowest_position,
             brightest_inputs,
@@ -570,7 +570,7 @@ def _mean_leakage_over_speckle(
     rate_at_brightest *= SPECKLE_POWER_MAX
     if rate_at_brightest < 1e-12:
         return 0.0
-    powers_per_octave = _n_powers_per_octave(rate_at_brightest)
+    powers_per_octave = _n_speckle_powers_per_octave(rate_at_brightest)
     power_stride = POWERS_PER_OCTAVE_MAX // powers_per_octave
     log_rates = np.empty(powers_per_octave * N_SPECKLE_OCTAVES + 1)
     for k in range(log_rates.size):
@@ -593,7 +593,7 @@ def _mean_leakage_over_speckle(
             )
             for i in range(n_listed):
                 rate += crossing_rate(probabilities[i])
-        log_rates[k] = math.log(min(max(rate, LEAKAGE_RATE_MIN), CERTAIN_LEAKAGE_RATE))
+        log_rates[k] = math.log(min(max(rate, LEAKAGE_RATE_MIN), LEAKAGE_RATE_MAX))
     return mean_leakage_from_log_rates(log_rates, powers_per_octave)
 
 
@@ -686,7 +686,7 @@ def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, 
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _n_powers_per_octave(rate_at_brightest):
+def _n_speckle_powers_per_octave(rate_at_brightest):
     """Return the number of speckle powers per octave at which leakage is computed.
 
     ``rate_at_brightest`` is the summed rate of false alarms in the brightest speckle. At a high
@@ -899,7 +899,7 @@ def _fill_crossing_probabilities(n_bins, inputs, span, crossing_series):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _extra_bins_min(weight_sum, line_extent, inputs, crossing_distance, envelope, layout):
+def _n_extra_bins_min(weight_sum, line_extent, inputs, crossing_distance, envelope, layout):
     """Return the number of bins to compute one by one beyond the clearance from the lines.
 
     The leakage integral covers the bins beyond these. The number is a heuristic, and a multiple of
@@ -1058,7 +1058,7 @@ def _leakage_of_all_bins(
         ),
         FAR_LINE_LOG_ACCURACY,
     )
-    _fill_far_powers(
+    _fill_squared_magnitudes_of_points(
         n_points, centre_bin, bundle, log_accuracy, shape, layout, bin_tangents, workspace
     )
     # The span's scratch arrays now serve the points of the integral.
@@ -1175,7 +1175,7 @@ def _end_correction_factor(offset):
 
 
 @njit(cache=True, error_model="numpy", borrows=True, inline="always")
-def _fill_far_powers(
+def _fill_squared_magnitudes_of_points(
     n_points, centre_bin, bundle, log_accuracy, shape, layout, bin_tangents, workspace
 ):
     """Compute the squared magnitude of the spectrum at the leakage integral's points.

@@ -100,7 +100,7 @@ END_DERIVATIVE_ORDER_MAX = 12
 """Highest order of the derivatives at the record's ends from which a line's spectrum far from the
 line is computed."""
 
-N_END_COEFFICIENTS = END_DERIVATIVE_ORDER_MAX + 2
+N_END_POLYNOMIAL_COEFFICIENTS = END_DERIVATIVE_ORDER_MAX + 2
 """Number of coefficients of an end polynomial. Two end polynomials, one of the record's start and
 one of its end, give a line's spectrum far from the line."""
 
@@ -133,20 +133,20 @@ ECHO_LENGTH_CLASS_RATIO = math.sqrt(2.0)
 """Largest ratio between the numbers of samples of two late echoes that share a line-shape table. A
 late echo fills only the last samples of its record."""
 
-_LATE_SAMPLES_PER_BIN_MIN = 16
+_LATE_ECHO_SAMPLES_PER_BIN_MIN = 16
 """Least number of samples of a late echo per bin of its table, whose bins are fs/L' wide for the
 echo's L' samples. With so many samples, a sum over samples is an integral with six Euler-Maclaurin
 corrections."""
 
-_LATE_TABLE_MARGIN_BINS = 16
+_LATE_ECHO_TABLE_MARGIN_BINS = 16
 """Number of extra bins in the table of a late echo, for lines that are spread together. The bins
 are fs/L' wide for the echo's L' samples. The extra bins follow the distance beyond which the
 record's ends determine the shape."""
 
-_LATE_PADDING_MAX = 16
+_LATE_ECHO_PADDING_FACTOR_MAX = 16
 """Largest ratio of FFT size to a late echo's samples at which its line shape is a sum of modes."""
 
-_LATE_VALUES_PER_BIN = 2
+_LATE_ECHO_TABLE_VALUES_PER_BIN = 2
 """Number of tabulated values of a late echo's line shape per bin. Bins are fs/L' wide for the
 echo's L' samples."""
 
@@ -168,13 +168,17 @@ class EndPolynomials(NamedTuple):
     """
 
     start_re: np.ndarray
-    """(..., N_END_COEFFICIENTS): real part of the coefficients of A, of the record's start."""
+    """(..., N_END_POLYNOMIAL_COEFFICIENTS): real part of the coefficients of A, of the record's
+    start."""
     start_im: np.ndarray
-    """(..., N_END_COEFFICIENTS): imaginary part of the coefficients of A, of the record's start."""
+    """(..., N_END_POLYNOMIAL_COEFFICIENTS): imaginary part of the coefficients of A, of the
+    record's start."""
     end_re: np.ndarray
-    """(..., N_END_COEFFICIENTS): real part of the coefficients of B, of the record's end."""
+    """(..., N_END_POLYNOMIAL_COEFFICIENTS): real part of the coefficients of B, of the record's
+    end."""
     end_im: np.ndarray
-    """(..., N_END_COEFFICIENTS): imaginary part of the coefficients of B, of the record's end."""
+    """(..., N_END_POLYNOMIAL_COEFFICIENTS): imaginary part of the coefficients of B, of the
+    record's end."""
 
 
 class LineEnvelope(NamedTuple):
@@ -255,10 +259,9 @@ class LineShapeTables(NamedTuple):
     ends of the record count half. It is real for even modes; for odd modes it is the imaginary
     part.
 
-    Places are the table's cells, at :func:`_cell_distances`. If amplitudes add, additional places
-    hold each mode's part of :attr:`LineShape.table_re`. For late echoes, the array is that of
-    :class:`LateModeTransforms`.
-    """
+    Places are the table's cells, at :func:`_table_cell_distances`. If amplitudes add, additional
+    places hold each mode's part of :attr:`LineShape.table_re`. For late echoes, the array is that
+    of :class:`LateModeTransforms`."""
     first_sample_cosine: np.ndarray
     """(places,): the window's first sample times cos(pi L y / N) at y bins from the line. L is the
     number of samples, N the FFT size. The array is empty for late echoes.
@@ -268,9 +271,8 @@ class LineShapeTables(NamedTuple):
     number of samples, N the FFT size. The array is empty for late echoes.
     """
     mode_end_polynomials: EndPolynomials
-    """(modes, N_END_COEFFICIENTS) in each field: for each Chebyshev mode, the coefficients of the
-    polynomials that give its spectrum far from the line.
-    """
+    """(modes, N_END_POLYNOMIAL_COEFFICIENTS) in each field: for each Chebyshev mode, the
+    coefficients of the polynomials that give its spectrum far from the line."""
     envelope_distance: np.ndarray
     """(m,): distances from the line at which envelopes are tabulated [bins of fs/N]."""
     cotangent_at_envelope_distance: np.ndarray
@@ -332,7 +334,7 @@ def line_shape_tables(
     table_half_width_bins = math.ceil(table_half_width / ratio)
     cell_density, cell_distances = (
         TABLE_CELLS_PER_BIN[adds_powers],
-        _cell_distances(table_half_width_bins, adds_powers),
+        _table_cell_distances(table_half_width_bins, adds_powers),
     )
     n_nodes = 4 * ((math.ceil(math.pi * table_half_width) + n_modes) // 4) + 64
     node, weight = _gauss_legendre(n_nodes)
@@ -358,7 +360,7 @@ def line_shape_tables(
     )
     if not adds_powers:
         chebyshev_transforms, first_sample_cosine, first_sample_sine = (
-            np.concatenate([values, _deconvolve_into_rows(values, cell_density)], axis=-1)
+            np.concatenate([values, _deconvolve_and_sort_by_cell(values, cell_density)], axis=-1)
             for values in (chebyshev_transforms, first_sample_cosine, first_sample_sine)
         )
     distance = _envelope_distances(table_half_width_bins, fft_size)
@@ -433,9 +435,9 @@ def late_echo_has_modes(
     """
     if window.name not in COSINE_SUM_COEFFICIENTS:
         return np.zeros(length_min.shape, np.bool_)
-    table_half_width = LINE_SHAPE_TIERS[tier].clearance_bins + _LATE_TABLE_MARGIN_BINS
-    is_long_enough = (length_min >= _LATE_SAMPLES_PER_BIN_MIN * table_half_width) & (
-        length_min * _LATE_PADDING_MAX >= fft_size
+    table_half_width = LINE_SHAPE_TIERS[tier].clearance_bins + _LATE_ECHO_TABLE_MARGIN_BINS
+    is_long_enough = (length_min >= _LATE_ECHO_SAMPLES_PER_BIN_MIN * table_half_width) & (
+        length_min * _LATE_ECHO_PADDING_FACTOR_MAX >= fft_size
     )
     class_length_max = window.length * ECHO_LENGTH_CLASS_RATIO ** (
         1.0 - late_echo_length_classes(window, length_min)
@@ -443,7 +445,7 @@ def late_echo_has_modes(
     return np.asarray(is_long_enough & (length_max <= 1.01 * class_length_max))
 
 
-def late_window_samples(
+def window_over_last_samples(
     window: Window, late_position: np.ndarray, n_samples: np.ndarray
 ) -> np.ndarray:
     """Return the window's values over the last samples of a record.
@@ -493,7 +495,7 @@ def late_line_shape_tables(
         Class of the echo's number of samples (:func:`late_echo_length_classes`).
     """
     clearance_bins = LINE_SHAPE_TIERS[tier].clearance_bins
-    table_half_width = clearance_bins + _LATE_TABLE_MARGIN_BINS
+    table_half_width = clearance_bins + _LATE_ECHO_TABLE_MARGIN_BINS
     filled_fraction = window.length * ECHO_LENGTH_CLASS_RATIO ** (-float(length_class)) / fft_size
     table_half_width_bins = math.ceil(table_half_width / filled_fraction)
     transforms = _late_mode_transforms(tier)
@@ -540,17 +542,18 @@ def _late_mode_transforms(tier: int) -> LateModeTransforms:
     """Compute the :class:`LateModeTransforms` of a tier, an index in :data:`LINE_SHAPE_TIERS`."""
     n_modes, clearance_bins, _ = LINE_SHAPE_TIERS[tier]
     half_count = math.ceil(
-        (1.02 * ECHO_LENGTH_CLASS_RATIO * (clearance_bins + _LATE_TABLE_MARGIN_BINS) + 14)
-        * _LATE_VALUES_PER_BIN
+        (1.02 * ECHO_LENGTH_CLASS_RATIO * (clearance_bins + _LATE_ECHO_TABLE_MARGIN_BINS) + 14)
+        * _LATE_ECHO_TABLE_VALUES_PER_BIN
         + N_KERNEL_CELLS
     )
-    frequency = np.arange(-half_count, half_count + 1) / _LATE_VALUES_PER_BIN
+    frequency = np.arange(-half_count, half_count + 1) / _LATE_ECHO_TABLE_VALUES_PER_BIN
     n_nodes = 4 * ((math.ceil(math.pi * frequency[-1]) + n_modes) // 4) + 96
     node, weight = _gauss_legendre(n_nodes)
     weighted_modes = np.cos(np.outer(np.arange(n_modes), np.arccos(node))) * weight / 2
     return LateModeTransforms(
         _chebyshev_fourier_integrals(
-            weighted_modes / spreading_kernel_transform(np.pi / _LATE_VALUES_PER_BIN * node),
+            weighted_modes
+            / spreading_kernel_transform(np.pi / _LATE_ECHO_TABLE_VALUES_PER_BIN * node),
             node,
             frequency,
         ),
@@ -723,7 +726,7 @@ def spreading_kernel_transform(theta: np.ndarray) -> np.ndarray:
     return np.asarray(N_KERNEL_CELLS * np.sinh(root) / root / i0(KERNEL_BETA))
 
 
-def table_size(layout: SpectrumLayout) -> int:
+def n_line_shape_table_values(layout: SpectrumLayout) -> int:
     """Return the number of values in the table of a line shape, cells per bin times columns."""
     columns = layout.fft_size if layout.holds_all_bins else 2 * layout.table_half_width_bins + 1
     return layout.cells_per_bin * columns
@@ -745,14 +748,16 @@ def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
         Arrays with a leading dimension of segments. The values of the tables are undefined. The
         envelopes' magnitudes and integrals, and the end polynomials, are 0.
     """
-    distance, n_cells = tables.envelope_distance, table_size(tables.layout)
+    distance, n_cells = tables.envelope_distance, n_line_shape_table_values(tables.layout)
     return LineShape(
         np.empty((segments, n_cells)),
         np.empty((segments, n_cells)),
         LineEnvelope(
             distance, np.zeros((segments, distance.size)), np.zeros((segments, distance.size))
         ),
-        EndPolynomials(*(np.zeros((segments, N_END_COEFFICIENTS)) for _ in EndPolynomials._fields)),
+        EndPolynomials(
+            *(np.zeros((segments, N_END_POLYNOMIAL_COEFFICIENTS)) for _ in EndPolynomials._fields)
+        ),
     )
 
 
@@ -839,7 +844,7 @@ def chebyshev_coefficient_matrix(n_nodes: int) -> np.ndarray:
     return matrix
 
 
-def _cell_distances(table_half_width_bins: int, adds_powers: bool) -> np.ndarray:
+def _table_cell_distances(table_half_width_bins: int, adds_powers: bool) -> np.ndarray:
     """Return the distances of a table's cells from the line [bins of fs/N], in rising order.
 
     They include those of the extra cells on each side that the filter DECONVOLUTION_TAPS needs.
@@ -854,11 +859,11 @@ def _cell_distances(table_half_width_bins: int, adds_powers: bool) -> np.ndarray
     )
 
 
-def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
+def _deconvolve_and_sort_by_cell(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
     """Return a line's table divided by the transform of the spreading kernel, and sorted.
 
-    ``values`` (..., places) is the table at the distances of :func:`_cell_distances`. The result,
-    (..., cells * columns), is sorted by cell within a bin, then by bin.
+    ``values`` (..., places) is the table at the distances of :func:`_table_cell_distances`. The
+    result, (..., cells * columns), is sorted by cell within a bin, then by bin.
     """
     n_inner = values.shape[-1] - 2 * _TAP_REACH_CELLS
     filtered = DECONVOLUTION_TAPS[0] * values[..., _TAP_REACH_CELLS : _TAP_REACH_CELLS + n_inner]
@@ -973,10 +978,10 @@ def _euler_maclaurin_corrections(
 def _power_sum_polynomials() -> np.ndarray:
     """Return sum_n n^j e^{-i theta n} over n = 0, 1, 2, .. as polynomials in cot(theta / 2).
 
-    The result holds coefficients, (END_DERIVATIVE_ORDER_MAX + 1, N_END_COEFFICIENTS), by j and by
-    power of the cotangent.
+    The result holds coefficients, (END_DERIVATIVE_ORDER_MAX + 1, N_END_POLYNOMIAL_COEFFICIENTS), by
+    j and by power of the cotangent.
     """
-    n_coefficients = N_END_COEFFICIENTS
+    n_coefficients = N_END_POLYNOMIAL_COEFFICIENTS
     sums = np.zeros((END_DERIVATIVE_ORDER_MAX + 1, n_coefficients), complex)
     sums[0, :2] = 0.5, -0.5j
     for j in range(END_DERIVATIVE_ORDER_MAX):
@@ -1007,10 +1012,10 @@ for _m, _coefficient in EULER_MACLAURIN_COEFFICIENTS.items():
 
 
 def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> EndPolynomials:
-    """Compute the :class:`EndPolynomials` of Chebyshev modes, (modes, N_END_COEFFICIENTS).
+    """Compute the :class:`EndPolynomials` of Chebyshev modes.
 
     ``taylor_coefficients`` are those of the modes at the record's end; ``length`` is the number of
-    samples.
+    samples. Arrays of the result are (modes, N_END_POLYNOMIAL_COEFFICIENTS).
     """
     power_sums = _POWER_SUM_POLYNOMIALS
     step_powers = (2 / length) ** np.arange(END_DERIVATIVE_ORDER_MAX + 1)
@@ -1149,11 +1154,11 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
         for i in range(n_values):
             transform_re[i] += a * chebyshev_transforms[j, i]
             transform_im[i] += b * chebyshev_transforms[j, i]
-        for d in range(N_END_COEFFICIENTS):
+        for d in range(N_END_POLYNOMIAL_COEFFICIENTS):
             re, im = mode_end_polynomials.start_re[j, d], mode_end_polynomials.start_im[j, d]
             ends.start_re[d] += mode_re[j] * re - mode_im[j] * im
             ends.start_im[d] += mode_re[j] * im + mode_im[j] * re
-        for d in range(N_END_COEFFICIENTS):
+        for d in range(N_END_POLYNOMIAL_COEFFICIENTS):
             re, im = mode_end_polynomials.end_re[j, d], mode_end_polynomials.end_im[j, d]
             ends.end_re[d] += mode_re[j] * re - mode_im[j] * im
             ends.end_im[d] += mode_re[j] * im + mode_im[j] * re
@@ -1181,7 +1186,7 @@ def build_line_shape(segment, line_shape_index, previous_index, modes, tables, s
 @njit(cache=True, error_model="numpy", borrows=True)
 def _zero_end_polynomials(ends):
     """Set all coefficients of an :class:`EndPolynomials` to 0."""
-    for d in range(N_END_COEFFICIENTS):
+    for d in range(N_END_POLYNOMIAL_COEFFICIENTS):
         ends.start_re[d], ends.start_im[d], ends.end_re[d], ends.end_im[d] = 0.0, 0.0, 0.0, 0.0
 
 
@@ -1290,7 +1295,7 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
         scale *= sample_step
     _zero_end_polynomials(ends)
     for i in range(n_derivatives):
-        for d in range(N_END_COEFFICIENTS):
+        for d in range(N_END_POLYNOMIAL_COEFFICIENTS):
             p, q = _POWER_SUM_POLYNOMIALS_RE[i, d], _POWER_SUM_POLYNOMIALS_IM[i, d]
             ends.start_re[d] += start_re[i] * p - start_im[i] * q
             ends.start_im[d] += start_re[i] * q + start_im[i] * p
@@ -1322,7 +1327,7 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
     for i in range(n_cells):
         y = (first_cell + i) / cells_per_bin
         u = length_ratio * y
-        value_position = u * _LATE_VALUES_PER_BIN + middle
+        value_position = u * _LATE_ECHO_TABLE_VALUES_PER_BIN + middle
         cell = math.floor(value_position)
         kernel_coordinate = 2.0 * (value_position - cell) - 1.0
         _copy_values(KERNEL_POLYNOMIALS[KERNEL_POLYNOMIAL_DEGREE], kernel_weights)
@@ -1361,8 +1366,8 @@ def build_late_line_shape(segment, line_shape_index, modes, tables, shape):
 def _fill_line_shape_table(values, layout, table):
     """Fill ``table`` with values divided by the transform of the spreading kernel, and sorted.
 
-    ``values`` are at the distances of :func:`_cell_distances`. The table is sorted by cell within a
-    bin, then by bin.
+    ``values`` are at the distances of :func:`_table_cell_distances`. The table is sorted by cell
+    within a bin, then by bin.
     """
     cells_per_bin, columns = layout.cells_per_bin, 2 * layout.table_half_width_bins + 1
     n_values = np.uint64(cells_per_bin * columns)
@@ -1393,8 +1398,8 @@ def _fill_line_envelope(squared_magnitude, layout, cotangent_at_envelope_distanc
     half_bin_cells = cells_per_bin // 2
     for i in range(np.uint64(table_half_width_bins + 1), np.uint64(distance.size)):
         c, a, b, p, q = cotangent_at_envelope_distance[i], 0.0, 0.0, 0.0, 0.0
-        for k in range(N_END_COEFFICIENTS):
-            d = N_END_COEFFICIENTS - 1 - k
+        for k in range(N_END_POLYNOMIAL_COEFFICIENTS):
+            d = N_END_POLYNOMIAL_COEFFICIENTS - 1 - k
             a, b = a * c + ends.start_re[d], b * c + ends.start_im[d]
             p, q = p * c + ends.end_re[d], q * c + ends.end_im[d]
         squared_first, squared_last = a * a + b * b, p * p + q * q

@@ -670,7 +670,7 @@ def _iter_late_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[L
                 n_nodes = 2 * line_shape.LINE_SHAPE_TIERS[tier].n_modes_max
                 record_positions = line_shape.chebyshev_nodes(n_nodes)
                 phase = _phase_errors(shots, distinct_points[selected], record_positions)
-                window_values = line_shape.late_window_samples(
+                window_values = line_shape.window_over_last_samples(
                     window, record_positions, echo_lengths[:, selected]
                 )
                 modes = line_shape.zero_phase_error_modes(segments, phase.shape[1], n_nodes // 2)

@@ -72,7 +72,7 @@ _DERIVATIVE_MATRIX = np.array(
 the same points."""
 
 
-class SpanProbabilities(NamedTuple):
+class OtherPeakProbabilities(NamedTuple):
     """Probabilities that another peak is larger than the echo's, at m points."""
 
     pd_loss: np.ndarray
@@ -163,8 +163,8 @@ def strongest_peak_probabilities(
     )
 
 
-def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> SpanProbabilities:
-    """Compute the :class:`SpanProbabilities` of the points of some spans.
+def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> OtherPeakProbabilities:
+    """Compute the :class:`OtherPeakProbabilities` of the points of some spans.
 
     A span is a set of adjacent bins around a segment's lines. ``pd`` (3, n) is the probability that
     the echo is detected, of all n shots by segment.
@@ -217,7 +217,7 @@ def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> SpanPr
         )
         _fill_joint_probability_increase(up, down, squared_correlation, joint_excess)
     total_loss = (weight * pd_loss[..., 1:]).sum(axis=-1)
-    return SpanProbabilities(
+    return OtherPeakProbabilities(
         np.where(segment_exists, total_loss, np.nan),
         np.where(segment_exists, p_alarm, np.nan),
         joint_excess,
