@@ -140,8 +140,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    The current variance [A^2] is that of :func:`emission_beat_current_variance`. It is multiplied
-    by the noise at the ADC per squared current [V^2/A^2].
+    The current variance [A^2] is that of :func:`emission_beat_current_variance`. The noise
+    variance at the ADC is this variance times a factor [V^2/A^2] of the receiver.
     """
     if shots.waveform.architecture == "direct":
         return shots

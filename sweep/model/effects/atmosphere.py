@@ -42,8 +42,8 @@ from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
 
 _PATH_HEIGHT_DIFFERENCE_MIN = 1e-9
-"""Smallest difference of height [m] between the ends of a path. Paths that are more level count as
-having this difference, so that the mean extinction over height is defined."""
+"""Smallest difference of height [m] between the ends of a path. Paths whose difference is
+smaller count as having this one, so that the mean extinction over height is defined."""
 
 
 class ExtinctionProfile(NamedTuple):
@@ -423,11 +423,12 @@ def backscatter_integral(
     power, A the aperture's area, tau_o the transmission of the optics, and S the lidar ratio [sr].
     The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
     nearer than r_0, the image of a point is larger than the field of view. For a
-    diffraction-limited beam, Theta = 4 lambda / (pi D), it is that of a coherent lidar focused at
-    infinity [1]_.
+    diffraction-limited beam, Theta = 4 lambda / (pi D), the factor is that of a coherent lidar
+    focused at infinity [1]_.
 
-    Gauss-Legendre quadrature over atan(r / r_0) is applied between the rows of the profile that the
-    path crosses, split further where extinction or overlap has fallen.
+    Gauss-Legendre quadrature over atan(r / r_0) is applied to sections of the path. Sections end at
+    the rows of the profile that the path crosses, and where extinction or overlap has fallen by
+    certain factors.
 
     References
     ----------
@@ -517,9 +518,9 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     excess noise factor F and responsivity Re, and the electrical bandwidth B_e. The power P [W] is
     P_tx A tau_o / S times the integral of :func:`backscatter_integral`.
 
-    The beat of this light with the local oscillator is neglected. This light comes from grains that
-    change all the time, and is spread over the bins from the nearest range to the target's.
-    [T 3.3.2] counts backscatter as noise as well.
+    The beat of backscattered light with the local oscillator is neglected. Backscattered light
+    comes from grains that change all the time, and is spread over the bins from the nearest range
+    to the target's. [T 3.3.2] counts backscatter as noise as well.
     """
     parameters = context.parameters
     profile = extinction_profile(parameters)

@@ -89,8 +89,8 @@ DEFAULT_EFFECTS = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",
     "signal_shot_noise", "solar_background", "image", "leakage",
 )  # fmt: skip
-"""Names of the effects that the model's functions simulate by default. These effects make ideal
-lines and their noise."""
+"""Names of the effects that the model's functions simulate by default. Together they make
+ideal lines and the lines' noise."""
 
 SEPARATE_BATCHES_MASK = np.uint32(
     sum(1 << k for k, effect in enumerate(EFFECTS) if effect.needs_separate_batches)

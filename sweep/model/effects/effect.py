@@ -86,7 +86,7 @@ class EffectContext(NamedTuple):
     effect, else 0.0."""
 
     def effect_mask(self, effect: str) -> np.ndarray | float:
-        """Return the mask of a named effect, (n,): 1 for points that have it, 0 for others.
+        """Return the mask of a named effect, (n,): 1.0 for points with the effect, else 0.0.
 
         The result is the number 1.0 if all points have the effect.
         """
@@ -161,7 +161,7 @@ class Effect:
     """Physical effect, with its error bound and its change of the shots; compared by identity.
 
     A deterministic effect has `apply`. A random one has `perturb_parameters` or `perturb_shots`,
-    which change each draw (random realisation). An effect of the scene alone has none of them.
+    which change each draw (random realisation). Effects of the scene alone have no such function.
     """
 
     name: str
@@ -173,16 +173,16 @@ class Effect:
     ``noise``; ``record`` and its phases; ``spectrum``; ``detection``; and ``draws``, random changes
     of any of these."""
     error_bound: "Callable[[PlannerInputs], ErrorBound | None]"
-    """Function that bounds the change of results at n points if the effect is omitted. It takes
-    their :class:`~sweep.model.effects.planner_inputs.PlannerInputs`, and returns None where the
-    effect is absent."""
+    """Function that bounds the change of results at n points if the effect is omitted. The argument
+    is the :class:`~sweep.model.effects.planner_inputs.PlannerInputs` of the points. The result is
+    None where the effect is absent."""
     phase_error_bound: "Callable[[PlannerInputs], PhaseErrorBound | None] | None" = None
-    """Function that bounds the phase error that the effect adds over the record, at n points. It
-    takes their :class:`~sweep.model.effects.planner_inputs.PlannerInputs`, and may return None. It
-    is evaluated for all effects before any `error_bound`."""
+    """Function that bounds the phase error that the effect adds over the record, at n points. The
+    argument is the :class:`~sweep.model.effects.planner_inputs.PlannerInputs` of the points. The
+    result may be None. The function is evaluated for all effects before any `error_bound`."""
     apply: Callable[[Shots, EffectContext], Shots] | None = None
-    """Function that simulates the effect. It takes prepared shots and their :class:`EffectContext`,
-    and returns the changed shots."""
+    """Function that simulates the effect. The arguments are prepared shots and the shots'
+    :class:`EffectContext`, and the result is the changed shots."""
     perturb_parameters: (
         Callable[[dict[str, np.ndarray], DrawAddresses], dict[str, np.ndarray]] | None
     ) = None
@@ -194,23 +194,24 @@ class Effect:
     parameters: tuple[Parameter, ...] = ()
     """Parameters of the effect, which become fields of a spec."""
     parent: str = ""
-    """Name of the effect that this one is part of. Where this effect is simulated, so is the
-    parent. Where the parent is off, so is this effect."""
+    """Name of the effect that this one is part of; empty if there is none. The parent is simulated
+    wherever this effect is. This effect is off wherever the parent is off."""
     needs_separate_batches: bool = True
     """True if points with and without the effect are computed separately. If False, `apply` uses
     :attr:`EffectContext.masks_by_effect` and leaves the bits of points without the effect
     unchanged."""
     uses_beamlet_velocities: bool = False
-    """True if `apply` reads the radial velocities of single beamlets, which are computed only then.
-    """
+    """True if `apply` reads the radial velocities of single beamlets. The velocities are computed
+    only if a simulated effect has this flag."""
     defines_scene_if_off: bool = False
-    """True if ``off`` is a rule of the scene, such as "all segments begin at one range", and not
-    the omission of something that is there. ``off`` then counts as no error."""
+    """True if ``off`` states a rule of the scene, such as "all segments begin at one range". Mode
+    ``off`` then counts as no error. False if ``off`` omits something that is present."""
     is_in_time_domain_truth: bool = True
     """False if :func:`sweep.model.time_domain_truth.evaluate_segments_in_time_domain` leaves the
-    effect out. Comparisons with it then leave the effect out as well."""
+    effect out. Comparisons with that function leave such an effect out as well."""
     required_effects: tuple[str, ...] = ()
-    """Names of effects that are simulated with this one, however small their own change is."""
+    """Names of effects that are simulated wherever this one is, however small a change they
+    make."""
 
     @property
     def is_random(self) -> bool:

@@ -29,8 +29,8 @@ class ErrorBound(NamedTuple):
     """Shift of measured frequencies [FFT bins] if the effect is omitted. One bin counts as much as
     a change of a probability by 1."""
     log10_pfa_change: ArrayOrFloat = 0.0
-    """Change of log10 of a shot's false-alarm probability if the effect is omitted. It is due to
-    bins that the effect moves across the threshold."""
+    """Change of log10 of a shot's false-alarm probability if the effect is omitted. Bins that the
+    effect moves across the threshold cause this change."""
     leaking_bin_change_sigma: ArrayOrFloat = 0.0
     """Change of |X| that only bins with leaked signal (from sidelobes) have, in units of the noise
     per quadrature. The change that these bins share with the largest bin is not included."""
@@ -40,9 +40,9 @@ class ErrorBound(NamedTuple):
     residual_magnitude_change: ArrayOrFloat = 0.0
     """Relative error of |X| in the largest bin that remains although the effect is simulated."""
     residual_coherent_sum_change: ArrayOrFloat = 0.0
-    """Error of |X| in the largest bin that remains although the effect is simulated. It is a
-    fraction of |X| of the line on the beam's axis, if that line lay on a bin. The smaller of the
-    two residual errors counts."""
+    """Error of |X| in the largest bin that remains although the effect is simulated. The unit is
+    the |X| of the line on the beam's axis, if that line lay on a bin. The smaller of this error and
+    ``residual_magnitude_change`` counts."""
 
 
 class PhaseErrorBound(NamedTuple):
@@ -59,8 +59,8 @@ class PhaseErrorBound(NamedTuple):
     """Largest magnitude [cycles] of the part of the phase error beyond the polynomial of
     ``coefficients``."""
     mid_record_phase: np.ndarray | float = 0.0
-    """Largest magnitude of the phase error in the record's middle [cycles]. It only matters to
-    lines near their images."""
+    """Largest magnitude of the phase error in the record's middle [cycles]. Only lines near their
+    images are affected by this phase."""
     extra_shift_window_bins: np.ndarray | float = 0.0
     """Shift of a line's light in frequency that is not due to the slopes of the polynomial.
     The unit is the sample rate over the number of samples in the record."""

@@ -72,8 +72,8 @@ def image_error_bound(points: PlannerInputs) -> ErrorBound | None:
     -----
     Let all light be at least e bins from DC and Nyquist. If powers add, the bound follows from the
     window's largest sidelobes at e/2, e and 3 e/2 bins, as the module's description states. If
-    amplitudes add, they may cancel. Images then add to any bin at most the largest sidelobe at e
-    bins, relative to the sum of all lines in phase.
+    amplitudes add, they may cancel. In this case images add to any bin at most the largest sidelobe
+    at e bins, relative to the sum of all lines in phase.
     """
     if points.shared_option(RECORD_TYPE_PATH) == "complex":
         return None
@@ -229,8 +229,7 @@ IMAGE = Effect(
 
 
 _TABULATED_LIGHT_SHIFTS_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
-"""Largest shifts of light from its line [bins]. There is a table of leakage bounds for each of
-them."""
+"""Largest shifts of light from its line [bins]. Each shift has a table of leakage bounds."""
 _ROWS_PER_OCTAVE, _OCTAVE_MIN, _OCTAVE_MAX = 2, -8, 30
 """Rows of tables of leakage bounds: number per octave, and first and last octave, of the magnitude
 of all lines over the threshold."""

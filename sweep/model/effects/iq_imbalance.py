@@ -41,9 +41,9 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
     Parameters
     ----------
     gain : array_like
-        Power of Q over that of I; g is the square root of it.
+        Power of Q over power of I, the square of their ratio g of amplitudes.
     phase : array_like
-        Departure p of their phase from 90 degrees [rad].
+        Departure p of the phase between I and Q from 90 degrees [rad].
 
     Returns
     -------

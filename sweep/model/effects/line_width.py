@@ -88,10 +88,10 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     (2 pi s)^2 var_w (sum |w|)^2. Here w is the window, and s the standard deviation of the line
     [bins of fs/L]. The variance var_w is that of the position in the record, weighted by |w|.
 
-    Lorentzian line of FWHM dnu: the pure line keeps the fraction exp(-g) of its power. Here
-    g = Gamma min(tau, T_w), with Gamma = 2 pi dnu, the delay tau of the echo and the duration T_w
-    of the record. The pedestal is noise that comes with the signal. No bin holds more of it than
-    sum w^2 (fs S(0) + 1 - exp(-g)). Here fs is the sample rate, and S(0) is the density of the
+    Lorentzian line of FWHM dnu: the pure line keeps the fraction exp(-g) of its power. Here g =
+    Gamma min(tau, T_w), with Gamma = 2 pi dnu, the delay tau of the echo and the duration T_w of
+    the record. The pedestal is noise that comes with the signal. No bin holds more of the pedestal
+    than sum w^2 (fs S(0) + 1 - exp(-g)). Here fs is the sample rate, and S(0) is the density of the
     pedestal under the line [1/Hz], :func:`sweep.model.laser_line.pedestal_density_under_line`.
     """
     if not points.any_nonzero(_WIDTH_PATH):

@@ -119,10 +119,8 @@ def solar_irradiance(
     ndarray
         Spectral irradiance [W/m^3]; 0 for a distance of 0.
 
-    Notes
-    -----
-    It is pi B (R / d)^2 sin(elevation), with Planck's radiance B of a black body of the temperature
-    SUN_TEMPERATURE, and the sun's radius R.
+    Notes ----- The irradiance is pi B (R / d)^2 sin(elevation), with Planck's radiance B of a black
+    body of the temperature SUN_TEMPERATURE, and the sun's radius R.
     """
     x, d = np.asarray(wavelength, float), np.asarray(distance, float)
     exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)
@@ -323,8 +321,8 @@ def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shot
 
     Notes
     -----
-    The current variance [A^2] is that of :func:`intensity_noise_current_variance`. It is multiplied
-    by the noise at the ADC per squared current [V^2/A^2].
+    The current variance [A^2] is that of :func:`intensity_noise_current_variance`. The noise
+    variance at the ADC is this variance times a factor [V^2/A^2] of the receiver.
     """
     if shots.waveform.architecture == "direct":
         return shots

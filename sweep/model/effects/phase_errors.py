@@ -87,7 +87,7 @@ from sweep.model.waveform import round_trip_delay
 from sweep.model.window import Window, window_samples
 
 _N_WINDOW_NODES = 256
-"""Number of positions in the record at which the window is sampled, for means weighted by it."""
+"""Number of positions in the record at which the window is sampled, for means under the window."""
 _RADIANS_PER_CYCLE = 2 * math.pi
 """Factor 2 pi that converts a phase from cycles to radians."""
 _REMAINING_AMPLITUDE_WITH_IMAGE_MIN = 0.9
@@ -116,7 +116,7 @@ class WindowMoments(NamedTuple):
 
     absolute_moments: MomentsByExponent
     """Means of |x^k| for k = 1, 3, and of |x^k - <x^k>| for k = 2, 4. x is the position in the
-    record, -1..1, and < > the mean weighted by the window."""
+    record, -1..1, and < > the mean weighted by the window's |w|."""
     rms_moments: MomentsByExponent
     """Root mean squares of x^k about its mean for k = 2, 4, and 0 for k = 1, 3. x is the position
     in the record, -1..1; means are weighted by the window."""
@@ -357,8 +357,8 @@ def _add_phase_error(
 ) -> Shots:
     """Return shots whose records have an additional phase error.
 
-    ``phase_function`` returns the phase [cycles] at positions in the record. ``values`` are its
-    other arguments.
+    ``phase_function`` returns the phase [cycles] at positions in the record. ``values`` are the
+    keyword arguments of ``phase_function``.
     """
     phase_error = PhaseError(phase_function, values | shots.echo_interval_in_record)
     return replace(
@@ -594,7 +594,7 @@ def acceleration_phase(
 
 
 def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the bound of the phase that acceleration adds over the record; None without it."""
+    """Return the bound of the phase over the record that acceleration adds; None if it is 0."""
     if not points.any_nonzero(_ACCELERATION_PATH):
         return None
     alpha = points[_ACCELERATION_PATH] / SPEED_OF_LIGHT

@@ -54,7 +54,7 @@ below 0.4 %, and its derivatives are below 5 %."""
 class PeakPowerBounds(NamedTuple):
     """Bounds on the power of the largest bin.
 
-    They are relative to the power that all lines would have if they lay on one bin.
+    The bounds are relative to the power that all lines would have if they lay on one bin.
     """
 
     power_min: np.ndarray
@@ -270,7 +270,7 @@ class PlannerInputs(LinkBudget):
     def segment_starts(self) -> np.ndarray:
         """Time from the shot's start to each segment's start, of the middle look [s].
 
-        Segments start at these times whether or not the motion between them is simulated.
+        These times hold whether or not the motion between segments is simulated.
         """
         starts = self.waveform.middle_look_starts(self.looks)
         return self.stack_segments(*self._select_existing_segments(starts))
@@ -279,8 +279,8 @@ class PlannerInputs(LinkBudget):
     def existing_segments(self) -> list[WaveformSegment]:
         """Existing segments of the shots' waveform.
 
-        They include the target's motion, unless the effects ``doppler`` or ``segment_motion`` are
-        switched off.
+        Each segment includes the target's motion, unless the effects ``doppler`` or
+        ``segment_motion`` are switched off.
         """
         motion = LineMotion(
             doppler_ratio=0.0 if "doppler" in self.effects_off else self.target.doppler_ratio,
@@ -297,7 +297,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def missing_samples(self) -> MissingSampleBounds | None:
-        """Samples without an echo, and bounds on their effect; None if echoes fill all records."""
+        """Bounds on the effect of samples that lack the echo; None if echoes fill all records."""
         if "overlap" in self.effects_off:
             return None
         delay = self.stack_segments(*(s.delay(self.range) for s in self.existing_segments))

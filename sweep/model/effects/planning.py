@@ -285,9 +285,9 @@ def omission_errors(
 
     Notes
     -----
-    The change of pd is the sum over all segments, which bounds that of their product. If
-    `moves_light` is given, bins with leaked signal change by as many sigmas as the largest bin.
-    This counts at most as much as the error if leakage is omitted.
+    The change of pd is the sum over all segments, which is a bound on the change of the segments'
+    product. If `moves_light` is given, bins with leaked signal change by as many sigmas as the
+    largest bin. This change counts at most as much as the error if leakage is omitted.
     """
     signal_ratio_min, signal_ratio_max = signal_ratio_bounds(bounds, points)
     threshold = points.threshold_ratio
@@ -436,12 +436,10 @@ def signal_ratio_bounds(
     ratio_min, ratio_max : ndarray (segments, ...)
         Bounds >= 0, by segment and point.
 
-    Notes
-    -----
-    Effect i changes |X| by at most the fraction m_i of |X|, and by the fraction c_i of the sum of
-    all amplitudes in phase. It changes the noise variance by the fraction v_i. Let x be |X| over
-    the noise per quadrature of the line on the beam's axis, times the gain of combining looks. With
-    C = sum_i c_i,
+    Notes ----- Effect i changes |X| by at most the fraction m_i of |X|, and by the fraction c_i of
+    the sum of all amplitudes in phase. Effect i changes the noise variance by the fraction v_i. Let
+    x be |X| over the noise per quadrature of the line on the beam's axis, times the gain of
+    combining looks. With C = sum_i c_i,
 
         high = x prod_i (1 + m_i) / min(sqrt(1 + v_i), 1),  at most 1e12
         low = x prod_i max(1 - m_i, 0) / max(sqrt(1 + v_i), 1)

@@ -203,9 +203,9 @@ def log_irradiance_variances(
     -----
     exp(large + small) - 1 is the scintillation index: the Rytov variance for a point in weak
     turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong turbulence. The published fit
-    serves any strength and averages too little over wide apertures. In weak turbulence its
-    scintillation index is 1.3 times Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or
-    1.5 (spherical) times where it is 10.
+    serves any strength and averages too little over wide apertures. In weak turbulence, the fit's
+    scintillation index is 1.3 times Kolmogorov's integral for k D^2 / 4 L = 1. For k D^2 / 4 L = 10
+    it is 2 times the integral for a plane wave, and 1.5 times for a spherical one.
     """
     rytov = np.asarray(rytov_variance, float)
     wavenumber = 2 * math.pi / np.asarray(wavelength, float)

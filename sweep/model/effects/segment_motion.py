@@ -109,7 +109,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Start the segments one after the other, while the target moves.
+    """Return shots whose segments start one after another, while the target moves.
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    The effect sets the start of each segment; with several looks it is that of the middle look. It
-    adds the mean start t_m of up- and down-chirp to the range walk's time. It also sets the
+    The effect sets the start of each segment, in the middle look if there are several. The mean
+    start t_m of up- and down-chirp is added to the range walk's time. The effect also sets the
     fraction S t_d / 2 of the optical frequency at mid-chirp by which the beats underestimate the
     radial velocity, and the drift of lines per look. S is the chirp rate, and t_d the time from up-
     to down-chirp.
@@ -234,4 +234,4 @@ SEGMENT_MOTION = Effect(
     apply=apply,
     defines_scene_if_off=True,
 )
-"""Effect that starts the segments one after the other, while range and velocity change."""
+"""Effect that starts the segments one after another, while range and velocity change."""

@@ -158,12 +158,10 @@ def speckle_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     The bound holds in all draws but a fraction of 1e-6.
 
-    Notes
-    -----
-    A bin of magnitude |X| becomes sqrt(kappa) X + D, with D complex normal of power (1 - kappa)
-    |X|^2. Between smooth and rough, 4 pi sigma_h << lambda, it lies within 1 +- 5 (4 pi sigma_h /
-    lambda). In incoherent footprints the coherent part has random phases. If a sum of amplitudes
-    may cancel, the bound is relative to the sum of powers.
+    Notes ----- A bin of magnitude |X| becomes sqrt(kappa) X + D, with D complex normal of power (1
+    - kappa) |X|^2. Between smooth and rough, 4 pi sigma_h << lambda, the bin's magnitude over |X|
+    lies within 1 +- 5 (4 pi sigma_h / lambda). In incoherent footprints the coherent part has
+    random phases. If a sum of amplitudes may cancel, the bound is relative to the sum of powers.
     """
     if not points.any_nonzero(_ROUGHNESS_PATH):
         return None
@@ -293,7 +291,7 @@ def fading_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_fading(shots: Shots, context: EffectContext) -> Shots:
-    """Set up detection in developed speckle, if the spec selects it and beamlets add as powers.
+    """Prepare detection in developed speckle, if the spec selects it and beamlets add as powers.
 
     Parameters
     ----------
@@ -372,7 +370,7 @@ having the same speckle."""
 
 
 def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
-    """Set the correlation of the speckle between the looks of a shot, from the motion between them.
+    """Return shots with the correlation of the speckle between looks, from the motion between them.
 
     Looks that are added coherently get a smaller amplitude (``echo_scales``) instead.
     """
@@ -555,8 +553,8 @@ def _make_beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
 def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineGradients:
     """Return gradients of line position and phase over the beam, along the slope and across it.
 
-    Across the slope only Doppler ratios change. The gradients are set even where the effects of the
-    footprint are too small to change probabilities, because peak positions wander with them.
+    Across the slope only Doppler ratios change. The gradients are set even where they are too small
+    to change probabilities, because they also make the positions of peaks wander.
     """
     if isinstance(ground, FlatGround):
         beam_gradients, doppler_across = ground.gradients, np.zeros(shots.size)
@@ -807,7 +805,7 @@ def _moments_about_surface_means(
 
     ``power`` is (rows, beamlets), ``values`` (2, rows, beamlets), and ``row`` (n,) the row of each
     point's footprint. ``is_on_other_surface`` (rows, beamlets) bool marks beamlets on a surface
-    that the axis does not meet; None if there are none.
+    that the axis does not meet; None if all are on the axis's surface.
     """
     values = np.array([doppler_ratio, relative_range])
     power_fraction = power / np.maximum(power.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)[:, None]

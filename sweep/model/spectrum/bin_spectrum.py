@@ -90,8 +90,7 @@ class LineBundle(NamedTuple):
     """Highest line frequency [bins from ``origin_bin``]."""
     weight_sum: float
     """Sum of the magnitudes of the lines' complex weights [V], or an upper bound of it. If powers
-    add, square root of the sum of their squares.
-    """
+    add, the square root of the sum of squared magnitudes."""
 
 
 class FoldedLineRange(NamedTuple):
@@ -139,8 +138,8 @@ class DetectedSpan(NamedTuple):
 class AveragingShifts(NamedTuple):
     """Frequency shifts of all lines, with weights, over which |X|^2 is averaged.
 
-    They stand for the laser's line width, and for the drift of lines over looks. X is the spectrum.
-    The arrays are empty if there is no average.
+    The shifts stand for the laser's line width, and for the drift of lines over looks. X is the
+    spectrum. The arrays are empty if |X|^2 is not averaged.
     """
 
     offset: np.ndarray
@@ -237,7 +236,7 @@ class LeakageQuadrature(NamedTuple):
 
     cotangent: np.ndarray
     """cot(pi q / N) at q bins from the centre of the lines, with the FFT size N. A later step
-    replaces it by tan(pi q / N).
+    replaces the values by tan(pi q / N).
     """
     weight: np.ndarray
     """Quadrature weight of the point in a sum over bins."""
@@ -267,8 +266,8 @@ class SpectrumWorkspace(NamedTuple):
     imaginary_part: np.ndarray
     """Scratch: imaginary part of the spectrum in the computed bins around the lines."""
     mean_square: np.ndarray
-    """Scratch: squared magnitude in the computed bins around the lines. It is averaged over
-    frequency shifts (:class:`AveragingShifts`)."""
+    """Scratch: squared magnitude in the computed bins around the lines, averaged over frequency
+    shifts (:class:`AveragingShifts`)."""
     span: SpanArrays
     """Magnitudes and crossing probabilities in the computed bins around the lines."""
     leakage_quadrature: LeakageQuadrature
@@ -389,7 +388,8 @@ def _spread_line_over_cells(cell_position, re, im, cell_re, cell_im):
     """Add a line to the N_KERNEL_CELLS table cells around its position.
 
     At a distance of z cells the weight is I_0(b sqrt(1 - (2 z / N_KERNEL_CELLS)^2)) / I_0(b), with
-    b = KERNEL_BETA (Kaiser-Bessel kernel [Fessler and Sutton 2003]). A polynomial approximates it.
+    b = KERNEL_BETA (Kaiser-Bessel kernel [Fessler and Sutton 2003]). A polynomial approximates this
+    weight.
 
     Parameters
     ----------
@@ -578,7 +578,7 @@ def compute_end_amplitudes_and_far_lines(bundle, distance_min, log_accuracy, lay
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def far_line_weight(weight_sum, n_sources, layout, sources):
-    """Return the total weight [V] that the lines have in bins far from them.
+    """Return the total weight [V] of the lines as seen from bins far away.
 
     Parameters
     ----------
@@ -661,7 +661,9 @@ def add_line_by_record_ends(
     layout,
     line_spectrum,
 ):
-    """Add the spectrum of one line, or equivalent line, to ``line_spectrum`` in bins far from it.
+    """Add the spectrum of one line in bins far from this line to ``line_spectrum``.
+
+    The line may be an equivalent line.
 
     Parameters
     ----------
@@ -1155,7 +1157,7 @@ def detect_in_span(
     bin_tangents,
     workspace,
 ):
-    """Compute the spectrum in the bins around a segment's lines, and detect the echo there.
+    """Compute the spectrum in the bins around a segment's lines, and detect the echo in these bins.
 
     Parameters
     ----------
@@ -1186,7 +1188,8 @@ def detect_in_span(
     Returns
     -------
     DetectedSpan
-        Bins around the lines, and detection; ``leakage`` is 0 and ``raised_bin_probability_max`` 1.
+        Bins around the lines, and the detection in them. No leakage is computed:
+        ``raised_bin_probability_max`` is 1, and ``leakage`` 0.
     """
     span, weight_sum = workspace.span, bundle.weight_sum
     is_complex = layout.spectrum_type == COMPLEX_RECORD

@@ -100,7 +100,7 @@ LEAKAGE_RATE_MIN = 1e-30
 this value. The probability of at least one false alarm is 1 - exp(-sum)."""
 LEAKAGE_RATE_MAX = 34.5
 """Upper limit of the bins' summed rate of false alarms due to leaked signal. Larger sums count as
-this value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
+this value, at which the probability of at least one false alarm, 1 - exp(-sum), is 1."""
 
 _N_SPECKLE_INTEGRATION_STEPS = 160
 _RELATIVE_ROOT_SPECKLE_POWERS = (
@@ -118,12 +118,12 @@ _SPECKLE_POWER_WEIGHTS = (
         _SPECKLE_POWER_NODES[2:] - _SPECKLE_POWER_NODES[:-2], np.diff(_SPECKLE_POWER_NODES[-2:])
     )
 )
-"""Weight of each speckle power, except 0, in a mean over speckle. It is the density e^-u of the
-power u, times its trapezoidal interval."""
+"""Weight of each speckle power u, except 0, in a mean over speckle: the density e^-u times the
+trapezoidal interval of u."""
 
 _END_CORRECTION_FACTORS = 1.0 / 24.0, -17.0 / 5760.0, 367.0 / 967680.0
-"""Factors of the integrand's first, third and fifth difference in an Euler-Maclaurin correction. It
-applies at the end, near the lines, of an integral over bins."""
+"""Factors of the integrand's first, third and fifth difference in the Euler-Maclaurin correction of
+the end of an integral over bins that is near the lines."""
 
 _GAUSS_ORDER_MAX = 12
 _GAUSS_NODES = np.zeros((_GAUSS_ORDER_MAX + 1, _GAUSS_ORDER_MAX))
@@ -168,7 +168,7 @@ class LeakageResult(NamedTuple):
     """Upper bound on the probability that leaked signal raises any bin above the threshold,
     including bins that join the echo."""
     is_valid: bool
-    """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
+    """True if enough bins around the lines are computed; if not, ``leakage`` is invalid."""
 
 
 class EnvelopeTail(NamedTuple):
@@ -464,9 +464,9 @@ def false_peak_probability_of_bins_in_speckle(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _clear_negligible_bins(n_bins, noise_sigma, negligible_signal_ratio, span):
-    """Set small magnitudes to 0, except those of the echo.
+    """Set magnitudes below ``negligible_signal_ratio`` times ``noise_sigma`` to 0, in place.
 
-    The limit is ``negligible_signal_ratio`` times ``noise_sigma``.
+    Magnitudes of the echo are kept.
     """
     for i in range(n_bins):
         if not span.is_exempt[i] and span.magnitude[i] < negligible_signal_ratio * noise_sigma:
@@ -789,7 +789,7 @@ def _far_leakage_bound(weight_sum, distance_min, image_distance, inputs, envelop
 
         x dQ_1/dx = x y e^{-y} g(z),    g(z) = I_1(z) / (z/2),
 
-    where g(z) is at most e^{z^2/8}, and at most 2 e^z / sqrt(2 pi z^3). It rises with z, so the
+    where g(z) is at most e^{z^2/8}, and at most 2 e^z / sqrt(2 pi z^3). g rises with z, so the
     nearest bin has the largest value. All bins together add at most y e^{-y} times this value times
     the sum of x. Images are no nearer to a bin than the lines, nor than ``image_distance`` bins.
     """

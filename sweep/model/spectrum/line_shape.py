@@ -93,8 +93,8 @@ LINE_SHAPE_TIERS = (
 modes."""
 
 SHARED_TABLE_HALF_WIDTH_BINS = 256
-"""Half-width [bins of fs/L, L samples] of a line-shape table that many points share. It is wide
-enough for wide footprints."""
+"""Half-width of a line-shape table that many points share, enough for wide footprints. The unit is
+fs/L, with the sample rate fs and L samples in the record."""
 
 END_DERIVATIVE_ORDER_MAX = 12
 """Highest order of the derivatives at the record's ends from which a line's spectrum far from the
@@ -126,7 +126,7 @@ KERNEL_POLYNOMIAL_DEGREE = 13
 """Degree of the polynomials that approximate the spreading kernel within a cell."""
 
 N_ZERO_WEIGHT_CELLS = 2
-"""Number of cells of weight 0 after the N_KERNEL_CELLS cells of a line. They fill the processor's
+"""Number of cells of weight 0 after the N_KERNEL_CELLS cells of a line, which fill the processor's
 vectors."""
 
 ECHO_LENGTH_CLASS_RATIO = math.sqrt(2.0)
@@ -187,7 +187,7 @@ class LineEnvelope(NamedTuple):
     distance: np.ndarray
     """(m,): distance from the line [bins of width fs/N]; the same for all segments."""
     magnitude: np.ndarray
-    """(..., m): largest magnitude of the line's spectrum at this distance or farther."""
+    """(..., m): largest magnitude of the line's spectrum at ``distance`` or farther."""
     square_integral: np.ndarray
     """(..., m): upper bound of the integral of the squared magnitude from ``distance`` on [bins].
     """
@@ -219,9 +219,8 @@ class PhaseErrorModes(NamedTuple):
     im: np.ndarray
     """(segments, shapes, modes): imaginary part of the Chebyshev coefficients."""
     n_modes: np.ndarray
-    """(segments, shapes) int64: number of coefficients that are not negligible. It is 0 if more are
-    needed than the arrays hold.
-    """
+    """(segments, shapes) int64: number of coefficients that are not negligible; 0 if the arrays are
+    too short for them."""
 
     def select(self, is_selected: np.ndarray) -> "PhaseErrorModes":
         """Return the modes of the shapes for which ``is_selected`` is true."""
@@ -1388,8 +1387,8 @@ def _fill_line_envelope(squared_magnitude, layout, cotangent_at_envelope_distanc
     """Fill the envelope of a shape from squared magnitudes at cells and from its end polynomials.
 
     The polynomials are used at distances outside the table. The squared magnitude varies over
-    distance as a sine with a period of one bin. It is therefore nowhere larger than the sum of two
-    values that are half a bin apart.
+    distance as a sine with a period of one bin. The sum of two values half a bin apart is therefore
+    an upper bound.
     """
     table_half_width_bins, cells_per_bin = layout.table_half_width_bins, layout.cells_per_bin
     distance, ends = shape.envelope.distance, shape.end_polynomials

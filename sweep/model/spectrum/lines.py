@@ -78,7 +78,7 @@ continue below 0 and above N, the FFT size."""
 
 
 class SpectrumLayout(NamedTuple):
-    """Sizes of a spectrum and of the line-shape table for computing it."""
+    """Sizes of a spectrum, and of the line-shape table from which the spectrum is computed."""
 
     fft_size: int
     """FFT size N, the number of samples after zero padding."""
@@ -132,10 +132,10 @@ class LineSummary(NamedTuple):
     """Sums of the lines' weights, and their lowest and highest frequency."""
 
     magnitude_sum: float
-    """Sum of the lines' amplitudes [V], or an upper bound of it; sum of their powers if powers add.
-    """
+    """Sum of the lines' amplitudes [V], or an upper bound of it; the sum of powers [V^2] if powers
+    add."""
     power_sum: float
-    """Sum of the lines' powers [V^2]; sum of their squared powers if powers add."""
+    """Sum of the lines' powers [V^2]; the sum of squared powers [V^4] if powers add."""
     lowest_position: float
     """Lowest line frequency [FFT bins from the origin bin]."""
     highest_position: float
@@ -533,7 +533,7 @@ def summarise_lines(lines, n_lines, adds_powers, batch):
 
     If amplitudes add, ``magnitude_sum`` is an upper bound by Cauchy and Schwarz of the sum of |C_b|
     over the n lines b of weights C_b: sqrt(n sum |C_b|^2). Where the sum of squares is below
-    1e-250, it is another bound, the sum of |Re C_b| + |Im C_b|.
+    1e-250, the bound is the sum of |Re C_b| + |Im C_b|.
 
     Parameters
     ----------
@@ -639,8 +639,8 @@ def n_required_nodes(phase_span, tolerance, phase_limits):
     tolerance : float
         Error of the sum over lines, relative to the sum of their magnitudes.
     phase_limits : ndarray (tolerances, NODES_MAX + 1)
-        Table of :func:`node_phase_limits`. The row of the largest tolerance up to ``tolerance`` is
-        used, or the first row if there is none.
+        Table of :func:`node_phase_limits`. The row of the largest tolerance up to ``tolerance``
+        is used, or the first row if all tolerances are larger.
 
     Returns
     -------
@@ -658,7 +658,7 @@ def n_required_nodes(phase_span, tolerance, phase_limits):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def replace_lines_by_nodes(lines, n_lines, n_nodes, middle, half_width, scratch, nodes):
-    """Replace lines by equivalent lines at Chebyshev nodes, if these are fewer.
+    """Replace lines by equivalent lines at Chebyshev nodes, if the nodes are fewer than the lines.
 
     Parameters
     ----------

@@ -196,7 +196,7 @@ def line_alarm_probability(
 def line_bin_masks(
     shots: Shots, i: int, line: LineTransforms, *, half_amplitude: float, echo_bins: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bins that a permanent line masks, and those in which it may raise alarms.
+    """Return the bins that a permanent line masks, the searched bins, and those of false alarms.
 
     A masked bin raises no alarm. An echo whose largest bin is masked is not detected.
 
@@ -283,9 +283,9 @@ def echo_magnitude_with_line(
 def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
     """Apply a permanent line to spectra: mask some bins and raise the magnitude of others.
 
-    The line is light other than the echo that is in every record. Probabilities of detection are
-    not set here: :func:`sweep.model.detection.detection_probability.detect_in_spans` computes them
-    from the changed bins.
+    A permanent line is light in every record that does not come from the target. Probabilities of
+    detection are not set here: :func:`sweep.model.detection.detection_probability.detect_in_spans`
+    computes them from the changed bins.
 
     Parameters
     ----------

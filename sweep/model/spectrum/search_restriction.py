@@ -29,10 +29,10 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     """Restrict spans, adjacent bins around the lines, to the bins of the search band.
 
     Bins outside the band neither detect nor raise a false alarm. If the strongest bin of an echo is
-    outside, the echo is not detected, and fewer of its bins are exempt from false alarms. Exempt
-    are then groups of adjacent bins above the threshold that hold a line of the footprint and have
-    their strongest bin in the band. The peak magnitude is that of the strongest bin, in the band or
-    not.
+    outside, the echo is not detected, and fewer of its bins are exempt from false alarms. The
+    exempt bins are groups of adjacent bins above the threshold that hold a line of the footprint
+    and have their strongest bin in the band. The peak magnitude is that of the strongest bin, in
+    the band or not.
 
     Parameters
     ----------
@@ -176,7 +176,8 @@ def axis_line_positions(shots: Any) -> np.ndarray:
 def _fold_to_bins(shots: Any, cycles_per_sample: np.ndarray) -> np.ndarray:
     """Return the positions [FFT bins] of lines from their frequencies [cycles per sample].
 
-    Frequencies alias to within half the sample rate. Those of real records also fold at 0.
+    Frequencies are aliased to within half the sample rate. In real records, negative frequencies
+    are folded at 0.
     """
     positions = (cycles_per_sample - np.floor(cycles_per_sample + 0.5)) * shots.fft_size
     return np.asarray(positions if shots.complex_record else abs(positions))

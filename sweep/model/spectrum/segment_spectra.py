@@ -81,8 +81,8 @@ from sweep.model.spectrum.search_restriction import restrict_to_band
 from sweep.model.window import Window
 
 POINTS_PER_BATCH = 256
-"""Number of points that are processed in one batch. It is 16 times as large if all points share few
-line shapes."""
+"""Number of points that are processed in one batch. Batches are 16 times as large if all points
+share few line shapes."""
 
 SPAN_BINS_PER_BATCH = 1 << 21
 """Least number of bins, over all spans, for which memory is allocated in one step. A span is a
@@ -239,13 +239,12 @@ class EvaluationSettings(NamedTuple):
     segment_exists: np.ndarray
     """(segments,) bool: true if the up, Doppler or down segment exists."""
     leakage_methods: np.ndarray
-    """(segments,): method for the probability of false alarms due to leaked signal. It is
-    NO_LEAKAGE, LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN.
-    """
+    """(segments,): method for the probability of false alarms due to leaked signal: NO_LEAKAGE,
+    LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN."""
     window_sum: float
     """Sum of the window's samples, the peak of its transform."""
     detection_rule: DetectionRule
-    """Rule by which the bins of an echo detect it."""
+    """Rule by which bins of an echo decide whether the echo is detected."""
     node_phase_limits: np.ndarray
     """Table of :func:`sweep.model.spectrum.lines.node_phase_limits` for the record's window. It
     gives the number of equivalent lines that replace all lines.
@@ -745,7 +744,7 @@ def _sort_by_line_shape(
 ) -> LineShapeGroup:
     """Return a :class:`LineShapeGroup` whose points are sorted by line shape.
 
-    Each line shape is then computed only once.
+    Sorting makes points of the same line shape adjacent, so that the shape is computed once.
     """
     order = np.argsort(line_shape_index, kind="stable")
     return LineShapeGroup(points[order], line_shape_index[order], tables, modes)
@@ -887,8 +886,8 @@ def _evaluate_batch(
 def _node_phase_limits_of_group(shots: Shots, group: LineShapeGroup) -> np.ndarray:
     """Return the table that gives the number of equivalent lines for a group of points.
 
-    The table is that of :func:`sweep.model.spectrum.lines.node_phase_limits`. For late echoes it
-    assumes a window whose whole weight is at the record's end.
+    The table is that of :func:`sweep.model.spectrum.lines.node_phase_limits`, for the record's
+    window. For late echoes the table is for a window with all its weight at the record's end.
     """
     if not group.has_late_echoes:
         return shots.window.node_phase_limits(shots.footprint.adds_powers)

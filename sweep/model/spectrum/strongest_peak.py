@@ -280,10 +280,10 @@ def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
 def _joint_probability_increase(exponent_first, exponent_second, squared_correlation):
     """Return the increase of two Rayleigh magnitudes' joint probability due to correlation.
 
-    Each magnitude has to exceed a level of its own. Alone, the first exceeds its level with the
+    Each magnitude has to exceed a level of its own. The first exceeds its level with the
     probability exp(-``exponent_first``), the second with exp(-``exponent_second``). The result is
-    their joint probability minus the product of both. ``squared_correlation`` is the square of the
-    correlation of their complex amplitudes.
+    the probability that both exceed their levels, minus the product of the two probabilities.
+    ``squared_correlation`` is the square of the correlation of the complex amplitudes.
     """
     if squared_correlation <= 0.0 or exponent_first + exponent_second > 700.0:
         return 0.0
