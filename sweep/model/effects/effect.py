@@ -210,8 +210,8 @@ class Effect:
     """False if :func:`sweep.model.time_domain_truth.evaluate_segments_in_time_domain` leaves the
     effect out. Comparisons with that function leave such an effect out as well."""
     required_effects: tuple[str, ...] = ()
-    """Names of effects that are simulated wherever this one is, however small a change they
-    make."""
+    """Names of effects that are simulated wherever this one is, even if their own change is
+    negligible."""
 
     @property
     def is_random(self) -> bool:
