@@ -168,7 +168,7 @@ class LeakageResult(NamedTuple):
     """Upper bound on the probability that leaked signal raises any bin above the threshold,
     including bins that join the echo."""
     is_valid: bool
-    """True if enough bins around the lines are computed; if not, ``leakage`` is invalid."""
+    """True if enough bins around the lines are computed for a valid ``leakage``."""
 
 
 class EnvelopeTail(NamedTuple):
