@@ -27,40 +27,41 @@ class BinGroups(NamedTuple):
     """
 
     strongest_bin: np.ndarray
-    """(n, 3, groups) int64: number of the group's strongest bin. For a real record it is 0..N/2,
-    with N the FFT size; for a complex record numbers are periodic in N."""
+    """(n, 3, groups) int64: number of the group's strongest bin; -1 for no group. With the FFT size
+    N it is 0..N/2 for a real record. Numbers of a complex record are periodic in N."""
     first_bin: np.ndarray
-    """(n, 3, groups) int64: number of the first (lowest) bin of the group."""
+    """(n, 3, groups) int64: number of the first (lowest) bin of the group; -1 for no group."""
     last_bin: np.ndarray
-    """(n, 3, groups) int64: number of the last (highest) bin of the group."""
+    """(n, 3, groups) int64: number of the last (highest) bin of the group; -1 for no group."""
     neighbour_magnitudes: np.ndarray
-    """(n, 3, groups, 3): noiseless |X| [V, summed over the record] of the bin below the group's
-    strongest bin, of that bin, and of the bin above it."""
+    """(n, 3, groups, 3): |X| without noise [V, summed over the record] of three bins: the bin below
+    the group's strongest bin, the strongest bin, and the bin above it."""
     pd: np.ndarray
-    """(n, 3, groups): probability that the group is detected in noise."""
+    """(n, 3, groups): probability, in noise, that the segment detects the group; nan for no group.
+    """
     n_exempt_bins: np.ndarray
-    """(n, 3): number of bins of a segment that belong to echoes, and so cannot raise a false alarm.
+    """(n, 3): number of bins of a segment that belong to echoes. They cannot raise a false alarm.
     """
     leakage_probability: np.ndarray
-    """(n, 3): probability of a false peak raised by leaked signal (echo power far from its line),
-    in addition to false peaks of noise alone."""
+    """(n, 3): probability that leaked signal (echo power far from its line) raises a false peak.
+    False peaks of noise alone are not included."""
     raised_bin_probability_max: np.ndarray
-    """(n, 3): upper bound on the probability that leaked signal raises any bin above the threshold,
-    one that joins an echo included; 1 where it is not computed
-    (:class:`sweep.model.spectrum.segment_spectra.BinSpans`)."""
+    """(n, 3): upper bound on the probability that leaked signal raises any bin above the threshold.
+    Bins that join an echo count. The bound is 1 where it is not computed."""
 
     @property
     def magnitude(self) -> np.ndarray:
-        """Noiseless |X| of each group's strongest bin [V, summed over the record].
+        """Return |X| without noise of each group's strongest bin [V, summed over the record].
 
         The result is (n, 3, groups).
         """
         return self.neighbour_magnitudes[..., 1]
 
     def without_unused_groups(self) -> "BinGroups":
-        """Return the groups without the trailing entries that no point and segment uses.
+        """Return a copy of the record with a shorter axis of groups.
 
-        At least one entry remains.
+        Trailing entries that are -1 (no group) for all points and segments are cut off. At least
+        one entry remains.
         """
         n_groups = max(int((self.strongest_bin >= 0).any(axis=(0, 1)).sum()), 1)
         return self._replace(
@@ -81,17 +82,17 @@ class GroupBinIndices(NamedTuple):
     """Strongest, first and last bins of the groups of one segment, as indices in its span."""
 
     strongest: np.ndarray
-    """(groups,) int64: index of each group's strongest bin."""
+    """(groups,) int64: index of each group's strongest bin in an array of adjacent bins."""
     first: np.ndarray
-    """(groups,) int64: index of the first (lowest) bin of each group."""
+    """(groups,) int64: index of each group's first (lowest) bin in the same array."""
     last: np.ndarray
-    """(groups,) int64: index of the last (highest) bin of each group."""
+    """(groups,) int64: index of each group's last (highest) bin in the same array."""
 
 
 def list_bin_groups(
     shots: Shots, *, groups_max: int = 4, every_bin: bool = False, with_leakage: bool = True
 ) -> BinGroups:
-    """Return the strongest groups of each segment's spectrum without noise.
+    """Return the strongest groups of bins in the noiseless spectra of all points and segments.
 
     A group is a run of adjacent bins at or above the threshold.
 
@@ -115,7 +116,7 @@ def list_bin_groups(
 
 
 def allocate_bin_groups(n_points: int, groups_max: int) -> BinGroups:
-    """Return arrays for the groups of bins of n points, without any group.
+    """Return a :class:`BinGroups` without any group, for n points.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def allocate_bin_groups(n_points: int, groups_max: int) -> BinGroups:
 
 
 def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -> None:
-    """Find groups of adjacent bins above the threshold, and write them into preallocated arrays.
+    """Find groups of adjacent bins above the threshold, and write them into ``bin_groups``.
 
     The search covers spans: ranges of adjacent bins around the lines of each segment.
 
@@ -202,10 +203,11 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
 
 
 def _zero_leakage_of_unsearched_echoes(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``n_bins`` and ``magnitudes`` of spans without the sidelobes of unsearched echoes.
+    """Return the numbers of bins and the magnitudes of spans without unsearched echoes' leakage.
 
-    An echo whose strongest bin is outside the search band is unsearched. Its sidelobes are leaked
-    signal and no groups, so |X| is set to 0 in all bins of its segment outside the echo.
+    A span is a range of adjacent bins of one segment. An echo is unsearched if its strongest bin is
+    outside the search band. Its sidelobes are leaked signal and make no groups, so |X| is set to 0
+    in all bins of its segment outside the echo.
     """
     n_bins, magnitudes = spans.n_bins.copy(), spans.magnitudes.copy()
     for s, j in np.argwhere(~spans.peak_is_searched):
@@ -305,9 +307,10 @@ def _find_and_write_groups(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _magnitude_of_bin_or_mirror(magnitude, first_bin, index, nyquist_bin):
-    """Return |X| of a bin given by its index in a span (adjacent bins from ``first_bin`` on).
+    """Return |X| of a bin, given by its index in a span (adjacent bins from ``first_bin`` on).
 
-    Bins beyond DC or Nyquist are mirrored. Bins outside the span have magnitude 0.
+    A bin beyond frequency 0 or Nyquist has the magnitude of its mirror image. A bin outside the
+    span has the magnitude 0.
     """
     if nyquist_bin > 0:
         bin_ = abs(first_bin + index)
@@ -319,9 +322,9 @@ def _magnitude_of_bin_or_mirror(magnitude, first_bin, index, nyquist_bin):
 def _list_strongest_groups(magnitude, is_echo, peak_index, threshold, bounds):
     """List the strongest groups of adjacent bins at or above the threshold; return their number.
 
-    Groups whose strongest bin is no bin of an echo are leaked signal, and omitted. A group whose
-    strongest bin is the span's largest bin is always listed. If the largest bin is below the
-    threshold, it is listed alone.
+    A group whose strongest bin does not belong to an echo is leaked signal, and is omitted. The
+    group of the span's largest bin is never omitted. If the largest bin is below the threshold, it
+    is the only listed group.
 
     Parameters
     ----------

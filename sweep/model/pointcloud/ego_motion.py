@@ -61,8 +61,9 @@ class MotionPriors(NamedTuple):
     """Prior standard deviations of the slope and motion of surfaces, which no instrument knows."""
 
     terrain_slope: float = 0.2
-    """Standard deviation of the slope (rise over run) of the surface that a beam meets. Slopes are
-    relative to level ground, or to a plane across a beam that does not point down."""
+    """Standard deviation of the slope (rise over run) of the surface that a beam meets. The slope
+    is relative to level ground, for a beam that does not point down relative to a plane across the
+    beam."""
     target_speed: float = 0.0
     """Standard deviation of each component of the velocity [m/s] of the surface that a beam meets.
     """
@@ -79,42 +80,42 @@ class EgoMotion(NamedTuple):
     """
 
     closing_speed: np.ndarray
-    """Component of the instrument's velocity along the beam [m/s]: the speed at which ground at
-    rest approaches."""
+    """(n,): component of the instrument's velocity along the beam [m/s]. It is the speed at which
+    ground at rest approaches."""
     closing_acceleration: np.ndarray
-    """Time derivative of ``closing_speed`` [m/s^2]."""
+    """(n,): time derivative of ``closing_speed`` [m/s^2]."""
     slip_at_range_0: np.ndarray
-    """Slip [m/s] at range 0: closing speed minus the speed at which the range to level ground
-    falls."""
+    """(n,): slip [m/s] at range 0. The slip is the closing speed minus the speed at which the range
+    to level ground falls."""
     slip_per_range: np.ndarray
-    """Derivative of the slip with respect to the range [(m/s)/m]. The slip is the closing speed
-    minus the speed at which the range falls."""
+    """(n,): derivative of the slip with respect to the range [(m/s)/m]. The slip is the closing
+    speed minus the speed at which the range falls."""
     slip_per_slope: np.ndarray
     """(n, 3): derivative of the slip [m/s] with respect to the gradient (rise over run) of the
     surface, at range 0. The slip is the closing speed minus the speed at which the range falls."""
     slip_per_slope_per_range: np.ndarray
-    """(n, 3): growth of the derivative ``slip_per_slope`` with the range [(m/s)/m]. At range R the
-    derivative is ``slip_per_slope`` + R ``slip_per_slope_per_range``."""
+    """(n, 3): derivative of ``slip_per_slope`` with respect to the range [(m/s)/m].
+    ``slip_per_slope`` is the value at range 0."""
     slip_per_target_speed: np.ndarray
-    """Ratio of two standard deviations: that of the slip due to motion of the surface, and that of
-    one component of the surface's velocity. The slip is the closing speed minus the speed at which
-    the range falls."""
+    """(n,): standard deviation of the slip due to motion of the surface, divided by the standard
+    deviation of one component of the surface's velocity. The slip is the closing speed minus the
+    speed at which the range falls."""
     turn_rate: np.ndarray
-    """Angular speed at which the beam's direction turns [rad/s]."""
+    """(n,): angular speed at which the beam's direction turns [rad/s]."""
     priors: MotionPriors
-    """Prior standard deviations of what the instrument does not know: slope and motion of surfaces.
-    """
+    """Standard deviations of what the instrument does not know: slope and motion of surfaces."""
 
     def select(self, beams: np.ndarray) -> EgoMotion:
-        """Return the motion along the beams with the given indices."""
+        """Return the record for the beams with the given indices."""
         return self._replace(
             **{name: getattr(self, name)[beams] for name in self._fields if name != "priors"}
         )
 
     def slip_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the slip [m/s] of each beam at ranges (n, ...) [m], for level ground at rest.
+        """Return the slip [m/s] of n beams at given ranges, for level ground at rest.
 
-        The slip is the closing speed minus the speed at which the range falls.
+        ``distance`` (n, ...) holds ranges [m], and the result has its shape. The slip is the
+        closing speed minus the speed at which the range falls.
         """
         slip, per_range = (
             _align_with_ranges(v, distance) for v in (self.slip_at_range_0, self.slip_per_range)
@@ -122,16 +123,19 @@ class EgoMotion(NamedTuple):
         return np.asarray(slip + per_range * distance)
 
     def approach_speed_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the speed [m/s] at which the range to level ground at rest falls.
+        """Return the speed [m/s] at which the range to level ground at rest falls, for n beams.
 
-        The speed depends on the range: ``distance`` (n, ...) holds ranges [m] of each beam.
+        ``distance`` (n, ...) holds the ranges [m] at which the speed is computed. The result has
+        its shape.
         """
         return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
 
     def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:
-        """Return the standard deviation [m/s] of the slip, by the priors, at ranges (n, ...) [m].
+        """Return the standard deviation [m/s] of the slip at given ranges.
 
-        The slip is the closing speed minus the speed at which the range falls.
+        ``distance`` (n, ...) holds ranges [m] of n beams, and the result has its shape. The slip is
+        the closing speed minus the speed at which the range falls. It is uncertain because slope
+        and motion of the surface are unknown.
 
         Notes
         -----
@@ -158,7 +162,10 @@ class EgoMotion(NamedTuple):
 
     @property
     def acceleration_standard_error(self) -> np.ndarray:
-        """Standard deviation (n,) [m/s^2], by the priors, of the acceleration along each beam."""
+        """Return the standard deviation (n,) of the acceleration along each beam [m/s^2].
+
+        The acceleration is uncertain because the motion of the surface is unknown.
+        """
         return np.hypot(self.priors.target_acceleration, self.priors.target_speed * self.turn_rate)
 
 
@@ -250,7 +257,7 @@ def assumed_motion_along_beams(
 
 
 def _align_with_ranges(values: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Reshape values (n,) so that they broadcast with ranges (n, ...)."""
+    """Reshape values (n,) to (n, 1, ...), with as many axes as the ranges (n, ...)."""
     return values.reshape(-1, *[1] * (np.ndim(distance) - 1))
 
 

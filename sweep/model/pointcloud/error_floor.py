@@ -39,10 +39,11 @@ if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
 ERROR_FLOOR_KEY_DOMAIN = "sweep.error_floor"
-"""Text that is hashed into the random keys of the errors shared by several shots."""
+"""Text that is hashed into the random keys of errors that several shots share, so that these keys
+differ from other keys."""
 
 INSTRUMENT_KEY_NUMBER = -1.0
-"""Number used instead of a beam's number in the random key of the errors common to all beams."""
+"""Number that replaces the number of a beam in the random key of errors common to all beams."""
 
 
 class ErrorFloor(NamedTuple):
@@ -57,20 +58,20 @@ class ErrorFloor(NamedTuple):
     pointing: float = 0.0
     """Standard deviation of the error of a beam's known direction, on each of two axes [rad]."""
     clock: float = 0.0
-    """Standard deviation of the relative error of the sampling clock's frequency."""
+    """Standard deviation of the relative error of the sampling clock's frequency [1]."""
     wavelength: float = 0.0
-    """Standard deviation of the relative error of the known wavelength."""
+    """Standard deviation of the relative error of the known wavelength [1]."""
     vibration: float = 0.0
     """Standard deviation of the instrument's velocity along the beam due to its vibration [m/s].
     """
     range_noise: float = 0.0
-    """Standard deviation of an additional error of each measured range [m]."""
+    """Standard deviation of a random error that is added to each measured range [m]."""
 
     @property
     def velocity_scale_error(self) -> float:
-        """Standard deviation of the relative error common to all velocities of a draw.
+        """Standard deviation of the relative error common to all radial velocities of a draw.
 
-        The standard deviation combines the errors of clock and wavelength.
+        It is the root of ``clock`` squared plus ``wavelength`` squared.
         """
         return float(np.hypot(self.clock, self.wavelength))
 
@@ -105,7 +106,8 @@ class ErrorFloor(NamedTuple):
 
 
 NO_ERROR_FLOOR = ErrorFloor()
-"""Standard deviations, all 0, of an instrument whose errors all depend on the echo."""
+""":class:`ErrorFloor` with all standard deviations 0: all errors of the instrument depend on the
+echo."""
 
 
 def apply_error_floor(
@@ -201,8 +203,8 @@ def _draw_normal_numbers_by_beam(
 ) -> np.ndarray:
     """Draw two standard normal random numbers for each beam and draw, (beams, draws, 2).
 
-    They are errors in standard deviations: of a beam's pointing on two axes, or, with the number
-    INSTRUMENT_KEY_NUMBER in place of a beam's, of clock and wavelength.
+    A beam's two numbers are the errors of its pointing about two axes, in standard deviations. The
+    numbers for INSTRUMENT_KEY_NUMBER in place of a beam are the errors of clock and wavelength.
     """
     keys = np.repeat(
         point_keys(beam_numbers[:, None], domain=ERROR_FLOOR_KEY_DOMAIN, seed=seed),
@@ -223,9 +225,8 @@ def _scalar_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors perpendicular to each direction and to each other.
 
-    ``direction`` holds unit vectors (n, 3).
-
-    The result is a pair of arrays (n, 3). Both vary continuously with the direction.
+    ``direction`` holds unit vectors (n, 3). The result is a pair of arrays (n, 3). Both vary
+    continuously with the direction.
 
     References
     ----------

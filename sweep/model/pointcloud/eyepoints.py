@@ -41,8 +41,8 @@ at range 0, with an infinite echo.
 """
 
 _GRAZING_SINE_MIN = 0.01
-"""Smallest sine of the angle between a ray and the surface that it hits. It replaces smaller sines
-in the speed at which the range falls."""
+"""Smallest sine of the angle between a ray and the surface that it hits. A smaller sine is replaced
+by it where the speed at which the range falls is computed."""
 
 
 class Eyepoints(NamedTuple):
@@ -55,7 +55,7 @@ class Eyepoints(NamedTuple):
     time: np.ndarray
     """(n,): time at which the measurement of the shot begins [s]."""
     beam: np.ndarray
-    """(n,) int64: number of the scanner's beam that fires the shot."""
+    """(n,) int64: number of the beam of the scanner in which the shot is fired."""
     cycle: np.ndarray
     """(n,) int64: number of the measurement cycle to which the shot belongs."""
     position: np.ndarray
@@ -63,10 +63,11 @@ class Eyepoints(NamedTuple):
     velocity: np.ndarray
     """(n, 3): velocity of the instrument [m/s]."""
     direction: np.ndarray
-    """(n, 3): unit vector along the beam's axis, as commanded, in the world's frame."""
+    """(n, 3): unit vector along the beam's axis in the world's frame, as commanded (without
+    jitter)."""
     range: np.ndarray
-    """(n,): range of the reference beamlet, the first that hits a surface [m]; inf for a shot that
-    hits nothing."""
+    """(n,): range of the reference beamlet [m]: the first beamlet that hits a surface. It is inf
+    for a shot that hits nothing."""
     offset: np.ndarray
     """(n, b): range of each beamlet minus the range of the reference beamlet [m]; nan for a beamlet
     that misses."""
@@ -80,10 +81,10 @@ class Eyepoints(NamedTuple):
     """(n,): speed at which the reference beamlet's range falls [m/s]; nan for a shot that hits
     nothing."""
     turn_rate: np.ndarray
-    """(n,): angular speed at which scanner and platform turn the direction of the reference beamlet
-    [rad/s]."""
+    """(n,): angular speed at which scanner and platform together turn the direction of the
+    reference beamlet [rad/s]."""
     direction_rate: np.ndarray
-    """(n, 3): time derivative of the commanded ``direction`` [1/s]."""
+    """(n, 3): time derivative of the commanded ``direction`` of the beam [1/s]."""
     platform_acceleration: np.ndarray
     """(n, 3): acceleration of the instrument in the world's frame [m/s^2]."""
     velocity_offset: np.ndarray
@@ -104,7 +105,7 @@ class Eyepoints(NamedTuple):
 
     @property
     def reference_beamlet(self) -> np.ndarray:
-        """Index of the reference beamlet, the first that hits a surface, (n,)."""
+        """Index (n,) of each shot's reference beamlet: the first that hits a surface."""
         return np.asarray((self.surface >= 0).argmax(axis=1))
 
     @property
@@ -113,7 +114,10 @@ class Eyepoints(NamedTuple):
         return _scalar_products(self.velocity, self.direction)
 
     def select(self, selection: slice | np.ndarray) -> "Eyepoints":
-        """Return selected shots, by slice, indices or mask, without a copy of consecutive shots."""
+        """Return the record for shots selected by a slice, indices or a mask.
+
+        A slice is not copied.
+        """
         indices = np.arange(len(self.time))[selection]
         if indices.size and (np.diff(indices) == 1).all():
             selection = slice(indices[0], indices[-1] + 1)
@@ -243,9 +247,9 @@ def _require_finite(
     bundle: BundleHits,
     velocity: np.ndarray,
 ) -> None:
-    """Raise UnsupportedShotError if a shot's geometry is not finite.
+    """Raise UnsupportedShotError if the geometry of any shot is not finite.
 
-    Later loops over bins would not end for such a shot.
+    Loops over bins would not end for that shot.
     """
     is_hit = bundle.is_hit
     for label, is_wrong in (
@@ -273,7 +277,7 @@ def _radial_velocities(
     body_states: Sequence[BodyState | None],
     bodies_rotate: bool,
 ) -> np.ndarray:
-    """Compute the radial velocities of beamlets [m/s], (n, b); nan for a beamlet that misses.
+    """Compute the radial velocities of beamlets, (n, b) [m/s]; nan for a beamlet that misses.
 
     Parameters
     ----------
@@ -332,6 +336,8 @@ def _reference_beamlet_motion(
     bodies_rotate: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute acceleration, approach speed and turn rate along the reference beamlets of n shots.
+
+    The reference beamlet of a shot is the first that hits a surface.
 
     Parameters
     ----------

@@ -58,92 +58,96 @@ from sweep.model.spectrum.permanent_line import N_PHASES, line_bin_masks, line_o
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 N_TABLE_AMPLITUDES = 2048
-"""Number of signal amplitudes at which the rate -ln(1 - c) is tabulated. c is the probability that
-signal lifts a bin above the threshold."""
+"""Number of signal amplitudes at which the crossing rate is tabulated. The rate of a bin is -ln(1 -
+c), with c the probability that signal lifts the bin above the threshold."""
 
 CERTAIN_CROSSING_MARGIN_SIGMA = 12.0
-"""Amplitude above the threshold, in standard deviations of the noise, from which signal is taken to
-raise a bin above the threshold with certainty."""
+"""Amplitude minus threshold, in standard deviations of the noise per quadrature, from which signal
+counts as certain to lift a bin above the threshold."""
 
 TABLE_AMPLITUDE_MIN_SIGMA = 1e-2
-"""Lowest signal amplitude, in standard deviations of the noise, at which rates -ln(1 - c) are
-tabulated. c is the probability that signal lifts a bin above the threshold. At lower amplitudes the
-rate is proportional to the amplitude squared."""
+"""Lowest signal amplitude, in standard deviations of the noise per quadrature, at which the
+crossing rate is tabulated. The rate of a bin is -ln(1 - c), with c the probability that signal
+lifts the bin above the threshold. At lower amplitudes the rate is proportional to the amplitude
+squared."""
 
 LEAKAGE_PROBABILITY_MIN = 1e-9
-"""Smallest probability of a false peak by leaked signal in a segment for which such peaks are
-drawn."""
+"""Probability per segment of a false peak by leaked signal, up to which no false peaks by leaked
+signal are drawn."""
 
 RAISED_BIN_RATE_MARGIN = 1.01
-"""Factor on the sum of the rates of all bins, as an integral over far bins gives it, to bound the
-sum over listed bins. The integral is accurate to 1e-3."""
+"""Factor on a sum of crossing rates that makes it an upper bound. The sum replaces far bins by an
+integral, which is accurate to 1e-3, and the bound holds for the sum over listed bins."""
 
 PERMANENT_LINE_FIRST_RANDOM_INDEX = np.int64(1 << 24)
-"""Index of the first random number used for the line of leaked light. Lower indices of the same
-stream are used for signal leaked from echoes."""
+"""Index, in the stream of leaked signal, of the first random number used for the line of light
+leaked in the circulator. Lower indices are used for signal leaked from echoes."""
 
 ECHO_EDGE_FIRST_RANDOM_INDEX = 1 << 25
 """Index of the first random number used for the noise of an echo's outermost bins, which are next
 to bins of leaked signal."""
 
 PERMANENT_LINE_BATCH_POINTS = 4
-"""Number of points that are processed together if leaked light has a line. It limits memory to some
-1e8 numbers."""
+"""Number of points that are processed together if light leaked in the circulator has a line. The
+number limits memory to some 1e8 numbers."""
 
 BISECTION_STEPS = 40
-"""Number of bisection steps by which the magnitude of a false peak is computed, to a relative error
-of 1e-11."""
+"""Number of bisection steps that compute the magnitude of a false peak, to a relative error of
+1e-11."""
 
 LOG_SPECKLE_POWER_MIN, LOG_SPECKLE_POWER_MAX = -10.0, 3.5
 """Limits of the integral over speckle, in ln(speckle power). The mean speckle power is 1."""
 
 FAINT_LEAKAGE_LOG_SPECKLE_POWER_MIN = -5.0
-"""Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal. The part
-below this limit is extrapolated. Signal is faint if its sum of rates is at most
-FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX."""
+"""Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal. The
+integral below this limit is extrapolated. Signal is faint if the sum of its crossing rates is at
+most FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX."""
 FAINT_LEAKAGE_CROSSING_RATE_SUM_MAX = 0.1
-"""Largest sum of rates -ln(1 - c) over the bins of a segment for which leaked signal counts as
-faint. The integral over speckle then begins at FAINT_LEAKAGE_LOG_SPECKLE_POWER_MIN. c is the
-probability, at mean speckle power, that leaked signal lifts a bin above the threshold."""
+"""Largest sum of the crossing rates of a segment's bins for which leaked signal counts as faint.
+The rate of a bin is -ln(1 - c), with c the probability, at mean speckle power, that leaked signal
+lifts the bin above the threshold. For faint signal the integral over speckle begins at
+FAINT_LEAKAGE_LOG_SPECKLE_POWER_MIN."""
 
 LOG_SPECKLE_POWER_STEP_MAX = 0.25
-"""Largest step in ln(speckle power) of the integral over speckle. The relative error of the mean is
-then 1e-8."""
+"""Largest step in ln(speckle power) of the integral over speckle. With this step the mean over
+speckle has a relative error of 1e-8."""
 
 JOINING_CROSSING_RATE_MIN = 1e-2
-"""Smallest rate -ln(1 - c) of a bin, in bright speckle, at which the next bin may still join an
-echo. c is the probability that leaked signal lifts the bin above the threshold. At lower rates the
-run of bins that may join the echo ends."""
+"""Smallest crossing rate of a bin, in bright speckle, at which the next bin may still join an echo.
+The rate is -ln(1 - c), with c the probability that leaked signal lifts the bin above the threshold.
+The run of bins that may join the echo ends at the first bin of a lower rate."""
 BRIGHT_SPECKLE_LOG_AMPLITUDE = math.log(4.0)
-"""ln of the factor by which bright speckle raises the signal amplitude, where rates are compared
-with JOINING_CROSSING_RATE_MIN."""
+"""ln of the factor on the signal amplitude that stands for bright speckle, in the comparison of
+crossing rates with JOINING_CROSSING_RATE_MIN."""
 
 FAINT_LEAKAGE_PROBABILITY_MAX = 1e-5
-"""Largest probability of a false peak by leaked signal for which the means over speckle of the
-bins' probabilities are simply added.
+"""Largest probability, per segment, of a false peak by leaked signal for which the crossing
+probabilities of bins, averaged over speckle, are simply added.
 
-Bins as faint as that hardly ever cross the threshold together, or together with an adjacent echo.
+Bins with such faint signal hardly ever cross the threshold together with each other or with an
+adjacent echo.
 """
 
 MEAN_CROSSING_TABLE_STRIDE = 8
-"""Number of table steps between signal amplitudes at which the mean over speckle of a bin's
-crossing probability is integrated. Amplitudes between them are interpolated."""
+"""Number of table steps between signal amplitudes at which a bin's crossing probability is averaged
+over speckle. The average at amplitudes between them is interpolated."""
 
 N_BOUND_SPECKLE_POWERS = 5
-"""Number of speckle powers 1, 2, 4 .. (mean 1) at which upper bounds of the sum of a segment's
-rates -ln(1 - c) are stored. c is the probability that signal lifts a bin above the threshold."""
+"""Number of speckle powers (1, 2, 4 .. times the mean) at which upper bounds of the sum of a
+segment's crossing rates are stored. The rate of a bin is -ln(1 - c), with c the probability that
+signal lifts the bin above the threshold."""
 
 ECHO_EDGE_LOG_SPECKLE_POWER_STEP = 0.75
-"""Step in ln(speckle power) between values at which the probability that an echo's outermost bin
-crosses the threshold is computed. It is interpolated between them."""
+"""Step in ln(speckle power) of the table of the probability that an echo's outermost bin crosses
+the threshold."""
 ECHO_EDGE_LOG_SPECKLE_POWER_DEPTH = 3.0
-"""Largest -ln(speckle power) at which the probability that an echo's outermost bin crosses the
-threshold is computed. At lower powers the value at this power is used."""
+"""Largest -ln(speckle power) in the table of the probability that an echo's outermost bin crosses
+the threshold. At lower powers the probability at this power is used."""
 
 LOG_CROSSING_RATE_STEP_MAX = 0.5
-"""Largest difference of ln(rate) between successive nodes of the integral over speckle. With a
-larger one the mean errs by more than 1e-7. The rate is -ln(1 - c), with c the probability that
-signal lifts a bin above the threshold."""
+"""Largest difference of ln(crossing rate) between successive nodes of the integral over speckle. A
+larger difference would give the mean over speckle an error above 1e-7. The rate of a bin is -ln(1 -
+c), with c the probability that signal lifts the bin above the threshold."""
 
 
 class LeakageBins(NamedTuple):
@@ -156,77 +160,83 @@ class LeakageBins(NamedTuple):
     """
 
     bins_begin: np.ndarray
-    """(m, 3) int64: index of each segment's first bin in the arrays from ``bins`` to
+    """(m, 3) int64: index of each segment's first bin in the arrays (bins,): ``bins``,
+    ``log_amplitude``, ``fading_group``, ``exempt_neighbour_magnitude_ratio`` and
     ``side_of_adjacent_echo_bin``."""
     bins_end: np.ndarray
-    """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1."""
+    """(m, 3) int64: index of each segment's last bin, plus 1, in the arrays (bins,) that
+    ``bins_begin`` names."""
     bins: np.ndarray
-    """(bins,) int64: numbers of the bins with signal leaked from an echo, as
-    ``BinGroups.strongest_bin`` numbers bins."""
+    """(bins,) int64: numbers of the bins that hold signal leaked from an echo."""
     log_amplitude: np.ndarray
-    """(bins,): ln of the leaked signal |X| over the noise sigma of a bin per quadrature."""
+    """(bins,): ln(|X| / sigma) of the leaked signal. sigma is the noise of a bin per quadrature."""
     fading_group: np.ndarray
-    """(bins,) int64: index of the echo (group of bins) whose speckle makes the bin fade."""
+    """(bins,) int64: index of the echo (group of adjacent bins) with whose speckle the bin fades.
+    """
     exempt_neighbour_magnitude_ratio: np.ndarray
-    """(bins,): |X| / sigma of the adjacent bin that belongs to an echo, and so cannot raise a false
-    alarm; 0 if no adjacent bin does."""
+    """(bins,): |X| / sigma of the adjacent bin, if it belongs to an echo and so cannot raise a
+    false alarm; 0 if neither adjacent bin does. sigma is the noise of a bin per quadrature."""
     side_of_adjacent_echo_bin: np.ndarray
-    """(bins,) int64: 1 if the adjacent bin of the echo is above the bin, -1 if it is below."""
+    """(bins,) int64: 1 if the next higher bin belongs to an echo, -1 if the next lower bin does;
+    without meaning if neither does."""
     crossing_rate_sum_bound_at_mean: np.ndarray
-    """(m, 3): upper bound on the sum of rates -ln(1 - c) of a segment's bins at mean speckle power.
-    c is the probability that a bin crosses the threshold."""
+    """(m, 3): upper bound, at mean speckle power, on the sum of the crossing rates of a segment's
+    bins. The rate of a bin is -ln(1 - c), with c the probability that signal lifts the bin above
+    the threshold."""
     crossing_rate_sum_bounds: np.ndarray
-    """(m, 3, N_BOUND_SPECKLE_POWERS): upper bounds on the sum of rates -ln(1 - c) of a segment's
-    bins. c is the probability that a bin crosses the threshold. Bounds are for speckle powers of 1,
-    2, 4 .. times the mean."""
+    """(m, 3, N_BOUND_SPECKLE_POWERS): upper bounds on the sum of the crossing rates of a segment's
+    bins, at speckle powers of 1, 2, 4 .. times the mean. The rate of a bin is -ln(1 - c), with c
+    the probability that signal lifts the bin above the threshold."""
     mean_crossing_probability_sum: np.ndarray
-    """(m, 3): sum over a segment's bins of the probability, averaged over speckle, that leaked
-    signal lifts the bin above the threshold; nan if not computed."""
+    """(m, 3): sum, over a segment's bins, of the probability that leaked signal lifts the bin above
+    the threshold. Each probability is a mean over speckle. The sum is nan if not computed."""
     permanent_line_begin: np.ndarray
     """(m, 3) int64: index of each segment's first bin in ``permanent_line_bins`` and
     ``permanent_line_log_amplitude``."""
     permanent_line_end: np.ndarray
-    """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1."""
+    """(m, 3) int64: index of each segment's last bin, plus 1, in ``permanent_line_bins`` and
+    ``permanent_line_log_amplitude``."""
     permanent_line_bins: np.ndarray
     """(line bins,) int64: numbers of the bins that the line of light leaked in the circulator may
     lift above the threshold."""
     permanent_line_log_amplitude: np.ndarray
-    """(N_PHASES, line bins): ln(|X| / sigma) by the line of leaked light, at each of its phases.
-    sigma is the noise of a bin per quadrature."""
+    """(N_PHASES, line bins): ln(|X| / sigma) of the line of light leaked in the circulator, at each
+    of N_PHASES phases of the line. sigma is the noise of a bin per quadrature."""
     permanent_line_crossing_rate_sum: np.ndarray
-    """(m, 3): sum over ``permanent_line_bins`` of the rates -ln(1 - c), with c the probability that
-    the line of leaked light lifts a bin above the threshold. It is the largest sum of all phases of
-    the line."""
+    """(m, 3): sum of the crossing rates of ``permanent_line_bins``, at the phase of the line with
+    the largest sum. The rate of a bin is -ln(1 - c), with c the probability that the line of leaked
+    light lifts the bin above the threshold."""
     no_noise_peak_begin: np.ndarray
     """(m, 3) int64: index of each segment's first bin in ``no_noise_peak_bins``."""
     no_noise_peak_end: np.ndarray
     """(m, 3) int64: index of each segment's last bin in ``no_noise_peak_bins``, plus 1."""
     no_noise_peak_bins: np.ndarray
-    """(excluded,) int64: numbers of the bins in which no false peak of noise alone is drawn."""
+    """(excluded,) int64: numbers of the bins in which no false peak is drawn for noise alone."""
     threshold_index: np.ndarray
-    """(m,) int64: index of each point's threshold in ``log_crossing_rates`` and the other arrays
-    by threshold."""
+    """(m,) int64: index of each point's threshold in the arrays (thresholds, ...), such as
+    ``log_crossing_rates``."""
     log_crossing_rates: np.ndarray
-    """(thresholds, N_TABLE_AMPLITUDES): ln of the rate -ln(1 - c) at evenly spaced ln(|X| / sigma),
-    for each threshold. c is the probability that signal lifts a bin above the threshold."""
+    """(thresholds, N_TABLE_AMPLITUDES): ln of the crossing rate at evenly spaced ln(|X| / sigma),
+    for each threshold. The rate is -ln(1 - c), with c the probability that signal of |X| lifts a
+    bin above the threshold. sigma is the noise of a bin per quadrature."""
     first_log_amplitude: np.ndarray
     """(thresholds,): smallest ln(|X| / sigma) at which ``log_crossing_rates`` is tabulated."""
     log_amplitude_step: np.ndarray
     """(thresholds,): difference of successive ln(|X| / sigma) at which ``log_crossing_rates`` is
     tabulated."""
     threshold_ratio: np.ndarray
-    """(thresholds,): threshold [sigma] for one record that is equivalent to the combination of all
-    looks (records of a segment)."""
+    """(thresholds,): threshold over sigma, the noise of a bin per quadrature. If looks (records of
+    a segment) are combined, it is the equivalent threshold for a single record."""
     amplitude_gain_max: float
-    """Factor from |X| / sigma in one look (record) to |X| / sigma in the single record that is
-    equivalent to all looks."""
+    """Largest factor from |X| / sigma in one look (record of a segment) to |X| / sigma in the
+    single record that is equivalent to all looks; 1 for one look."""
     sidelobe_neighbour_noise_correlation: float
     """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
     the signal."""
 
     @classmethod
     def empty(cls, n_points: int) -> "LeakageBins":
-        """Return a record without bins of leaked signal, for ``n_points`` points."""
+        """Return a record of ``n_points`` points without bins of leaked signal."""
         no_indices, no_bins, sum_shape = (
             np.zeros((n_points, 3), np.int64),
             np.empty(0, np.int64),
@@ -261,7 +271,7 @@ class LeakageBins(NamedTuple):
         )
 
     def select_points(self, points: np.ndarray) -> "LeakageBins":
-        """Return the record for selected points, by indices or a mask.
+        """Return the record for points selected by indices or a mask.
 
         Arrays of bins are shared with this record, not copied.
         """
@@ -283,7 +293,8 @@ class LeakageBins(NamedTuple):
     def mean_leakage_probability(self) -> np.ndarray:
         """Return the probability of a false peak by leaked signal in each segment, (m, 3).
 
-        It is the mean over speckle and over the phase of the line of leaked light.
+        The probability is a mean over speckle, and over the phase of the line of light leaked in
+        the circulator.
         """
         leakage = np.empty(self.crossing_rate_sum_bound_at_mean.shape)
         _mean_segment_leakage(self, leakage)
@@ -296,15 +307,15 @@ class _LeakedBinLocations(NamedTuple):
     bin_number: np.ndarray
     """(bins,) int64: number of the bin."""
     batch_index: np.ndarray
-    """(bins,) int64: index of the point in the batch."""
+    """(bins,) int64: index, in the batch, of the point to which the bin belongs."""
     segment: np.ndarray
-    """(bins,) int64: 0 up, 1 Doppler, 2 down."""
+    """(bins,) int64: segment of the bin: 0 up, 1 Doppler, 2 down."""
 
 
 def find_leaking_points(groups: BinGroups) -> np.ndarray:
     """Return indices of points with a notable probability of a false peak by leaked signal.
 
-    The probability exceeds LEAKAGE_PROBABILITY_MIN in at least one segment.
+    The probability exceeds LEAKAGE_PROBABILITY_MIN in at least one segment of these points.
 
     Parameters
     ----------
@@ -325,10 +336,10 @@ def find_leaking_points(groups: BinGroups) -> np.ndarray:
 def find_segments_with_raised_bins(
     groups: BinGroups, points: np.ndarray, keys: np.ndarray, first_draw: int, draws: int
 ) -> np.ndarray:
-    """Return in which segments leaked signal may raise a bin in at least one draw, (n, 3) bool.
+    """Return a mask (n, 3), True for segments in which leaked signal may raise a bin in any draw.
 
-    In all other segments the first random number of :func:`draw_leaked_peaks` exceeds the sum of
-    the bins' rates in every draw, so that their bins need not be listed.
+    In the other segments the first random number of :func:`draw_leaked_peaks` exceeds the sum of
+    the bins' crossing rates in every draw, so no bin needs to be listed.
 
     Parameters
     ----------
@@ -386,9 +397,10 @@ def _mark_segments_with_raised_bins(keys, rate_sum_max, first_draw, n_draws, has
 def fading_group_of_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> np.ndarray:
-    """Return the group (echo) whose speckle makes each bin of leaked signal fade.
+    """Return the group (echo) with whose speckle each bin of leaked signal fades.
 
-    It is the group whose strongest bin is nearest. Bins of a complex record are periodic.
+    It is the group whose strongest bin is nearest to the bin. Bins of a complex record are
+    periodic.
 
     Parameters
     ----------
@@ -417,9 +429,9 @@ def fading_group_of_bins(
 def bins_without_noise_peaks(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> LeakageBins:
-    """List the bins of leaked signal as bins in which noise alone raises no false peak.
+    """Return the bins of leaked signal as bins in which noise alone raises no false peak.
 
-    Their noise is drawn together with the signal instead.
+    The noise of these bins is drawn together with their signal instead.
 
     Parameters
     ----------
@@ -535,9 +547,9 @@ def find_groups_and_leakage_bins(
 def _iter_leaking_spans(
     shots: Shots, point_indices: np.ndarray, has_raised_bin: np.ndarray | None = None
 ) -> Iterator[BinSpans]:
-    """Yield adjacent bins (spans) of points, down to a negligible magnitude of leaked signal.
+    """Yield the spans (adjacent bins) of points in which leaked signal is not negligible.
 
-    In segments that are not marked in ``has_raised_bin`` (n, 3) they end at the threshold.
+    In segments that ``has_raised_bin`` (n, 3) does not mark, spans end at the threshold.
     """
     magnitude_min = np.minimum(
         shots.threshold, _leaking_signal_ratio_min(shots) * shots.bin_noise_sigma
@@ -550,9 +562,10 @@ def _iter_leaking_spans(
 
 
 def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
-    """Return the |X| / sigma, (n,), from which a bin's leaked signal may raise a false peak.
+    """Return the smallest |X| / sigma, (n,), at which leaked signal may raise a false peak.
 
-    It is infinite if the settings omit leaked signal.
+    sigma is the noise of a bin per quadrature. The result is infinite if the settings omit leaked
+    signal.
     """
     return np.broadcast_to(
         shots.negligible_signal_ratio if shots.detection_settings.includes_leakage else np.inf,
@@ -561,7 +574,7 @@ def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
 
 
 def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> LeakageBins:
-    """List the bins of leaked signal in spans (adjacent bins), with tables of rates."""
+    """Return the :class:`LeakageBins` in spans (adjacent bins), with their crossing rates."""
     first_bin, n_bins, peak_index, span_start = (
         np.ascontiguousarray(array)
         for array in (spans.first_bin, spans.n_bins, spans.peak_index, spans.span_start)
@@ -692,10 +705,10 @@ def _fill_leakage_bins(
 def _add_crossing_rate_tables(
     shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins
 ) -> LeakageBins:
-    """Add the tables and sums of rates -ln(1 - c) to a list of bins of leaked signal.
+    """Return :class:`LeakageBins` with the tables and sums of crossing rates included.
 
-    c is the probability that signal lifts a bin above the threshold. ``batch`` holds the indices of
-    the points of ``leakage_bins``.
+    The rate of a bin is -ln(1 - c), with c the probability that signal lifts the bin above the
+    threshold. ``batch`` holds the indices of the points of ``leakage_bins``.
     """
     point_threshold_ratio = np.broadcast_to(shots.threshold / shots.bin_noise_sigma, shots.size)[
         batch
@@ -731,7 +744,9 @@ class CrossingRateTable(NamedTuple):
     """
 
     log_crossing_rates: np.ndarray
-    """(N_TABLE_AMPLITUDES,): ln of the rate at evenly spaced ln(|X| / sigma) of the signal."""
+    """(N_TABLE_AMPLITUDES,): ln of the crossing rate at evenly spaced ln(|X| / sigma). The rate is
+    -ln(1 - c), with c the probability that signal of |X| lifts a bin above the threshold. sigma is
+    the noise of a bin per quadrature."""
     first_log_amplitude: float
     """Smallest ln(|X| / sigma) in the table."""
     log_amplitude_step: float
@@ -746,25 +761,27 @@ class CrossingTables(NamedTuple):
     """
 
     log_crossing_rates: np.ndarray
-    """(N_TABLE_AMPLITUDES,): ln of the rate -ln(1 - c), with c the probability that signal lifts a
-    bin above the threshold."""
+    """(N_TABLE_AMPLITUDES,): ln of the crossing rate -ln(1 - c) at evenly spaced ln(|X| / sigma). c
+    is the probability that signal of |X| lifts a bin above the threshold."""
     first_log_amplitude: float
     """Smallest ln(|X| / sigma) in the tables."""
     log_amplitude_step: float
     """Difference of successive ln(|X| / sigma) in the tables."""
     linear_rates: np.ndarray
-    """(N_TABLE_AMPLITUDES,): rate -ln(1 - c), with c the probability that signal lifts a bin above
-    the threshold."""
+    """(N_TABLE_AMPLITUDES,): crossing rate -ln(1 - c) at evenly spaced ln(|X| / sigma). c is the
+    probability that signal of |X| lifts a bin above the threshold."""
     mean_probabilities: np.ndarray
     """(N_TABLE_AMPLITUDES,): probability, averaged over speckle, that signal lifts a bin above the
-    threshold, by ln(|X| / sigma) at mean speckle power. Without speckle it has no elements."""
+    threshold, at evenly spaced ln(|X| / sigma). |X| is that at mean speckle power. Without speckle
+    the array is empty."""
 
 
 @lru_cache(maxsize=64)
 def _make_crossing_tables(looks: Looks, threshold_ratio: float, in_speckle: bool) -> CrossingTables:
     """Return :class:`CrossingTables` for a threshold [sigma].
 
-    ``in_speckle`` is True to include the probabilities averaged over speckle.
+    sigma is the noise of a bin per quadrature. ``in_speckle`` is True to include the probabilities
+    averaged over speckle.
     """
     rate_table = _tabulate_log_crossing_rates(looks, threshold_ratio)
     mean_probabilities = np.empty(0)
@@ -791,7 +808,7 @@ def _make_crossing_tables(looks: Looks, threshold_ratio: float, in_speckle: bool
 def _fill_mean_probabilities(rate_table, mean_probabilities):
     """Compute the probability, averaged over speckle, that signal lifts a bin above the threshold.
 
-    The signal amplitudes are every MEAN_CROSSING_TABLE_STRIDE-th of ``rate_table``, a
+    It is computed at every MEAN_CROSSING_TABLE_STRIDE-th signal amplitude of ``rate_table``, a
     :class:`CrossingRateTable`.
     """
     quadrature = _make_speckle_quadrature(rate_table)
@@ -809,7 +826,7 @@ def _fill_mean_probabilities(rate_table, mean_probabilities):
 
 
 def _locate_leaked_bins(spectra: NoiselessSpectra) -> _LeakedBinLocations:
-    """Return number, point and segment of each bin of leaked signal."""
+    """Return number, point and segment of each bin of leaked signal in noiseless spectra."""
     n_bins = (spectra.leaked_end - spectra.leaked_begin).ravel()
     span = np.repeat(np.arange(n_bins.size), n_bins)
     return _LeakedBinLocations(
@@ -822,9 +839,9 @@ def _remove_bins_masked_by_leaked_light(
 ) -> tuple[NoiselessSpectra, np.ndarray, LeakageBins]:
     """Remove bins that a line of leaked light masks, and list the bins that the line raises.
 
-    ``group`` is the result of :func:`fading_group_of_bins`. The results are the spectra and the
-    groups of the remaining bins, and :class:`LeakageBins` with the fields ``permanent_line_*`` and
-    ``no_noise_peak_*`` alone.
+    ``group`` is the result of :func:`fading_group_of_bins`. Three results are returned: the spectra
+    without the masked bins, the groups of the remaining bins, and a :class:`LeakageBins` with only
+    the fields ``permanent_line_*`` and ``no_noise_peak_*`` filled.
     """
     is_kept = np.ones(spectra.leaked_index.size, bool)
     n_kept, n_raised, n_masked = np.zeros((3, batch.size, 3), np.int64)
@@ -886,19 +903,19 @@ def _remove_bins_masked_by_leaked_light(
 
 
 def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct thresholds [sigma], and the index of each point's threshold.
+    """Return the distinct thresholds [sigma], and the index in them of each point's threshold.
 
-    Thresholds within 1e-7 of each other, as in a flight, share one table of rates.
+    Thresholds within 1e-7 of each other, as in a flight, count as equal.
     """
     distinct_ratios, threshold_index = np.unique(np.round(threshold_ratio, 7), return_inverse=True)
     return distinct_ratios, threshold_index.ravel().astype(np.int64)
 
 
 def _tabulate_log_crossing_rates(looks: Looks, threshold_ratio: float) -> CrossingRateTable:
-    """Tabulate the logarithm of the crossing rate of a bin by the amplitude of its signal.
+    """Return a :class:`CrossingRateTable`: ln of the crossing rate by signal amplitude.
 
-    The rate is -ln(1 - c), where signal adds c to the probability that the bin crosses the
-    threshold [sigma]. If looks are summed noncoherently, c is that of their sum.
+    The rate is -ln(1 - c), where signal adds c to the probability that a bin crosses the threshold
+    [sigma]. If powers of looks are summed, c is the probability that the sum crosses.
     """
     log_crossing_rates = np.empty(N_TABLE_AMPLITUDES)
     first_log_amplitude, log_amplitude_step = _fill_log_crossing_rates(
@@ -917,10 +934,10 @@ def _tabulate_log_crossing_rates(looks: Looks, threshold_ratio: float) -> Crossi
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_log_crossing_rates(threshold_ratio, log_crossing_rates):
-    """Fill the table ``log_crossing_rates`` (N_TABLE_AMPLITUDES,) for one record of each segment.
+    """Fill a table of ln(crossing rate) for one record; return its first ln(|X| / sigma) and step.
 
-    ``threshold_ratio`` is the threshold [sigma]. The smallest ln(|X| / sigma) of the table and the
-    step are returned.
+    ``log_crossing_rates`` (N_TABLE_AMPLITUDES,) is the table, and ``threshold_ratio`` the threshold
+    over sigma, the noise of a bin per quadrature.
     """
     first_log_amplitude = math.log(TABLE_AMPLITUDE_MIN_SIGMA)
     log_amplitude_step = (
@@ -941,10 +958,11 @@ def _fill_log_crossing_rates(threshold_ratio, log_crossing_rates):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _crossing_rate(log_amplitude, rate_table):
-    """Return the rate -ln(1 - c) of a bin by interpolation, with c its probability of crossing.
+    """Interpolate the crossing rate of a bin in a table.
 
-    ``log_amplitude`` is ln(|X| / sigma), and ``rate_table`` a :class:`CrossingRateTable`. Below the
-    table the rate is proportional to the amplitude squared.
+    The rate is -ln(1 - c), with c the probability that signal lifts the bin above the threshold.
+    ``log_amplitude`` is ln(|X| / sigma), and ``rate_table`` a :class:`CrossingRateTable`. At
+    amplitudes below the table the rate is proportional to the amplitude squared.
     """
     log_crossing_rates = rate_table.log_crossing_rates
     table_position = (
@@ -965,13 +983,12 @@ def _crossing_rate(log_amplitude, rate_table):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
-    """Compute the fields of ``leakage_bins`` that are sums of rates -ln(1 - c), in place.
+    """Fill the fields of ``leakage_bins`` that are sums of crossing rates, in place.
 
-    c is the probability that signal lifts a bin above the threshold.
-
-    ``permanent_line_log_amplitude`` is converted from amplitudes to logarithms. ``linear_rates``
-    and ``mean_probabilities`` (thresholds, N_TABLE_AMPLITUDES) are those of
-    :class:`CrossingTables`.
+    The rate of a bin is -ln(1 - c), with c the probability that signal lifts the bin above the
+    threshold. ``permanent_line_log_amplitude`` is converted from amplitudes to logarithms.
+    ``linear_rates`` and ``mean_probabilities`` (thresholds, N_TABLE_AMPLITUDES) are the fields of
+    :class:`CrossingTables` for each threshold.
     """
     for phase in range(leakage_bins.permanent_line_log_amplitude.shape[0]):
         for k in range(leakage_bins.permanent_line_log_amplitude.shape[1]):
@@ -1050,26 +1067,26 @@ class SpeckleQuadrature(NamedTuple):
     """
 
     node_stride: int
-    """Distance of successive nodes of the rule, in steps of ln(amplitude) of the table of rates. A
-    node's ln(power) is twice its ln(amplitude)."""
+    """Number of steps of ln(amplitude) in the table of rates between successive nodes of the
+    quadrature."""
     n_nodes_below_mean: int
-    """Number of nodes whose speckle power is below the mean, which is 1."""
+    """Number of nodes whose speckle power is below the mean power 1."""
     weights: np.ndarray
-    """(nodes,): weights of the trapezoidal rule. Node i has the speckle power e^(2 node_stride step
-    (i - n_nodes_below_mean)), with the ``step`` of the table's ln(amplitude)."""
+    """(nodes,): weights of the trapezoidal rule. Node i has the speckle power exp(2 node_stride
+    step (i - n_nodes_below_mean)), where step is the table's step of ln(amplitude)."""
     rates_by_node_phase: np.ndarray
-    """(node_stride * columns,): rates -ln(1 - c) at evenly spaced ln(amplitude), one row after the
-    other.
+    """(node_stride * columns,): crossing rates at evenly spaced ln(amplitude), sorted so that the
+    rates of a bin at all nodes are adjacent.
 
-    Step 0 is ``n_nodes_below_mean`` strides below the table. The row p (phase of the nodes) has the
-    rates at the steps p, p + node_stride, p + 2 node_stride .. in its columns. The nodes of a bin
-    lie in one row, so that they are adjacent in memory.
+    The array holds node_stride rows, one after the other. Row p holds the rates at the steps p, p +
+    node_stride, p + 2 node_stride .. of ln(amplitude). Step 0 is ``n_nodes_below_mean`` strides
+    below the table.
     """
 
 
 @njit(cache=True, error_model="numpy")
 def _make_speckle_quadrature(rate_table):
-    """Return the trapezoidal rule for means over speckle, for one :class:`CrossingRateTable`."""
+    """Return the :class:`SpeckleQuadrature` (trapezoidal rule) for one table of crossing rates."""
     log_crossing_rates, log_amplitude_step, log_rate_step_max = (
         rate_table.log_crossing_rates,
         rate_table.log_amplitude_step,
@@ -1114,10 +1131,10 @@ def _make_speckle_quadrature(rate_table):
 
 @njit(cache=True, error_model="numpy")
 def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
-    """Add the rates -ln(1 - c) of a bin at the nodes of speckle power to ``rate_sums``.
+    """Add the crossing rates of a bin, at the nodes of speckle power, to ``rate_sums``, in place.
 
-    ``log_amplitude`` is ln(|X| / sigma) at mean power, and ``rate_table`` the table of which
-    ``quadrature`` is made. Only the last nodes, as many as ``rate_sums`` has, are evaluated. Rates
+    ``log_amplitude`` is ln(|X| / sigma) at mean power, and ``rate_table`` the table from which
+    ``quadrature`` was made. Only the last nodes, as many as ``rate_sums`` has, are evaluated. Rates
     are interpolated by cubic polynomials.
     """
     log_amplitude_above_first = log_amplitude - rate_table.first_log_amplitude
@@ -1176,10 +1193,9 @@ def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
 def _mean_leakage_from_rate_sums(rate_sums, weights):
     """Return the mean over speckle of the probability 1 - exp(-R) that any bin is raised.
 
-    R is the sum of the bins' rates. ``rate_sums`` holds it at the last nodes of speckle power.
-
-    Below the first node the terms of the sum are continued as a geometric series. They are
-    proportional to the power if all draws leak, else to its square.
+    R is the sum of the bins' crossing rates. ``rate_sums`` holds R at the last nodes of speckle
+    power. Below the first of these nodes, terms of the mean are continued as a geometric series.
+    The terms are proportional to the speckle power if all draws leak, else to its square.
     """
     mean, lowest_term, next_term = 0.0, 0.0, 0.0
     for i in range(rate_sums.size - 1, -1, -1):
@@ -1205,7 +1221,7 @@ def _compute_separate_peak_rates(
 ):
     """Compute the rates of false peaks, in leaked bins next to an echo, that do not join the echo.
 
-    Adjacent crossing bins join the echo if the echo's outermost bin crosses the threshold.
+    Crossing bins adjacent to the echo join it if the echo's outermost bin crosses the threshold.
 
     Parameters
     ----------
@@ -1296,7 +1312,7 @@ def _compute_separate_peak_rates(
 
 @njit(cache=True, error_model="numpy")
 def _crossing_probability(rate):
-    """Return the probability 1 - e^-rate that a bin of a given rate crosses the threshold."""
+    """Return 1 - exp(-rate): the probability that a bin with this crossing rate is raised."""
     if rate < 1e-4:
         return rate * (1.0 - rate * (0.5 - rate / 6.0))
     return -math.expm1(-rate)
@@ -1304,10 +1320,11 @@ def _crossing_probability(rate):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mean_segment_leakage(leakage_bins, leakage_probability):
-    """Compute the probability of a false peak by leaked signal in each segment, (m, 3).
+    """Compute the probability of a false peak by leaked signal in each segment.
 
-    It is the mean over speckle, with which each echo fades independently, and over the phase of the
-    line of leaked light.
+    The results are written into ``leakage_probability`` (m, 3). The probability is a mean over
+    speckle, in which each echo fades independently, and over the phase of the line of light leaked
+    in the circulator.
     """
     is_evaluated = np.zeros(leakage_bins.bins.size, np.bool_)
     no_quadrature = SpeckleQuadrature(1, 0, np.empty(0), np.empty(0))
@@ -1654,7 +1671,8 @@ def _draw_raised_bins(
 def _added_crossing_probability(signal, threshold_ratio):
     """Return the probability c(z) that signal lifts a bin to a level z that noise alone misses.
 
-    ``signal`` and ``threshold_ratio`` (z) are amplitudes over the noise per quadrature.
+    ``signal`` and ``threshold_ratio`` (the level z) are amplitudes over sigma, the noise of a bin
+    per quadrature.
     """
     return marcum_q1_excess(signal, threshold_ratio) / -math.expm1(
         -0.5 * threshold_ratio * threshold_ratio
@@ -1663,10 +1681,10 @@ def _added_crossing_probability(signal, threshold_ratio):
 
 @njit(cache=True, error_model="numpy")
 def _magnitude_at_crossing_probability(signal, threshold_ratio, probability):
-    """Return the magnitude z [sigma] at which c(z) of the module is ``probability``.
+    """Return the magnitude z [sigma] at which c(z) equals ``probability``, by bisection.
 
-    c(z) is the probability that ``signal`` lifts a bin to z, if noise alone does not. z is at least
-    ``threshold_ratio``.
+    c(z) is the probability that ``signal`` lifts a bin to z if noise alone does not. sigma is the
+    noise of a bin per quadrature. z is at least ``threshold_ratio``.
     """
     low, high = threshold_ratio, max(signal, threshold_ratio) + CERTAIN_CROSSING_MARGIN_SIGMA
     for _ in range(BISECTION_STEPS):

@@ -66,15 +66,15 @@ from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 
 BEAMS_PER_BATCH = 1 << 14
 """Largest number of beams, summed over cycles and draws, that are solved together. Intermediate
-arrays then fit into the processor's cache."""
+arrays of this size fit into the processor's cache."""
 
 GRAZING_SINE_MIN = 0.05
-"""Smallest sine of the angle between beam and ground in the weights of ground points: that of some
-3 deg."""
+"""Smallest sine of the angle between beam and ground (some 3 deg) that is used for the weights of
+ground points."""
 
 _CONDITION_NUMBER_MAX = 1e6
-"""Largest condition number of a cycle's least-squares equations. Above it the beams count as
-coplanar, and no velocity is computed."""
+"""Largest condition number of a cycle's least-squares equations. Beams of a cycle with a larger one
+count as coplanar, and no velocity is computed."""
 
 _INTERPOLATION_ERROR_RATIO_MIN = 1e-6
 """Smallest standard error of a value interpolated between bins, as a fraction of the standard error
@@ -84,17 +84,18 @@ _BELOW_ONE_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal random number is below its mean plus one standard deviation."""
 
 _RELATIVE_VARIANCE_ROUNDING_ERROR = 1e-14
-"""Relative rounding error of a squared standard error. It limits how small a variance may get when
-a common part is subtracted from it."""
+"""Relative rounding error of a squared standard error. A variance from which a common part is
+subtracted is kept at or above this fraction of itself."""
 
 _CONTRADICTION_PROBABILITY = 1e-4
-"""Probability below which a chi-square contradicts the stated errors. It is the probability that
-true errors give a chi-square as large. The covariance then follows from the residuals."""
+"""Probability, under the stated errors, of a chi-square at least as large as the observed one,
+below which the residuals contradict the stated errors. The covariance is then scaled by the
+residuals."""
 
 STATUS_SOLVED = 0
 """Status of a cycle whose solution uses all beams with a return."""
 STATUS_EXCLUDED = 1
-"""Status of a cycle whose solution omits one beam, because it contradicts all others."""
+"""Status of a cycle whose solution excludes one beam that contradicts all others."""
 STATUS_WITHHELD = 2
 """Status of a cycle without a solution: its beams contradict each other, and the false beam cannot
 be identified."""
@@ -112,12 +113,13 @@ class FittedCycles(NamedTuple):
     """
 
     value: np.ndarray
-    """(n, 3) velocity of the instrument [m/s], or (n,) altitude [m]."""
+    """(n, 3): velocity of the instrument [m/s]; or (n,): its altitude [m]. The record holds one of
+    the two."""
     covariance: np.ndarray
-    """(n, 3, 3) or (n,): covariance of the velocity's error [m^2/s^2], or variance of the
-    altitude's error [m^2]."""
+    """(n, 3, 3): covariance of the velocity's error [m^2/s^2]; or (n,): variance of the altitude's
+    error [m^2]."""
     chi_square: np.ndarray
-    """(n,): sum of squared residuals over their variances; nan without a solution."""
+    """(n,): sum of squared residuals, each divided by its variance; nan without a solution."""
     degrees_of_freedom: np.ndarray
     """(n,) int64: number of observations minus number of unknowns; 0 without a solution."""
 
@@ -135,11 +137,11 @@ class NavigationSolution(NamedTuple):
     """(..., 3, 3): covariance of the velocity's error [m^2/s^2]; or (...,): variance of the
     altitude's error [m^2]."""
     chi_square: np.ndarray
-    """(...,): sum of squared residuals over their variances. For a withheld solution it is that of
-    the fit to all beams with a return."""
+    """(...,): sum of squared residuals, each divided by its variance. For a withheld solution it is
+    the sum of the fit to all beams with a return."""
     degrees_of_freedom: np.ndarray
     """(...,) int64: number of observations minus number of unknowns; 0 for an undetermined cycle.
-    It is the expectation of ``chi_square``."""
+    It is the expectation of ``chi_square`` for true errors."""
     is_beam_used: np.ndarray
     """(..., b) bool: True for beams whose measurements the solution uses."""
     status: np.ndarray
@@ -147,7 +149,7 @@ class NavigationSolution(NamedTuple):
 
     @property
     def is_available(self) -> np.ndarray:
-        """True for cycles that have a solution, (...,) bool."""
+        """Mask (...,), True for cycles that have a solution."""
         return self.status <= STATUS_EXCLUDED
 
 
@@ -158,7 +160,7 @@ def solve_velocity(
     standard_error: np.ndarray,
     test_level: float | None = None,
 ) -> NavigationSolution:
-    """Solve for the velocity vector of each cycle of b beams, with its covariance.
+    """Return the velocity vector of each cycle of b beams, with its covariance.
 
     Parameters
     ----------
@@ -240,9 +242,7 @@ def solve_altitude(
     relief: float = 0.0,
     test_level: float | None = None,
 ) -> NavigationSolution:
-    """Solve for the altitude above the plane through each cycle's ground points.
-
-    The solution includes the variance of the altitude.
+    """Return the altitude above the plane through each cycle's ground points, with its variance.
 
     Parameters
     ----------
@@ -398,13 +398,13 @@ def _ground_points(
 def _covariance_scale(
     chi_square: np.ndarray, degrees_of_freedom: np.ndarray, residual_degrees: np.ndarray
 ) -> np.ndarray:
-    """Return the factor (n,) that scales covariances where residuals contradict the stated errors.
+    """Return the factor (n,) by which the covariance of each solution is multiplied.
 
-    Residuals contradict the stated errors if true errors would give a chi-square as large with a
-    probability below :data:`_CONTRADICTION_PROBABILITY`. The factor is then ``chi_square`` over
-    ``residual_degrees`` (at least 1), times the square of Student's t at one standard deviation: an
-    error over a deviation estimated from residuals follows Student's t. The scaled deviation covers
-    68 % of the errors. Other solutions have the factor 1.
+    The factor is 1 unless the residuals contradict the stated errors, that is, unless the
+    probability of a chi-square at least as large is below :data:`_CONTRADICTION_PROBABILITY`. In
+    that case it is ``chi_square`` over ``residual_degrees`` (at least 1), times the square of
+    Student's t at one standard deviation, because an error over a deviation estimated from
+    residuals follows Student's t. The scaled deviation covers 68 % of the errors.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def _residuals_contradict_errors(
 ) -> np.ndarray:
     """Return a mask (...,), True for solutions whose residuals contradict the stated errors.
 
-    True errors would give a ``chi_square`` as large with a probability below
+    For these the probability, under the stated errors, of a chi-square at least as large is below
     :data:`_CONTRADICTION_PROBABILITY`.
     """
     return (degrees_of_freedom > 0) & (
@@ -441,19 +441,19 @@ class _GroundPlane(NamedTuple):
     """Planes fitted to the ground points of n cycles; arrays are (n,) unless stated otherwise."""
 
     platform_height: np.ndarray
-    """Height of the platform above the plane [m]."""
+    """(n,): height of the platform above the plane [m]."""
     platform_height_variance: np.ndarray
-    """Variance of the error of ``platform_height`` [m^2]."""
+    """(n,): variance of the error of ``platform_height`` [m^2]."""
     chi_square: np.ndarray
-    """Sum of squared residuals of the ground points over their variances."""
+    """(n,): sum of squared residuals of the ground points, each divided by its variance."""
     gradient: np.ndarray
     """(2, n): gradient (rise over run) of the plane along x and y."""
     n_fitted_slopes: np.ndarray
-    """Effective number, 0..2, of the plane's two slopes that the points determine. The prior
-    determines the rest."""
+    """(n,): effective number, 0..2, of the plane's two slopes that the ground points determine. The
+    rest is determined by the prior of the slope."""
     centroid_height_variance: np.ndarray
-    """Variance of the height of the ground points' centroid [m^2]: 1 over the sum of the inverse
-    variances of the points' heights."""
+    """(n,): variance of the height of the ground points' weighted mean [m^2]. It is 1 over the sum
+    of the inverse variances of the points' heights."""
 
 
 def _fit_plane(
@@ -519,7 +519,7 @@ def _fit_plane(
 def _flatten_cycles(
     direction: np.ndarray, value: np.ndarray, standard_error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Broadcast measurements of beams, and flatten their leading dimensions to one of n cycles.
+    """Broadcast measurements of beams, and flatten their leading dimensions to n cycles.
 
     Parameters
     ----------
@@ -547,7 +547,7 @@ def _least_squares(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve n linear least-squares problems by singular value decomposition.
 
-    Normal equations would square the condition number.
+    The condition number is not squared, as it would be by normal equations.
 
     Parameters
     ----------
@@ -710,7 +710,8 @@ _BEAM_MOTION_VARIABLES = (
     "platform_position", "platform_velocity", "beam_direction", "beam_turning",
     "platform_acceleration",
 )  # fmt: skip
-"""Names of the output variables that fill the fields of :class:`BeamMotion`, in their order."""
+"""Names of the output variables that fill the fields of :class:`BeamMotion`, in the order of the
+fields."""
 
 
 class BeamMotion(NamedTuple):
@@ -731,7 +732,7 @@ class BeamMotion(NamedTuple):
     """(..., 3): acceleration of the instrument in the world's frame [m/s^2]."""
 
     def reshape_by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
-        """Reshape the arrays (n, 3) of n shots to (cycles, beams, 3)."""
+        """Return the record with its arrays (n, 3) of n shots reshaped to (cycles, beams, 3)."""
         return BeamMotion(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
 
 
@@ -742,7 +743,7 @@ def _select_points(
     error_floor: ErrorFloor,
     known_motion: EgoMotion,
 ) -> dict[str, np.ndarray]:
-    """Select the point that navigation uses of each shot and draw.
+    """Return, for each shot and draw, the point that navigation uses.
 
     It is the first point that a Doppler peak confirms and whose values and standard errors are
     finite.

@@ -47,8 +47,8 @@ from sweep.model.waveform import (
 )
 
 CONFIRMATION_TOLERANCE_BINS = 3.0
-"""Default of the largest distance [bins] between a Doppler peak and the position that a pair of an
-up and a down peak predicts, at which the peak confirms the pair.
+"""Default tolerance [bins] for the confirmation of a pair of an up and a down peak: largest
+distance of a Doppler peak from the position that the pair predicts.
 
 Rounding to bins moves the prediction and the Doppler peak by half a bin each. Noise near the
 threshold moves them by as much again. A pair has 16 readings (ways to read its beats as range and
@@ -57,32 +57,29 @@ probability of at most 16 (2 tolerance) / (N/2), with N the FFT size: 1.5e-3 at 
 """
 
 CHANCE_MATCH_PROBABILITY = 0.01
-"""Largest probability that a false Doppler peak selects the reading of an unconfirmed pair. It sets
-how near a Doppler peak must be to the predicted position. A reading is one way to interpret the
-beats as range and velocity."""
+"""Largest probability that a false Doppler peak selects the reading (way to interpret the beats as
+range and velocity) of a pair that has no true Doppler peak. It limits the distance of a Doppler
+peak from the predicted position."""
 
 _UNPAIRED_COST_BINS = 1e9
-"""Cost [bins] of an up peak that stays without a down peak. It exceeds any sum of distances between
-Doppler peaks and their predicted positions."""
+"""Cost [bins] of an up peak without a down peak, in the search for the best pairing. It exceeds any
+sum of distances between Doppler peaks and their predicted positions."""
 
 TRUE_RETURN_FLAG = 1
-"""Flag bit of a return whose range and velocity are those of a true surface, sampled by a beamlet
-(:data:`FLAG_BITS`)."""
+"""Flag bit of a true return: range and velocity are those of a surface that a beamlet hits."""
 FALSE_ALARM_FLAG = 2
-"""Flag bit of a return with a peak of noise, or of leaked signal raised by noise
-(:data:`FLAG_BITS`)."""
+"""Flag bit of a return with a peak of noise, or of leaked signal raised by noise."""
 MISPAIRED_FLAG = 4
-"""Flag bit of a return whose up, Doppler and down peaks belong to different beamlets
-(:data:`FLAG_BITS`)."""
+"""Flag bit of a return whose up, Doppler and down peaks belong to different beamlets."""
 MISREAD_FLAG = 8
 """Flag bit of a return whose peaks belong to one beamlet, but were converted to a wrong range or
-velocity (:data:`FLAG_BITS`)."""
+velocity."""
 SIDELOBE_FLAG = 16
-"""Flag bit of a return with a peak of signal that contains no beamlet's line, such as a sidelobe
-(:data:`FLAG_BITS`)."""
+"""Flag bit of a return with a peak of signal that contains no beamlet's line, such as a sidelobe.
+"""
 UNCONFIRMED_FLAG = 32
-"""Flag bit of a return for which no Doppler peak is near the position that the up and down peak
-predict (:data:`FLAG_BITS`)."""
+"""Flag bit of a return for which no Doppler peak is near the position that its up and down peak
+predict."""
 FLAG_BITS = {
     "true": TRUE_RETURN_FLAG,
     "false_alarm": FALSE_ALARM_FLAG,
@@ -95,22 +92,20 @@ FLAG_BITS = {
 
 Exactly one of the first five bits is set. They follow from a comparison with the truth.
 
-- true: all its peaks contain lines of one beamlet, whose range and velocity it reports to within
-  the width of the peaks;
-- false alarm: one of its peaks is noise, or leaked signal raised by noise;
-- mispaired: its peaks are signal, but contain lines of no common beamlet;
-- misread: all its peaks contain lines of one beamlet, but were converted to a wrong range or
-  velocity;
-- sidelobe: one of its peaks contains no beamlet's line;
-- unconfirmed, which the instrument knows: no Doppler peak is within the tolerance.
+- true: all peaks of the return contain lines of one beamlet, and its range and velocity are those
+of this beamlet to within the width of the peaks; - false alarm: one of its peaks is noise, or
+leaked signal raised by noise; - mispaired: its peaks are signal, but contain lines of no common
+beamlet; - misread: all its peaks contain lines of one beamlet, but were converted to a wrong range
+or velocity; - sidelobe: one of its peaks contains no beamlet's line; - unconfirmed, which the
+instrument knows: no Doppler peak is within the tolerance.
 """
 
 
 FALSE_PEAK_GROUP = NO_INDEX
 """Group number of a false peak, which belongs to no group of bins of an echo."""
 NO_PEAK_GROUP = -2
-"""Group number of a missing peak: no Doppler peak confirms the return, or the segment does not
-exist."""
+"""Group number of a missing peak. It is missing if no Doppler peak confirms the return, or if the
+segment does not exist."""
 
 
 class DopplerPrediction(NamedTuple):
@@ -125,10 +120,10 @@ class DopplerPrediction(NamedTuple):
     """Derivative of the predicted Doppler beat with respect to the down beat."""
     motion_shift_max_bins: np.ndarray | float
     """Largest shift of the Doppler beat by the instrument's motion between the segments [bins]. It
-    is added to the tolerance of the prediction."""
+    is added to the tolerance of the predicted position."""
 
     def select(self, indices: np.ndarray) -> "DopplerPrediction":
-        """Return the coefficients of the points with the given indices."""
+        """Return the record for the points with the given indices."""
         return DopplerPrediction(*(np.asarray(values)[indices] for values in self))
 
 
@@ -139,18 +134,18 @@ class PeakPairs(NamedTuple):
     """
 
     up_index: np.ndarray
-    """(pairs,) int64: index of the up peak."""
+    """(pairs,) int64: index of the pair's up peak in the list of up peaks."""
     doppler_index: np.ndarray
     """(pairs,) int64: index of the Doppler peak that confirms the pair; -1 for none."""
     down_index: np.ndarray
-    """(pairs,) int64: index of the down peak."""
+    """(pairs,) int64: index of the pair's down peak in the list of down peaks."""
     reading: np.ndarray
-    """(pairs,) int64: which reading of the beats gave range and velocity, as numbered by
-    :func:`sweep.model.waveform.doppler_and_range_beat`."""
+    """(pairs,) int64: number of the reading (way to interpret the beats) that gives range and
+    velocity, as in :func:`sweep.model.waveform.doppler_and_range_beat`."""
 
     @classmethod
     def allocate(cls, pairs_max: int) -> "PeakPairs":
-        """Allocate arrays for at most ``pairs_max`` pairs."""
+        """Return a record with uninitialised arrays for at most ``pairs_max`` pairs."""
         return cls(*np.empty((4, pairs_max), np.int64))
 
 
@@ -167,7 +162,7 @@ class ConfirmingPeak(NamedTuple):
     doppler_index: int
     """Index of the Doppler peak in the list of the segment's peaks; -1 if no peak fits."""
     reading: int
-    """Number of the reading of the beats that gives range and velocity, counted as in
+    """Number of the reading (way to interpret the beats) that gives range and velocity, as in
     :func:`sweep.model.waveform.doppler_and_range_beat`; -1 if no peak fits."""
 
 
@@ -183,9 +178,9 @@ def pair_peaks(
     tolerance,
     pairs,
 ):
-    """Pair up and down peaks one to one, and return the numbers of confirmed and of all pairs.
+    """Pair up and down peaks one to one; return the numbers of confirmed and of all pairs.
 
-    A pair is confirmed by a Doppler peak near the position that it predicts.
+    A pair is confirmed by a Doppler peak near the position that the pair predicts.
 
     Parameters
     ----------
@@ -381,7 +376,7 @@ def compare_return_with_truth(
 ):
     """Compare a return's peaks with the truth; return its flag and the nearest beamlet.
 
-    Range and velocity, to which the peaks are converted, are not compared here.
+    Range and velocity of the return are not compared here.
 
     Parameters
     ----------

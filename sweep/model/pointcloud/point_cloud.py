@@ -44,12 +44,12 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import STRONGEST_PEAK
 
 VALUES_PER_BATCH = 1 << 20
-"""Largest number of values, besides the results, that are held in memory for the shots computed
+"""Largest number of array elements, without the results, in memory for shots that are computed
 together."""
 
 _EMPTY_SHOT_RANGE = 1.0
-"""Range [m] assumed for a shot that hits nothing, so that it can be simulated. Such a shot returns
-no light."""
+"""Range [m] that is set for a shot that hits nothing, so that it can be simulated. Its echo has no
+power."""
 
 
 def simulate_cloud(
@@ -68,7 +68,7 @@ def simulate_cloud(
     estimates_ray_error: bool = False,
     motion_priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
 ) -> dict[str, np.ndarray]:
-    """Simulate n shots of a flight: probabilities of detection, and the points that are reported.
+    """Simulate n shots of a flight: return detection probabilities and measured points.
 
     Parameters
     ----------
@@ -188,8 +188,8 @@ class _PreparedBatch(NamedTuple):
     beamlet_table: BeamletTable
     """Footprints of the shots, by beamlets (rays that sample the beam)."""
     bin_groups: BinGroups
-    """Runs of adjacent bins above the threshold in the noiseless spectra; none for a shot without a
-    target."""
+    """Runs of adjacent bins above the threshold in the noiseless spectra. A shot without a target
+    has none."""
     leakage_bins: list[tuple[np.ndarray, LeakageBins]] | None
     """List of pairs: indices of shots, and the bins in which leaked signal may raise false peaks in
     these shots. It is None if the bins were not listed, or are too many to keep."""
@@ -264,7 +264,7 @@ def _prepare_batch(
 
 
 def _closed_form_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
-    """Return the statistics (n,) of shots that do not depend on draws, by name.
+    """Return statistics (n,) of shots that need no draws, by name.
 
     The names are those of :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`.
     """
@@ -296,10 +296,12 @@ def _closed_form_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np
 def _cloud_points(
     eyepoints: Eyepoints, shot_returns: Returns, n_lines: int
 ) -> dict[str, np.ndarray]:
-    """Return points and their truth by name of POINT_CLOUD_VARIABLES, (n, draws, returns[, 3]).
+    """Return measured points and their true values, as a mapping of arrays.
 
-    ``n_lines`` is the number of lines of a shot in ``shot_returns``. It is 1 if the effect of the
-    footprint is skipped, else the number of beamlets.
+    The keys are the names in :data:`sweep.model.outputs.POINT_CLOUD_VARIABLES`, and the arrays are
+    (n, draws, returns) or (n, draws, returns, 3). ``n_lines`` is the number of lines of a shot in
+    ``shot_returns``. It is 1 if the effect of the footprint is skipped, else the number of
+    beamlets.
     """
     has_beamlet = shot_returns.beamlet >= 0
     shot = np.arange(len(has_beamlet))[:, None, None]

@@ -45,34 +45,34 @@ from sweep.model.preparation import Shots
 from sweep.model.window import window_samples
 
 _CHIRP_SIGNS = 1.0, 0.0, -1.0
-"""Signs of the chirp rates (frequency slopes) of the up, Doppler and down segment."""
+"""Signs of the frequency slopes of the segments: up 1, Doppler 0, down -1."""
 
 _LOBE_REACH_CELLS = 4
-"""Distance from a line [resolution cells] at which the table of its power ends. A cell is the
-sample rate over the number of samples in the record."""
+"""Largest distance from a line's centre in the table of the line's power [resolution cells]. A cell
+is the sample rate over the number of samples in the record."""
 _LOBE_STEPS_PER_CELL = 1024
-"""Number of entries per resolution cell in the table of a line's power by distance. A cell is the
-sample rate over the number of samples in the record."""
+"""Number of entries per resolution cell in the table of a line's power by distance from its centre.
+A cell is the sample rate over the number of samples in the record."""
 _LINE_TABLE_WINDOW_SAMPLES = 1024
-"""Number of samples of the window from which the table of a line's power by distance is computed.
-"""
+"""Number of window samples from which the table of a line's power by distance is computed."""
 
 _NEIGHBOUR_DISTANCE_RATIO = 1.3
-"""Largest distance between beamlets that count as neighbours, in units of the lattice's smallest
-distance. The second smallest distance is 1.7."""
+"""Largest distance of two beamlets that count as neighbours, divided by the lattice's smallest
+distance. The second smallest distance is 1.7 times the smallest."""
 
 _QUARTIC_RAYS_MIN = 37
-"""Smallest number of rays for which polynomials of degree 4, and not 2, are subtracted. With fewer
-rays too few residuals would remain."""
+"""Smallest number of rays for which polynomials of degree 4 are subtracted from the powers. With
+fewer rays the degree is 2, because too few residuals would remain."""
 
 _NEGLIGIBLE_DENSITY_DISTANCE_SIGMA = 15.0
-"""Difference between magnitude and threshold, in standard deviations of the noise, beyond which an
-error of the magnitude changes no probability. The noise's density there is e^-112 of its maximum.
-"""
+"""Difference between magnitude and threshold, in standard deviations of the noise per quadrature,
+beyond which an error of the magnitude changes no probability. The density of the noise is e^-112 of
+its maximum at this difference."""
 
 _RESULT_CHANGE_MIN = 1e-9
-"""Smallest possible change of a result for which the error of a shot due to too few rays is
-computed. The result is a probability of detection, or a peak's magnitude (relative change)."""
+"""Smallest change of a result that matters. The error due to too few rays is computed only for
+peaks whose results could change by more. Results are probabilities of detection, and magnitudes of
+peaks (relative change)."""
 
 
 class OppositeBeamletPairs(NamedTuple):
@@ -87,33 +87,36 @@ class OppositeBeamletPairs(NamedTuple):
     opposite_beamlet: np.ndarray
     """(h,) int64: index of the second beamlet of each pair of opposite beamlets."""
     inverse_weight: np.ndarray
-    """(h,): 1 divided by the fraction of the beam's power in both beamlets of a pair."""
+    """(h,): 1 divided by the fraction of the beam's power that both beamlets of a pair have
+    together."""
     polynomials: np.ndarray
-    """(k, h): k even polynomials of beamlet position, evaluated at each of the h pairs. They are
-    orthonormal with the power fractions of the pairs as weights."""
+    """(k, h): values of k even polynomials of beamlet position at each of h pairs. They are
+    orthonormal, with the power fractions of the pairs as weights."""
     weighted_polynomials: np.ndarray
     """(k, h): ``polynomials`` times the power fractions of the pairs."""
     relative_density_change: np.ndarray
-    """(h,): relative difference (u - w) / w of two fractions of the beam's power: u in the area
-    about a beamlet, and w, the beamlet's weight."""
+    """(h,): (u - w) / w, with u the fraction of the beam's power in the area about a beamlet, and w
+    the fraction that the beamlet has as its weight."""
     first_neighbouring_pair: np.ndarray
-    """(m,) int64: index of the first of two neighbouring pairs of beamlets."""
+    """(m,) int64: index of the first pair of each two neighbouring pairs of beamlets."""
     second_neighbouring_pair: np.ndarray
-    """(m,) int64: index of the second of two neighbouring pairs of beamlets."""
+    """(m,) int64: index of the second pair of each two neighbouring pairs of beamlets."""
     neighbour_weight: np.ndarray
     """(m,): product of the power fractions of two neighbours, summed over both sides of the beam,
-    times h / (h - k). The factor replaces the roughness that k fitted polynomials remove."""
+    times h / (h - k). h is the number of pairs and k that of fitted polynomials, which remove
+    roughness that the factor restores."""
 
 
 def estimate_ray_error(
     shots: Shots, beamlet_table: BeamletTable, peak_bins: np.ndarray, magnitude: np.ndarray
 ) -> np.ndarray:
-    """Estimate the error of the results of shots that is due to too few rays per beam.
+    """Estimate the error of each shot's results that is due to too few rays per beam.
 
-    The estimate (n,), 0..1, is the larger of two errors. The first is that of the probabilities of
-    detection, summed over the segments. The second is that of a peak's magnitude, relative to the
-    larger of the magnitude and sigma. It counts only without speckle: the magnitude of a speckled
-    echo varies by decibels from shot to shot.
+    The estimate (n,), 0..1, is the larger of two errors. The first is the error of the
+    probabilities of detection, summed over the segments. The second is the error of a peak's
+    magnitude, relative to the larger of the magnitude and sigma, the noise per quadrature. The
+    second error counts only without speckle: the magnitude of a speckled echo varies by decibels
+    from shot to shot.
 
     Parameters
     ----------
@@ -163,7 +166,7 @@ def estimate_ray_error(
 def _pd_change_bound(
     shots: Shots, a: np.ndarray, b: np.ndarray, relative_power_change: np.ndarray | float
 ) -> np.ndarray:
-    """Return an upper bound on the change of probabilities of detection, 0..1.
+    """Return an upper bound on the change of a probability of detection as power changes, 0..1.
 
     Parameters
     ----------
@@ -185,9 +188,11 @@ def _pd_change_bound(
 def _steady_pd_change_bound(
     a: np.ndarray, b: np.ndarray, relative_power_change: np.ndarray | float
 ) -> np.ndarray:
-    """Return an upper bound on the change of Marcum's Q_1(a, b), a probability of detection.
+    """Return an upper bound on the change of Marcum's Q_1(a, b) as a^2 changes.
 
-    ``a``, ``b`` and ``relative_power_change`` are as in :func:`_pd_change_bound`.
+    Q_1 is the probability of detection of an echo that does not fade. a is its magnitude and b the
+    threshold, both over the noise per quadrature. ``relative_power_change`` is the relative change
+    of a^2.
 
     Notes
     -----
@@ -204,11 +209,11 @@ def _steady_pd_change_bound(
 def _speckled_pd_change(
     a: np.ndarray, b: np.ndarray, relative_power_change: np.ndarray | float
 ) -> np.ndarray:
-    """Return by how much a probability of detection rises or falls as the signal power changes.
+    """Return the change of the probability of detection in speckle as the mean power a^2 changes.
 
-    The mean power a^2 rises or falls by the fraction ``relative_power_change``; the larger change
-    of the probability counts. The probability is that of a bin in developed speckle,
-    exp(-(b^2 / 2) / (1 + a^2 / 2)). The arguments are as in :func:`_pd_change_bound`.
+    The probability is exp(-(b^2 / 2) / (1 + a^2 / 2)), with a the magnitude and b the threshold,
+    both over the noise per quadrature. a^2 rises or falls by the fraction
+    ``relative_power_change``, and the larger of the two changes is returned.
     """
     snr, squared_threshold = 0.5 * a * a, 0.5 * b * b
     less, equal, more = (
@@ -225,7 +230,7 @@ def _speckled_pd_change(
 def _pd_change_bound_of_looks(
     n_looks: int, relative_power_change: np.ndarray | float
 ) -> np.ndarray:
-    """Return an upper bound on the change of a detection probability of several faded looks.
+    """Return an upper bound on the change of the detection probability of several faded looks.
 
     The summed power of N looks is gamma-distributed with the shape N. Its logarithm has a density
     of at most sqrt(N / (2 pi)). A loss of the fraction x, ``relative_power_change``, changes the
@@ -236,7 +241,7 @@ def _pd_change_bound_of_looks(
 
 
 def _magnitude_change(a: np.ndarray, relative_power_change: np.ndarray | float) -> np.ndarray:
-    """Return the change of a magnitude a, over the larger of a and 1.
+    """Return the change of a magnitude ``a`` as its square changes, over the larger of a and 1.
 
     ``a`` is a magnitude over the standard deviation of the noise per quadrature, and
     ``relative_power_change`` the relative change of a^2.
@@ -248,11 +253,11 @@ class BinPowers(NamedTuple):
     """Powers of beamlets in one bin of m shots, and the width of the shots' echoes."""
 
     power: np.ndarray
-    """(m, b): power that each beamlet's line has in the bin, up to a factor that is common to the
-    beamlets of a shot."""
+    """(m, b): power that the line of each of b beamlets has in a bin of each of m shots, up to a
+    factor common to the beamlets of a shot."""
     echo_width: np.ndarray
-    """(m,): width of a uniform echo with the spread of the lines, plus 1 [resolution cells]. A cell
-    is the sample rate over the number of samples in the record."""
+    """(m,): width [resolution cells] of a uniform echo with the standard deviation of the lines,
+    plus 1. A cell is the sample rate over the number of samples in the record."""
 
 
 def _bin_powers(
@@ -262,7 +267,7 @@ def _bin_powers(
     indices: np.ndarray,
     bins: np.ndarray,
 ) -> BinPowers:
-    """Return the :class:`BinPowers` that beamlets' lines have in one bin of m shots.
+    """Return the powers that beamlets' lines have in one bin of each of m shots.
 
     Parameters
     ----------
@@ -346,9 +351,9 @@ def _bin_powers(
 
 @lru_cache(maxsize=16)
 def pair_opposite_beamlets(n_beamlets: int) -> OppositeBeamletPairs:
-    """Return the hexagonal lattice of ``n_beamlets`` beamlets as pairs of opposite beamlets.
+    """Return the lattice of ``n_beamlets`` beamlets as an :class:`OppositeBeamletPairs`.
 
-    The beamlets fill whole shells of the lattice.
+    The lattice is hexagonal, and the beamlets fill its shells completely.
     """
     from scipy.spatial import cKDTree  # slow to import
 
@@ -402,8 +407,8 @@ def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the fraction of the beam's power about each beamlet minus the beamlet's weight.
 
     The result is (beamlets,). The beam is Gaussian, and the cells about the beamlets have equal
-    areas. Beamlets at the largest radius share the power outside of all cells, so that the sum of
-    the result is 0.
+    areas. Power outside of all cells is shared by the beamlets at the largest radius, so that the
+    sum of the result is 0.
 
     Parameters
     ----------
@@ -426,7 +431,7 @@ def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
 def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> np.ndarray:
     """Return the values (k, h) of k even polynomials at h positions.
 
-    The polynomials are orthonormal with the given weights.
+    The polynomials are orthonormal with ``weights``.
 
     Parameters
     ----------
@@ -448,8 +453,9 @@ def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> 
 def _main_lobe_table(window_name: str) -> np.ndarray:
     """Return the power |W(y) / W(0)|^2 of a line at distances y = 0, 1, 2 .. steps from its centre.
 
-    W is the transform of the window. A resolution cell has ``_LOBE_STEPS_PER_CELL`` steps, for
-    windows of any length and any sample rate.
+    W is the transform of the window. A step is 1 / ``_LOBE_STEPS_PER_CELL`` of a resolution cell,
+    which is the sample rate over the number of samples in the record. So one table serves windows
+    of any length.
     """
     w = window_samples(window_name, _LINE_TABLE_WINDOW_SAMPLES)
     transform = np.abs(
@@ -465,7 +471,7 @@ def _main_lobe_table(window_name: str) -> np.ndarray:
 def _fill_power_errors(powers, beamlet_pairs, relative_errors):
     """Compute the relative errors of the powers of m bins that are due to too few rays per beam.
 
-    The module's description derives them.
+    The description of :mod:`sweep.model.pointcloud.ray_error` derives them.
 
     Parameters
     ----------

@@ -195,9 +195,9 @@ class EchoBounds(NamedTuple):
     """
 
     first_bin: np.ndarray
-    """(k,) int64: index of the first bin of each echo."""
+    """(k,) int64: index, in the spectrum, of the first bin of each of k echoes."""
     last_bin: np.ndarray
-    """(k,) int64: index of the last bin of each echo."""
+    """(k,) int64: index, in the spectrum, of the last bin of each of k echoes."""
 
 
 class FlaggedPeaks(NamedTuple):
@@ -207,18 +207,21 @@ class FlaggedPeaks(NamedTuple):
     """
 
     spectrum_power: np.ndarray
-    """(bins,): |X|^2 of all bins of the segment's spectrum in the draw [V^2]."""
+    """(bins,): |X|^2 of all bins of the spectrum of a segment in a draw [V^2]."""
     strongest_bin: np.ndarray
     """(peaks,) int64: index of the strongest bin of each peak."""
     echo_number: list[int]
-    """Number, for each peak, of the echo to which it belongs; FALSE_PEAK_GROUP for a peak of no
-    echo."""
+    """(peaks,) int64: number of the echo to which each peak belongs; FALSE_PEAK_GROUP for a peak of
+    no echo."""
 
 
 def _echo_bin_bounds(
     point_spectra: PointSpectra, segment: int, signal: SegmentSignal | None
 ) -> EchoBounds:
-    """Return first and last bin of each echo of a point in a segment; none without a signal."""
+    """Return the first and last bin of each echo of a point in a segment, as :class:`EchoBounds`.
+
+    A segment without a signal has no echoes.
+    """
     echo_indices = point_spectra.echo_indices(segment)
     if signal is None or not echo_indices.size:
         return EchoBounds(np.empty(0, np.int64), np.empty(0, np.int64))
@@ -252,7 +255,7 @@ def list_flagged_peaks(
     point_spectra: PointSpectra,
     peaks_max: int,
 ) -> FlaggedPeaks:
-    """List the peaks in one draw of a segment, strongest first.
+    """Return the peaks in one draw of a segment, strongest first, as :class:`FlaggedPeaks`.
 
     A peak is a run of adjacent bins that the detector flags.
 
