@@ -84,8 +84,8 @@ _BELOW_ONE_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal random number is below its mean plus one standard deviation."""
 
 _RELATIVE_VARIANCE_ROUNDING_ERROR = 1e-14
-"""Relative rounding error of a squared standard error. A variance from which a common part is
-subtracted is kept at or above this fraction of itself."""
+"""Relative rounding error of a squared standard error. It sets the smallest standard error that
+remains after the error due to an unknown slip is subtracted."""
 
 _CONTRADICTION_PROBABILITY = 1e-4
 """Probability, under the stated errors, of a chi-square at least as large as the observed one,

@@ -58,7 +58,7 @@ probability of at most 16 (2 tolerance) / (N/2), with N the FFT size: 1.5e-3 at 
 
 CHANCE_MATCH_PROBABILITY = 0.01
 """Largest probability that a false Doppler peak selects the reading (way to interpret the beats as
-range and velocity) of a pair that has no true Doppler peak. It limits the distance of a Doppler
+range and velocity) of a pair that no Doppler peak confirms. It limits the distance of a Doppler
 peak from the predicted position."""
 
 _UNPAIRED_COST_BINS = 1e9

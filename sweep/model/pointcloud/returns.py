@@ -143,57 +143,60 @@ from sweep.model.sampling.speckle_lines import (
 from sweep.model.spectrum.search_restriction import beamlet_line_positions
 
 DRAWN_INDEPENDENT_BINS_MAX = 32.0
-"""Largest equivalent number of independent bins that are drawn for an echo in developed speckle."""
+"""Largest equivalent number of independent bins that is used to draw an echo in developed speckle.
+Larger numbers are replaced by it."""
 
 ROUNDING_VARIANCE = 1 / 12
-"""Variance of the error that rounding a position to whole bins makes [bins^2]."""
+"""Variance [bins^2] of the error of a position that is rounded to whole bins."""
 
 CORRELATED_LOOKS_MAX = 32
-"""Largest number of looks (records of a segment) for which partly correlated speckle is drawn look
-by look. For more looks one drawn amplitude is compared with the probability of detection."""
+"""Largest number of looks (records of a segment) for which partly correlated speckle is drawn in
+each look. With more looks, one drawn amplitude is compared with the probability of detection."""
 
 
 class Peak(NamedTuple):
     """Peak of one segment in one draw."""
 
     bin: float
-    """Number of the largest bin."""
+    """Number of the peak's largest bin; nan for no peak."""
     position: float
-    """Position between bins [bins]."""
+    """Position of the peak, interpolated between bins [bins]."""
     position_error: float
-    """Standard error of ``position`` by noise and by the spread of lines [bins]."""
+    """Standard error of ``position`` due to noise and to the spread of the footprint's lines
+    [bins]."""
     magnitude_ratio: float
     """|X| of the largest bin over sigma, the noise of a bin per quadrature."""
 
 
 UNDETECTED_PEAK = Peak(math.nan, math.nan, math.nan, math.nan)
-"""Peak of an echo that is not detected."""
+""":class:`Peak` that stands for an undetected echo."""
 
 
 class Peaks(NamedTuple):
     """Peaks of segments in arrays of equal shape; nan for no peak."""
 
     bin: np.ndarray
-    """(...): number of the largest bin."""
+    """(...): number of each peak's largest bin; nan for no peak."""
     position: np.ndarray
-    """(...): position between bins [bins]."""
+    """(...): position of each peak, interpolated between bins [bins]."""
     position_error: np.ndarray
-    """(...): standard error of ``position`` by noise and by the spread of lines [bins]."""
+    """(...): standard error of ``position`` due to noise and to the spread of the footprint's lines
+    [bins]."""
     magnitude_ratio: np.ndarray
-    """(...): |X| of the largest bin over sigma, the noise of a bin per quadrature."""
+    """(...): |X| of each peak's largest bin over sigma, the noise of a bin per quadrature."""
 
     @classmethod
     def empty(cls, shape: tuple[int, ...]) -> "Peaks":
-        """Return arrays of a given shape without peaks."""
+        """Return a record of a given shape whose values (nan) mark no peaks."""
         return cls(*(np.full(shape, np.nan) for _ in cls._fields))
 
     def select(self, indices: np.ndarray) -> "Peaks":
-        """Return the peaks with the given indices, or where a mask is True."""
+        """Return the record of the peaks with the given indices, or where a mask is True."""
         return Peaks(*(values[indices] for values in self))
 
     @property
     def offset(self) -> np.ndarray:
-        """Position minus the number of the largest bin [bins], (...)."""
+        """Return ``position`` minus ``bin``, (...) [bins]."""
         return self.position - self.bin
 
 
@@ -203,14 +206,14 @@ class PeakLists(NamedTuple):
     peaks: Peaks
     """(3, peaks) in each field: peaks of the up, Doppler and down segment."""
     group: np.ndarray
-    """(3, peaks) int64: index of the group of adjacent bins to which each peak belongs, or
+    """(3, peaks) int64: index of the echo (group of adjacent bins) to which each peak belongs, or
     FALSE_PEAK_GROUP."""
     n_peaks: np.ndarray
-    """(3,) int64: number of peaks of each segment."""
+    """(3,) int64: number of listed peaks of the up, Doppler and down segment."""
 
     @classmethod
     def allocate(cls, peaks_max: int) -> "PeakLists":
-        """Allocate lists for at most ``peaks_max`` peaks of each segment, without peaks."""
+        """Return empty lists with room for ``peaks_max`` peaks of each segment."""
         return cls(
             Peaks.empty((3, peaks_max)),
             np.empty((3, peaks_max), np.int64),
@@ -231,12 +234,12 @@ class Returns(NamedTuple):
     range: np.ndarray
     """Range computed from the whole bins of the peaks [m]."""
     range_interpolated: np.ndarray
-    """Range computed from positions of the peaks between bins [m]."""
+    """Range computed from positions of the peaks that are interpolated between bins [m]."""
     radial_velocity: np.ndarray
     """Radial velocity computed from the whole bins of the peaks [m/s], positive when closing."""
     radial_velocity_interpolated: np.ndarray
-    """Radial velocity computed from positions of the peaks between bins [m/s], positive when
-    closing."""
+    """Radial velocity computed from positions of the peaks that are interpolated between bins
+    [m/s], positive when closing."""
     range_standard_error: np.ndarray
     """Standard error of ``range`` [m]."""
     range_interpolated_standard_error: np.ndarray
@@ -249,28 +252,28 @@ class Returns(NamedTuple):
     """Measured power of the weaker of the up and down peak, divided by the mean noise power of a
     bin."""
     pd: np.ndarray
-    """Probability that up and down segment both detect the echo of the return; nan if a peak is
-    false."""
+    """Probability that the up and the down segment both detect the echo of the return; nan if one
+    of its peaks is false."""
     flags: np.ndarray
     """uint8: bits that compare the return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """(n, draws, returns) int32: index of the beamlet that gave the peaks of a true or misread
-    return (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); -1 for others and without a return.
-    """
+    """(n, draws, returns) int32: index of the beamlet that made the peaks of a true or misread
+    return (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); -1 for a return of another kind, and
+    without a return."""
     group: np.ndarray
-    """(n, draws, returns, 3) int8: index of the group (adjacent bins above the threshold) of the
-    up, Doppler and down peak; -1 for no peak or a false peak."""
+    """(n, draws, returns, 3) int8: index of the echo (group of adjacent bins above the threshold)
+    that made the up, Doppler and down peak; -1 for no peak or a false peak."""
     range_per_slip: np.ndarray
-    """Shift of the interpolated range [m] by a slip of 1 m/s. The slip is the closing speed minus
-    the speed at which the range falls."""
+    """Derivative of ``range_interpolated`` with respect to the slip [m/(m/s)]. The slip is the
+    closing speed minus the speed at which the range falls."""
     radial_velocity_per_slip: np.ndarray
-    """Shift of the interpolated radial velocity [m/s] by a slip of 1 m/s. The slip is the closing
-    speed minus the speed at which the range falls."""
+    """Derivative of ``radial_velocity_interpolated`` with respect to the slip [1]. The slip is the
+    closing speed minus the speed at which the range falls."""
 
     @classmethod
     def empty(cls, shape: tuple[int, ...]) -> "Returns":
-        """Return arrays (n, draws, returns) that hold no returns."""
+        """Return a record of arrays (n, draws, returns) whose values mark no returns."""
         arrays: dict[str, np.ndarray] = {
             "flags": np.zeros(shape, np.uint8),
             "beamlet": np.full(shape, -1, np.int32),
@@ -399,7 +402,7 @@ def _iter_spectra(
     keys: np.ndarray,
     draw_range: range,
 ) -> Iterator[tuple[np.ndarray, NoiselessSpectra, LeakageBins]]:
-    """Yield indices of points in parts, with their noiseless spectra and bins of leaked signal.
+    """Yield, for batches of points, their indices, noiseless spectra and bins of leaked signal.
 
     The arguments are those of :func:`draw_returns`, and the numbers of the draws.
     """
@@ -447,50 +450,52 @@ class DrawConfig(NamedTuple):
     """Settings for draws of peaks that are common to all points."""
 
     first_draw: int
-    """Number of the first draw that is made."""
+    """Number of the first draw."""
     adds_noise: bool
-    """True if noise is added to the bins of an echo; False if random numbers are compared with
-    probabilities of detection."""
+    """True if noise is added to the bins of an echo and the sum is compared with the threshold;
+    False if random numbers are compared with probabilities of detection."""
     adds_powers: bool
-    """True if the lines of beamlets add in power, False if they add in amplitude."""
+    """True if the powers of beamlets' lines are added, False if their amplitudes are."""
     has_doppler: bool
-    """True if a shot has a Doppler segment, in which the frequency is constant."""
+    """True if shots have a Doppler segment, in which the frequency is constant."""
     nyquist_bin: int
     """Number of the bin at the Nyquist frequency: N/2, with N the FFT size."""
     down_beat_sign: float
-    """Sign for a complex record, with bins -N/2..N/2 - 1: 1 if the down beat minus the up beat
-    rises with the range, else -1. It is 0 for a real record, with bins 1..N/2. N is the FFT size.
-    """
+    """Sign by which a complex record, with bins -N/2..N/2 - 1, tells range from velocity: 1 if the
+    down beat minus the up beat rises with the range, -1 if it falls. It is 0 for a real record,
+    with bins 1..N/2. N is the FFT size."""
     two_beat_reading: int
     """Number of the reading (way to interpret an up and a down beat as range and velocity) that is
-    used without a Doppler peak."""
+    used if no Doppler peak confirms the pair."""
     real_ends_fft_size: int
-    """FFT size N if noise in the bins at frequency 0 (DC) and at Nyquist is real, else 0."""
+    """FFT size N if noise in the bins at frequency 0 and at Nyquist is real; 0 if it counts as
+    complex."""
     lobe_half_width: int
     """Half-width of the main lobe of a line [bins] if any bin of an echo may detect it; 0 if only
     its strongest bin may."""
     noise_filter: NoiseFilter
-    """Filter that makes the correlated noise of an echo's bins from independent numbers."""
+    """Filter that makes the correlated noise of an echo's bins from independent random numbers."""
     noise_covariance_root: np.ndarray
-    """Matrix that makes the noise of adjacent bins from as many independent numbers
+    """Matrix (k, k) that makes the noise of k adjacent bins from k independent random numbers
     (:func:`sweep.model.sampling.draws.noise_covariance_root`)."""
     spectrum_end_noise_filter: NoiseFilter
-    """Filter, like ``noise_filter``, for bins next to frequency 0 (DC) or Nyquist. It has no bins
-    if no echo in developed speckle is near either."""
+    """Filter that makes the noise of bins near frequency 0 or Nyquist. It has no bins if no echo in
+    developed speckle is near either."""
     noise_pseudo_variance_ratio: np.ndarray
-    """(bins,): ratio E[X^2] / E[|X|^2] of the complex noise X of bins, by their distance from
-    frequency 0 (DC) or Nyquist, up to the last bin with non-circular noise. It is empty if no echo
-    in developed speckle is near."""
+    """(bins,): ratio E[X^2] / E[|X|^2] of a bin's complex noise X. Element i is for the bin i bins
+    from frequency 0 or Nyquist, and the last element for the last bin with non-circular noise. The
+    array is empty if no echo in developed speckle is near either."""
     n_looks: int
-    """Number of looks (records of a segment) whose powers are averaged or that vote; 1 if looks are
-    added in amplitude."""
+    """Number of looks (records of a segment) whose powers are averaged or whose detections are
+    votes; 1 if the amplitudes of looks are added."""
     has_independent_speckle: bool
     """True if the speckle differs between looks (records of a segment), whether independent or
     partly correlated."""
     votes_needed: int
-    """Number of looks (records of a segment) that must detect an echo. It is 0 if the looks' mean
-    power detects. It is -1 if more than CORRELATED_LOOKS_MAX looks have partly correlated speckle;
-    one amplitude is then compared with the probability of detection."""
+    """Number of looks (records of a segment) that must detect an echo. It is 0 if the mean power of
+    the looks is compared with the threshold. It is -1 if more than CORRELATED_LOOKS_MAX looks have
+    partly correlated speckle; in this case one amplitude is compared with the probability of
+    detection."""
 
     @classmethod
     def from_shots(cls, shots: Shots, first_draw: int, adds_noise: bool) -> "DrawConfig":
@@ -557,7 +562,7 @@ class DrawInputs(NamedTuple):
     last_bin: np.ndarray
     """(n, 3, groups) int64: number of the group's last (highest) bin; -1 for no group."""
     pd: np.ndarray
-    """(n, 3, groups): probability that a segment detects the group (adjacent bins above the
+    """(n, 3, groups): probability that a segment detects the echo (group of adjacent bins above the
     threshold)."""
     magnitude_below: np.ndarray
     """(n, 3, groups): noiseless |X| of the bin below the group's strongest bin [V]."""
@@ -567,7 +572,7 @@ class DrawInputs(NamedTuple):
     """(n, 3, groups): noiseless |X| of the bin above the group's strongest bin [V]."""
     line_deviation_bins: np.ndarray
     """(n, 3, groups): standard deviation, weighted by power, of the positions of the beamlets'
-    lines in a group of adjacent bins [bins]."""
+    lines in each group of adjacent bins [bins]."""
     line_positions: np.ndarray
     """(n, 3, beamlets): position of each beamlet's line [bins], 0..N/2 with N the FFT size. For a
     complex record it is signed, and shifted by a multiple of N to be nearest to the strongest
@@ -580,46 +585,48 @@ class DrawInputs(NamedTuple):
     threshold_ratio: np.ndarray
     """(n,): threshold divided by sigma, the noise of a bin per quadrature."""
     line_noise_ratio: np.ndarray
-    """(n,): noise of bins that hold lines of the echo, divided by sigma, the noise of other bins
-    per quadrature."""
+    """(n,): noise per quadrature of bins that hold lines of the echo, divided by sigma, the noise
+    per quadrature of bins without signal."""
     bin_thresholds: BinThresholds
-    """(n,) in each field: threshold on |X| and noise of each point's bins
+    """Record with (n,) in each field: threshold on |X|, and noise, of each point's bins
     (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa_noise: np.ndarray
     """(n, 3): probability that noise alone raises a false alarm in a segment."""
     doppler_prediction: DopplerPrediction
-    """(n,) in each field: coefficients that predict the Doppler beat from the up and down beat."""
+    """Record with (n,) in each field: coefficients that predict the Doppler beat from the up and
+    down beat."""
     down_pd_if_up_missed: np.ndarray
-    """(n, groups): probability that the down segment detects a group, if the up segment misses the
-    group of the same number."""
+    """(n, groups): probability that the down segment detects echo i, if the up segment misses echo
+    i. i is the index along the second axis."""
     down_pd_if_up_detected: np.ndarray
-    """(n, groups): probability that the down segment detects a group, if the up segment detects the
-    group of the same number."""
+    """(n, groups): probability that the down segment detects echo i, if the up segment detects echo
+    i. i is the index along the second axis."""
     first_searched_bin: np.ndarray
-    """(n, 3) int64: first bin in which noise alone may raise a false peak."""
+    """(n, 3) int64: number of the first bin in which a false peak of noise alone may be drawn."""
     last_searched_bin: np.ndarray
-    """(n, 3) int64: last bin in which noise alone may raise a false peak."""
+    """(n, 3) int64: number of the last bin in which a false peak of noise alone may be drawn."""
     line_grid: SpeckleLineGrid
     """Lines that represent each point's footprint in developed speckle. Without developed speckle
-    the arrays have no points (length 0 instead of n)."""
+    it has no points."""
     line_centre: np.ndarray
-    """(n, 3, groups): mean position of the beamlets' lines in a group of adjacent bins [bins]."""
+    """(n, 3, groups): mean position [bins] of the beamlets' lines in each group of adjacent bins.
+    """
     echo_fraction: np.ndarray
-    """(n, 3, groups): fraction, 0..1, of the echo in the mean power (echo plus noise) of the
-    amplitude that detects a group in speckle."""
+    """(n, 3, groups): fraction, 0..1, of the echo in the mean power of echo plus noise, for the
+    random amplitude that decides on the detection of a group in developed speckle."""
     n_independent_bins: np.ndarray
-    """(n, 3, groups): equivalent number of independent bins, any of which may detect a group in
+    """(n, 3, groups): equivalent number of independent bins, each of which may detect a group in
     developed speckle."""
     speckle_mixing: SpeckleMixing
-    """(n,) in each field: coefficients of the amplitudes by speckle in the three segments; 0
-    without speckle."""
+    """Record with (n,) in each field: coefficients by which independent random amplitudes are mixed
+    into the speckle of the three segments; 0 without speckle."""
     look_covariance_root: np.ndarray
-    """(n, 3, looks, sets) complex: coefficients by which independent sets of speckle are mixed into
-    the partly correlated speckle of looks (records of a segment). In other cases there are no sets.
-    """
+    """(n, 3, looks, sets) complex: coefficients by which independent sets of speckle amplitudes are
+    mixed into the partly correlated speckle of looks (records of a segment). Without partly
+    correlated speckle, or with more than CORRELATED_LOOKS_MAX looks, it is empty (sets = 0)."""
 
     def select(self, indices: np.ndarray) -> "DrawInputs":
-        """Return the quantities of the points with the given indices."""
+        """Return the record of the points with the given indices."""
         return DrawInputs(
             *(
                 v.select(indices)
@@ -634,16 +641,18 @@ class DrawWorkspace(NamedTuple):
     """Arrays that compiled code writes to within a draw, allocated once for all draws."""
 
     noise: NoiseScratch
-    """Noise of an echo's bins over sigma, the standard deviation per quadrature."""
+    """Scratch for the noise of an echo's bins over sigma, the noise of a bin per quadrature."""
     bin_magnitude_ratio: np.ndarray
-    """(bins,): |X| of an echo's bins over sigma, the noise of a bin per quadrature."""
+    """(bins,): |X| of an echo's bins in a draw over sigma, the noise of a bin per quadrature."""
     bin_power: np.ndarray
-    """(bins,): |X|^2 of an echo's bins over sigma^2, the noise power of a bin per quadrature."""
+    """(bins,): |X|^2 of an echo's bins in a draw over sigma^2, the noise power of a bin per
+    quadrature."""
     pedestal_power: np.ndarray
     """(bins,): power of the phase-noise pedestal in an echo's bins, divided by the power of noise.
     """
     all_bins_are_echo: np.ndarray
-    """(bins,) bool: mask that marks all bins as bins of the echo (all True)."""
+    """(bins,) bool: mask of True in all elements, for functions that need a mask of the bins of an
+    echo."""
     false_peak_bins: np.ndarray
     """(groups + 1,) int64: numbers of the bins of a segment's false peaks."""
     false_peak_magnitude_ratios: np.ndarray
@@ -654,7 +663,7 @@ class DrawWorkspace(NamedTuple):
 
     @classmethod
     def allocate(cls, n_bins: int, groups_max: int) -> "DrawWorkspace":
-        """Allocate arrays for a largest number of bins of an echo, and of echoes of a segment.
+        """Allocate arrays for a given number of bins of an echo, and of echoes of a segment.
 
         Parameters
         ----------
@@ -684,25 +693,25 @@ class DrawnPeaks(NamedTuple):
     """Peaks of n points, drawn and paired into returns (measured points)."""
 
     peaks: Peaks
-    """(n, draws, returns, 3) in each field: up, Doppler and down peak of each return; nan for none.
-    """
+    """Record with (n, draws, returns, 3) in each field: up, Doppler and down peak of each return;
+    nan for none."""
     reading: np.ndarray
-    """(n, draws, returns) int64: which reading of the beats gave range and velocity, as numbered by
-    :func:`sweep.model.waveform.doppler_and_range_beat`; -1 without a return."""
+    """(n, draws, returns) int64: number of the reading (way to interpret the beats) that gives
+    range and velocity, as in :func:`sweep.model.waveform.doppler_and_range_beat`; -1 without a
+    return."""
     group: np.ndarray
-    """(n, draws, returns, 3) int8: index of the group of adjacent bins to which the up, Doppler and
-    down peak belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
+    """(n, draws, returns, 3) int8: index of the echo (group of adjacent bins) that made the up,
+    Doppler and down peak, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
     flags: np.ndarray
     """(n, draws, returns) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """(n, draws, returns) int32: index of the beamlet to which the peaks of a return belong, if it
-    is true or misread; else -1. The peaks of a misread return were converted to a wrong range or
-    velocity."""
+    """(n, draws, returns) int32: index of the beamlet that made the peaks of a return that is true
+    or misread (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); else -1."""
 
     @classmethod
     def empty(cls, bin_groups: BinGroups, draws: int) -> "DrawnPeaks":
-        """Return the drawn peaks of n shots without any return (measured point).
+        """Return a record for n shots whose values mark no returns (measured points).
 
         Parameters
         ----------
@@ -731,25 +740,25 @@ class ListedReturns(NamedTuple):
     """Returns (measured points) of all shots and draws in one list of length m."""
 
     point: np.ndarray
-    """(m,) int64: index of the shot to which each return belongs."""
+    """(m,) int64: index of the shot to which each of m returns belongs."""
     peaks: Peaks
-    """(m, 3) in each field: up, Doppler and down peak of each return; nan for none."""
+    """Record with (m, 3) in each field: up, Doppler and down peak of each return; nan for none."""
     reading: np.ndarray
-    """(m,) int64: which reading of the beats gave range and velocity, as numbered by
-    :func:`sweep.model.waveform.doppler_and_range_beat`."""
+    """(m,) int64: number of the reading (way to interpret the beats) that gives range and velocity,
+    as in :func:`sweep.model.waveform.doppler_and_range_beat`."""
     group: np.ndarray
-    """(m, 3) int8: index of the group of adjacent bins to which the up, Doppler and down peak
-    belong, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
+    """(m, 3) int8: index of the echo (group of adjacent bins) that made the up, Doppler and down
+    peak, or FALSE_PEAK_GROUP or NO_PEAK_GROUP."""
     flags: np.ndarray
     """(m,) uint8: bits that compare each return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`)."""
     beamlet: np.ndarray
-    """(m,) int32: index of the beamlet to which the peaks of a return belong, if it is true or
-    misread; else -1. The peaks of a misread return were converted to a wrong range or velocity."""
+    """(m,) int32: index of the beamlet that made the peaks of a return that is true or misread
+    (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); else -1."""
 
     @classmethod
     def from_drawn_peaks(cls, drawn_peaks: DrawnPeaks) -> "ListedReturns":
-        """List the returns of all points and draws, in this order."""
+        """Return the list of all returns in ``drawn_peaks``, ordered by point, then draw."""
         is_return = drawn_peaks.flags > 0
         point, _, _ = np.nonzero(is_return)
         return cls(
@@ -765,7 +774,7 @@ class ListedReturns(NamedTuple):
 def make_draw_inputs(
     shots: Shots, bin_groups: BinGroups, motion: EgoMotion | None = None
 ) -> DrawInputs:
-    """Return the quantities of shots on which draws of their peaks depend.
+    """Return the quantities of shots from which their peaks are drawn.
 
     Parameters
     ----------
@@ -847,7 +856,10 @@ def make_draw_inputs(
 
 
 def _speckle_mixing(shots: Shots) -> SpeckleMixing:
-    """Return the coefficients of the amplitudes by speckle in the segments of n shots."""
+    """Return the coefficients that mix independent amplitudes into the speckle of three segments.
+
+    The fields of the result are (n,) for n shots; 0 without speckle.
+    """
     if shots.speckle.segment_correlations is None:
         return SpeckleMixing(*np.zeros((6, shots.size)))
     return shots.speckle.segment_correlations.speckle_mixing().broadcast(shots.size)
@@ -856,7 +868,8 @@ def _speckle_mixing(shots: Shots) -> SpeckleMixing:
 def _look_covariance_roots(shots: Shots) -> np.ndarray:
     """Return coefficients that mix independent speckle into that of each look, (n, 3, looks, sets).
 
-    A look is a record of a segment. The result is :attr:`DrawInputs.look_covariance_root`.
+    A look is a record of a segment. The result is empty (sets = 0) without partly correlated
+    speckle, and with more than CORRELATED_LOOKS_MAX looks.
     """
     n_looks = shots.looks.number
     if shots.speckle.look_speckle is None or n_looks > CORRELATED_LOOKS_MAX:
@@ -867,9 +880,10 @@ def _look_covariance_roots(shots: Shots) -> np.ndarray:
 def _n_independent_bins(
     shots: Shots, bin_groups: BinGroups, has_noncircular_bins: np.ndarray
 ) -> np.ndarray:
-    """Return the equivalent number of independent bins that detect each echo, (n, 3, groups).
+    """Return the equivalent number of independent bins that may detect each echo, (n, 3, groups).
 
-    For the chirps it is that of :func:`joint_detection_probability`; near DC and Nyquist it is 1.
+    For the up and down segment it is that of :func:`joint_detection_probability`. It is 1 for an
+    echo near frequency 0 or Nyquist, and if only the strongest bin may detect.
     """
     n_independent = np.ones(bin_groups.pd.shape)
     if shots.detection_settings.echo_bin_rule == "peak_bin":
@@ -918,7 +932,7 @@ def _speckle_draw_inputs(shots: Shots, bin_groups: BinGroups) -> tuple[np.ndarra
 def _doppler_prediction(shots: Shots, motion: EgoMotion | None = None) -> DopplerPrediction:
     """Return the coefficients that predict the Doppler beat from the up and the down beat.
 
-    The known ``motion`` sets the shift that is added to the tolerance of the prediction. The shift
+    ``motion_shift_max_bins`` of the result follows from the known ``motion`` of the instrument. It
     is 0 if ``motion`` is None.
     """
     _, doppler, down = shots.waveform.chirp_rate_ratios
@@ -943,9 +957,9 @@ def _doppler_prediction(shots: Shots, motion: EgoMotion | None = None) -> Dopple
 def _searched_bins(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
     """Return the first and the last bin in which noise alone may raise a false peak, (n, 3) each.
 
-    N is the FFT size. For a complex record the bins are 0..N - 1. For a real record they are those
-    whose noise is circular: all but a few next to frequency 0 and Nyquist, or 1..N/2 if noise is
-    taken as circular in all. A search band narrows them.
+    For a complex record these are bins 0 and N - 1, with N the FFT size. For a real record they
+    bound the bins whose noise is circular: all but a few next to frequency 0 and Nyquist, or 1..N/2
+    if noise counts as circular in all bins. A search band narrows the range.
     """
     first_searched, nyquist_bin = shots.first_searched_bin, shots.fft_size // 2
     last_searched = nyquist_bin - first_searched if shots.real_ends_fft_size else nyquist_bin
@@ -972,25 +986,25 @@ class MeasuredValues(NamedTuple):
     radial_velocity: np.ndarray
     """(m,): radial velocity of each return [m/s]."""
     range_standard_error: np.ndarray
-    """(m,): standard error by noise of ``range`` [m]."""
+    """(m,): standard error of ``range`` due to noise [m]."""
     radial_velocity_standard_error: np.ndarray
-    """(m,): standard error by noise of ``radial_velocity`` [m/s]."""
+    """(m,): standard error of ``radial_velocity`` due to noise [m/s]."""
 
 
 class Measurements(NamedTuple):
     """Range and radial velocity of m returns, by whole bins and by positions between bins."""
 
     by_whole_bins: MeasuredValues
-    """(m,) in each field: values computed from the whole bins of the peaks."""
+    """Record with (m,) in each field: values computed from the whole bins of the peaks."""
     interpolated: MeasuredValues
-    """(m,) in each field: values computed from positions of the peaks between bins."""
+    """Record with (m,) in each field: values computed from interpolated positions of the peaks."""
     range_per_half_bin: np.ndarray
-    """(m,): difference of range that shifts the beats of the chirps by half a bin [m]."""
+    """(m,): change of range that shifts the beats of the chirps by half a bin [m]."""
     velocity_per_half_bin: np.ndarray
-    """(m,): difference of radial velocity that shifts the beats of the chirps by half a bin [m/s].
-    """
+    """(m,): change of radial velocity that shifts the beats of the chirps by half a bin [m/s]."""
     range_bias: np.ndarray | float
-    """(m,): measured range minus the range at the shot's start, by motion within the shot [m]."""
+    """(m,): measured range minus the range at the start of the shot, due to motion during the shot
+    [m]."""
 
 
 def measure_returns(
@@ -1039,9 +1053,9 @@ def _measure_listed_returns(
     motion: EgoMotion | None,
     from_three_bins: bool,
 ) -> Returns:
-    """Compute the returns of :func:`measure_returns` for m returns in a list.
+    """Compute range and velocity of m listed returns, and flag wrong conversions.
 
-    The fields of the result are (m,).
+    The result is that of :func:`measure_returns`, with the fields (m,).
     """
     uses_fit = shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS
     point, at_returns = (
@@ -1135,14 +1149,17 @@ def _measure_listed_returns(
 
 
 def _values_of_points(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> np.ndarray:
-    """Return the values (m,) at the indices ``point``, of values (n,) or one value for all."""
+    """Return the values (m,) at the indices ``point`` (m,).
+
+    The values are an array (n,), or one number for all points.
+    """
     return np.broadcast_to(values, shots.size)[point]
 
 
 def _wander_covariance(
     shots: Shots, inputs: DrawInputs, listed_returns: ListedReturns, from_three_bins: bool
 ) -> np.ndarray | None:
-    """Return the covariance [bins^2], by speckle, of the position errors of a return's three peaks.
+    """Return the covariance [bins^2], due to speckle, of the position errors of a return's peaks.
 
     It is (m, 3, 3) by segment, with the signs of the beats; None for shots without speckle.
     """
@@ -1195,10 +1212,10 @@ def _wander_covariance(
 def _add_drift_errors(
     shots: Shots, listed_returns: ListedReturns, motion: EgoMotion | None
 ) -> ListedReturns:
-    """Add the errors by the drift of lines within the record to the peaks' standard errors.
+    """Return the list of returns, with the drift of lines within the record in standard errors.
 
-    Lines drift because range and velocity change within the record. The drift follows from the
-    known motion, if given, else from the true motion of the shots.
+    Lines drift because range and velocity change within the record. The drift is that of the known
+    motion, or of the true motion of the shots if ``motion`` is None.
     """
     if motion is not None:
         shots = replace(
@@ -1230,16 +1247,17 @@ def _add_drift_errors(
 
 
 _POSITION_ERROR_MAX_BINS = 0.5
-"""Limit on the standard error of a peak's position [bins] after the correction for late echoes."""
+"""Upper limit of the standard error of a peak's position [bins] that is corrected for a late echo.
+"""
 
 
 def _correct_late_echoes(
     shots: Shots, listed_returns: ListedReturns, measurements: Measurements
 ) -> ListedReturns:
-    """Correct peak positions for the samples that lack the echo because it arrives late.
+    """Return the list of returns, with peak positions corrected for echoes that arrive late.
 
-    The instrument knows the number of these samples from the range by whole bins. Standard errors
-    are limited to half a bin.
+    The first samples of a record lack a late echo. The instrument knows their number from the range
+    by whole bins. Standard errors of the positions are limited to half a bin.
     """
     at_returns = partial(_values_of_points, shots, listed_returns.point)
     delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.by_whole_bins.range)
@@ -1270,21 +1288,23 @@ class ShiftsByMotion(NamedTuple):
     """Shifts of measured range and velocity by motion that the beats do not show."""
 
     range: np.ndarray
-    """(m,): shift of the range [m] by one unit of the motion."""
+    """(m,): shift of the measured range [m] by one unit of the motion (1 m/s or 1 m/s^2)."""
     radial_velocity: np.ndarray
-    """(m,): shift of the radial velocity [m/s] by one unit of the motion."""
+    """(m,): shift of the measured radial velocity [m/s] by one unit of the motion (1 m/s or 1
+    m/s^2)."""
 
 
 class MotionCorrection(NamedTuple):
     """Measured values of m returns after the correction for the instrument's known motion."""
 
     by_whole_bins: MeasuredValues
-    """(m,) in each field: values computed from whole bins. Their errors alone are changed."""
+    """Record with (m,) in each field: values computed from whole bins. The correction changes their
+    standard errors only."""
     interpolated: MeasuredValues
-    """(m,) in each field: values computed from positions between bins."""
+    """Record with (m,) in each field: corrected values computed from interpolated positions."""
     shifts_per_slip: ShiftsByMotion
-    """(m,) in each field: shifts by a slip of 1 m/s. The slip is the closing speed minus the speed
-    at which the range falls."""
+    """Record with (m,) in each field: shifts of range and velocity by a slip of 1 m/s. The slip is
+    the closing speed minus the speed at which the range falls."""
 
 
 def _correct_for_motion(
@@ -1296,8 +1316,8 @@ def _correct_for_motion(
 ) -> MotionCorrection:
     """Correct interpolated ranges and velocities for the instrument's known motion.
 
-    The standard deviation by unknown motion is added to the standard errors
-    (:mod:`sweep.model.pointcloud.ego_motion`).
+    The error due to unknown motion is added to the standard errors
+    (:mod:`sweep.model.pointcloud.ego_motion`). The result is a :class:`MotionCorrection`.
     """
     motion = motion.select(listed_returns.point)
     per_acceleration, per_slip = _response_to_motion(shots, listed_returns)
@@ -1333,8 +1353,8 @@ def _response_to_motion(
 ) -> tuple[ShiftsByMotion, ShiftsByMotion]:
     """Return the shifts of measured range and velocity by motion that the beats do not show.
 
-    The first shifts are by an acceleration of 1 m/s^2, the second by a slip of 1 m/s. The slip is
-    the radial velocity minus the speed at which the range falls.
+    The result is two :class:`ShiftsByMotion`: by an acceleration of 1 m/s^2, and by a slip of 1
+    m/s. The slip is the radial velocity minus the speed at which the range falls.
     """
     coefficients = shots.beat_coefficients
     by_acceleration, by_slip = _beat_change_by_motion(shots)
@@ -1367,9 +1387,10 @@ def _response_to_motion(
 
 
 def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shifts (3, n) of the beats [Hz] by 1 m/s^2 of acceleration and by 1 m/s of slip.
+    """Return the shifts of the beats [Hz] by an acceleration of 1 m/s^2, and by a slip of 1 m/s.
 
-    The slip is the radial velocity minus the speed at which the range falls.
+    Each of the two results is (3, n), by segment. The slip is the radial velocity minus the speed
+    at which the range falls.
     """
     chirp_rates = shots.beat_coefficients.chirp_rate
     starts = np.array([np.broadcast_to(start, shots.size) for start in shots.motion.segment_starts])
@@ -1395,8 +1416,8 @@ def _measure_by_reading(
     """Compute range and velocity at mid-chirp from the up and down peak of each return.
 
     The reading of a return says how its beats are interpreted: far or fast target, folded at
-    Nyquist or not. Errors of both peaks by common speckle are correlated. Their covariance reduces
-    the variance of the range, and adds to that of the velocity.
+    Nyquist or not. Speckle common to both peaks makes their errors correlated. Their covariance
+    reduces the variance of the range, and adds to that of the velocity.
     """
     at_returns = partial(_values_of_points, shots, listed_returns.point)
     up_carrier, _, _ = shots.waveform.carriers
@@ -1459,7 +1480,7 @@ def _measure_by_reading(
 def _measure_by_fit(
     shots: Shots, listed_returns: ListedReturns, wander_covariance: np.ndarray | None
 ) -> Measurements:
-    """Compute range and velocity at the shot's start by a fit of each return's peaks."""
+    """Compute range and velocity at the start of the shot by a fit to each return's peaks."""
     point = listed_returns.point
     bin_width = np.broadcast_to(shots.record.bin_width, shots.size)
     carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.waveform.carriers]
@@ -1546,9 +1567,10 @@ def _add_wander_covariance(
     weights: np.ndarray,
     point_index: np.ndarray,
 ) -> RangeVelocityDeviation:
-    """Add the covariance of the beats by speckle to the deviations of range and velocity.
+    """Add the variance due to speckle to the standard errors of range and velocity.
 
-    ``beat_covariance`` (m, 3, 3) [Hz^2] is the covariance of the beats by speckle.
+    ``beat_covariance`` (m, 3, 3) [Hz^2] is the covariance of the beats of the three segments due to
+    speckle.
     """
     coefficients = shots.beat_coefficients.select_points(point_index)
     responses = []
@@ -1646,38 +1668,40 @@ class GroupSpeckle(NamedTuple):
     """
 
     first_bin: np.ndarray
-    """(groups, 3) int64: number of the first bin of each group of adjacent bins, by segment."""
+    """(groups, 3) int64: number of the first bin of each echo (group of adjacent bins), by segment.
+    """
     n_bins: np.ndarray
-    """(groups, 3) int64: number of bins of each group; 0 for a segment without the group."""
+    """(groups, 3) int64: number of bins of each echo; 0 for a segment without the echo."""
     mean_power: np.ndarray
-    """(groups, 3, bins): mean power of each bin over speckle, for lines of a footprint with the
-    total power 1."""
+    """(groups, 3, bins): mean over speckle of each bin's power, if all lines of the footprint
+    together have the power 1."""
     pseudo_variance_ratio: np.ndarray
     """(groups, 3, bins): pseudo-variance E[A^2] of a bin's complex amplitude A over its mean power
     E[|A|^2]."""
     rms_magnitude_ratio: np.ndarray
-    """(groups, 3, bins): root mean square over speckle of the echo's |X|, over sigma, the noise of
-    a bin per quadrature."""
+    """(groups, 3, bins): root mean square over speckle of the echo's |X| in each bin, over sigma,
+    the noise of a bin per quadrature."""
     amplitudes: np.ndarray
-    """(groups, looks, 3, bins): complex factors by speckle, of mean power 1, on the echo's bins in
-    each look (record); one look if all looks have the same speckle."""
+    """(groups, looks, 3, bins) complex: speckle, of mean power 1, by which each bin of an echo is
+    multiplied in each look (record of a segment). If all looks have the same speckle, the axis has
+    one look."""
     covariance_factor_rank: np.ndarray
-    """(groups,) int64: number of rows of ``covariance_factor`` in use; 0 if the speckle is summed
-    over the lines of the footprint."""
+    """(groups,) int64: number of rows of ``covariance_factor`` in use; 0 if the speckle of the echo
+    is summed over the lines of the footprint instead."""
     covariance_factor: np.ndarray
-    """(groups, rows, 3, bins): factor of the covariance of the bins' speckle, by which the speckle
-    is drawn from few random numbers."""
+    """(groups, rows, 3, bins) complex: factor of the covariance of the bins' speckle. It makes the
+    speckle from few random numbers, one for each row."""
     independent_amplitudes: np.ndarray
-    """(sets, 3, bins): complex factors by speckle, by draw, segment and bin. The draws (sets) are
-    independent, and are mixed into the partly correlated speckle of the looks."""
+    """(sets, 3, bins) complex: independent sets of speckle in one draw, by segment and bin. They
+    are mixed into the partly correlated speckle of the looks (records of a segment)."""
     detection_amplitude_weights: np.ndarray
-    """(groups, 3, bins): weights of the bins in one amplitude of mean power 1, which is compared
-    with the probability of detection."""
+    """(groups, 3, bins): weights that sum the bins' speckle to one amplitude of mean power 1. This
+    amplitude is compared with the probability of detection."""
 
 
 @njit(cache=True, error_model="numpy")
 def empty_group_speckle(groups_max):
-    """Return the speckle record of a point whose echoes do not fade."""
+    """Return a :class:`GroupSpeckle` for a point whose echoes do not fade."""
     bins = np.zeros((groups_max, 3), np.int64)
     no_amplitudes = np.zeros((groups_max, 1, 3, 0), np.complex128)
     powers = np.zeros((groups_max, 3, 0))
@@ -1699,7 +1723,7 @@ def empty_group_speckle(groups_max):
 
 @njit(cache=True, error_model="numpy")
 def prepare_group_speckle(point, config, inputs, spectra):
-    """Return the bins of a point's echoes for which speckle is drawn, with their mean powers.
+    """Return the bins of a point's echoes in which speckle is drawn, with their mean powers.
 
     Parameters
     ----------
@@ -1844,9 +1868,9 @@ def fill_detection_amplitude_weights(
 ):
     """Compute the weights of an echo's bins in the amplitude that decides on its detection.
 
-    With ``peak_bin`` only the strongest bin has a weight. If any bin detects, the bins are weighted
-    as a lone line in the middle of the echo would fill them. The amplitudes of two segments then
-    have the same correlation as in the middle of the echo.
+    Under the rule ``peak_bin`` only the strongest bin has a weight. If any bin may detect, bins
+    have the weights that a single line in the middle of the echo would give them. The amplitudes of
+    two segments then have the same correlation as in the middle of the echo.
 
     Parameters
     ----------
@@ -1888,7 +1912,7 @@ def fill_detection_amplitude_weights(
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_group_speckle(address, point, inputs, speckle, speckle_factors):
-    """Draw the speckle of a point's echoes, and set factors on their magnitudes.
+    """Draw the speckle of a point's echoes, and compute the factors on their magnitudes.
 
     Parameters
     ----------
@@ -2351,7 +2375,7 @@ def list_noisy_leaked_peaks(
 def detect_by_peak_bin(
     address, point, segment, group, config, inputs, spectra, speckle, interpolation, workspace
 ):
-    """Add noise to an echo's strongest bin, and detect the echo if the sum reaches the threshold.
+    """Add noise to an echo's strongest bin, and detect the echo if its sum reaches the threshold.
 
     Parameters
     ----------
@@ -2644,13 +2668,13 @@ def detect_in_speckle(
 
 
 _OTHER_BINS_FIRST_RANDOM_INDEX = 1 << 22
-"""Index of the first random number used for an echo's independent bins other than its strongest.
-Each echo has its own range of indices."""
+"""Index, in the stream, of the first random number used for the independent bins of echo 0 without
+its strongest bin. Later echoes use later ranges of indices."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_pd):
-    """Return True if an echo is detected by an independent bin other than its strongest bin.
+    """Return True if an independent bin of an echo, not its strongest, detects the echo.
 
     Parameters
     ----------
@@ -2692,7 +2716,9 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_adjacent_bin_noise(address, stream, first_index, first_bin, n_bins, config, noise):
-    """Draw the noise of adjacent bins over sigma, the standard deviation per quadrature.
+    """Draw the noise of adjacent bins, in units of sigma, into ``noise``.
+
+    sigma is the standard deviation of a bin's noise per quadrature.
 
     Parameters
     ----------
@@ -2723,7 +2749,7 @@ def draw_adjacent_bin_noise(address, stream, first_index, first_bin, n_bins, con
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def is_near_spectrum_end(first_bin, n_bins, config):
-    """Return True if any of adjacent bins has non-circular noise, near DC or Nyquist.
+    """Return True if any of the adjacent bins has non-circular noise, near frequency 0 or Nyquist.
 
     Parameters
     ----------
@@ -2740,9 +2766,10 @@ def is_near_spectrum_end(first_bin, n_bins, config):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_noise_near_spectrum_end(address, stream, first_index, first_bin, n_bins, config, noise):
-    """Draw the noise of adjacent bins near frequency 0 (DC) or Nyquist.
+    """Draw the noise of adjacent bins near frequency 0 (DC) or Nyquist, in units of sigma.
 
-    Bins beyond either end are complex conjugates of their mirror images.
+    sigma is the standard deviation of a bin's noise per quadrature. Bins beyond frequency 0 or
+    Nyquist are complex conjugates of their mirror images.
 
     Parameters
     ----------
@@ -2791,7 +2818,9 @@ def draw_noise_near_spectrum_end(address, stream, first_index, first_bin, n_bins
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_three_bin_noise(address, stream, first_index, interpolation, noise):
-    """Draw the noise of three adjacent bins over sigma, the standard deviation per quadrature.
+    """Draw the noise of three adjacent bins, in units of sigma, into ``noise``.
+
+    sigma is the standard deviation of a bin's noise per quadrature.
 
     Parameters
     ----------
@@ -2956,9 +2985,9 @@ def detect_by_any_bin(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, interpolation):
-    """Return a peak, mirrored into 0..N/2 if it is beyond DC or Nyquist.
+    """Return a peak, mirrored into 0..N/2 if its bin is beyond frequency 0 or Nyquist.
 
-    N is the FFT size. A peak of a complex record wraps from N/2 to -N/2.
+    N is the FFT size. A peak of a complex record is not mirrored: its bin wraps from N/2 to -N/2.
 
     Parameters
     ----------
@@ -3003,7 +3032,7 @@ def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def store_peak(peak, group, segment, index, peak_lists):
-    """Store a peak in a segment's list.
+    """Write a peak into the list of a segment, in place.
 
     Parameters
     ----------
@@ -3037,7 +3066,7 @@ def draw_false_peak_bin(
     fft_size,
     down_beat_sign,
 ):
-    """Draw the bin of a false peak of noise, uniformly from the searched bins outside all echoes.
+    """Return the bin of a false peak of noise, uniform over the searched bins outside all echoes.
 
     Parameters
     ----------

@@ -195,9 +195,11 @@ class EchoBounds(NamedTuple):
     """
 
     first_bin: np.ndarray
-    """(k,) int64: index, in the spectrum, of the first bin of each of k echoes."""
+    """(k,) int64: index of the first bin of each of k echoes. The spectrum of a complex record is
+    rotated by :func:`sweep.model.sampling.noisy_spectra.rotate_to_centre`."""
     last_bin: np.ndarray
-    """(k,) int64: index, in the spectrum, of the last bin of each of k echoes."""
+    """(k,) int64: index of the last bin of each of k echoes, in the same spectrum as ``first_bin``.
+    """
 
 
 class FlaggedPeaks(NamedTuple):

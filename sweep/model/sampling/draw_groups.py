@@ -41,17 +41,19 @@ from sweep.model.sampling.philox import (
 
 _INDEX_BITS = 6
 GROUP_SIZE = 1 << _INDEX_BITS
-"""Number of draws in a group. The means of larger groups vary less, but there must be several
-groups, because a confidence interval follows from their variance. A tolerance of 0.01 takes at
-least 384 draws."""
+"""Number of draws in a group, over which random numbers are spread evenly. The means of larger
+groups vary less, but a confidence interval follows from the variance of several groups' means. A
+tolerance of 0.01 takes at least 384 draws."""
 
 GROUPED_NUMBERS_MAX = 32
-"""Number of random numbers of a draw, for each cause, that are spread evenly over a group. Further
-numbers are independent, as none of so many matters much."""
+"""Largest number of random numbers of a draw, for each cause, that are spread evenly over a group
+of draws. All later numbers are independent: as none of so many matters much, spreading them would
+gain little."""
 
 _WORDS_PER_PAIR = 4 + GROUP_SIZE
-"""Number of random words of a group for each pair of numbers: two to scramble the cells of the two
-numbers, two unused, and GROUP_SIZE to shuffle the order of the cells."""
+"""Number of random words of a group of draws for each pair of random numbers. Two words scramble
+the cells of the two numbers, two are unused, and GROUP_SIZE words shuffle the order of the cells.
+"""
 
 _CELL_SHIFT, _OFFSET_SHIFT = np.uint64(64 - _INDEX_BITS), np.uint64(_INDEX_BITS)
 _ONE = np.uint64(1)
@@ -180,10 +182,11 @@ def _fill_cells(group_address, stream, cells):
 
 @njit(cache=True)
 def _scramble_cell(cell, word):
-    """Return a cell, 0 to GROUP_SIZE - 1, whose bits are flipped at random.
+    """Return a cell, 0 to GROUP_SIZE - 1, with bits flipped at random (Owen's scrambling).
 
-    A bit of the random ``word`` decides on each flip. It depends on the higher bits of the cell, so
-    that every half of the unit interval, every half of a half, and so on is swapped by itself.
+    A bit of the random ``word`` decides on each flip. The choice of this bit depends on the higher
+    bits of the cell, so that every half of the unit interval, every half of a half, and so on is
+    swapped by itself.
     """
     node, scrambled = np.uint64(1), np.uint64(0)
     for level in range(_INDEX_BITS - 1, -1, -1):
@@ -197,10 +200,10 @@ class GroupStatistics(NamedTuple):
     """Number and variance of the means of whole groups of draws, (names, points) each."""
 
     n_groups: np.ndarray
-    """(names, points) int64: number of whole groups."""
+    """(names, points) int64: number of groups of draws that are complete."""
     group_variance: np.ndarray
-    """(names, points): unbiased estimate of the variance of a group's mean; nan with fewer than two
-    groups."""
+    """(names, points): unbiased estimate of the variance of the mean of a group of draws; nan with
+    fewer than two complete groups."""
 
 
 class GroupMeans:
@@ -229,7 +232,7 @@ class GroupMeans:
     def add(
         self, point_indices: np.ndarray, draw_numbers: np.ndarray, values: Mapping[str, np.ndarray]
     ) -> None:
-        """Add the values of draws to those of their points.
+        """Add the values of draws to the sums and means of their points, in place.
 
         Parameters
         ----------
@@ -246,7 +249,7 @@ class GroupMeans:
         )
 
     def statistics(self, point_indices: np.ndarray, n_values: np.ndarray) -> GroupStatistics:
-        """Return the number of whole groups, and the variance of their means, of selected points.
+        """Return the numbers of complete groups of draws, and the variances of their means.
 
         Parameters
         ----------
@@ -270,7 +273,7 @@ class GroupMeans:
         return np.concatenate([self.mean, self.squared_deviations, self.open_sum])
 
     def restore_state(self, state: np.ndarray) -> None:
-        """Replace all means and sums by an array that :meth:`state` returned."""
+        """Set all means and sums from an array that :meth:`state` returned."""
         self.mean[...], self.squared_deviations[...], self.open_sum[...] = np.split(state, 3)
 
 
@@ -278,7 +281,9 @@ class GroupMeans:
 def _add_to_group_means(
     point_indices, draw_numbers, values, mean, squared_deviations, open_sum
 ):  # fmt: skip
-    """Add values of draws to means over groups; the last draw of a group completes it.
+    """Add values of draws to means over groups of draws, in place.
+
+    A group is complete after its last draw, and only then counts in the means.
 
     Parameters
     ----------

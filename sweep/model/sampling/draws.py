@@ -60,11 +60,12 @@ from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import iter_spans
 
 PD_BOTH_CHIRPS = "pd_both_chirps"
-"""Name of the output with the probability that both chirps, up and down, detect the echo. It exists
-only if any two segments suffice to detect a shot; otherwise ``pd_shot`` is this probability."""
+"""Name of the output for the probability that both chirps, up and down, detect the echo. The output
+exists only if any two segments suffice to detect a shot. Otherwise ``pd_shot`` is this probability.
+"""
 
 _DRAWS_PER_STEP = 256
-"""Number of draws of one point whose random numbers are generated in one step."""
+"""Number of draws of one point for which random numbers are generated in one step."""
 
 
 class DrawRanges(NamedTuple):
@@ -73,7 +74,7 @@ class DrawRanges(NamedTuple):
     point_index: np.ndarray
     """(m,) int64: index of the point to whose counts the draws are added."""
     keys: np.ndarray
-    """(m, 2) uint64: random key of the point, on which its random numbers depend."""
+    """(m, 2) uint64: random key of the point, from which its random numbers follow."""
     first_draw: np.ndarray
     """(m,) int64: number of the first draw of the range."""
     end_draw: np.ndarray
@@ -84,8 +85,8 @@ class DrawCountConfig(NamedTuple):
     """Settings and tables for counting detections and false alarms, common to all points."""
 
     adds_noise: bool
-    """True if noise is added to the bins of an echo; False if random numbers are compared with
-    probabilities of detection."""
+    """True if noise is added to the bins of an echo and the sum is compared with the threshold;
+    False if random numbers are compared with probabilities of detection."""
     noise_filter: "NoiseFilter"
     """Filter that makes the correlated noise of an echo's bins. It has no bins if only the
     strongest bin may detect the echo."""
@@ -94,7 +95,7 @@ class DrawCountConfig(NamedTuple):
     the signal."""
     pseudo_variance_ratio: np.ndarray
     """(ratio rows, bins): ratio E[X^2] / E[|X|^2] of complex amplitudes X in bins near frequency 0
-    (DC) and Nyquist (:class:`sweep.model.detection.echo_detection.SpeckleTable`)."""
+    (DC) and Nyquist. ``DrawCountInputs.pseudo_variance_row`` selects the row."""
     nyquist_bin: int
     """Number of the bin at the Nyquist frequency: N/2, with N the FFT size."""
 
@@ -108,30 +109,34 @@ class DrawCountInputs(NamedTuple):
     threshold_ratio: np.ndarray
     """(m,): threshold divided by sigma, the noise of a bin per quadrature."""
     line_noise_ratio: np.ndarray
-    """(m,): noise of bins that hold lines of the echo, divided by sigma, the noise of other bins
-    per quadrature."""
+    """(m,): noise per quadrature of bins that hold lines of the echo, divided by sigma, the noise
+    per quadrature of bins without signal."""
     bin_thresholds: BinThresholds
-    """(m,) in each field: threshold on |X| and noise of an echo's bins, if any bin may detect the
-    echo (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
+    """Record with (m,) in each field: threshold on |X|, and noise, of an echo's bins, for detection
+    by any bin (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa: np.ndarray
-    """(3, m): probability of a false alarm in those bins of each segment that are not drawn one by
+    """(3, m): probability of a false alarm in a segment, in bins whose noise is not drawn one by
     one."""
     pd_if_condition_fails: np.ndarray
-    """(3, m): probability that each segment detects the echo if the condition of
-    :class:`EventProbabilities` is not met; unused if noise is drawn."""
+    """(3, m): probability that each segment detects the echo if its condition is False; unused if
+    noise is drawn. The condition of the down segment is that the up segment detects, and that of
+    the Doppler segment that exactly one of the other two segments detects. The up segment has none.
+    """
     pd_if_condition_holds: np.ndarray
-    """(3, m): probability that each segment detects the echo if the condition of
-    :class:`EventProbabilities` is met; unused if noise is drawn."""
+    """(3, m): probability that each segment detects the echo if its condition is True; unused if
+    noise is drawn. The condition of the down segment is that the up segment detects, and that of
+    the Doppler segment that exactly one of the other two segments detects. The up segment has none.
+    """
     detects_by_any_two_segments: np.ndarray
     """(m,) bool: True if a shot counts as detected by any two of its segments."""
     speckle_mixing: SpeckleMixing
-    """(m,) in each field: coefficients of the amplitudes by speckle in the three segments; (0,)
-    without speckle."""
+    """Record with (m,) in each field: coefficients by which independent random amplitudes are mixed
+    into the speckle of the three segments. Without speckle the arrays are (0,)."""
     pseudo_variance_row: np.ndarray
     """(3, m) int64: row of ``DrawCountConfig.pseudo_variance_ratio`` for each segment; 0 for an
     echo far from frequency 0 and Nyquist."""
     line_grid: SpeckleLineGrid
-    """Lines that represent the footprints in developed speckle."""
+    """Lines that represent each point's footprint in developed speckle."""
     line_centre: np.ndarray
     """(m, 3): mean position of the lines of each segment's echo [bins]; (0, 3) without speckle."""
 
@@ -143,20 +148,22 @@ class DrawCounts(NamedTuple):
     """
 
     up_detections: np.ndarray
-    """Number of draws with a detection in the up segment."""
+    """(points, batches) int64: number of draws with a detection in the up segment."""
     down_detections: np.ndarray
-    """Number of draws with a detection in the down segment."""
+    """(points, batches) int64: number of draws with a detection in the down segment."""
     doppler_detections: np.ndarray
-    """Number of draws with a detection in the Doppler segment."""
+    """(points, batches) int64: number of draws with a detection in the Doppler segment."""
     shot_detections: np.ndarray
-    """Number of draws with a detection of the shot: in up and down segment, or in any two segments
-    if these detect the point (``DrawCountInputs.detects_by_any_two_segments``)."""
+    """(points, batches) int64: number of draws that detect the shot. Up and down segment must
+    detect it, or any two segments if ``DrawCountInputs.detects_by_any_two_segments`` is True for
+    the point."""
     up_alarms: np.ndarray
-    """Number of draws with a false alarm in the up segment."""
+    """(points, batches) int64: number of draws with a false alarm in the up segment."""
     down_alarms: np.ndarray
-    """Number of draws with a false alarm in the down segment."""
+    """(points, batches) int64: number of draws with a false alarm in the down segment."""
     joint_alarms: np.ndarray
-    """Number of draws with a false alarm in both the up and the down segment."""
+    """(points, batches) int64: number of draws with a false alarm in both the up and the down
+    segment."""
 
 
 class EventProbabilities(NamedTuple):
@@ -171,20 +178,24 @@ class EventProbabilities(NamedTuple):
     alarm: np.ndarray
     """(3, n): probability of a false alarm by noise and leaked signal; 0 for Doppler segments."""
     pd_if_condition_fails: np.ndarray
-    """(3, n): probability of a detection if the condition is not met."""
+    """(3, n): probability that each segment detects the echo if its condition is False. The
+    condition of the down segment is that the up segment detects, and that of the Doppler segment
+    that exactly one of the other two segments detects. The up segment has none."""
     pd_if_condition_holds: np.ndarray
-    """(3, n): probability of a detection if the condition is met."""
+    """(3, n): probability that each segment detects the echo if its condition is True. The
+    condition of the down segment is that the up segment detects, and that of the Doppler segment
+    that exactly one of the other two segments detects. The up segment has none."""
 
 
 class SegmentAmplitudes(NamedTuple):
     """Complex factors by speckle on an echo in the three segments, of mean square 1."""
 
     up: complex
-    """Factor on the echo's complex amplitude in the up segment."""
+    """Complex factor, due to speckle, on the echo's amplitude in the up segment."""
     doppler: complex
-    """Factor on the echo's complex amplitude in the Doppler segment."""
+    """Complex factor, due to speckle, on the echo's amplitude in the Doppler segment."""
     down: complex
-    """Factor on the echo's complex amplitude in the down segment."""
+    """Complex factor, due to speckle, on the echo's amplitude in the down segment."""
 
 
 class BinInNoise(NamedTuple):
@@ -194,18 +205,21 @@ class BinInNoise(NamedTuple):
     """
 
     magnitude_ratio: float
-    """|X| of the bin without noise and speckle, over sigma."""
+    """|X| of the bin without noise and speckle, over sigma, the noise of a bin per quadrature."""
     noise_deviation_in_phase: float
-    """Standard deviation, over sigma, of the noise in phase with the signal."""
+    """Standard deviation, over sigma, of the noise component in phase with the signal. sigma is the
+    noise of a bin without signal per quadrature."""
     noise_deviation_in_quadrature: float
-    """Standard deviation, over sigma, of the noise in quadrature with the signal."""
+    """Standard deviation, over sigma, of the noise component in quadrature with the signal. sigma
+    is the noise of a bin without signal per quadrature."""
     squared_threshold_ratio: float
-    """Square of the threshold over sigma."""
+    """Square of the threshold over sigma, the noise of a bin per quadrature."""
     speckle_factor_in_phase: np.ndarray
-    """(draws,): real part of the factor by speckle on the signal."""
+    """(draws,): real part of the complex speckle factor, of mean power 1, by which the signal is
+    multiplied."""
     speckle_factor_in_quadrature: np.ndarray
-    """(draws,): imaginary part of the complex speckle factor, of mean power 1, by which the
-    signal is multiplied."""
+    """(draws,): imaginary part of the complex speckle factor, of mean power 1, by which the signal
+    is multiplied."""
 
 
 def count_by_probability(
@@ -214,7 +228,9 @@ def count_by_probability(
     outputs: Mapping[str, np.ndarray],
     counts: np.ndarray,
 ) -> None:
-    """Count detections and false alarms by comparing random numbers with their probabilities.
+    """Count detections and false alarms, by comparing random numbers with their probabilities.
+
+    The counts are added to ``counts`` in place.
 
     Parameters
     ----------
@@ -259,7 +275,9 @@ def count_by_probability(
 def count_in_noise(
     draw_ranges: DrawRanges, batch_edges: np.ndarray, shots: Shots, counts: np.ndarray
 ) -> None:
-    """Count detections and false alarms by drawing the noise of prepared shots.
+    """Count detections and false alarms, by drawing the noise of prepared shots.
+
+    The counts are added to ``counts`` in place.
 
     Parameters
     ----------
@@ -322,10 +340,11 @@ class NoiseFilter(NamedTuple):
     """(bins, N_NOISE_FILTER_TAPS): weights of the independent normal numbers whose weighted sum is
     a bin's noise. The squares of a bin's weights sum to 1."""
     first_number_index: np.ndarray
-    """(bins,) int64: index of the first independent number that each bin uses, minus the index at
+    """(bins,) int64: index of the first independent normal number in each bin's weighted sum; 0 for
     the first bin."""
     real_ends_fft_size: int
-    """FFT size N if the noise in the bins at frequency 0 (DC) and at Nyquist is real, else 0."""
+    """FFT size N if noise in the bins at frequency 0 and at Nyquist is real; 0 if it counts as
+    complex."""
 
 
 class NoiseScratch(NamedTuple):
@@ -335,24 +354,26 @@ class NoiseScratch(NamedTuple):
     """
 
     in_phase: np.ndarray
-    """(k,): component, over sigma, of each bin's noise in phase with the signal."""
+    """(k,): noise component in phase with the signal in each of k bins, over sigma, the noise of a
+    bin per quadrature."""
     in_quadrature: np.ndarray
-    """(k,): component, over sigma, of each bin's noise in quadrature with the signal."""
+    """(k,): noise component in quadrature with the signal in each of k bins, over sigma, the noise
+    of a bin per quadrature."""
     independent_in_phase: np.ndarray
-    """(k,): independent normal numbers from which the filter makes ``in_phase``."""
+    """(k,): independent normal numbers that a filter turns into ``in_phase``."""
     independent_in_quadrature: np.ndarray
-    """(k,): independent normal numbers from which the filter makes ``in_quadrature``."""
+    """(k,): independent normal numbers that a filter turns into ``in_quadrature``."""
 
     @classmethod
     def allocate(cls, n_bins: int) -> "NoiseScratch":
-        """Allocate arrays for the noise of ``n_bins`` bins."""
+        """Return a record with arrays for the noise of ``n_bins`` bins."""
         return cls(*np.empty((4, n_bins + N_NOISE_FILTER_TAPS)))
 
 
 def make_echo_noise_filter(
     shots: Shots, spectra: "NoiselessSpectra", bins_min: int = 0
 ) -> NoiseFilter:
-    """Return the filter that makes the noise of an echo's bins from independent numbers.
+    """Return the filter that makes the correlated noise of an echo's bins.
 
     Parameters
     ----------
@@ -384,8 +405,8 @@ def make_echo_noise_filter(
 
 
 COVARIANCE_ROOT_BINS_MAX = 16
-"""Largest number of adjacent bins whose correlated noise is made by a Cholesky factor, from one
-independent number for each bin."""
+"""Largest number of adjacent bins whose correlated noise is made by a Cholesky factor of its
+covariance. The factor takes one independent random number for each bin."""
 
 
 def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
@@ -418,12 +439,12 @@ def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
 
 
 _UNEXPLAINED_VARIANCE_FRACTION_MIN = 1e-9
-"""Smallest fraction of a bin's noise variance left unexplained by the bins before it, for which the
-bin gets an independent random number."""
+"""Smallest fraction of a bin's noise variance, not determined by the noise of the bins before it,
+for which the bin gets an independent random number."""
 
 
 def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilities:
-    """Return the probabilities of detections and false alarms that the outputs of points imply."""
+    """Return the :class:`EventProbabilities` that follow from the outputs of points."""
     pd_up, pd_down, pd_shot = (
         np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot")
     )
@@ -454,9 +475,9 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilitie
 
 
 def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """Return the threshold and the noise in the echo's bins, both over sigma, (n,) each.
+    """Return the threshold, and the noise of the echo's bins per quadrature, over sigma, (n,) each.
 
-    sigma is the noise per quadrature of a bin without signal.
+    sigma is the noise of a bin without signal per quadrature.
     """
     ratios = np.stack([shots.threshold, shots.line_noise_sigma]) / shots.bin_noise_sigma
     threshold_ratio, line_noise_ratio = np.ascontiguousarray(
@@ -466,8 +487,8 @@ def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarra
 
 
 ECHO_NOISE_FIRST_RANDOM_INDEX = np.int64(1 << 24)
-"""Index in the noise stream of the first random number for the noise of all bins of an echo. Lower
-indices are used for bins that are drawn one by one."""
+"""Index, in the noise stream, of the first random number used for the noise of all bins of an echo.
+Lower indices are used for bins whose noise is drawn one by one."""
 
 
 class NoiselessSpectra(NamedTuple):
@@ -482,8 +503,8 @@ class NoiselessSpectra(NamedTuple):
     peak_index: np.ndarray
     """(m, 3) int64: index of the bin with the largest magnitude, counted from ``first_bin``."""
     peak_magnitude_ratio: np.ndarray
-    """(m, 3): largest |X| / sigma in the segment's bins; nan for a segment that does not exist.
-    sigma is the noise of a bin per quadrature."""
+    """(m, 3): largest |X| / sigma of the segment; nan for a segment that does not exist. sigma is
+    the noise of a bin per quadrature."""
     peak_has_real_noise: np.ndarray
     """(m, 3) bool: True if the noise in the bin with the largest magnitude is real, as at frequency
     0 (DC) and Nyquist."""
@@ -496,29 +517,29 @@ class NoiselessSpectra(NamedTuple):
     """(bins,): |X| / sigma in the bins of all points and segments. sigma is the noise of a bin per
     quadrature."""
     is_echo: np.ndarray
-    """(bins,) bool: True for those of the bins of all points and segments that belong to an
-    echo."""
+    """(bins,) bool: mask of the bins, of all points and segments, that belong to an echo."""
     n_noise_bins: np.ndarray
     """(m, 3): equivalent number of independent bins that hold noise alone and may raise a false
-    alarm."""
+    alarm (not an integer)."""
     leaked_begin: np.ndarray
-    """(m, 3) int64: index of each segment's first bin in the arrays from ``leaked_index`` to
+    """(m, 3) int64: index of each segment's first bin in the arrays (leaked,): ``leaked_index``,
+    ``leaked_magnitude_ratio``, ``exempt_neighbour_magnitude_ratio`` and
     ``side_of_adjacent_echo_bin``."""
     leaked_end: np.ndarray
-    """(m, 3) int64: index of each segment's last bin in the same arrays, plus 1; equal to
-    ``leaked_begin`` without leaked signal."""
+    """(m, 3) int64: index of each segment's last bin, plus 1, in the arrays (leaked,) that
+    ``leaked_begin`` names. It equals ``leaked_begin`` without leaked signal."""
     leaked_index: np.ndarray
     """(leaked,) int64: indices, counted from ``first_bin``, of the bins with signal leaked from an
-    echo. With noise they may raise a false alarm."""
+    echo. Leaked signal and noise together may raise a false alarm in these bins."""
     leaked_magnitude_ratio: np.ndarray
     """(leaked,): |X| / sigma in the bins that hold leaked signal. sigma is the noise of a bin per
     quadrature."""
     exempt_neighbour_magnitude_ratio: np.ndarray
-    """(leaked,): |X| over sigma of the adjacent bin that belongs to an echo, and so cannot raise a
-    false alarm; 0 if no adjacent bin does."""
+    """(leaked,): |X| / sigma of the adjacent bin, if it belongs to an echo and so cannot raise a
+    false alarm; 0 if neither adjacent bin does. sigma is the noise of a bin per quadrature."""
     side_of_adjacent_echo_bin: np.ndarray
-    """(leaked,) int64: 1 if the adjacent bin of the echo is above the bin of leaked signal, -1 if
-    it is below."""
+    """(leaked,) int64: 1 if the next higher bin belongs to an echo, -1 if the next lower bin does;
+    without meaning if neither does."""
 
     @classmethod
     def empty(cls, n_points: int) -> "NoiselessSpectra":
@@ -550,7 +571,7 @@ class NoiselessSpectra(NamedTuple):
 def iter_noiseless_spectra(
     shots: Shots, point_indices: np.ndarray | None = None
 ) -> Iterator[tuple[np.ndarray, NoiselessSpectra]]:
-    """Yield indices of points and their noiseless spectra, in parts that fit the memory.
+    """Yield indices of points and their noiseless spectra, in batches that fit into memory.
 
     Parameters
     ----------
@@ -624,7 +645,7 @@ def iter_noiseless_spectra(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
-    """Draw detections and false alarms of m points, and add them to the counts.
+    """Draw detections and false alarms of m rows, and add them to the counts of their points.
 
     Parameters
     ----------
@@ -920,7 +941,7 @@ def _mark_leakage_alarms(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_factors(address, group, mixing):
-    """Return the factors by speckle on an echo's magnitudes in the three segments.
+    """Return the real factors, due to speckle, on an echo's magnitudes in the three segments.
 
     Parameters
     ----------
@@ -947,7 +968,9 @@ def speckle_factors(address, group, mixing):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_amplitudes(address, group, mixing):
-    """Return the complex factors by speckle on an echo in the three segments, of mean square 1.
+    """Return the complex factors, due to speckle, on an echo's amplitudes in the three segments.
+
+    Their mean square is 1.
 
     Parameters
     ----------
@@ -1033,7 +1056,10 @@ def _mark_random_events(
 
 @njit(cache=True, error_model="numpy")
 def _first_and_last_echo_index(point, segment, spectra):
-    """Return an echo's first and last bin, as indices in its span; the last is -1 for no echo."""
+    """Return an echo's first and last bin, as indices counted from the segment's first bin.
+
+    The last index is -1 if the segment has no echo.
+    """
     bins_start, n_bins = spectra.bins_start[point, segment], spectra.n_bins[point, segment]
     first_index, last_index = 0, n_bins - 1
     while first_index < n_bins and not spectra.is_echo[bins_start + first_index]:
@@ -1045,7 +1071,7 @@ def _first_and_last_echo_index(point, segment, spectra):
 
 @njit(cache=True, error_model="numpy")
 def _draw_echo_amplitudes(address, n_draws, row, spectra, line_grid, line_centres, segment_factors):
-    """Draw the complex factors by developed speckle on the bins of a point's echo.
+    """Draw the complex factors, due to developed speckle, on the bins of a point's echo.
 
     The factors have mean power 1, and follow from the lines of the footprint
     (:func:`sweep.model.sampling.speckle_lines.draw_bin_amplitudes`). Bins that no line reaches have
@@ -1151,9 +1177,9 @@ def _mark_any_bin_crossings(
 
         |r A + (1 + p |A|^2)^(1/2) n| >= t
 
-    with its noiseless magnitude r, factor A by speckle, complex noise n, and power p of the
-    phase-noise pedestal, which fades with the echo's bin. r, t and n are over sigma, the receiver's
-    noise of a bin per quadrature. p is over the receiver's noise power.
+    with its noiseless magnitude r, speckle factor A, complex noise n, and power p of the
+    phase-noise pedestal, which fades with the echo. r, t and n are over sigma, the receiver's noise
+    of a bin per quadrature. p is over the receiver's noise power.
 
     Parameters
     ----------
@@ -1354,7 +1380,7 @@ def _mark_crossings(address, n_draws, stream, pair_index, bin_in_noise, random_w
 def largest_noise_magnitude(n_bins, probability, n_looks):
     """Return the |X| / sigma that the largest of n noise bins exceeds with a given probability.
 
-    sigma is the standard deviation of a bin's noise per quadrature.
+    X is a bin of the spectrum, and sigma the standard deviation of its noise per quadrature.
 
     Parameters
     ----------

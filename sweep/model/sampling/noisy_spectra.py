@@ -105,9 +105,9 @@ AVERAGED_VALUE_NAMES = (
     "squared_range_bound",
     "squared_radial_velocity_bound",
 )
-"""Names of values that are averaged over draws. They are the fraction of bins with a false alarm,
-the number of false alarms, the errors of range [m] and radial velocity [m/s] (measured minus true),
-and the squares of their bounds [m^2, m^2/s^2]."""
+"""Names of values that are averaged over draws: the fraction of bins with a false alarm, the number
+of false alarms, the errors of range [m] and radial velocity [m/s] (measured minus true), and the
+squares of the smallest standard deviations of both [m^2, m^2/s^2]."""
 
 
 class SpectrumMethods(NamedTuple):
@@ -117,9 +117,10 @@ class SpectrumMethods(NamedTuple):
     """
 
     detectors: Mapping[str, Detector] = DETECTORS
-    """Detectors by name: functions that flag bins of a spectrum's power."""
+    """Detectors by name. A detector is a function that flags bins by their power |X|^2."""
     estimators: Mapping[str, Estimator] = ESTIMATORS
-    """Estimators by name: functions that compute the frequency of a peak."""
+    """Estimators by name. An estimator is a function that computes the position of a peak between
+    bins."""
 
 
 class SegmentSignal(NamedTuple):
@@ -129,17 +130,17 @@ class SegmentSignal(NamedTuple):
     """
 
     spectrum: np.ndarray
-    """Complex spectrum without noise [V]: (N/2 + 1,), or (N,) for a complex record, with N the FFT
-    size."""
+    """Complex spectrum without noise [V]. It is (N/2 + 1,) for a real record, (N,) for a complex
+    record, with N the FFT size."""
     strongest_bin: int
-    """Index of the bin with the largest magnitude. DC and Nyquist are excluded if the noise of a
-    real record counts as circular in all bins."""
+    """Index of the bin with the largest magnitude. The bins at frequency 0 and Nyquist are excluded
+    if the noise of a real record counts as circular in all bins."""
     first_bin: int
-    """Index of the first bin that the signal occupies. The signal extends from the first to the
-    last bin with half the largest magnitude, plus half a main lobe on either side."""
+    """Index of the first bin of the signal. The signal extends from the first to the last bin with
+    at least half the largest magnitude, plus half a main lobe on either side."""
     last_bin: int
-    """Index of the last bin that the signal occupies. It is below ``first_bin`` if there is no
-    echo, or if the strongest bin is outside the search band."""
+    """Index of the last bin of the signal. It is below ``first_bin`` if there is no echo, or if the
+    strongest bin is outside the search band."""
     frequency_bins: float
     """Signed frequency [bins] of a pure tone whose magnitudes equal those of the signal about its
     strongest bin."""
@@ -148,25 +149,24 @@ class SegmentSignal(NamedTuple):
     segment: int
     """Number of the segment: 0 up, 1 Doppler, 2 down."""
     nearest_echo: np.ndarray | None = None
-    """(bins,) int64: number of the echo nearest to each bin, if a shot has several; None with a
+    """(bins,) int64: number of the echo nearest to each bin, if a shot has several; None for a
     single echo."""
     multiple_echo_peaks: "EchoPeaks | None" = None
-    """Strongest bins and positions of the echoes, if a shot has several; None with a single echo.
-    """
+    """Strongest bins and positions of the echoes, if a shot has several; None for a single echo."""
     echo_half_width: int = 0
-    """Number of bins on either side of an echo's strongest bin that the echo occupies, if a shot
+    """Number of bins, on either side of an echo's strongest bin, that belong to the echo, if a shot
     has several echoes."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """One :class:`FootprintRecord` for each echo, from which the echo's speckle is drawn; None
-    until :func:`add_footprint_records` sets the field. An empty tuple means that the speckle of
-    this segment is drawn in another way: its lines spread over more than
-    RECORD_LINE_DEVIATION_MAX_CELLS, or an echo has no samples in the segment."""
+    """One :class:`FootprintRecord` for each echo, from which the echo's speckle is drawn. It is
+    None until :func:`add_footprint_records` sets it. It is empty if speckle is drawn without
+    records: for lines that spread over more than RECORD_LINE_DEVIATION_MAX_CELLS, and for an echo
+    without samples in the segment."""
     record_scalings: tuple[np.ndarray, ...] = ()
-    """(bins,) complex for each echo: factors from the transform of a drawn record to the speckle by
-    which the bins of ``spectrum`` are multiplied."""
+    """One array (bins,) complex for each echo. It times the transform of a drawn record is the
+    speckle by which ``spectrum`` is multiplied."""
     is_exempt: np.ndarray | None = None
-    """(bins,) bool: True for bins that cannot raise a false alarm. These are ``first_bin`` to
-    ``last_bin``, and bins at or above the threshold with their neighbours
+    """(bins,) bool: True for bins that cannot raise a false alarm. They are ``first_bin`` to
+    ``last_bin``, bins of signal at or above the threshold, and the neighbours of these bins
     (:func:`sweep.model.detection.echo_detection.mark_exempt_bins`)."""
 
 
@@ -174,10 +174,10 @@ class EchoPeaks(NamedTuple):
     """Strongest bins and positions of k echoes in a segment."""
 
     strongest_bin: np.ndarray
-    """(k,) int64: index of the bin with each echo's largest magnitude."""
+    """(k,) int64: index of the strongest bin of each of k echoes."""
     tone_position: np.ndarray
-    """(k,): position, as a fractional index, of a pure tone whose magnitudes equal those of the
-    echo about its strongest bin."""
+    """(k,): position, as a fractional index, of a pure tone that has the magnitudes of the echo
+    about its strongest bin."""
 
 
 class EchoBinRange(NamedTuple):
@@ -189,7 +189,7 @@ class EchoBinRange(NamedTuple):
     strongest_bin: int
     """Index of the strongest bin of the echo."""
     middle_position: float
-    """Middle of the echo, as a fractional index in the spectrum."""
+    """Position of the middle of the echo, as a fractional index in the spectrum."""
     first_bin: int
     """Index of the first bin whose speckle is drawn."""
     last_bin: int
@@ -366,12 +366,12 @@ def _exempt_bin_mask(
 
 
 def zero_frequency_index(shots: Shots) -> int:
-    """Return the index in a spectrum of the bin at frequency 0."""
+    """Return the index of the bin at frequency 0 in a spectrum of these shots."""
     return int(shots.bin_indices(np.zeros((), int)))
 
 
 def centring_shift(shots: Shots, middle_index: int) -> int:
-    """Return the number of bins by which :func:`rotate_to_centre` moves a given bin upwards.
+    """Return the number that :func:`rotate_to_centre` adds to the index of a bin.
 
     Parameters
     ----------
@@ -390,11 +390,11 @@ def centring_shift(shots: Shots, middle_index: int) -> int:
 
 
 def rotate_to_centre(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarray:
-    """Rotate the bins of a complex record's spectrum until a given bin is in the middle.
+    """Return the bins of a complex record's spectrum, rotated until a given bin is in the middle.
 
-    Bins about it are then adjacent, although the first bin of the spectrum follows its last. A 0 is
-    added at either end, where a real record has DC and Nyquist. The bins of a real record are
-    returned unchanged.
+    Bins about the given bin are then adjacent, although the first bin of the spectrum follows its
+    last. A 0 is added at either end, where a real record has frequency 0 and Nyquist. The bins of a
+    real record are returned unchanged.
 
     Parameters
     ----------
@@ -414,8 +414,8 @@ def rotate_to_centre(shots: Shots, values: np.ndarray, middle_index: int) -> np.
 def _interpolate_tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> float:
     """Return the position of a peak between bins, as a fractional index.
 
-    The position is that of a pure tone whose magnitudes equal those about the peak. ``magnitude``
-    (bins,) is |X|, and ``peak_index`` the index of its largest bin.
+    The position is that of a pure tone that has the magnitudes of the three bins about the peak.
+    ``magnitude`` (bins,) is |X|, and ``peak_index`` the index of the peak's largest bin.
     """
     last_index = magnitude.size - 1
     if shots.complex_record:
@@ -431,9 +431,9 @@ def _interpolate_tone_position(shots: Shots, magnitude: np.ndarray, peak_index: 
 
 
 def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray:
-    """Return the phase factors X / |X| (bins,) of a pure tone's spectrum X; 1 where X is 0.
+    """Return X / |X| (bins,) of the spectrum X of a pure tone; 1 where X is 0.
 
-    The tone is at a position, as a fractional index, and begins with sample ``first_sample``.
+    The tone has a ``position``, as a fractional index, and begins with sample ``first_sample``.
     """
     fft_size = shots.fft_size
     cycles = (position - zero_frequency_index(shots)) / fft_size
@@ -471,9 +471,9 @@ def transform_record(shots: Shots, record: np.ndarray) -> np.ndarray:
 
 
 def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
-    """Return the quantities of a point on which its phase noise depends, by name.
+    """Return the quantities of a point from which its phase noise follows, by name.
 
-    The quantities are the ``line_width`` of the laser [Hz], the ``delay`` of the echo [s] and the
+    The names are ``line_width``, that of the laser [Hz], ``delay`` of the echo [s], and
     ``duration`` of the record [s].
     """
     return {
@@ -494,9 +494,8 @@ def draw_signal_spectra(
 ) -> np.ndarray:
     """Draw complex spectra (m, bins) of the signal [V] with the laser's phase noise.
 
-    No receiver noise is added.
-
-    If the laser has no line width, all draws are equal, and there is one row.
+    No receiver noise is added. If the laser has no line width, all draws are equal, and the result
+    has one row.
 
     Parameters
     ----------
@@ -586,10 +585,11 @@ def draw_bin_speckle(
     draws: np.ndarray,
     line_grid: SpeckleLineGrid | None = None,
 ) -> np.ndarray:
-    """Draw the complex factors (m, bins) by which speckle multiplies the bins of a segment.
+    """Draw the complex speckle factors (m, bins) by which the bins of a segment are multiplied.
 
-    The bins that an echo occupies have factors that the lines of its footprint make. Its other bins
-    have the factor of its strongest bin. Without speckle all factors are 1, as one row of one bin.
+    In the bins that an echo occupies, the factors follow from the lines of its footprint. The other
+    bins of an echo have the factor of its strongest bin. Without speckle the result is (1, 1), with
+    the value 1.
 
     Parameters
     ----------
@@ -684,7 +684,7 @@ def draw_bin_speckle(
 def add_footprint_records(
     shots: Shots, point: int, signal: SegmentSignal, line_grid: SpeckleLineGrid
 ) -> SegmentSignal:
-    """Return a segment's signal together with the records from which its speckle is drawn.
+    """Return a segment's signal with the records from which its speckle is drawn.
 
     Parameters
     ----------
@@ -749,9 +749,9 @@ def add_footprint_records(
 def _draw_speckle_from_records(
     shots: Shots, signal: SegmentSignal, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Draw the factors (m, bins) by which speckle multiplies a segment's bins, from records.
+    """Draw the complex speckle factors (m, bins) of a segment's bins, from footprint records.
 
-    Each echo has one :class:`FootprintRecord`.
+    The record of each echo is a :class:`FootprintRecord`.
     """
     assert signal.footprint_records is not None
     factors = np.empty((draws.size, signal.spectrum.size), complex)
@@ -770,9 +770,9 @@ def _draw_speckle_from_records(
 def iter_look_spectra(
     point_spectra: "PointSpectra", segment: int, draws: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Draw and yield complex noisy spectra of a segment, look by look.
+    """Draw and yield the complex noisy spectra of a segment, look by look.
 
-    A look is one record of the segment. If looks are added in amplitude, only their mean is
+    A look is one record of the segment. If amplitudes of looks are added, only their mean is
     yielded.
 
     Parameters
@@ -818,12 +818,11 @@ def _draw_look_speckle(
     draws: np.ndarray,
     signal: SegmentSignal,
 ) -> np.ndarray:
-    """Draw the complex factors (m, bins) by which speckle multiplies the bins of one look.
+    """Draw the complex speckle factors (m, bins) by which the bins of one look are multiplied.
 
-    A look is one record of the segment.
-
-    The speckle of successive looks is equal, independent or correlated. Correlated speckle is a sum
-    of independent realisations, with different coefficients in each look.
+    A look is one record of the segment. Looks have equal, independent or correlated speckle.
+    Correlated speckle is a sum of independent realisations, with different coefficients in each
+    look.
     """
     draw_arguments: dict[str, Any] = {
         "key": point_spectra.random_key,
@@ -865,10 +864,11 @@ class PointSpectra(NamedTuple):
     random_key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[SegmentSignal | None, ...]
-    """Noiseless signal of each segment at the time of ``shots``; None for a segment that does not
-    exist."""
+    """Noiseless signal of each segment at the time of ``shots`` (the first look); None for a
+    segment that does not exist."""
     look_shots: list[Shots]
-    """Prepared shots at the time of each look (record of each segment), while the target moves."""
+    """Prepared shots at the time of each look (record of each segment). The target moves between
+    looks."""
     settings: SpectrumSettings
     """Settings of the spectra and of the detector."""
     detect: Detector
@@ -878,11 +878,11 @@ class PointSpectra(NamedTuple):
     """Estimator of frequency: a function of complex spectra (m, bins), indices of peak bins (m,)
     and the settings, which returns positions (m,) as fractional indices."""
     signal_cache: dict[tuple[int, int], SegmentSignal]
-    """Noiseless signals computed so far for looks (records of a segment) after the first, by
-    segment and look. The target moves between looks."""
+    """Noiseless signals of looks (records of a segment) after the first, by segment and look, as
+    far as computed. The target moves between looks."""
     echo_bins: np.ndarray | None = None
-    """(3, k) int64: indices of the strongest bins of the shot's k echoes in each segment, -1 for
-    none; None for a single echo."""
+    """(3, k) int64: indices of the strongest bins of k echoes in each segment, -1 for no echo. It
+    is None for a shot with a single echo."""
     line_grid: SpeckleLineGrid | None = None
     """Lines that represent the footprints of all shots in developed speckle."""
     fixed_threshold: float = math.inf
@@ -891,8 +891,8 @@ class PointSpectra(NamedTuple):
     def get_signal_in_look(self, segment: int, look: int) -> SegmentSignal:
         """Return the noiseless signal of a segment at the time of a look.
 
-        A look is one record of the segment. The target moves between looks. A signal that is
-        computed is kept in ``signal_cache``.
+        A look is one record of the segment. The target moves between looks. Computed signals are
+        kept in ``signal_cache``.
 
         Parameters
         ----------
@@ -920,10 +920,7 @@ class PointSpectra(NamedTuple):
         return self.signal_cache[segment, look]
 
     def echo_indices(self, segment: int) -> np.ndarray:
-        """Return the indices of the echoes' strongest bins in a segment.
-
-        The result is empty if the shot has a single echo.
-        """
+        """Return the indices of the echoes' strongest bins in a segment; empty for a single echo."""
         bins = np.empty(0, np.int64) if self.echo_bins is None else self.echo_bins[segment]
         bins = bins[bins >= 0]
         return self.shots.bin_indices(bins)
@@ -935,19 +932,19 @@ class SegmentDetections(NamedTuple):
     is_detected: np.ndarray
     """(m,) bool: True for draws in which the detector flags a bin of the echo."""
     n_false_groups: np.ndarray
-    """(m,) int64: number of runs of adjacent flagged bins outside the bins of the echo: false
-    alarms."""
+    """(m,) int64: number of false alarms in each draw. A false alarm is a run of adjacent flagged
+    bins outside the bins of the echo."""
     n_false_bins: np.ndarray
-    """(m,) int64: number of flagged bins in the false alarms that ``n_false_groups`` counts."""
+    """(m,) int64: number of flagged bins in all false alarms of each draw."""
     frequency_bins: np.ndarray
     """(m,): estimated frequency of the echo [bins], signed for a complex record."""
     peak_offset: np.ndarray
-    """(m,): estimated position minus the largest bin of the detected group of adjacent flagged bins
-    [bins]."""
+    """(m,): estimated position minus the number of the largest bin of the echo's run of flagged
+    bins [bins]."""
     peak_power: np.ndarray
     """(m,): |X|^2 [V^2] from which errors due to speckle are computed. It is the larger of two
-    values: that of the bin that is strongest without noise, and that of the peak, limited to the
-    squared threshold."""
+    powers: the power of the bin that is strongest without noise, and the power of the peak, which
+    is limited to the squared threshold."""
 
 
 def prepare_point_spectra(
@@ -1027,7 +1024,7 @@ def prepare_point_spectra(
 def flag_detected_bins(
     spectra: Sequence[np.ndarray], point_spectra: PointSpectra, segment: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Flag the bins of a segment in which the detector finds a signal, with its looks combined.
+    """Flag the bins of a segment in which the detector finds a signal, with looks combined.
 
     A look is one record of the segment.
 
@@ -1064,7 +1061,7 @@ def flag_detected_bins(
 def estimate_positions(
     spectra: Sequence[np.ndarray], peak_bins: np.ndarray, point_spectra: PointSpectra
 ) -> np.ndarray:
-    """Estimate the positions of peaks, averaged over looks (records of a segment).
+    """Return the estimated positions of peaks, averaged over looks (records of a segment).
 
     Parameters
     ----------
@@ -1162,7 +1159,9 @@ def detect_and_estimate_frequency(
 def count_detections(
     point_spectra: PointSpectra, draws: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Count detections and false alarms in draws, and return values to be averaged over the draws.
+    """Return, for each draw, which events occur, and values to be averaged over draws.
+
+    The events are detections and false alarms.
 
     Parameters
     ----------
@@ -1240,9 +1239,9 @@ def count_detections(
 def _error_bounds_by_draw(
     point_spectra: PointSpectra, is_detected: np.ndarray
 ) -> RangeVelocityDeviation:
-    """Return the smallest standard deviations of range and radial velocity by draw, (m,) each.
+    """Return the smallest standard deviations of range and radial velocity in m draws, (m,) each.
 
-    They are the bounds (:func:`measurement_bound`) for the segments that are detected in each draw:
+    They are those of :func:`measurement_bound` for the segments that are detected in the draw, by
     ``is_detected`` (3, m).
     """
     bounds = RangeVelocityDeviation(
@@ -1265,8 +1264,8 @@ def _wander_variances(
 ) -> MeanSquareErrors:
     """Return the mean square errors of range and radial velocity due to speckle, (m,) each.
 
-    `detections` has one element for each segment. Those of a draw count where `is_detected` (3, m)
-    is True.
+    `detections` has one record for each segment. A segment counts in the draws in which
+    `is_detected` (3, m) is True.
     """
     shots, point, n_draws = point_spectra.shots, point_spectra.point, is_detected.shape[1]
     if shots.speckle.line_gradients is None:
@@ -1297,7 +1296,7 @@ def _wander_variances(
 def measurement_bound(
     point_spectra: PointSpectra, is_used: Sequence[bool] | np.ndarray | None = None
 ) -> RangeVelocityDeviation:
-    """Return the smallest standard deviations of range and radial velocity from selected beats.
+    """Return the smallest standard deviations of range and radial velocity for selected beats.
 
     Parameters
     ----------
@@ -1357,10 +1356,10 @@ def measurement_bound(
 def _measurement_errors(
     point_spectra: PointSpectra, detections: Sequence[SegmentDetections], is_detected: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return measured minus true range [m] and radial velocity [m/s] in each draw, (m,) each.
+    """Return measured minus true range [m] and radial velocity [m/s] in m draws, (m,) each.
 
-    `detections` has one element for each segment. Those of a draw count where `is_detected` (3, m)
-    is True.
+    `detections` has one record for each segment. A segment counts in the draws in which
+    `is_detected` (3, m) is True.
     """
     shots, point = point_spectra.shots, point_spectra.point
     bin_width = point_spectra.settings.sample_rate / point_spectra.settings.fft_size
@@ -1408,6 +1407,6 @@ def _carriers_at(shots: Shots, point: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Return the value of a point from an array (n,), or from one number common to all points."""
+    """Return the value at index ``point`` of an array (n,), or a number common to all points."""
     column = np.asarray(column)
     return np.asarray(column[point] if column.ndim else column)

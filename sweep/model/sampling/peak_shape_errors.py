@@ -26,15 +26,16 @@ if TYPE_CHECKING:
 _TABULATED_SPREADS_CELLS = np.array(
     [0.01, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0, 4.0]
 )
-"""Tabulated spreads (standard deviations) of a footprint's lines, in resolution cells. A cell is
-fs/L, the sample rate over the number of samples in the record."""
+"""Standard deviations of a footprint's lines for which errors are tabulated [resolution cells]. A
+cell is the sample rate over the number of samples in the record."""
 _IMAGINARY_SHIFT_VARIANCES = np.concatenate([[1e-4], np.geomspace(3e-3, 30.0, 13)])
-"""Tabulated variances of Im s [squared resolution cells], with the complex shift s by which speckle
-deforms a peak (:class:`PeakShapeErrors`)."""
+"""Variances of Im s for which errors are tabulated [squared resolution cells]. s is the complex
+shift by which speckle deforms a peak (:class:`PeakShapeErrors`). A cell is the sample rate over the
+number of samples in the record."""
 _SHAPE_OFFSETS_BINS = np.linspace(0.0, 1.0, 33)
-"""Tabulated offsets of a peak from the bin about which it is estimated [bins]."""
+"""Distances of a peak from its strongest bin for which errors are tabulated [bins]."""
 _SHAPE_SAMPLES_MAX = 2048
-"""Largest number of window samples from which deformed peaks are computed."""
+"""Largest number of window samples that is used to compute deformed peaks."""
 _SHAPE_NODES, _SHAPE_WEIGHTS = np.polynomial.hermite_e.hermegauss(20)
 
 
@@ -67,19 +68,20 @@ class PeakShapeErrors(NamedTuple):
     """
 
     spread_error: np.ndarray
-    """(m, 3): error of the peak position [bins] by the broadening of the line, equation (1)."""
+    """(m, 3): error of the peak position [bins] because the footprint broadens the line, equation
+    (1) of the class."""
     imaginary_shift_error: np.ndarray
-    """(m, 3): mean error of the peak position [bins] by the imaginary part of the complex shift,
-    equation (2)."""
+    """(m, 3): mean error of the peak position [bins] due to the imaginary part of the complex
+    shift, equation (2) of the class."""
     imaginary_shift_deviation: np.ndarray
-    """(m, 3): standard deviation of the error by the imaginary part [bins], with the sign of the
-    mean error at small shifts."""
+    """(m, 3): standard deviation [bins] of the error due to the imaginary part of the complex
+    shift. It has the sign of the mean error at small shifts."""
 
     @classmethod
     def from_offset(
         cls, offset: np.ndarray, squared_shift: np.ndarray, variance: np.ndarray, shots: "Shots"
     ) -> "PeakShapeErrors":
-        """Return the errors of the positions of peaks at given offsets from their strongest bin.
+        """Return the position errors of peaks at given offsets from their strongest bin.
 
         Parameters
         ----------
@@ -128,17 +130,23 @@ class PeakShapeErrorTables(NamedTuple):
     """
 
     spread_error: np.ndarray
-    """Error by the broadening of the line [bins], over b^2 [cells^2], by spread and offset."""
+    """Position error [bins] because a footprint broadens the line, divided by b^2 [squared
+    resolution cells], with b the spread of the lines. Axes are spread and offset."""
     imaginary_shift_error: np.ndarray
-    """Mean error by the imaginary shift [bins], over its variance; by spread, log variance and
-    offset."""
+    """Mean position error [bins] due to the imaginary part of the complex shift, divided by the
+    variance of this part. Axes are spread, log variance and offset."""
     imaginary_shift_deviation: np.ndarray
-    """Standard deviation of that error [bins], over the variance; by the same coordinates."""
+    """Standard deviation [bins] of the error due to the imaginary part of the complex shift,
+    divided by the variance of this part. Axes are spread, log variance and offset."""
 
 
 @lru_cache(maxsize=16)
 def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTables:
-    """Tabulate the errors of the positions of deformed peaks."""
+    """Return the :class:`PeakShapeErrorTables` of a window.
+
+    Peaks are deformed by the spread of a footprint's lines and by speckle. The errors are those of
+    positions that are estimated from the magnitudes of three bins.
+    """
     interpolation, padding = interpolator(window, fft_size), fft_size / window.length
     n_samples = min(window.length, _SHAPE_SAMPLES_MAX)
     window_values = window_samples(window.name, n_samples)
@@ -169,13 +177,16 @@ def _peak_shape_error_tables(window: Window, fft_size: int) -> PeakShapeErrorTab
 
 
 def _imaginary_shift_table_shape() -> tuple[int, int]:
-    """Return the numbers of tabulated variances and offsets."""
+    """Return the numbers of tabulated variances and offsets, in this order."""
     return _IMAGINARY_SHIFT_VARIANCES.size, _SHAPE_OFFSETS_BINS.size
 
 
 @njit(cache=True, error_model="numpy")
 def _estimate_sub_bin_offsets(magnitudes, interpolation, offset):
-    """Fill ``offset`` (m,) with estimates from the magnitudes (3, m) below, at and above a bin."""
+    """Fill ``offset`` (m,) with estimated offsets of peaks from a bin [bins].
+
+    The magnitudes (3, m) are those of the bin below, the bin itself, and the bin above.
+    """
     for i in range(offset.size):
         offset[i] = estimate_sub_bin_offset(
             magnitudes[0, i], magnitudes[1, i], magnitudes[2, i], interpolation
@@ -183,7 +194,10 @@ def _estimate_sub_bin_offsets(magnitudes, interpolation, offset):
 
 
 def _offsets_of_magnitudes(magnitudes: np.ndarray, interpolation: Interpolator) -> np.ndarray:
-    """Return the estimated offset [bins] of peaks with magnitudes (3, ...) of three bins."""
+    """Return the estimated offsets (...) [bins] of peaks from the middle one of three bins.
+
+    ``magnitudes`` (3, ...) are those of the bin below, the middle bin, and the bin above.
+    """
     offset = np.empty(magnitudes.shape[1:])
     _estimate_sub_bin_offsets(
         np.ascontiguousarray(magnitudes.reshape(3, -1)), interpolation, offset.reshape(-1)
@@ -197,21 +211,22 @@ _TWO_BIN_NOISE_RATIOS = np.concatenate([[1e-4], np.geomspace(2e-3, 0.3, 6)])
 _TWO_BIN_OFFSETS_BINS = np.array(
     [0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0]
 )
-"""Coordinates of the tables of :func:`_two_bin_error_tables`: spread of the lines [resolution
-cells], echo fraction over relative power, noise per quadrature over the peak's |X|, and estimated
-offset [bins]."""
+"""Estimated offsets of a peak from its strongest bin for which two-bin errors are tabulated [bins].
+The three arrays before are the other coordinates of the tables: spread of the lines [resolution
+cells], echo fraction over relative power, and noise per quadrature over the peak's |X|."""
 _TWO_BIN_DRAWS_PER_ENTRY = 4096
-"""Number of drawn peaks from which each entry of these tables is averaged."""
+"""Number of drawn peaks over which each entry of the two-bin tables is averaged."""
 _TWO_BIN_LINES, _TWO_BIN_LINE_POWERS = np.polynomial.hermite_e.hermegauss(24)
 """Positions y_j of the lines of a drawn footprint, in units of the spread, and their powers a_j^2.
 """
 _TWO_BIN_SEARCH_BINS = 5
 """Largest distance [bins] from bin 0 at which the mean echo of a drawn footprint may be largest."""
 _TABULATED_VARIANCE_MIN = 1e-10
-"""Smallest tabulated variance [bins^2]."""
+"""Smallest variance of a position error in the two-bin tables [bins^2]. Smaller ones are replaced
+by it."""
 _TABLE_ENTRY_DRAWS_MIN = 2.0
-"""Smallest effective number of draws of a table's entry. With fewer, the entry is interpolated from
-other offsets."""
+"""Smallest effective number of draws of an entry of the two-bin tables. An entry with fewer draws
+is interpolated from entries at other offsets."""
 
 
 def estimates_by_two_bins(shots: "Shots") -> bool:
@@ -238,12 +253,13 @@ class TwoBinErrors(NamedTuple):
     """
 
     mean: np.ndarray
-    """(m, 3): mean error [bins]."""
+    """(m, 3): mean error of the peak position [bins]."""
     wander_gain: np.ndarray
-    """(m, 3): slope of the regression of the position error on the linear wander w."""
+    """(m, 3): slope of the regression of the position error on the linear wander w, the shift of
+    the peak by speckle to first order."""
     excess_variance: np.ndarray
-    """(m, 3): variance of the error [bins^2] minus two parts: the variance of the wander times its
-    gain, and the square of the standard error by noise
+    """(m, 3): variance of the position error [bins^2] minus two parts: the variance of the linear
+    wander times ``wander_gain``, and the square of the standard error by noise
     (:func:`sweep.model.detection.sub_bin_interpolation.sub_bin_standard_error`)."""
 
     @classmethod
@@ -255,7 +271,7 @@ class TwoBinErrors(NamedTuple):
         noise_ratio: np.ndarray,
         shots: "Shots",
     ) -> "TwoBinErrors":
-        """Return the errors of peaks at given estimated offsets from their strongest bin.
+        """Return the position errors of peaks at given estimated offsets from their strongest bin.
 
         Parameters
         ----------
@@ -302,22 +318,24 @@ class TwoBinErrorTables(NamedTuple):
     """
 
     relative_mean: np.ndarray
-    """Mean error, over the square root of the variance in ``log_variance``."""
+    """Mean position error, divided by the square root of the variance whose logarithm is
+    ``log_variance``."""
     log_variance: np.ndarray
-    """Logarithm of the variance of the error minus the variance of the wander times its gain
-    [bins^2]. It includes noise."""
+    """Logarithm of a variance [bins^2]: that of the position error, noise included, minus that of
+    the linear wander times ``wander_gain``."""
     wander_gain: np.ndarray
-    """Slope of the regression of the error on the linear wander."""
+    """Slope of the regression of the position error on the linear wander, the shift of the peak by
+    speckle to first order."""
 
 
 @lru_cache(maxsize=8)
 def _two_bin_error_tables(
     window: Window, fft_size: int, keeps_strongest_bin: bool
 ) -> TwoBinErrorTables:
-    """Tabulate mean, variance and wander gain of the errors of drawn peaks.
+    """Tabulate mean, variance and wander gain of the position errors of randomly drawn peaks.
 
     ``keeps_strongest_bin`` is True if peaks are estimated about the bin that is strongest without
-    noise and speckle; else they are estimated about the largest bin.
+    noise and speckle, False if about the largest bin.
     """
     interpolation, padding = interpolator(window, fft_size), fft_size / window.length
     bins = np.arange(-1, 2) if keeps_strongest_bin else np.arange(-2, 3)
@@ -356,20 +374,21 @@ class _DrawnFootprints(NamedTuple):
     bins: np.ndarray
     """(bins,): numbers of the bins."""
     tone_position: np.ndarray
-    """(m,): position of the tone [bins]."""
+    """(m,): position of the middle of each footprint's lines [bins]."""
     echo: np.ndarray
-    """(bins, m) complex: echo of the lines."""
+    """(bins, m) complex: echo of each footprint's lines in each bin."""
     echo_covariance: np.ndarray
-    """(bins, bins, m): covariance of the echo over draws of the amplitudes."""
+    """(bins, bins, m): covariance of the echo in two bins, over random amplitudes of the lines."""
     noise: np.ndarray
-    """(bins, m) complex: noise."""
+    """(bins, m) complex: noise in each bin."""
     weighted_offset: np.ndarray
-    """(m,): real part of the sum over lines of offset [bins] times amplitude: b Re(sum a_j y_j
-    z_j)."""
+    """(m,): b Re(sum_j a_j y_j z_j), with the spread b of the lines [bins], and for line j the
+    weight a_j, the relative offset y_j and the random amplitude z_j."""
     weighted_offset_covariance: np.ndarray
-    """(bins, m): covariance of the complex sum b sum a_j y_j z_j with the echo [bins]."""
+    """(bins, m): covariance, with the echo in each bin, of the complex sum b sum_j a_j y_j z_j
+    [bins]. Symbols are those of ``weighted_offset``."""
     strongest_mean_power: np.ndarray
-    """(m,): mean power of the echo in the bin where it is largest."""
+    """(m,): mean power of the echo in the bin where this power is largest."""
 
     @classmethod
     def from_random(
@@ -507,7 +526,7 @@ class _DrawnFootprints(NamedTuple):
 
 
 def _two_bin_error_grids() -> tuple[np.ndarray, ...]:
-    """Return the coordinates of :func:`_two_bin_error_tables`, in the order of their axes."""
+    """Return the coordinates of :func:`_two_bin_error_tables`, in the order of the tables' axes."""
     return (
         np.log(_TWO_BIN_SPREADS_CELLS),
         np.log(_TWO_BIN_SHIFT_RATIOS),
@@ -521,10 +540,10 @@ def _moments_by_offset(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return mean error, logarithm of the residual variance, and gain, at the tabulated offsets.
 
-    The gain is the slope of the regression of the error on the shift (linear wander), and the
-    residual variance is that about the regression [bins^2]. Arguments are (m,), by draw: estimated
-    offset, error, shift and weight. A draw counts at the two tabulated offsets next to its own. The
-    result is None if no offset has _TABLE_ENTRY_DRAWS_MIN draws.
+    The gain is the slope of the regression of the error on the shift (linear wander). The residual
+    variance [bins^2] is that of the error about the regression. Arguments are (m,), by draw:
+    estimated offset, error, shift and weight. A draw counts at the two tabulated offsets next to
+    its own offset. The result is None if no offset has _TABLE_ENTRY_DRAWS_MIN draws.
     """
     n_offsets = _TWO_BIN_OFFSETS_BINS.size
     position = np.interp(offset, _TWO_BIN_OFFSETS_BINS, np.arange(n_offsets))

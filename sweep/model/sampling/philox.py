@@ -28,14 +28,14 @@ STREAM_DETECTION = (1, 3, 2)
 """Stream numbers, for up, Doppler and down segment, of the random numbers that are compared with
 probabilities of detection."""
 STREAM_FALSE_ALARM = (4, 6, 5)
-"""Stream numbers, for up, Doppler and down segment, of the random numbers that decide on false
-alarms due to noise and choose their bins."""
+"""Stream numbers, for up, Doppler and down segment, of the random numbers for false alarms of
+noise: whether one occurs, and in which bin."""
 STREAM_NOISE = (7, 9, 8)
-"""Stream numbers, for up, Doppler and down segment, of the noise in the bins of echoes and of
-leaked signal."""
+"""Stream numbers, for up, Doppler and down segment, of the random numbers for the noise in bins of
+echoes and of leaked signal."""
 STREAM_NOISE_MAXIMUM = (10, 12, 11)
-"""Stream numbers, for up, Doppler and down segment, of the largest magnitude in bins of noise
-alone, and of its bin."""
+"""Stream numbers, for up, Doppler and down segment, of the random numbers for the largest magnitude
+in bins of noise alone, and for its bin."""
 STREAM_FOOTPRINT_PHASE = 13
 """Stream number of the random phases of the beamlets' echoes."""
 STREAM_SPECKLE = 14
@@ -51,11 +51,12 @@ STREAM_LASER_PHASE = (21, 23, 22)
 STREAM_ERROR_FLOOR = 24
 """Stream number of an instrument's random errors that do not depend on the echo."""
 STREAM_LEAKAGE = (25, 27, 26)
-"""Stream numbers, for up, Doppler and down segment, of false peaks due to leaked signal."""
+"""Stream numbers, for up, Doppler and down segment, of the random numbers for false peaks of leaked
+signal."""
 GROUP_STREAM_OFFSET = 1000
-"""Difference between the number of a stream and that of the random words that spread its numbers
-over a group of draws (:mod:`sweep.model.sampling.draw_groups`). The words' address has the number
-of the group in place of that of the draw."""
+"""Number to add to the number of a stream, for the stream of random words that spread its numbers
+evenly over a group of draws (:mod:`sweep.model.sampling.draw_groups`). The address of these words
+has the number of the group in place of the number of the draw."""
 
 _MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _MULTIPLIER_0, _MULTIPLIER_1 = (np.uint64(m) for m in _MULTIPLIERS)
@@ -86,19 +87,21 @@ class CounterIncrements(NamedTuple):
     """
 
     draw: int
-    """Number of the draw in the next column, minus that in this column."""
+    """Number of the draw in the next column, minus the number of the draw in this column."""
     block: int
-    """Number of the block (four random words) in the next column, minus that in this column."""
+    """Number of the block (four random words) in the next column, minus the number in this column.
+    """
 
 
 # Arguments of `fill_words` as constants, because numba compiles anew for each literal in a call.
 FIRST_BLOCK_NUMBER = np.int64(0)
 """Number of the first block (four random words) of a stream."""
 DRAW_INCREMENTS = CounterIncrements(draw=1, block=0)
-"""Counter increments for columns that hold the same block (four random words) of successive
+""":class:`CounterIncrements` for columns that hold the same block (four random words) of successive
 draws."""
 BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
-"""Counter increments of successive blocks of four random words that belong to one draw."""
+""":class:`CounterIncrements` for columns that hold successive blocks (four random words) of one
+draw."""
 
 
 @njit(cache=True)
@@ -252,8 +255,8 @@ def to_normals(word0, word1):
 def uniform(key0, key1, draw, stream, index):
     """Return one uniform random number of a stream in a draw.
 
-    The number is between 2^-53 and 1 - 2^-53. An event of a probability below 2^-53 = 1.1e-16 never
-    happens in a comparison with it.
+    The number is between 2^-53 and 1 - 2^-53. If it is compared with the probability of an event,
+    an event of probability below 2^-53 = 1.1e-16 never happens.
 
     Parameters
     ----------
@@ -313,7 +316,7 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np
 def _fill_uniforms(keys, draws, stream, out):
     """Fill the rows of ``out`` (m, count) with the first uniform numbers of a stream.
 
-    The arguments are those of :func:`uniforms`. The count is a multiple of 4.
+    The arguments are those of :func:`uniforms`. ``count`` is a multiple of 4.
     """
     words = np.empty((4, out.shape[1] // 4), np.uint64)
     for i in range(draws.size):
@@ -327,8 +330,8 @@ def _fill_uniforms(keys, draws, stream, out):
 def to_normals_by_row(uniform_numbers: np.ndarray) -> np.ndarray:
     """Convert uniform numbers (m, k), with even k, to standard normal numbers (m, k).
 
-    Columns 2 i and 2 i + 1 hold pair i, which equals that of :func:`normal_pair` up to the last
-    bit.
+    Columns 2 i and 2 i + 1 hold pair i, which equals the result of :func:`normal_pair` for the
+    index i up to the last bit.
     """
     # Contiguous copies, so that bits do not depend on the number of rows.
     first, second = (np.ascontiguousarray(uniform_numbers[:, lane::2]) for lane in range(2))

@@ -35,8 +35,8 @@ from sweep.model.preparation import Parameters, Shots
 DRAWS_PER_BATCH = 4096
 """Largest number of draws, summed over points, that are prepared at once."""
 BEAMLETS_PER_BATCH = 1 << 19
-"""Largest number of beamlets, summed over draws, that are prepared at once. Each takes some 100
-bytes of memory."""
+"""Largest number of beamlets, summed over draws, that are prepared at once. A beamlet takes some
+100 bytes of memory."""
 
 
 class RealisedShots(NamedTuple):
@@ -48,13 +48,13 @@ class RealisedShots(NamedTuple):
     point_indices: np.ndarray
     """(m,) int64: index of the point that each draw belongs to."""
     draw_numbers: np.ndarray
-    """(m,) int64: number of each draw."""
+    """(m,) int64: number of each draw of its point."""
     shots: Shots
-    """Prepared shots of the m draws, with their random effects."""
+    """Prepared shots of the m draws, after their random effects."""
 
 
 def random_effects(effects: Collection[str]) -> tuple[Effect, ...]:
-    """Return the effects that are simulated by random draws, among the named ones."""
+    """Return those of the named effects that are simulated by random draws."""
     return tuple(effect for effect in select_effects(effects) if effect.is_random)
 
 
@@ -118,9 +118,8 @@ def _realise_batch(
 ) -> Shots:
     """Return prepared shots, with all effects, for m draws of points that share all settings.
 
-    Settings are parameters that are words or sizes.
-
-    ``draw_keys`` holds the random key of the point and the number of each draw.
+    Settings are parameters that are words or sizes. ``draw_keys`` holds, for each draw, the random
+    key of its point and its number.
     """
     n_points, random = draw_keys.draw_numbers.size, random_effects(effects)
     for effect in random:
@@ -138,7 +137,10 @@ def _realise_batch(
 
 
 def zero_standard_errors(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return standard errors by name where nothing is random: 0, or nan if the output is nan."""
+    """Return the standard errors of outputs that nothing random affects, by name.
+
+    They are 0, or nan where the output is nan.
+    """
     return {name: 0.0 * outputs[name.removesuffix("_error")] for name in STANDARD_ERROR_OUTPUTS}
 
 
@@ -165,7 +167,7 @@ class RunningMeans:
         sum of the numbers over the largest number."""
 
     def add(self, point_indices: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-        """Add the values of m draws to the means.
+        """Add the values of m draws to the means, in place.
 
         The draws of one point must be in the order of their numbers.
 
@@ -189,7 +191,7 @@ class RunningMeans:
     def moments(
         self, names: Sequence[str], point_indices: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mean and unbiased variance of values over draws, and the numbers of draws.
+        """Return mean, unbiased variance and number of values over draws, for selected points.
 
         Parameters
         ----------
@@ -213,11 +215,11 @@ class RunningMeans:
             )
 
     def running_sums(self) -> np.ndarray:
-        """Return the sums that further draws need in addition to the stored means, (n, columns).
+        """Return the array (n, columns) that, with the stored means, lets later runs add draws.
 
-        A row holds a point's numbers of values of all outputs, the sums of squared deviations of
-        those in OUTPUT_HAS_SQUARED_DEVIATIONS, and the largest logarithms of those in
-        OUTPUT_IS_LOGARITHM.
+        A row holds, for a point: the numbers of values of all outputs, the sums of squared
+        deviations of the outputs in OUTPUT_HAS_SQUARED_DEVIATIONS, and the largest logarithms of
+        the outputs in OUTPUT_IS_LOGARITHM.
         """
         arrays = (
             self.n_values,
@@ -227,10 +229,11 @@ class RunningMeans:
         return np.concatenate(arrays).T
 
     def restore_from_results(self, results: Mapping[str, np.ndarray]) -> None:
-        """Restore means and sums from the results of earlier draws, so that draws can be added.
+        """Set means and sums from the results of earlier draws, so that draws can be added.
 
-        `results` are those of :meth:`results` by name, with the array of :meth:`running_sums` as
-        RUNNING_SUMS_NAME; further columns are not used. Points without draws have zeros there.
+        `results` has the names of :meth:`results`, and RUNNING_SUMS_NAME with the array of
+        :meth:`running_sums`. Columns of that array beyond those of :meth:`running_sums` are
+        ignored. Points without draws have zeros in it.
         """
         sizes = [a.sum() for a in (OUTPUT_HAS_SQUARED_DEVIATIONS, OUTPUT_IS_LOGARITHM)]
         split_rows = np.cumsum([len(self.names), *sizes])
@@ -244,14 +247,11 @@ class RunningMeans:
         self.mean[...] = np.where(n_values > 0, mean, self.mean)
 
     def state(self) -> np.ndarray:
-        """Return all means, sums and counts as one array, for :meth:`restore_state`.
-
-        The result is (3 * names, n).
-        """
+        """Return means, sums and counts as one array (3 * names, n), for :meth:`restore_state`."""
         return np.concatenate([self.n_values, self.mean, self.squared_deviations])
 
     def restore_state(self, state: np.ndarray) -> None:
-        """Replace all means, sums and counts by an array that :meth:`state` returned."""
+        """Set all means, sums and counts from an array that :meth:`state` returned."""
         self.n_values[...], self.mean[...], self.squared_deviations[...] = np.split(state, 3)
 
     def standard_errors(self) -> np.ndarray:
@@ -261,7 +261,10 @@ class RunningMeans:
             return np.sqrt(self.squared_deviations / (n * (n - 1.0)))
 
     def results(self) -> dict[str, np.ndarray]:
-        """Return means by name, and standard errors by names of STANDARD_ERROR_OUTPUTS, (n,)."""
+        """Return means and their standard errors, (n,) by name.
+
+        The names are those of the outputs and of STANDARD_ERROR_OUTPUTS.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = self.mean + np.log10(self.squared_deviations / self.n_values)
         # If all logarithms are -inf, the sum relative to the largest is 0: keep -inf.
@@ -276,15 +279,15 @@ class RunningMeans:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_to_running_means(point_indices, values, is_logarithm, n_values, mean, squared_deviations):
-    """Add values to running means and sums of squared deviations [1].
+    """Add values to running means and sums of squared deviations, in place [1].
 
     Parameters
     ----------
     point_indices
         (m,): index of the point of each column of `values`.
     values
-        (names, m): values of draws; nan does not count. If a value is infinite, as a bound without
-        an echo is, so is the mean.
+        (names, m): values of draws; nan does not count. An infinite value, such as an error bound
+        where there is no echo, makes the mean infinite.
     is_logarithm
         (names,) bool: True for values that are log10 of a number.
     n_values

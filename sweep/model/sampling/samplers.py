@@ -68,13 +68,13 @@ from sweep.model.sampling.realisations import (
 )
 
 NOISE_DRAWS_PER_STEP = 1 << 16
-"""Number of draws of each point that are made in one step if nothing but noise is random."""
+"""Number of draws of each point that are made in one step if only noise is random."""
 RANDOM_EFFECT_DRAWS_PER_STEP_MIN = 16
 """Smallest number of draws of each point that are made in one step if random effects are simulated.
 """
 
 SPECTRUM_SAMPLES_PER_STEP = 1 << 18
-"""Largest number of samples, over all draws, of the full spectra that are processed at once."""
+"""Largest number of samples of full spectra, summed over draws, that are processed in one step."""
 
 FFT_SIZE_PATH = "instrument.processing.fft_size"
 """Dotted path of the parameter for the FFT size."""
@@ -86,17 +86,18 @@ SPECTRA_METHOD = "spectra"
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUT_NAMES
 ]
-"""Rows of arrays of counts that hold numbers of detections, in the order of
-``PD_OUTPUT_NAMES``. The rows of such an array are in the order of ``DRAW_COUNT_OUTPUTS``."""
+"""Indices of the rows, in an array of counts ordered as ``DRAW_COUNT_OUTPUTS``, that hold numbers
+of detections. They are in the order of ``PD_OUTPUT_NAMES``."""
 
 
 STANDARD_ERROR_GROUPS_MIN = 4
-"""Smallest number of groups of draws whose means are used for a standard error. The variance of
-fewer groups is too uncertain: with two, one error in fifty would exceed five standard errors. With
-four it is one in 250."""
+"""Smallest number of groups of draws from whose means a standard error is computed. The variance of
+fewer means is too uncertain: with two groups, one error in fifty would exceed five standard errors.
+With four groups it is one in 250."""
 
 STANDARD_ERROR_CONFIDENCE = 0.95
-"""Confidence at which Student's quantile widens a standard error by the means of groups."""
+"""Confidence of Student's quantile, by which a standard error that follows from the means of few
+groups of draws is widened."""
 
 
 class PriorDraws(NamedTuple):
@@ -106,13 +107,13 @@ class PriorDraws(NamedTuple):
     """
 
     n_draws: np.ndarray
-    """(n,) int64: number of draws made so far of each point."""
+    """(n,) int64: number of draws made so far for each point."""
     counts: np.ndarray
-    """(names, n, batches) int64: number of draws with each event, in the order of
-    DRAW_COUNT_OUTPUTS, in each batch of draws."""
+    """(names, n, batches) int64: number of draws with each event, by point and batch of draws.
+    Events are in the order of DRAW_COUNT_OUTPUTS."""
     means: Mapping[str, np.ndarray]
-    """Means (n,) by the names of outputs, and RUNNING_SUMS_NAME (n, columns). They are used for
-    points with random effects or full spectra."""
+    """Arrays by name: means (n,) by the names of outputs, and RUNNING_SUMS_NAME (n, columns). They
+    are used for points with random effects or full spectra only."""
 
 
 class Sampler(ABC):
@@ -153,7 +154,7 @@ class Sampler(ABC):
         """
 
     def draw(self, point_indices: np.ndarray, n_draws: int) -> None:
-        """Add draws to selected points.
+        """Make draws of selected points, and add them to the sampler's counts and means.
 
         Parameters
         ----------
@@ -174,7 +175,7 @@ class Sampler(ABC):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make draws of points, and count their events.
+        """Make draws of points, and add the numbers of their events to ``counts`` in place.
 
         Parameters
         ----------
@@ -207,14 +208,15 @@ class Sampler(ABC):
 
     @abstractmethod
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return the results of all draws by name: outputs, standard errors and half-widths, (n,).
+        """Return the results of all draws: outputs, standard errors and half-widths, (n,) by name.
 
-        Half-widths are those of confidence intervals. The running sums that further draws need are
-        included, (n, columns).
+        Half-widths are those of the confidence intervals of detection probabilities.
+        RUNNING_SUMS_NAME (n, columns), from which draws can be added later, is included if effects
+        are random or spectra are drawn.
         """
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
-        """Return the values of all parameters for selected points, by dotted path."""
+        """Return a mapping of all parameters, by dotted path, for selected points."""
         return {
             path: v[point_indices] if isinstance(v, np.ndarray) and v.ndim else v
             for path, v in self.parameters.items()
@@ -225,9 +227,9 @@ class Sampler(ABC):
         return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
 
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return the half-widths of the confidence intervals of fractions of detections.
+        """Return the half-widths of confidence intervals that follow from counted detections alone.
 
-        The half-widths follow from the counts of draws alone. The kind of interval is
+        The intervals are those of detection probabilities, of the kind
         ``error_budget.count_interval_name``.
 
         Parameters
@@ -273,7 +275,8 @@ class Sampler(ABC):
     def accuracy_arrays(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
         """Return numbers of draws, half-widths and their excess over the tolerance, (n,) by name.
 
-        The names are those of ACCURACY_OUTPUTS.
+        The names are those of ACCURACY_OUTPUTS. Half-widths are those of the confidence intervals
+        of detection probabilities.
         """
         point_indices = np.arange(self.n_draws.size)
         widths = zip(PD_OUTPUT_NAMES, self.half_widths(point_indices, error_budget), strict=True)
@@ -285,15 +288,15 @@ class Sampler(ABC):
 
 
 def never_stop() -> bool:
-    """Return False: the default of ``should_stop``, with which all draws are made."""
+    """Return False. As the default of ``should_stop`` it lets all draws be made."""
     return False
 
 
 def stopping_check_draws(batch_size: int, draws_max: int, group_size: int = 1) -> Iterator[int]:
     """Yield, in rising order, the numbers of draws after which sampling may stop.
 
-    After each of these numbers of draws, the half-widths of the confidence intervals of detection
-    probabilities are compared with the tolerance.
+    At each number, half-widths of the confidence intervals of detection probabilities are compared
+    with the tolerance.
 
     Parameters
     ----------
@@ -336,7 +339,7 @@ def simulate_draws(
     prior_draws: PriorDraws | None = None,
     should_stop: Callable[[], bool] = never_stop,
 ) -> dict[str, np.ndarray]:
-    """Simulate draws of points with all effects, and return outputs, their errors and counts.
+    """Simulate draws of points with all effects; return outputs, their errors and counts.
 
     Parameters
     ----------
@@ -449,10 +452,12 @@ def draw_until_accurate(
 
 
 def _can_be_accurate(n_draws: int, error_budget: ErrorBudget) -> bool:
-    """Return False if no point with random effects can meet its tolerance with ``n_draws`` draws.
+    """Return False if ``n_draws`` draws are too few for any point with random effects to be
+    accurate.
 
-    With n draws in at least two whole groups, half-widths are at least z^2 / n, with the normal
-    quantile z; with fewer draws they are at least half of that (:mod:`sweep.model.error_budget`).
+    A point is accurate if its half-widths are within the tolerance. With n draws in at least two
+    whole groups, half-widths are at least z^2 / n, with the normal quantile z. With fewer draws
+    they are at least half of z^2 / n (:mod:`sweep.model.error_budget`).
     """
     least_width = two_sided_normal_quantile(error_budget.confidence) ** 2 / n_draws
     if n_draws < 2 * GROUP_SIZE:
@@ -464,8 +469,8 @@ class DetectionSampler(Sampler):
     """Sampler of detections in draws, by probabilities or by noise in the bins of echoes."""
 
     draws_are_grouped = True
-    """True if random effects are drawn in groups of draws; False for independent draws, with which
-    benchmarks compare."""
+    """True if random effects are spread evenly over groups of draws; False for independent draws,
+    with which benchmarks compare."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, method: str,
@@ -485,7 +490,7 @@ class DetectionSampler(Sampler):
             )
 
     def draws_per_step(self, n_points: int) -> int:
-        """Return the number of draws of each point that are made in one step."""
+        """Return the number of draws of each of ``n_points`` points that are made in one step."""
         return (
             NOISE_DRAWS_PER_STEP
             if self._running_means is None
@@ -495,9 +500,9 @@ class DetectionSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make draws of points, and count their events.
+        """Make draws of points, and add the numbers of their events to ``counts`` in place.
 
-        If effects are random, statistics of each draw are added to running means.
+        If effects are random, the outputs of each draw are also added to running means.
 
         Parameters
         ----------
@@ -543,9 +548,9 @@ class DetectionSampler(Sampler):
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        With random effects the intervals are those of means over the draws. Without random effects
-        they are those of counted detections in drawn noise, or 0, because a probability is then
-        exact.
+        With random effects they are intervals of means over the draws. Without random effects they
+        are intervals of counted detections if noise is drawn, and 0 if not, because probabilities
+        are then exact.
 
         Parameters
         ----------
@@ -598,11 +603,11 @@ class DetectionSampler(Sampler):
         return outputs | self.accuracy_arrays(error_budget)
 
     def _standard_errors(self) -> dict[str, np.ndarray]:
-        """Return the standard errors of mean probabilities of detection, (n,) by name.
+        """Return the standard errors of mean detection probabilities, (n,) by name.
 
-        The variance of draws in whole groups follows from the groups' means, as in half-widths, if
-        there are at least :data:`STANDARD_ERROR_GROUPS_MIN` groups. Other draws have the variance
-        of independent draws.
+        They follow from the means of complete groups of draws, if there are at least
+        :data:`STANDARD_ERROR_GROUPS_MIN` groups. Otherwise, and for draws in an incomplete group,
+        draws count as independent.
         """
         assert self._running_means is not None
         point_indices = np.arange(self.n_draws.size)
@@ -657,8 +662,8 @@ class SpectraSampler(Sampler):
     def draws_per_step(self, n_points: int) -> int:
         """Return the number of draws of each point that are made in one step.
 
-        The result is a multiple of the number of draws that a detector processes together. So the
-        division into steps does not change which draws a detector processes together.
+        It is a multiple of the number of draws that a detector processes together. So the division
+        into steps does not change which draws a detector processes together.
         """
         fft_sizes = np.unique(self.parameters[FFT_SIZE_PATH])
         return max(1, 4 // n_points) * math.lcm(
@@ -668,7 +673,9 @@ class SpectraSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make draws of points, and count their events; add measured values to the means.
+        """Make draws of points, and add the numbers of their events to ``counts`` in place.
+
+        Measured values of each draw are also added to running means.
 
         Parameters
         ----------
@@ -692,7 +699,11 @@ class SpectraSampler(Sampler):
     def _iter_point_spectra(
         self, point: int, first_draw: int, end_draw: int
     ) -> Iterator[tuple[PointSpectra, np.ndarray]]:
-        """Yield the noiseless signals of a point with the numbers of the draws that share them."""
+        """Yield the noiseless spectra of a point, with the numbers (m,) of the draws that share
+        them.
+
+        With random effects each draw has its own spectra.
+        """
         point_parameters = self.select_parameters(point)
         if self._shot_of_point:
             point_spectra = prepare_point_spectra(
@@ -719,10 +730,10 @@ class SpectraSampler(Sampler):
                 yield point_spectra, np.array([draw_number])
 
     def _nan_for_missing_segments(self) -> np.ndarray:
-        """Return terms (4, n) that, added to outputs, set those of missing segments to nan.
+        """Return an array (4, n): nan for a segment that does not exist, else 0.
 
-        A term is nan for a segment that does not exist, else 0. Rows are in the order of
-        PD_OUTPUT_NAMES.
+        Rows are in the order of PD_OUTPUT_NAMES. Added to outputs, it sets those of missing
+        segments to nan.
         """
         is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
         segment_orders = np.asarray(
@@ -740,7 +751,7 @@ class SpectraSampler(Sampler):
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
-        The intervals are those of counted detections.
+        The intervals follow from counted detections.
 
         Parameters
         ----------

@@ -69,23 +69,23 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
 QUADRATURE_NODE_COUNTS = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
-"""Possible numbers of nodes of a Gaussian quadrature: numbers of lines that represent a footprint
-along one coordinate of the beam."""
+"""Numbers of nodes from which that of a Gaussian quadrature is chosen. The nodes are lines that
+represent a footprint along one coordinate of the beam."""
 
 _QUADRATURE_PHASE_SLOPE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
 """Largest slope of a phase [rad per standard deviation of the beam] for which a Gaussian quadrature
-errs by at most 1e-3. There is one value for each number of nodes in QUADRATURE_NODE_COUNTS."""
+errs by at most 1e-3, for each number of nodes in QUADRATURE_NODE_COUNTS."""
 
 _LINE_WEIGHT_MIN = 1e-6
-"""Smallest fraction of the beam's power for which a line of the footprint is included."""
+"""Fraction of the beam's power below which a line of the footprint is omitted."""
 
 ECHO_RANDOM_INDEX_STRIDE = 1 << 24
 """Number of indices of random numbers reserved for each echo. The indices of echo g (0, 1, ..)
 begin at (1 + g) times this number."""
 
 LOOK_DRAW_STRIDE = np.int64(1 << 48)
-"""Offset added to the number of a draw for each further look (record of a segment), so that looks
-have different random numbers."""
+"""Difference of the draw numbers used for successive looks (records of a segment) of one draw, so
+that looks have different random numbers."""
 
 _FIRST, _SECOND = 0, 1
 """Indices of the beam's two coordinates, y and x, as rotated by :func:`_rotate_to_steepest`."""
@@ -120,8 +120,8 @@ class SpeckleLineGrid(NamedTuple):
     n_nodes: np.ndarray
     """(quadratures,) int64: number of nodes of each Gaussian quadrature, without padding."""
     window_transform: np.ndarray
-    """(m,): transform of the window, sampled at distances from the line of 0, 1, 2 .. times 1 /
-    ``samples_per_bin`` bins."""
+    """(m,): transform of the window at the distances 0, 1, 2 .. times 1 / ``samples_per_bin`` from
+    a line [bins]."""
     samples_per_bin: float
     """Number of samples of ``window_transform`` per bin of fs/N, with the sampling rate fs and the
     FFT size N."""
@@ -129,12 +129,12 @@ class SpeckleLineGrid(NamedTuple):
     """Largest distance [bins of fs/N] at which a line contributes to a bin. fs is the sampling rate
     and N the FFT size."""
     nyquist_bin: int
-    """Half of the FFT size if bins near DC and Nyquist also contain the conjugate images of lines,
-    as in a real record; else 0."""
+    """Half of the FFT size for a real record, whose bins near frequency 0 and Nyquist also contain
+    conjugate images of lines; 0 for a complex record."""
 
     @classmethod
     def empty(cls) -> "SpeckleLineGrid":
-        """Return a grid of lines for no points."""
+        """Return a record of lines for no points."""
         no_gradients, no_indices = np.zeros((0, 3, 2)), np.zeros(0, np.int64)
         no_table = np.zeros((0, 0))
         return cls(
@@ -152,7 +152,7 @@ class SpeckleLineGrid(NamedTuple):
         )
 
     def select(self, points: np.ndarray) -> "SpeckleLineGrid":
-        """Return the lines of the points with the given indices."""
+        """Return the record for the points with the given indices."""
         if not len(self.line_shift_gradient):
             return self
         return self._replace(
@@ -216,9 +216,9 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
 def _rotate_to_steepest(
     line_shift: np.ndarray, phase: np.ndarray, padding_factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate the beam's coordinates so that shifts and phases change most along the first.
+    """Rotate the beam's coordinates so that line shifts and phases change most along the first.
 
-    The beam is round, so the joint distribution of the amplitudes is unchanged. Few lines are then
+    The beam is round, so the joint distribution of the amplitudes is unchanged. Few lines are
     needed along the second coordinate.
 
     Parameters
@@ -251,7 +251,7 @@ def _rotate_to_steepest(
 def folding_signs(shots: "Shots") -> np.ndarray:
     """Return -1 for segments whose peak moves to lower bins as the beat rises, else 1, (n, 3).
 
-    It moves to lower bins if the beat is folded at Nyquist or at frequency 0.
+    A peak moves to lower bins if its beat is folded at frequency 0 or at Nyquist.
     """
     signs = np.ones((shots.size, 3))
     if shots.complex_record:
@@ -294,9 +294,7 @@ def interpolate_transform(distance, grid):
 
 @njit(cache=True, error_model="numpy")
 def nearest_image_position(position, nyquist_bin):
-    """Return the position of a line's mirror image at frequency 0 or Nyquist.
-
-    The image is the one at whichever of the two is nearer.
+    """Return the position of the nearer mirror image of a line: at frequency 0 or at Nyquist.
 
     Parameters
     ----------
@@ -315,9 +313,9 @@ def nearest_image_position(position, nyquist_bin):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fill_mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_variance):
-    """Compute the mean powers over speckle of an echo's bins.
+    """Compute, into ``mean_power``, the mean powers over speckle of an echo's bins.
 
-    The lines of the echo have the total power 1.
+    All lines of the echo together have the power 1.
 
     Parameters
     ----------
@@ -393,9 +391,7 @@ def fill_mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo
 def draw_bin_amplitudes(
     address, echo_number, grid, point, echo_centre, first_bin, mean_power, amplitudes
 ):
-    """Draw the complex speckle amplitudes of an echo's bins, as sums over its lines.
-
-    The amplitudes have mean power 1.
+    """Draw the complex speckle amplitudes of an echo's bins, of mean power 1, as sums over lines.
 
     Parameters
     ----------
@@ -480,10 +476,11 @@ def draw_bin_amplitudes(
 
 FACTORED_BINS_MAX = 48
 """Largest number of bins, summed over segments, whose speckle is drawn by a factor of its
-covariance. For more bins it is summed over the lines of the footprint."""
+covariance. The speckle of more bins is summed over the lines of the footprint."""
 
 _RESIDUAL_POWER_MAX = 1e-8
-"""Largest fraction of a bin's mean power that a factor of the covariance of speckle may omit."""
+"""Largest fraction of a bin's mean power that the factor of the speckle's covariance may leave out.
+"""
 
 
 @njit(cache=True, error_model="numpy")
@@ -491,7 +488,7 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
     """Compute a factor of the covariance of the speckle in an echo's bins; return its rank.
 
     Amplitudes drawn by the factor (:func:`draw_factored_amplitudes`) have the same distribution as
-    those by :func:`draw_bin_amplitudes`, and take fewer random numbers.
+    those drawn by :func:`draw_bin_amplitudes`, and take fewer random numbers.
 
     Parameters
     ----------
@@ -594,6 +591,8 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
 def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
     """Draw the complex speckle amplitudes of an echo's bins by a factor of their covariance.
 
+    The amplitudes have mean power 1.
+
     Parameters
     ----------
     address, echo_number
@@ -682,9 +681,9 @@ def draw_segment_bin_amplitudes(
 
 
 RECORD_LINE_DEVIATION_MAX_CELLS = 1.0
-"""Largest standard deviation of the positions of a footprint's lines for which draws use a
-:class:`FootprintRecord` [resolution cells]. A cell is the sample rate over the number of samples in
-the record."""
+"""Largest standard deviation of the positions of a footprint's lines [resolution cells] for which
+speckle is drawn by a :class:`FootprintRecord`. A cell is the sample rate over the number of samples
+in the record."""
 
 
 class FootprintRecord(NamedTuple):
@@ -697,15 +696,17 @@ class FootprintRecord(NamedTuple):
     """
 
     series_coefficients: np.ndarray
-    """(lines, k) complex: coefficients of each line's part of the Chebyshev series, for a line of
-    amplitude 1."""
+    """(lines, k) complex: Chebyshev coefficients of each line's contribution to the record, for a
+    line of amplitude 1."""
     chebyshev_arguments: np.ndarray
-    """(L,): argument of the Chebyshev polynomials at each of the L samples. It is -1..1 over the
-    samples that contain the echo."""
+    """(L,): argument of the Chebyshev polynomials at each of the L samples. It rises from -1 to 1
+    over the samples that contain the echo."""
     windowed_tone: np.ndarray
-    """(L,) complex: windowed record of a pure tone of amplitude 1 at the middle of the echo."""
+    """(L,) complex: samples times window of a pure tone of amplitude 1 at the middle of the echo.
+    """
     mean_bin_power: np.ndarray
-    """(N,): mean power over speckle of each bin of the record's transform, with N the FFT size."""
+    """(N,): mean over speckle of the power of each bin of the record's transform, with N the FFT
+    size."""
 
     @classmethod
     def from_line_grid(
@@ -718,7 +719,7 @@ class FootprintRecord(NamedTuple):
         first_sample: int,
         fft_size: int,
     ) -> "FootprintRecord":
-        """Prepare the record from which the speckle of a point's echo in a segment is drawn.
+        """Return the record from which the speckle of a point's echo in a segment is drawn.
 
         Parameters
         ----------
@@ -788,7 +789,7 @@ class FootprintRecord(NamedTuple):
     def draw_speckled_record(
         self, key: np.ndarray, draw_number: int, echo_number: int
     ) -> np.ndarray:
-        """Draw the complex windowed record of an echo in speckle.
+        """Draw the complex windowed samples of an echo in speckle.
 
         The random numbers are those of :func:`draw_bin_amplitudes`.
 
@@ -823,8 +824,8 @@ class FootprintRecord(NamedTuple):
 
 
 _RELATIVE_POWER_MIN = 1e-14
-"""Smallest mean power of a bin, relative to the largest of all bins. Float64 does not resolve
-smaller ones, which are replaced by it."""
+"""Smallest mean power of a bin over the largest mean power of all bins. A smaller power, which
+float64 does not resolve, is replaced by it."""
 
 
 class _LineTable(NamedTuple):
@@ -834,15 +835,18 @@ class _LineTable(NamedTuple):
     """
 
     offset: np.ndarray
-    """Frequency of each line minus that of the middle of the echo [bins]."""
+    """(lines,): frequency of each line minus that of the middle of the echo [bins]."""
     phase: np.ndarray
-    """Phase of each line's amplitude, relative to the up segment [rad]."""
+    """(lines,): phase of each line's amplitude, relative to the up segment [rad]."""
     weight: np.ndarray
-    """Fraction of the echo's power in each line."""
+    """(lines,): fraction of the echo's power in each line."""
 
 
 def _line_table(line_grid: SpeckleLineGrid, point: int, segment: int) -> _LineTable:
-    """Return the frequencies, phases and weights of the lines of a point in a segment."""
+    """Return the frequencies, phases and weights of the lines of a point in a segment.
+
+    The result is a :class:`_LineTable`.
+    """
     first_quadrature, second_quadrature = line_grid.quadrature_index[point]
     y, x = (
         line_grid.node[quadrature_index, : line_grid.n_nodes[quadrature_index]]
@@ -864,8 +868,8 @@ def _line_table(line_grid: SpeckleLineGrid, point: int, segment: int) -> _LineTa
 def _draw_line_amplitudes(address, first_number, amplitudes):
     """Fill ``amplitudes`` with circular complex Gaussian numbers of mean power 2.
 
-    They are pairs of normal numbers of the speckle's stream, from pair ``first_number`` on.
-    ``address`` is that of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    Each is a pair of normal numbers of the stream of speckle, beginning with pair ``first_number``.
+    ``address`` is the address of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
     """
     key_0, key_1, draw = address
     for k in range(amplitudes.size):
@@ -908,7 +912,7 @@ _SERIES_SAMPLES_PER_BATCH = 128
 def _multiply_by_chebyshev_series(coefficients, positions, values):
     """Multiply complex values (n,) in place by a Chebyshev series at positions -1..1 (n,).
 
-    The series has complex ``coefficients`` (k,), and is evaluated by Clenshaw's algorithm.
+    ``coefficients`` (k,) complex are those of the series, which Clenshaw's algorithm evaluates.
     """
     b1_re, b1_im = np.empty(_SERIES_SAMPLES_PER_BATCH), np.empty(_SERIES_SAMPLES_PER_BATCH)
     b2_re, b2_im = np.empty(_SERIES_SAMPLES_PER_BATCH), np.empty(_SERIES_SAMPLES_PER_BATCH)
@@ -934,9 +938,9 @@ def _multiply_by_chebyshev_series(coefficients, positions, values):
 
 @lru_cache(maxsize=16)
 def _window_autocorrelation(window: Window, first_sample: int) -> np.ndarray:
-    """Return the autocorrelation (L,) of a window by lag in samples, from lag 0 on.
+    """Return the autocorrelation (L,) of a window of L samples, at lags of 0 to L - 1 samples.
 
-    The samples before ``first_sample`` count as 0.
+    Samples before ``first_sample`` count as 0.
     """
     window_values = window_samples(window.name, window.length).copy()
     window_values[:first_sample] = 0.0
@@ -1015,21 +1019,21 @@ class SpecklePeaks(NamedTuple):
     """Detected peaks of m echoes in developed speckle, (m, 3) by segment; nan without a peak."""
 
     offset: np.ndarray
-    """(m, 3): interpolated position of the peak, minus the bin about which it was estimated [bins].
-    """
+    """(m, 3): interpolated position of the peak minus the number of the bin about which it was
+    estimated [bins]."""
     folding_sign: np.ndarray
     """(m, 3): -1 if the peak moves to lower bins as the beat rises (:func:`folding_signs`), else 1.
     """
     relative_power: np.ndarray
-    """(m, 3): power of the peak bin in this draw, divided by its mean over draws; both include
-    noise."""
+    """(m, 3): power of the peak's bin in a draw, divided by its mean over draws. Both powers
+    include noise."""
     echo_fraction: np.ndarray
     """(m, 3): fraction, 0..1, of the echo in the mean power of the peak bin; the rest is noise."""
 
 
 WANDER_MAX_BINS = 1.5
-"""Limit on the standard deviation by which speckle moves a peak [bins], if only the bin that is
-strongest without noise is tested (``peak_bin``)."""
+"""Upper limit of the standard deviation by which speckle moves a peak [bins], under the rule
+``peak_bin``: only the bin that is strongest without noise is tested."""
 
 
 SEGMENT_PAIRS_WITH_SELF = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
@@ -1048,7 +1052,7 @@ def position_error_moments(
 ) -> np.ndarray:
     """Return the second moments E[e_i e_j] of peak position errors due to speckle [bins^2].
 
-    e_i is the error in segment i.
+    e_i is the error of the peak's position in segment i.
 
     Parameters
     ----------

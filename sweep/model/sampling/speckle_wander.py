@@ -10,8 +10,8 @@ from sweep.model.preparation import Shots
 from sweep.model.sampling.speckle_lines import SpecklePeaks, folding_signs, position_error_moments
 
 NEGATIVE_LOG_PD_MAX = 700.0
-"""Upper limit of -ln(pd), where pd is the probability of detection. A smaller pd counts as
-e^-700."""
+"""Upper limit of -ln(pd), with pd the probability of detection. A pd below e^-700 counts as e^-700.
+"""
 
 
 class MeanSquareErrors(NamedTuple):
@@ -87,7 +87,7 @@ def mean_range_velocity_wander_variance(
 ) -> MeanSquareErrors:
     """Return the mean square errors of range and radial velocity at n points due to speckle.
 
-    The means are over detected echoes.
+    Means are over draws in which the echo is detected.
 
     Parameters
     ----------
