@@ -426,7 +426,7 @@ def prepare_eyepoint_shots(
     eyepoints
         Geometry of n shots.
     parameters
-        Other parameters by dotted path, scalars.
+        Parameters that `eyepoints` does not hold, by dotted path, scalars.
     surfaces
         Materials by the surface numbers of `eyepoints`.
     effects
@@ -450,7 +450,7 @@ def parameters_and_ground_of_eyepoints(
     eyepoints
         Geometry of n shots; each shot hits a surface.
     parameters
-        Other parameters by dotted path, scalars.
+        Parameters that `eyepoints` does not hold, by dotted path, scalars.
     surfaces
         Materials by the surface numbers of `eyepoints`.
 

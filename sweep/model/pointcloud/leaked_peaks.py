@@ -346,7 +346,7 @@ def find_segments_with_raised_bins(
     groups : BinGroups
         Groups of adjacent bins above the threshold of n points, with bounds on raised bins.
     points : ndarray (m,) int64
-        Indices of the points that may leak; in others no segment is marked.
+        Indices of the points that may leak. Segments of other points are not marked.
     keys : ndarray (n, 2) uint64
         Random key of each point.
     first_draw, draws : int
@@ -474,8 +474,8 @@ def iter_leakage_bins(
     points : ndarray (m,) int64
         Indices of the points that may have such bins (:func:`find_leaking_points`).
     has_raised_bin : ndarray (n, 3) bool, optional
-        Segments in which all such bins are listed; in others those above the threshold suffice. By
-        default they are all segments. With a permanent line they are all in any case.
+        True for segments in which all these bins are listed; in other segments only bins above
+        the threshold are. By default, and in any case with a permanent line, all segments are True.
 
     Yields
     ------

@@ -75,7 +75,7 @@ def simulate_cloud(
     eyepoints
         Geometry of the n shots.
     parameters
-        Other parameters by dotted path, scalars.
+        Parameters that `eyepoints` does not hold, by dotted path, scalars.
     surfaces
         Materials by the surface numbers of `eyepoints`.
     keys

@@ -3076,7 +3076,7 @@ def draw_false_peak_bin(
         (groups,) int64: strongest, first and last bin of each echo (group of adjacent bins). An
         echo includes one bin on either side. Groups end at the first negative strongest bin.
     no_noise_peak_bins
-        (excluded,) int64: other bins that are not drawn.
+        (excluded,) int64: bins outside the echoes that are not drawn either.
     first_searched_bin, last_searched_bin
         First and last bin that may be drawn.
     fft_size

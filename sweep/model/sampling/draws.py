@@ -1031,9 +1031,9 @@ def _mark_random_events(
     n_draws : int
         Number of consecutive draws.
     stream : int
-        Number of the stream, of which the first number of each draw is compared.
+        Number of the stream. Its first number in each draw is compared with the probability.
     probability_otherwise, probability_if_condition : float
-        Probability of the event in draws in which the condition is False, and True.
+        Probabilities of the event: in draws whose condition is False, and True.
     condition : ndarray (draws,) bool
         The condition; it may be the same array as ``is_marked``.
     random_words : ndarray (4, >= n_draws) uint64

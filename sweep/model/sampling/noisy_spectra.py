@@ -920,7 +920,10 @@ class PointSpectra(NamedTuple):
         return self.signal_cache[segment, look]
 
     def echo_indices(self, segment: int) -> np.ndarray:
-        """Return the indices of the echoes' strongest bins in a segment; empty for a single echo."""
+        """Return the indices of the echoes' strongest bins in a segment.
+
+        The result is empty for a shot with a single echo.
+        """
         bins = np.empty(0, np.int64) if self.echo_bins is None else self.echo_bins[segment]
         bins = bins[bins >= 0]
         return self.shots.bin_indices(bins)

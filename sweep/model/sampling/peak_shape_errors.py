@@ -222,8 +222,8 @@ _TWO_BIN_LINES, _TWO_BIN_LINE_POWERS = np.polynomial.hermite_e.hermegauss(24)
 _TWO_BIN_SEARCH_BINS = 5
 """Largest distance [bins] from bin 0 at which the mean echo of a drawn footprint may be largest."""
 _TABULATED_VARIANCE_MIN = 1e-10
-"""Smallest variance of a position error in the two-bin tables [bins^2]. Smaller ones are replaced
-by it."""
+"""Variance [bins^2] that is added to the variances of the two-bin tables, so that their logarithms
+are finite."""
 _TABLE_ENTRY_DRAWS_MIN = 2.0
 """Smallest effective number of draws of an entry of the two-bin tables. An entry with fewer draws
 is interpolated from entries at other offsets."""

@@ -353,8 +353,8 @@ def simulate_draws(
     first_draw
         Number of the first draw.
     batch_sizes
-        Numbers of draws in batches that are counted separately; a point then has their sum of
-        draws. Without batch sizes a point has as many draws as `error_budget` needs, counted
+        Numbers of draws in batches that are counted separately; a point has the sum of these
+        numbers as its draws. If empty, a point has as many draws as `error_budget` needs, counted
         together.
     batch
         Number of draws in a batch. Whole batches are made between tests against `error_budget`,
@@ -368,8 +368,8 @@ def simulate_draws(
     prior_draws
         Earlier draws from `first_draw` on, for the same tolerance or a looser one.
     should_stop
-        Function that is called between steps. If it returns True, no more draws are made. At least
-        one step is made, and the results can be the `prior_draws` of another call.
+        Function that is called between steps. If it returns True, no more draws are made; a later
+        call can continue with the results as `prior_draws`. At least one step is made.
 
     Returns
     -------
@@ -452,8 +452,7 @@ def draw_until_accurate(
 
 
 def _can_be_accurate(n_draws: int, error_budget: ErrorBudget) -> bool:
-    """Return False if ``n_draws`` draws are too few for any point with random effects to be
-    accurate.
+    """Return False if points with random effects need more than ``n_draws`` draws to be accurate.
 
     A point is accurate if its half-widths are within the tolerance. With n draws in at least two
     whole groups, half-widths are at least z^2 / n, with the normal quantile z. With fewer draws
@@ -699,8 +698,7 @@ class SpectraSampler(Sampler):
     def _iter_point_spectra(
         self, point: int, first_draw: int, end_draw: int
     ) -> Iterator[tuple[PointSpectra, np.ndarray]]:
-        """Yield the noiseless spectra of a point, with the numbers (m,) of the draws that share
-        them.
+        """Yield the noiseless spectra of a point, with the numbers (m,) of the draws they serve.
 
         With random effects each draw has its own spectra.
         """

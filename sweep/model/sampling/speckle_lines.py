@@ -324,7 +324,7 @@ def fill_mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo
     echo_centre
         (3,): middle of the echo in each segment [bins]; nan for a segment without an echo.
     first_bin
-        (3,): number of the first bin in each segment; the others follow it.
+        (3,): number of the first bin in each segment; later elements are for successive bins.
     mean_power
         (3, bins): output array of mean powers.
     pseudo_variance
