@@ -293,7 +293,7 @@ def _find_and_write_groups(
                 )
                 for side in range(3):
                     bin_groups.neighbour_magnitudes[i, segment, group, side] = (
-                        _magnitude_of_bin_or_mirror(
+                        _magnitude_at_mirrored_index(
                             magnitude,
                             first_bin[segment, j],
                             strongest_index + side - 1,
@@ -306,7 +306,7 @@ def _find_and_write_groups(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _magnitude_of_bin_or_mirror(magnitude, first_bin, index, nyquist_bin):
+def _magnitude_at_mirrored_index(magnitude, first_bin, index, nyquist_bin):
     """Return |X| of a bin, given by its index in a span (adjacent bins from ``first_bin`` on).
 
     A bin beyond frequency 0 or Nyquist has the magnitude of its mirror image. A bin outside the

@@ -213,7 +213,7 @@ def compute_eyepoints(
     reference_velocity = radial_velocity[rows, np.maximum(bundle.reference_beamlet, 0)]
     scanner_rate = rotate(state.attitude, shots.direction_rate)
     _require_finite(shot_numbers, time, state, bundle, radial_velocity)
-    acceleration, approach_speed, turn_rate = _reference_beamlet_motion(
+    acceleration, approach_speed, turn_rate = _reference_beamlet_rates(
         state, scanner_rate, ray_directions, bundle, body_states, bodies_rotate
     )
     direction = rotate(state.attitude, shots.direction)
@@ -327,7 +327,7 @@ def _radial_velocities(
     return closing_speed
 
 
-def _reference_beamlet_motion(
+def _reference_beamlet_rates(
     state: BodyState,
     scanner_rate: np.ndarray,
     ray_directions: np.ndarray,

@@ -75,7 +75,7 @@ LEAKAGE_PROBABILITY_MIN = 1e-9
 """Probability per segment of a false peak by leaked signal, up to which no false peaks by leaked
 signal are drawn."""
 
-RAISED_BIN_RATE_MARGIN = 1.01
+RAISED_BIN_RATE_SAFETY_FACTOR = 1.01
 """Factor on a sum of crossing rates that makes it an upper bound. The sum replaces far bins by an
 integral, which is accurate to 1e-3, and the bound holds for the sum over listed bins."""
 
@@ -87,11 +87,11 @@ ECHO_EDGE_FIRST_RANDOM_INDEX = 1 << 25
 """Index of the first random number used for the noise of an echo's outermost bins, which are next
 to bins of leaked signal."""
 
-PERMANENT_LINE_BATCH_POINTS = 4
+PERMANENT_LINE_POINTS_PER_BATCH = 4
 """Number of points that are processed together if light leaked in the circulator has a line. The
 number limits memory to some 1e8 numbers."""
 
-BISECTION_STEPS = 40
+N_BISECTION_STEPS = 40
 """Number of bisection steps that compute the magnitude of a false peak, to a relative error of
 1e-11."""
 
@@ -297,7 +297,7 @@ class LeakageBins(NamedTuple):
         the circulator.
         """
         leakage = np.empty(self.crossing_rate_sum_bound_at_mean.shape)
-        _mean_segment_leakage(self, leakage)
+        _fill_mean_leakage_probabilities(self, leakage)
         return leakage
 
 
@@ -306,7 +306,7 @@ class _LeakedBinLocations(NamedTuple):
 
     bin_number: np.ndarray
     """(bins,) int64: number of the bin."""
-    batch_index: np.ndarray
+    point_in_batch: np.ndarray
     """(bins,) int64: index, in the batch, of the point to which the bin belongs."""
     segment: np.ndarray
     """(bins,) int64: segment of the bin: 0 up, 1 Doppler, 2 down."""
@@ -354,7 +354,7 @@ def find_segments_with_raised_bins(
     """
     with np.errstate(divide="ignore"):  # a certain crossing has an infinite rate
         rate_sums = -np.log1p(-groups.raised_bin_probability_max[points])
-    rate_sum_max = RAISED_BIN_RATE_MARGIN * rate_sums
+    rate_sum_max = RAISED_BIN_RATE_SAFETY_FACTOR * rate_sums
     has_raised_bin = np.zeros((keys.shape[0], 3), np.bool_)
     has_raised_bin_at_points = np.zeros((points.size, 3), np.bool_)
     _mark_segments_with_raised_bins(
@@ -419,7 +419,7 @@ def fading_group_of_bins(
         Index of the group in the segment of each bin.
     """
     bins = _locate_leaked_bins(spectra)
-    group_bins = groups.strongest_bin[points[bins.batch_index], bins.segment]
+    group_bins = groups.strongest_bin[points[bins.point_in_batch], bins.segment]
     distance = np.abs(bins.bin_number[:, None] - group_bins)
     if shots.complex_record:
         distance = np.minimum(distance % shots.fft_size, -distance % shots.fft_size)
@@ -489,9 +489,9 @@ def iter_leakage_bins(
             yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
         return
     echoes_alone = replace(shots, permanent_line=None)
-    for batch_begin in range(0, points.size, PERMANENT_LINE_BATCH_POINTS):
+    for batch_begin in range(0, points.size, PERMANENT_LINE_POINTS_PER_BATCH):
         for batch, spectra in iter_noiseless_spectra(
-            echoes_alone, points[batch_begin : batch_begin + PERMANENT_LINE_BATCH_POINTS]
+            echoes_alone, points[batch_begin : batch_begin + PERMANENT_LINE_POINTS_PER_BATCH]
         ):
             fading_group = fading_group_of_bins(shots, groups, batch, spectra)
             spectra, fading_group, leakage_bins = _remove_bins_masked_by_leaked_light(
@@ -822,7 +822,7 @@ def _fill_mean_probabilities(rate_table, mean_probabilities):
             quadrature,
             rate_sums,
         )
-        mean_probabilities[k] = _mean_leakage_from_rate_sums(rate_sums, quadrature.weights)
+        mean_probabilities[k] = _mean_leakage_probability_from_rates(rate_sums, quadrature.weights)
 
 
 def _locate_leaked_bins(spectra: NoiselessSpectra) -> _LeakedBinLocations:
@@ -1190,7 +1190,7 @@ def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_leakage_from_rate_sums(rate_sums, weights):
+def _mean_leakage_probability_from_rates(rate_sums, weights):
     """Return the mean over speckle of the probability 1 - exp(-R) that any bin is raised.
 
     R is the sum of the bins' crossing rates. ``rate_sums`` holds R at the last nodes of speckle
@@ -1319,7 +1319,7 @@ def _crossing_probability(rate):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mean_segment_leakage(leakage_bins, leakage_probability):
+def _fill_mean_leakage_probabilities(leakage_bins, leakage_probability):
     """Compute the probability of a false peak by leaked signal in each segment.
 
     The results are written into ``leakage_probability`` (m, 3). The probability is a mean over
@@ -1399,9 +1399,9 @@ def _mean_segment_leakage(leakage_bins, leakage_probability):
                             _add_rates_at_nodes(
                                 leakage_bins.log_amplitude[k], rate_table, quadrature, rate_sums
                             )
-                    p_leakage += _mean_leakage_from_rate_sums(rate_sums, quadrature.weights) * (
-                        1.0 - p_leakage
-                    )
+                    p_leakage += _mean_leakage_probability_from_rates(
+                        rate_sums, quadrature.weights
+                    ) * (1.0 - p_leakage)
                 n_phases, p_line_alarm = leakage_bins.permanent_line_log_amplitude.shape[0], 0.0
                 for phase in range(n_phases):
                     crossing_rate_sum = 0.0
@@ -1634,7 +1634,7 @@ def _draw_raised_bins(
         previous_bin, signal = bins[k], math.exp(log_amplitude_k) * root_looks
         probability = philox.uniform(
             key_0, key_1, draw, stream, first_random + 1
-        ) * _added_crossing_probability(signal, scaled_threshold)
+        ) * _crossing_probability_added_by_signal(signal, scaled_threshold)
         if (
             exempt_neighbour_magnitude_ratio.size > 0 and exempt_neighbour_magnitude_ratio[k] > 0.0
         ):  # its noise is correlated with that of this bin
@@ -1653,7 +1653,7 @@ def _draw_raised_bins(
         )
         if (
             ratio_min * root_looks < scaled_threshold
-            or _added_crossing_probability(signal, ratio_min * root_looks) > probability
+            or _crossing_probability_added_by_signal(signal, ratio_min * root_looks) > probability
         ):
             peak_bin, peak_ratio = (
                 bins[k],
@@ -1668,7 +1668,7 @@ def _draw_raised_bins(
 
 
 @njit(cache=True, error_model="numpy")
-def _added_crossing_probability(signal, threshold_ratio):
+def _crossing_probability_added_by_signal(signal, threshold_ratio):
     """Return the probability c(z) that signal lifts a bin to a level z that noise alone misses.
 
     ``signal`` and ``threshold_ratio`` (the level z) are amplitudes over sigma, the noise of a bin
@@ -1687,9 +1687,9 @@ def _magnitude_at_crossing_probability(signal, threshold_ratio, probability):
     noise of a bin per quadrature. z is at least ``threshold_ratio``.
     """
     low, high = threshold_ratio, max(signal, threshold_ratio) + CERTAIN_CROSSING_MARGIN_SIGMA
-    for _ in range(BISECTION_STEPS):
+    for _ in range(N_BISECTION_STEPS):
         middle = 0.5 * (low + high)
-        if _added_crossing_probability(signal, middle) > probability:
+        if _crossing_probability_added_by_signal(signal, middle) > probability:
             low = middle
         else:
             high = middle

@@ -80,14 +80,14 @@ _INTERPOLATION_ERROR_RATIO_MIN = 1e-6
 """Smallest standard error of a value interpolated between bins, as a fraction of the standard error
 of the value by whole bins."""
 
-_BELOW_ONE_SIGMA_PROBABILITY = 0.8413447460685429
+_BELOW_MEAN_PLUS_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal random number is below its mean plus one standard deviation."""
 
 _RELATIVE_VARIANCE_ROUNDING_ERROR = 1e-14
 """Relative rounding error of a squared standard error. It sets the smallest standard error that
 remains after the error due to an unknown slip is subtracted."""
 
-_CONTRADICTION_PROBABILITY = 1e-4
+_CONTRADICTION_PROBABILITY_MAX = 1e-4
 """Probability, under the stated errors, of a chi-square at least as large as the observed one,
 below which the residuals contradict the stated errors. The covariance is then scaled by the
 residuals."""
@@ -190,7 +190,7 @@ def solve_velocity(
         The velocity V minimises the sum over beams of ((u . V - v) / e)^2, with the direction u,
         the measured radial velocity v and its standard error e. The covariance is the inverse of
         the sum of u u^T / e^2. It is scaled where residuals contradict the stated errors
-        (:func:`_covariance_scale`).
+        (:func:`_covariance_scale_factor`).
 
         Parameters
         ----------
@@ -222,7 +222,7 @@ def solve_velocity(
             )
         chi_square = np.where(is_solved, sum(residual.T**2), np.nan)
         degrees_of_freedom = np.where(is_solved, is_used.sum(axis=1) - 3, 0)
-        scale = _covariance_scale(chi_square, degrees_of_freedom, degrees_of_freedom)
+        scale = _covariance_scale_factor(chi_square, degrees_of_freedom, degrees_of_freedom)
         return FittedCycles(
             value, covariance * scale[:, None, None], chi_square, degrees_of_freedom
         )
@@ -311,7 +311,7 @@ def solve_altitude(
             np.where(n_used > 0, plane.chi_square, np.nan),
             np.maximum(n_used - 1, 0),
         )
-        scale = _covariance_scale(
+        scale = _covariance_scale_factor(
             chi_square, degrees_of_freedom, n_used - 1 - plane.n_fitted_slopes
         )
         off_plane_variance = n_used * np.where(scale > 1, plane.centroid_height_variance, 0.0)
@@ -395,16 +395,16 @@ def _ground_points(
     return ground_points, u, error, leading_shape
 
 
-def _covariance_scale(
+def _covariance_scale_factor(
     chi_square: np.ndarray, degrees_of_freedom: np.ndarray, residual_degrees: np.ndarray
 ) -> np.ndarray:
     """Return the factor (n,) by which the covariance of each solution is multiplied.
 
-    The factor is 1 unless the residuals contradict the stated errors, that is, unless the
-    probability of a chi-square at least as large is below :data:`_CONTRADICTION_PROBABILITY`. In
-    that case it is ``chi_square`` over ``residual_degrees`` (at least 1), times the square of
-    Student's t at one standard deviation, because an error over a deviation estimated from
-    residuals follows Student's t. The scaled deviation covers 68 % of the errors.
+    The factor is 1 unless the residuals contradict the stated errors, that is, unless a chi-square
+    at least as large has a probability below :data:`_CONTRADICTION_PROBABILITY_MAX`. In that case
+    it is ``chi_square`` over ``residual_degrees`` (at least 1), times the square of Student's t at
+    one standard deviation, because an error over a deviation estimated from residuals follows
+    Student's t. The scaled deviation covers 68 % of the errors.
 
     Parameters
     ----------
@@ -419,7 +419,7 @@ def _covariance_scale(
     scale = (
         chi_square
         / n_residual_degrees
-        * stdtrit(n_residual_degrees, _BELOW_ONE_SIGMA_PROBABILITY) ** 2
+        * stdtrit(n_residual_degrees, _BELOW_MEAN_PLUS_SIGMA_PROBABILITY) ** 2
     )
     return np.where(_residuals_contradict_errors(chi_square, degrees_of_freedom), scale, 1.0)
 
@@ -430,10 +430,10 @@ def _residuals_contradict_errors(
     """Return a mask (...,), True for solutions whose residuals contradict the stated errors.
 
     For these the probability, under the stated errors, of a chi-square at least as large is below
-    :data:`_CONTRADICTION_PROBABILITY`.
+    :data:`_CONTRADICTION_PROBABILITY_MAX`.
     """
     return (degrees_of_freedom > 0) & (
-        chi_square > chdtri(np.maximum(degrees_of_freedom, 1), _CONTRADICTION_PROBABILITY)
+        chi_square > chdtri(np.maximum(degrees_of_freedom, 1), _CONTRADICTION_PROBABILITY_MAX)
     )
 
 

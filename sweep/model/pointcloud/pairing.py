@@ -56,7 +56,7 @@ velocity), each with a predicted position. A peak at a random position confirms 
 probability of at most 16 (2 tolerance) / (N/2), with N the FFT size: 1.5e-3 at N = 2^17.
 """
 
-CHANCE_MATCH_PROBABILITY = 0.01
+CHANCE_MATCH_PROBABILITY_MAX = 0.01
 """Largest probability that a false Doppler peak selects the reading (way to interpret the beats as
 range and velocity) of a pair that no Doppler peak confirms. It limits the distance of a Doppler
 peak from the predicted position."""
@@ -229,7 +229,7 @@ def pair_peaks(
             j += 1
         if down_of_up[i] < 0 and j < down.size:
             n_readings = 1 if down_beat_sign else N_POSSIBLE_BEAT_READINGS
-            chance_tolerance = CHANCE_MATCH_PROBABILITY * fft_size / (4.0 * n_readings)
+            chance_tolerance = CHANCE_MATCH_PROBABILITY_MAX * fft_size / (4.0 * n_readings)
             reading = find_confirming_peak(
                 up[i],
                 doppler,

@@ -170,7 +170,7 @@ def simulate_cloud(
                 bin_groups.strongest_bin[:, :, 0],
                 bin_groups.magnitude[:, :, 0],
             )
-        part_results = _closed_form_statistics(shots, bin_groups) | _cloud_points(
+        part_results = _closed_form_statistics(shots, bin_groups) | _point_cloud_arrays(
             part_eyepoints, part_returns, shots.footprint.n_beamlets
         )
         part_results["beamlets_error"] = np.where(part_eyepoints.has_target, rays_error, np.nan)
@@ -293,7 +293,7 @@ def _closed_form_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np
     }
 
 
-def _cloud_points(
+def _point_cloud_arrays(
     eyepoints: Eyepoints, shot_returns: Returns, n_lines: int
 ) -> dict[str, np.ndarray]:
     """Return measured points and their true values, as a mapping of arrays.

@@ -94,7 +94,7 @@ class OppositeBeamletPairs(NamedTuple):
     orthonormal, with the power fractions of the pairs as weights."""
     weighted_polynomials: np.ndarray
     """(k, h): ``polynomials`` times the power fractions of the pairs."""
-    relative_density_change: np.ndarray
+    relative_weight_deficit: np.ndarray
     """(h,): (u - w) / w, with u the fraction of the beam's power in the area about a beamlet, and w
     the fraction that the beamlet has as its weight."""
     first_neighbouring_pair: np.ndarray
@@ -142,9 +142,9 @@ def estimate_ray_error(
         counts_magnitude = has_peak if s == 0 else has_peak & ~(peak_bins[:, 0] >= 0)
         if shots.detection_rule.in_speckle:
             counts_magnitude = np.zeros(shots.size, bool)
-        is_relevant = (counts_magnitude & (_magnitude_change(a, 1.0) >= _RESULT_CHANGE_MIN)) | (
-            _pd_change_bound(shots, a, b, 1.0) >= _RESULT_CHANGE_MIN
-        )
+        is_relevant = (
+            counts_magnitude & (_relative_magnitude_change(a, 1.0) >= _RESULT_CHANGE_MIN)
+        ) | (_pd_change_bound(shots, a, b, 1.0) >= _RESULT_CHANGE_MIN)
         indices = np.flatnonzero(has_peak & is_relevant)
         relative_power_error = np.empty(indices.size)
         bin_powers = _bin_powers(shots, beamlet_table, s, indices, peak_bins[indices, s])
@@ -157,7 +157,9 @@ def estimate_ray_error(
         magnitude_change[indices] = np.maximum(
             magnitude_change[indices],
             np.where(
-                counts_magnitude[indices], _magnitude_change(a[indices], relative_power_error), 0.0
+                counts_magnitude[indices],
+                _relative_magnitude_change(a[indices], relative_power_error),
+                0.0,
             ),
         )
     return np.minimum(np.maximum(pd_change, magnitude_change), 1.0)
@@ -240,7 +242,9 @@ def _pd_change_bound_of_looks(
     return np.asarray(np.minimum(log_change * math.sqrt(n_looks / (2.0 * math.pi)), 1.0))
 
 
-def _magnitude_change(a: np.ndarray, relative_power_change: np.ndarray | float) -> np.ndarray:
+def _relative_magnitude_change(
+    a: np.ndarray, relative_power_change: np.ndarray | float
+) -> np.ndarray:
     """Return the change of a magnitude ``a`` as its square changes, over the larger of a and 1.
 
     ``a`` is a magnitude over the standard deviation of the noise per quadrature, and
@@ -387,8 +391,8 @@ def pair_opposite_beamlets(n_beamlets: int) -> OppositeBeamletPairs:
     neighbour_weights = neighbour_weights * (
         representatives.size / (representatives.size - len(polynomials))
     )
-    relative_density_change = (
-        _density_change(offsets, weights)[representatives] / weights[representatives]
+    relative_weight_deficit = (
+        _beamlet_weight_deficit(offsets, weights)[representatives] / weights[representatives]
     )
     return OppositeBeamletPairs(
         representatives,
@@ -396,14 +400,14 @@ def pair_opposite_beamlets(n_beamlets: int) -> OppositeBeamletPairs:
         1 / folded_weights,
         polynomials,
         folded_weights * polynomials,
-        relative_density_change,
+        relative_weight_deficit,
         neighbour_keys // n_beamlets,
         neighbour_keys % n_beamlets,
         neighbour_weights,
     )
 
 
-def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _beamlet_weight_deficit(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the fraction of the beam's power about each beamlet minus the beamlet's weight.
 
     The result is (beamlets,). The beam is Gaussian, and the cells about the beamlets have equal
@@ -483,9 +487,9 @@ def _fill_power_errors(powers, beamlet_pairs, relative_errors):
         (m,): output array, at most 1.
     """
     beamlet, opposite_beamlet = beamlet_pairs.beamlet, beamlet_pairs.opposite_beamlet
-    inverse_weight, relative_density_change = (
+    inverse_weight, relative_weight_deficit = (
         beamlet_pairs.inverse_weight,
-        beamlet_pairs.relative_density_change,
+        beamlet_pairs.relative_weight_deficit,
     )
     polynomials, weighted_polynomials = (
         beamlet_pairs.polynomials,
@@ -504,7 +508,7 @@ def _fill_power_errors(powers, beamlet_pairs, relative_errors):
             if opposite_beamlet[f] != beamlet[f]:
                 pair_power += powers[i, opposite_beamlet[f]]
             total_power += pair_power
-            bias += relative_density_change[f] * pair_power
+            bias += relative_weight_deficit[f] * pair_power
             residual[f] = pair_power * inverse_weight[f]
         for j in range(polynomials.shape[0]):  # orthonormal, so one at a time suffices
             projection = 0.0

@@ -146,7 +146,7 @@ DRAWN_INDEPENDENT_BINS_MAX = 32.0
 """Largest equivalent number of independent bins that is used to draw an echo in developed speckle.
 Larger numbers are replaced by it."""
 
-ROUNDING_VARIANCE = 1 / 12
+BIN_ROUNDING_VARIANCE = 1 / 12
 """Variance [bins^2] of the error of a position that is rounded to whole bins."""
 
 CORRELATED_LOOKS_MAX = 32
@@ -456,7 +456,7 @@ class DrawConfig(NamedTuple):
     False if random numbers are compared with probabilities of detection."""
     adds_powers: bool
     """True if the powers of beamlets' lines are added, False if their amplitudes are."""
-    has_doppler: bool
+    has_doppler_segment: bool
     """True if shots have a Doppler segment, in which the frequency is constant."""
     nyquist_bin: int
     """Number of the bin at the Nyquist frequency: N/2, with N the FFT size."""
@@ -517,7 +517,7 @@ class DrawConfig(NamedTuple):
             else waveform.FAR_TARGET_READING
         )
         down_beat_sign = 0.0
-        _, has_doppler, _ = shots.has_segment
+        _, has_doppler_segment, _ = shots.has_segment
         _, _, down_slope = shots.waveform.chirp_rate_ratios
         if shots.complex_record:
             two_beat_reading, down_beat_sign = (
@@ -531,7 +531,7 @@ class DrawConfig(NamedTuple):
             int(first_draw),
             adds_noise,
             shots.footprint.adds_powers,
-            bool(has_doppler),
+            bool(has_doppler_segment),
             shots.fft_size // 2,
             down_beat_sign,
             two_beat_reading,
@@ -946,7 +946,7 @@ def _doppler_prediction(shots: Shots, motion: EgoMotion | None = None) -> Dopple
     mismatch = sum(
         abs((up_share * up_beat + down_share * down_beat - doppler_beat) * known_value)
         for (up_beat, doppler_beat, down_beat), known_value in zip(
-            _beat_change_by_motion(shots), known_motion, strict=True
+            _beat_shifts_by_motion(shots), known_motion, strict=True
         )
     )
     return DopplerPrediction(
@@ -1320,7 +1320,7 @@ def _correct_for_motion(
     (:mod:`sweep.model.pointcloud.ego_motion`). The result is a :class:`MotionCorrection`.
     """
     motion = motion.select(listed_returns.point)
-    per_acceleration, per_slip = _response_to_motion(shots, listed_returns)
+    per_acceleration, per_slip = _measurement_shifts_by_motion(shots, listed_returns)
     known_slip = motion.slip_at(interpolated.range)
     interpolated = interpolated._replace(
         range=interpolated.range
@@ -1348,7 +1348,7 @@ def _correct_for_motion(
     return MotionCorrection(by_whole_bins, interpolated, per_slip)
 
 
-def _response_to_motion(
+def _measurement_shifts_by_motion(
     shots: Shots, listed_returns: ListedReturns
 ) -> tuple[ShiftsByMotion, ShiftsByMotion]:
     """Return the shifts of measured range and velocity by motion that the beats do not show.
@@ -1386,7 +1386,7 @@ def _response_to_motion(
     return per_acceleration, per_slip
 
 
-def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+def _beat_shifts_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
     """Return the shifts of the beats [Hz] by an acceleration of 1 m/s^2, and by a slip of 1 m/s.
 
     Each of the two results is (3, n), by segment. The slip is the radial velocity minus the speed
@@ -1463,7 +1463,7 @@ def _measure_by_reading(
             * np.sqrt(velocity_variance + rounding_variance),
         )
         for peak_positions, rounding_variance in (
-            (listed_returns.peaks.bin, 2 * ROUNDING_VARIANCE),
+            (listed_returns.peaks.bin, 2 * BIN_ROUNDING_VARIANCE),
             (listed_returns.peaks.position, 0.0),
         )
     )
@@ -1552,7 +1552,7 @@ def _measure_by_fit(
         np.where(segments, np.sqrt(0.5), np.inf) + 0 * bin_width, np.arange(shots.size)
     )
     return Measurements(
-        by_whole_bins=fit_peak_positions(listed_returns.peaks.bin, ROUNDING_VARIANCE),
+        by_whole_bins=fit_peak_positions(listed_returns.peaks.bin, BIN_ROUNDING_VARIANCE),
         interpolated=fit_peak_positions(listed_returns.peaks.position, 0.0),
         range_per_half_bin=half_bin_deviation.range[point],
         velocity_per_half_bin=half_bin_deviation.radial_velocity[point],
@@ -1640,7 +1640,7 @@ def _draw_returns_of_points(
             if in_speckle:
                 draw_group_speckle(address, i, inputs, speckle, speckle_factors)
             for s in range(3):
-                if s != 1 or config.has_doppler:
+                if s != 1 or config.has_doppler_segment:
                     draw_segment_peaks(
                         address,
                         i,
@@ -2030,7 +2030,7 @@ def pair_into_returns(point, row, draw, config, inputs, peak_lists, pairs, works
         peak_lists.n_peaks[1],
         peak_lists.n_peaks[2],
     )
-    if config.has_doppler:
+    if config.has_doppler_segment:
         n_confirmed, n_pairs = pair_peaks(
             peaks.position[0, :n_up],
             peaks.position[1, :n_doppler],
@@ -3024,7 +3024,7 @@ def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, 
     line_error = line_spread_error(
         folded_position - folded_bin,
         line_deviation,
-        config.adds_powers or not config.has_doppler,
+        config.adds_powers or not config.has_doppler_segment,
         interpolation,
     )
     return Peak(folded_bin, folded_position, math.hypot(noise_error, line_error), ratio)

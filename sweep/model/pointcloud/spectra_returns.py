@@ -41,7 +41,7 @@ from sweep.model.pointcloud.bin_groups import BinGroups
 from sweep.model.pointcloud.ego_motion import EgoMotion
 from sweep.model.pointcloud.pairing import FALSE_PEAK_GROUP, PeakPairs
 from sweep.model.pointcloud.returns import (
-    ROUNDING_VARIANCE,
+    BIN_ROUNDING_VARIANCE,
     DrawConfig,
     DrawnPeaks,
     DrawWorkspace,
@@ -118,7 +118,7 @@ def draw_spectra_returns(
         1 if shots.detection_settings.reported_peaks_option == STRONGEST_PEAK else groups_max + 1,
     )
     estimator = str(method_parameters[ESTIMATOR_PREFIX + "kind"])
-    rounding_error = math.sqrt(ROUNDING_VARIANCE) if estimator == PEAK_BIN else 0.0
+    rounding_error = math.sqrt(BIN_ROUNDING_VARIANCE) if estimator == PEAK_BIN else 0.0
     error_law = interpolation
     if shots.speckle.line_gradients is not None:
         error_at_unit_signal = position_error_at_unit_signal(
@@ -188,7 +188,7 @@ def draw_spectra_returns(
     return measure_returns(shots, inputs, drawn_peaks, motion, from_three_bins=False)
 
 
-class EchoBounds(NamedTuple):
+class EchoBinBounds(NamedTuple):
     """First and last bin of each of k echoes in a segment.
 
     Bins have the indices that :func:`rotate_to_centre` gives them.
@@ -219,22 +219,24 @@ class FlaggedPeaks(NamedTuple):
 
 def _echo_bin_bounds(
     point_spectra: PointSpectra, segment: int, signal: SegmentSignal | None
-) -> EchoBounds:
-    """Return the first and last bin of each echo of a point in a segment, as :class:`EchoBounds`.
+) -> EchoBinBounds:
+    """Return the first and last bin of each echo of a point in a segment.
 
     A segment without a signal has no echoes.
     """
     echo_indices = point_spectra.echo_indices(segment)
     if signal is None or not echo_indices.size:
-        return EchoBounds(np.empty(0, np.int64), np.empty(0, np.int64))
+        return EchoBinBounds(np.empty(0, np.int64), np.empty(0, np.int64))
     shots, settings = point_spectra.shots, point_spectra.settings
     shift = centring_shift(shots, signal.strongest_bin)
     if shots.complex_record:
         echo_indices = (echo_indices + shift - 1) % shots.fft_size + 1
     if shots.detection_settings.echo_bin_rule != "any_bin":
-        return EchoBounds(echo_indices, echo_indices)
+        return EchoBinBounds(echo_indices, echo_indices)
     if echo_indices.size == 1:
-        return EchoBounds(np.array([signal.first_bin + shift]), np.array([signal.last_bin + shift]))
+        return EchoBinBounds(
+            np.array([signal.first_bin + shift]), np.array([signal.last_bin + shift])
+        )
     magnitude = rotate_to_centre(shots, np.abs(signal.spectrum), signal.strongest_bin)
     lobe_half_width = math.ceil(
         main_lobe_half_width(settings.window) * settings.fft_size / settings.window.length
@@ -247,13 +249,13 @@ def _echo_bin_bounds(
         last = low_bins[next_low] - 1 if next_low < low_bins.size else magnitude.size - 1
         first_bins.append(first - lobe_half_width)
         last_bins.append(last + lobe_half_width)
-    return EchoBounds(np.array(first_bins), np.array(last_bins))
+    return EchoBinBounds(np.array(first_bins), np.array(last_bins))
 
 
 def list_flagged_peaks(
     spectra: Sequence[np.ndarray],
     signal: SegmentSignal,
-    echo_bounds: EchoBounds,
+    echo_bounds: EchoBinBounds,
     point_spectra: PointSpectra,
     peaks_max: int,
 ) -> FlaggedPeaks:
@@ -285,7 +287,7 @@ def list_flagged_peaks(
         for end, inner_bin in ((0, 1), (end_index, end_index - 1)):
             if flags[end] and end in (signal.first_bin, signal.last_bin):
                 flags[inner_bin] = True
-                echo_bounds = EchoBounds(
+                echo_bounds = EchoBinBounds(
                     *(np.where(bins == end, inner_bin, bins) for bins in echo_bounds)
                 )
     flags[[0, -1]] = False

@@ -39,8 +39,8 @@ from sweep.model.sampling.philox import (
     to_uniform,
 )
 
-_INDEX_BITS = 6
-GROUP_SIZE = 1 << _INDEX_BITS
+_DRAW_IN_GROUP_BITS = 6
+GROUP_SIZE = 1 << _DRAW_IN_GROUP_BITS
 """Number of draws in a group, over which random numbers are spread evenly. The means of larger
 groups vary less, but a confidence interval follows from the variance of several groups' means. A
 tolerance of 0.01 takes at least 384 draws."""
@@ -55,8 +55,8 @@ _WORDS_PER_PAIR = 4 + GROUP_SIZE
 the cells of the two numbers, two are unused, and GROUP_SIZE words shuffle the order of the cells.
 """
 
-_CELL_SHIFT, _OFFSET_SHIFT = np.uint64(64 - _INDEX_BITS), np.uint64(_INDEX_BITS)
-_ONE = np.uint64(1)
+_CELL_SHIFT, _OFFSET_SHIFT = np.uint64(64 - _DRAW_IN_GROUP_BITS), np.uint64(_DRAW_IN_GROUP_BITS)
+_UINT64_ONE = np.uint64(1)
 
 
 def grouped_uniforms(
@@ -118,10 +118,10 @@ def _fill_grouped_uniforms(keys, draw_numbers, stream, are_polar, cells, uniform
     """
     words = np.empty((4, uniform_numbers.shape[1] // 4), np.uint64)
     for i in range(draw_numbers.size):
-        group = draw_numbers[i] >> _INDEX_BITS
+        group = draw_numbers[i] >> _DRAW_IN_GROUP_BITS
         if (
             i == 0
-            or group != draw_numbers[i - 1] >> _INDEX_BITS
+            or group != draw_numbers[i - 1] >> _DRAW_IN_GROUP_BITS
             or keys[i, 0] != keys[i - 1, 0]
             or keys[i, 1] != keys[i - 1, 1]
         ):
@@ -134,8 +134,8 @@ def _fill_grouped_uniforms(keys, draw_numbers, stream, are_polar, cells, uniform
             if number < cells.shape[0]:
                 word = cells[number, member] << _CELL_SHIFT | own_word >> _OFFSET_SHIFT
                 if are_polar and number & 1:  # the lowest bit is in no cell: it is the sign
-                    word = word >> _ONE
-                    word = ~word if own_word & _ONE else word
+                    word = word >> _UINT64_ONE
+                    word = ~word if own_word & _UINT64_ONE else word
             uniform_numbers[i, number] = to_uniform(word)
 
 
@@ -174,7 +174,7 @@ def _fill_cells(group_address, stream, cells):
             order[last], order[other] = order[other], order[last]
         for member in range(GROUP_SIZE):
             index, reversed_index = order[member], 0
-            for bit in range(_INDEX_BITS):
+            for bit in range(_DRAW_IN_GROUP_BITS):
                 reversed_index = reversed_index << 1 | (index >> bit & 1)
             cells[2 * pair, member] = _scramble_cell(index, words[0, 0])
             cells[2 * pair + 1, member] = _scramble_cell(reversed_index, words[1, 0])
@@ -189,10 +189,10 @@ def _scramble_cell(cell, word):
     swapped by itself.
     """
     node, scrambled = np.uint64(1), np.uint64(0)
-    for level in range(_INDEX_BITS - 1, -1, -1):
+    for level in range(_DRAW_IN_GROUP_BITS - 1, -1, -1):
         bit = np.uint64(cell >> level & 1)
-        scrambled = scrambled << _ONE | (bit ^ (word >> node & _ONE))
-        node = node << _ONE | bit
+        scrambled = scrambled << _UINT64_ONE | (bit ^ (word >> node & _UINT64_ONE))
+        node = node << _UINT64_ONE | bit
     return scrambled
 
 
@@ -302,8 +302,8 @@ def _add_to_group_means(
             if np.isnan(x):
                 continue
             open_sum[k, i] += x
-            n_groups = (draw_numbers[j] + 1) >> _INDEX_BITS
-            if n_groups << _INDEX_BITS == draw_numbers[j] + 1:
+            n_groups = (draw_numbers[j] + 1) >> _DRAW_IN_GROUP_BITS
+            if n_groups << _DRAW_IN_GROUP_BITS == draw_numbers[j] + 1:
                 group_mean = open_sum[k, i] / GROUP_SIZE
                 deviation = group_mean - mean[k, i]
                 mean[k, i] += deviation / n_groups

@@ -175,7 +175,7 @@ class EventProbabilities(NamedTuple):
     condition.
     """
 
-    alarm: np.ndarray
+    false_alarm_probability: np.ndarray
     """(3, n): probability of a false alarm by noise and leaked signal; 0 for Doppler segments."""
     pd_if_condition_fails: np.ndarray
     """(3, n): probability that each segment detects the echo if its condition is False. The
@@ -187,7 +187,7 @@ class EventProbabilities(NamedTuple):
     that exactly one of the other two segments detects. The up segment has none."""
 
 
-class SegmentAmplitudes(NamedTuple):
+class SegmentAmplitudeFactors(NamedTuple):
     """Complex factors by speckle on an echo in the three segments, of mean square 1."""
 
     up: complex
@@ -251,7 +251,7 @@ def count_by_probability(
         threshold_ratio=np.zeros(n_rows),
         line_noise_ratio=np.zeros(n_rows),
         bin_thresholds=BinThresholds(*np.zeros((7, n_rows))),
-        pfa=probabilities.alarm,
+        pfa=probabilities.false_alarm_probability,
         pd_if_condition_fails=probabilities.pd_if_condition_fails,
         pd_if_condition_holds=probabilities.pd_if_condition_holds,
         detects_by_any_two_segments=np.isfinite(
@@ -262,7 +262,7 @@ def count_by_probability(
         line_grid=SpeckleLineGrid.empty(),
         line_centre=np.empty((0, 3)),
     )
-    _count_draws(
+    _draw_and_count_events(
         draw_ranges,
         batch_edges,
         DrawCountConfig(False, no_filter, 0.0, np.zeros((1, 0)), 0),
@@ -330,7 +330,9 @@ def count_in_noise(
             shots.fft_size // 2,
         )
         part_ranges = DrawRanges(*(column[indices] for column in draw_ranges))
-        _count_draws(part_ranges, batch_edges, config, inputs, spectra, DrawCounts(*counts))
+        _draw_and_count_events(
+            part_ranges, batch_edges, config, inputs, spectra, DrawCounts(*counts)
+        )
 
 
 class NoiseFilter(NamedTuple):
@@ -464,7 +466,7 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilitie
     alarm_up = 1 - (1 - pfa_noise_up) * (1 - outputs["p_leakage_up"])
     alarm_down = 1 - (1 - pfa_noise_down) * (1 - outputs["p_leakage_down"])
     return EventProbabilities(
-        alarm=np.array([alarm_up, np.zeros_like(alarm_up), alarm_down]),
+        false_alarm_probability=np.array([alarm_up, np.zeros_like(alarm_up), alarm_down]),
         pd_if_condition_fails=np.array(
             [pd_up, doppler_pd.pd_if_condition_fails, down_pd.pd_if_condition_fails]
         ),
@@ -644,7 +646,7 @@ def iter_noiseless_spectra(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
+def _draw_and_count_events(draw_ranges, batch_edges, config, inputs, spectra, counts):
     """Draw detections and false alarms of m rows, and add them to the counts of their points.
 
     Parameters
@@ -984,7 +986,7 @@ def speckle_amplitudes(address, group, mixing):
 
     Returns
     -------
-    SegmentAmplitudes
+    SegmentAmplitudeFactors
         Mixtures of three independent circular normal amplitudes of the echo.
     """
     key_0, key_1, draw = address
@@ -1004,7 +1006,7 @@ def speckle_amplitudes(address, group, mixing):
         + (mixing.down_from_doppler_re * im_1 + mixing.down_from_doppler_im * re_1)
         + mixing.down_from_independent * im_2
     )
-    return SegmentAmplitudes(
+    return SegmentAmplitudeFactors(
         complex(root_half * re_0, root_half * im_0),
         complex(root_half * doppler_re, root_half * doppler_im),
         complex(root_half * down_re, root_half * down_im),

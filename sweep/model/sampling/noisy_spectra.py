@@ -510,7 +510,7 @@ def draw_signal_spectra(
     """
     phase_noise_arguments, sample_rate = (
         _phase_noise_arguments(shots, point),
-        float(_value_at(shots.sample_rate, point)),
+        float(_value_of_point(shots.sample_rate, point)),
     )
     if not phase_noise_arguments["line_width"] > 0:
         return signal.spectrum[None]
@@ -1159,7 +1159,7 @@ def detect_and_estimate_frequency(
     )
 
 
-def count_detections(
+def detections_by_draw(
     point_spectra: PointSpectra, draws: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return, for each draw, which events occur, and values to be averaged over draws.
@@ -1222,7 +1222,7 @@ def count_detections(
         sum(f.n_false_bins for f in detections),
         sum(f.n_false_groups for f in detections),
     )
-    least_deviations = _error_bounds_by_draw(point_spectra, is_detected)
+    least_deviations = _measurement_bounds_by_draw(point_spectra, is_detected)
     speckle_errors = _wander_variances(point_spectra, detections, is_detected)
     squared_bounds = [
         np.square(least_deviations.range) + speckle_errors.range,
@@ -1239,7 +1239,7 @@ def count_detections(
     )
 
 
-def _error_bounds_by_draw(
+def _measurement_bounds_by_draw(
     point_spectra: PointSpectra, is_detected: np.ndarray
 ) -> RangeVelocityDeviation:
     """Return the smallest standard deviations of range and radial velocity in m draws, (m,) each.
@@ -1349,8 +1349,8 @@ def measurement_bound(
         )
     )
     return range_velocity_deviation(
-        up=up, doppler=doppler, down=down, carriers=_carriers_at(shots, point),
-        chirp_rate=_value_at(shots.waveform.chirp_rate, point), range=shots.range[point],
+        up=up, doppler=doppler, down=down, carriers=_carrier_frequencies_of_point(shots, point),
+        chirp_rate=_value_of_point(shots.waveform.chirp_rate, point), range=shots.range[point],
         radial_velocity=shots.target.radial_velocity[point],
         slopes=shots.waveform.chirp_rate_ratios,
     )  # fmt: skip
@@ -1373,19 +1373,19 @@ def _measurement_errors(
         up=up,
         doppler=doppler if has_doppler else None,
         down=down,
-        carrier=_value_at(up_carrier, point),
-        bandwidth=_value_at(shots.waveform.chirp_bandwidth, point),
-        duration=_value_at(shots.waveform.chirp_duration, point),
+        carrier=_value_of_point(up_carrier, point),
+        bandwidth=_value_of_point(shots.waveform.chirp_bandwidth, point),
+        duration=_value_of_point(shots.waveform.chirp_duration, point),
         sample_rate=shots.sample_rate[point],
         bin_width=np.asarray(bin_width),
         two_beat_assumption=shots.detection_settings.two_beat_assumption,
         has_signs=shots.complex_record,
     )
     measured_velocity = measured.radial_velocity * (
-        1 + _value_at(shots.motion.velocity_bias_fraction, point)
+        1 + _value_of_point(shots.motion.velocity_bias_fraction, point)
     )
     range_walk = (
-        _value_at(shots.motion.range_reference_time, point) * measured_velocity
+        _value_of_point(shots.motion.range_reference_time, point) * measured_velocity
     )  # to the shot's start
     measured_range = measured.range + range_walk
     uses_fit = shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS or (
@@ -1403,13 +1403,15 @@ def _measurement_errors(
     ]
 
 
-def _carriers_at(shots: Shots, point: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _carrier_frequencies_of_point(
+    shots: Shots, point: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the carrier (optical) frequencies of a point in the three segments [Hz]."""
-    up, doppler, down = (_value_at(carrier, point) for carrier in shots.waveform.carriers)
+    up, doppler, down = (_value_of_point(carrier, point) for carrier in shots.waveform.carriers)
     return up, doppler, down
 
 
-def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
+def _value_of_point(column: np.ndarray | float, point: int) -> np.ndarray:
     """Return the value at index ``point`` of an array (n,), or a number common to all points."""
     column = np.asarray(column)
     return np.asarray(column[point] if column.ndim else column)

@@ -229,7 +229,7 @@ _TABLE_ENTRY_DRAWS_MIN = 2.0
 is interpolated from entries at other offsets."""
 
 
-def estimates_by_two_bins(shots: "Shots") -> bool:
+def uses_two_bin_estimator(shots: "Shots") -> bool:
     """Return True if positions are estimated from the strongest bin and its larger neighbour."""
     return interpolator(shots.window, shots.fft_size).magnitude_ratio_kind == TWO_BINS
 
@@ -354,7 +354,7 @@ def _two_bin_error_tables(
             known_moments = None
             for j, shift_ratio in enumerate(_TWO_BIN_SHIFT_RATIOS):
                 peaks = [
-                    footprints.weighted_errors(shift_ratio, noise_ratio, index, interpolation)
+                    footprints.errors_and_weights(shift_ratio, noise_ratio, index, interpolation)
                     for index in largest_bins
                 ]
                 moments = _moments_by_offset(*np.concatenate(peaks, axis=1))
@@ -466,7 +466,7 @@ class _DrawnFootprints(NamedTuple):
             strongest_mean_power=np.max(mean_powers, axis=0),
         )
 
-    def weighted_errors(
+    def errors_and_weights(
         self,
         shift_ratio: float,
         noise_ratio: float,

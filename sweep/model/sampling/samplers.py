@@ -56,7 +56,7 @@ from sweep.model.sampling.noisy_spectra import (
     AVERAGED_VALUE_NAMES,
     PointSpectra,
     SpectrumMethods,
-    count_detections,
+    detections_by_draw,
     prepare_point_spectra,
 )
 from sweep.model.sampling.realisations import (
@@ -167,12 +167,12 @@ class Sampler(ABC):
         counts = np.zeros(
             (len(DRAW_COUNT_OUTPUTS), point_indices.size, self.batch_edges.size - 1), np.int64
         )
-        self.count_draws(point_indices, first_draw, first_draw + n_draws, counts)
+        self.draw_and_count_events(point_indices, first_draw, first_draw + n_draws, counts)
         self.counts[:, point_indices] += counts
         self.n_draws[point_indices] += n_draws
 
     @abstractmethod
-    def count_draws(
+    def draw_and_count_events(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
         """Make draws of points, and add the numbers of their events to ``counts`` in place.
@@ -188,7 +188,7 @@ class Sampler(ABC):
         """
 
     @abstractmethod
-    def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    def pd_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
         A half-width is the distance from the estimate to the farther end of its interval.
@@ -226,7 +226,9 @@ class Sampler(ABC):
         """Return the numbers of draws with a detection, (4, n), in the order of PD_OUTPUT_NAMES."""
         return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
 
-    def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    def pd_half_widths_from_counts(
+        self, point_indices: np.ndarray, error_budget: ErrorBudget
+    ) -> np.ndarray:
         """Return the half-widths of confidence intervals that follow from counted detections alone.
 
         The intervals are those of detection probabilities, of the kind
@@ -268,7 +270,7 @@ class Sampler(ABC):
         ndarray (m,)
             Excess of the largest half-width. Segments that do not exist are left out.
         """
-        widths = self.half_widths(point_indices, error_budget)
+        widths = self.pd_half_widths(point_indices, error_budget)
         excess = widths - error_budget.select_points(point_indices, self.n_draws.size).tolerance
         return np.fmax.reduce(excess, axis=0, initial=0.0)
 
@@ -279,7 +281,7 @@ class Sampler(ABC):
         of detection probabilities.
         """
         point_indices = np.arange(self.n_draws.size)
-        widths = zip(PD_OUTPUT_NAMES, self.half_widths(point_indices, error_budget), strict=True)
+        widths = zip(PD_OUTPUT_NAMES, self.pd_half_widths(point_indices, error_budget), strict=True)
         return {
             "n_draws": self.n_draws,
             **{f"{name}_half_width": width for name, width in widths},
@@ -496,7 +498,7 @@ class DetectionSampler(Sampler):
             else max(RANDOM_EFFECT_DRAWS_PER_STEP_MIN, 4 * DRAWS_PER_BATCH // n_points)
         )
 
-    def count_draws(
+    def draw_and_count_events(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
         """Make draws of points, and add the numbers of their events to ``counts`` in place.
@@ -544,7 +546,7 @@ class DetectionSampler(Sampler):
                 DrawRanges(*(v[indices] for v in draw_ranges)), self.batch_edges, shots, counts
             )
 
-    def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    def pd_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
         With random effects they are intervals of means over the draws. Without random effects they
@@ -587,7 +589,9 @@ class DetectionSampler(Sampler):
             [0.0 * self._outputs[name][point_indices] for name in PD_OUTPUT_NAMES]
         )
         return zero_or_nan + (
-            self.count_half_widths(point_indices, error_budget) if self._draws_noise else 0.0
+            self.pd_half_widths_from_counts(point_indices, error_budget)
+            if self._draws_noise
+            else 0.0
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
@@ -669,7 +673,7 @@ class SpectraSampler(Sampler):
             *(max(1, SPECTRUM_SAMPLES_PER_STEP // int(n)) for n in fft_sizes)
         )
 
-    def count_draws(
+    def draw_and_count_events(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
         """Make draws of points, and add the numbers of their events to ``counts`` in place.
@@ -686,16 +690,16 @@ class SpectraSampler(Sampler):
             Numbers of events, in the order of DRAW_COUNT_OUTPUTS. Those of the new draws are added.
         """
         for column, point in enumerate(point_indices):
-            for point_spectra, draws in self._iter_point_spectra(
+            for point_spectra, draws in self._iter_noiseless_signals_of_point(
                 int(point), int(first_draw), int(end_draw)
             ):
                 batch_index = np.searchsorted(self.batch_edges, draws, "right") - 1
-                draw_counts, values = count_detections(point_spectra, draws)
+                draw_counts, values = detections_by_draw(point_spectra, draws)
                 np.add.at(counts[:, column].T, batch_index, draw_counts.T)
                 values_by_name = dict(zip(AVERAGED_VALUE_NAMES, values, strict=True))
                 self._value_means.add(np.full(draws.size, point), values_by_name)
 
-    def _iter_point_spectra(
+    def _iter_noiseless_signals_of_point(
         self, point: int, first_draw: int, end_draw: int
     ) -> Iterator[tuple[PointSpectra, np.ndarray]]:
         """Yield the noiseless spectra of a point, with the numbers (m,) of the draws they serve.
@@ -746,7 +750,7 @@ class SpectraSampler(Sampler):
         ] = np.nan
         return zero_or_nan
 
-    def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    def pd_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return the half-widths of the confidence intervals of detection probabilities.
 
         The intervals follow from counted detections.
@@ -764,7 +768,7 @@ class SpectraSampler(Sampler):
             Half-widths in the order of PD_OUTPUT_NAMES; nan for a segment that does not exist.
         """
         return (
-            self.count_half_widths(point_indices, error_budget)
+            self.pd_half_widths_from_counts(point_indices, error_budget)
             + self._nan_for_missing_segments()[:, point_indices]
         )
 

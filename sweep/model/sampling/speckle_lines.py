@@ -61,7 +61,7 @@ from sweep.model.sampling import philox
 from sweep.model.sampling.peak_shape_errors import (
     PeakShapeErrors,
     TwoBinErrors,
-    estimates_by_two_bins,
+    uses_two_bin_estimator,
 )
 from sweep.model.window import Window, window_samples
 
@@ -1097,7 +1097,7 @@ def position_error_moments(
     offset, shift_ratio = np.where(has_peak, peaks.offset, 0.0), echo_fraction / relative_power
     shape_deviation, imaginary_shift_deviation, own_variance = np.zeros((3, *variance.shape))
     wander_factor = np.ones(variance.shape)
-    if from_three_bins and estimates_by_two_bins(shots):
+    if from_three_bins and uses_two_bin_estimator(shots):
         noise_ratio = np.sqrt((1 - echo_fraction) / (2 * relative_power))
         side_errors = TwoBinErrors.from_offset(
             offset, squared_spread, shift_ratio, noise_ratio, shots
