@@ -203,7 +203,7 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
 
 
 def _zero_leakage_of_unsearched_echoes(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of bins and the magnitudes of spans without unsearched echoes' leakage.
+    """Return the bin counts and |X| of spans, with leakage of unsearched echoes set to 0.
 
     A span is a range of adjacent bins of one segment. An echo is unsearched if its strongest bin is
     outside the search band. Its sidelobes are leaked signal and make no groups, so |X| is set to 0

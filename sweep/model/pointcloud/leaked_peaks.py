@@ -826,7 +826,7 @@ def _fill_mean_probabilities(rate_table, mean_probabilities):
 
 
 def _locate_leaked_bins(spectra: NoiselessSpectra) -> _LeakedBinLocations:
-    """Return number, point and segment of each bin of leaked signal in noiseless spectra."""
+    """Return the bin number, point and segment of all bins of leaked signal."""
     n_bins = (spectra.leaked_end - spectra.leaked_begin).ravel()
     span = np.repeat(np.arange(n_bins.size), n_bins)
     return _LeakedBinLocations(
@@ -1476,7 +1476,7 @@ def draw_leaked_peaks(
     leakage_bins
         :class:`LeakageBins` of the batch.
     fading_factors
-        (groups, 3): factors on the echoes' magnitudes by speckle.
+        (groups, 3): factors, due to speckle, on the echoes' magnitudes.
     threshold_ratio
         Threshold [sigma].
     n_looks
@@ -1598,7 +1598,7 @@ def _draw_raised_bins(
     group, exempt_neighbour_magnitude_ratio
         Fields of :class:`LeakageBins`; empty for bins that do not fade and join no echo.
     fading_factors
-        (groups,): factors on the echoes' magnitudes by speckle.
+        (groups,): factors, due to speckle, on the echoes' magnitudes.
     crossing_rate_sum
         Upper bound on the sum of the rates of all bins in this draw.
     rate_table

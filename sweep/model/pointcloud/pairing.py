@@ -393,7 +393,8 @@ def compare_return_with_truth(
     flag
         TRUE_RETURN_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG or SIDELOBE_FLAG.
     beamlet
-        The nearest to the peaks of all beamlets with a line in every peak; -1 for none.
+        Index of the beamlet nearest to the peaks, among those with a line in every peak; -1 for
+        none.
     """
     for s in range(3):
         if groups[s] == FALSE_PEAK_GROUP:

@@ -2116,7 +2116,7 @@ def draw_segment_peaks(
     config, inputs, spectra, leakage_bins
         Settings, quantities of the points, noiseless spectra, and bins of leaked signal.
     speckle_factors
-        (groups, 3): factors on the groups' magnitudes by speckle.
+        (groups, 3): factors, due to speckle, on the groups' magnitudes.
     speckle
         Speckle in the bins of the point's groups.
     interpolation
@@ -2322,7 +2322,7 @@ def list_noisy_leaked_peaks(
     leakage_bins : LeakageBins
         Bins of leaked signal; ``fading_group`` is the echo whose speckle makes each bin fade.
     speckle_factors : ndarray (groups,)
-        Factors by speckle on the magnitudes of the point's echoes in this segment.
+        Factors, due to speckle, on the magnitudes of the point's echoes in this segment.
     threshold_ratio : float
         Threshold over sigma.
     interpolation : Interpolator
@@ -2684,8 +2684,8 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
         Indices of the point, of its segment (up, Doppler, down) and of the echo. An echo is a group
         of adjacent bins.
     inputs : DrawInputs
-        Quantities of all points. ``n_independent_bins`` is the number of bins, of which the last is
-        a fraction of one.
+        Quantities of all points. ``n_independent_bins`` is the number of bins; its fractional part
+        counts as that fraction of a bin.
     single_bin_pd : float
         Probability of detection of one bin, 0..1.
     """

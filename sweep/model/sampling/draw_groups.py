@@ -1,8 +1,8 @@
 """Groups of draws whose random numbers are spread evenly, so that their means vary little.
 
 Draws of random effects come in groups of :data:`GROUP_SIZE` consecutive numbers. Each draw is
-as random as one that is alone: its numbers are uniform and independent. The draws of a group, however,
-depend on each other. A pair of numbers, such as those of one complex amplitude, visits every cell
+as random as one that is alone: its numbers are uniform and independent. The draws of a group,
+however, depend on each other. A pair of numbers, such as those of one complex amplitude, visits every cell
 of equal area among 64 once: cells of 1/64 by 1, 1/32 by 1/2, and so on to 1 by 1/64. Such a set of
 points is a scrambled net [1]_. Different pairs visit their cells in independent random orders
 (Latin supercube sampling [2]_). Different groups are independent.
@@ -150,8 +150,8 @@ def _fill_cells(group_address, stream, cells):
     stream
         Number of the stream of the random numbers.
     cells
-        (numbers, GROUP_SIZE) uint64: output array of cells, 0 to GROUP_SIZE - 1, by number
-        and draw. The two numbers of pair i are in rows 2 i and 2 i + 1.
+        (numbers, GROUP_SIZE) uint64: output array of cells, 0 to GROUP_SIZE - 1, by
+        number and draw. The two numbers of pair i are in rows 2 i and 2 i + 1.
 
     Notes
     -----

@@ -647,7 +647,7 @@ def iter_noiseless_spectra(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_and_count_events(draw_ranges, batch_edges, config, inputs, spectra, counts):
-    """Draw detections and false alarms of m rows, and add them to the counts of their points.
+    """Draw detections and false alarms in m ranges of draws, and add them to the counts.
 
     Parameters
     ----------
