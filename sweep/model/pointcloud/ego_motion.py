@@ -62,8 +62,8 @@ class MotionPriors(NamedTuple):
 
     terrain_slope: float = 0.2
     """Standard deviation of the slope (rise over run) of the surface that a beam meets. The slope
-    is relative to level ground, for a beam that does not point down relative to a plane across the
-    beam."""
+    is relative to level ground. For a beam that does not point down it is relative to a plane
+    across the beam."""
     target_speed: float = 0.0
     """Standard deviation of each component of the velocity [m/s] of the surface that a beam meets.
     """

@@ -119,11 +119,11 @@ def apply_error_floor(
     seed: int,
     first_draw: int = 0,
 ) -> dict[str, np.ndarray]:
-    """Add an instrument's errors to points, and to their standard errors.
+    """Add an instrument's random errors to measured points, and to their standard errors.
 
-    Errors are added to ranges and radial velocities, both those by whole bins and those
-    interpolated between bins. Standard errors, compensated velocities and positions follow. The
-    true values stay as they are.
+    Errors are added to ranges and radial velocities, computed from whole bins as well as from
+    interpolated positions. Compensated velocities and positions change accordingly. True values are
+    unchanged.
 
     Parameters
     ----------

@@ -88,8 +88,8 @@ ECHO_EDGE_FIRST_RANDOM_INDEX = 1 << 25
 to bins of leaked signal."""
 
 PERMANENT_LINE_POINTS_PER_BATCH = 4
-"""Number of points that are processed together if light leaked in the circulator has a line. The
-number limits memory to some 1e8 numbers."""
+"""Number of points that are processed together if light leaked in the circulator has a line. It
+limits arrays to some 1e8 elements."""
 
 N_BISECTION_STEPS = 40
 """Number of bisection steps that compute the magnitude of a false peak, to a relative error of
@@ -220,10 +220,11 @@ class LeakageBins(NamedTuple):
     for each threshold. The rate is -ln(1 - c), with c the probability that signal of |X| lifts a
     bin above the threshold. sigma is the noise of a bin per quadrature."""
     first_log_amplitude: np.ndarray
-    """(thresholds,): smallest ln(|X| / sigma) at which ``log_crossing_rates`` is tabulated."""
+    """(thresholds,): smallest ln(|X| / sigma) at which ``log_crossing_rates`` is tabulated. sigma
+    is the noise of a bin per quadrature."""
     log_amplitude_step: np.ndarray
     """(thresholds,): difference of successive ln(|X| / sigma) at which ``log_crossing_rates`` is
-    tabulated."""
+    tabulated. sigma is the noise of a bin per quadrature."""
     threshold_ratio: np.ndarray
     """(thresholds,): threshold over sigma, the noise of a bin per quadrature. If looks (records of
     a segment) are combined, it is the equivalent threshold for a single record."""
@@ -748,9 +749,10 @@ class CrossingRateTable(NamedTuple):
     -ln(1 - c), with c the probability that signal of |X| lifts a bin above the threshold. sigma is
     the noise of a bin per quadrature."""
     first_log_amplitude: float
-    """Smallest ln(|X| / sigma) in the table."""
+    """Smallest tabulated ln(|X| / sigma) of signal. sigma is the noise of a bin per quadrature."""
     log_amplitude_step: float
-    """Difference of successive ln(|X| / sigma) in the table."""
+    """Difference of successive tabulated ln(|X| / sigma) of signal. sigma is the noise of a bin per
+    quadrature."""
 
 
 class CrossingTables(NamedTuple):
@@ -764,9 +766,10 @@ class CrossingTables(NamedTuple):
     """(N_TABLE_AMPLITUDES,): ln of the crossing rate -ln(1 - c) at evenly spaced ln(|X| / sigma). c
     is the probability that signal of |X| lifts a bin above the threshold."""
     first_log_amplitude: float
-    """Smallest ln(|X| / sigma) in the tables."""
+    """Smallest tabulated ln(|X| / sigma) of signal. sigma is the noise of a bin per quadrature."""
     log_amplitude_step: float
-    """Difference of successive ln(|X| / sigma) in the tables."""
+    """Difference of successive tabulated ln(|X| / sigma) of signal. sigma is the noise of a bin per
+    quadrature."""
     linear_rates: np.ndarray
     """(N_TABLE_AMPLITUDES,): crossing rate -ln(1 - c) at evenly spaced ln(|X| / sigma). c is the
     probability that signal of |X| lifts a bin above the threshold."""
@@ -903,9 +906,10 @@ def _remove_bins_masked_by_leaked_light(
 
 
 def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct thresholds [sigma], and the index in them of each point's threshold.
+    """Return the distinct thresholds [sigma], and each point's index into them.
 
-    Thresholds within 1e-7 of each other, as in a flight, count as equal.
+    Thresholds within 1e-7 of each other, as in a flight, count as equal. sigma is the noise of a
+    bin per quadrature.
     """
     distinct_ratios, threshold_index = np.unique(np.round(threshold_ratio, 7), return_inverse=True)
     return distinct_ratios, threshold_index.ravel().astype(np.int64)

@@ -953,7 +953,7 @@ def _add_pointing_errors(
     pointing_jitter: float,
     pointing: float,
 ) -> dict[str, np.ndarray]:
-    """Return the standard errors of range and radial velocity with those of pointing included.
+    """Return the standard errors of range and radial velocity, with errors of pointing included.
 
     Parameters
     ----------

@@ -93,11 +93,13 @@ FLAG_BITS = {
 Exactly one of the first five bits is set. They follow from a comparison with the truth.
 
 - true: all peaks of the return contain lines of one beamlet, and its range and velocity are those
-of this beamlet to within the width of the peaks; - false alarm: one of its peaks is noise, or
-leaked signal raised by noise; - mispaired: its peaks are signal, but contain lines of no common
-beamlet; - misread: all its peaks contain lines of one beamlet, but were converted to a wrong range
-or velocity; - sidelobe: one of its peaks contains no beamlet's line; - unconfirmed, which the
-instrument knows: no Doppler peak is within the tolerance.
+  of this beamlet to within the width of the peaks;
+- false alarm: one of its peaks is noise, or leaked signal raised by noise;
+- mispaired: its peaks are signal, but contain lines of no common beamlet;
+- misread: all its peaks contain lines of one beamlet, but were converted to a wrong range or
+  velocity;
+- sidelobe: one of its peaks contains no beamlet's line;
+- unconfirmed, which the instrument knows: no Doppler peak is within the tolerance.
 """
 
 

@@ -866,10 +866,10 @@ def _speckle_mixing(shots: Shots) -> SpeckleMixing:
 
 
 def _look_covariance_roots(shots: Shots) -> np.ndarray:
-    """Return coefficients that mix independent speckle into that of each look, (n, 3, looks, sets).
+    """Return coefficients that mix independent sets of speckle into the speckle of each look.
 
-    A look is a record of a segment. The result is empty (sets = 0) without partly correlated
-    speckle, and with more than CORRELATED_LOOKS_MAX looks.
+    The result is (n, 3, looks, sets). A look is a record of a segment. The result is empty (sets =
+    0) without partly correlated speckle, and with more than CORRELATED_LOOKS_MAX looks.
     """
     n_looks = shots.looks.number
     if shots.speckle.look_speckle is None or n_looks > CORRELATED_LOOKS_MAX:
@@ -882,8 +882,8 @@ def _n_independent_bins(
 ) -> np.ndarray:
     """Return the equivalent number of independent bins that may detect each echo, (n, 3, groups).
 
-    For the up and down segment it is that of :func:`joint_detection_probability`. It is 1 for an
-    echo near frequency 0 or Nyquist, and if only the strongest bin may detect.
+    In the up and down segment it is the number that :func:`joint_detection_probability` uses. It is
+    1 for an echo near frequency 0 or Nyquist, and if only the strongest bin may detect.
     """
     n_independent = np.ones(bin_groups.pd.shape)
     if shots.detection_settings.echo_bin_rule == "peak_bin":
@@ -1416,8 +1416,8 @@ def _measure_by_reading(
     """Compute range and velocity at mid-chirp from the up and down peak of each return.
 
     The reading of a return says how its beats are interpreted: far or fast target, folded at
-    Nyquist or not. Speckle common to both peaks makes their errors correlated. Their covariance
-    reduces the variance of the range, and adds to that of the velocity.
+    Nyquist or not. Speckle common to both peaks makes their errors correlated. The covariance
+    reduces the variance of the range, and adds to the variance of the velocity.
     """
     at_returns = partial(_values_of_points, shots, listed_returns.point)
     up_carrier, _, _ = shots.waveform.carriers
@@ -1532,7 +1532,7 @@ def _measure_by_fit(
         -------
         MeasuredValues
             (m,) in each field: range [m] and radial velocity [m/s] at the shot's start, with
-            standard errors. The errors include the wander of beats by speckle, if there is any.
+            standard errors. The errors include the wander of beats due to speckle.
         """
         errors = np.where(is_finite, position_error, np.inf)
         errors = np.hypot(errors, math.sqrt(rounding_variance))
@@ -1868,9 +1868,10 @@ def fill_detection_amplitude_weights(
 ):
     """Compute the weights of an echo's bins in the amplitude that decides on its detection.
 
-    Under the rule ``peak_bin`` only the strongest bin has a weight. If any bin may detect, bins
-    have the weights that a single line in the middle of the echo would give them. The amplitudes of
-    two segments then have the same correlation as in the middle of the echo.
+    If any bin may detect, a bin's weight is proportional to the window's transform, for a single
+    line in the middle of the echo, times the root of the bin's mean power. The amplitudes of two
+    segments then have the same correlation as in the middle of the echo. If only the strongest bin
+    may detect, or ``covariance_factor_rank`` is 0, only the strongest bin has a weight.
 
     Parameters
     ----------
@@ -1987,9 +1988,9 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
     covariance_root : ndarray (3, looks, sets) complex
         Coefficients of each independent set in each look, by segment.
     independent_amplitudes : ndarray (sets, 3, bins) complex
-        Independent factors by speckle, of mean power 1.
+        Independent sets of speckle, of mean power 1.
     look_amplitudes : ndarray (looks, 3, bins) complex
-        Result: factors by speckle in each look.
+        Result: speckle in each look.
     """
     look_amplitudes[:] = 0.0
     n_sets, _, n_bins = independent_amplitudes.shape
@@ -2996,7 +2997,7 @@ def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, 
     position : float
         Position between bins [bins].
     noise_error : float
-        Standard error of the position by noise [bins].
+        Standard error of the position due to noise [bins].
     ratio : float
         |X| of the largest bin over sigma, the noise of a bin per quadrature.
     line_deviation : float
@@ -3009,7 +3010,7 @@ def fold_peak(bin_number, position, noise_error, ratio, line_deviation, config, 
     Returns
     -------
     Peak
-        Largest bin, position, standard error by noise and by the spread of lines, and ratio.
+        Largest bin, position, standard error (due to noise and the spread of lines) and ratio.
     """
     fft_size = 2 * config.nyquist_bin
     if config.down_beat_sign:

@@ -2,10 +2,10 @@
 
 Draws of random effects come in groups of :data:`GROUP_SIZE` consecutive numbers. Each draw is
 as random as one that is alone: its numbers are uniform and independent. The draws of a group,
-however, depend on each other. A pair of numbers, such as those of one complex amplitude, visits every cell
-of equal area among 64 once: cells of 1/64 by 1, 1/32 by 1/2, and so on to 1 by 1/64. Such a set of
-points is a scrambled net [1]_. Different pairs visit their cells in independent random orders
-(Latin supercube sampling [2]_). Different groups are independent.
+however, depend on each other. A pair of numbers, such as those of one complex amplitude, visits
+every cell of equal area among 64 once: cells of 1/64 by 1, 1/32 by 1/2, and so on to 1 by 1/64.
+Such a set of points is a scrambled net [1]_. Different pairs visit their cells in independent
+random orders (Latin supercube sampling [2]_). Different groups are independent.
 
 The mean of a group is therefore unbiased. If a probability is a smooth function of one pair, the
 variance of the mean is far below that of independent draws. For any function it is at most twice

@@ -176,7 +176,7 @@ class EventProbabilities(NamedTuple):
     """
 
     false_alarm_probability: np.ndarray
-    """(3, n): probability of a false alarm by noise and leaked signal; 0 for Doppler segments."""
+    """(3, n): probability of a false alarm by noise or by leaked signal; 0 for Doppler segments."""
     pd_if_condition_fails: np.ndarray
     """(3, n): probability that each segment detects the echo if its condition is False. The
     condition of the down segment is that the up segment detects, and that of the Doppler segment

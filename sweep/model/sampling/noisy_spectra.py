@@ -142,7 +142,7 @@ class SegmentSignal(NamedTuple):
     """Index of the last bin of the signal. It is below ``first_bin`` if there is no echo, or if the
     strongest bin is outside the search band."""
     frequency_bins: float
-    """Signed frequency [bins] of a pure tone whose magnitudes equal those of the signal about its
+    """Signed frequency [bins] of a pure tone that has the magnitudes of the signal about its
     strongest bin."""
     cnr: float
     """Carrier-to-noise ratio: signal power divided by noise power in the record, before the FFT."""
@@ -473,8 +473,8 @@ def transform_record(shots: Shots, record: np.ndarray) -> np.ndarray:
 def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
     """Return the quantities of a point from which its phase noise follows, by name.
 
-    The names are ``line_width``, that of the laser [Hz], ``delay`` of the echo [s], and
-    ``duration`` of the record [s].
+    The names are ``line_width`` (of the laser [Hz]), ``delay`` (of the echo [s]) and ``duration``
+    (of the record [s]).
     """
     return {
         "line_width": _value_at(shots.laser_line.lorentzian_fwhm, point),
@@ -1244,7 +1244,7 @@ def _measurement_bounds_by_draw(
 ) -> RangeVelocityDeviation:
     """Return the smallest standard deviations of range and radial velocity in m draws, (m,) each.
 
-    They are those of :func:`measurement_bound` for the segments that are detected in the draw, by
+    :func:`measurement_bound` computes them for the segments that are detected in a draw, by
     ``is_detected`` (3, m).
     """
     bounds = RangeVelocityDeviation(

@@ -540,9 +540,9 @@ def _moments_by_offset(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return mean error, logarithm of the residual variance, and gain, at the tabulated offsets.
 
-    The gain is the slope of the regression of the error on the shift (linear wander). The residual
-    variance [bins^2] is that of the error about the regression. Arguments are (m,), by draw:
-    estimated offset, error, shift and weight. A draw counts at the two tabulated offsets next to
+    Arguments are (m,), by draw: estimated offset, error, shift (linear wander) and weight. The gain
+    is the slope of the regression of the error on the shift. The residual variance [bins^2] is the
+    variance of the error about this regression. A draw counts at the two tabulated offsets next to
     its own offset. The result is None if no offset has _TABLE_ENTRY_DRAWS_MIN draws.
     """
     n_offsets = _TWO_BIN_OFFSETS_BINS.size

@@ -210,9 +210,9 @@ class Sampler(ABC):
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
         """Return the results of all draws: outputs, standard errors and half-widths, (n,) by name.
 
-        Half-widths are those of the confidence intervals of detection probabilities.
-        RUNNING_SUMS_NAME (n, columns), from which draws can be added later, is included if effects
-        are random or spectra are drawn.
+        Half-widths belong to the confidence intervals of detection probabilities. RUNNING_SUMS_NAME
+        (n, columns), from which draws can be added later, is included if effects are random or
+        spectra are drawn.
         """
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
@@ -229,9 +229,9 @@ class Sampler(ABC):
     def pd_half_widths_from_counts(
         self, point_indices: np.ndarray, error_budget: ErrorBudget
     ) -> np.ndarray:
-        """Return the half-widths of confidence intervals that follow from counted detections alone.
+        """Return half-widths of confidence intervals that follow from counted detections alone.
 
-        The intervals are those of detection probabilities, of the kind
+        The intervals are for detection probabilities, and of the kind
         ``error_budget.count_interval_name``.
 
         Parameters
@@ -256,7 +256,7 @@ class Sampler(ABC):
     def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return each point's largest half-width minus the tolerance, but at least 0.
 
-        The half-widths are those of the confidence intervals of detection probabilities.
+        Half-widths belong to the confidence intervals of detection probabilities.
 
         Parameters
         ----------
@@ -277,8 +277,8 @@ class Sampler(ABC):
     def accuracy_arrays(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
         """Return numbers of draws, half-widths and their excess over the tolerance, (n,) by name.
 
-        The names are those of ACCURACY_OUTPUTS. Half-widths are those of the confidence intervals
-        of detection probabilities.
+        The names are in ACCURACY_OUTPUTS. Half-widths belong to the confidence intervals of
+        detection probabilities.
         """
         point_indices = np.arange(self.n_draws.size)
         widths = zip(PD_OUTPUT_NAMES, self.pd_half_widths(point_indices, error_budget), strict=True)
@@ -376,10 +376,11 @@ def simulate_draws(
     Returns
     -------
     dict of str to ndarray
-        By names of :mod:`sweep.model.outputs`: (n,) those of GRID_OUTPUTS and
-        STANDARD_ERROR_OUTPUTS, or of SPECTRA_STUDY_OUTPUTS, and of ACCURACY_OUTPUTS; those of
-        DRAW_COUNT_OUTPUTS, (n, batches) with `batch_sizes`, else (n,). With random effects or full
-        spectra outputs are means over the draws, and RUNNING_SUMS_NAME (n, columns) is included.
+        Arrays by the names in :mod:`sweep.model.outputs`. Outputs of GRID_OUTPUTS and
+        STANDARD_ERROR_OUTPUTS (for ``spectra`` of SPECTRA_STUDY_OUTPUTS), and of ACCURACY_OUTPUTS,
+        are (n,). Outputs of DRAW_COUNT_OUTPUTS are (n, batches) with `batch_sizes`, else (n,).
+        With random effects or full spectra, outputs are means over the draws, and
+        RUNNING_SUMS_NAME (n, columns) is included.
     """
     batch_edges = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
     sampler_arguments: dict[str, Any] = {
@@ -734,8 +735,8 @@ class SpectraSampler(Sampler):
     def _nan_for_missing_segments(self) -> np.ndarray:
         """Return an array (4, n): nan for a segment that does not exist, else 0.
 
-        Rows are in the order of PD_OUTPUT_NAMES. Added to outputs, it sets those of missing
-        segments to nan.
+        Rows are in the order of PD_OUTPUT_NAMES. Added to outputs, the array sets outputs of
+        missing segments to nan.
         """
         is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
         segment_orders = np.asarray(

@@ -69,8 +69,8 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
 QUADRATURE_NODE_COUNTS = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
-"""Numbers of nodes from which that of a Gaussian quadrature is chosen. The nodes are lines that
-represent a footprint along one coordinate of the beam."""
+"""Numbers of nodes that a Gaussian quadrature may have. The nodes are lines that represent a
+footprint along one coordinate of the beam."""
 
 _QUADRATURE_PHASE_SLOPE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
 """Largest slope of a phase [rad per standard deviation of the beam] for which a Gaussian quadrature
@@ -835,7 +835,7 @@ class _LineTable(NamedTuple):
     """
 
     offset: np.ndarray
-    """(lines,): frequency of each line minus that of the middle of the echo [bins]."""
+    """(lines,): frequency of each line minus the frequency of the middle of the echo [bins]."""
     phase: np.ndarray
     """(lines,): phase of each line's amplitude, relative to the up segment [rad]."""
     weight: np.ndarray
