@@ -68,8 +68,8 @@ class MotionPriors(NamedTuple):
     """Standard deviation of each component of the velocity [m/s] of the surface that a beam meets.
     """
     target_acceleration: float = 0.0
-    """Standard deviation of the acceleration [m/s^2] along the beam of the surface that it meets.
-    """
+    """Standard deviation of the acceleration, along the beam, of the surface that a beam meets
+    [m/s^2]."""
 
 
 class EgoMotion(NamedTuple):

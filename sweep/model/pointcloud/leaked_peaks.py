@@ -76,8 +76,8 @@ LEAKAGE_PROBABILITY_MIN = 1e-9
 signal are drawn."""
 
 RAISED_BIN_RATE_SAFETY_FACTOR = 1.01
-"""Factor on a sum of crossing rates that makes it an upper bound. The sum replaces far bins by an
-integral, which is accurate to 1e-3, and the bound holds for the sum over listed bins."""
+"""Factor by which a sum of crossing rates is multiplied to make it an upper bound. The sum contains
+an integral over far bins, which is accurate to 1e-3."""
 
 PERMANENT_LINE_FIRST_RANDOM_INDEX = np.int64(1 << 24)
 """Index, in the stream of leaked signal, of the first random number used for the line of light
@@ -371,7 +371,7 @@ def find_segments_with_raised_bins(
 
 @njit(cache=True, nogil=True, error_model="numpy", borrows=True)
 def _mark_segments_with_raised_bins(keys, rate_sum_max, first_draw, n_draws, has_raised_bin):
-    """Mark the segments of m points in which leaked signal may raise a bin in any of some draws.
+    """Mark the segments of m points in which leaked signal may raise a bin in at least one draw.
 
     Parameters
     ----------
@@ -430,7 +430,7 @@ def fading_group_of_bins(
 def bins_without_noise_peaks(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> LeakageBins:
-    """Return the bins of leaked signal as bins in which noise alone raises no false peak.
+    """List the bins of leaked signal as bins in which no false peak of noise alone is drawn.
 
     The noise of these bins is drawn together with their signal instead.
 

@@ -258,8 +258,8 @@ class TwoBinErrors(NamedTuple):
     """(m, 3): slope of the regression of the position error on the linear wander w, the shift of
     the peak by speckle to first order."""
     excess_variance: np.ndarray
-    """(m, 3): variance of the position error [bins^2] minus two parts: the variance of the linear
-    wander times ``wander_gain``, and the square of the standard error by noise
+    """(m, 3): variance of the position error [bins^2] minus two parts: the variance of the product
+    of ``wander_gain`` and the linear wander, and the square of the standard error by noise
     (:func:`sweep.model.detection.sub_bin_interpolation.sub_bin_standard_error`)."""
 
     @classmethod
@@ -321,8 +321,8 @@ class TwoBinErrorTables(NamedTuple):
     """Mean position error, divided by the square root of the variance whose logarithm is
     ``log_variance``."""
     log_variance: np.ndarray
-    """Logarithm of a variance [bins^2]: that of the position error, noise included, minus that of
-    the linear wander times ``wander_gain``."""
+    """Logarithm of the residual variance [bins^2]: variance of the position error, noise included,
+    minus the variance of the product of ``wander_gain`` and the linear wander."""
     wander_gain: np.ndarray
     """Slope of the regression of the position error on the linear wander, the shift of the peak by
     speckle to first order."""
