@@ -330,7 +330,7 @@ def draw_returns(
     window_bins = int(2 * inputs.line_grid.peak_search_half_width.max(initial=0) + 1)
     _, _, groups_max = bin_groups.strongest_bin.shape
     noise_roots: dict[int, np.ndarray] = {}
-    for indices, spectra, part_leakage_bins in _iter_spectra(
+    for indices, spectra, part_leakage_bins in _iter_spectra_and_leakage_bins(
         shots,
         bin_groups,
         adds_noise,
@@ -394,7 +394,7 @@ _CIRCULAR_PSEUDO_VARIANCE_RATIO_MAX = 1e-3
 for which the noise counts as circular."""
 
 
-def _iter_spectra(
+def _iter_spectra_and_leakage_bins(
     shots: Shots,
     bin_groups: BinGroups,
     adds_noise: bool,

@@ -221,7 +221,7 @@ _TWO_BIN_LINES, _TWO_BIN_LINE_POWERS = np.polynomial.hermite_e.hermegauss(24)
 """
 _TWO_BIN_SEARCH_BINS = 5
 """Largest distance [bins] from bin 0 at which the mean echo of a drawn footprint may be largest."""
-_TABULATED_VARIANCE_MIN = 1e-10
+_VARIANCE_ADDED_BEFORE_LOG = 1e-10
 """Variance [bins^2] that is added to the variances of the two-bin tables, so that their logarithms
 are finite."""
 _TABLE_ENTRY_DRAWS_MIN = 2.0
@@ -347,9 +347,7 @@ def _two_bin_error_tables(
     mean, log_variance, gain = np.empty((3, *shape))
     for i, spread in enumerate(_TWO_BIN_SPREADS_CELLS * padding):
         tone_position_max = 0.5 if keeps_strongest_bin else 1.5 + spread
-        footprints = _DrawnFootprints.from_random(
-            rng, window, padding, spread, tone_position_max, bins
-        )
+        footprints = _DrawnFootprints.draw(rng, window, padding, spread, tone_position_max, bins)
         for k, noise_ratio in enumerate(_TWO_BIN_NOISE_RATIOS):
             known_moments = None
             for j, shift_ratio in enumerate(_TWO_BIN_SHIFT_RATIOS):
@@ -391,7 +389,7 @@ class _DrawnFootprints(NamedTuple):
     """(m,): mean power of the echo in the bin where this power is largest."""
 
     @classmethod
-    def from_random(
+    def draw(
         cls,
         rng: np.random.Generator,
         window: Window,
@@ -566,7 +564,7 @@ def _moments_by_offset(
     )
     gain = (product - mean_error * mean_shift) / (squared_shift - mean_shift**2)
     variance = squared_error - mean_error**2 - gain * (product - mean_error * mean_shift)
-    log_variance = np.log(np.maximum(variance, 0.0) + _TABULATED_VARIANCE_MIN)
+    log_variance = np.log(np.maximum(variance, 0.0) + _VARIANCE_ADDED_BEFORE_LOG)
     known_offsets = _TWO_BIN_OFFSETS_BINS[is_known]
     mean_error, log_variance, gain = (
         np.interp(_TWO_BIN_OFFSETS_BINS, known_offsets, values)
