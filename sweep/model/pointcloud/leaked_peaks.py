@@ -184,8 +184,8 @@ class LeakageBins(NamedTuple):
     bins. The rate of a bin is -ln(1 - c), with c the probability that signal lifts the bin above
     the threshold."""
     crossing_rate_sum_bounds: np.ndarray
-    """(m, 3, N_BOUND_SPECKLE_POWERS): upper bounds on the sum of the crossing rates of a segment's
-    bins, at speckle powers of 1, 2, 4 .. times the mean. The rate of a bin is -ln(1 - c), with c
+    """(m, 3, N_BOUND_SPECKLE_POWERS): upper bounds on the sum of crossing rates in a
+    segment, at speckle powers of 1, 2, 4 .. times the mean. The rate of a bin is -ln(1 - c), with c
     the probability that signal lifts the bin above the threshold."""
     mean_crossing_probability_sum: np.ndarray
     """(m, 3): sum, over a segment's bins, of the probability that leaked signal lifts the bin above
