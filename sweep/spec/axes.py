@@ -39,21 +39,23 @@ from sweep.spec.sections import (
 from sweep.units import ExactQuantity, QuantityError, Unit
 
 RESERVED_DIMENSION_NAMES = (DRAW_BATCH_DIM, "draw", "point", "spec", "study_id")
-"""Names of dimensions that a store may have in addition to the axes.
-
-No axis may have such a name.
-"""
+"""Names that no axis may have, because a store uses them for dimensions besides its axes."""
 
 STUDY_MARKER_NAME_PATTERN = re.compile("study_[0-9a-f]{16}")
-"""Pattern of the name of a coordinate that marks the study from which a dataset's points come.
+"""Regular expression for the name of a study marker: ``study_`` and 16 hexadecimal digits.
 
-No zipped axis may have a name of this pattern.
+A study marker is a coordinate that marks the study from which the points of a dataset come. No
+zipped axis may have a name of this pattern.
 """
 
 _AXIS_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
-"""Pattern of the name of a zipped axis."""
+"""Regular expression for the name of a zipped axis, along which several parameters vary
+together."""
 _VALUES_LISTED_IN_IDENTITY_MAX = 64
-"""Maximum number of values that the identity of an axis lists; a longer axis has a digest."""
+"""Largest number of values of an axis that a study's identity lists one by one.
+
+For a longer axis the identity holds a digest of the values.
+"""
 _AXIS_NAME_REMEDY = "take a word such as 'cut'"
 
 
@@ -66,10 +68,11 @@ class AxisParameter:
     coordinate_name: str
     """Name of the parameter's coordinate in the store."""
     values: np.ndarray | tuple[str, ...]
-    """Values (n,) in SI units, float64 or int64; a tuple of n words if the parameter takes
-    words."""
+    """Values (n,) along the axis: an array of float64 or int64 in SI units, or a tuple of n words
+    if the parameter takes words."""
     display_values: np.ndarray
-    """Values (n,) in `units`; the words if the parameter takes words."""
+    """Values (n,) along the axis as an array in the unit `units`, or of words if the parameter
+    takes words."""
     units: str
     """Unit in which the user wrote the values; empty if the parameter has no unit."""
 
@@ -90,7 +93,7 @@ class Axis:
 
     @property
     def is_zipped(self) -> bool:
-        """True if the axis is zipped: it has several parameters, or a name of its own."""
+        """True if several parameters vary along the axis, or the axis has a name of its own."""
         return len(self.parameters) > 1 or self.parameters[0].coordinate_name != self.name
 
 
@@ -120,9 +123,10 @@ def axis_identity(axis: Axis) -> dict[str, Any]:
 
 
 def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
-    """Return the values of one parameter of an axis, in the form that enters the study's identity.
+    """Return a dict that identifies the values of one parameter along an axis.
 
-    Many values are replaced by their number, the first and last value, and a digest of all.
+    Up to 64 values are listed. For more values the dict holds their number, the first value, the
+    last value, and a digest of all values.
     """
     n_values, has_words = len(parameter.values), isinstance(parameter.values, tuple)
     if n_values <= _VALUES_LISTED_IN_IDENTITY_MAX:
@@ -139,7 +143,10 @@ def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
 
 
 def parameter_location(path: str, axes: tuple[Axis, ...]) -> SpecLocation:
-    """Return the location of a parameter's values in a spec: its axis, if any, else its field."""
+    """Return the keys that lead to a parameter's values in a spec.
+
+    The values are on the axis over the parameter, if there is one, else in the parameter's field.
+    """
     for axis in axes:
         if any(parameter.path == path for parameter in axis.parameters):
             return ("axes", axis.name if axis.is_zipped else path)
@@ -174,9 +181,10 @@ def read_axes(raw_axes: object) -> tuple[tuple[Axis, ...], list[Finding]]:
 
 
 def first_values_on_axes(raw_axes: object) -> dict[str, object]:
-    """Return the first written value of each parameter that a spec's ``axes`` section sets.
+    """Return the first value of each parameter on a spec's axes, as written, by dotted path.
 
-    Keys of the result are dotted paths. Paths that name no parameter are left out.
+    `raw_axes` is the section ``axes`` as parsed from YAML. Paths that name no parameter are left
+    out. The result is empty if the section is no mapping.
     """
     first_values: dict[str, object] = {}
     for key, value in raw_axes.items() if isinstance(raw_axes, dict) else ():
@@ -219,10 +227,9 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _paths_with_raw_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
-    """Return the dotted path and the written values of each parameter of an axis.
+    """Return a pair (dotted path, values as written) for each parameter of an axis.
 
-    A zipped axis is written in pieces, one after the other. The result then has one pair for each
-    parameter of each piece.
+    A zipped axis is a list of pieces. It has one pair for each parameter of each piece.
     """
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
         return [(key, raw_axis)]
@@ -232,14 +239,17 @@ def _paths_with_raw_values(key: str, raw_axis: object) -> list[tuple[str, object
 
 
 def _first_raw_value(values: object) -> object:
-    """Return the first value of a written list or generator; None if it is empty."""
+    """Return the first value of a list or generator as written in a spec; None for an empty one."""
     while isinstance(values, dict | list) and values:
         values = next(iter(values.values())) if isinstance(values, dict) else values[0]
     return None if isinstance(values, dict | list) else values
 
 
 def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
-    """Read one axis, plain or zipped; raise `FindingsError` if it can't be read."""
+    """Convert one entry of the section ``axes`` to an `Axis`.
+
+    Raise `FindingsError` if the entry is invalid. `location` holds the keys that lead to it.
+    """
     if isinstance(raw_axis, dict) and "zip" in raw_axis:
         return _read_zipped_axis(key, raw_axis, location)
     if key in MODEL_BY_SECTION and isinstance(raw_axis, dict):
@@ -254,9 +264,9 @@ def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
 
 
 def _first_field_path_and_hint(path: str, raw_section: object) -> tuple[str, str]:
-    """Return the dotted path of the first field in a section, and how to write its values.
+    """Return the dotted path of a section's first field, and a text on how to write its values.
 
-    They are for the remedy if a user writes a whole section under ``axes``, not a field's path.
+    The remedy for a section that a user writes under ``axes`` shows this path and this text.
     """
     while (
         isinstance(raw_section, dict)
@@ -269,7 +279,10 @@ def _first_field_path_and_hint(path: str, raw_section: object) -> tuple[str, str
 
 
 def _axis_parameter_rule(path: str, location: SpecLocation) -> Rule:
-    """Return the rule of the parameter at a path; raise `FindingsError` if no axis may set it."""
+    """Return the rule of the parameter at a dotted path.
+
+    Raise `FindingsError` if no axis may set the parameter.
+    """
     rule = parameter_rules().get(path)
     if rule is None:
         raise single_finding_error(location, *_axis_path_problem_and_remedy(path))
@@ -281,11 +294,11 @@ def _axis_parameter_rule(path: str, location: SpecLocation) -> Rule:
 
 
 _NOT_ON_AXES_PROBLEM = "is the same for a whole study"
-"""Problem stated for a parameter that no axis may set."""
+"""Words of the error message for a parameter that no axis may set."""
 
 
 def _axis_path_problem_and_remedy(path: str) -> tuple[str, str]:
-    """Return the problem and the remedy for a path that no axis may set."""
+    """Return two texts, problem and remedy, on a dotted path that no axis may set."""
     section, _, name = path.partition(".")
     if path == "seed":
         problem = (
@@ -307,7 +320,7 @@ def _axis_path_problem_and_remedy(path: str) -> tuple[str, str]:
 def _make_axis_parameter(
     path: str, entries: list[AxisEntry], location: SpecLocation
 ) -> AxisParameter:
-    """Concatenate the entries of an axis into the values of one parameter along the axis."""
+    """Return the `AxisParameter` whose values are those of all entries, one after the other."""
     name = parameter_short_name(path)
     n_values = _number_of_values(entries)
     if n_values > AXIS_VALUES_MAX:
@@ -327,7 +340,7 @@ def _make_axis_parameter(
 
 
 def _check_values_distinct(parameter: AxisParameter, location: SpecLocation) -> None:
-    """Raise `FindingsError` if a value occurs more than once along an axis."""
+    """Raise `FindingsError` if a parameter has the same value twice along its axis."""
     values = np.asarray(parameter.values)
     if values.dtype.kind != "U" and (
         np.all(values[1:] > values[:-1]) or np.all(values[1:] < values[:-1])
@@ -346,9 +359,10 @@ def _check_values_distinct(parameter: AxisParameter, location: SpecLocation) -> 
 
 
 def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: SpecLocation) -> Axis:
-    """Read a zipped axis, along which several parameters vary together.
+    """Convert an entry of the section ``axes`` to a zipped `Axis`, whose parameters vary together.
 
-    It is written in pieces, one after the other. Every piece must set the same parameters.
+    The entry is a list of pieces, whose values are joined. Every piece must set the same
+    parameters. Raise `FindingsError` if the entry is invalid.
     """
     findings = Findings(
         Finding((*location, str(other)), "is no part of a zipped axis", "write {zip: [...]}")
@@ -390,9 +404,10 @@ def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: SpecLocation
 
 
 def _read_zipped_piece(raw_piece: object, location: SpecLocation) -> dict[str, list[AxisEntry]]:
-    """Return the entries of one piece of a zipped axis by path, with equally many values each.
+    """Return the `AxisEntry` objects of one piece of a zipped axis, by the parameter's path.
 
-    A single value is repeated to the length of the piece's lists.
+    All parameters of the piece have equally many values: a single value is repeated as often as
+    needed. Raise `FindingsError` if the piece is invalid.
     """
     if not isinstance(raw_piece, dict) or not raw_piece:
         raise single_finding_error(location, "must be a mapping of paths to values", "", raw_piece)
@@ -423,7 +438,7 @@ def _read_zipped_piece(raw_piece: object, location: SpecLocation) -> dict[str, l
 
 
 def _number_of_values(entries: list[AxisEntry]) -> int:
-    """Return the total number of values in the entries of an axis."""
+    """Return the total number of values in a list of `AxisEntry`."""
     return sum(len(entry.si_values) for entry in entries)
 
 
@@ -431,9 +446,9 @@ def _number_of_values(entries: list[AxisEntry]) -> int:
 
 
 def _assign_coordinate_names(axes: list[Axis]) -> list[Axis]:
-    """Return the axes with names of their coordinates.
+    """Return copies of the axes whose parameters have the coordinate names of the store.
 
-    A coordinate's name is the shortest unambiguous end of its parameter's path.
+    A coordinate's name is the shortest end of its parameter's path that no other parameter shares.
     """
     paths = [parameter.path for axis in axes for parameter in axis.parameters]
     named_axes = []
@@ -450,9 +465,10 @@ def _assign_coordinate_names(axes: list[Axis]) -> list[Axis]:
 
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
-    """Return the shortest unambiguous end of a parameter's path, with underscores in place of dots.
+    """Return the coordinate name of the parameter at `path`: the path's shortest unambiguous end.
 
-    No other path in ``paths`` has this end, and no variable of a store has this name.
+    Underscores replace dots. No other path in `paths` has the same end, and no variable of a store
+    has the same name.
     """
     keys, *other_keys = (
         parameter_path.removesuffix(".kind").split(".")
@@ -467,7 +483,7 @@ def _coordinate_name(path: str, paths: list[str]) -> str:
 
 
 def _duplicate_path_findings(raw_axes: dict[Any, Any]) -> list[Finding]:
-    """Return a finding for each parameter that two axes set."""
+    """Return a `Finding` for each parameter that is set by two axes."""
     keys_by_path: dict[str, list[str]] = {}
     for key, value in raw_axes.items():
         for path in sorted({path for path, _ in _paths_with_raw_values(str(key), value)}):
@@ -480,7 +496,7 @@ def _duplicate_path_findings(raw_axes: dict[Any, Any]) -> list[Finding]:
 
 
 def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
-    """Return a finding for each zipped axis that has the name of a coordinate or variable."""
+    """Return a `Finding` for each zipped axis named like a store's coordinate or variable."""
     findings = []
     for axis in axes:
         other_coordinates = {
@@ -515,14 +531,15 @@ _GENERATOR_EXAMPLES = {
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
-"""Example of each generator of values along an axis, by the generator's keyword."""
+"""Example text of each generator of values along an axis, by its keyword: linear, log or step."""
 _GENERATOR_BY_NUMPY_FUNCTION = {
     "linspace": "linear",
     "geomspace": "log",
     "logspace": "log",
     "arange": "step",
 }
-"""Keyword of the generator that corresponds to a NumPy function, by the function's name."""
+"""Keyword of the generator of axis values that corresponds to a NumPy function, by the name of the
+function."""
 _NUMBER_OF_VALUES_RULE = NumericRule(
     description="", example="10", at_least="2", at_most=str(AXIS_VALUES_MAX), is_integer=True
 )
@@ -538,26 +555,26 @@ class Progression:
     start: Fraction
     """First value."""
     increment: Fraction = Fraction(0)
-    """Difference between a value and the one before it."""
+    """Difference of successive values."""
     n_values: int = 1
     """Number of values."""
 
     def apply_affine_transform(self, factor: Fraction, offset: Fraction) -> Progression:
-        """Return the progression whose values are ``factor * value + offset``."""
+        """Return the `Progression` whose values are ``factor * value + offset``."""
         return Progression(self.start * factor + offset, self.increment * factor, self.n_values)
 
     def values(self) -> np.ndarray:
-        """Return the values (n_values,) as floats, each rounded once from its exact value."""
+        """Return the values as a float array (n_values,); each is rounded from its exact value."""
         denominator = math.lcm(self.start.denominator, self.increment.denominator)
         first, step = int(self.start * denominator), int(self.increment * denominator)
         return np.array([(first + step * i) / denominator for i in range(self.n_values)])
 
 
 def _round_to_15_digits(values: np.ndarray) -> np.ndarray:
-    """Round values (n,) to 15 significant digits.
+    """Return values (n,) rounded to 15 significant digits.
 
-    Powers and logarithms may differ in the last bit between machines. Rounded to 15 digits they are
-    equal on all machines.
+    Powers and logarithms may differ in the last bit between machines. Rounding to 15 digits makes
+    the values equal on all machines.
     """
     magnitude = np.abs(values)
     np.floor(np.log10(magnitude, where=magnitude > 0, out=np.zeros(values.shape)), out=magnitude)
@@ -569,7 +586,7 @@ def _round_to_15_digits(values: np.ndarray) -> np.ndarray:
 
 
 def convert_from_si(unit: Unit, si_values: np.ndarray) -> np.ndarray:
-    """Convert SI values to a unit, rounded to 15 significant digits.
+    """Convert SI values to a unit; round the result to 15 significant digits.
 
     Parameters
     ----------
@@ -593,7 +610,7 @@ def convert_from_si(unit: Unit, si_values: np.ndarray) -> np.ndarray:
 
 
 def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
-    """Read a written value and convert it to a unit.
+    """Convert a value as written in a spec to a number in a unit.
 
     Parameters
     ----------
@@ -625,14 +642,15 @@ class AxisEntry:
     """Entry in the list of values along an axis: a single value, or the values of a generator."""
 
     si_values: np.ndarray
-    """Values (n,) in SI units; words for parameters that take words."""
+    """Values (n,) in SI units; an array of words for a parameter that takes words."""
     unit: Unit
     """Unit in which the values were written; ``Unit("")`` for words."""
     progression: Progression | None = None
-    """Exact values in `unit`, if they are an arithmetic progression; else None."""
+    """The values in `unit` as exact numbers; None for words, and for values without a constant
+    difference."""
 
     def values_in_unit(self, unit: Unit) -> np.ndarray:
-        """Return the values (n,) in a unit."""
+        """Return the entry's values as an array (n,), converted to `unit`."""
         if self.progression is not None and unit == self.unit:
             return self.progression.values()
         if self.progression is None or unit.is_logarithmic or self.unit.is_logarithmic:
@@ -643,7 +661,7 @@ class AxisEntry:
         ).values()
 
     def repeat(self, n_repeats: int) -> AxisEntry:
-        """Return a single value repeated `n_repeats` times."""
+        """Return a copy of a single-valued entry in which the value occurs `n_repeats` times."""
         progression = self.progression and replace(self.progression, n_values=n_repeats)
         return replace(
             self, si_values=np.repeat(self.si_values, n_repeats), progression=progression
@@ -651,7 +669,7 @@ class AxisEntry:
 
 
 def read_axis_entries(raw_value: object, rule: Rule, location: SpecLocation) -> list[AxisEntry]:
-    """Read the values of one parameter along an axis.
+    """Convert the values of one axis parameter, as written in a spec, to `AxisEntry` objects.
 
     Parameters
     ----------
@@ -691,7 +709,7 @@ def read_axis_entries(raw_value: object, rule: Rule, location: SpecLocation) -> 
 
 
 def read_single_value(raw_value: object, rule: Rule, location: SpecLocation) -> AxisEntry:
-    """Read one value: a number with its unit for numeric fields, else a word.
+    """Return the `AxisEntry` of one value as written: a number with its unit, or a word.
 
     Raises
     ------
@@ -712,9 +730,10 @@ def read_single_value(raw_value: object, rule: Rule, location: SpecLocation) -> 
 def _read_value_generator(
     raw_generator: dict[Any, Any], rule: Rule, location: SpecLocation
 ) -> AxisEntry:
-    """Read a generator ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``; return its values.
+    """Return the `AxisEntry` of a generator ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``.
 
-    Raise `FindingsError` if the generator is invalid or a value is outside the field's bounds.
+    Raise `FindingsError` if the generator is invalid, or if a value is outside the bounds of the
+    field that `rule` belongs to.
     """
     given_forms = [key for key in raw_generator if key in _GENERATOR_EXAMPLES]
     if len(given_forms) != 1:
@@ -762,7 +781,11 @@ def _read_value_generator(
 def _generate_values(
     form: str, raw_bounds: object, number: int, rule: NumericRule, location: SpecLocation
 ) -> AxisEntry:
-    """Return the values of a generator from its written bounds."""
+    """Return the `AxisEntry` of a generator with the keyword `form` and the bounds `raw_bounds`.
+
+    `number` is the number of values of a linear or log generator. Raise `FindingsError` if the
+    bounds, as written in the spec, are invalid.
+    """
     bounds, unit = _read_generator_bounds(form, raw_bounds, rule, location)
     if form == "step":
         return _arithmetic_values(_progression_from_bounds(bounds, location), unit, rule, location)
@@ -779,9 +802,10 @@ def _generate_values(
 def _read_generator_bounds(
     form: str, raw_bounds: object, rule: NumericRule, location: SpecLocation
 ) -> tuple[list[Fraction], Unit]:
-    """Return the first value, last value and (for a step) increment, and their common unit.
+    """Return the exact numbers that define a generator's values, and their common unit.
 
-    The numbers are exact and in the unit of the first value.
+    The numbers are the first value, the last value and, if `form` is ``step``, the increment. The
+    unit is that of the first value as written. Raise `FindingsError` if a number is invalid.
     """
     count = 3 if form == "step" else 2
     if not isinstance(raw_bounds, list) or len(raw_bounds) != count:
@@ -817,9 +841,10 @@ def _read_generator_bounds(
 
 
 def _progression_from_bounds(bounds: list[Fraction], location: SpecLocation) -> Progression:
-    """Return the progression of a step generator from its first value, last value and step.
+    """Return the `Progression` of a step generator with the bounds [first value, last value, step].
 
-    The last value is included if a whole number of steps leads to it.
+    The last value is included if a whole number of steps leads from the first value to it. Raise
+    `FindingsError` if the step is 0 or has the wrong sign.
     """
     first, last, step = bounds
     if step == 0:
@@ -837,9 +862,10 @@ def _progression_from_bounds(bounds: list[Fraction], location: SpecLocation) -> 
 def _arithmetic_values(
     progression: Progression, unit: Unit, rule: NumericRule, location: SpecLocation
 ) -> AxisEntry:
-    """Return the values of an arithmetic progression in `unit` as an entry of an axis.
+    """Return the `AxisEntry` of an arithmetic progression whose numbers are in `unit`.
 
-    The values are integers if the field takes integers.
+    The values are integers if the field takes integers. Raise `FindingsError` if they are not
+    whole.
     """
     if unit.is_logarithmic:
         si_values = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
@@ -858,10 +884,10 @@ def _arithmetic_values(
 def _geometric_values(
     bounds: list[Fraction], unit: Unit, number: int, rule: NumericRule, location: SpecLocation
 ) -> AxisEntry:
-    """Return `number` values with a constant ratio, from the first to the second bound.
+    """Return an `AxisEntry` of `number` values with a constant ratio, including both bounds.
 
-    The ratio is constant in SI units, so that the unit in which the bounds are written does not
-    matter.
+    The ratio is constant in SI units, whatever the unit of the bounds as written. Raise
+    `FindingsError` if a bound is not positive, or if the unit is decibels.
     """
     if unit.is_logarithmic:
         remedy = f"write {_GENERATOR_EXAMPLES['linear']}"
@@ -884,7 +910,7 @@ def _geometric_values(
 def _check_within_field_bounds(
     values: AxisEntry, rule: NumericRule, location: SpecLocation
 ) -> None:
-    """Raise `FindingsError` if a value of a generator is outside the bounds of the field."""
+    """Raise `FindingsError` if a value of a generator is outside the bounds of the field's rule."""
     violation = rule.first_bound_violation(values.si_values)
     if violation is not None:
         value = values.values_in_unit(values.unit)[violation.value_index]

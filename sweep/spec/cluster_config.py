@@ -27,9 +27,10 @@ from sweep.spec.yaml_document import (
 from sweep.units import QuantityError
 
 LOOPBACK_ADDRESS = "127.0.0.1"
-"""Address at which a service accepts connections from its own machine alone."""
+"""IP address at which a service accepts connections from its own machine only."""
 NO_DASHBOARD, DASHBOARD_PORT = "none", 8787
-"""Value of the dashboard's port that means no dashboard, and the usual port of Dask's dashboard."""
+"""Value of a spec's field ``dashboard`` that means no dashboard, and the default port of Dask's
+dashboard."""
 _WORKER_COUNT_RULE = NumericRule(
     description="Workers", example="8", at_least="1", at_most="100000", is_integer=True
 )
@@ -40,11 +41,11 @@ class CertificatePaths(NamedTuple):
     """Paths of the files with which the processes of a cluster identify themselves by TLS."""
 
     ca: str
-    """Certificate of the authority that signed the certificate."""
+    """Path of the certificate of the authority that signed `certificate`."""
     certificate: str
-    """Certificate of the cluster's processes."""
+    """Path of the certificate that all processes of the cluster share."""
     key: str
-    """Private key of the certificate."""
+    """Path of the private key of `certificate`."""
 
 
 class WorkerBounds(NamedTuple):
@@ -57,7 +58,10 @@ class WorkerBounds(NamedTuple):
 
 
 def _read_worker_bounds(raw_value: object) -> WorkerBounds:
-    """Read a number of workers, or a mapping with their minimum and maximum."""
+    """Return the `WorkerBounds` of a number of workers, or of ``{least: 2, most: 40}``.
+
+    Raise `QuantityError` if the value is invalid.
+    """
     if not isinstance(raw_value, Mapping):
         try:
             return WorkerBounds(
@@ -79,7 +83,10 @@ def _read_worker_bounds(raw_value: object) -> WorkerBounds:
 
 
 def _read_environment_mapping(raw_value: object) -> dict[str, str]:
-    """Read environment variables: a mapping of names to values of one line each, without quotes."""
+    """Check environment variables, such as ``{TMPDIR: /scratch}``; return a dict of texts.
+
+    Raise `QuantityError` if a name is invalid, or if a value has a quote or more than one line.
+    """
     remedy = "write e.g. {TMPDIR: /scratch}"
     if not isinstance(raw_value, Mapping):
         raise QuantityError("must be a mapping of names to values", remedy)
@@ -100,9 +107,10 @@ _SINGLE_LINE_RULE_ARGUMENTS = {
 }
 """Keyword arguments of `TextRule` for a text that must be a single line."""
 _TEXTS_PER_LIST_MAX = 100_000
-"""Maximum number of texts in a list of a cluster's configuration."""
+"""Largest number of texts in a list-valued field of a cluster's configuration."""
 _MEMORY_FIELD_ARGUMENTS = ("byte", "4 GB", "64 MB", "100 TB")
-"""Arguments of `declare.quantity_field` for an amount of memory: unit, example, and bounds."""
+"""Arguments of `declare.quantity_field` for an amount of memory: unit, example, lower bound and
+upper bound."""
 
 
 class Security(SpecSection):
@@ -187,16 +195,16 @@ class ClusterConfig(SpecSection):
     security: Security | None = None
 
     _base_folder: Path = PrivateAttr(default=Path())
-    """Folder that paths in the configuration are relative to."""
+    """Folder of the cluster's file, to which relative paths in the configuration refer."""
 
     def resolve_path(self, raw_path: str) -> str:
-        """Return the path of a file; ``raw_path`` may be relative to the cluster file's folder."""
+        """Return a path as text; a relative path is joined to the cluster file's folder."""
         return str(
             self._base_folder / os.path.expanduser(raw_path)
         )  # an unknown ~user is left as it is
 
     def certificate_paths(self) -> CertificatePaths | None:
-        """Return the paths of authority, certificate and private key; None without `security`."""
+        """Return the paths of TLS certificates and private key; None without ``security``."""
         security = self.security
         if security is None:
             return None
@@ -398,7 +406,10 @@ def cluster_config_from_mapping(
 
 
 def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
-    """Validate the configuration in a document; raise `SpecError` with every mistake."""
+    """Return the validated configuration in a document; raise `SpecError` with every mistake in it.
+
+    `base` is the folder that paths in the document are relative to.
+    """
     findings = document.findings
     try:
         cluster = _CLUSTER_CONFIG_ADAPTER.validate_python(document.content)
@@ -413,7 +424,7 @@ def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
 
 
 def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
-    """Yield findings about missing files, and about fields that contradict each other."""
+    """Yield a `Finding` for each missing file and for fields that contradict each other."""
     for name, path in zip(Security.model_fields, cluster.certificate_paths() or (), strict=False):
         if not Path(path).is_file():
             remedy = "make certificates with 'sweep certificates DIRECTORY'"
@@ -441,9 +452,9 @@ def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
 
 
 def _scheduler_findings(scheduler: SchedulerConfig, *, is_remote: bool) -> Iterator[Finding]:
-    """Yield mistakes in the address of the scheduler.
+    """Yield a `Finding` if the scheduler has two addresses, or none although it needs one.
 
-    `is_remote` is True if workers are on other machines. The scheduler then needs an address.
+    The scheduler needs an address if `is_remote` is True: workers are on other machines.
     """
     if scheduler.host and scheduler.interface:
         yield Finding(("scheduler",), "has both a host and an interface", "keep one of them")

@@ -17,11 +17,11 @@ from sweep.spec.sections import MODEL_BY_SECTION
 from sweep.units import read_unit
 
 LISTED_VALUES_MAX = 8
-"""Largest number of values of a field that a line of differences lists in full."""
+"""Largest length of a list that is shown in full where two studies differ."""
 SHOWN_CHARACTERS_MAX = 200
-"""Largest number of characters of a text that a line of differences shows."""
+"""Largest number of characters of a text that is shown where two studies differ."""
 _DECIMAL_CONTEXT = Context(prec=20)
-"""Decimal arithmetic with more digits than a float has."""
+"""Decimal arithmetic with 20 digits, more than a float has."""
 SCENE_SECTION_MODELS: spec_fields.ModelClasses = (
     Scene,
     Platform,
@@ -36,9 +36,9 @@ SCENE_SECTION_MODELS: spec_fields.ModelClasses = (
 
 @cache
 def rules_by_field_name() -> MappingProxyType[str, Rule]:
-    """Return the rule of every field by the field's name.
+    """Return the rule of every field of a spec, by the name of the field.
 
-    Fields of equal name have equal units in all sections.
+    A name that occurs in several sections has the same unit in all of them.
     """
     return MappingProxyType({
         name: rule
@@ -49,7 +49,7 @@ def rules_by_field_name() -> MappingProxyType[str, Rule]:
 
 
 def describe_differences(a: Any, b: Any) -> list[str]:
-    """Return a line ``path: value -> value`` for each difference between two specs.
+    """Return a text ``path: value of a -> value of b`` for each difference between two specs.
 
     Parameters
     ----------
@@ -79,10 +79,10 @@ def describe_differences(a: Any, b: Any) -> list[str]:
 
 
 def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a study's identity by dotted path.
+    """Return the entries of a study's identity in one dict, by dotted path.
 
-    Two studies are the same if their identities are equal. The values of a parameter along an axis
-    are one entry.
+    The identity is nested data that is equal for equal studies. All values of a parameter along an
+    axis are one entry.
     """
     leaves: dict[str, Any] = dict(identity.get("parameters", {}))
     for key, value in identity.items():
@@ -101,10 +101,7 @@ def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _format_identity_entry(path: str, value: Any) -> str:
-    """Return the value of an identity's entry as text with its unit.
-
-    `path` is the dotted path of the entry.
-    """
+    """Return the value at the dotted path `path` of a study's identity as text with its unit."""
     rule = rules_by_field_name().get(path.rsplit(".", 1)[-1])
     if value is None:
         return "(none)"
@@ -132,7 +129,7 @@ def _format_identity_entry(path: str, value: Any) -> str:
 
 
 def _format_list(rule: Rule | None, values: Sequence[Any]) -> str:
-    """Return the values of a field as a list with its unit; more than 8 values are shortened."""
+    """Return the SI values of a field as text ``[1, 2, 3] m``; more than 8 values are shortened."""
     texts = [_format_number(rule, value) for value in values]
     if len(texts) > LISTED_VALUES_MAX:
         texts = [*texts[:2], "...", texts[-1], f"{len(texts)} in all"]
@@ -140,9 +137,9 @@ def _format_list(rule: Rule | None, values: Sequence[Any]) -> str:
 
 
 def _unit_suffix(rule: Rule | None) -> str:
-    """Return the unit in which a field is shown, after a blank; empty for a pure number.
+    """Return a blank and the unit in which a field's values are shown; empty for a pure number.
 
-    Angles are shown in the unit of the field's example, all other quantities in SI units.
+    The unit of an angle is that of the example in the field's rule. All other units are SI units.
     """
     unit_name = "" if rule is None else rule.value_unit
     if rule is not None and unit_name.startswith("rad"):
@@ -151,9 +148,9 @@ def _unit_suffix(rule: Rule | None) -> str:
 
 
 def _format_number(rule: Rule | None, value: Any) -> str:
-    """Return an SI value as a number in the unit in which its field is shown, without the unit.
+    """Return an SI value as text without its unit: a number in the unit of `_unit_suffix`.
 
-    Angles, which are not shown in SI units, read back as exactly the same value.
+    For an angle, the text has enough digits to read back as exactly the same SI value.
     """
     unit_name = _unit_suffix(rule).strip()
     if rule is None or unit_name == rule.value_unit or isinstance(value, str):

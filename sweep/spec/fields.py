@@ -33,17 +33,18 @@ from sweep.spec.rules import (
 )
 
 AUTO, ON, OFF = EFFECT_MODES
-"""Modes of an effect: simulated only where the tolerance requires it, always, or never."""
+"""Modes of an effect: simulated if the tolerance requires it (auto), always (on), or never
+(off)."""
 ModelClasses = tuple[type[BaseModel], ...]
-"""Pydantic models, each a kind of section. A value is validated as one of them."""
+"""Pydantic models of sections; a value in a spec is validated as one of them."""
 KeyPath = tuple[str, ...]
-"""Keys that lead to a value in a spec: the names of the sections around it and of its field."""
+"""Keys that lead to a value in a spec: names of the enclosing sections, then the field's name."""
 Vector = tuple[float, ...]
 """Numbers of one kind in SI units, such as the components of a vector along x, y and z."""
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
 KIND_RULE = TextRule(description="Which of several a part is")
-"""Rule of the field ``kind``, which selects one of several models of a section."""
+"""Rule of the field ``kind``, whose value selects one of several models for a section."""
 
 
 class SpecSection(BaseModel):
@@ -64,11 +65,11 @@ _DEFAULT_MAGNITUDE_MAX_BY_UNIT = {
     "rad/s": "1e6 deg/s",
     "": "1e12",
 }
-"""Largest magnitude of a quantity whose field states no bound, by SI unit."""
+"""Largest magnitude of a quantity whose field states no bounds, with its unit, by SI unit."""
 
 
 def field_with_rule(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
-    """Declare a field with a rule.
+    """Return the declaration of a field whose values obey `rule`.
 
     Parameters
     ----------
@@ -138,7 +139,7 @@ def quantity_field(
     keyword: str = "",
     **rule_options: Any,
 ) -> Any:
-    """Declare a field for a number with a unit.
+    """Return the declaration of a field for a number with a unit.
 
     Parameters
     ----------
@@ -161,7 +162,10 @@ def quantity_field(
 
 
 def number_field(description: str, example: str = "0.5", *bounds: str, **rule_options: Any) -> Any:
-    """Declare a field for a pure number."""
+    """Return the declaration of a field for a number without a unit.
+
+    `bounds` are the least and the greatest value as text; see `quantity_field` for `rule_options`.
+    """
     return quantity_field(description, "", example, *bounds, **rule_options)
 
 
@@ -172,31 +176,31 @@ def integer_field(
     at_most: str = "1e6",
     **rule_options: Any,
 ) -> Any:
-    """Declare a field for an integer, from 1 to 1e6 by default."""
+    """Return the declaration of a field for an integer, from 1 to 1e6 by default."""
     return quantity_field(
         description, "", example, at_least, at_most, is_integer=True, **rule_options
     )
 
 
 def length_field(description: str, example: str = "10 m", *bounds: str, **rule_options: Any) -> Any:
-    """Declare a field for a length of either sign [m]."""
+    """Return the declaration of a field for a length of either sign, in metres after reading."""
     return quantity_field(description, "m", example, *bounds, **rule_options)
 
 
 def positive_length_field(description: str, example: str = "10 m", **rule_options: Any) -> Any:
-    """Declare a field for a length of at least 1 um [m]."""
+    """Return the declaration of a field for a length of at least 1 um, in metres after reading."""
     return length_field(description, example, "1 um", **rule_options)
 
 
 def angle_field(
     description: str, example: str = "10 deg", *bounds: str, **rule_options: Any
 ) -> Any:
-    """Declare a field for an angle of either sign [rad]."""
+    """Return the declaration of a field for an angle of either sign, in radians after reading."""
     return quantity_field(description, "rad", example, *bounds, **rule_options)
 
 
 def speed_field(description: str, **rule_options: Any) -> Any:
-    """Declare a field for a speed of at least 0 [m/s]."""
+    """Return the declaration of a field for a speed of at least 0, in m/s after reading."""
     return quantity_field(description, "m/s", "30 m/s", "0 m/s", **rule_options)
 
 
@@ -207,19 +211,19 @@ def duration_field(
     at_most: str = "1e8 s",
     **rule_options: Any,
 ) -> Any:
-    """Declare a field for a duration, from 0 to 1e8 s by default [s]."""
+    """Return the declaration of a field for a duration in seconds, from 0 to 1e8 s by default."""
     return quantity_field(description, "s", example, at_least, at_most, **rule_options)
 
 
 def frequency_field(description: str, example: str = "20 Hz") -> Any:
-    """Declare a field for a rate or frequency from 1e-6 to 1e9 Hz [Hz]."""
+    """Return the declaration of a field for a rate or frequency from 1e-6 to 1e9 Hz."""
     return quantity_field(description, "Hz", example, "1e-6 Hz", "1e9 Hz")
 
 
 def list_field(
     element_rule: Rule, length_min: int, length_max: int, default: Any = ..., **rule_options: Any
 ) -> Any:
-    """Declare a field for a list of values that have a common rule.
+    """Return the declaration of a field for a list whose values all obey `element_rule`.
 
     Parameters
     ----------
@@ -246,7 +250,7 @@ def list_field(
 def vector_field(
     description: str, unit: str, example: str, *, dimensions: int = 3, **rule_options: Any
 ) -> Any:
-    """Declare a field for the components of a vector of `dimensions` dimensions."""
+    """Return the declaration of a field for a vector of `dimensions` components in `unit`."""
     return list_field(
         quantity_rule("Component", unit, example),
         dimensions,
@@ -257,17 +261,17 @@ def vector_field(
 
 
 def position_field(description: str, *, dimensions: int = 3, **rule_options: Any) -> Any:
-    """Declare a field for a position in `dimensions` dimensions [m]."""
+    """Return the declaration of a field for a position: a list of `dimensions` coordinates [m]."""
     return vector_field(description, "m", "10 m", dimensions=dimensions, **rule_options)
 
 
 def seed_field(description: str = "Seed of its random numbers") -> Any:
-    """Declare a field for the seed of random numbers, 0 by default."""
+    """Return the declaration of a field for the seed of random numbers, 0 by default."""
     return integer_field(description, "1", "0", "2^63", default=0)
 
 
 def object_name_rule(description: str, example: str = "ground") -> TextRule:
-    """Return the rule of the name of an object of a scene or of a scanner."""
+    """Return the rule for the name of a scene's object or of a scanner, such as ``ground``."""
     return TextRule(
         description=description,
         example=example,
@@ -277,40 +281,40 @@ def object_name_rule(description: str, example: str = "ground") -> TextRule:
 
 
 def object_name_field(description: str, default: Any = ...) -> Any:
-    """Declare a field for the name of an object of a scene or of a scanner."""
+    """Return the declaration of a field for the name of a scene's object or of a scanner."""
     return field_with_rule(object_name_rule(description), default)
 
 
 def command_word_rule(description: str, example: str) -> TextRule:
-    """Return the rule of a word on a command line, without blanks, quotes or other shell syntax."""
+    """Return the rule for one word of a shell command, without blanks, quotes or shell syntax."""
     remedy = f"write one word, such as '{example}'"
     pattern = r"[A-Za-z0-9_.:/@%+=,\[\]~-]{1,500}"
     return TextRule(description=description, example=example, pattern=pattern, remedy=remedy)
 
 
 def command_word_field(description: str, example: str, default: Any = ...) -> Any:
-    """Declare a field for a word on a command line."""
+    """Return the declaration of a field for one word of a shell command, without shell syntax."""
     return field_with_rule(command_word_rule(description, example), default)
 
 
 def text_field(description: str, default: Any = ..., **rule_options: str) -> Any:
-    """Declare a field for a text; `rule_options` are further fields of `TextRule`."""
+    """Return the declaration of a field for a text; `rule_options` are fields of `TextRule`."""
     return field_with_rule(TextRule(description=description, **rule_options), default)
 
 
 def choice_field(description: str, options: tuple[str, ...], default: Any = MISSING) -> Any:
-    """Declare a field for one of several words, the first by default."""
+    """Return the declaration of a field for one word of `options`, the first one by default."""
     rule = ChoiceRule(description=description, options=options)
     return field_with_rule(rule, options[0] if default is MISSING else default)
 
 
 def flag_field(description: str, *, default: bool) -> Any:
-    """Declare a field for a truth value."""
+    """Return the declaration of a field for a truth value."""
     return field_with_rule(FlagRule(description=description), default)
 
 
 def file_path_field(description: str, default: Any = ..., **rule_options: Any) -> Any:
-    """Declare a field for the path of a file."""
+    """Return the declaration of a field for the path of a file."""
     return field_with_rule(FilePathRule(description=description, **rule_options), default)
 
 
@@ -318,9 +322,10 @@ def file_path_field(description: str, default: Any = ..., **rule_options: Any) -
 
 
 def add_effect_parameter_fields(section_path: str) -> Callable[[type[SectionT]], type[SectionT]]:
-    """Return a class decorator that adds a field for each effect parameter of a section.
+    """Return a class decorator that adds fields for effect parameters to a section's model.
 
-    `section_path` is the dotted path of the section that is decorated.
+    The decorator returns a subclass with a field for each effect parameter in the section at the
+    dotted path `section_path`.
     """
     field_definitions = {
         parameter.path.removeprefix(f"{section_path}."): (
@@ -337,9 +342,9 @@ def add_effect_parameter_fields(section_path: str) -> Callable[[type[SectionT]],
 
 
 def add_effect_mode_fields(section: type[SectionT]) -> type[SectionT]:
-    """Return a subclass of a section that has a field for the mode of every effect.
+    """Return a subclass of a section's model with one field for the mode of each effect.
 
-    The default mode is `auto`.
+    The mode is ``auto`` by default.
     """
     mode_rules = {
         effect.name: ChoiceRule(
@@ -353,7 +358,7 @@ def add_effect_mode_fields(section: type[SectionT]) -> type[SectionT]:
 
 
 def _effect_parameter_rule(parameter: Parameter) -> Rule:
-    """Return the rule of an effect's parameter."""
+    """Return the rule of an effect's parameter: for a table, one of several words, or a number."""
     if parameter.is_table:
         return FrequencyErrorTableRule(description=parameter.description)
     if parameter.options:
@@ -368,7 +373,10 @@ def _effect_parameter_rule(parameter: Parameter) -> Rule:
 
 
 def _extend_section(section: type[SectionT], field_definitions: dict[str, Any]) -> type[SectionT]:
-    """Return a subclass of a section, of the same name, with further fields."""
+    """Return a subclass of a section's model with the same name and additional fields.
+
+    Raise `TypeError` if the model has one of the fields already.
+    """
     if duplicate_names := sorted(set(field_definitions) & set(section.model_fields)):
         raise TypeError(f"{section.__name__} has {', '.join(duplicate_names)} already")
     extended: type[SectionT] = create_model(
@@ -385,24 +393,24 @@ def _extend_section(section: type[SectionT], field_definitions: dict[str, Any]) 
 
 
 def rule_of_field(field: Any) -> Rule | None:
-    """Return the rule in a field's metadata; None if it has none."""
+    """Return the rule in the metadata of a pydantic field; None if the field has no rule."""
     return next((item for item in field.metadata if isinstance(item, Rule)), None)
 
 
 def yaml_name(name: str, field: Any) -> str:
-    """Return a field's name in a spec: its alias, such as `from`, else its attribute name."""
+    """Return the name that a pydantic field has in a spec: its alias, else its attribute's name."""
     return str(field.alias or name)
 
 
 def fields_by_name(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the fields of a model (section) by the names that they have in a spec."""
+    """Return the pydantic fields of a section's model, by the names that they have in a spec."""
     return {yaml_name(name, field): field for name, field in model.model_fields.items()}
 
 
 def rules_by_path(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
-    """Return the rules of a model's fields and nested sections, by dotted path.
+    """Return the rules of all fields in a section's model and its nested models, by dotted path.
 
-    Every path begins with `prefix`, the path of the model itself.
+    Every path begins with `prefix`, the path of the section itself.
     """
     rules: dict[str, Rule] = {}
     for name, field in model.model_fields.items():
@@ -416,7 +424,7 @@ def rules_by_path(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
 
 
 def models_of_annotation(annotation: Any) -> ModelClasses:
-    """Return the pydantic models in a type annotation: several if it is a union of models."""
+    """Return the pydantic models in a type annotation: one, several (a union), or none."""
     if get_origin(annotation) is Annotated:
         return models_of_annotation(get_args(annotation)[0])
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -429,15 +437,15 @@ def models_of_annotation(annotation: Any) -> ModelClasses:
 
 
 def kind_of_model(model: type[BaseModel]) -> str:
-    """Return the value of the field ``kind`` that selects a model; empty for models without it."""
+    """Return the value of the field ``kind`` that selects a model; empty for a model without it."""
     field = model.model_fields.get("kind")
     return str(get_args(field.annotation)[0]) if field is not None else ""
 
 
 def _element_annotation(annotation: Any) -> Any:
-    """Return the annotation of the values of a mapping or the elements of a list.
+    """Return the type annotation of a dict's values, or of the elements of a list or tuple.
 
-    The result is None for other annotations.
+    The result is None if `annotation` is neither a dict nor a list or tuple.
     """
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
@@ -448,7 +456,7 @@ def _element_annotation(annotation: Any) -> Any:
 
 
 def reachable_models(*roots: type[BaseModel]) -> list[type[BaseModel]]:
-    """Return the given models and all models nested in them, without duplicates."""
+    """Return the models `roots` and all models nested in them, each once."""
     visited: dict[type[BaseModel], None] = {}
     pending = list(roots)
     while pending:
@@ -469,11 +477,12 @@ class ModelLocation(NamedTuple):
     """Location of a value in a spec, with the models of the value and of the section around it."""
 
     keys: SpecLocation
-    """Keys and indices that lead to the value in the file."""
+    """Keys and list indices that lead to the value in the file."""
     value_models: ModelClasses
-    """Pydantic models that the value may have, one for each ``kind``; empty if it is no section."""
+    """Pydantic models that the value may have, one for each ``kind``; empty if the value is no
+    section."""
     enclosing_section_models: ModelClasses
-    """Pydantic models that the section around the value may have, one for each ``kind``."""
+    """Pydantic models that the enclosing section may have, one for each ``kind``."""
 
 
 def translate_pydantic_location(pydantic_location: SpecLocation, root: Any) -> ModelLocation:
@@ -508,7 +517,7 @@ def translate_pydantic_location(pydantic_location: SpecLocation, root: Any) -> M
 
 
 def validate_or_none(annotation: Any, raw_value: object) -> Any:
-    """Validate a part of a spec by itself; return None if it is invalid.
+    """Validate a part of a spec without the rest; return the model, or None if the part is invalid.
 
     Parameters
     ----------
@@ -525,7 +534,7 @@ def validate_or_none(annotation: Any, raw_value: object) -> Any:
 
 @cache
 def _type_adapter(annotation: Any) -> TypeAdapter[Any]:
-    """Return the pydantic adapter of an annotation."""
+    """Return the pydantic `TypeAdapter` for a type annotation, from a cache."""
     return TypeAdapter(annotation)
 
 
@@ -533,28 +542,28 @@ class FieldValue(NamedTuple):
     """Value of a field in a section of a spec."""
 
     key_path: KeyPath
-    """Keys that lead to the field."""
+    """Keys that lead to the field in the spec."""
     rule: Rule
-    """Rule of the field."""
+    """Rule that the field's values obey."""
     value: Any
-    """Value in SI units."""
+    """The field's value after reading, in SI units."""
 
 
 class FileField(NamedTuple):
     """Field of a section that names a file."""
 
     key_path: KeyPath
-    """Keys that lead to the field."""
+    """Keys that lead to the field from its section."""
     rule: FilePathRule
-    """Rule that reads the field's path."""
+    """Rule that reads the path and computes the file's digest."""
     raw_path: str
     """Path of the file, as written in the spec."""
 
 
 def iter_section_values(section: BaseModel, prefix: KeyPath = ()) -> Iterator[FieldValue]:
-    """Yield path, rule and SI value of every value in a section and its nested sections.
+    """Yield a `FieldValue` for each field of a section and its nested sections, except None values.
 
-    Values that are None are skipped.
+    Each key path begins with `prefix`, the keys that lead to the section.
     """
     for name, field in type(section).model_fields.items():
         value, key_path = getattr(section, name), (*prefix, yaml_name(name, field))
@@ -571,7 +580,7 @@ def iter_section_values(section: BaseModel, prefix: KeyPath = ()) -> Iterator[Fi
 def values_by_path(
     section: BaseModel, prefix: KeyPath = (), digests: Mapping[str, str] = MappingProxyType({})
 ) -> dict[str, Any]:
-    """Return the SI values of a section by dotted path.
+    """Return the SI values of all fields in a section and its nested sections, by dotted path.
 
     Parameters
     ----------
@@ -590,7 +599,10 @@ def values_by_path(
 
 
 def set_if_absent(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
-    """Set a value at a path of nested mappings if there is none; return True if it was set."""
+    """Set a value in nested mappings, in place, unless there is one; return True if it was set.
+
+    `path` lists the keys. Missing mappings on the way are created.
+    """
     for name in path[:-1]:
         mapping = mapping.setdefault(name, {})
         if not isinstance(mapping, dict):
@@ -604,9 +616,9 @@ def set_if_absent(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
 
 
 def to_canonical_data(value: Any) -> Any:
-    """Return data in a form in which equal data has equal JSON text.
+    """Return a copy of plain data in a form in which equal data has equal JSON text.
 
-    Floats without a fraction below 2**53 become integers, keys are sorted, and tuples become lists.
+    Whole floats below 2**53 become integers, keys are sorted, and tuples become lists.
     """
     if isinstance(value, Mapping):
         return {str(key): to_canonical_data(value[key]) for key in sorted(value)}
@@ -618,10 +630,10 @@ def to_canonical_data(value: Any) -> Any:
 
 
 def identity_digest(identity: Mapping[str, Any]) -> str:
-    """Return the hash of a study's identity.
+    """Return the hash of a study's identity, 32 hexadecimal digits.
 
-    Two studies are the same if their identities are equal. The hash is BLAKE2b of the canonical
-    JSON text, 32 hexadecimal digits.
+    Two studies are the same if their identities are equal. The hash is BLAKE2b of the identity's
+    canonical JSON text.
     """
     text = json.dumps(
         to_canonical_data(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
@@ -637,17 +649,17 @@ class SpecFiles:
     """Files that a spec names, with the digests that they had when it was loaded."""
 
     base_folder: Path
-    """Folder that paths in the spec are relative to."""
+    """Folder that relative paths in the spec refer to."""
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Digest of each file's content, by the file's path as written in the spec."""
+    """Digest of each file's content when the spec was loaded, by the file's path as written."""
     time_origin: Decimal = Decimal(0)
-    """Time in the tables of waypoints at which the flight begins [s].
+    """Time at which the flight begins, on the clock of the tables of waypoints [s].
 
-    It is the first time in the platform's table.
+    It is the first time in the platform's table, and 0 without a table.
     """
 
     def resolve(self, raw_path: str, digest_of: Callable[[Path], str] = file_digest) -> Path:
-        """Return the path of a file, with ``~`` as the user's home folder.
+        """Return the full path of a file; ``~`` stands for the user's home folder.
 
         Parameters
         ----------
@@ -673,7 +685,7 @@ class SpecFiles:
 
 
 def iter_file_fields(section: BaseModel) -> Iterator[FileField]:
-    """Yield all fields of a section that name a file."""
+    """Yield a `FileField` for each field in a section, or nested in it, that names a file."""
     for key_path, rule, value in iter_section_values(section):
         if isinstance(rule, FilePathRule):
             yield FileField(key_path, rule, value)

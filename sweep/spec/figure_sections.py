@@ -22,17 +22,17 @@ from sweep.spec.sections import SPECTRA_METHOD, parameter_rules
 from sweep.units import QuantityError, read_number
 
 CoordinateSelection = str | int | float | tuple[str | int | float, ...]
-"""One value, or several values, of a coordinate, as written in a spec."""
+"""Value of a coordinate as written in a spec, or several values in a tuple."""
 PublishedNumbers = tuple[Any, ...]
-"""Numbers from a publication for comparison, in nested tuples of SI values."""
+"""Numbers from a publication as SI values, in nested tuples, for comparison with results."""
 CropLimits = tuple[float, ...]
-"""Lower and upper limit of a scene's coordinate [m], or of time [s], that a figure shows."""
+"""Least and greatest value of a coordinate [m], or of time [s], that a figure shows."""
 
 
 def _read_coordinate_selection(raw_value: object) -> dict[str, CoordinateSelection]:
-    """Check a mapping of coordinates to a value or a list of values; return it as written.
+    """Check a dict of values, or lists of values, by coordinate; return a dict of the same values.
 
-    Lists become tuples.
+    Lists become tuples. Raise `QuantityError` if the dict is invalid.
     """
     if not isinstance(raw_value, dict):
         problem = "must be a mapping of coordinates to values"
@@ -46,14 +46,14 @@ def _read_coordinate_selection(raw_value: object) -> dict[str, CoordinateSelecti
 
 
 def _read_selected_value(raw_value: object) -> str | int | float:
-    """Check that one value of a coordinate is text or a number; return it as written."""
+    """Return a coordinate's value as written; raise `QuantityError` if it is no text or number."""
     if isinstance(raw_value, bool) or not isinstance(raw_value, str | int | float):
         raise QuantityError("must hold a value, or a list of values, of each coordinate")
     return raw_value
 
 
 def _read_published_numbers(raw_value: object) -> PublishedNumbers:
-    """Read numbers in nested lists; return nested tuples of SI values."""
+    """Convert nested lists of numbers as written to nested tuples of SI values."""
     if not isinstance(raw_value, list | tuple):
         raise QuantityError("must be a list of numbers or of rows of numbers")
     return tuple(
@@ -65,7 +65,7 @@ def _read_published_numbers(raw_value: object) -> PublishedNumbers:
 
 
 def _read_published_number(raw_value: object) -> float:
-    """Read one number; return its SI value."""
+    """Convert one number as written, such as ``5 %``, to a float."""
     return read_number(raw_value).to_si()
 
 
@@ -97,7 +97,7 @@ _PUBLISHED_NUMBERS_RULE = CustomRule(
 
 
 def _name_in_store_field(description: str, example: str, default: Any = ...) -> Any:
-    """Declare a field that holds the name of a coordinate or variable of a store."""
+    """Return the declaration of a field for the name of a coordinate or variable of a store."""
     pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
     return declare.text_field(
         f"Name of {description}", default, pattern=pattern, remedy=f"take {example}"
@@ -105,7 +105,7 @@ def _name_in_store_field(description: str, example: str, default: Any = ...) -> 
 
 
 def _coordinate_name_field(default: Any = ...) -> Any:
-    """Declare a field that holds the name of a coordinate."""
+    """Return the declaration of a field for the name of a coordinate of a store."""
     example = "the last part of an axis's path, such as 'range'"
     return _name_in_store_field("a coordinate: the last part of an axis's path", example, default)
 
@@ -119,9 +119,9 @@ class FigureBase(SpecSection):
     """Base of all figures and tables."""
 
     FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields whose values make up the file name.
+    """Names of the fields whose values, joined by underscores, make up the figure's file name.
 
-    Entries that name no field are used as they are.
+    A text in the tuple that names no field is itself a part of the file name.
     """
 
     name: str = declare.text_field(
@@ -134,7 +134,7 @@ class FigureBase(SpecSection):
 
     @property
     def file_stem(self) -> str:
-        """File name of the picture without suffix: `name`, or `FILE_NAME_PARTS` and the kind."""
+        """File name without suffix: `name`, or if it is empty, `FILE_NAME_PARTS` and ``kind``."""
         words = [
             getattr(self, name_part, name_part) for name_part in (*self.FILE_NAME_PARTS, "kind")
         ]
@@ -242,13 +242,10 @@ FIGURE_QUANTITIES = (
     *(name for name, output in _PLOTTABLE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
-"""Names of the quantities of shots and of points that a scene's figure can show."""
+"""Names of the quantities of shots and of points that a figure of a scene can show."""
 
 SHOT_WITH_SEVERAL_SURFACES_KEYWORD = "several_surfaces"
-"""Word that may replace a shot's number in a figure.
-
-It selects the first shot whose footprint has several surfaces.
-"""
+"""Word for the field ``shot`` of a figure: the first shot whose footprint has several surfaces."""
 _VIEW_DIRECTION_RULE = ChoiceRule(
     description="Direction from which the cloud is seen",
     options=("oblique", "above", "side", "front"),
@@ -262,7 +259,10 @@ _EYE_ANGLE_RULES = {
 
 
 def _read_view_direction(raw_value: object) -> str | dict[str, float]:
-    """Read a view: a word, or azimuth and elevation of the eye, returned in rad."""
+    """Return the direction of view: a word as written, or azimuth and elevation of the eye [rad].
+
+    Raise `QuantityError` if the value as written is invalid.
+    """
     if not isinstance(raw_value, dict):
         return _VIEW_DIRECTION_RULE.read(raw_value)
     if set(raw_value) != set(_EYE_ANGLE_RULES):
@@ -289,7 +289,7 @@ _VIEW_RULE = CustomRule(
 
 
 def _plotted_quantity_field(description: str, default: Any = ...) -> Any:
-    """Declare a field that holds the name of a quantity of shots or points."""
+    """Return the declaration of a field for the name of a quantity of shots or points to plot."""
     remedy = "take range, radial_velocity, snr, pd, surface, beam, time or altitude"
     problem = "is no quantity of shots or points"
     return declare.field_with_rule(
@@ -301,7 +301,7 @@ def _plotted_quantity_field(description: str, default: Any = ...) -> Any:
 
 
 def _crop_field(axis: str) -> Any:
-    """Declare a field that holds the lower and upper limit of a scene's coordinate [m]."""
+    """Return the declaration of a field for the two limits of a coordinate that is shown [m]."""
     rule = declare.quantity_rule("Coordinate", "m", "100 m")
     return declare.list_field(
         rule, 2, 2, None, description=f"Part along {axis}", is_increasing=True
@@ -406,16 +406,16 @@ SceneFigure = Annotated[
 # Checks of figures
 
 _COORDINATE_FIELD_NAMES = ("x", "y", "by", "rows", "columns")
-"""Fields of a grid's figure whose value is the name of a coordinate."""
+"""Names of the fields of a grid's figures that hold the name of a coordinate."""
 
 NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
-"""Minimum number of shots in a measurement cycle from which a velocity can be computed."""
+"""Smallest number of shots in a measurement cycle from which a velocity vector can be computed."""
 
 
 def grid_figure_findings(
     raw_spec: Mapping[str, Any], axes: tuple[Axis, ...], extra_variables: Collection[str] = ()
 ) -> Iterator[Finding]:
-    """Yield mistakes in the figures of a grid's spec.
+    """Yield a `Finding` for each mistake in the figures of a grid's spec.
 
     Parameters
     ----------
@@ -446,7 +446,7 @@ def grid_figure_findings(
 def scene_figure_findings(
     raw_spec: Mapping[str, Any], axes: tuple[Axis, ...] | None
 ) -> Iterator[Finding]:
-    """Yield mistakes in the figures of a scene's spec.
+    """Yield a `Finding` for each mistake in the figures of a scene's spec.
 
     Parameters
     ----------
@@ -474,7 +474,7 @@ def scene_figure_findings(
 def _iter_readable_figures(
     raw_spec: Mapping[str, Any], annotation: Any
 ) -> Iterator[tuple[SpecLocation, Any]]:
-    """Yield location and model of each figure that can be read."""
+    """Yield a pair (location, model) for each figure of a spec that can be read."""
     figures = raw_spec.get("figures")
     for i, raw_figure in enumerate(figures if isinstance(figures, list | tuple) else ()):
         if (figure := validate_or_none(annotation, raw_figure)) is not None:
@@ -484,7 +484,7 @@ def _iter_readable_figures(
 def _duplicate_file_name_findings(
     raw_spec: Mapping[str, Any], annotation: Any, problem: str
 ) -> Iterator[Finding]:
-    """Yield a finding for each figure that has the same file name as an earlier one."""
+    """Yield a `Finding` for each figure with the same file name as an earlier figure."""
     stems: set[str] = set()
     for location, figure in _iter_readable_figures(raw_spec, annotation):
         if figure.file_stem in stems:
@@ -495,9 +495,9 @@ def _duplicate_file_name_findings(
 def _figure_coordinate_findings(
     figure: Any, axes: tuple[Axis, ...], figure_location: SpecLocation
 ) -> Iterator[Finding]:
-    """Yield mistakes in the coordinates that a figure names, and in values that it selects.
+    """Yield a `Finding` for each unknown coordinate of a figure, and for each wrong value of one.
 
-    Figures of scenes may select only one value of a coordinate.
+    A figure of a scene may select only one value of a coordinate.
     """
     is_grid_figure = isinstance(figure, GridFigureBase)
     coordinate_names = (
@@ -536,7 +536,7 @@ def _figure_coordinate_findings(
 def _figure_variable_findings(
     figure: Any, draws: object, extra_variables: Collection[str], location: SpecLocation
 ) -> Iterator[Finding]:
-    """Yield a finding if a figure shows a variable that the study does not store."""
+    """Yield a `Finding` if a figure of a grid shows a variable that the study does not store."""
     variable = getattr(figure, "variable", None)
     amount_fields = ("number", "limit") if isinstance(draws, Mapping) else ()
     has_draws = any(draws.get(name, 0) not in (0, "0") for name in amount_fields)  # type: ignore[attr-defined]
@@ -564,7 +564,7 @@ def _figure_variable_findings(
 
 
 def _spectra_variable_findings(figure: Any, location: SpecLocation) -> Iterator[Finding]:
-    """Yield a finding if a figure shows a result that a study of whole spectra does not store."""
+    """Yield a `Finding` if a figure shows what a study of whole spectra does not store."""
     stored_variables = (
         outputs.SPECTRA_STUDY_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
     )
@@ -585,7 +585,10 @@ def _spectra_variable_findings(figure: Any, location: SpecLocation) -> Iterator[
 def _figure_scanner_findings(
     figure: Any, scanners: Mapping[str, Any], location: SpecLocation
 ) -> Iterator[Finding]:
-    """Yield a finding for each missing scanner, and for too few shots per cycle for navigation."""
+    """Yield a `Finding` for each unknown scanner of a figure, and for too few shots per cycle.
+
+    A figure of navigation needs a scanner with three or more shots per cycle.
+    """
     single_scanner, listed_scanners = (
         getattr(figure, "scanner", None),
         getattr(figure, "scanners", None) or (),
@@ -616,9 +619,9 @@ def _figure_scanner_findings(
 
 
 def _allows_navigation(raw_scanner: object) -> bool:
-    """Return True if a scanner has enough shots per cycle to compute a velocity.
+    """Return True if a scanner has enough shots per cycle for a velocity, or can't be read.
 
-    The result is also True if the scanner can't be read.
+    `raw_scanner` is the scanner's section as parsed from YAML.
     """
     scanner = validate_or_none(AnyScanner, raw_scanner)
     try:
@@ -633,9 +636,9 @@ def _allows_navigation(raw_scanner: object) -> bool:
 def _draw_number_findings(
     figure: Any, raw_draws: object, location: SpecLocation
 ) -> Iterator[Finding]:
-    """Yield a finding if a figure shows a draw that the study does not make.
+    """Yield a `Finding` if a figure shows a draw whose number is not below the number of draws.
 
-    Studies whose draws can't be read are skipped.
+    There is no finding if the section ``draws`` can't be read.
     """
     draw, draws = getattr(figure, "draw", 0), validate_or_none(SceneDraws, raw_draws or {})
     if draws is not None and draw >= draws.number:

@@ -21,7 +21,7 @@ from sweep.spec.rules import JsonObject, ListRule, Rule, read_list_element
 from sweep.units import QuantityError
 
 TimeSpan = tuple[float, float]
-"""Start and stop of a time interval [s]."""
+"""Start and end of a time interval [s]."""
 
 
 class StraightPath(SpecSection):
@@ -38,7 +38,7 @@ class StraightPath(SpecSection):
     def build_trajectory(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.Trajectory:
-        """Return the trajectory along the straight line; `files` and `span` are not used."""
+        """Return the trajectory along a straight line; the arguments are not used."""
         return motion_laws.straight_trajectory(
             start_point=self.begin,
             end_point=self.to,
@@ -61,7 +61,7 @@ class AccelerationPath(SpecSection):
     def build_trajectory(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.Trajectory:
-        """Return the trajectory of constant acceleration; `files` and `span` are not used."""
+        """Return the trajectory of constant acceleration; the arguments are not used."""
         path_class = motion_laws.ConstantAcceleration
         return path_class(self.position, self.velocity, self.acceleration, self.duration)
 
@@ -97,7 +97,7 @@ class StationaryPath(SpecSection):
     def build_trajectory(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.Trajectory:
-        """Return the trajectory of a body at rest, over its `duration` or else over `span`.
+        """Return the trajectory of a body at rest, which lasts for `duration`, else for `span`.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class Orientation(SpecSection):
     )
 
     def to_quaternion(self) -> np.ndarray:
-        """Return the unit quaternion (4,) as w, x, y, z.
+        """Return the orientation as a unit quaternion (4,) with the components w, x, y, z.
 
         Raises
         ------
@@ -160,7 +160,10 @@ class NadirAttitude(SpecSection):
     )  # fmt: skip
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the attitude law of a level body, with a fixed heading or that of its track."""
+        """Return the attitude law of a level body; the arguments are not used.
+
+        The heading is fixed, or follows the direction of motion if it is ``track``.
+        """
         return motion_laws.NadirAttitude(None if self.heading == "track" else float(self.heading))
 
 
@@ -171,7 +174,10 @@ class AlongTrackAttitude(SpecSection):
     roll: float = declare.angle_field("Angle by which the left side is up", default=0.0)
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the attitude law of a body whose forward axis points along its velocity."""
+        """Return the attitude law of a body that points along its velocity.
+
+        The arguments are not used.
+        """
         return motion_laws.AlongTrackAttitude(self.roll)
 
 
@@ -181,7 +187,7 @@ class FixedAttitude(Orientation):
     kind: Literal["fixed"]
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the attitude law of a constant attitude."""
+        """Return the attitude law of a constant orientation; the arguments are not used."""
         return motion_laws.FixedAttitude(self.to_quaternion())
 
 
@@ -194,7 +200,7 @@ class SpinningAttitude(Orientation):
     )
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the attitude law of a constant angular velocity, from the start of `path`."""
+        """Return the attitude law of a constant angular velocity from the start of `path` on."""
         return motion_laws.SpinningAttitude(
             self.angular_velocity, self.to_quaternion(), path.start_time
         )
@@ -209,7 +215,7 @@ class TabulatedAttitude(SpecSection):
     )
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the attitude law that interpolates the attitudes of a table.
+        """Return the attitude law that interpolates between the orientations in a table.
 
         Raises
         ------
@@ -244,7 +250,7 @@ class RigidMotion(SpecSection):
     def build_moving_body(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.MovingBody:
-        """Return the motion of the body: position and attitude as functions of time.
+        """Return the motion of a rigid body: trajectory and attitude as functions of time.
 
         Parameters
         ----------
@@ -264,9 +270,9 @@ class RigidMotion(SpecSection):
     def build_attitude(
         self, files: SpecFiles, path: motion_laws.Trajectory
     ) -> motion_laws.AttitudeLaw:
-        """Return the attitude law along a path.
+        """Return the attitude law of the body on `path`.
 
-        A tabulated attitude without a file of its own is read from the path's file of waypoints.
+        A tabulated attitude without a file is read from the table of waypoints of the path.
         """
         attitude = self.attitude
         if (
@@ -292,9 +298,9 @@ class Platform(RigidMotion):
     )  # fmt: skip
 
     def read_time_origin(self, files: SpecFiles) -> Decimal:
-        """Return the exact time in the tables of waypoints at which the flight begins [s].
+        """Return the first time in the path's table of waypoints [s], exactly as written.
 
-        This is the first time of the path's table, or 0 if the path is not given by a table.
+        The flight begins at this time. The result is 0 if the path has no table.
         """
         from sweep.scenes.scene_files import read_first_waypoint_time
 
@@ -305,7 +311,7 @@ class Platform(RigidMotion):
     def build_moving_body(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.MovingBody:
-        """Return the motion of the instrument on its platform, with lever arm and mounting applied.
+        """Return the motion of the instrument, mounted on its platform with a lever arm.
 
         Parameters
         ----------
@@ -334,26 +340,30 @@ class Platform(RigidMotion):
 # Scan patterns
 
 BEAMS_MAX = 10_000
-"""Maximum number of beams of a scanner; also of directions along each side of a raster scan."""
+"""Largest number of beams of a scanner, and of rows or columns of a raster scan."""
 STEERING_ANGLES_RULE = ListRule(
     description="Angles of a beam towards forward and towards the left",
     element_rule=declare.quantity_rule("Angle from nadir", "rad", "22.5 deg", "-89 deg", "89 deg"),
     length_min=2,
     length_max=2,
 )
-"""Rule of a beam's direction that is given by two steering angles [rad]."""
+"""Rule of a beam direction as two angles from nadir [rad]: towards forward, and towards the
+left."""
 _DIRECTION_VECTOR_RULE = ListRule(
     description="Direction of a beam in the body frame",
     element_rule=declare.quantity_rule("Component", "", "-1", "-1e9", "1e9"),
 )
-"""Rule of a beam's direction that is given by three components in the body frame."""
+"""Rule of a beam direction as a vector of three components in the body frame."""
 
 
 class BeamDirectionsRule(Rule):
     """Rule of a list of beam directions: steering angles, or vectors in the body frame."""
 
     def read(self, raw_value: object) -> tuple[tuple[float, ...], ...]:
-        """Return a tuple for each beam: two steering angles [rad] or three vector components."""
+        """Return a tuple per beam: two steering angles [rad] or three vector components.
+
+        Raise `QuantityError` if the list as written is invalid.
+        """
         remedy = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
         if not isinstance(raw_value, list | tuple) or not 0 < len(raw_value) <= BEAMS_MAX:
             raise QuantityError(f"must be a list of 1 to {BEAMS_MAX} beams", remedy)
@@ -363,7 +373,10 @@ class BeamDirectionsRule(Rule):
         )
 
     def format(self, value: Any) -> Any:
-        """Return the beams as a spec would hold them; `read` converts them back exactly."""
+        """Return a tuple of beam directions as a spec would hold it: a list of lists.
+
+        `read` converts the list back to exactly the same tuple.
+        """
         return [beam_direction_rule(beam).format(beam) for beam in value]
 
     def _value_schema(self) -> JsonObject:
@@ -373,7 +386,7 @@ class BeamDirectionsRule(Rule):
 
 
 def beam_direction_rule(beam: object) -> ListRule:
-    """Return the rule of one beam: a direction vector for three numbers, else two angles."""
+    """Return the rule of a beam direction: a vector if `beam` has 3 numbers, else two angles."""
     return (
         _DIRECTION_VECTOR_RULE
         if isinstance(beam, list | tuple) and len(beam) == 3
@@ -382,7 +395,7 @@ def beam_direction_rule(beam: object) -> ListRule:
 
 
 _NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
-"""Smallest and largest angle between a beam and the downward vertical (nadir), with units."""
+"""Least and greatest angle between a beam and straight down (nadir), with units."""
 _CYCLE_RATE_FIELD = declare.frequency_field("Number of measurement cycles per second")
 _BEAM_INTERVAL_FIELD_DEFAULT_ZERO = declare.duration_field(
     "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
@@ -408,7 +421,7 @@ class ConeScanner(SpecSection):
     interval: float = _BEAM_INTERVAL_FIELD_DEFAULT_ZERO
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern of beams on a cone around nadir."""
+        """Return the scan pattern of beams on a cone around nadir, which fire in every cycle."""
         directions = scan_patterns.cone_directions(
             self.beams, half_angle=self.half_angle, azimuth=self.azimuth
         )
@@ -429,7 +442,7 @@ class FixedBeamsScanner(SpecSection):
     interval: float = _BEAM_INTERVAL_FIELD_DEFAULT_ZERO
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern of beams at the given directions."""
+        """Return the scan pattern of beams in the directions `beams`, which fire in every cycle."""
         directions = [
             scan_patterns.steered_directions(*beam) if len(beam) == 2 else np.array(beam)  # type: ignore[arg-type]
             for beam in self.beams
@@ -450,7 +463,7 @@ class CornersScanner(SpecSection):
     interval: float | None = _BEAM_INTERVAL_FIELD_DEFAULT_UNIFORM
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern of a beam steered to the four corners of a square."""
+        """Return the scan pattern of one beam that is steered to the four corners of a square."""
         return scan_patterns.fixed_beams(
             scan_patterns.corner_directions(self.angle), rate=self.rate, interval=self.interval
         )
@@ -468,7 +481,7 @@ class SquaresScanner(SpecSection):
     interval: float | None = _BEAM_INTERVAL_FIELD_DEFAULT_UNIFORM
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern of a beam steered along squares, one square per cycle."""
+        """Return the scan pattern of one beam that is steered along squares, one per cycle."""
         directions, visited_directions = scan_patterns.square_patterns(self.elements)
         return scan_patterns.BeamCycle(directions, visited_directions, self.rate, self.interval)
 
@@ -487,7 +500,7 @@ class RasterScanner(SpecSection):
     both_ways: bool = declare.flag_field("Every other row runs backwards", default=True)
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern of a beam steered over a grid, one grid per cycle."""
+        """Return the scan pattern of one beam, steered over a grid of directions per cycle."""
         return scan_patterns.raster_scan(**self.model_dump(exclude={"kind"}))
 
 
@@ -508,7 +521,7 @@ class LineScanner(SpecSection):
     interval: float = _BEAM_INTERVAL_FIELD_DEFAULT_ZERO
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern of beams swept from side to side."""
+        """Return the scan pattern of beams that are swept together from side to side."""
         return scan_patterns.LineScan(**self.model_dump(exclude={"kind"}))
 
 

@@ -70,19 +70,18 @@ ROUGHNESS_PATH = "target.roughness"
 TRAINING_PATH, GUARD_PATH, RANK_PATH = (
     DETECTOR_PREFIX + name for name in ("training", "guard", "rank")
 )
-"""Dotted paths of the parameters of CFAR detectors: training cells, guard cells and rank.
+"""Dotted paths of a CFAR detector's parameters: training cells, guard cells and rank.
 
-Such a detector compares a bin with the noise in neighbouring bins, its training cells.
+A CFAR detector compares a bin with the noise in neighbouring bins, its training cells.
 """
 
 _WINDOW_TRIAL_SAMPLES_MAX = 16
-"""Maximum number of samples with which a window function is tried.
+"""Largest number of samples with which a window function is computed as a trial.
 
-`WindowFunctionRule` tries windows with this number too. A window that exists with this number of
-samples exists with any larger number.
+A window function that exists with this number of samples exists with any larger number.
 """
 _SPECTRUM_BINS_MIN = 8
-"""Minimum number of bins of a spectrum for detectors that examine the whole spectrum."""
+"""Smallest number of bins between DC and Nyquist for a detector that examines whole spectra."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +94,16 @@ class GridValues:
     field_values: Mapping[str, Any]
     """SI values of the parameters' fields, or their defaults, by dotted path.
 
-    `axes` overrides the value of a parameter on an axis.
+    The value of a parameter that is on one of the `axes` is not used.
     """
     axes: tuple[Axis, ...] = ()
     """Axes of the study."""
     effect_modes: Mapping[str, str] = field(default_factory=dict)
-    """Mode of each effect (auto, on, off) by the effect's name."""
+    """Mode of each effect (auto, on or off), by the effect's name."""
 
     @classmethod
     def from_raw_spec(cls, raw_spec: Mapping[str, Any], axes: tuple[Axis, ...]) -> GridValues:
-        """Read the values of a spec as parsed from YAML, without those that break their rule."""
+        """Return the values of a spec as parsed from YAML, except values that break a rule."""
         values: dict[str, Any] = {}
         for path, rule in parameter_rules().items():
             raw_value = raw_value_at(raw_spec, path)
@@ -119,11 +118,14 @@ class GridValues:
         return cls(values, axes, effect_modes)
 
     def has_values(self, *paths: str) -> bool:
-        """Return True if all given parameters could be read."""
+        """Return True if the spec has readable values for all parameters at the dotted paths."""
         return all(self.parameter_values(path).size for path in paths)
 
     def parameter_values(self, path: str) -> np.ndarray:
-        """Return a parameter's values (n,) over the grid; empty if it could not be read."""
+        """Return a parameter's values (n,) along its axis; (1,) for a parameter on no axis.
+
+        The array is empty if the parameter could not be read.
+        """
         for axis in self.axes:
             for parameter in axis.parameters:
                 if parameter.path == path:
@@ -131,7 +133,7 @@ class GridValues:
         return np.asarray([self.field_values[path]] if path in self.field_values else [])
 
     def make_finding(self, path: str, problem: str, remedy: str) -> Finding:
-        """Return a finding about a parameter, located at its axis, if any, else at its field."""
+        """Return a `Finding` about a parameter, located at its axis, if any, or at its field."""
         return Finding(parameter_location(path, self.axes), problem, remedy)
 
     def any_point_meets(self, conditions: Mapping[str, ValueCondition]) -> bool:
@@ -155,9 +157,9 @@ class GridValues:
         terms: Mapping[str, Callable[[Any], Any]],
         conditions: Mapping[str, ValueCondition] = MappingProxyType({}),
     ) -> dict[str, float]:
-        """Return the point of the grid that minimises a sum of functions of single parameters.
+        """Return the point of the grid at which a sum of functions of single parameters is least.
 
-        The axes are independent, so that each is minimised by itself.
+        Axes vary independently of each other, so that the sum is minimised axis by axis.
 
         Parameters
         ----------
@@ -189,7 +191,7 @@ class GridValues:
 
 
 def raw_value_at(raw_spec: Mapping[str, Any], path: str, default: object = MISSING) -> Any:
-    """Return the value written at a dotted path of a spec, or `default`."""
+    """Return the value written at a dotted path of a spec; `default` if there is none."""
     raw_value: Any = raw_spec
     for name in path.split("."):
         raw_value = raw_value.get(name, MISSING) if isinstance(raw_value, Mapping) else MISSING
@@ -197,7 +199,10 @@ def raw_value_at(raw_spec: Mapping[str, Any], path: str, default: object = MISSI
 
 
 def _condition_mask(axis: Axis, conditions: Mapping[str, ValueCondition]) -> np.ndarray:
-    """Return a mask (n,) of the points along an axis that meet the conditions on its parameters."""
+    """Return a mask (n,) of the values along an axis: True where all conditions are met.
+
+    Conditions on parameters that are not on the axis are ignored.
+    """
     is_met = np.ones(axis.size, bool)
     for parameter in axis.parameters:
         if parameter.path in conditions:
@@ -206,7 +211,7 @@ def _condition_mask(axis: Axis, conditions: Mapping[str, ValueCondition]) -> np.
 
 
 def grid_findings(grid: GridValues) -> list[Finding]:
-    """Return the mistakes in combinations of values of a study's grid."""
+    """Return a `Finding` for each invalid combination of values in a study's grid."""
     return [
         *(list(_echo_time_findings(grid)) or _window_findings(grid)),
         *_responsivity_findings(grid),
@@ -224,7 +229,10 @@ def grid_findings(grid: GridValues) -> list[Finding]:
 
 
 def _least_weighted_sum(grid: GridValues, weights: Mapping[str, float]) -> float | None:
-    """Return the minimum over a grid of a weighted sum of parameters; None if any is unknown."""
+    """Return the minimum over a grid of a weighted sum of parameters.
+
+    `weights` has the weights by dotted path. The result is None if a parameter could not be read.
+    """
     terms = {path: partial(operator.mul, weight) for path, weight in weights.items()}
     minimum = grid.argmin_of_sum(terms)
     return sum(weights[path] * minimum[path] for path in weights) if minimum else None
@@ -237,19 +245,19 @@ ECHO_TIME_PATHS = (
     SAMPLE_RATE_PATH,
     FFT_SIZE_PATH,
 )
-"""Dotted paths of the parameters that determine when a record ends and when its echo arrives."""
+"""Dotted paths of the parameters from which the echo's delay and the end of the record follow."""
 _ECHO_TIME_POINTS_MAX = 10**7
-"""Maximum number of combinations of `ECHO_TIME_PATHS` values at which echo times are checked.
+"""Largest number of points of a grid at which the delay of the echo is compared with the record.
 
-Grids with more combinations are not checked.
+Only axes over the parameters `ECHO_TIME_PATHS` count. Larger grids are not checked.
 """
 
 
 def _echo_time_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if no point of the grid has an echo in its record, or records are too short.
+    """Yield a `Finding` if no point of the grid has an echo in its record, or if records are short.
 
-    A record needs two samples. A grid in which only some points lack an echo is valid: these points
-    detect nothing.
+    A record needs two samples. A grid with an echo in the record of one point or more is valid. The
+    points without one detect nothing.
     """
     lateness = _least_echo_lateness(grid)
     if lateness is not None and lateness.after_chirp_end >= 0:
@@ -285,16 +293,16 @@ class _EchoLateness(NamedTuple):
     """
 
     after_chirp_end: float
-    """Time from the end of the chirp to the echo's arrival [s]."""
+    """Time from the end of the chirp to the arrival of the echo [s]."""
     after_record_end: float
-    """Time from the end of the record to the echo's arrival [s].
+    """Time from the end of the record to the arrival of the echo [s].
 
-    If the effect `overlap` is off, it is the time from the end of the chirp.
+    If the effect `overlap` is off, the time starts at the end of the chirp.
     """
 
 
 def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
-    """Return the smallest times over a grid from the ends of chirp and record to the echo.
+    """Return the least times, over a grid, from the ends of chirp and record to the echo's arrival.
 
     The result is None if a parameter could not be read, or if the grid is too large to evaluate.
     """
@@ -330,11 +338,10 @@ def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
 
 
 def _segment_samples_min(grid: GridValues) -> float | None:
-    """Return the smallest number of samples of a segment over the grid, not rounded.
+    """Return the smallest number of samples of a segment over a grid, as a float.
 
-    The number is (chirp duration - acquisition delay) * sample rate. It is evaluated at each value
-    of an axis over the sample rate. Each other axis contributes its smallest difference of the two
-    times. The result is None if one of the three parameters is not given.
+    The number is (chirp duration - acquisition delay) * sample rate. The result is None if one of
+    these three parameters could not be read.
     """
     if not grid.has_values(CHIRP_DURATION_PATH, ACQUISITION_DELAY_PATH, SAMPLE_RATE_PATH):
         return None
@@ -367,10 +374,7 @@ def _segment_samples_min(grid: GridValues) -> float | None:
 
 
 def _window_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if a window function does not exist for the number of samples of a record.
-
-    The shortest record of the grid counts.
-    """
+    """Yield a `Finding` if a window function does not exist for the grid's shortest record."""
     samples = _segment_samples_min(grid)
     if samples is None or not grid.has_values(WINDOW_PATH, FFT_SIZE_PATH):
         return
@@ -389,10 +393,10 @@ def _window_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _responsivity_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if the detector's responsivity exceeds one electron per photon.
+    """Yield a `Finding` if the detector's responsivity exceeds one electron per photon.
 
-    That limit is q lambda / (h c) [A/W], with the elementary charge q, wavelength lambda, Planck's
-    constant h and the speed of light c.
+    One electron per photon is q lambda / (h c) [A/W], with the elementary charge q, the wavelength
+    lambda, Planck's constant h and the speed of light c.
     """
     responsivity_per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
     least_margin = _least_weighted_sum(
@@ -409,7 +413,7 @@ def _responsivity_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if the table of the frequency error does not cover the longest chirp."""
+    """Yield a `Finding` if the table of the sweep's frequency error is shorter than a chirp."""
     table_text = grid.field_values.get(ERROR_TABLE_PATH, NO_TABLE)
     if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
         return
@@ -431,11 +435,12 @@ _SINGLE_MODE_CONDITIONS = {
     beam.COUPLING_PATH: condition_equal_to(beam.SINGLE_MODE_COUPLING),
     beam.ARCHITECTURE_PATH: condition_different_from("direct"),
 }
-"""Conditions on parameters under which a coherent receiver couples to a single spatial mode."""
+"""Conditions on parameters, by dotted path, under which a coherent receiver mixes one spatial
+mode."""
 
 
 def _beam_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the beam's width: stated twice or not at all, too large, or too small."""
+    """Yield a `Finding` if the beam's width is stated twice, not at all, or is impossible."""
     if not grid.has_values(
         beam.WAVELENGTH_PATH, beam.APERTURE_DIAMETER_PATH, beam.DIVERGENCE_PATH, beam.WAIST_PATH
     ):
@@ -451,7 +456,7 @@ def _beam_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for beams that are narrower or wider than possible.
+    """Yield a `Finding` for a beam that is narrower than its aperture can make, or too wide.
 
     Notes
     -----
@@ -498,10 +503,10 @@ def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> str:
-    """Describe a beam of the study that its aperture can't make; return '' if there is none.
+    """Return a sentence on a beam of the study that its aperture can't make; '' if there is none.
 
-    Covers direct detection and receivers with ``coupling: aperture``. For other receivers such a
-    beam is a mistake (`grid_findings`).
+    Only direct detection and receivers with ``coupling: aperture`` are examined. For other
+    receivers an impossible beam is a mistake in the spec (`grid_findings`).
 
     Parameters
     ----------
@@ -535,10 +540,10 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
 def _narrowest_impossible_beam(
     grid: GridValues, conditions: Mapping[str, ValueCondition]
 ) -> tuple[dict[str, float], float] | None:
-    """Find the beam that is furthest below the divergence limit of its aperture.
+    """Return the parameters of the beam that is furthest below its aperture's limit, and the limit.
 
-    Return its parameters and the limit [rad]; None if all beams that meet the conditions are
-    possible.
+    The limit is the least full divergence [rad] that the aperture can make. The result is None if
+    all beams that meet `conditions` are possible.
     """
     # This product of powers is proportional to the ratio of the waist to the radius of the
     # aperture.
@@ -560,7 +565,10 @@ def _narrowest_impossible_beam(
 def _convert_between_waist_and_divergence(
     parameters: Mapping[str, float], waist_or_divergence: float
 ) -> float:
-    """Convert a beam's waist radius [m] to its full divergence [rad], or the reverse."""
+    """Convert a beam's waist radius [m] to its full divergence [rad], or the reverse.
+
+    Both conversions are the same formula. `parameters` supplies wavelength and beam quality.
+    """
     return float(
         beam.divergence_from_waist(
             waist_or_divergence,
@@ -573,19 +581,17 @@ def _convert_between_waist_and_divergence(
 def _argmax_of_product(
     grid: GridValues, powers: Mapping[str, float], conditions: Mapping[str, ValueCondition]
 ) -> dict[str, float]:
-    """Return the parameters at which a product of powers of them is largest.
+    """Return the parameters, by dotted path, at which a product of their powers is largest.
 
-    The result is empty if no point of the grid meets the conditions.
+    `powers` has the exponents by dotted path. The result is empty if no point of the grid meets
+    `conditions`.
     """
     terms = {path: partial(_exponent_times_log, -power) for path, power in powers.items()}
     return grid.argmin_of_sum(terms, conditions)
 
 
 def _exponent_times_log(power: float, values: np.ndarray) -> np.ndarray:
-    """Return ``power * log(values)``, a term in the logarithm of a product of powers.
-
-    It is infinite where a value is 0.
-    """
+    """Return ``power * log(values)`` as an array; infinite where a value is 0."""
     with np.errstate(divide="ignore"):
         return np.asarray(power * np.log(values))
 
@@ -593,16 +599,15 @@ def _exponent_times_log(power: float, values: np.ndarray) -> np.ndarray:
 # Looks
 
 VOTING_LOOKS_MAX = 64
-"""Maximum number of looks of a shot whose detections are combined by votes.
-
-A look is one record of each segment (chirp).
-"""
+"""Largest number of looks (records of each segment) of a shot whose detections are counted as
+votes."""
 
 
 def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the settings of several looks, the repeated records of each segment.
+    """Yield a `Finding` for each invalid setting of several looks, the records of each segment.
 
-    Mistakes are settings that contradict each other, or whose detection probability is unknown.
+    Settings are invalid if they contradict each other, or if their detection probability is
+    unknown.
     """
     several_looks: dict[str, ValueCondition] = {looks.LOOKS_NUMBER_PATH: exceeds_one}
     combined_by_bin: dict[str, ValueCondition] = {
@@ -679,9 +684,9 @@ def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
-    """Yield a finding if noise is to be drawn together with leaked light or several looks.
+    """Yield a `Finding` if noise is drawn where leaked light or several looks forbid it.
 
-    Looks are repeated records of each segment.
+    `method` is the value of ``draws.method``. Looks are repeated records of each segment.
     """
     if method != "probabilities" and grid.any_point_meets(
         {circulator_leak.LEAK_LENGTH_PATH: is_positive}
@@ -702,10 +707,10 @@ def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
 
 
 def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the search band, the ranges and velocities in which echoes are searched.
+    """Yield a `Finding` for each mistake in the search band: the ranges and velocities searched.
 
-    Its four limits must all be given, or none. Each upper limit must exceed the lower one. A band
-    must not be combined with false alarms that are counted in all bins.
+    Its four limits must all be given, or none. Each upper limit must exceed the lower one. With a
+    search band, false alarms must not be counted in all bins.
     """
     missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.parameter_values(path).size]
     if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
@@ -728,7 +733,7 @@ def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for each effect that is on although an effect that it depends on is off."""
+    """Yield a `Finding` for each effect that is on although a parent effect of it is off."""
     outer_of_effect = {effect.name: effect.parent for effect in EFFECTS}
     for name, outer in outer_of_effect.items():
         while outer and grid.effect_modes.get(name) == ON:
@@ -739,7 +744,10 @@ def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _effect_requirement_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for each broken requirement of an effect that is not off."""
+    """Yield a `Finding` for each requirement of an effect that the grid's values break.
+
+    Effects whose mode is ``off`` are not checked.
+    """
     for effect in EFFECTS:
         mode = grid.effect_modes.get(effect.name, OFF)
         if mode == OFF:
@@ -761,10 +769,10 @@ def _effect_requirement_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in complex records of direct detection and in the anti-alias filter.
+    """Yield a `Finding` for a complex record of direct detection, and for a useless filter.
 
-    A filter wider than the sample rate keeps no alias out, and ``noise_shape: white`` ignores the
-    filter.
+    The filter is the anti-alias filter. It is useless if it is wider than the sample rate, or if
+    ``noise_shape: white`` ignores it.
     """
     if grid.any_point_meets(
         {
@@ -798,7 +806,7 @@ def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def undrawn_effect_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for each active random effect of a grid that has no draws."""
+    """Yield a `Finding` for each random effect that is active in a grid without draws."""
     problem = "is simulated by draws, and the study has none"
     for effect in EFFECTS:
         if effect.is_random and grid.effect_modes.get(effect.name) == ON:
@@ -814,9 +822,9 @@ def undrawn_effect_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Finding]:
-    """Yield findings about random effects and draw methods that a flight does not support.
+    """Yield a `Finding` for each random effect or draw method that flights do not support.
 
-    Parameters of the section ``target`` are not checked here: a scene's spec has no such section.
+    Parameters of the section ``target`` are not checked: a scene's spec has no such section.
 
     Parameters
     ----------
@@ -864,12 +872,15 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
 
 
 def _effect_mode_finding(effect: str, problem: str, remedy: str) -> Finding:
-    """Return a finding about an effect whose mode is ``on``."""
+    """Return a `Finding` about the effect named `effect`, whose mode is ``on``."""
     return Finding(("effects", effect), problem, remedy, ON)
 
 
 def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parameter]]:
-    """Yield each random effect that is not off, with each parameter whose value enables it."""
+    """Yield the pairs of a random effect that is not off and a parameter of it that enables it.
+
+    The parameter's value differs from its default at one point of the grid or more.
+    """
     for effect in EFFECTS:
         if effect.is_random and grid.effect_modes.get(effect.name, OFF) != OFF:
             for parameter in effect.parameters:
@@ -886,15 +897,15 @@ def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parame
 
 
 def is_detector_or_estimator_parameter(path: str) -> bool:
-    """Return True if a parameter belongs to the detector or the estimator of whole spectra."""
+    """Return True if a dotted path is a parameter of the detector or estimator of whole spectra."""
     return path.startswith((DETECTOR_PREFIX, ESTIMATOR_PREFIX))
 
 
 def spectrum_method_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in detectors and estimators, which examine whole spectra.
+    """Yield a `Finding` for each mistake in the detector or estimator, which examine whole spectra.
 
-    They need ``draws.method: spectra`` and a number of draws, and the cells of a CFAR detector must
-    fit into the spectrum.
+    Both need ``draws.method: spectra`` and a number of draws. The cells of a CFAR detector must fit
+    into the spectrum.
 
     Parameters
     ----------
@@ -917,7 +928,7 @@ def spectrum_method_findings(draws: Draws | SceneDraws, grid: GridValues) -> Ite
 
 
 def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
-    """Return the paths of the detector and estimator parameters that the spec changes.
+    """Return the dotted paths of the detector's and estimator's parameters that the spec changes.
 
     A changed parameter is on an axis, or its value differs from the default.
     """
@@ -937,10 +948,11 @@ def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
 
 
 def _cfar_cell_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the cells of CFAR detectors, which compare a bin with neighbouring bins.
+    """Yield a `Finding` for each mistake in a CFAR detector's cells.
 
-    Mistakes are an odd number of training cells, more cells than the spectrum has bins, and a rank
-    above the number of training cells.
+    The cells are bins next to the tested bin. Training cells measure the noise. Mistakes are an odd
+    number of training cells, more cells than the spectrum has bins, and a rank above the number of
+    training cells.
     """
     training, guard, rank = (
         grid.parameter_values(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)

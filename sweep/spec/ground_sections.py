@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from sweep.scenes.terrain import Terrain
 
 GRID_STEPS_PER_SIDE_MAX = 7000
-"""Maximum number of grid steps along one side of a square."""
+"""Largest number of grid steps along a side of a square ground."""
 _RANDOM_STREAM_NAMES = ("relief", "hills", "craters", "boulders", "trees")
-"""Names of the uses of random numbers; the index of a name selects its stream."""
+"""Uses of random numbers in a scene; the index of a use selects its independent stream."""
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:
-    """Return the random number generator of one use, such as ``craters`` or ``trees``.
+    """Return the random number generator for one use, such as drawing craters or trees.
 
-    Uses with the same seed have independent random numbers.
+    Generators of different uses with the same seed are independent.
 
     Parameters
     ----------
@@ -56,10 +56,7 @@ class Material(SpecSection):
 
 
 OPTICAL_FIELDS = tuple(Material.model_fields)
-"""Names of the optical fields of a surface, such as its reflectance.
-
-They do not change where rays hit.
-"""
+"""Names of the fields of a surface that describe its optics and do not change where rays hit."""
 
 
 class Relief(SpecSection):
@@ -74,7 +71,7 @@ class Relief(SpecSection):
     seed: int = declare.seed_field()
 
     def draw_heights(self, shape: tuple[int, int], spacing: tuple[float, float]) -> np.ndarray:
-        """Draw fractal heights with mean 0 on a grid.
+        """Draw fractal heights with mean 0 at the nodes of a grid.
 
         Parameters
         ----------
@@ -116,7 +113,7 @@ class Craters(SpecSection):
     seed: int = declare.seed_field()
 
     def carve_into(self, terrain: Terrain) -> Terrain:
-        """Return the terrain with randomly drawn craters carved into it."""
+        """Return a copy of the terrain with craters, drawn at random, carved into it."""
         from sweep.scenes.scattered_objects import carve_craters, draw_craters, lunar_crater_law
 
         equilibrium_diameter = (
@@ -132,7 +129,7 @@ class Craters(SpecSection):
 
 
 def _require_grid_memory(n_nodes: int) -> None:
-    """Raise `SceneError` if the triangles of a grid would need more memory than is free."""
+    """Raise `SceneError` if the triangles of a grid of `n_nodes` heights exceed the free memory."""
     remedy = "take a coarser grid, or a smaller part of it"
     require_memory(
         f"a ground of {n_nodes:,} heights", TRIANGULATION_BYTES_PER_CELL * n_nodes, remedy
@@ -153,7 +150,7 @@ class Ground(Material, ABC):
     craters: Craters | None = None
 
     def build_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the ground in its own coordinates, after smoothing, refining, relief and craters.
+        """Return the ground in its own coordinates, with smoothing, refining, relief and craters.
 
         Raises
         ------
@@ -165,7 +162,7 @@ class Ground(Material, ABC):
         return self.process_terrain(self.unprocessed_terrain(files))
 
     def process_terrain(self, terrain: Terrain) -> Terrain:
-        """Smooth and refine a terrain, then add relief and craters.
+        """Return a terrain after smoothing and refining, with relief and craters added.
 
         Parameters
         ----------
@@ -202,15 +199,15 @@ class Ground(Material, ABC):
 
     @abstractmethod
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the ground before smoothing, refining, relief and craters are applied."""
+        """Return the ground as terrain, before smoothing, refining, relief and craters."""
 
     def check_grid(self) -> None:
-        """Raise `ValueError` if the fields of the section define an invalid grid."""
+        """Raise `ValueError` if the section's fields define an invalid grid; here never."""
 
     def grid_step(self) -> float | None:
-        """Return the larger of the two grid steps, after refining [m].
+        """Return the larger of the grid steps along x and y, after refining [m].
 
-        The result is None if only a file defines the grid.
+        The result is None if the grid step is stated only in a file, as for this base class.
         """
         return None
 
@@ -223,7 +220,10 @@ class PlacedGround(Ground):
     )
 
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the ground at its position, before smoothing, refining, relief and craters."""
+        """Return the ground as terrain that is centred at `position`.
+
+        Smoothing, refining, relief and craters are not applied.
+        """
         terrain = self.unplaced_terrain(files)
         (rows, columns), (dx, dy) = terrain.heights.shape, terrain.spacing
         corner = np.array([-(columns - 1) / 2 * dx, -(rows - 1) / 2 * dy, 0.0])
@@ -231,7 +231,7 @@ class PlacedGround(Ground):
 
     @abstractmethod
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the heights on a grid of arbitrary origin."""
+        """Return the heights on a grid whose origin has no meaning."""
 
 
 # Ground of surveys and files
@@ -256,7 +256,7 @@ class JacksboroGround(PlacedGround):
     )  # fmt: skip
 
     def unplaced_terrain(self, files: SpecFiles | None) -> Terrain:
-        """Return the heights of the survey, or of the square cut from it [m above sea level]."""
+        """Return the survey, or the square cut from it, with heights above sea level [m]."""
         from sweep.scenes.rasters import read_jacksboro_terrain
         from sweep.scenes.terrain import crop_to_square
 
@@ -268,11 +268,11 @@ class JacksboroGround(PlacedGround):
         )  # type: ignore[arg-type]
 
     def check_grid(self) -> None:
-        """Raise `ValueError` if the square does not lie within the survey."""
+        """Raise `ValueError` if the square is not completely inside the survey."""
         self.unplaced_terrain(None)
 
     def grid_step(self) -> float | None:
-        """Return the larger of the two grid steps, after refining [m]."""
+        """Return the larger of the grid steps along x and y, after refining [m]."""
         return max(abs(step) for step in self.unplaced_terrain(None).spacing) / self.factor
 
 
@@ -316,7 +316,7 @@ class RasterGround(Ground):
     )
 
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the heights of the raster, times `scale`, in the raster's coordinates."""
+        """Return the raster as terrain in its own coordinates, with heights times `scale` [m]."""
         field_names = {"band", "window", "metres_per_degree", "metres_per_unit", "height_unit"}
         terrain = read_raster_terrain(
             files.resolve(self.file, raster_digest),
@@ -341,7 +341,7 @@ class ArrayGround(PlacedGround):
     scale: float = _HEIGHT_SCALE_FIELD
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the heights of the NumPy file, times `scale`."""
+        """Return the array in the NumPy file as terrain, with heights times `scale` [m]."""
         from sweep.scenes.rasters import read_numpy_terrain
 
         spacing, no_data = (self.spacing[0], self.spacing[1]), self.no_data
@@ -360,7 +360,7 @@ class ImageGround(PlacedGround):
     black: float = declare.length_field("Height of black", "0 m", default=0.0)
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the heights of the image, linear in the grey level between `black` and `white`."""
+        """Return the image as terrain: heights linear in grey level, `black` to `white` [m]."""
         from sweep.scenes.rasters import read_image_terrain
 
         path = files.resolve(self.file)
@@ -371,7 +371,7 @@ class ImageGround(PlacedGround):
 
 
 def _nodes_per_side(side: float, step: float) -> int:
-    """Return the number of nodes at spacing `step` [m] along a side of at least `side` [m]."""
+    """Return the number of grid nodes, `step` [m] apart, that span a side of `side` [m] or more."""
     return math.ceil(side / step * (1 - 1e-12)) + 1
 
 
@@ -381,12 +381,12 @@ class SquareGround(PlacedGround):
     size: float = declare.positive_length_field("Side of the square", "3 km")
 
     def unrefined_step(self) -> float:
-        """Return the grid step before refining [m]: the spacing, or else the side of the square."""
+        """Return the grid step before refining [m]: `spacing`, or the side if `spacing` is None."""
         spacing = self.spacing  # type: ignore[attr-defined]
         return float(self.size if spacing is None else spacing)
 
     def flat_terrain(self) -> Terrain:
-        """Return the grid with all heights 0."""
+        """Return a terrain on the square grid with all heights 0."""
         from sweep.scenes.terrain import Terrain
 
         self.check_grid()
@@ -395,7 +395,7 @@ class SquareGround(PlacedGround):
         return Terrain(np.zeros((n_nodes, n_nodes)), (step, step), np.zeros(3))
 
     def check_grid(self) -> None:
-        """Raise `ValueError` if the number of grid steps is 0 or too large."""
+        """Raise `ValueError` if a side of the square has no grid step or too many."""
         n_steps = _nodes_per_side(self.size, self.unrefined_step()) - 1
         if not 1 <= n_steps <= GRID_STEPS_PER_SIDE_MAX:
             raise ValueError(
@@ -404,7 +404,7 @@ class SquareGround(PlacedGround):
             )
 
     def grid_step(self) -> float | None:
-        """Return the grid step after refining [m]."""
+        """Return the grid step after refining [m], which is equal along x and y."""
         return self.unrefined_step() / self.factor
 
 
@@ -422,7 +422,7 @@ class PlaneGround(SquareGround):
     )
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the plane of slope angle `slope` that rises in the direction `uphill`."""
+        """Return the plane as terrain; it rises by the angle `slope` in the heading `uphill`."""
         terrain = self.flat_terrain()
         tangent, node_numbers = math.tan(self.slope), np.arange(len(terrain.heights))
         rise_along_side = (node_numbers - node_numbers.mean()) * terrain.spacing[0] * tangent
@@ -440,7 +440,7 @@ class ReliefGround(Relief, SquareGround):
     spacing: float = declare.positive_length_field("Grid step", "5 m")
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the fractal ground, drawn from its seed."""
+        """Return the fractal ground as terrain, with heights drawn from its seed."""
         terrain = self.flat_terrain()
         shape = len(terrain.heights), len(terrain.heights)
         return replace(terrain, heights=self.draw_heights(shape, terrain.spacing))
@@ -458,13 +458,13 @@ class HillsGround(SquareGround):
     seed: int = declare.seed_field()
 
     def check_grid(self) -> None:
-        """Raise `ValueError` if the grid has too many steps, or too coarse ones for the hills."""
+        """Raise `ValueError` if the grid has too many steps, or steps too large for the hills."""
         super().check_grid()
         if not self.correlation_length > 3 * self.spacing:
             raise ValueError("hills need a correlation length over three grid steps")
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the hills, drawn from their seed."""
+        """Return the hills as terrain, with heights drawn from their seed."""
         from sweep.scenes.terrain import draw_hills
 
         terrain = self.flat_terrain()

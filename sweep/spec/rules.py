@@ -37,19 +37,19 @@ SpecLocation = tuple[str | int, ...]
 """Keys and list indices that lead to a value in a spec."""
 
 MISSING = object()
-"""Marker that takes the place of a value which the spec does not contain."""
+"""Marker for a value that a spec does not contain."""
 _SHOWN_VALUE_CHARACTERS_MAX = 60
-"""Maximum number of characters of a wrong value that an error message shows."""
+"""Largest number of characters of a wrong value that an error message shows."""
 _PARTIAL_NAME_CHARACTERS_MIN, _SUGGESTIONS_MAX = 4, 3
-"""Limits of the suggestion of known names that contain a misspelt name.
+"""Limits for suggestions of longer names that contain a wrong name.
 
-The first is the minimum number of characters of the misspelt name. The second is the maximum number
-of names to suggest.
+The first is the smallest number of characters of the wrong name. The second is the largest number
+of names that are suggested.
 """
 _OFF_WORDS = {"no", "n", "false", "none", "never", "null", "disable", "disabled", "0", "off"}
-"""Words that users write in place of ``off``, such as no."""
+"""Words that users write where a spec takes ``off``."""
 _ON_WORDS = {"yes", "y", "true", "always", "enable", "enabled", "1", "on"}
-"""Words that users write in place of ``on``, such as yes."""
+"""Words that users write where a spec takes ``on``."""
 
 
 @dataclass(frozen=True, order=True)
@@ -57,17 +57,19 @@ class Mistake:
     """One mistake in a user's spec; text fields may be empty."""
 
     path: str
-    """Dotted path in the file, such as ``instrument.laser.power`` or ``axes.target.range[2]``."""
+    """Dotted path of the value in the spec, such as ``instrument.laser.power`` or
+    ``axes.target.range[2]``."""
     problem: str
-    """The broken rule, as the end of a sentence about the path."""
+    """What is wrong, as the end of a sentence that begins with the path: ``must be at least 1
+    m``."""
     value: str = ""
-    """Value as the user wrote it."""
+    """Wrong value as the user wrote it; empty if it is not to be shown."""
     suggestion: str = ""
-    """Advice to the user: a similar name, or a remedy."""
+    """Advice to the user, such as a similar name or a remedy; may be empty."""
     line: int | None = None
-    """Line in the file, from 1."""
+    """Line in the file, counted from 1; None if unknown."""
     file: str = ""
-    """Path of the file."""
+    """Path of the file; empty if the spec is not from a file."""
 
     def __str__(self) -> str:
         prefix = (
@@ -101,11 +103,12 @@ class Finding:
     location: SpecLocation
     """Keys and list indices that lead to the value."""
     problem: str
-    """The broken rule, as the end of a sentence about the location."""
+    """What is wrong, as the end of a sentence that begins with the location: ``must be at least 1
+    m``."""
     suggestion: str = ""
-    """Advice to the user: a similar name, or a remedy; may be empty."""
+    """Advice to the user, such as a similar name or a remedy; may be empty."""
     raw_value: object = MISSING
-    """Value as read from the file, if it is to be shown; else `MISSING`."""
+    """Wrong value as read from the file; `MISSING` if it is not to be shown."""
 
 
 class FindingsError(Exception):
@@ -119,7 +122,7 @@ class FindingsError(Exception):
 def single_finding_error(
     location: SpecLocation, problem: str, suggestion: str = "", raw_value: object = MISSING
 ) -> FindingsError:
-    """Return a `FindingsError` with a single finding, to be raised."""
+    """Return a `FindingsError` that holds one finding; the caller raises it."""
     return FindingsError(Finding(location, problem, suggestion, raw_value))
 
 
@@ -130,10 +133,10 @@ class Findings(list[Finding]):
     def collect_errors(
         self, location: SpecLocation = (), raw_value: object = MISSING
     ) -> Iterator[None]:
-        """Context manager that appends the reading errors of its body to this list.
+        """Context manager that appends the errors raised in its body to this list, as findings.
 
-        A `QuantityError` becomes a finding at `location` that shows `raw_value`; a `FindingsError`
-        adds its own findings.
+        A `QuantityError` becomes a finding at `location` that shows `raw_value`. The findings of a
+        `FindingsError` are appended as they are. Other errors propagate.
         """
         try:
             yield
@@ -143,13 +146,13 @@ class Findings(list[Finding]):
             self.append(Finding(location, error.rule, error.suggestion, raw_value))
 
     def raise_if_any(self) -> None:
-        """Raise a `FindingsError` with all findings, if there are any."""
+        """Raise a `FindingsError` with all findings in this list, unless the list is empty."""
         if self:
             raise FindingsError(*self)
 
 
 def dotted_path(location: SpecLocation) -> str:
-    """Return a location as text, such as ``axes.target.range[2]``."""
+    """Return the keys and indices of a location as text, such as ``axes.target.range[2]``."""
     path = ""
     for key in location:
         path += f"[{key}]" if isinstance(key, int) else f".{key}" if path else str(key)
@@ -157,7 +160,10 @@ def dotted_path(location: SpecLocation) -> str:
 
 
 def format_raw_value(raw_value: object) -> str:
-    """Return a value of a spec as one short line; empty for `MISSING`, mappings and lists."""
+    """Return a value of a spec as one line of at most 60 characters, for messages.
+
+    The result is empty for `MISSING`, mappings and lists.
+    """
     if raw_value is MISSING or isinstance(raw_value, dict | list | tuple):
         return ""
     if raw_value is None:
@@ -201,14 +207,15 @@ def suggest_similar_name(name: str, known_names: Iterable[str], *, fallback: str
 # Rules
 
 RULE_ERROR_TYPE = "broken_rule"
-"""Type of the pydantic errors that rules raise, which distinguishes them from all others."""
+"""Type name of a pydantic error that a broken rule raises; pydantic's own errors have other
+names."""
 
 JsonObject = dict[str, Any]
-"""Mapping with text keys, as in JSON."""
+"""JSON object: a dict with text keys."""
 
 
 def rule_error(problem: str, suggestion: str) -> PydanticCustomError:
-    """Return the pydantic error for a broken rule of a field or section, to be raised."""
+    """Return the pydantic error for a broken rule of a field or section; the caller raises it."""
     return PydanticCustomError(
         RULE_ERROR_TYPE, "{rule}", {"rule": problem, "suggestion": suggestion}
     )
@@ -219,20 +226,20 @@ class Rule:
     """Base of rules. A rule defines which values a field may hold."""
 
     description: str
-    """Description of the field for users."""
+    """Description of the field, shown to users."""
 
     @property
     def example(self) -> str:
-        """A valid value as a user would write it; empty if none needs to be shown."""
+        """A valid value as a user would write it; empty if messages need no example."""
         return ""
 
     @property
     def value_unit(self) -> str:
-        """SI unit of the value after reading; empty if it has no unit."""
+        """SI unit of the value that `read` returns; empty if the value has no unit."""
         return ""
 
     def read(self, raw_value: object) -> Any:
-        """Convert a value as written in a spec to SI units, or check it if it has no unit.
+        """Convert a value as written in a spec: a number to SI units, other values to their type.
 
         Raises
         ------
@@ -242,15 +249,15 @@ class Rule:
         raise QuantityError("holds nothing that can be read")
 
     def format(self, value: Any) -> Any:
-        """Return a value as a spec would hold it; `read` converts it back to exactly `value`."""
+        """Return a value, as `read` returned it, in the form in which a spec would hold it."""
         return value
 
     def schema(self) -> JsonObject:
-        """Return the JSON Schema of a value as written."""
+        """Return the JSON Schema of a value as written, with the field's description."""
         return {"description": self.description} | self._value_schema()
 
     def _value_schema(self) -> JsonObject:
-        """Return the JSON Schema of a value as written, without the description."""
+        """Return the JSON Schema of a value as written, without the field's description."""
         return {}
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -262,7 +269,7 @@ class Rule:
         return self.schema()
 
     def _validate(self, raw_value: object) -> Any:
-        """Read a value; raise a pydantic error if it breaks the rule."""
+        """Return the result of `read`; raise a pydantic error if the value breaks the rule."""
         try:
             return self.read(raw_value)
         except QuantityError as error:
@@ -274,12 +281,12 @@ class CustomRule(Rule):
     """Rule of a single field, given by a function."""
 
     reader: Callable[[Any], Any]
-    """Function that reads a value as written, or raises a `QuantityError`."""
+    """Function that converts a value as written in a spec, or raises a `QuantityError`."""
     value_schema: JsonObject = dataclasses.field(default_factory=dict, compare=False)
-    """JSON Schema of a value as written."""
+    """JSON Schema of a value as written in a spec."""
 
     def read(self, raw_value: object) -> Any:
-        """Convert a value as written in a spec with the function `reader`."""
+        """Return what the function `reader` returns for a value as written in a spec."""
         return self.reader(raw_value)
 
     def _value_schema(self) -> JsonObject:
@@ -292,9 +299,9 @@ _BOUND_KINDS = {
     "below": ("less than", np.greater_equal, "exclusiveMaximum"),
     "at_most": ("at most", np.greater, "maximum"),
 }
-"""Kinds of bounds of a number, by the names of `NumericRule`'s fields.
+"""Kinds of bounds of a number, by the name of the field of `NumericRule`.
 
-Each entry has the words for messages, a comparison that is True for values outside the bound, and
+An entry has the words for messages, a NumPy function that is True for values outside the bound, and
 the keyword of JSON Schema.
 """
 
@@ -303,7 +310,7 @@ class BoundViolation(NamedTuple):
     """First of several values that is outside the bounds of a rule."""
 
     value_index: int
-    """Index of the value among those that were checked."""
+    """Index of the value in the array that was checked."""
     broken_bound_text: str
     """The broken bound in words, such as ``must be at least 1 m``."""
 
@@ -313,44 +320,45 @@ class NumericRule(Rule):
     """Rule of a number within bounds; bounds are written as users write values."""
 
     si_unit: str = ""
-    """SI unit after reading; empty for a pure number.
+    """SI unit of the value that `read` returns; empty for a pure number.
 
-    It is ``"dB"`` for a power ratio written in decibels.
+    It is ``"dB"`` for a power ratio that is written in decibels and read as a pure number.
     """
     example: str = ""
     """A valid value as a user would write it."""
     above: str | None = None
-    """Exclusive lower bound; None if there is none."""
+    """Exclusive lower bound as text with its unit; None if there is none."""
     at_least: str | None = None
-    """Inclusive lower bound; None if there is none."""
+    """Inclusive lower bound as text with its unit; None if there is none."""
     below: str | None = None
-    """Exclusive upper bound; None if there is none."""
+    """Exclusive upper bound as text with its unit; None if there is none."""
     at_most: str | None = None
-    """Inclusive upper bound; None if there is none."""
+    """Inclusive upper bound as text with its unit; None if there is none."""
     is_integer: bool = False
-    """True for integers."""
+    """True if the number must be an integer."""
     is_power_ratio: bool = False
-    """True for a pure number that may also be written in decibels, as a ratio of powers."""
+    """True for a pure number, a ratio of powers, that may also be written in decibels."""
     keyword: str = ""
-    """Word that may replace the number, except on axes; empty for none."""
+    """Word that a spec may hold in place of the number, except on an axis; empty if there is
+    none."""
     keyword_value: float | str = 0
-    """Value that the keyword stands for; may be outside the bounds."""
+    """Value that `read` returns for the keyword; may be outside the bounds."""
 
     @property
     def value_unit(self) -> str:
-        """SI unit of the value after reading; empty for a power ratio."""
+        """SI unit of the value that `read` returns; empty for a power ratio or a pure number."""
         return "" if self.si_unit == DECIBEL else self.si_unit
 
     @property
     def bound_texts(self) -> dict[str, str]:
-        """Texts of the bounds that are set, by kind of bound, such as ``at_least``."""
+        """Texts of the bounds that are not None, such as ``{"at_least": "1 um"}``."""
         bound_texts = {name: getattr(self, name) for name in _BOUND_KINDS}
         return {
             name: bound_text for name, bound_text in bound_texts.items() if bound_text is not None
         }
 
     def read_exact_number(self, raw_value: object) -> ExactQuantity:
-        """Return the exact number and the unit of a written value, without a check of the bounds.
+        """Return the exact number and the unit of a value as written; the bounds are not checked.
 
         Raises
         ------
@@ -376,7 +384,7 @@ class NumericRule(Rule):
             raise QuantityError(f"must be a number or {self.keyword}", error.suggestion) from None
 
     def read(self, raw_value: object) -> Any:
-        """Return the SI value of a written value within the bounds, or the value of the keyword.
+        """Return the SI value of a number as written, or `keyword_value` for the keyword.
 
         Raises
         ------
@@ -406,9 +414,9 @@ class NumericRule(Rule):
             return False
 
     def _read_number(self, raw_value: object) -> float | int:
-        """Return the SI value of a written number within the bounds.
+        """Return the SI value of a number as written; raise `QuantityError` if it breaks the rule.
 
-        The value is an int if the rule requires integers.
+        The value is an int if the rule requires integers, else a float.
         """
         quantity = self.read_exact_number(raw_value)
         if self.is_integer and quantity.number.denominator != 1:
@@ -420,7 +428,7 @@ class NumericRule(Rule):
         return int(quantity.number) if self.is_integer else value
 
     def first_bound_violation(self, values: np.ndarray) -> BoundViolation | None:
-        """Return the first violation of the bounds: index of the value, and broken bound in words.
+        """Return the first violated bound with the index of the first value outside it.
 
         Parameters
         ----------
@@ -442,9 +450,9 @@ class NumericRule(Rule):
         return None
 
     def format(self, value: Any) -> str | int | float:
-        """Return a number, or text such as ``0.001 W``; `read` converts it back exactly.
+        """Return an SI value as a spec would hold it: a number, or text such as ``0.001 W``.
 
-        Decibels are converted back to 15 digits.
+        `read` returns exactly the same value for the result; for decibels, the same to 15 digits.
         """
         if self.keyword and value == self.keyword_value:
             return self.keyword
@@ -477,19 +485,19 @@ class NumericRule(Rule):
 
 
 def _first_clause(description: str) -> str:
-    """Return the first clause of a description, with a small first letter, to end a sentence."""
+    """Return the first clause of a text, with a small first letter, for the end of a sentence."""
     clause = re.split(r"[;:,.(] ?", description)[0].strip()
     return clause[:1].lower() + clause[1:] if clause[1:2].islower() else clause
 
 
 @lru_cache(maxsize=1024)
 def _bound_in_si(rule: NumericRule, bound_text: str) -> float:
-    """Convert a bound of a rule, such as ``1 um``, to SI units."""
+    """Return a bound of a rule, written as text such as ``1 um``, as an SI value."""
     return rule.read_exact_number(bound_text).to_si()
 
 
 _FUNCTION_PATTERN = r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*:[A-Za-z_][A-Za-z0-9_]*"
-"""Pattern of a function's name as ``module:function``."""
+"""Regular expression for the name of a function as ``module:function``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -502,12 +510,16 @@ class ChoiceRule(Rule):
     options: tuple[str, ...]
     """Valid words."""
     problem: str = ""
-    """Problem stated for a word that is no option; by default a list of the options."""
+    """Words of the error message for a word that is no option; if empty, the message lists the
+    options."""
     remedy: str = ""
-    """Remedy for words that resemble none of the options."""
+    """Advice to the user for a wrong word that resembles none of the options."""
 
     def read(self, raw_value: object) -> str:
-        """Return the word; ``on`` or ``off`` for a truth value."""
+        """Return the word that was written; for a truth value, ``on`` or ``off``.
+
+        Raise `QuantityError` if the word is none of the options.
+        """
         if isinstance(raw_value, bool) and "on" in self.options:
             return "on" if raw_value else "off"
         if raw_value in self.options and isinstance(raw_value, str):
@@ -540,7 +552,10 @@ class ChoiceOrFunctionRule(ChoiceRule):
     """
 
     def read(self, raw_value: object) -> str:
-        """Return the word or the name of the function."""
+        """Return the word, or the function's name ``module:function``, as written.
+
+        Raise `QuantityError` for any other value.
+        """
         if isinstance(raw_value, str) and re.fullmatch(_FUNCTION_PATTERN, raw_value):
             return raw_value
         try:
@@ -562,7 +577,7 @@ class FlagRule(Rule):
     """Rule of a truth value."""
 
     def read(self, raw_value: object) -> bool:
-        """Return the truth value."""
+        """Return the truth value as written; raise `QuantityError` for any other value."""
         if not isinstance(raw_value, bool):
             raise QuantityError("must be true or false", "write 'true' or 'false'")
         return raw_value
@@ -580,10 +595,13 @@ class TextRule(Rule):
     pattern: str = r"[^\x00-\x08\x0b-\x1f\x7f-\x9f]{0,5000}"
     """Regular expression that the full text must match."""
     remedy: str = "write at most 5000 characters that can be printed"
-    """Remedy for texts that do not match."""
+    """Advice to the user for a text that does not match the pattern."""
 
     def read(self, raw_value: object) -> str:
-        """Return the text; numbers are converted to text."""
+        """Return the text; raise `QuantityError` if it does not match the pattern.
+
+        A number is converted to text.
+        """
         if isinstance(raw_value, bool) or not isinstance(raw_value, str | int | float):
             remedy = (
                 self.remedy
@@ -604,10 +622,14 @@ class FilePathRule(Rule):
     """Rule of a file's path, relative to the file that names it."""
 
     compute_digest: Callable[[Path], str] = file_digest
-    """Function that computes the digest of everything that is read from the file."""
+    """Function that returns a digest of the content of the file and of the files that belong to
+    it."""
 
     def read(self, raw_value: object) -> str:
-        """Return the path as written, after a check that it may be the path of a file."""
+        """Return the path as written; raise `QuantityError` if it can't be the path of a file.
+
+        Whether the file exists is not checked.
+        """
         if not isinstance(raw_value, str) or not 0 < len(raw_value.strip()) <= 4096:
             raise QuantityError("must be the path of a file", "write it relative to this file")
         if "\0" in raw_value:
@@ -623,30 +645,33 @@ class ListRule(Rule):
     """Rule of a list of values that have a common rule."""
 
     element_rule: Rule
-    """Rule of each value."""
+    """Rule that each value of the list obeys."""
     length_min: int = 3
     """Minimum number of values."""
     length_max: int = 3
     """Maximum number of values."""
     element_noun: str = "values"
-    """Noun for the values in messages."""
+    """Noun for the values of the list in error messages."""
     is_increasing: bool = False
-    """True if each value must be larger than the one before it."""
+    """True if each value must be larger than the preceding one."""
     is_distinct: bool = False
     """True if no value may occur twice."""
 
     @property
     def value_unit(self) -> str:
-        """SI unit of the values after reading; empty if they have no unit."""
+        """SI unit of the values that `read` returns; empty if the values have no unit."""
         return self.element_rule.value_unit
 
     @property
     def example(self) -> str:
-        """A valid list."""
+        """A valid list as a user would write it, made of the element rule's example."""
         return f"[{', '.join([self.element_rule.example] * max(self.length_min, 1))}]"
 
     def read(self, raw_value: object) -> tuple[Any, ...]:
-        """Return the SI values of a written list."""
+        """Return the values of a list as written, as a tuple of SI values.
+
+        Raise `QuantityError` if the list or one of its values breaks the rule.
+        """
         remedy = f"write e.g. {self.example}"
         if (
             not isinstance(raw_value, list | tuple)
@@ -667,7 +692,7 @@ class ListRule(Rule):
         return values
 
     def format(self, value: Any) -> Any:
-        """Return the list as a spec would hold it; `read` converts it back exactly."""
+        """Return a list of values as a spec would hold it; `read` converts it back exactly."""
         return [self.element_rule.format(element) for element in value]
 
     def _value_schema(self) -> JsonObject:
@@ -681,7 +706,10 @@ class ListRule(Rule):
 
 
 def read_list_element(rule: Rule, index: int, raw_value: object) -> Any:
-    """Read one value of a list; the error of an invalid value names its index."""
+    """Return the value that a rule reads from one element of a list.
+
+    The `QuantityError` of an invalid element names `index`, the element's index in the list.
+    """
     try:
         return rule.read(raw_value)
     except QuantityError as error:
@@ -699,7 +727,7 @@ _CHIRP_TIME_RULE = NumericRule(
     at_least="-1e6 s",
     at_most="1e6 s",
 )
-"""Rule of a time [s] in the up-chirp, in a table of the sweep's frequency error."""
+"""Rule of a time in the up-chirp [s]: one column of a table of the sweep's frequency error."""
 _FREQUENCY_ERROR_RULE = NumericRule(
     description="Frequency error",
     si_unit="Hz",
@@ -707,16 +735,19 @@ _FREQUENCY_ERROR_RULE = NumericRule(
     at_least="-1e15 Hz",
     at_most="1e15 Hz",
 )
-"""Rule of a frequency error [Hz] in a table of the chirp's frequency error over time."""
+"""Rule of a frequency error [Hz]: one column of a table of the sweep's frequency error."""
 FREQUENCY_ERROR_TABLE_ROWS_MAX = 4096
-"""Maximum number of rows of a table of the chirp's frequency error over time."""
+"""Largest number of rows in a table of the sweep's frequency error over time."""
 
 
 class FrequencyErrorTableRule(Rule):
     """Rule of a table of the sweep's frequency error over time, which is held as text."""
 
     def read(self, raw_value: object) -> str:
-        """Return the rows ``time error`` [s, Hz] as text, separated by commas; or `NO_TABLE`."""
+        """Return the table as text: rows ``time error`` [s, Hz] separated by commas, or `NO_TABLE`.
+
+        Raise `QuantityError` if the table is invalid or not smooth.
+        """
         if raw_value == NO_TABLE:
             return NO_TABLE
         remedy = "write e.g. [[0 us, 0 Hz], [10 us, 2 kHz], [20 us, 1 kHz]], or a CSV file's path"
@@ -745,7 +776,10 @@ class FrequencyErrorTableRule(Rule):
         return table_text
 
     def format(self, value: Any) -> Any:
-        """Return the rows as a spec would hold them; `read` converts them back exactly."""
+        """Return the table, given as text, as a spec would hold it: a list of rows [time, error].
+
+        `read` returns the same text for the list. `NO_TABLE` stays as it is.
+        """
         if value == NO_TABLE:
             return value
         rules = (_CHIRP_TIME_RULE, _FREQUENCY_ERROR_RULE)
@@ -761,20 +795,17 @@ class FrequencyErrorTableRule(Rule):
 
 
 COSINE_SUM_WINDOWS = tuple(COSINE_SUM_COEFFICIENTS)
-"""Names of windows that are sums of cosines and are computed without scipy, which imports slowly.
-
-All other windows are made by scipy.
-"""
+"""Names of the windows that are sums of cosines; these are computed without scipy."""
 SCIPY_WINDOWS = (
     "barthann", "bartlett", "bohman", "chebwin", "cosine", "dpss", "exponential", "gaussian",
     "general_gaussian", "general_hamming", "kaiser", "lanczos", "parzen", "taylor", "triang",
     "tukey",
 )  # fmt: skip
-"""Names of scipy's windows that are suggested to users."""
+"""Names of scipy's window functions that error messages suggest."""
 _WINDOW_NAME_PATTERN = re.compile(
     r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]*)\))?"
 )
-"""Pattern of a window's name with its parameters."""
+"""Regular expression for a window as written: a name, with or without parameters in parentheses."""
 _KAISER_REMEDY = "write e.g. 'kaiser(8.6)'"
 
 
@@ -782,7 +813,10 @@ class WindowFunctionRule(Rule):
     """Rule of a window function with its parameters, such as ``hamming`` or ``kaiser(8.6)``."""
 
     def read(self, raw_value: object) -> str:
-        """Return the window as its name, with parameters in parentheses if it has any."""
+        """Return the window's canonical name, with any parameters in parentheses: ``kaiser(8.6)``.
+
+        Raise `QuantityError` if the window or its parameters are invalid.
+        """
         match = (
             _WINDOW_NAME_PATTERN.fullmatch(raw_value.strip().lower())
             if isinstance(raw_value, str)
@@ -814,10 +848,7 @@ class WindowFunctionRule(Rule):
 
 @lru_cache(maxsize=256)
 def _check_scipy_window(name: str, parameters: tuple[float, ...]) -> None:
-    """Check a window's name and parameters by computing it with scipy.
-
-    Raise `QuantityError` if the window is unknown or its parameters are invalid.
-    """
+    """Compute a window with scipy; raise `QuantityError` if its name or parameters are invalid."""
     from scipy.signal import get_window  # slow to import and rarely needed
 
     try:

@@ -38,32 +38,32 @@ from sweep.spec.sections import default_value
 from sweep.units import QuantityError, read_unit
 
 SHOTS_PER_SCANNER_MAX = 10**9
-"""Maximum number of shots of a scanner in a flight. Arrays of this length must fit into memory."""
+"""Largest number of shots of a scanner in a flight; arrays of this length must fit into memory."""
 
 RESERVED_SCANNER_NAMES = ("scene_map",)
-"""Names that no scanner may have, because other groups in a store have them."""
+"""Names that no scanner may have, because a store uses them for groups of other content."""
 _SOLIDS_WITH_REQUIRED_POSITION = (scene_sections.Sphere, scene_sections.Box)
-"""Models of solids that need a position or a motion."""
+"""Models of solids that must have either a position or a motion."""
 OBJECTS_SECTION_LOCATION: SpecLocation = ("scene", "objects")
-"""Location of the section of objects in a spec."""
+"""Keys that lead to the section of objects in a scene's spec."""
 _N_ATTITUDE_TRIAL_TIMES = 257
-"""Number of instants of a path at which its attitude is evaluated as a trial."""
+"""Number of times along a path at which an attitude is computed to find out whether it exists."""
 
 
 def _raw_section(raw_spec: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
-    """Return the mapping at a path of a spec as written; empty if there is none."""
+    """Return the section at the given keys of a parsed spec; an empty dict if there is none."""
     raw_section = raw_value_at(raw_spec, ".".join(map(str, path)))
     return dict(raw_section) if isinstance(raw_section, Mapping) else {}
 
 
 def _read_sections(raw_sections: Mapping[str, Any], annotation: Any) -> dict[str, Any]:
-    """Return the sections that can be read as a model, by name."""
+    """Return the models of the sections that are valid as `annotation`, by the sections' names."""
     sections = {name: validate_or_none(annotation, value) for name, value in raw_sections.items()}
     return {name: section for name, section in sections.items() if section is not None}
 
 
 def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Finding]:
-    """Return the mistakes in scene, platform and scanners beyond their single fields.
+    """Return a `Finding` for each mistake in scene, platform and scanners, except in single fields.
 
     Parameters
     ----------
@@ -110,7 +110,11 @@ def _name_findings(
     is_taken: Callable[[str], bool],
     owner: str,
 ) -> Iterator[Finding]:
-    """Yield a finding for each invalid or reserved name in a section, and for an empty section."""
+    """Yield a `Finding` for each invalid or reserved name in a section, and for an empty section.
+
+    `is_taken` returns True for a reserved name. `owner` is what uses the reserved names, for the
+    message.
+    """
     raw_sections = _raw_section(raw_spec, *section_location)
     for name in raw_sections:
         try:
@@ -128,9 +132,9 @@ def _name_findings(
 def _reference_findings(
     raw_spec: Mapping[str, Any], objects: Mapping[str, Any]
 ) -> Iterator[Finding]:
-    """Yield findings for references to missing grounds, and for a ground at the origin.
+    """Yield a `Finding` for each reference to a missing ground, and for a wrong position.
 
-    The ground that is the scene's origin may state no position.
+    The ground that is the origin of the scene may not state a position.
     """
     raw_objects = _raw_section(raw_spec, *OBJECTS_SECTION_LOCATION)
     if not raw_objects:
@@ -162,7 +166,10 @@ def _ground_reference_findings(
     objects: Mapping[str, Any],
     extra_remedy: str,
 ) -> Iterator[Finding]:
-    """Yield a finding if no ground of the scene has the name."""
+    """Yield a `Finding` if a field at `location` names an object that is missing or no ground.
+
+    `raw_objects` are the scene's objects as parsed from YAML, `objects` the valid ones.
+    """
     grounds = [key for key, scene_object in objects.items() if isinstance(scene_object, Ground)]
     remedy = f"the grounds are {', '.join(grounds)}" if grounds else "add a ground"
     remedy += extra_remedy
@@ -178,7 +185,7 @@ def _ground_reference_findings(
 def _file_findings(
     objects: Mapping[str, Any], platform: flight_sections.Platform | None, base: Path
 ) -> Iterator[Finding]:
-    """Yield a finding for each file of objects and platform that is missing or can't be read."""
+    """Yield a `Finding` for each file of objects or platform that is missing or can't be read."""
     located_sections: list[tuple[SpecLocation, Any]] = [
         ((*OBJECTS_SECTION_LOCATION, name), section) for name, section in objects.items()
     ]
@@ -201,7 +208,7 @@ def _file_findings(
 def _construction_findings(
     construct: Callable[[], object], location: SpecLocation
 ) -> list[Finding]:
-    """Return a finding if calling `construct` raises an error, else nothing."""
+    """Call `construct`; return a list with one `Finding` if it raises an error, else with none."""
     try:
         construct()
     except (ValueError, ArithmeticError) as error:
@@ -210,7 +217,7 @@ def _construction_findings(
 
 
 def _object_findings(scene_object: Any, location: SpecLocation) -> Iterator[Finding]:
-    """Yield mistakes in an object, except those in its references and files."""
+    """Yield a `Finding` for each mistake in an object's fields, except references and files."""
     if isinstance(scene_object, Ground):
         yield from _ground_findings(scene_object, location)
     if isinstance(scene_object, RasterGround) and scene_object.height_unit is not None:
@@ -246,14 +253,14 @@ def _object_findings(scene_object: Any, location: SpecLocation) -> Iterator[Find
 def _diameter_findings(
     section: scene_sections.Boulders | Craters, location: SpecLocation
 ) -> Iterator[Finding]:
-    """Yield a finding if the largest diameter is not above the smallest."""
+    """Yield a `Finding` if the largest diameter is not larger than the smallest."""
     if not section.smallest < section.largest:
         problem = f"must exceed the smallest diameter, {section.smallest:g} m"
         yield Finding((*location, "largest"), problem, "", f"{section.largest:g} m")
 
 
 def _ground_findings(ground: Ground, location: SpecLocation) -> Iterator[Finding]:
-    """Yield a finding for an invalid grid, or for craters smaller than three grid steps."""
+    """Yield a `Finding` for an invalid grid, and for craters smaller than three grid steps."""
     field_name = "middle" if isinstance(ground, JacksboroGround) else "spacing"
     construction_findings = _construction_findings(ground.check_grid, (*location, field_name))
     yield from construction_findings
@@ -273,7 +280,10 @@ def _ground_findings(ground: Ground, location: SpecLocation) -> Iterator[Finding
 def _solid_findings(
     scene_object: scene_sections.SolidObject, location: SpecLocation
 ) -> Iterator[Finding]:
-    """Yield mistakes in a solid: two positions or none, an invalid rotation, an unknown unit."""
+    """Yield a `Finding` for each mistake in a solid's position, rotation or unit of length.
+
+    A position is a mistake in addition to a motion. Some solids need one of the two.
+    """
     position_location = (*location, "position")
     if scene_object.motion is not None and scene_object.position is not None:
         problem = "is given in addition to a motion, whose path places the object"
@@ -301,9 +311,10 @@ def _flight_findings(
     objects: Mapping[str, Any],
     base: Path | None,
 ) -> list[Finding]:
-    """Return the mistakes in platform, scanners and moving objects.
+    """Return a `Finding` for each mistake in platform, scanners and moving objects.
 
-    Parts that could not be read (None, or missing), and tables if ``base`` is None, are skipped.
+    A part is skipped if it is missing or None, which means that it can't be read. Tables are not
+    read if `base` is None.
     """
     span: flight_sections.TimeSpan | None = None
     findings: list[Finding] = []
@@ -327,7 +338,7 @@ def _flight_findings(
 
 
 def _reads_tables(motion: flight_sections.RigidMotion) -> bool:
-    """Return True if the path or the attitude is read from a table."""
+    """Return True if the path or the attitude of a motion is read from a table in a file."""
     return motion.path.kind == "waypoints" or motion.attitude.kind == "track"
 
 
@@ -337,9 +348,9 @@ def _motion_findings(
     files: SpecFiles,
     span: flight_sections.TimeSpan | None,
 ) -> Iterator[Finding]:
-    """Yield a finding for an invalid path or attitude, or for a path shorter than the flight.
+    """Yield a `Finding` for an invalid path or attitude, and for a path shorter than the flight.
 
-    `span` is the start and stop of the flight [s]; None if `motion` is that of the platform.
+    `span` is start and end of the flight [s]; None if `motion` is the platform's own motion.
     """
     field_name = "path"
     try:
@@ -369,7 +380,10 @@ def _motion_findings(
 def _scan_pattern_findings(
     scanner: Any, location: SpecLocation, span: flight_sections.TimeSpan | None
 ) -> Iterator[Finding]:
-    """Yield a finding for an invalid scan pattern, less than a full cycle, or too many shots."""
+    """Yield a `Finding` if a scan pattern is invalid, or has less than a cycle or too many shots.
+
+    `span` is start and end of the flight [s]; None skips the number of shots.
+    """
     construction_findings = _construction_findings(scanner.build_pattern, location)
     yield from construction_findings
     if construction_findings or span is None:
@@ -396,7 +410,7 @@ def _scan_pattern_findings(
 
 
 def store_array_and_dimension_names() -> frozenset[str]:
-    """Return the names of a store's arrays and dimensions."""
+    """Return the names of all arrays and dimensions that the store of a scene may have."""
     output_tables = (
         SHOT_GEOMETRY_VARIABLES,
         CYCLE_VARIABLES,
@@ -417,7 +431,7 @@ _BEAM_WIDTH_PATHS = (
     beam.OSCILLATOR_WAIST_PATH,
     beam.COUPLING_PATH,
 )
-"""Dotted paths of the parameters from which the width of the beam follows."""
+"""Dotted paths of the parameters from which the beam's width follows."""
 _BEAMLET_POSITION_PATHS = (
     PATTERN_PATH,
     "footprint.phases",
@@ -426,25 +440,26 @@ _BEAMLET_POSITION_PATHS = (
     beam.WAIST_PATH,
     beam.FOCUS_PATH,
 )
-"""Dotted paths of the parameters that determine where beamlets (rays of a beam) hit."""
+"""Dotted paths of the parameters that determine where beamlets, the rays of a beam, hit."""
 
 
 class AxisRefusal(NamedTuple):
     """Why no axis may set a parameter; both texts are empty if an axis may."""
 
     problem: str
-    """Problem, as the end of a sentence about the parameter's path."""
+    """Why no axis may set the parameter, as the end of a sentence about its path; empty if one
+    may."""
     remedy: str
-    """Remedy to suggest."""
+    """Advice on what to do instead of an axis; empty if an axis may set the parameter."""
 
 
 _NO_REFUSAL = AxisRefusal("", "")
-"""Result for parameters that axes may set."""
+"""Refusal with empty texts, for a parameter that an axis may set."""
 _MOVES_BEAMLETS_REFUSAL = AxisRefusal(
     "moves the beamlets, and a study casts its rays once",
     _OTHER_STUDY_REMEDY,
 )
-"""Problem and remedy to state for an axis over a parameter that moves beamlets (rays of a beam)."""
+"""Refusal of an axis over a parameter that moves beamlets, the rays of a beam."""
 _AXIS_REFUSALS = {
     "footprint.speckle": _NO_REFUSAL,  # moves no beamlet, unlike other fields of footprint
     "target.": AxisRefusal("is given by the scene, shot by shot", "change the scene or the flight"),
@@ -453,14 +468,14 @@ _AXIS_REFUSALS = {
         "says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY
     ),
 }
-"""Problem and remedy to state for parameters that no axis may set, by prefix of their path.
+"""Refusal of an axis over a parameter, by the first characters of the parameter's dotted path.
 
-The first matching prefix applies.
+The first key with which a path begins applies.
 """
 
 
 def axis_refusal(path: str) -> AxisRefusal:
-    """Return why no axis may set a parameter, and a remedy; empty texts if an axis may.
+    """Return why no axis may set a parameter of a scene, and advice; empty texts if one may.
 
     Parameters
     ----------
@@ -485,7 +500,7 @@ def axis_refusal(path: str) -> AxisRefusal:
 def variation_findings(
     parameters: Mapping[str, Any], path: str, values: Iterable[Any], location: SpecLocation
 ) -> list[Finding]:
-    """Return the reasons why one parameter of a scene may not take several values.
+    """Return a `Finding` for each reason why one parameter of a scene may not take several values.
 
     Parameters
     ----------
@@ -518,10 +533,10 @@ def variation_findings(
 
 
 def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for each axis that would change where rays hit, as rays are cast only once.
+    """Yield a `Finding` for each axis that is invalid in a scene, and for an unsuitable pattern.
 
-    Also yield one for a pattern of beamlets that only suits a plane, and for an axis whose name the
-    store uses.
+    No axis may change where rays hit, because they are cast once, or have a name of the store. A
+    pattern of beamlets is unsuitable if only a plane can have it.
     """
     parameters = {path: default_value(path) for path in _BEAMLET_POSITION_PATHS} | dict(
         grid.field_values

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 WORLD_ORIGIN_KEYWORD = "world"
-"""Value of ``scene.origin`` that leaves the coordinates of objects as they are."""
+"""Value of ``scene.origin`` for which the coordinates of objects are used without a shift."""
 
 
 class SolidObject(Material, ABC):
@@ -61,7 +61,7 @@ class SolidObject(Material, ABC):
     motion: RigidMotion | None = None
 
     def build_facets(self, files: SpecFiles) -> Facets:
-        """Return the rotated facets relative to the object's origin [m].
+        """Return the facets of the object after its rotation, relative to its own origin [m].
 
         Raises
         ------
@@ -72,7 +72,7 @@ class SolidObject(Material, ABC):
 
     @abstractmethod
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Return the facets before rotation, relative to the object's origin [m]."""
+        """Return the facets of the object without its rotation, relative to its own origin [m]."""
 
 
 class MeshObject(SolidObject):
@@ -91,7 +91,7 @@ class MeshObject(SolidObject):
     scale: float = declare.number_field("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Return the facets of the file before rotation [m]."""
+        """Return the facets in the file, converted to metres, without the object's rotation."""
         from sweep.scenes.meshes import read_mesh_facets
 
         return read_mesh_facets(
@@ -113,7 +113,7 @@ class Sphere(SolidObject):
     )
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Return the facets of the sphere, relative to its centre [m]."""
+        """Return the facets of the sphere relative to its centre [m]."""
         from sweep.scenes.meshes import sphere_facets
 
         return sphere_facets(radius=self.radius, subdivisions=self.subdivisions)
@@ -126,7 +126,7 @@ class Box(SolidObject):
     size: Vector = declare.vector_field("Length along x, y and z", "m", "2 m")
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Return the facets of the box, relative to its centre [m]."""
+        """Return the facets of the box relative to its centre, without the box's rotation [m]."""
         from sweep.scenes.meshes import box_facets
 
         return box_facets(size=self.size)
@@ -141,7 +141,7 @@ class MartianRocks(SpecSection):
     )
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
-        """Return the size-frequency law of Golombek and Rapp (1997)."""
+        """Return the law of Golombek and Rapp (1997) for rocks per area over diameter."""
         from sweep.scenes.scattered_objects import MartianRockLaw
 
         return MartianRockLaw(self.abundance)
@@ -157,7 +157,7 @@ class PowerLaw(SpecSection):
     exponent: float = declare.number_field("Exponent", "2.5", "1e-3", "20")
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
-        """Return the power law of the number of boulders per area over their diameter."""
+        """Return the law for boulders per area over diameter, a power law."""
         from sweep.scenes.scattered_objects import MinimumOfPowerLaws
 
         return MinimumOfPowerLaws(((self.density, self.exponent),))
@@ -193,7 +193,7 @@ class Boulders(Material):
     seed: int = declare.seed_field()
 
     def build_facets(self, ground: Terrain) -> Facets:
-        """Draw boulders on a ground and return their facets in the scene's frame.
+        """Draw boulders at random on a ground; return their facets in the scene's frame.
 
         Parameters
         ----------
@@ -263,7 +263,7 @@ class Trees(SpecSection):
     seed: int = declare.seed_field()
 
     def build_facets(self, ground: Terrain) -> Facets:
-        """Draw trees on a ground and return their facets in the scene's frame.
+        """Draw trees at random on a ground; return their facets in the scene's frame.
 
         Parameters
         ----------
@@ -310,14 +310,17 @@ AnySceneObject = Annotated[
 
 
 def has_relief(scene_object: SpecSection) -> bool:
-    """Return True for ground that is not a plane, and for boulders and trees."""
+    """Return True if a scene's object is boulders, trees, or ground other than a smooth plane."""
     if isinstance(scene_object, PlaneGround):
         return scene_object.relief is not None or scene_object.craters is not None
     return isinstance(scene_object, Ground | Boulders | Trees)
 
 
 def surface_names_and_materials(name: str, scene_object: SpecSection) -> list[tuple[str, Material]]:
-    """Return name and material of each surface of an object, in the order of surface numbers."""
+    """Return a pair (name, material) per surface of an object, in the order of surface numbers.
+
+    `name` is the object's name, with which the names of its surfaces begin.
+    """
     if isinstance(scene_object, Trees):
         return [(f"{name}.leaf", scene_object.leaf), (f"{name}.trunk", scene_object.trunk)]
     assert isinstance(scene_object, Material)
@@ -349,12 +352,12 @@ class SceneDraws(SpecSection):
 
     @property
     def has_draws(self) -> bool:
-        """True: a point cloud always has at least one draw."""
+        """Always True: a point cloud has at least one draw."""
         return True
 
     @property
     def draws_whole_spectra(self) -> bool:
-        """True if draws are whole spectra that a detector and an estimator examine."""
+        """True if a draw is a spectrum with noise in every bin, for detector and estimator."""
         return self.method == SPECTRA_METHOD
 
 
@@ -467,7 +470,10 @@ class Interface(SpecSection):
 
     @model_validator(mode="after")
     def _check_limits_and_period(self) -> Self:
-        """Check that lower limits are below upper limits, and that averaging has a rate."""
+        """Raise a pydantic error for a lower limit above its upper limit, or a missing rate.
+
+        A report that needs more than one valid shot needs a rate.
+        """
         for name in ("range", "radial_velocity"):
             low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
             if low is not None and high is not None and low >= high:
@@ -502,25 +508,25 @@ class BuiltScene(NamedTuple):
     """Scene as bodies at which rays can be cast, in the scene's frame."""
 
     caster: RayCaster
-    """Object that finds where rays hit the bodies.
+    """Object that computes where rays hit the bodies.
 
-    All objects at rest form the first body, if there are any. Each moving object is a body of its
-    own.
+    All objects at rest are one body, the first, if there are any. Every moving object is one more
+    body.
     """
     surface_materials: tuple[SurfaceMaterial, ...]
-    """Materials of the surfaces, in the order of the surface numbers."""
+    """Materials of all surfaces; the index is the surface's number."""
     body_motions: tuple[MovingBody | None, ...]
-    """Motion of each body of the ray caster; None for the body at rest."""
+    """Motion of each body of `caster`; None for the body of all objects at rest."""
     mesh_reports: tuple[str, ...]
-    """One line per object: the size of its mesh, and the repairs made on loading."""
+    """One text per object: the size of its mesh, and repairs that were made when it was loaded."""
     origin: np.ndarray
-    """Origin (3,) that was subtracted from the objects' own coordinates [m]."""
+    """Scene's origin (3,) in the coordinates of its objects, from which it was subtracted [m]."""
     warnings: tuple[str, ...] = ()
-    """Warnings about the scene's files, as sentences."""
+    """Warnings for the user about the scene's files, one sentence each."""
 
 
 def scene_surface_materials(scene: Scene) -> tuple[SurfaceMaterial, ...]:
-    """Return the materials of a scene's surfaces, in the order of their numbers."""
+    """Return the materials of all surfaces of a scene; the index is the surface's number."""
     from sweep.model.geometry.mesh import SurfaceMaterial
 
     return tuple(
@@ -531,10 +537,7 @@ def scene_surface_materials(scene: Scene) -> tuple[SurfaceMaterial, ...]:
 
 
 def scene_projection_wkt(scene: Scene, files: SpecFiles) -> str:
-    """Return the map projection of a scene's coordinates as WKT.
-
-    Coordinates in a store are relative to the scene's origin: add the origin to obtain coordinates
-    of the map [m].
+    """Return the map projection of a scene's coordinates as well-known text (WKT).
 
     Parameters
     ----------
@@ -566,7 +569,7 @@ def scene_projection_wkt(scene: Scene, files: SpecFiles) -> str:
 
 
 def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
-    """Build the bodies of a scene.
+    """Return a scene's bodies, at which rays can be cast, with their surfaces and motions.
 
     Parameters
     ----------
@@ -624,20 +627,20 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
 
 
 def _build_mesh(facets: Facets, first_surface: int) -> CleanedMesh:
-    """Return the mesh of facets and its report; surface numbers start at `first_surface`."""
+    """Return the mesh of facets with a report of repairs; its surfaces start at `first_surface`."""
     surface = (facets.surface + first_surface).astype(np.int16)
     return replace(facets, surface=surface).to_cleaned_mesh()
 
 
 def _object_error(name: str, error: Exception) -> SceneError:
-    """Return an error that states which object can't be built, and why."""
+    """Return a `SceneError` for the object `name` that can't be built because of `error`."""
     return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
 
 
 def _build_grounds(
     scene: Scene, files: SpecFiles
 ) -> tuple[np.ndarray, dict[str, Terrain], tuple[str, ...]]:
-    """Return the scene's origin (3,) [m], grounds in the scene's frame by name, and warnings."""
+    """Return the scene's origin (3,) [m], terrains in the scene's frame by name, and warnings."""
     from sweep.scenes.map_frames import require_one_map
     from sweep.scenes.tiles import extend_tiles_to_neighbours
 
@@ -699,7 +702,7 @@ def _build_object_facets(
     origin: np.ndarray,
     files: SpecFiles,
 ) -> Facets:
-    """Return an object's facets in the scene's frame, or in its own frame if the object moves."""
+    """Return an object's facets in the scene's frame, or in the object's frame if it moves."""
     if isinstance(scene_object, Ground):
         return grounds[name].to_facets()
     if isinstance(scene_object, Boulders | Trees):

@@ -15,17 +15,17 @@ from sweep.spec.specs import GridSpec, SceneSpec
 from sweep.spec.yaml_document import library_instrument_files
 
 JSON_SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
-"""URI of the JSON Schema dialect that the schema uses."""
+"""URI of the dialect in which the JSON Schema of specs is written."""
 
 _INSTRUMENT_SECTION_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
-"""Names of the pydantic models of the sections of an instrument."""
+"""Names of the pydantic models for the sections of an instrument."""
 
 
 def json_schema() -> JsonObject:
-    """Return the JSON Schema (2020-12) of spec files, for a flat target or a scene.
+    """Return the JSON Schema (2020-12) of spec files, for studies of a flat target and of a scene.
 
-    Values of parameters are described field by field. Fields that an axis or an instrument's file
-    may supply are not required by the schema, although `sweep.load` requires them.
+    All fields of parameters are described. A field that may come from an axis or an instrument's
+    file is not required by the schema; `sweep.load` requires it.
     """
     _, schema = models_json_schema([(GridSpec, "validation"), (SceneSpec, "validation")])
     definitions: JsonObject = schema["$defs"]
@@ -69,7 +69,10 @@ def json_schema() -> JsonObject:
 def _add_study_sections(
     study_schema: JsonObject, rules: Mapping[str, Rule], required: tuple[str, ...]
 ) -> None:
-    """Add instrument, axes and required sections to the schema of a study."""
+    """Add instrument, axes and required sections to the schema of a study, in place.
+
+    `rules` are those of the parameters that an axis may set, by dotted path.
+    """
     study_schema["properties"]["instrument"] = {
         "description": "The instrument: its name in the library (sweep instruments), the path of "
         "its file, one of these with changed fields, or all of its fields",
@@ -86,9 +89,9 @@ def _add_study_sections(
 
 
 def _format_schema_defaults(properties: JsonObject, model: type[BaseModel]) -> None:
-    """Replace the defaults of a model's fields, in SI units, by values as users write them.
+    """Replace defaults in SI units by values as users write them, in place in a JSON Schema.
 
-    `properties` is the JSON Schema of the fields, which is changed in place.
+    `properties` has the schema of each field of `model`, by the field's name.
     """
     for name, field in fields_by_name(model).items():
         field_schema, rule = properties[name], rule_of_field(field)
@@ -99,12 +102,18 @@ def _format_schema_defaults(properties: JsonObject, model: type[BaseModel]) -> N
 
 
 def _definition_reference(path: str, suffix: str) -> JsonObject:
-    """Return the reference to the schema of a field; `suffix` is ``value`` or ``values``."""
+    """Return a reference to the JSON Schema of a field's value, or of its values on an axis.
+
+    `suffix` is ``value`` or ``values``.
+    """
     return {"$ref": f"#/$defs/{path}.{suffix}"}
 
 
 def _mapping_schema(properties: JsonObject, *required: str, **keywords: Any) -> JsonObject:
-    """Return the schema of a mapping with the given properties only."""
+    """Return the JSON Schema of a mapping that has no other keys than those of `properties`.
+
+    `required` are the keys that must be there. `keywords` are added to the schema.
+    """
     required_keyword = {"required": list(required)} if required else {}
     return (
         {"type": "object", "properties": properties, "additionalProperties": False}
@@ -114,12 +123,15 @@ def _mapping_schema(properties: JsonObject, *required: str, **keywords: Any) -> 
 
 
 def _list_schema(items: JsonObject, length_min: int = 1, **keywords: Any) -> JsonObject:
-    """Return the schema of a list."""
+    """Return the JSON Schema of a list of `length_min` or more `items`, with more `keywords`."""
     return {"type": "array", "items": items, "minItems": length_min} | keywords
 
 
 def _values_schema(path: str, rule: Rule) -> JsonObject:
-    """Return the schema of a list of values and generators, or of one generator."""
+    """Return the JSON Schema of a parameter's values on an axis.
+
+    The values are a list of values and generators, or one generator.
+    """
     value_schema = _definition_reference(path, "value")
     generator_schemas = (
         list(_generator_schemas(value_schema)) if isinstance(rule, NumericRule) else []
@@ -129,7 +141,7 @@ def _values_schema(path: str, rule: Rule) -> JsonObject:
 
 
 def _generator_schemas(value_schema: JsonObject) -> Iterator[JsonObject]:
-    """Yield the JSON schemas of the generators of values: linear, log and step."""
+    """Yield the JSON Schema of each generator of an axis's values: linear, log and step."""
     number_schema = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
     for form in ("linear", "log"):
         bounds_schema = _list_schema(value_schema, 2, maxItems=2)
@@ -139,10 +151,9 @@ def _generator_schemas(value_schema: JsonObject) -> Iterator[JsonObject]:
 
 
 def _axes_schema(rules: Mapping[str, Rule]) -> JsonObject:
-    """Return the JSON schema of the section ``axes``.
+    """Return the JSON Schema of the section ``axes``.
 
-    The key of an axis is the path of the parameter that it varies. The key of a zipped axis is any
-    other name.
+    The key of an axis is the dotted path of its parameter, and any other name for a zipped axis.
     """
     value_schemas = {
         path: {

@@ -36,15 +36,15 @@ from sweep.spec.rules import (
 )
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
-"""Names of the receiver architectures: how the echo is detected."""
+"""Names of receiver architectures: two kinds of coherent detection, and direct detection."""
 _POWER_BOUNDS = ("1e-18 W", "1e9 W")
-"""Lower and upper bound of an optical power, with units."""
+"""Least and greatest optical power that a field takes, with units."""
 _FREQUENCY_BOUNDS = ("1 mHz", "1e15 Hz")
-"""Lower and upper bound of a frequency or bandwidth, with units."""
+"""Least and greatest frequency or bandwidth that a field takes, with units."""
 _RESISTANCE_BOUNDS = ("1 uohm", "1e12 ohm")
-"""Lower and upper bound of a resistance, with units."""
+"""Least and greatest resistance that a field takes, with units."""
 _WAIST_EXAMPLE_AND_BOUNDS = ("5 mm", "100 nm", "1 km")
-"""Example, lower bound and upper bound of the waist radius of a beam, with units."""
+"""Example, least value and greatest value for the waist radius of a beam, with units."""
 
 
 @add_effect_parameter_fields("instrument.laser")
@@ -246,7 +246,10 @@ class Estimator(SpecSection):
 
 
 def _search_limit_field(description: str, *rule_arguments: str) -> Any:
-    """Declare a field for one limit of the search band."""
+    """Return the declaration of a field for one limit of the search band.
+
+    The search band is the range and the velocity in which echoes are searched.
+    """
     full_description = (
         f"{description}, as a segment starts; a search band has all four ends, and without them "
         "the "
@@ -274,7 +277,10 @@ class SearchBandSection(SpecSection):
 
 
 def _design_pfa_field(noise_scope: str) -> Any:
-    """Declare a field for a false-alarm probability from which the threshold follows."""
+    """Return the declaration of a field for a false-alarm probability that sets the threshold.
+
+    `noise_scope` says in words what the probability refers to, such as ``a bin``.
+    """
     description = (
         f"Instead of tnr: probability that noise alone raises a false alarm in {noise_scope}"
     )
@@ -345,7 +351,7 @@ class Processing(SpecSection):
 
     @model_validator(mode="after")
     def _check_single_threshold(self) -> Self:
-        """Check that exactly one field sets the threshold."""
+        """Raise a pydantic error unless exactly one field sets the threshold."""
         threshold_fields = [
             field_name.removeprefix(PROCESSING_PREFIX) for field_name in THRESHOLD_PATHS
         ]
@@ -407,7 +413,10 @@ class Instrument(SpecSection):
 
 
 def sunlight_field(illuminated: str) -> Any:
-    """Declare a field for the spectral irradiance of sunlight on a target or scene [W/m^3]."""
+    """Return the declaration of a field for the spectral irradiance of sunlight [W/m^3].
+
+    `illuminated` names in words what is lit: a target or a scene.
+    """
     description = f"Spectral irradiance of sunlight on the {illuminated}"
     return declare.quantity_field(
         description, "W/m^3", "0.5 W/m^2/nm", "0 W/m^3", "1e18 W/m^3", default=0.0
@@ -415,7 +424,7 @@ def sunlight_field(illuminated: str) -> Any:
 
 
 REFLECTANCE_FIELD = declare.number_field("Fraction of light scattered back", "0.1", "0", "1")
-"""Declaration of a field for a reflectance, 0..1."""
+"""Declaration of a field for a reflectance from 0 to 1."""
 
 
 @add_effect_parameter_fields("target")
@@ -465,9 +474,9 @@ class Effects(SpecSection):
 
 
 def _tolerance_share_field(description: str) -> Any:
-    """Declare a field for the part of the tolerance that one source of error may use.
+    """Return the declaration of a field for the part of the tolerance that one error may use.
 
-    By default the part is chosen automatically.
+    The field takes a number, or ``auto``: the part follows from the tolerance.
     """
     description += "; auto: as accuracy.tolerance needs"
     return declare.number_field(
@@ -503,7 +512,7 @@ class Accuracy(SpecSection):
 
 
 SPECTRA_METHOD = "spectra"
-"""Value of ``draws.method`` for drawing whole spectra, including noise in every bin."""
+"""Value of ``draws.method`` for which a draw is a spectrum with noise in every bin."""
 
 
 class Draws(SpecSection):
@@ -537,17 +546,17 @@ class Draws(SpecSection):
 
     @property
     def has_draws(self) -> bool:
-        """True if the study draws random realisations."""
+        """True if the study has draws, random realisations of each point."""
         return self.number > 0 or self.is_adaptive
 
     @property
     def draws_whole_spectra(self) -> bool:
-        """True if draws are whole spectra that a detector and an estimator examine."""
+        """True if a draw is a spectrum with noise in every bin, for detector and estimator."""
         return self.method == SPECTRA_METHOD
 
     @property
     def is_adaptive(self) -> bool:
-        """True if each point is drawn until its statistical error is within the tolerance."""
+        """True if a point is drawn until the tolerance or `limit` is reached."""
         return self.limit > 0
 
 
@@ -591,7 +600,7 @@ MODEL_BY_SECTION: dict[str, type[BaseModel]] = {
     "footprint": Footprint,
     "accuracy": Accuracy,
 }
-"""Pydantic models of the sections whose fields an axis may vary, by the name of the section."""
+"""Pydantic models of the sections whose fields an axis may set, by the name of the section."""
 
 
 AXES_REMEDY = (
@@ -601,12 +610,12 @@ SECTIONS_NOT_ON_AXES = (
     "draws", "effects", "error_floor", "execution", "figures", "interface",
     "navigation", "platform", "question", "scanners", "scene", "seed", "storage", "title",
 )  # fmt: skip
-"""Sections and fields of a study that no axis may set."""
+"""Names of the sections, and of fields outside sections, that no axis may set."""
 
 
 @cache
 def parameter_rules() -> MappingProxyType[str, Rule]:
-    """Return the rule of every parameter that an axis may vary, by dotted path."""
+    """Return the rule of every parameter, a field that an axis may set, by dotted path."""
     rules: dict[str, Rule] = {}
     for section, model in MODEL_BY_SECTION.items():
         rules |= rules_by_path(model, section)
@@ -614,7 +623,7 @@ def parameter_rules() -> MappingProxyType[str, Rule]:
 
 
 def default_value(path: str) -> Any:
-    """Return the default of a parameter in SI units; None if the parameter is required."""
+    """Return a parameter's default in SI units; None if a spec must state the parameter."""
     section, *names = path.split(".")
     model: Any = MODEL_BY_SECTION[section]
     for name in names[:-1]:
@@ -624,16 +633,13 @@ def default_value(path: str) -> Any:
 
 
 def parameter_short_name(path: str) -> str:
-    """Return the last part of a parameter's path.
-
-    If the last part is ``kind``, return the part before it.
-    """
+    """Return the last part of a parameter's dotted path; if it is ``kind``, the part before it."""
     *parent_names, last_name = path.split(".")
     return parent_names[-1] if last_name == "kind" and parent_names else last_name
 
 
 def suggest_parameter(path: str, known_paths: Iterable[str] | None = None) -> str:
-    """Suggest the parameter that a wrong path probably means.
+    """Return advice on a dotted path that names no parameter, such as a similar path.
 
     Parameters
     ----------

@@ -105,22 +105,24 @@ if TYPE_CHECKING:
 
 
 GRID_POINTS_MAX = 10**15
-"""Maximum number of points of a grid."""
+"""Largest number of points of a study's grid."""
 LINE_DRIFT_WARNING_BINS = 2.0
-"""Drift of a line within a record, due to acceleration, above which users are warned [bins].
+"""Drift of a spectral line within a record, due to acceleration, above which users are warned
+[bins].
 
-It applies to echoes in developed speckle. Above it the stated standard errors are too small.
+The line is that of an echo in developed speckle. With more drift, the stated standard errors are
+too small.
 """
 
 _N_ACCELERATION_SAMPLES = 1000
-"""Number of times in a flight at which the acceleration of the platform is evaluated."""
+"""Number of times in a flight at which the platform's acceleration is computed."""
 
 FILE_DIGESTS_KEY = "files"
-"""Key in the JSON of a stored spec under which the digests of files are held, by path."""
+"""Key in the JSON of a stored spec that holds the digests of files, by path."""
 _SECTIONS_WITHOUT_DEFAULTS = ("question", "execution", "axes", "figures")
-"""Sections to which `to_yaml_mapping` adds no defaults for fields that the spec does not state."""
+"""Sections in which `to_yaml_mapping` has only the fields that the user stated, and no defaults."""
 _AXES_RULE = CustomRule(description="What varies", reader=lambda axes: axes)
-"""Rule of the field `axes`, which is read by `read_axes` before pydantic validates the spec."""
+"""Rule of the field `axes` that accepts any value: `read_axes` checks the axes beforehand."""
 
 
 class BaseSpec(SpecSection):
@@ -143,20 +145,17 @@ class BaseSpec(SpecSection):
     axes: tuple[Axis, ...] = declare.field_with_rule(_AXES_RULE, ())
 
     _yaml_mapping: dict[str, Any] = PrivateAttr(default_factory=dict)
-    """The spec with all defaults, as a user would write it."""
+    """The spec with all its defaults as nested dicts, with values as a user would write them."""
     _base_folder: Path = PrivateAttr(default=Path())
-    """Folder that paths in the spec are relative to."""
+    """Folder that relative paths in the spec refer to."""
     _file_digests: dict[str, str] = PrivateAttr(default_factory=dict)
     """Digest of each file's content, by the file's path as written in the spec."""
     _instrument_error_floor: InstrumentErrorFloor | None = PrivateAttr(default=None)
-    """Fields of the section error_floor that come from the instrument.
-
-    None if the spec states all of them.
-    """
+    """Fields of the section error_floor that come from the instrument; None if there are none."""
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], *, base: Path | str = ".") -> Self:
-        """Make a spec from plain data, written as in a YAML file.
+        """Make a spec from nested dicts whose values are written as in a YAML file.
 
         Parameters
         ----------
@@ -182,10 +181,10 @@ class BaseSpec(SpecSection):
 
     @classmethod
     def from_stored(cls, json_text: str, base: Path | str | None = None) -> Self:
-        """Make a spec from the JSON text of `to_json`.
+        """Make a spec from JSON text that `to_json` returned.
 
-        The spec equals the original, except for ``execution``, which is not stored. Files are not
-        read before they are needed.
+        The spec equals the original, except for ``execution``, which is not stored. Files that the
+        spec names are not read.
 
         Parameters
         ----------
@@ -209,7 +208,7 @@ class BaseSpec(SpecSection):
 
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
-        """Make a spec from a document.
+        """Make a spec from a `Document`, a spec as read with the lines of its values.
 
         Parameters
         ----------
@@ -272,14 +271,14 @@ class BaseSpec(SpecSection):
 
     @classmethod
     def may_be_on_axis(cls, path: str) -> bool:
-        """Return True if an axis may set the parameter at a dotted path; always for grids."""
+        """Return True if an axis may set the parameter at the dotted path `path`; here always."""
         return True
 
     @classmethod
     def class_specific_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Return the mistakes that only this class of spec can have.
+        """Return a `Finding` for each mistake that only this class of spec can have; here none.
 
         Parameters
         ----------
@@ -295,10 +294,10 @@ class BaseSpec(SpecSection):
         return []
 
     def parameters(self) -> dict[str, float | int | str]:
-        """Return the SI values of all parameters by dotted path.
+        """Return the SI values of all parameters (fields that axes may set) by dotted path.
 
-        A parameter on an axis has the value that its field states. If the spec does not state the
-        field, it has the first value on the axis.
+        The value of a parameter on an axis is that of its field. If the spec does not state the
+        field, the value is the first one on the axis.
         """
         return {
             path: value
@@ -308,13 +307,13 @@ class BaseSpec(SpecSection):
         }
 
     def effect_modes(self) -> dict[str, str]:
-        """Return the mode of each effect, `auto`, `on` or `off`, by the effect's name."""
+        """Return the mode of each effect (`auto`, `on` or `off`), by the effect's name."""
         return values_by_path(self.effects)
 
     def parameters_with_overrides(
         self, overrides: Mapping[str, object]
     ) -> dict[str, float | int | str]:
-        """Return the parameters with new values for some of them.
+        """Return the SI values of all parameters, with new values for some of them.
 
         Parameters
         ----------
@@ -360,14 +359,14 @@ class BaseSpec(SpecSection):
         return parameters
 
     def value_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
-        """Return the reasons why a parameter may not take an SI value; none for grids.
+        """Return a `Finding` for each reason why a parameter may not take an SI value; here none.
 
-        `location` is the location of the value in the spec, for findings.
+        `location` holds the keys that lead to the value in the spec.
         """
         return []
 
     def axis_parameter(self, name: str) -> AxisParameter:
-        """Return the parameter on an axis with a given coordinate name or dotted path.
+        """Return the `AxisParameter` with the coordinate name or dotted path `name`.
 
         Raises
         ------
@@ -381,7 +380,7 @@ class BaseSpec(SpecSection):
         raise KeyError(name)
 
     def read_coordinate_value(self, name: str, raw_value: object) -> float | int | str:
-        """Read a value of a coordinate and convert it to the unit in which the axis was written.
+        """Convert a coordinate's value as written to the unit in which the axis was written.
 
         Parameters
         ----------
@@ -409,17 +408,14 @@ class BaseSpec(SpecSection):
         return read_in_unit(rule, raw_value, parameter.units)
 
     def unstated_error_sentences(self) -> list[str]:
-        """Return sentences for the user about sources of error whose size the spec leaves open.
-
-        The list is empty for a grid; `SceneSpec` overrides this method.
-        """
+        """Return sentences for the user on errors whose size the spec does not state; here none."""
         return []
 
     def identity(self) -> dict[str, Any]:
-        """Return the content that identifies the study, in SI values.
+        """Return plain data in SI units that is equal for two specs of the same study.
 
-        Title, question, figures, execution and fields overridden by an axis do not count. The order
-        of the axes counts, because it determines the layout of the arrays.
+        Title, question, figures and execution are left out, and fields that an axis overrides. The
+        order of the axes matters, because it determines the layout of the arrays.
         """
         section_names = ("draws", "error_floor", "navigation", "storage")
         return {
@@ -443,7 +439,7 @@ class BaseSpec(SpecSection):
 
     @cached_property
     def id(self) -> str:
-        """Hash of the identity, 32 hexadecimal digits."""
+        """Hash of the study's identity, 32 hexadecimal digits."""
         return identity_digest(self.identity())
 
     def __eq__(self, other: object) -> bool:
@@ -458,16 +454,18 @@ class BaseSpec(SpecSection):
         return hash(self.id)
 
     def to_yaml_mapping(self) -> dict[str, Any]:
-        """Return the complete spec as a user would write it, with the instrument and all defaults.
+        """Return the spec as nested dicts as a user would write it, with instrument and defaults.
 
-        Fields that an axis sets are left out, so that the result does not depend on values that a
-        user wrote there in addition. ``execution`` is left out because it is no part of a study's
-        identity.
+        Fields that an axis sets are left out: their values, if a user wrote any, have no effect.
+        ``execution`` is left out because it changes no result.
         """
         return copy.deepcopy(self._yaml_mapping)
 
     def _fill_defaults(self, raw_spec: dict[str, Any]) -> dict[str, Any]:
-        """Return the written spec with defaults, without ``execution`` and fields set by axes."""
+        """Return a copy of a spec as written, with the defaults of fields that it does not state.
+
+        The copy lacks ``execution`` and the fields that axes set.
+        """
         mapping = copy.deepcopy(
             {name: value for name, value in raw_spec.items() if name != "execution"}
         )
@@ -477,7 +475,7 @@ class BaseSpec(SpecSection):
         return remove_fields_on_axes(mapping)
 
     def to_json(self) -> str:
-        """Return the spec as JSON text for a store, with the digests of its files."""
+        """Return the spec as JSON text for a store, with the digests of files that it names."""
         mapping = self.to_yaml_mapping() | (
             {FILE_DIGESTS_KEY: self._file_digests} if self._file_digests else {}
         )
@@ -485,10 +483,10 @@ class BaseSpec(SpecSection):
 
 
 def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, Rule | None]:
-    """Return dotted path and rule of the parameter that `name` denotes.
+    """Return dotted path and rule of the parameter that is meant by `name`.
 
-    The name is a dotted path or the last part of one. If none or several paths match, return the
-    name itself and None.
+    `name` is a dotted path or the last part of one. If it matches no path in `known_paths`, or
+    several, the result is `name` itself and None.
     """
     rules = sections.parameter_rules()
     paths = [path for path in known_paths if name in (path, sections.parameter_short_name(path))]
@@ -496,7 +494,10 @@ def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, 
 
 
 def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if the slopes of segments do not separate range and velocity."""
+    """Yield a `Finding` if the chirp rates of two segments are equal.
+
+    Range and velocity then can't be separated.
+    """
     if grid.any_point_meets({waveform.DOWN_CHIRP_RATE_RATIO_PATH: lambda slope: slope == 1.0}):
         problem = "is the slope of the segment 'up': range and velocity need two slopes"
         yield grid.make_finding(
@@ -523,11 +524,11 @@ def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
 STRONGEST_PEAK_CONDITION: dict[str, ValueCondition] = {
     waveform.REPORTED_PEAKS_PATH: lambda peaks: peaks == waveform.STRONGEST_PEAK
 }
-"""Condition on parameters under which each segment reports only its strongest peak."""
+"""Condition on parameters, by dotted path: each segment reports only its strongest peak."""
 
 
 def _strongest_peak_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if only strongest peaks are reported where their probability is unknown."""
+    """Yield a `Finding` if only strongest peaks are reported and their probability is unknown."""
     several_looks: dict[str, ValueCondition] = {
         looks.LOOKS_NUMBER_PATH: lambda number: number > 1,
         looks.LOOKS_COMBINE_PATH: lambda combination: combination != looks.COMBINE_COHERENT,
@@ -548,7 +549,7 @@ def _strongest_peak_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _grid_size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
-    """Yield a finding if the grid has more than `GRID_POINTS_MAX` points."""
+    """Yield a `Finding` if the grid of the axes has more than `GRID_POINTS_MAX` points."""
     n_points = math.prod(axis.size for axis in axes)
     if n_points > GRID_POINTS_MAX:
         problem = f"make {n_points:.3g} points, and a study has at most {GRID_POINTS_MAX:.0e}"
@@ -572,7 +573,10 @@ class GridSpec(BaseSpec):
     def class_specific_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Return mistakes in figures and draws, and random effects of a study without draws."""
+        """Return a `Finding` for each mistake in figures and draws.
+
+        A random effect in a study without draws is a mistake.
+        """
         extra_variables = (
             STRONGEST_PEAK_OUTPUTS if grid.any_point_meets(STRONGEST_PEAK_CONDITION) else ()
         )
@@ -606,20 +610,20 @@ class GridSpec(BaseSpec):
 
     @cached_property
     def has_random_effects(self) -> bool:
-        """True if an effect other than noise may be random at some point of the grid."""
+        """True if some point of the grid may have a random effect other than noise."""
         return any(
             undrawn_effect_findings(GridValues(self.parameters(), self.axes, self.effect_modes()))
         )
 
     @property
     def reports_strongest_peak(self) -> bool:
-        """True if segments report only their strongest peak at some point of the grid."""
+        """True if segments report only their strongest peak at one point of the grid or more."""
         return GridValues(self.parameters(), self.axes).any_point_meets(STRONGEST_PEAK_CONDITION)
 
     def identity(self) -> dict[str, Any]:
-        """Return the content that identifies the study, in SI values.
+        """Return plain data in SI units that is equal for two specs of the same study.
 
-        Parameters of detectors and estimators count only if whole spectra are drawn.
+        Parameters of detectors and estimators are left out unless whole spectra are drawn.
         """
         identity = super().identity()
         if not self.draws.draws_whole_spectra:
@@ -652,7 +656,7 @@ class SceneSpec(BaseSpec):
 
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
-        """Make a spec from a document, and compute the digests of the files that it names.
+        """Make a spec from a `Document`, and compute the digests of the files that the spec names.
 
         Parameters
         ----------
@@ -681,7 +685,7 @@ class SceneSpec(BaseSpec):
     def class_specific_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Return mistakes in scene, flight, files, random effects and figures."""
+        """Return a `Finding` for each mistake in scene, flight, files, effects and figures."""
         draws = (
             validate_or_none(scene_sections.SceneDraws, raw_spec.get("draws", {}))
             or scene_sections.SceneDraws()
@@ -695,16 +699,22 @@ class SceneSpec(BaseSpec):
 
     @classmethod
     def may_be_on_axis(cls, path: str) -> bool:
-        """Return True if an axis may set the parameter at a dotted path: it moves no beamlet."""
+        """Return True if an axis may set the parameter at the dotted path `path`.
+
+        A parameter that changes where rays hit may not be on an axis.
+        """
         return not axis_refusal(path).problem
 
     def value_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
-        """Return the reasons why a parameter may not take an SI value with fixed rays."""
+        """Return a `Finding` if a parameter may not take an SI value: rays would hit elsewhere.
+
+        `location` holds the keys that lead to the value in the spec.
+        """
         return variation_findings(self.parameters(), path, [value], location)
 
     @property
     def base_folder(self) -> Path:
-        """Folder that paths in the spec are relative to."""
+        """Folder that relative paths in the spec refer to."""
         return self._base_folder
 
     @property
@@ -714,10 +724,11 @@ class SceneSpec(BaseSpec):
         return replace(files, time_origin=self.platform.read_time_origin(files))
 
     def parameters(self) -> dict[str, float | int | str]:
-        """Return the SI values of all parameters by dotted path.
+        """Return the SI values of all parameters (fields that axes may set) by dotted path.
 
         A parameter on an axis has the value of its field. The number of beamlets is the number of
-        rays cast per shot; detector and estimator are left out unless whole spectra are drawn.
+        rays cast per shot. Parameters of detector and estimator are left out unless whole spectra
+        are drawn.
         """
         parameters = super().parameters()
         if not self.draws.draws_whole_spectra:
@@ -732,18 +743,18 @@ class SceneSpec(BaseSpec):
 
     @property
     def is_ray_number_set_by_tolerance(self) -> bool:
-        """True if the number of rays of each shot follows from the tolerance."""
+        """True if the spec states no number of rays per shot, and it follows from the tolerance."""
         return self.footprint.beamlets == 0 and beamlets_converge(self.parameters())
 
     def surface_materials(self) -> tuple[SurfaceMaterial, ...]:
-        """Return the materials of the scene's surfaces, in the order of their numbers.
+        """Return the materials of all surfaces of the scene; the index is the surface's number.
 
-        No file is read.
+        Files that the spec names are not read.
         """
         return scene_sections.scene_surface_materials(self.scene)
 
     def build_scene(self) -> scene_sections.BuiltScene:
-        """Return the scene as bodies at which rays can be cast.
+        """Return the scene as bodies at which rays can be cast, with surfaces and motions.
 
         Raises
         ------
@@ -756,7 +767,7 @@ class SceneSpec(BaseSpec):
         )
 
     def build_flight(self) -> MovingBody:
-        """Return the motion of the instrument in the scene's frame.
+        """Return the motion of the instrument in the scene's frame, as a function of time.
 
         Raises
         ------
@@ -766,26 +777,26 @@ class SceneSpec(BaseSpec):
         return self.platform.build_moving_body(self.files)
 
     def scan_pattern(self, name: str) -> ScanPattern:
-        """Return the scan pattern of the scanner `name`."""
+        """Return the scan pattern of the scanner called `name`."""
         return self.scanners[name].build_pattern()
 
     def shots_per_cycle(self, name: str) -> int:
-        """Return the number of shots in a measurement cycle of the scanner `name`."""
+        """Return the number of shots in a measurement cycle of the scanner called `name`."""
         return shots_per_cycle(self.scan_pattern(name))
 
     @property
     def has_navigation_solution(self) -> bool:
-        """True if at least one scanner has enough shots per cycle for a navigation solution."""
+        """True if one scanner or more has enough shots per cycle to estimate a velocity vector."""
         return any(
             self.shots_per_cycle(name) >= NAVIGATION_SHOTS_PER_CYCLE_MIN for name in self.scanners
         )
 
     def unstated_error_sentences(self) -> list[str]:
-        """Return sentences for the user about sources of error whose size the spec leaves open.
+        """Return sentences for the user on errors whose size the spec does not state.
 
-        The sources are an error floor that the instrument brings along or that is missing, the
-        drift of lines within a record by acceleration, and relief of the ground for which the
-        navigation has no standard deviation.
+        The errors are a missing error floor, or one that comes from the instrument; the drift of
+        spectral lines within a record, due to acceleration; and relief of the ground, if the
+        navigation has no standard deviation for it.
         """
         sentences = []
         floor_values, rules = (
@@ -835,7 +846,7 @@ class SceneSpec(BaseSpec):
         return sentences
 
     def _line_drift_bins(self) -> float:
-        """Return the largest drift of a speckled line within a record, due to acceleration [bins].
+        """Return the largest drift of a spectral line within a record, due to acceleration [bins].
 
         Notes
         -----
@@ -861,19 +872,19 @@ class SceneSpec(BaseSpec):
         return drift if drift > LINE_DRIFT_WARNING_BINS else 0.0
 
     def number_of_cycles(self, name: str) -> int:
-        """Return the number of complete measurement cycles of the scanner `name` in the flight."""
+        """Return the number of complete measurement cycles of a scanner in the flight."""
         flight, pattern = self.build_flight(), self.scan_pattern(name)
         return pattern.count_shots(flight.stop_time - flight.start_time) // shots_per_cycle(pattern)
 
     @property
     def beamlet_pattern(self) -> str:
-        """Arrangement of the beamlets: a pattern of `sweep.model.beamlets.place_beamlets`."""
+        """Name of the arrangement of beamlets, for `sweep.model.beamlets.place_beamlets`."""
         return beamlet_pattern(self.parameters())
 
     def footprint_angles_function(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
-        """Return the function that computes the angles of a footprint from its range [m].
+        """Return a function from ranges [m] to the `FootprintAngles` of the beam.
 
-        The result is None if the divergence is constant.
+        The result is None if the beam's divergence does not depend on range.
         """
         parameters = self.parameters()
         return (
@@ -883,7 +894,9 @@ class SceneSpec(BaseSpec):
         )
 
     def interface_with_overrides(self, overrides: Mapping[str, object]) -> scene_sections.Interface:
-        """Return the section ``interface`` with new values for some fields, written as in a spec.
+        """Return the section ``interface`` with new values for some of its fields.
+
+        `overrides` has the new values, written as in a spec, by field.
 
         Raises
         ------
@@ -904,7 +917,7 @@ class SceneSpec(BaseSpec):
         raise SpecError(map(Document({}).mistake_from_finding, located_findings))
 
     def pointing_jitter(self) -> PointingJitter | None:
-        """Return the random pointing errors of the beams; None without jitter."""
+        """Return the model of the beams' random pointing errors; None if their sigma is 0."""
         from sweep.model.geometry.scanner import PointingJitter
 
         sigma = self.platform.jitter
@@ -912,17 +925,17 @@ class SceneSpec(BaseSpec):
 
     @property
     def has_rotating_bodies(self) -> bool:
-        """True if any body of the scene rotates."""
+        """True if one object of the scene or more may rotate during the flight."""
         motions = (
             getattr(scene_object, "motion", None) for scene_object in self.scene.objects.values()
         )
         return any(motion is not None and motion.attitude.kind != "fixed" for motion in motions)
 
     def geometry_identity(self, name: str) -> dict[str, Any]:
-        """Return the content that identifies one scanner's geometry: all that its rays depend on.
+        """Return plain data that is equal for two scanners whose rays hit the same points.
 
-        Names, reflectances and the paths of files do not count. Files count by their content.
-        Objects count by their order in the scene, which numbers their surfaces.
+        Names, reflectances and the paths of files are left out. Files are represented by digests of
+        their content. The order of objects matters, because it numbers their surfaces.
         """
         parameters, digests = self.parameters(), self._file_digests
         index_by_name = {key: index for index, key in enumerate(self.scene.objects)}
@@ -951,14 +964,15 @@ class SceneSpec(BaseSpec):
         }
 
     def geometry_id(self, name: str) -> str:
-        """Return the hash of the geometry seen by the scanner `name`, 32 hexadecimal digits."""
+        """Return the hash of a scanner's `geometry_identity`, 32 hexadecimal digits."""
         return identity_digest(self.geometry_identity(name))
 
     def identity(self) -> dict[str, Any]:
-        """Return the content that identifies the study, in SI values.
+        """Return plain data in SI units that is equal for two specs of the same study.
 
-        Files count by their content and not by their paths. The order of objects counts, because it
-        numbers the surfaces. A number of rays that follows from the tolerance counts as 0.
+        Files are represented by digests of their content, not by their paths. The order of objects
+        matters, because it numbers the surfaces. A number of rays that follows from the tolerance
+        is represented by 0.
         """
         digests, automatic_beamlets = (
             self._file_digests,
@@ -1017,9 +1031,9 @@ def load(path: str | Path) -> GridSpec | SceneSpec:
 
 
 def _user_values_on_axes(raw_spec: Any) -> dict[str, object]:
-    """Return the written values of fields that a user sets although an axis sets them too.
+    """Return the values, as written, of fields that the user states and an axis sets too, by path.
 
-    Fields of the library or of an instrument's file do not count: an axis may override them.
+    Fields of the instrument's file or library are left out: an axis may override them.
     """
     if not isinstance(raw_spec, Mapping):
         return {}
@@ -1033,7 +1047,10 @@ def _user_values_on_axes(raw_spec: Any) -> dict[str, object]:
 def _field_axis_contradiction_findings(
     user_values: Mapping[str, object], axes: Sequence[Axis]
 ) -> Iterator[Finding]:
-    """Yield a finding for each field whose value is not among the values of its axis."""
+    """Yield a `Finding` for each field whose value is not among the values on the field's axis.
+
+    `user_values` has the values as written, by dotted path.
+    """
     parameters_by_path = {
         parameter.path: parameter for axis in axes for parameter in axis.parameters
     }
@@ -1058,7 +1075,7 @@ def _field_axis_contradiction_findings(
 
 
 def from_stored(json_text: str, base: Path | str | None = None) -> GridSpec | SceneSpec:
-    """Make a spec from the JSON text of its `to_json`.
+    """Make a spec from JSON text that a store holds, which `to_json` of the spec returned.
 
     Parameters
     ----------
@@ -1076,12 +1093,12 @@ def from_stored(json_text: str, base: Path | str | None = None) -> GridSpec | Sc
 
 
 def _spec_class(raw_spec: Any) -> type[GridSpec] | type[SceneSpec]:
-    """Return the class of a spec: `SceneSpec` if it has a section ``scene``, else `GridSpec`."""
+    """Return `SceneSpec` if a spec as parsed from YAML has a section ``scene``, else `GridSpec`."""
     return SceneSpec if isinstance(raw_spec, dict) and "scene" in raw_spec else GridSpec
 
 
 def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
-    """Parse YAML values given as text by dotted path.
+    """Parse YAML texts, one for each dotted path, to plain data.
 
     Parameters
     ----------
@@ -1106,5 +1123,8 @@ def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _smallest_value_text(rule: Rule) -> str:
-    """Return the smallest value of a field, as a user would write it."""
+    """Return the least value that a field takes, as a user would write it.
+
+    For a rule without a lower bound the result is ``0``.
+    """
     return rule.bound_texts.get("at_least", "0") if isinstance(rule, NumericRule) else "0"

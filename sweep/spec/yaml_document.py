@@ -40,17 +40,18 @@ from sweep.spec.rules import (
 from sweep.spec.sections import parameter_rules
 
 YAML_FILE_BYTES_MAX = 1_000_000
-"""Maximum size of a YAML file [bytes]."""
+"""Largest size of a YAML file that is read [bytes]."""
 NESTING_DEPTH_MAX = 30
-"""Maximum depth of nested mappings and lists."""
+"""Largest depth of nested mappings and lists in a spec."""
 YAML_NODES_MAX = 200_000
-"""Maximum number of YAML nodes in a document; each repetition by an alias counts again."""
+"""Largest number of YAML nodes in a document; a node counts once more for each alias that repeats
+it."""
 
 _INSTRUMENT_LOCATION: SpecLocation = ("instrument",)
 _EXAMPLE_INSTRUMENT = "settembrini_2026"
-"""Name of the library's instrument that error messages use as an example."""
+"""Name of the library's instrument that error messages give as an example."""
 _ERROR_FLOOR_KEY = "error_floor"
-"""Name of the section with an instrument's error floor."""
+"""Name of the section with the instrument's errors that do not decrease with signal strength."""
 _INSTRUMENT_FILE_SECTIONS = frozenset(
     {
         "title",
@@ -63,19 +64,20 @@ _INSTRUMENT_FILE_SECTIONS = frozenset(
         "instrument",
     }
 )
-"""Sections of an instrument's file. A study uses `error_floor` and `instrument`."""
+"""Names of the sections of an instrument's file; a study uses only `error_floor` and
+`instrument`."""
 _INSTRUMENT_LIBRARY_FOLDER = Path(__file__).parents[1] / "instruments"
-"""Folder of the instruments that come with this package."""
+"""Folder of the library: the YAML files of the instruments that come with this package."""
 _THRESHOLD_FIELDS = {way.removeprefix(PROCESSING_PREFIX) for way in THRESHOLD_PATHS}
-"""Fields of ``instrument.processing`` that set the threshold, of which a spec may use one."""
+"""Fields of ``instrument.processing`` that set the threshold; a spec has exactly one of them."""
 
 _NUMBER_DIGITS_MAX = 4000
-"""Maximum number of characters of a number in YAML, and of bits of an integer in plain data.
+"""Largest number of characters of a number in YAML, and of bits of an integer in plain data.
 
-Python refuses integers of more than 4300 digits by default.
+Longer numbers in YAML are read as text. Python refuses integers of more than 4300 digits.
 """
 _DECIMAL_PATTERN = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
-"""Pattern of a number in decimal notation."""
+"""Regular expression for a number in decimal notation."""
 _FILE_PATH_REMEDY = "check the path, which is relative to the file that names it"
 _SYNTAX_REMEDY = "look at the brackets, quotes, colons and indentation there and above"
 _YAML_ERROR_REMEDIES = {
@@ -87,26 +89,26 @@ _YAML_ERROR_REMEDIES = {
     "another document": "keep one of them: a file holds one document, without lines '---' in it",
     "unexpected end of stream": "close the quotes of the text that begins there",
 }
-"""Remedy for a YAML error, by a phrase in the parser's message."""
+"""Advice to the user on a YAML error, by a phrase in the parser's message."""
 _STANDARD_TAGS = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in ("str", "int", "float", "bool", "null", "timestamp", "value", "map", "seq")
 )
-"""YAML tags that are read; all others are mistakes."""
+"""YAML tags that a spec may have; any other tag is a mistake."""
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _MERGE_KEY = "<<"
 _ANCHOR_SECTION_PREFIX = "x-"
-"""Prefix of the names of sections that only hold anchors for other sections."""
+"""Prefix of the names of sections that hold only YAML anchors, for use in other sections."""
 
 
 class InstrumentErrorFloor(NamedTuple):
     """Fields of a study's error floor that come from its instrument."""
 
     instrument: str
-    """Name of the instrument in the library, or path as written."""
+    """Name of the instrument in the library, or the path of its file as written in the spec."""
     fields: dict[str, Any]
-    """Fields of the error floor that the study does not state, with values as written in the
-    instrument's file."""
+    """Values as written in the instrument's file, by field; only fields that the study does not
+    state."""
 
 
 @dataclass
@@ -114,28 +116,28 @@ class Document:
     """A spec as written: values, their files and lines, and mistakes in the YAML text."""
 
     content: dict[str, Any]
-    """Plain data of the spec: dicts with text keys, lists and scalars."""
+    """The spec as dicts with text keys, lists and scalars."""
     source_positions: dict[SpecLocation, tuple[str, int | None]] = field(default_factory=dict)
-    """File and line of each location; an empty file and None if the value is not from a file."""
+    """File and line of the value at each location; an empty file and None if the value is from no
+    file."""
     findings: list[Finding] = field(default_factory=list)
-    """Mistakes in the YAML text, and in the instrument's file."""
+    """Mistakes in the YAML text of the spec and of its instrument's file."""
     file: str = ""
-    """Path of the file; empty for plain data."""
+    """Path of the spec's file; empty if the spec is not from a file."""
     n_nodes: int = 0
-    """Number of YAML nodes read; each repetition by an alias counts again."""
+    """Number of YAML nodes read so far; a node counts once more for each alias that repeats it."""
     enclosing_mappings: list[yaml.Node] = field(default_factory=list)
-    """Mappings that are being read, from the outermost to the innermost."""
+    """Mappings around the YAML node that is being read, the outermost first."""
     instrument_error_floor: InstrumentErrorFloor | None = None
-    """Fields of the error floor that come from the instrument; None if the study states all of
-    them."""
+    """Fields of the section error_floor that come from the instrument; None if there are none."""
 
     @classmethod
     def from_plain_data(cls, content: dict[str, Any]) -> Document:
-        """Make a document of plain data that is not from a file."""
+        """Return a `Document` of a dict that is not from a file, without files and lines."""
         return cls(content, dict.fromkeys(_iter_locations(content, ()), ("", None)))
 
     def read_node(self, node: yaml.Node, location: SpecLocation) -> Any:
-        """Return the value of a YAML node, and record its positions and mistakes.
+        """Return the value of a YAML node; record positions and mistakes in this document.
 
         Parameters
         ----------
@@ -170,10 +172,10 @@ class Document:
         return _read_scalar(node)
 
     def _read_mapping(self, node: yaml.MappingNode, location: SpecLocation) -> dict[str, Any]:
-        """Read a mapping with text keys; the first value of a repeated key counts.
+        """Return the dict of a YAML mapping; record positions and mistakes in this document.
 
-        A merge key, ``<<: *base``, adds the fields of other mappings that this mapping does not
-        have.
+        If a key occurs twice, its first value counts. A merge key, ``<<: *base``, adds the fields
+        of another mapping that this mapping does not have.
         """
         values: dict[str, Any] = {}
         merged_nodes: list[yaml.Node] = []
@@ -207,10 +209,10 @@ class Document:
     def _read_merged_fields(
         self, node: yaml.Node, location: SpecLocation, written_fields: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return the fields of a mapping under a merge key, and record their positions.
+        """Return the fields of the mapping under a merge key; record the positions of their values.
 
-        Fields in `written_fields` override merged fields, and keep their own positions. Mistakes in
-        the merged mapping are reported where it is defined, and not here.
+        Fields named in `written_fields` override merged fields and keep their positions. Mistakes
+        within the merged mapping are reported at its anchor and not here.
         """
         merge_location = (*location, _MERGE_KEY)
         if not isinstance(node, yaml.MappingNode):
@@ -233,12 +235,12 @@ class Document:
         return fields
 
     def mistake_from_finding(self, finding: Finding) -> Mistake:
-        """Convert a finding to a mistake with the file and line of its location.
+        """Return a `Mistake`: a finding with the file and line of its location.
 
-        If the location is not in a file, the line is that of the section around it.
+        If the location is not in a file, the line is that of the enclosing section.
 
-        Instruments of the library are valid by themselves. A mistake in a field of the library is
-        therefore located at the user's field that causes it.
+        A file of the library has no mistakes by itself. A mistake in one of its values is therefore
+        located at the user's field that contradicts the value.
         """
         location = finding.location
         while location and location not in self.source_positions:
@@ -261,10 +263,11 @@ class Document:
         return Mistake(path, rule, value, finding.suggestion, line, file)
 
     def _locate_cause(self, finding: Finding) -> tuple[str, int | None]:
-        """Return file and line of the user's field that causes a mistake in a field of the library.
+        """Return file and line of the user's field that contradicts a value of the library.
 
-        It is the first of these that exists in the user's file: a field that the finding names by
-        path or in words, a field of the same section, and the name of the instrument.
+        The result is the first of the following that is in the user's file: a field that the
+        finding names by path or in words, a field in the finding's section, the name of the
+        instrument. If none is, the line is None.
         """
         location, message = finding.location, f"{finding.problem} {finding.suggestion}"
         section = (
@@ -310,9 +313,9 @@ class Document:
         )
 
     def mistakes_from_findings(self, findings: Iterable[Finding]) -> list[Mistake]:
-        """Return findings as mistakes without duplicates, sorted by line.
+        """Return findings as a list of `Mistake` without duplicates, sorted by file and line.
 
-        Mistakes in other files come last.
+        Mistakes in the spec's file come first.
         """
         mistakes = dict.fromkeys(self.mistake_from_finding(finding) for finding in findings)
         return sorted(
@@ -322,7 +325,7 @@ class Document:
 
 
 def _iter_locations(value: Any, location: SpecLocation) -> Iterator[SpecLocation]:
-    """Yield the location of a value in plain data and of every value in it."""
+    """Yield the location of a value, and of every value within it if it is a dict or list."""
     yield location
     if isinstance(value, dict):
         for key, inner_value in value.items():
@@ -333,7 +336,7 @@ def _iter_locations(value: Any, location: SpecLocation) -> Iterator[SpecLocation
 
 
 def _read_scalar(node: yaml.Node) -> Any:
-    """Read a number in decimal notation, a truth value, null or text."""
+    """Return the value of a YAML scalar: number in decimal notation, truth value, None or text."""
     tag = node.tag.rsplit(":", 1)[-1]
     if tag == "null":
         return None
@@ -346,7 +349,7 @@ def _read_scalar(node: yaml.Node) -> Any:
 
 
 def read_document(path: Path) -> Document:
-    """Read the mapping in a YAML file.
+    """Read a YAML file that holds a mapping.
 
     Parameters
     ----------
@@ -367,7 +370,7 @@ def read_document(path: Path) -> Document:
 
 
 def parse_document(text: str, path: Path) -> Document:
-    """Parse the mapping in a YAML text.
+    """Parse a YAML text that holds a mapping.
 
     Parameters
     ----------
@@ -415,7 +418,7 @@ def parse_document(text: str, path: Path) -> Document:
 
 
 def drop_anchor_sections(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a file without its sections ``x-...``, which hold anchors only."""
+    """Return a file's content as a dict without the sections ``x-...``, which hold only anchors."""
     return {
         name: value
         for name, value in content.items()
@@ -424,9 +427,9 @@ def drop_anchor_sections(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_text(path: Path) -> str:
-    """Return the text of a file of at most `YAML_FILE_BYTES_MAX` bytes.
+    """Return the text of a file; raise `SpecError` if it can't be read.
 
-    Raise `SpecError` if the file is unreadable.
+    Files of more than `YAML_FILE_BYTES_MAX` bytes are refused with the same error.
     """
     try:
         with open(open_regular_file(path), "rb") as file:
@@ -452,12 +455,12 @@ def _read_text(path: Path) -> str:
 def _file_error(
     path: Path, problem: str, suggestion: str = "", line: int | None = None
 ) -> SpecError:
-    """Return a `SpecError` about a file as a whole, or one of its lines."""
+    """Return a `SpecError` with one mistake about a file, or about one of its lines."""
     return SpecError([Mistake("", problem, "", suggestion, line, str(path))])
 
 
 def suggest_similar_file(path: Path, *, fallback: str = _FILE_PATH_REMEDY) -> str:
-    """Suggest a YAML file in the same folder whose name resembles that of a missing file.
+    """Return advice on a missing YAML file: the name of a similar file in its folder.
 
     Parameters
     ----------
@@ -484,10 +487,10 @@ class _DepthLimitedLoader(yaml.SafeLoader):
     """Safe loader of YAML that refuses deep nesting before Python's recursion limit is reached."""
 
     depth = 0
-    """Current depth of nesting."""
+    """Depth of the YAML node that is being read."""
 
     def compose_scalar_node(self, anchor: Any) -> Any:
-        """Return a scalar node; refuse escapes that are half of a surrogate pair."""
+        """Return the next scalar node; raise a YAML error for half a surrogate pair."""
         node = super().compose_scalar_node(anchor)  # type: ignore[no-untyped-call]
         if not is_utf8_encodable(node.value):
             problem = "an escape there is half of a surrogate pair, and no character"
@@ -495,7 +498,7 @@ class _DepthLimitedLoader(yaml.SafeLoader):
         return node
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Return a node; refuse one that is nested too deeply."""
+        """Return the next YAML node; raise a YAML error if it is nested too deeply."""
         self.depth += 1
         if self.depth > NESTING_DEPTH_MAX:
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
@@ -506,7 +509,7 @@ class _DepthLimitedLoader(yaml.SafeLoader):
 
 
 def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = False) -> bool:
-    """Replace a reference to an instrument in a document by the instrument's fields.
+    """Replace the name or path of an instrument in a document by the instrument's fields, in place.
 
     Fields that the user states override those of the instrument.
 
@@ -570,7 +573,10 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
 
 
 def _merge_error_floor(document: Document, instrument_floor: object, instrument_name: str) -> None:
-    """Add the fields of an instrument's error floor that the study does not state."""
+    """Add to a document the fields of the instrument's error floor that the study does not state.
+
+    Fields that are added are also noted in the document's `instrument_error_floor`.
+    """
     study_floor = document.content.get(_ERROR_FLOOR_KEY, {})
     if not isinstance(study_floor, Mapping):  # validation reports this mistake
         return
@@ -587,9 +593,10 @@ def _merge_error_floor(document: Document, instrument_floor: object, instrument_
 
 
 def _load_frequency_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
-    """Replace the path of a CSV file in an instrument's fields by the rows of the file.
+    """Replace the path of a CSV file by its rows, in the dict `instrument` and in place.
 
-    The file holds the sweep's frequency error. Mistakes in it are added to the document's findings.
+    The CSV file holds the sweep's frequency error over time. Mistakes in the file are added to the
+    findings of `document`.
     """
     chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE_PATH.split(".")
     if not isinstance(chirp, dict) or not isinstance(chirp.get(name), str):
@@ -610,9 +617,10 @@ def _load_frequency_error_table(document: Document, instrument: dict[str, Any], 
 
 
 def _read_instrument(reference: object, location: SpecLocation, base: Path) -> Document:
-    """Read the file of an instrument, given by its name in the library or by a path.
+    """Return the document of an instrument, with the sections of a file of the library.
 
-    The document that is returned has the sections of a library file.
+    `reference` is the instrument's name in the library, or the path of a file. Raise
+    `FindingsError` if it denotes no instrument.
     """
     if not isinstance(reference, str):
         if "file" in location:
@@ -645,9 +653,9 @@ def _read_instrument(reference: object, location: SpecLocation, base: Path) -> D
 
 
 def _normalise_instrument_file(document: Document) -> Document:
-    """Return a user's instrument as a document with the sections of a library file.
+    """Return the document of a user's instrument with the sections of a file of the library.
 
-    The user's file may have these sections, or the fields of the instrument at its root.
+    The user's file may have these sections, or the instrument's fields at its root.
     """
     if "instrument" not in document.content:
         floor_section = (
@@ -698,9 +706,9 @@ def _normalise_instrument_file(document: Document) -> Document:
 
 
 def library_instrument_files() -> dict[str, Path]:
-    """Return the files of the library's instruments by name.
+    """Return the paths of the YAML files of the library's instruments, by the instrument's name.
 
-    Each file also names its publication, and the numbers that it must reproduce.
+    A file also names its publication, and published numbers that the instrument must reproduce.
 
     Examples
     --------
@@ -711,7 +719,7 @@ def library_instrument_files() -> dict[str, Path]:
 
 
 def _drop_overridden_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an instrument's fields, without its threshold if the overrides set a threshold."""
+    """Return an instrument's fields; the threshold is left out if `overrides` sets a threshold."""
     base_processing, new_processing = instrument.get("processing"), overrides.get("processing")
     if not (
         isinstance(base_processing, Mapping)
@@ -725,7 +733,7 @@ def _drop_overridden_threshold(instrument: Any, overrides: Mapping[str, Any]) ->
 
 
 def to_plain_data(data: Any, location: SpecLocation = ()) -> Any:
-    """Copy data into the types that a YAML parser returns: dicts with text keys, and lists.
+    """Return a copy of data as dicts with text keys, lists and scalars, as a YAML parser returns.
 
     Parameters
     ----------
@@ -759,7 +767,10 @@ def to_plain_data(data: Any, location: SpecLocation = ()) -> Any:
 
 
 def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a mapping with overrides applied, recursively for nested mappings."""
+    """Return a dict of all entries of `base` and `overrides`; `overrides` wins.
+
+    Nested mappings are merged in the same way.
+    """
     result = dict(base)
     for key, value in overrides.items():
         base_value = result.get(key)
@@ -769,7 +780,7 @@ def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
 
 
 def _value_at_location(value: Any, location: SpecLocation) -> Any:
-    """Return the value at a location of nested data; empty text if there is none."""
+    """Return the value at a location of nested data; '' if the location does not exist."""
     try:
         for key in location:
             value = value[key]
@@ -779,7 +790,7 @@ def _value_at_location(value: Any, location: SpecLocation) -> Any:
 
 
 def _is_leaf(value: Any, location: SpecLocation) -> bool:
-    """Return True if the value at a location is not a mapping, or does not exist."""
+    """Return True if the value at a location of nested data is no dict, or does not exist."""
     for key in location:
         try:
             value = value[key]
@@ -798,27 +809,30 @@ _PROBLEM_BY_ERROR_TYPE = {
     "tuple_type": "must be a list",
     "invalid_key": "must be a word",
 }
-"""Problem stated in a finding, by the type of pydantic's error."""
+"""Words of the error message for an error of pydantic, by pydantic's name for the type of error."""
 _SCENE_ONLY_REMEDY = "it is for studies with a scene, in place of a target"
-"""Remedy for a section of scenes in the spec of a grid."""
+"""Advice to a user whose spec of a flat target has a section that only a scene has."""
 _OTHER_SPEC_REMEDIES = {
     **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
     **dict.fromkeys(
         ("platform", "scanners", "error_floor", "navigation", "interface"), _SCENE_ONLY_REMEDY
     ),
 }
-"""Remedies for sections that only the other class of spec has, by the section's name."""
+"""Advice for a section that only the other kind of spec has, by the section's name.
+
+The kinds are specs of a flat target and specs of a scene.
+"""
 
 _REQUIRED_SECTION_BY_FIGURE_KIND = {
     spec_fields.kind_of_model(model): section_text
     for annotation, section_text in ((GridFigure, "a target"), (SceneFigure, "a scene"))
     for model in spec_fields.models_of_annotation(annotation)
 }
-"""Section that a study needs for a figure, ``a target`` or ``a scene``, by the figure's kind."""
+"""Section that a study must have for a kind of figure: ``a target`` or ``a scene``, by the kind."""
 
 
 def validation_findings(error: ValidationError, annotation: Any) -> list[Finding]:
-    """Convert a pydantic error to findings.
+    """Return the errors of a pydantic validation as a list of `Finding`.
 
     Parameters
     ----------
@@ -833,7 +847,10 @@ def validation_findings(error: ValidationError, annotation: Any) -> list[Finding
 
 
 def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
-    """Convert one entry of `ValidationError.errors` to a finding."""
+    """Return one entry of `ValidationError.errors` as a `Finding`.
+
+    `annotation` is the model, or union of models, that the data was validated as.
+    """
     error_type, raw_value = detail["type"], detail["input"]
     model_location = spec_fields.translate_pydantic_location(detail["loc"], annotation)
     location = model_location.keys
@@ -882,7 +899,7 @@ def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
 
 
 def _list_remedy(model_location: spec_fields.ModelLocation, error_type: str) -> str:
-    """Return the remedy for a value that must be a list, or a mapping of sections."""
+    """Return advice on a value that must be a list or a dict of sections; '' for other values."""
     if error_type in ("list_type", "tuple_type"):
         return "put it in brackets, [...], or on lines that begin with '- '"
     return (
@@ -893,12 +910,15 @@ def _list_remedy(model_location: spec_fields.ModelLocation, error_type: str) -> 
 
 
 def _kind_hint(models: spec_fields.ModelClasses) -> str:
-    """Return advice that lists the values of the field ``kind`` which select these models."""
+    """Return words on what to write as ``kind``: the values that select one of `models`."""
     return f"kind: and one of {', '.join(map(spec_fields.kind_of_model, models))}"
 
 
 def _suggest_kind(tag: str, kind_names: list[str]) -> str:
-    """Return a suggestion for an unknown kind."""
+    """Return advice on an unknown value of ``kind``: a similar one, or the study that it is for.
+
+    `kind_names` are the valid values. The result is empty if none is similar.
+    """
     if (
         tag in _REQUIRED_SECTION_BY_FIGURE_KIND
         and kind_names[0] in _REQUIRED_SECTION_BY_FIGURE_KIND
@@ -908,7 +928,7 @@ def _suggest_kind(tag: str, kind_names: list[str]) -> str:
 
 
 def _missing_field_remedy(model_location: spec_fields.ModelLocation) -> str:
-    """Return the remedy for a missing field or section."""
+    """Return advice on what to write for a missing field or section."""
     name, section = model_location.keys[-1], model_location.keys[:-1]
     if model_location.keys == _INSTRUMENT_LOCATION:
         return missing_instrument_remedy()
@@ -945,7 +965,7 @@ def _missing_field_remedy(model_location: spec_fields.ModelLocation) -> str:
 
 
 def missing_instrument_remedy() -> str:
-    """Return the remedy for a spec without an instrument."""
+    """Return advice on what to write in a spec that has no instrument."""
     return (
         f"write e.g. 'instrument: {{like: {_EXAMPLE_INSTRUMENT}}}' (the library has "
         f"{', '.join(library_instrument_files())}), "
@@ -954,7 +974,10 @@ def missing_instrument_remedy() -> str:
 
 
 def _suggest_field(model_location: spec_fields.ModelLocation, root_model: type[BaseModel]) -> str:
-    """Suggest a known field for an unknown one: of the same section, else of the whole spec."""
+    """Return advice on an unknown field: a similar field of its section, or of the whole spec.
+
+    The advice lists the section's fields if no field is similar.
+    """
     name = str(model_location.keys[-1])
     sibling_names = [
         field
