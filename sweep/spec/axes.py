@@ -253,7 +253,7 @@ def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
     if isinstance(raw_axis, dict) and "zip" in raw_axis:
         return _read_zipped_axis(key, raw_axis, location)
     if key in MODEL_BY_SECTION and isinstance(raw_axis, dict):
-        path, values_hint = _first_field_path_and_hint(key, raw_axis)
+        path, values_hint = _first_field_path_and_values_hint(key, raw_axis)
         problem = "is a section, and an axis is named by the whole path of a field"
         raise single_finding_error(location, problem, f"write '{path}: {values_hint}'")
     parameter = _make_axis_parameter(
@@ -263,7 +263,7 @@ def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
     return Axis(parameter.coordinate_name, (parameter,))
 
 
-def _first_field_path_and_hint(path: str, raw_section: object) -> tuple[str, str]:
+def _first_field_path_and_values_hint(path: str, raw_section: object) -> tuple[str, str]:
     """Return the dotted path of a section's first field, and a text on how to write its values.
 
     The remedy for a section that a user writes under ``axes`` shows this path and this text.
@@ -271,7 +271,7 @@ def _first_field_path_and_hint(path: str, raw_section: object) -> tuple[str, str
     while (
         isinstance(raw_section, dict)
         and raw_section
-        and not set(raw_section) & set(_GENERATOR_EXAMPLES)
+        and not set(raw_section) & set(_VALUE_GENERATOR_EXAMPLES)
     ):
         name = next(iter(raw_section))
         path, raw_section = f"{path}.{name}", raw_section[name]
@@ -526,13 +526,13 @@ def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
 
 AXIS_VALUES_MAX = 20_000_000
 """Maximum number of values along an axis."""
-_GENERATOR_EXAMPLES = {
+_VALUE_GENERATOR_EXAMPLES = {
     "linear": "{linear: [first, last], number: 10}",
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
 """Example text of each generator of values along an axis, by its keyword: linear, log or step."""
-_GENERATOR_BY_NUMPY_FUNCTION = {
+_GENERATOR_KEYWORD_BY_NUMPY_NAME = {
     "linspace": "linear",
     "geomspace": "log",
     "logspace": "log",
@@ -694,7 +694,7 @@ def read_axis_entries(raw_value: object, rule: Rule, location: SpecLocation) -> 
         return [_read_value_generator(raw_value, rule, location)]
     if not isinstance(raw_value, list):
         example = getattr(rule, "example", "") if raw_value is None else raw_value
-        remedy = f"write e.g. [{example}] or {_GENERATOR_EXAMPLES['linear']}"
+        remedy = f"write e.g. [{example}] or {_VALUE_GENERATOR_EXAMPLES['linear']}"
         raise single_finding_error(location, "must be a list or a generator", remedy, raw_value)
     if not raw_value:
         raise single_finding_error(location, "holds no value", "list at least one")
@@ -735,19 +735,19 @@ def _read_value_generator(
     Raise `FindingsError` if the generator is invalid, or if a value is outside the bounds of the
     field that `rule` belongs to.
     """
-    given_forms = [key for key in raw_generator if key in _GENERATOR_EXAMPLES]
+    given_forms = [key for key in raw_generator if key in _VALUE_GENERATOR_EXAMPLES]
     if len(given_forms) != 1:
         name, value = next(iter(raw_generator.items()), ("", None))
         remedy = suggest_similar_name(
-            _GENERATOR_BY_NUMPY_FUNCTION.get(str(name), str(name)), _GENERATOR_EXAMPLES
+            _GENERATOR_KEYWORD_BY_NUMPY_NAME.get(str(name), str(name)), _VALUE_GENERATOR_EXAMPLES
         )
         if (
             isinstance(value, list)
-            and name not in _GENERATOR_BY_NUMPY_FUNCTION
+            and name not in _GENERATOR_KEYWORD_BY_NUMPY_NAME
             and len(raw_generator) == 1
         ):
             remedy = remedy or f"write the list alone, without '{name}:'"
-        remedy = remedy or f"write e.g. {_GENERATOR_EXAMPLES['linear']}"
+        remedy = remedy or f"write e.g. {_VALUE_GENERATOR_EXAMPLES['linear']}"
         raise single_finding_error(
             location, "must have exactly one of linear, log and step", remedy
         )
@@ -755,7 +755,7 @@ def _read_value_generator(
         raise single_finding_error(location, "takes words, which have no steps", "list them")
     form, findings = given_forms[0], Findings()
     allowed_keys = {form} if form == "step" else {form, "number"}
-    remedy = f"write {_GENERATOR_EXAMPLES[form]}"
+    remedy = f"write {_VALUE_GENERATOR_EXAMPLES[form]}"
     for key, value in raw_generator.items():
         if key not in allowed_keys:
             key_location = (*location, str(key))
@@ -812,7 +812,7 @@ def _read_generator_bounds(
         raise single_finding_error(
             location,
             f"must be a list of {count} values",
-            f"write {_GENERATOR_EXAMPLES[form]}",
+            f"write {_VALUE_GENERATOR_EXAMPLES[form]}",
             raw_bounds,
         )
     exact_values: list[ExactQuantity] = []
@@ -890,7 +890,7 @@ def _geometric_values(
     `FindingsError` if a bound is not positive, or if the unit is decibels.
     """
     if unit.is_logarithmic:
-        remedy = f"write {_GENERATOR_EXAMPLES['linear']}"
+        remedy = f"write {_VALUE_GENERATOR_EXAMPLES['linear']}"
         raise single_finding_error(
             location, "steps in decibels, which are logarithms already", remedy
         )

@@ -96,7 +96,7 @@ _PUBLISHED_NUMBERS_RULE = CustomRule(
 )
 
 
-def _name_in_store_field(description: str, example: str, default: Any = ...) -> Any:
+def _store_array_name_field(description: str, example: str, default: Any = ...) -> Any:
     """Return the declaration of a field for the name of a coordinate or variable of a store."""
     pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
     return declare.text_field(
@@ -107,10 +107,12 @@ def _name_in_store_field(description: str, example: str, default: Any = ...) -> 
 def _coordinate_name_field(default: Any = ...) -> Any:
     """Return the declaration of a field for the name of a coordinate of a store."""
     example = "the last part of an axis's path, such as 'range'"
-    return _name_in_store_field("a coordinate: the last part of an axis's path", example, default)
+    return _store_array_name_field(
+        "a coordinate: the last part of an axis's path", example, default
+    )
 
 
-_VARIABLE_NAME_FIELD = _name_in_store_field(
+_VARIABLE_NAME_FIELD = _store_array_name_field(
     "a stored quantity, such as pd_shot", "a stored quantity, such as 'pd_shot'"
 )
 
@@ -300,7 +302,7 @@ def _plotted_quantity_field(description: str, default: Any = ...) -> Any:
     )
 
 
-def _crop_field(axis: str) -> Any:
+def _crop_limits_field(axis: str) -> Any:
     """Return the declaration of a field for the two limits of a coordinate that is shown [m]."""
     rule = declare.quantity_rule("Coordinate", "m", "100 m")
     return declare.list_field(
@@ -308,13 +310,13 @@ def _crop_field(axis: str) -> Any:
     )
 
 
-_SCANNER_FIELD = declare.object_name_field("Scanner; the first by default", None)
+_SCANNER_NAME_FIELD = declare.object_name_field("Scanner; the first by default", None)
 _RANGE_INTERPOLATION_FIELD = declare.choice_field(
     "Range shown for each point: quantised to FFT bins, or interpolated between bins",
     ("quantised", "interpolated"),
 )
-_DRAW_FIELD = declare.integer_field("Number of the draw, from 0", "0", "0", "1e9", default=0)
-_TIME_FIELD = declare.list_field(
+_DRAW_NUMBER_FIELD = declare.integer_field("Number of the draw, from 0", "0", "0", "1e9", default=0)
+_TIME_LIMITS_FIELD = declare.list_field(
     declare.quantity_rule("Time", "s", "10 s", "0 s", "1e8 s"), 2, 2, None,
     description="Part of the flight's time", is_increasing=True,
 )  # fmt: skip
@@ -331,18 +333,18 @@ class CloudFigure(SceneFigureBase):
 
     FILE_NAME_PARTS = ("scanner", "colour")
     kind: Literal["cloud"]
-    scanner: str | None = _SCANNER_FIELD
+    scanner: str | None = _SCANNER_NAME_FIELD
     colour: str = _plotted_quantity_field("Quantity that colours the points", "range")
     ranges: str = _RANGE_INTERPOLATION_FIELD
     view: str | dict[str, float] = declare.field_with_rule(_VIEW_RULE, "oblique")
-    x: CropLimits | None = _crop_field("x")
-    y: CropLimits | None = _crop_field("y")
-    z: CropLimits | None = _crop_field("z")
-    time: CropLimits | None = _TIME_FIELD
+    x: CropLimits | None = _crop_limits_field("x")
+    y: CropLimits | None = _crop_limits_field("y")
+    z: CropLimits | None = _crop_limits_field("z")
+    time: CropLimits | None = _TIME_LIMITS_FIELD
     terrain: bool = declare.flag_field("Whether to draw the ground", default=True)
     path: bool = declare.flag_field("Whether to draw the flight path", default=False)
     dropouts: bool = declare.flag_field("Whether to mark shots without a point", default=False)
-    draw: int = _DRAW_FIELD
+    draw: int = _DRAW_NUMBER_FIELD
 
 
 class ScatterFigure(SceneFigureBase):
@@ -350,13 +352,13 @@ class ScatterFigure(SceneFigureBase):
 
     FILE_NAME_PARTS = ("scanner", "y", "over", "x")
     kind: Literal["scatter"]
-    scanner: str | None = _SCANNER_FIELD
+    scanner: str | None = _SCANNER_NAME_FIELD
     x: str = _plotted_quantity_field("Quantity along x", "time")
     y: str = _plotted_quantity_field("Quantity along y")
     colour: str = _plotted_quantity_field("Quantity that colours the points", "beam")
     ranges: str = _RANGE_INTERPOLATION_FIELD
-    time: CropLimits | None = _TIME_FIELD
-    draw: int = _DRAW_FIELD
+    time: CropLimits | None = _TIME_LIMITS_FIELD
+    draw: int = _DRAW_NUMBER_FIELD
 
 
 class ShotSpectraFigure(SceneFigureBase):
@@ -364,13 +366,13 @@ class ShotSpectraFigure(SceneFigureBase):
 
     FILE_NAME_PARTS = ("scanner", "shot")
     kind: Literal["shot_spectra"]
-    scanner: str | None = _SCANNER_FIELD
+    scanner: str | None = _SCANNER_NAME_FIELD
     shot: int | str = declare.integer_field(
         "Number of the shot, from 0, or the first whose footprint has several surfaces",
         "0", "0", "1e15", keyword=SHOT_WITH_SEVERAL_SURFACES_KEYWORD,
         default=SHOT_WITH_SEVERAL_SURFACES_KEYWORD,
     )  # fmt: skip
-    draw: int = _DRAW_FIELD
+    draw: int = _DRAW_NUMBER_FIELD
 
 
 class _NavigationFigureBase(SceneFigureBase):

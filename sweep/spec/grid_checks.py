@@ -246,7 +246,7 @@ ECHO_TIME_PATHS = (
     FFT_SIZE_PATH,
 )
 """Dotted paths of the parameters from which the echo's delay and the end of the record follow."""
-_ECHO_TIME_POINTS_MAX = 10**7
+_ECHO_TIME_CHECK_POINTS_MAX = 10**7
 """Largest number of points of a grid at which the delay of the echo is compared with the record.
 
 Only axes over the parameters `ECHO_TIME_PATHS` count. Larger grids are not checked.
@@ -326,7 +326,7 @@ def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
             path: np.asarray(parameter.values, float).reshape(shape)
             for path, parameter in echo_parameters.items()
         }
-    if n_points > _ECHO_TIME_POINTS_MAX:
+    if n_points > _ECHO_TIME_CHECK_POINTS_MAX:
         return None
     end, delay = values[CHIRP_DURATION_PATH], 2 / SPEED_OF_LIGHT * values[RANGE_PATH]
     after_chirp = float(np.min(delay - end))
@@ -465,7 +465,7 @@ def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
     and must be so wide that the beam spreads by at most 90 deg.
     """
     remedy = "or set instrument.telescope.coupling: aperture, where all light mixes"
-    if narrowest := _narrowest_impossible_beam(grid, _SINGLE_MODE_CONDITIONS):
+    if narrowest := _beam_furthest_below_limit(grid, _SINGLE_MODE_CONDITIONS):
         narrow_beam, limit = narrowest
         problem = (
             f"must be at least {1e6 * limit:.3g} urad, 4 M^2 lambda / (pi D): no narrower beam "
@@ -525,7 +525,7 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
         {beam.COUPLING_PATH: condition_equal_to(beam.APERTURE_COUPLING)},
         {beam.ARCHITECTURE_PATH: condition_equal_to("direct")},
     ):
-        if narrowest := _narrowest_impossible_beam(GridValues(values, axes), conditions):
+        if narrowest := _beam_furthest_below_limit(GridValues(values, axes), conditions):
             narrow_beam, limit = narrowest
             aperture_text = (
                 f"an aperture of {1e3 * narrow_beam[beam.APERTURE_DIAMETER_PATH]:.3g} mm makes"
@@ -537,7 +537,7 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
     return ""
 
 
-def _narrowest_impossible_beam(
+def _beam_furthest_below_limit(
     grid: GridValues, conditions: Mapping[str, ValueCondition]
 ) -> tuple[dict[str, float], float] | None:
     """Return the parameters of the beam that is furthest below its aperture's limit, and the limit.

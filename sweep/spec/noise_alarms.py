@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PFA_SHOT_WARNING_ABOVE = 0.01
 """Probability that noise raises a false alarm in a shot, above which the user is warned."""
 
-SAMPLED_COMBINATIONS_MAX = 400
+SAMPLED_AXIS_COMBINATIONS_MAX = 400
 """Approximate maximum number of combinations for which false alarms are computed.
 
 A combination has one value from each axis over ``instrument.processing``.
@@ -61,7 +61,7 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
         axis for axis in spec.axes
         if any(member.path.startswith("instrument.processing.") for member in axis.parameters)
     ]  # fmt: skip
-    samples_per_axis = max(2, int(SAMPLED_COMBINATIONS_MAX ** (1 / max(len(axes), 1))))
+    samples_per_axis = max(2, int(SAMPLED_AXIS_COMBINATIONS_MAX ** (1 / max(len(axes), 1))))
     probabilities = []
     sampled_indices = (
         np.linspace(0, axis.size - 1, min(axis.size, samples_per_axis)).astype(int) for axis in axes

@@ -56,7 +56,7 @@ def _raw_section(raw_spec: Mapping[str, Any], *path: str | int) -> dict[str, Any
     return dict(raw_section) if isinstance(raw_section, Mapping) else {}
 
 
-def _read_sections(raw_sections: Mapping[str, Any], annotation: Any) -> dict[str, Any]:
+def _valid_sections_by_name(raw_sections: Mapping[str, Any], annotation: Any) -> dict[str, Any]:
     """Return the models of the sections that are valid as `annotation`, by the sections' names."""
     sections = {name: validate_or_none(annotation, value) for name, value in raw_sections.items()}
     return {name: section for name, section in sections.items() if section is not None}
@@ -72,10 +72,12 @@ def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Findi
     base : Path or None
         Folder that paths in the spec are relative to; None skips all checks that read files.
     """
-    objects = _read_sections(
+    objects = _valid_sections_by_name(
         _raw_section(raw_spec, *OBJECTS_SECTION_LOCATION), scene_sections.AnySceneObject
     )
-    scanners = _read_sections(_raw_section(raw_spec, "scanners"), flight_sections.AnyScanner)
+    scanners = _valid_sections_by_name(
+        _raw_section(raw_spec, "scanners"), flight_sections.AnyScanner
+    )
     platform = validate_or_none(flight_sections.Platform, raw_spec.get("platform"))
     findings = [
         *_name_findings(

@@ -469,7 +469,7 @@ class Interface(SpecSection):
     )
 
     @model_validator(mode="after")
-    def _check_limits_and_period(self) -> Self:
+    def _check_limits_and_rate(self) -> Self:
         """Raise a pydantic error for a lower limit above its upper limit, or a missing rate.
 
         A report that needs more than one valid shot needs a rate.

@@ -245,7 +245,7 @@ class Estimator(SpecSection):
     )
 
 
-def _search_limit_field(description: str, *rule_arguments: str) -> Any:
+def _search_band_limit_field(description: str, *rule_arguments: str) -> Any:
     """Return the declaration of a field for one limit of the search band.
 
     The search band is the range and the velocity in which echoes are searched.
@@ -266,12 +266,14 @@ class SearchBandSection(SpecSection):
     It selects bins by their beats.
     """
 
-    min_range: float | None = _search_limit_field("Smallest range searched", "m", "10 m", "0 m")
-    max_range: float | None = _search_limit_field("Largest range searched", "m", "2 km", "0 m")
-    min_radial_velocity: float | None = _search_limit_field(
+    min_range: float | None = _search_band_limit_field(
+        "Smallest range searched", "m", "10 m", "0 m"
+    )
+    max_range: float | None = _search_band_limit_field("Largest range searched", "m", "2 km", "0 m")
+    min_radial_velocity: float | None = _search_band_limit_field(
         "Smallest radial velocity searched, positive when closing", "m/s", "-5 m/s"
     )
-    max_radial_velocity: float | None = _search_limit_field(
+    max_radial_velocity: float | None = _search_band_limit_field(
         "Largest radial velocity searched, positive when closing", "m/s", "40 m/s"
     )
 

@@ -246,7 +246,7 @@ class BaseSpec(SpecSection):
         findings += grid_findings(grid)
         findings += [
             *_grid_size_findings(axes),
-            *_segment_slope_findings(grid),
+            *_equal_chirp_rate_findings(grid),
             *_strongest_peak_findings(grid),
         ]
         findings += cls.class_specific_findings(raw_spec, grid, base, all_axes_read)
@@ -350,7 +350,7 @@ class BaseSpec(SpecSection):
                 parameters[path] = rule.read(raw_value)
             except QuantityError as error:
                 findings.append(Finding((name,), error.rule, error.suggestion, raw_value))
-            findings += self.value_findings(path, parameters[path], (name,))
+            findings += self.override_findings(path, parameters[path], (name,))
         if not findings:
             grid = GridValues(parameters, effect_modes=self.effect_modes())
             findings = [*grid_findings(grid), *_strongest_peak_findings(grid)]
@@ -358,7 +358,7 @@ class BaseSpec(SpecSection):
             raise SpecError(Document({}).mistake_from_finding(finding) for finding in findings)
         return parameters
 
-    def value_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
+    def override_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
         """Return a `Finding` for each reason why a parameter may not take an SI value; here none.
 
         `location` holds the keys that lead to the value in the spec.
@@ -493,7 +493,7 @@ def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, 
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
 
 
-def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
+def _equal_chirp_rate_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a `Finding` if the chirp rates of two segments are equal.
 
     Range and velocity then can't be separated.
@@ -705,7 +705,7 @@ class SceneSpec(BaseSpec):
         """
         return not axis_refusal(path).problem
 
-    def value_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
+    def override_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
         """Return a `Finding` if a parameter may not take an SI value: rays would hit elsewhere.
 
         `location` holds the keys that lead to the value in the spec.
@@ -813,7 +813,7 @@ class SceneSpec(BaseSpec):
             brought_text = ", ".join(f"{name} {raw_value}" for name, raw_value in fields.items())
             zero_text = ", ".join(f"{name}: {_smallest_value_text(rules[name])}" for name in fields)
             sentences.append(
-                f"the instrument {instrument_floor.instrument} brings a floor of errors: "
+                f"the instrument {instrument_floor.instrument_reference} brings a floor of errors: "
                 f"{brought_text}. State "
                 f"error_floor in the study to change it; 'error_floor: {{{zero_text}}}' switches "
                 "it off"

@@ -104,7 +104,7 @@ _ANCHOR_SECTION_PREFIX = "x-"
 class InstrumentErrorFloor(NamedTuple):
     """Fields of a study's error floor that come from its instrument."""
 
-    instrument: str
+    instrument_reference: str
     """Name of the instrument in the library, or the path of its file as written in the spec."""
     fields: dict[str, Any]
     """Values as written in the instrument's file, by field; only fields that the study does not
@@ -812,7 +812,7 @@ _PROBLEM_BY_ERROR_TYPE = {
 """Words of the error message for an error of pydantic, by pydantic's name for the type of error."""
 _SCENE_ONLY_REMEDY = "it is for studies with a scene, in place of a target"
 """Advice to a user whose spec of a flat target has a section that only a scene has."""
-_OTHER_SPEC_REMEDIES = {
+_REMEDY_BY_OTHER_SPEC_SECTION = {
     **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
     **dict.fromkeys(
         ("platform", "scanners", "error_floor", "navigation", "interface"), _SCENE_ONLY_REMEDY
@@ -984,8 +984,10 @@ def _suggest_field(model_location: spec_fields.ModelLocation, root_model: type[B
         for model in model_location.enclosing_section_models
         for field in spec_fields.fields_by_name(model)
     ]
-    if name in _OTHER_SPEC_REMEDIES and model_location.enclosing_section_models == (root_model,):
-        return _OTHER_SPEC_REMEDIES[name]
+    if name in _REMEDY_BY_OTHER_SPEC_SECTION and model_location.enclosing_section_models == (
+        root_model,
+    ):
+        return _REMEDY_BY_OTHER_SPEC_SECTION[name]
     known_paths = dict.fromkeys((*parameter_rules(), *spec_fields.rules_by_path(root_model, "")))
     if name[:1].isdigit():
         return "a comma begins another field here: write numbers with a point, such as 2.5"
