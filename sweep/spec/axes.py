@@ -229,7 +229,7 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
 def _paths_with_raw_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
     """Return a pair (dotted path, values as written) for each parameter of an axis.
 
-    A zipped axis is a list of pieces. It has one pair for each parameter of each piece.
+    For a zipped axis, a list of pieces, the result has one pair for each parameter of each piece.
     """
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
         return [(key, raw_axis)]
@@ -248,7 +248,7 @@ def _first_raw_value(values: object) -> object:
 def _read_axis(key: str, raw_axis: object, location: SpecLocation) -> Axis:
     """Convert one entry of the section ``axes`` to an `Axis`.
 
-    Raise `FindingsError` if the entry is invalid. `location` holds the keys that lead to it.
+    Raise `FindingsError` if the entry is invalid. `location` holds the keys that lead to the entry.
     """
     if isinstance(raw_axis, dict) and "zip" in raw_axis:
         return _read_zipped_axis(key, raw_axis, location)

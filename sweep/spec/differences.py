@@ -148,7 +148,7 @@ def _unit_suffix(rule: Rule | None) -> str:
 
 
 def _format_number(rule: Rule | None, value: Any) -> str:
-    """Return an SI value as text without its unit: a number in the unit of `_unit_suffix`.
+    """Return an SI value as text: a number in the unit that `_unit_suffix` names, without the unit.
 
     For an angle, the text has enough digits to read back as exactly the same SI value.
     """

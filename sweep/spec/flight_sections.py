@@ -373,10 +373,7 @@ class BeamDirectionsRule(Rule):
         )
 
     def format(self, value: Any) -> Any:
-        """Return a tuple of beam directions as a spec would hold it: a list of lists.
-
-        `read` converts the list back to exactly the same tuple.
-        """
+        """Convert a result of `read` back to a list of beam directions as a spec would hold it."""
         return [beam_direction_rule(beam).format(beam) for beam in value]
 
     def _value_schema(self) -> JsonObject:

@@ -254,10 +254,9 @@ Only axes over the parameters `ECHO_TIME_PATHS` count. Larger grids are not chec
 
 
 def _echo_time_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a `Finding` if no point of the grid has an echo in its record, or if records are short.
+    """Yield a `Finding` if no record of the grid has an echo, or if a record has under 2 samples.
 
-    A record needs two samples. A grid with an echo in the record of one point or more is valid. The
-    points without one detect nothing.
+    A grid in which only some records have an echo is valid. Points without an echo detect nothing.
     """
     lateness = _least_echo_lateness(grid)
     if lateness is not None and lateness.after_chirp_end >= 0:
@@ -413,7 +412,10 @@ def _responsivity_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a `Finding` if the table of the sweep's frequency error is shorter than a chirp."""
+    """Yield a `Finding` if the table of the sweep's frequency error ends before the longest chirp.
+
+    The table must also start at the beginning of the chirp.
+    """
     table_text = grid.field_values.get(ERROR_TABLE_PATH, NO_TABLE)
     if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
         return

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 GRID_STEPS_PER_SIDE_MAX = 7000
 """Largest number of grid steps along a side of a square ground."""
 _RANDOM_STREAM_NAMES = ("relief", "hills", "craters", "boulders", "trees")
-"""Uses of random numbers in a scene; the index of a use selects its independent stream."""
+"""What random numbers are used for; the index in this tuple selects an independent stream."""
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:
@@ -202,7 +202,10 @@ class Ground(Material, ABC):
         """Return the ground as terrain, before smoothing, refining, relief and craters."""
 
     def check_grid(self) -> None:
-        """Raise `ValueError` if the section's fields define an invalid grid; here never."""
+        """Raise `ValueError` if the section's fields define an invalid grid.
+
+        This base class never raises.
+        """
 
     def grid_step(self) -> float | None:
         """Return the larger of the grid steps along x and y, after refining [m].
@@ -231,7 +234,7 @@ class PlacedGround(Ground):
 
     @abstractmethod
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the heights on a grid whose origin has no meaning."""
+        """Return the ground as terrain with an arbitrary origin."""
 
 
 # Ground of surveys and files

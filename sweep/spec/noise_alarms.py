@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
 PFA_SHOT_WARNING_ABOVE = 0.01
-"""Probability that noise raises a false alarm in a shot, above which the user is warned."""
+"""False-alarm probability of a shot, due to noise, above which the user is warned."""
 
 SAMPLED_AXIS_COMBINATIONS_MAX = 400
-"""Approximate maximum number of combinations for which false alarms are computed.
+"""Approximate largest number of combinations for which false-alarm probabilities are computed.
 
-A combination has one value from each axis over ``instrument.processing``.
+A combination has one value from each axis over fields of ``instrument.processing``.
 """
 
 
@@ -31,13 +31,13 @@ class ShotFalseAlarmProbabilities(NamedTuple):
     """Probabilities of false alarms of a shot, due to noise alone."""
 
     either_chirp: float
-    """Probability of a false alarm in at least one chirp."""
+    """Probability that noise raises a false alarm in the up-chirp, the down-chirp or both."""
     both_chirps: float
-    """Probability of a false alarm in both chirps."""
+    """Probability that noise raises a false alarm in the up-chirp and in the down-chirp."""
 
 
 def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarmProbabilities]:
-    """Compute the false-alarm probabilities of a shot, due to noise alone, over a study's axes.
+    """Compute a shot's false-alarm probabilities, due to noise alone, over a study's axes.
 
     Parameters
     ----------
@@ -92,9 +92,10 @@ def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[ShotFalseAlarm
 
 
 def iter_false_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
-    """Yield one sentence if noise alone raises a false alarm in more than 1 % of the shots.
+    """Yield one warning, a sentence, if noise alone raises false alarms in over 1 % of the shots.
 
     The sentence states the largest probability over the study's axes, and the fields to change.
+    Nothing is yielded if the probability is 1 % or less.
     """
     pfa_max = max((pfa.either_chirp for pfa in false_alarm_probabilities(spec)), default=0.0)
     if pfa_max > PFA_SHOT_WARNING_ABOVE:
@@ -105,7 +106,10 @@ def iter_false_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
 
 
 def false_alarm_remedy(spec: GridSpec | SceneSpec) -> str:
-    """Return advice on which fields to change for fewer false alarms, as an imperative clause."""
+    """Return advice on the fields to change for fewer false alarms, such as ``raise ...tnr``.
+
+    A study with both fixed and adaptive thresholds has one clause for each, joined by ``and``.
+    """
     parameters, kind_path = spec.parameters(), f"{DETECTOR_PREFIX}kind"
     values_by_path = {
         member.path: member.values for axis in spec.axes for member in axis.parameters

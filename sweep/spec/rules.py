@@ -239,7 +239,7 @@ class Rule:
         return ""
 
     def read(self, raw_value: object) -> Any:
-        """Convert a value as written in a spec: a number to SI units, other values to their type.
+        """Convert a quantity as written in a spec to SI units; check and return any other value.
 
         Raises
         ------
@@ -249,7 +249,7 @@ class Rule:
         raise QuantityError("holds nothing that can be read")
 
     def format(self, value: Any) -> Any:
-        """Return a value, as `read` returned it, in the form in which a spec would hold it."""
+        """Convert a result of `read` back to a value as a spec would hold it."""
         return value
 
     def schema(self) -> JsonObject:
@@ -286,7 +286,7 @@ class CustomRule(Rule):
     """JSON Schema of a value as written in a spec."""
 
     def read(self, raw_value: object) -> Any:
-        """Return what the function `reader` returns for a value as written in a spec."""
+        """Convert a value as written in a spec by the function `reader`."""
         return self.reader(raw_value)
 
     def _value_schema(self) -> JsonObject:
@@ -299,7 +299,7 @@ _BOUND_KINDS = {
     "below": ("less than", np.greater_equal, "exclusiveMaximum"),
     "at_most": ("at most", np.greater, "maximum"),
 }
-"""Kinds of bounds of a number, by the name of the field of `NumericRule`.
+"""Kinds of bounds of a number, by the names of fields of `NumericRule`, such as ``at_least``.
 
 An entry has the words for messages, a NumPy function that is True for values outside the bound, and
 the keyword of JSON Schema.
@@ -428,7 +428,7 @@ class NumericRule(Rule):
         return int(quantity.number) if self.is_integer else value
 
     def first_bound_violation(self, values: np.ndarray) -> BoundViolation | None:
-        """Return the first violated bound with the index of the first value outside it.
+        """Return the first violated bound and the index of the first value that violates it.
 
         Parameters
         ----------
@@ -450,9 +450,9 @@ class NumericRule(Rule):
         return None
 
     def format(self, value: Any) -> str | int | float:
-        """Return an SI value as a spec would hold it: a number, or text such as ``0.001 W``.
+        """Convert an SI value back to a number or text, ``0.001 W``, as a spec would hold it.
 
-        `read` returns exactly the same value for the result; for decibels, the same to 15 digits.
+        `read` converts the result to exactly the same value; for decibels, to 15 equal digits.
         """
         if self.keyword and value == self.keyword_value:
             return self.keyword
@@ -492,7 +492,7 @@ def _first_clause(description: str) -> str:
 
 @lru_cache(maxsize=1024)
 def _bound_in_si(rule: NumericRule, bound_text: str) -> float:
-    """Return a bound of a rule, written as text such as ``1 um``, as an SI value."""
+    """Convert a bound of a rule from text, such as ``1 um``, to an SI value."""
     return rule.read_exact_number(bound_text).to_si()
 
 
@@ -692,7 +692,7 @@ class ListRule(Rule):
         return values
 
     def format(self, value: Any) -> Any:
-        """Return a list of values as a spec would hold it; `read` converts it back exactly."""
+        """Convert a result of `read` back to a list as a spec would hold it."""
         return [self.element_rule.format(element) for element in value]
 
     def _value_schema(self) -> JsonObject:
@@ -776,9 +776,9 @@ class FrequencyErrorTableRule(Rule):
         return table_text
 
     def format(self, value: Any) -> Any:
-        """Return the table, given as text, as a spec would hold it: a list of rows [time, error].
+        """Convert a table, text from `read`, back to a list of rows [time, error] with units.
 
-        `read` returns the same text for the list. `NO_TABLE` stays as it is.
+        `NO_TABLE` is returned unchanged.
         """
         if value == NO_TABLE:
             return value

@@ -63,7 +63,7 @@ def _valid_sections_by_name(raw_sections: Mapping[str, Any], annotation: Any) ->
 
 
 def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Finding]:
-    """Return a `Finding` for each mistake in scene, platform and scanners, except in single fields.
+    """Return a `Finding` for each mistake in scene, platform and scanners, beyond single fields.
 
     Parameters
     ----------
@@ -114,8 +114,8 @@ def _name_findings(
 ) -> Iterator[Finding]:
     """Yield a `Finding` for each invalid or reserved name in a section, and for an empty section.
 
-    `is_taken` returns True for a reserved name. `owner` is what uses the reserved names, for the
-    message.
+    `is_taken` returns True for a reserved name. `owner`, a word for the message, has reserved the
+    names: ``scene`` or ``store``.
     """
     raw_sections = _raw_section(raw_spec, *section_location)
     for name in raw_sections:
@@ -134,9 +134,9 @@ def _name_findings(
 def _reference_findings(
     raw_spec: Mapping[str, Any], objects: Mapping[str, Any]
 ) -> Iterator[Finding]:
-    """Yield a `Finding` for each reference to a missing ground, and for a wrong position.
+    """Yield a `Finding` for each reference to a missing ground, and for an origin with a position.
 
-    The ground that is the origin of the scene may not state a position.
+    The ground that ``scene.origin`` names lies at zero and may not state a position.
     """
     raw_objects = _raw_section(raw_spec, *OBJECTS_SECTION_LOCATION)
     if not raw_objects:
@@ -168,9 +168,9 @@ def _ground_reference_findings(
     objects: Mapping[str, Any],
     extra_remedy: str,
 ) -> Iterator[Finding]:
-    """Yield a `Finding` if a field at `location` names an object that is missing or no ground.
+    """Yield a `Finding` if `name`, written at `location`, is not the name of a ground in the scene.
 
-    `raw_objects` are the scene's objects as parsed from YAML, `objects` the valid ones.
+    `raw_objects` are the scene's objects as parsed from YAML, `objects` the models of valid ones.
     """
     grounds = [key for key, scene_object in objects.items() if isinstance(scene_object, Ground)]
     remedy = f"the grounds are {', '.join(grounds)}" if grounds else "add a ground"
@@ -284,7 +284,7 @@ def _solid_findings(
 ) -> Iterator[Finding]:
     """Yield a `Finding` for each mistake in a solid's position, rotation or unit of length.
 
-    A position is a mistake in addition to a motion. Some solids need one of the two.
+    A solid must not have both a position and a motion. A sphere or box must have one of them.
     """
     position_location = (*location, "position")
     if scene_object.motion is not None and scene_object.position is not None:
@@ -315,8 +315,8 @@ def _flight_findings(
 ) -> list[Finding]:
     """Return a `Finding` for each mistake in platform, scanners and moving objects.
 
-    A part is skipped if it is missing or None, which means that it can't be read. Tables are not
-    read if `base` is None.
+    `platform` is None if it can't be read, and is skipped. Tables are not read if `base`, the
+    folder of files, is None.
     """
     span: flight_sections.TimeSpan | None = None
     findings: list[Finding] = []
@@ -384,7 +384,7 @@ def _scan_pattern_findings(
 ) -> Iterator[Finding]:
     """Yield a `Finding` if a scan pattern is invalid, or has less than a cycle or too many shots.
 
-    `span` is start and end of the flight [s]; None skips the number of shots.
+    `span` is start and end of the flight [s]; None skips the check of the number of shots.
     """
     construction_findings = _construction_findings(scanner.build_pattern, location)
     yield from construction_findings
@@ -470,9 +470,9 @@ _AXIS_REFUSALS = {
         "says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY
     ),
 }
-"""Refusal of an axis over a parameter, by the first characters of the parameter's dotted path.
+"""Refusal of an axis over a parameter, by prefix of the parameter's dotted path.
 
-The first key with which a path begins applies.
+The first prefix with which a path begins applies.
 """
 
 
@@ -535,10 +535,10 @@ def variation_findings(
 
 
 def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a `Finding` for each axis that is invalid in a scene, and for an unsuitable pattern.
+    """Yield a `Finding` for each axis invalid in a scene, and for an unsuitable beamlet pattern.
 
-    No axis may change where rays hit, because they are cast once, or have a name of the store. A
-    pattern of beamlets is unsuitable if only a plane can have it.
+    An axis is invalid if it changes where rays hit, because rays are cast once, or if a store uses
+    its name. A beamlet pattern is unsuitable if it only fits a plane.
     """
     parameters = {path: default_value(path) for path in _BEAMLET_POSITION_PATHS} | dict(
         grid.field_values

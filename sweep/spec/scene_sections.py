@@ -141,7 +141,7 @@ class MartianRocks(SpecSection):
     )
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
-        """Return the law of Golombek and Rapp (1997) for rocks per area over diameter."""
+        """Return Golombek and Rapp's law (1997) for the number of rocks per area by diameter."""
         from sweep.scenes.scattered_objects import MartianRockLaw
 
         return MartianRockLaw(self.abundance)
@@ -157,7 +157,7 @@ class PowerLaw(SpecSection):
     exponent: float = declare.number_field("Exponent", "2.5", "1e-3", "20")
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
-        """Return the law for boulders per area over diameter, a power law."""
+        """Return the power law for the number of boulders per area by diameter."""
         from sweep.scenes.scattered_objects import MinimumOfPowerLaws
 
         return MinimumOfPowerLaws(((self.density, self.exponent),))
@@ -357,7 +357,7 @@ class SceneDraws(SpecSection):
 
     @property
     def draws_whole_spectra(self) -> bool:
-        """True if a draw is a spectrum with noise in every bin, for detector and estimator."""
+        """True if each draw is a whole spectrum, which a detector and an estimator examine."""
         return self.method == SPECTRA_METHOD
 
 
@@ -470,7 +470,7 @@ class Interface(SpecSection):
 
     @model_validator(mode="after")
     def _check_limits_and_rate(self) -> Self:
-        """Raise a pydantic error for a lower limit above its upper limit, or a missing rate.
+        """Raise a pydantic error if a lower limit is not below its upper one, or a rate is missing.
 
         A report that needs more than one valid shot needs a rate.
         """
@@ -510,8 +510,8 @@ class BuiltScene(NamedTuple):
     caster: RayCaster
     """Object that computes where rays hit the bodies.
 
-    All objects at rest are one body, the first, if there are any. Every moving object is one more
-    body.
+    All objects at rest together are the first body, if there are any. Each moving object is one of
+    the following bodies.
     """
     surface_materials: tuple[SurfaceMaterial, ...]
     """Materials of all surfaces; the index is the surface's number."""

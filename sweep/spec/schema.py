@@ -24,8 +24,8 @@ _INSTRUMENT_SECTION_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "P
 def json_schema() -> JsonObject:
     """Return the JSON Schema (2020-12) of spec files, for studies of a flat target and of a scene.
 
-    All fields of parameters are described. A field that may come from an axis or an instrument's
-    file is not required by the schema; `sweep.load` requires it.
+    Values of parameters are described field by field. A field that may come from an axis or an
+    instrument's file is not required by the schema; `sweep.load` requires it.
     """
     _, schema = models_json_schema([(GridSpec, "validation"), (SceneSpec, "validation")])
     definitions: JsonObject = schema["$defs"]
@@ -112,7 +112,7 @@ def _definition_reference(path: str, suffix: str) -> JsonObject:
 def _mapping_schema(properties: JsonObject, *required: str, **keywords: Any) -> JsonObject:
     """Return the JSON Schema of a mapping that has no other keys than those of `properties`.
 
-    `required` are the keys that must be there. `keywords` are added to the schema.
+    `required` lists the mandatory keys. `keywords` are added to the schema.
     """
     required_keyword = {"required": list(required)} if required else {}
     return (
@@ -123,7 +123,10 @@ def _mapping_schema(properties: JsonObject, *required: str, **keywords: Any) -> 
 
 
 def _list_schema(items: JsonObject, length_min: int = 1, **keywords: Any) -> JsonObject:
-    """Return the JSON Schema of a list of `length_min` or more `items`, with more `keywords`."""
+    """Return the JSON Schema of a list with at least `length_min` values of the schema `items`.
+
+    `keywords` are added to the schema of the list.
+    """
     return {"type": "array", "items": items, "minItems": length_min} | keywords
 
 
@@ -153,7 +156,8 @@ def _generator_schemas(value_schema: JsonObject) -> Iterator[JsonObject]:
 def _axes_schema(rules: Mapping[str, Rule]) -> JsonObject:
     """Return the JSON Schema of the section ``axes``.
 
-    The key of an axis is the dotted path of its parameter, and any other name for a zipped axis.
+    The key of an axis is the dotted path of its parameter. The key of a zipped axis is any other
+    name.
     """
     value_schemas = {
         path: {

@@ -553,12 +553,12 @@ class Draws(SpecSection):
 
     @property
     def draws_whole_spectra(self) -> bool:
-        """True if a draw is a spectrum with noise in every bin, for detector and estimator."""
+        """True if each draw is a whole spectrum, which a detector and an estimator examine."""
         return self.method == SPECTRA_METHOD
 
     @property
     def is_adaptive(self) -> bool:
-        """True if a point is drawn until the tolerance or `limit` is reached."""
+        """True if a point has draws until the tolerance is met or their number is `limit`."""
         return self.limit > 0
 
 
@@ -617,7 +617,7 @@ SECTIONS_NOT_ON_AXES = (
 
 @cache
 def parameter_rules() -> MappingProxyType[str, Rule]:
-    """Return the rule of every parameter, a field that an axis may set, by dotted path."""
+    """Return the rules of all parameters (fields that an axis may set) by dotted path."""
     rules: dict[str, Rule] = {}
     for section, model in MODEL_BY_SECTION.items():
         rules |= rules_by_path(model, section)

@@ -359,9 +359,10 @@ class BaseSpec(SpecSection):
         return parameters
 
     def override_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
-        """Return a `Finding` for each reason why a parameter may not take an SI value; here none.
+        """Return a `Finding` for each reason why a parameter may not have an SI value; here none.
 
-        `location` holds the keys that lead to the value in the spec.
+        `path` is the parameter's dotted path. `location` holds the keys that lead to the value in
+        the spec.
         """
         return []
 
@@ -456,8 +457,8 @@ class BaseSpec(SpecSection):
     def to_yaml_mapping(self) -> dict[str, Any]:
         """Return the spec as nested dicts as a user would write it, with instrument and defaults.
 
-        Fields that an axis sets are left out: their values, if a user wrote any, have no effect.
-        ``execution`` is left out because it changes no result.
+        Fields that an axis sets are left out, so that the result does not depend on a value that a
+        user also wrote for the field. ``execution`` is left out because it changes no result.
         """
         return copy.deepcopy(self._yaml_mapping)
 
@@ -496,7 +497,7 @@ def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, 
 def _equal_chirp_rate_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a `Finding` if the chirp rates of two segments are equal.
 
-    Range and velocity then can't be separated.
+    Range and velocity can be separated only by segments of different chirp rates.
     """
     if grid.any_point_meets({waveform.DOWN_CHIRP_RATE_RATIO_PATH: lambda slope: slope == 1.0}):
         problem = "is the slope of the segment 'up': range and velocity need two slopes"
@@ -706,7 +707,7 @@ class SceneSpec(BaseSpec):
         return not axis_refusal(path).problem
 
     def override_findings(self, path: str, value: object, location: SpecLocation) -> list[Finding]:
-        """Return a `Finding` if a parameter may not take an SI value: rays would hit elsewhere.
+        """Return a `Finding` if an SI value of the parameter at `path` would move where rays hit.
 
         `location` holds the keys that lead to the value in the spec.
         """
@@ -743,7 +744,7 @@ class SceneSpec(BaseSpec):
 
     @property
     def is_ray_number_set_by_tolerance(self) -> bool:
-        """True if the spec states no number of rays per shot, and it follows from the tolerance."""
+        """True if the number of rays per shot follows from the tolerance and is not stated."""
         return self.footprint.beamlets == 0 and beamlets_converge(self.parameters())
 
     def surface_materials(self) -> tuple[SurfaceMaterial, ...]:
@@ -934,8 +935,9 @@ class SceneSpec(BaseSpec):
     def geometry_identity(self, name: str) -> dict[str, Any]:
         """Return plain data that is equal for two scanners whose rays hit the same points.
 
-        Names, reflectances and the paths of files are left out. Files are represented by digests of
-        their content. The order of objects matters, because it numbers their surfaces.
+        `name` is the scanner's name. Names, reflectances and the paths of files are left out. Files
+        are represented by digests of their content. The order of objects matters, because it
+        numbers their surfaces.
         """
         parameters, digests = self.parameters(), self._file_digests
         index_by_name = {key: index for index, key in enumerate(self.scene.objects)}
@@ -1075,7 +1077,7 @@ def _field_axis_contradiction_findings(
 
 
 def from_stored(json_text: str, base: Path | str | None = None) -> GridSpec | SceneSpec:
-    """Make a spec from JSON text that a store holds, which `to_json` of the spec returned.
+    """Make a spec from the JSON text in a store, which the method `to_json` of a spec wrote.
 
     Parameters
     ----------
@@ -1098,7 +1100,7 @@ def _spec_class(raw_spec: Any) -> type[GridSpec] | type[SceneSpec]:
 
 
 def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
-    """Parse YAML texts, one for each dotted path, to plain data.
+    """Convert YAML texts by dotted path to plain data by dotted path.
 
     Parameters
     ----------

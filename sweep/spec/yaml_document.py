@@ -267,7 +267,7 @@ class Document:
 
         The result is the first of the following that is in the user's file: a field that the
         finding names by path or in words, a field in the finding's section, the name of the
-        instrument. If none is, the line is None.
+        instrument. If the file has none of them, the line is None.
         """
         location, message = finding.location, f"{finding.problem} {finding.suggestion}"
         section = (
@@ -349,7 +349,7 @@ def _read_scalar(node: yaml.Node) -> Any:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML file that holds a mapping.
+    """Return the `Document` of a YAML file that holds a mapping.
 
     Parameters
     ----------
@@ -370,7 +370,7 @@ def read_document(path: Path) -> Document:
 
 
 def parse_document(text: str, path: Path) -> Document:
-    """Parse a YAML text that holds a mapping.
+    """Return the `Document` of a YAML text that holds a mapping.
 
     Parameters
     ----------
@@ -593,7 +593,7 @@ def _merge_error_floor(document: Document, instrument_floor: object, instrument_
 
 
 def _load_frequency_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
-    """Replace the path of a CSV file by its rows, in the dict `instrument` and in place.
+    """Replace a CSV file's path by the file's rows in an instrument's fields, in place.
 
     The CSV file holds the sweep's frequency error over time. Mistakes in the file are added to the
     findings of `document`.
@@ -769,7 +769,7 @@ def to_plain_data(data: Any, location: SpecLocation = ()) -> Any:
 def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return a dict of all entries of `base` and `overrides`; `overrides` wins.
 
-    Nested mappings are merged in the same way.
+    Two mappings under the same key are merged in the same way.
     """
     result = dict(base)
     for key, value in overrides.items():
@@ -809,7 +809,7 @@ _PROBLEM_BY_ERROR_TYPE = {
     "tuple_type": "must be a list",
     "invalid_key": "must be a word",
 }
-"""Words of the error message for an error of pydantic, by pydantic's name for the type of error."""
+"""Words of the error message for a pydantic error, by pydantic's name for the error's type."""
 _SCENE_ONLY_REMEDY = "it is for studies with a scene, in place of a target"
 """Advice to a user whose spec of a flat target has a section that only a scene has."""
 _REMEDY_BY_OTHER_SPEC_SECTION = {
@@ -915,7 +915,7 @@ def _kind_hint(models: spec_fields.ModelClasses) -> str:
 
 
 def _suggest_kind(tag: str, kind_names: list[str]) -> str:
-    """Return advice on an unknown value of ``kind``: a similar one, or the study that it is for.
+    """Return advice on an unknown value of ``kind``: a similar kind, or the studies that have it.
 
     `kind_names` are the valid values. The result is empty if none is similar.
     """
