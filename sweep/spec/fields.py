@@ -106,8 +106,8 @@ def quantity_rule(
     at_least, at_most : str
         Inclusive bounds with units; wide ones by default (`_DEFAULT_MAGNITUDE_MAX_BY_UNIT`).
     **rule_options
-        Further fields of `NumericRule`. `at_least` is ignored if `above` is given, and `at_most` if
-        `below` is given.
+        Fields of `NumericRule` that have no argument here. `at_least` is ignored if `above` is
+        given, and `at_most` if `below` is given.
     """
     bounds = (
         {"at_least": at_least or f"-{_DEFAULT_MAGNITUDE_MAX_BY_UNIT[unit]}"}
@@ -234,8 +234,8 @@ def list_field(
     default : object
         Tuple of SI values if the spec states no list. Without a default the field is required.
     **rule_options
-        Further fields of `ListRule`, such as `description`, and `alias`, the field's name in a
-        spec.
+        Fields of `ListRule` that have no argument here, such as `description`; and `alias`, the
+        field's name in a spec.
     """
     alias = rule_options.pop("alias", None)
     return field_with_rule(
@@ -494,6 +494,11 @@ def translate_pydantic_location(pydantic_location: SpecLocation, root: Any) -> M
         Location from pydantic, which contains the kind of a section after the section's key.
     root : type
         Model, or union of models, that was validated.
+
+    Returns
+    -------
+    ModelLocation
+        Location without kinds, with the models of the value and of its enclosing section.
     """
     annotation = root
     keys: list[str | int] = []
