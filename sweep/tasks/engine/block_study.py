@@ -44,9 +44,9 @@ class EarlierResults(NamedTuple):
 
 
 def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
-    """Concatenate the results of several parts of a block.
+    """Return the results of several parts of a block as one; `NO_RESULTS` without parts.
 
-    Every part has the arrays of the first one.
+    All parts must have arrays of the same names.
     """
     if not parts:
         return NO_RESULTS
@@ -93,13 +93,16 @@ class StoreTemplate(Protocol):
         """Version of the model that computes the results. Stores of other versions are refused."""
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return those root attributes of the store that are the same on all machines.
+        """Return the store's root attributes, by name, without those that depend on the machine.
 
-        Software versions are not among them.
+        Software versions depend on the machine, and are added by the engine.
         """
 
     def group_attributes(self) -> dict[str, dict[str, Any]]:
-        """Return the attributes of each group by its path; empty if all arrays are in the root."""
+        """Return the attributes of each group of the store, by the group's path.
+
+        The result is empty if all arrays are in the root group.
+        """
         return {}
 
     def array_layouts(self) -> list[ArrayLayout]:
@@ -152,7 +155,10 @@ class BlockStudy(StoreTemplate, ABC):
 
     @abstractmethod
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return layouts, with values, of arrays known when the store is made: coordinates etc."""
+        """Return layouts, with values, of the arrays that are known when the store is made.
+
+        Coordinates are such arrays.
+        """
 
     @abstractmethod
     def output_layouts(self) -> list[ArrayLayout]:
@@ -160,9 +166,10 @@ class BlockStudy(StoreTemplate, ABC):
 
     @abstractmethod
     def evaluate(self, block: int) -> Results:
-        """Compute one block.
+        """Compute a block, given by its number. Return its results, by the name of the array.
 
-        Return one array of results for each chunk that it writes, by array name.
+        A block writes at most one chunk of each array. The result for an array has the shape of
+        that chunk.
         """
 
     @abstractmethod
@@ -177,17 +184,17 @@ class BlockStudy(StoreTemplate, ABC):
     def evaluate_until(
         self, block: int, checkpoint_results: EarlierResults, deadline: Deadline
     ) -> Results:
-        """Compute a block from a checkpoint on, with the same results as `evaluate`.
+        """Continue a block from a checkpoint until it is complete, and return its results.
 
-        Raise `UnfinishedBlockException` at the deadline. If `supports_checkpoints`, this is called
-        in place of `evaluate`.
+        The results equal those of `evaluate`. `UnfinishedBlockException` is raised at the deadline.
+        If `supports_checkpoints`, the engine calls this method in place of `evaluate`.
         """
         raise NotImplementedError
 
     def pop_reused_point_count(self, block: int) -> int:
-        """Return how many points of a computed block were taken from another store.
+        """Return the number of points of a computed block that were copied from another store.
 
-        The count is then deleted, so it can be asked for once.
+        The count is deleted on return, so that a second call for the block returns 0.
         """
         return 0
 
@@ -244,7 +251,7 @@ class BlockStudy(StoreTemplate, ABC):
 
     @cached_property
     def _grid_by_group(self) -> dict[str, GroupGrid]:
-        """Grid of each group of the store, with the number of its first block."""
+        """Grid of each group's blocks, with the number of its first block, by group path."""
         last_blocks = np.cumsum([grid.n_blocks for grid in self.grids]).tolist()
         return {
             block_grid.group: GroupGrid(end - block_grid.n_blocks, block_grid)
@@ -261,7 +268,7 @@ class BlockStudy(StoreTemplate, ABC):
         return grid.count_block_points(block_in_grid)
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Return the total number of points in the blocks where a mask (blocks,) is True."""
+        """Return the total number of points in the blocks that a mask (blocks,) selects."""
         parts = np.split(is_included, np.cumsum([grid.n_blocks for grid in self.grids])[:-1])
         return sum(
             grid.count_points_in_blocks(part) for grid, part in zip(self.grids, parts, strict=True)
@@ -269,9 +276,10 @@ class BlockStudy(StoreTemplate, ABC):
 
     @cached_property
     def _grid_dim_indices_by_array(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
-        """Grid dimensions along which the dimensions of each array are cut, by group and array.
+        """Grid dimension along which each dimension of an array is cut, by group and array.
 
-        An entry is the index of a grid dimension, or None for a dimension that is not cut.
+        A grid dimension is stated as its index. None stands for a dimension of the array that is
+        not cut.
         """
         grid_dims: dict[str, dict[str, tuple[int | None, ...]]] = {
             group: {} for group in self._grid_by_group
@@ -285,8 +293,8 @@ class BlockStudy(StoreTemplate, ABC):
         """Return the position of the chunk that a block writes in each array, by array name.
 
         A position is the index of the chunk along each dimension of the array. If an array lacks a
-        dimension of the block grid, only the first block along that dimension writes it, and the
-        result for other blocks has no entry for this array.
+        dimension of the block grid, only the first block along that dimension writes the array. The
+        result for any other block has no entry for that array.
         """
         grid, block_in_grid = self.locate_block(block)
         position = grid.block_position(block_in_grid)
@@ -300,7 +308,7 @@ class BlockStudy(StoreTemplate, ABC):
         }
 
     def chunk_regions_of_block(self, block: int) -> dict[str, tuple[slice, ...]]:
-        """Return the slices of each array that a block writes, by the name of the array."""
+        """Return the part of each array that a block writes, as slices, by array name."""
         return {
             name: self.output_layout_by_name[name].chunk_region(position)
             for name, position in self.chunk_positions_of_block(block).items()
@@ -309,7 +317,7 @@ class BlockStudy(StoreTemplate, ABC):
     def chunk_owner_blocks(self) -> dict[str, np.ndarray]:
         """Return the number of the block that writes each chunk, by the name of the array.
 
-        Each value is an array in the shape of the grid of chunks.
+        Each value of the result is an integer array in the shape of that array's grid of chunks.
         """
         owners_by_array = {}
         for array_name, layout in self.output_layout_by_name.items():
@@ -335,9 +343,9 @@ class StoredStudy(NamedTuple, Generic[StudyT]):
 
 
 StudyReader = Callable[["Location"], StoredStudy[BlockStudy]]
-"""Function that returns the study in a store, or raises a StoreError.
+"""Function that returns the study in the store at a location, or raises a StoreError.
 
-It must be defined at the top level of a module, as it is sent to workers by name.
+The function must be defined at the top level of a module, as it is sent to workers by name.
 """
 
 

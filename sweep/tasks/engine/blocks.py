@@ -33,9 +33,10 @@ FILL_VALUE_BY_DTYPE_KIND = {"f": float("nan"), "i": -1, "u": 0}
 def chunk_slices(
     position: tuple[int, ...], chunks: tuple[int, ...], shape: tuple[int, ...]
 ) -> tuple[slice, ...]:
-    """Return the slices of an array that one chunk covers, cut at the edge of the array.
+    """Return the part of an array that one chunk covers, as slices, cut at the edge of the array.
 
-    The chunk is given by its position in the grid of chunks.
+    `position` is the index of the chunk along each dimension. `chunks` is the shape of a chunk, and
+    `shape` that of the array.
     """
     return tuple(
         slice(index * chunk, min((index + 1) * chunk, size))
@@ -96,13 +97,13 @@ class ArrayLayout:
         )
 
     def nbytes_of_part(self, shape: tuple[int, ...]) -> int:
-        """Return the size [bytes] of a part of the array with a given shape, before compression."""
+        """Return the uncompressed size [bytes] of a part of the array, given the part's shape."""
         return math.prod(shape) * np.dtype(self.dtype).itemsize
 
     def chunk_region(self, position: tuple[int, ...]) -> tuple[slice, ...]:
-        """Return the slices of the array that one chunk covers.
+        """Return the part of the array that one chunk covers, as slices.
 
-        `position` is the index of the chunk along each dimension of the grid of chunks.
+        `position` is the index of the chunk along each dimension of the array's grid of chunks.
         """
         return chunk_slices(position, self.chunks, self.shape)
 
@@ -151,29 +152,32 @@ class BlockGrid:
         return math.prod(self.shape) * self.fine_steps
 
     def block_position(self, block: int) -> tuple[int, ...]:
-        """Return the index of a block along each dimension of the grid of blocks.
+        """Return the index of a block along each dimension, given the block's number.
 
-        IndexError is raised if there is no such block.
+        IndexError is raised if the grid has no block of this number.
         """
         if not 0 <= block < self.n_blocks:
             raise IndexError(f"block {block} of {self.n_blocks}")
         return tuple(map(int, np.unravel_index(block, self.blocks_per_dim)))
 
     def block_at(self, block_position: tuple[int, ...]) -> int:
-        """Return the number of the block at a position in the grid of blocks."""
+        """Return the number of the block whose index along each dimension is `block_position`."""
         return (
             int(np.ravel_multi_index(block_position, self.blocks_per_dim)) if block_position else 0
         )
 
     def block_slices(self, block: int) -> tuple[slice, ...]:
-        """Return the slices of grid steps that a block covers along each dimension.
+        """Return the part of the grid that a block covers, as a slice for each dimension.
 
-        Blocks at the edge are cut there.
+        The slices count grid steps. A block at the edge of the grid is cut at the edge.
         """
         return chunk_slices(self.block_position(block), self.block_shape, self.shape)
 
     def actual_block_shape(self, block: int) -> tuple[int, ...]:
-        """Return how many grid steps a block covers along each dimension; fewer at the edge."""
+        """Return the number of grid steps that a block covers along each dimension.
+
+        A block at the edge of the grid may be smaller than `block_shape`.
+        """
         return tuple(
             block_slice.stop - block_slice.start for block_slice in self.block_slices(block)
         )
@@ -183,14 +187,14 @@ class BlockGrid:
         return math.prod(self.actual_block_shape(block)) * self.fine_steps
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Return the total number of points in the blocks where a mask (blocks,) is True."""
+        """Return the total number of points in the blocks that a mask (blocks,) selects."""
         counts = np.asarray(is_included, bool).reshape(self.blocks_per_dim)
         for size, chunk in zip(self.shape[::-1], self.block_shape[::-1], strict=True):
             counts = counts @ np.minimum(chunk, size - np.arange(0, size, chunk))
         return int(counts) * self.fine_steps
 
     def locate_points(self, grid_indices: np.ndarray) -> PointLocations:
-        """Return the number of each point's block, and the index of the point within it.
+        """Return the block of each point, by number, and the point's index within the block.
 
         `grid_indices` (n,) are the indices of the points in C order over the whole grid.
         """
@@ -231,7 +235,7 @@ class BlockGrid:
     ) -> ArrayLayout:
         """Return the layout of an array of results, cut into chunks as the grid is cut into blocks.
 
-        `sizes` gives the sizes of the dimensions in `dims` that the grid does not have.
+        `sizes` has the lengths of those dimensions in `dims` that the grid lacks, by name.
         """
         array_sizes = dict(sizes) | dict(zip(self.dims, self.shape, strict=True))
         chunk_sizes = dict(sizes) | dict(zip(self.dims, self.block_shape, strict=True))

@@ -75,14 +75,15 @@ class ThroughputEstimator:
     work_seconds: float = 0.0  # computing time of these blocks, summed over workers [s]
 
     def add_task_result(self, task_result: TaskResult) -> None:
-        """Add the computing times of the blocks that a task has finished."""
+        """Add the number and the computing time of the blocks that a task has finished."""
         self.n_finished_blocks += len(task_result.receipts)
         self.work_seconds += sum(receipt.seconds for receipt in task_result.receipts)
 
     def blocks_per_task(self, n_blocks_left: int, n_worker_threads: int) -> int:
-        """Return the number of blocks for the next task.
+        """Return the number of blocks for the next task; 1 until any block is finished.
 
-        Tasks become smaller near the end, so that all workers end together.
+        A task is to last `TARGET_TASK_SECONDS`. Tasks become smaller as `n_blocks_left` falls, so
+        that all workers end together.
         """
         if not self.n_finished_blocks:
             return 1
@@ -102,7 +103,10 @@ class WorkerThreadCounter:
     last_counted_at: float = -1e9  # time of the last count, by `time.monotonic` [s]
 
     def current_count(self) -> int:
-        """Return the number of worker threads, connected or expected, at least 1."""
+        """Return the larger of the connected and expected numbers of worker threads, at least 1.
+
+        Connected threads are counted at most once per `WORKER_THREADS_REFRESH_SECONDS`.
+        """
         if time.monotonic() - self.last_counted_at > WORKER_THREADS_REFRESH_SECONDS:
             self.n_threads_by_worker = dict(self.client.nthreads())
             self.n_worker_threads = max(
@@ -168,12 +172,12 @@ class TaskDispatcher:
         self._stall_monitor = StallMonitor(say, self.state_summary)
 
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
-        """Yield results of tasks as they arrive, or empty ones while none arrives.
+        """Send all blocks of the queue in tasks. Yield the result of each task when the task ends.
 
-        Empty results come every `IDLE_POLL_SECONDS`. Once `is_stopping` returns True, no more tasks
-        are sent. The iteration ends when all sent tasks have ended, or at once if there is no
-        worker. SchedulerLostError is raised if the scheduler is gone; StoreError or OSError is
-        raised if no worker can write to the store.
+        While no task ends, an empty result is yielded every `IDLE_POLL_SECONDS`. Once
+        `is_stopping()` returns True, no more tasks are sent; the iteration ends when all sent tasks
+        have ended, or when no usable worker is connected. SchedulerLostError is raised if the
+        scheduler is gone. StoreError or OSError is raised if no worker can write to the store.
         """
         try:
             while True:
@@ -230,7 +234,7 @@ class TaskDispatcher:
         return "\n".join(lines)
 
     def _report_if_stalled(self) -> None:
-        """Print a message and log the state of the run if no result arrives for long."""
+        """Print a message, and log the state of the run, if no task has ended for a long time."""
         if (
             not self._in_flight or not self._usable_workers()
         ):  # the session reports a lack of workers
@@ -251,11 +255,15 @@ class TaskDispatcher:
 
     @property
     def _all_workers_excluded(self) -> bool:
-        """True if all workers known so far are excluded, but further workers may still connect."""
+        """True if at least one worker is excluded, and no connected worker is usable."""
         return bool(self._excluded_workers) and not self._usable_workers()
 
     def _submit_tasks(self, *, may_submit: bool) -> None:
-        """Submit tasks until there are twice as many unfinished tasks as worker threads."""
+        """Submit tasks until there are twice as many unfinished tasks as worker threads.
+
+        Nothing new is submitted if the queue is empty, or if `may_submit` is False. Overdue tasks
+        of silent workers are sent to idle workers in either case.
+        """
         n_worker_threads = self._thread_counter.current_count()
         if time.monotonic() - self._duplicated_at > WORKER_THREADS_REFRESH_SECONDS:
             self._duplicated_at = time.monotonic()
@@ -277,9 +285,10 @@ class TaskDispatcher:
             self._submit_task(_InFlightTask(blocks), **self._placement_kwargs(blocks[0]))
 
     def _is_failed_block_in_flight(self) -> bool:
-        """Return True if a block that failed before is being computed.
+        """Return True if an unfinished task computes a block that has failed before.
 
-        Only one is computed at a time, so that none is blamed for an error that another causes.
+        Blocks that have failed are computed one at a time, so that a worker's death is attributed
+        to the block that caused it.
         """
         failed_blocks = self._block_queue.failed_blocks
         return bool(failed_blocks) and any(
@@ -287,7 +296,11 @@ class TaskDispatcher:
         )
 
     def _placement_kwargs(self, block: int) -> dict[str, Any]:
-        """Return arguments of `Client.submit` that keep a block from the worker where it failed."""
+        """Return arguments of `Client.submit` that keep a block from the worker where it failed.
+
+        Excluded workers are avoided as well. The result is empty if any worker may compute the
+        block.
+        """
         failing_worker = self._failing_worker.get(block)
         other_workers = [worker for worker in self._usable_workers() if worker != failing_worker]
         if failing_worker and other_workers:
@@ -295,7 +308,7 @@ class TaskDispatcher:
         return {"workers": self._usable_workers()} if self._excluded_workers else {}
 
     def _submit_task(self, task: _InFlightTask, **placement: Any) -> None:
-        """Submit a task to Dask, with further arguments of `Client.submit`."""
+        """Submit a task to Dask. `placement` has arguments of `Client.submit` for its workers."""
         first_block = task.blocks[0]
         key = task_key(
             self._settings,
@@ -313,7 +326,7 @@ class TaskDispatcher:
         future.add_done_callback(self._finished_futures.put)
 
     def _duplicate_stragglers(self) -> None:
-        """Send overdue tasks to idle workers as well, if their worker is silent or lost."""
+        """Send overdue tasks also to idle workers, if the tasks' workers are silent or lost."""
         now = time.monotonic()
         overdue_tasks = [
             task
@@ -360,9 +373,9 @@ class TaskDispatcher:
             self._submit_task(task, workers=idle_workers)
 
     def _seconds_until_resend(self, task: _InFlightTask) -> float:
-        """Return the time after which a task may be sent to a further worker [s].
+        """Return the time after sending a task at which the task counts as overdue [s].
 
-        It doubles each time that the task is sent.
+        The time doubles with each sending of the task.
         """
         return max(WORKER_SILENCE_SECONDS, 5 * self._expected_task_seconds(task)) * 2.0 ** (
             len(task.futures_by_key) - 1
@@ -378,7 +391,10 @@ class TaskDispatcher:
         )
 
     def _next_result(self) -> TaskResult:
-        """Return the result of the next task that ends; an empty one if none ends in time."""
+        """Wait up to `IDLE_POLL_SECONDS` for a task to end. Return its result, or an empty one.
+
+        The result has only receipts of blocks that this process sees in the store.
+        """
         task_result = TaskResult()
         try:
             future = self._finished_futures.get(timeout=IDLE_POLL_SECONDS)
@@ -393,7 +409,10 @@ class TaskDispatcher:
         return task_result
 
     def _finish_task(self, future: Future) -> TaskResult:
-        """Return the result of a task that has ended. Update the queue and the state of workers."""
+        """Return the result of an ended task, given its future. Requeue its unfinished blocks.
+
+        The worker is excluded if the result states that the worker can't compute any block.
+        """
         task = self._in_flight[future.key]
         for key in task.futures_by_key:
             del self._in_flight[key]
@@ -426,15 +445,16 @@ class TaskDispatcher:
         return task_result
 
     def _requeue_blocks(self, blocks: list[int]) -> None:
-        """Put blocks that are unfinished, or whose task was lost, back into the queue."""
+        """Put blocks back into the queue that are unfinished, or whose task was lost."""
         self._block_queue.requeue(blocks)
         self._resend_counts.update(blocks)
 
     def _verify_receipts(self, task_result: TaskResult) -> None:
-        """Keep, in a task's result, only receipts of blocks that this process sees in the store.
+        """Remove receipts from a task's result, in place, if this process can't see their blocks.
 
-        Other receipts are checked again later. A block that does not appear in time is sent again,
-        and its worker is excluded.
+        A removed receipt is checked again later. Once its block is visible in the store, the
+        receipt is added to the result of that later call. If the block is not visible within
+        `FILE_VISIBILITY_SECONDS_MAX`, it is queued again, and its worker is excluded.
         """
         now = time.monotonic()
         receipts_to_verify = [
@@ -457,9 +477,10 @@ class TaskDispatcher:
                 self._exclude_worker(worker, receipt.host, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
 
     def _exclude_worker(self, worker: str, host: str, error: Exception) -> None:
-        """Send no more tasks to a worker. Its error is raised if no other worker is left.
+        """Send no more tasks to a worker, and print its error.
 
-        Workers that may still connect count as left.
+        The error is raised instead if no worker is usable and no more workers are expected to
+        connect. `worker` is the worker's address.
         """
         if worker in self._excluded_workers:
             return
@@ -483,7 +504,11 @@ class TaskDispatcher:
 
 
 def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
-    """Return the result of a task that has ended; an empty one if it was lost with its worker."""
+    """Return the result of an ended task, given its future and its blocks.
+
+    The result is empty if it was lost with its worker. If the task raised an error, the result has
+    a failure of every block. SchedulerLostError is raised if the scheduler is gone.
+    """
     error: BaseException | None = None
     if future.status == "finished":
         try:
@@ -502,9 +527,9 @@ def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
 
 
 def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
-    """Return the result of a task that raised an error or killed its workers.
+    """Return a result with a failure of every block, for a task that raised an error.
 
-    It holds a failure of every block of the task.
+    The error may be that the task killed its workers.
     """
     from distributed.scheduler import KilledWorker
 
@@ -522,9 +547,11 @@ def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
 def task_key(
     settings: TaskSettings, blocks: list[int], is_retry: bool, resend_count: int = 0
 ) -> str:
-    """Return the key that identifies a task for Dask.
+    """Return the text by which Dask identifies a task of these blocks.
 
-    It is equal for the same blocks of the same store in any process.
+    The key is equal in all processes. It depends on the store's path, the study's id, the numbers
+    of the blocks, whether the first block has failed before (`is_retry`), and how often the task
+    was sent again (`resend_count`).
     """
     identity = repr(
         (settings.store_path, settings.study_id, blocks, is_retry, resend_count)

@@ -99,7 +99,10 @@ class InterruptHandler:
             self._watcher = None
 
     def announce_stop(self) -> None:
-        """Print, once only, that the run stops when the blocks being computed are written."""
+        """Tell the listener that the run stops once its running blocks are written.
+
+        Only the first call does so.
+        """
         with self._announce_lock:
             if not self._is_announced:
                 self._is_announced = True
@@ -124,10 +127,7 @@ class InterruptHandler:
     # Methods of the watcher thread
 
     def _start_watcher(self) -> None:
-        """Start the thread that watches for signals.
-
-        It is not started if an event loop of the caller already receives signals.
-        """
+        """Start the watcher thread, unless an event loop of the caller already receives signals."""
         receiver, sender = socket.socketpair()
         receiver.setblocking(False)
         sender.setblocking(False)
@@ -168,15 +168,15 @@ class InterruptHandler:
                 self.announce_stop()
 
     def _seconds_to_deadline(self) -> float | None:
-        """Return the time until running blocks are stopped [s]; None if no deadline is set."""
+        """Return the time until running blocks are stopped [s]; None without a deadline."""
         deadline = self._deadline
         return None if deadline is None else max(deadline - time.monotonic(), 0.0)
 
     def _unhandled_signals(self, receiver: socket.socket) -> list[int]:
-        """Return the numbers of signals that the main thread has not handled yet.
+        """Return the signal numbers of the signals that the main thread has not handled yet.
 
-        Python sends one byte per signal to `receiver`, and the main thread removes these bytes when
-        it handles the signal. Other bytes, which only wake this thread, are removed here.
+        Python sends one byte per signal to the socket `receiver`. The main thread removes the bytes
+        when it handles a signal. This method removes bytes that only wake the watcher thread.
         """
         try:
             signal_bytes = receiver.recv(_SIGNALS_PER_READ_MAX, socket.MSG_PEEK)
@@ -192,9 +192,11 @@ class InterruptHandler:
         return unhandled
 
     def _wait_until_handled(self, receiver: socket.socket, n_signals: int) -> bool:
-        """Wait until the main thread handles a signal. Return False if it does not in time.
+        """Wait for the main thread to handle a signal. Return False if the wait times out.
 
-        `n_signals` is the number of unhandled signals so far.
+        The wait lasts at most `SIGNAL_HANDLING_SECONDS_MAX`. `receiver` is the socket that holds
+        one byte per unhandled signal. `n_signals` is the number of unhandled signals when the wait
+        begins.
         """
         deadline = time.monotonic() + SIGNAL_HANDLING_SECONDS_MAX
         while time.monotonic() < deadline:
@@ -206,9 +208,12 @@ class InterruptHandler:
         return False
 
     def _react_to_stalled_signals(self, unhandled: list[int], *, is_repeated: bool) -> None:
-        """Print a message or end the process, as compiled code keeps signals from being handled.
+        """React to signals that the main thread can't handle, as it runs compiled code.
 
-        `is_repeated` means that this method was called before for earlier ones of these signals.
+        SIGTERM ends the process. A second signal ends the process of a `sweep` command, and prints
+        a message in any other Python program. A first signal prints a message. The signal of a
+        closed terminal has no effect. `unhandled` holds signal numbers. `is_repeated` is True if an
+        earlier call has reacted to one of these signals.
         """
         if set(unhandled) == {HANGUP_SIGNAL}:
             return

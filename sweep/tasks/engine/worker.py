@@ -69,7 +69,8 @@ RESULTS_NOT_VISIBLE_MESSAGE = (
 ReceiptVerifier = Callable[[Receipt, bool], bool]
 """Function that returns True if a receipt's block is in the store as this process sees it.
 
-The first argument is the receipt. The second tells whether to compare digests, and not only sizes.
+The first argument is the receipt. If the second is True, digests are compared; otherwise only sizes
+are.
 """
 
 
@@ -113,9 +114,10 @@ _block_writer_cache_lock = threading.Lock()
 def get_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
-    """Return the writer of a store's blocks, which each process opens only once.
+    """Return a writer of blocks into a study's store.
 
-    StoreError is raised if the store holds another study.
+    The writer is cached, so that each process opens a store only once. StoreError is raised if the
+    store holds another study.
     """
     with _block_writer_cache_lock:
         return _cached_block_writer(store_path, study_id, read_study)
@@ -124,9 +126,10 @@ def get_block_writer(
 def _open_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
-    """Open the store of a study for writing.
+    """Open the store of a study, and return a new writer of its blocks.
 
-    StoreError is raised for another study, or for a store of other versions of the software.
+    StoreError is raised if the store holds another study, or was begun with other versions of the
+    software.
     """
     attributes, stored_study = read_study(parse_location(store_path))
     _refuse_replaced_store(store_path, study_id)
@@ -143,7 +146,7 @@ _cached_block_writer = lru_cache(maxsize=OPEN_STUDIES_MAX)(_open_block_writer)
 
 
 def _refuse_replaced_store(store_path: str, study_id: str) -> None:
-    """Raise a StoreError if the store was replaced since the task was sent."""
+    """Raise a StoreError if the store at a path now holds another study than `study_id`."""
     stat_fingerprint = store_stat_fingerprint(parse_location(store_path))
     stored_id = (
         _stored_study_id(store_path, stat_fingerprint)
@@ -156,18 +159,19 @@ def _refuse_replaced_store(store_path: str, study_id: str) -> None:
 
 @lru_cache(maxsize=OPEN_STUDIES_MAX)
 def _stored_study_id(store_path: str, stat_fingerprint: tuple[int, ...] | None) -> str:
-    """Return the id of the study in a store.
+    """Return the id of the study whose store is at a path.
 
-    The result is cached; the fingerprint is part of the key of the cache.
+    The result is cached. `stat_fingerprint` is part of the cache's key, and changes if the store is
+    replaced.
     """
     return str(read_attributes(parse_location(store_path))["study_id"])
 
 
 def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
-    """Compute and write blocks. An error of one block does not stop the others.
+    """Compute and write blocks, given by number. Return their receipts and failures.
 
-    A block that takes long is computed in part and saved as a checkpoint, from which the next task
-    continues.
+    An error of one block does not stop the others. A block that takes long is computed in part and
+    saved as a checkpoint, from which a later task continues.
     """
     task_result = TaskResult(worker_address=worker_address(), host=socket.gethostname())
     try:
@@ -185,9 +189,10 @@ def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
 
 
 def _allow_user_code(settings: TaskSettings) -> None:
-    """Allow this worker to import the user's modules that the run allows.
+    """Allow this worker to import the user's modules that `settings` lists.
 
-    CodeError is raised if a module's file differs here.
+    CodeError is raised if a module's file on this machine differs from that of the process that
+    started the run.
     """
     for module, digest in settings.user_module_digests:
         user_code.allow_identical_module(module, digest)
@@ -199,7 +204,7 @@ def _run_blocks(
     blocks: list[int],
     settings: TaskSettings,
 ) -> None:
-    """Compute and write blocks. Add receipts, failures and checkpoint points to `task_result`."""
+    """Compute and write blocks. Add receipts, failures and unfinished blocks to `task_result`."""
     receipts, checkpoint_time = [], time.monotonic() + CHECKPOINT_INTERVAL_SECONDS
     for block in blocks:
         try:
@@ -222,9 +227,10 @@ def _run_blocks(
 def _compute_block(
     writer: study_store.BlockWriter, block: int, settings: TaskSettings, deadline: Deadline
 ) -> Receipt | float:
-    """Compute and write one block.
+    """Compute and write one block, or a part of it until a deadline.
 
-    Return its receipt, or the number of points done at the deadline.
+    Return the receipt of a complete block. At the deadline save a checkpoint, and return the number
+    of points done.
     """
     stored_study, store_path, checkpoint = writer.study, writer.store_path, Checkpoint()
     started_at = time.perf_counter()
@@ -289,11 +295,12 @@ class _TimeoutInterruption(SystemExit):
 def run_with_timeout(
     function: Callable[[], ReturnValueT], timeout: float | None, seconds_spent: float = 0.0
 ) -> ReturnValueT:
-    """Call a function in a thread and return its result.
+    """Call a function, without arguments, in a thread, and return its result.
 
-    BlockTimeoutError is raised if it takes longer than `timeout` less `seconds_spent` [s]. Python
-    code is then interrupted. A worker process ends itself if the thread is still in compiled code
-    `INTERRUPT_GRACE_SECONDS` later; any other process waits.
+    BlockTimeoutError is raised if the call takes longer than `timeout` less `seconds_spent` [s].
+    Python code is interrupted at that time. If the thread is still in compiled code
+    `INTERRUPT_GRACE_SECONDS` later, a worker process ends itself; any other process waits. If
+    `timeout` is None, the function is called in this thread without a limit.
     """
     if timeout is None:
         return function()
@@ -363,10 +370,10 @@ class BlockQueue:
         self.failed_blocks: set[int] = set()
 
     def take_blocks(self, count: int, *, include_failed: bool = True) -> list[int]:
-        """Remove up to `count` blocks from the queue, for one task.
+        """Remove up to `count` blocks from the queue, and return their numbers; [] if none is left.
 
-        A block that failed, or was put back, is taken alone. If not `include_failed`, failed blocks
-        stay in the queue.
+        A block that failed, or was put back, is returned alone. If not `include_failed`, blocks
+        that failed stay in the queue.
         """
         if self._failed_once and include_failed:
             return [self._failed_once.popleft()]
@@ -377,7 +384,10 @@ class BlockQueue:
         return blocks
 
     def requeue_failed(self, block: int) -> bool:
-        """Put a failed block back. Return False, and drop it, at its second failure."""
+        """Put a block back into the queue after its first failure, and return True.
+
+        After a second failure the block is not put back, and the result is False.
+        """
         if block in self.failed_blocks:
             return False
         self.failed_blocks.add(block)
@@ -385,9 +395,9 @@ class BlockQueue:
         return True
 
     def requeue(self, blocks: list[int]) -> None:
-        """Put blocks back that are unfinished, or whose task was lost.
+        """Put blocks back into the queue that are unfinished, or whose task was lost.
 
-        Blocks that failed before are queued as failed again.
+        Blocks that have failed before are computed alone again.
         """
         for block in blocks:
             (self._failed_once if block in self.failed_blocks else self._requeued).append(block)
@@ -406,10 +416,11 @@ def run_serial(
     verify_receipt: ReceiptVerifier,
     say: MessagePrinter,
 ) -> Iterator[TaskResult]:
-    """Compute blocks in this process one after the other. Yield the result of each.
+    """Compute blocks in this process one after the other. Yield a TaskResult for each block.
 
-    Every other way to compute must write the same bytes as this reference. ``say`` gets messages
-    for the user about a block that takes long.
+    Every other way to compute must write the same bytes as this reference. ``is_stopping`` returns
+    True once no more blocks are to begin. ``say`` gets messages for the user about a block that
+    takes long.
     """
     monitor = InProcessMonitor(say, lambda: block_queue.n_unassigned)
     with monitor.watch_in_thread(IDLE_POLL_SECONDS):
@@ -501,7 +512,7 @@ def run_in_threads(
 
 
 def _record_result(monitor: InProcessMonitor, task_result: TaskResult) -> None:
-    """Report to the monitor the blocks that a task has finished, and their computing time."""
+    """Report the number and the computing time of a task's finished blocks to a stall monitor."""
     work_seconds = sum(receipt.seconds for receipt in task_result.receipts)
     monitor.record_result(len(task_result.receipts), work_seconds)
 
@@ -512,10 +523,11 @@ def _accept_result(
     block_queue: BlockQueue,
     verify_receipt: ReceiptVerifier,
 ) -> TaskResult:
-    """Return the result of a task of this process, after checking that its blocks are in the store.
+    """Return a task's result, after checking that the blocks of its receipts are in the store.
 
-    If one is missing there, all blocks of the task count as failed. Unfinished blocks go back to
-    the queue. An error that would prevent every block from being computed is raised.
+    If a block is missing from the store, all blocks of the task count as failed. Unfinished blocks
+    are put back into the queue. An error that would prevent every block from being computed is
+    raised.
     """
     if task_result.worker_error is not None:
         raise task_result.worker_error
