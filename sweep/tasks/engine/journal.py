@@ -142,9 +142,10 @@ class Journal:
             log.remove_damaged_lines(lambda line: verified_line_body(line) is not None)
 
     def commit(self, *receipts: Receipt) -> None:
-        """Append receipts to the log, which marks their blocks as done.
+        """Append receipts to the log of receipts. A written receipt marks its block as done.
 
-        In an object store the blocks are done after the next `flush` that writes.
+        On disk, receipts are written at once. In an object store, the next `flush` that is due
+        writes them.
         """
         commit_time = round(time.time(), 3)
         self._append(
@@ -152,15 +153,18 @@ class Journal:
         )
 
     def withdraw_receipt(self, block: int, reason: str) -> None:
-        """Add a line that cancels a block's receipt, so that the block is computed again."""
+        """Add a log line that cancels a block's receipt, so that the block is computed again.
+
+        `reason` is recorded in the line.
+        """
         self._append(
             RECEIPTS_FILE, {"block": block, "withdrawn": reason, "time": round(time.time(), 3)}
         )
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write the pending lines that are due, or all if `force`.
+        """Write the pending lines of all logs. Return True if no pending line is left.
 
-        Return True if no pending line is left.
+        In an object store, lines that are not due yet are written only if `force`.
         """
         is_flushed = [log.flush(force=force) for log in self._logs.values()]
         return all(is_flushed)
@@ -185,7 +189,7 @@ class Journal:
 
 
 def read_committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
-    """Return the digest in the receipt of each block, (blocks,) of bytes; b'' without a receipt."""
+    """Return the digest in each block's receipt, (blocks,) of bytes; b'' without a receipt."""
     digest_by_block = np.zeros(n_blocks, dtype="S32")
     for record in iter_log_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
         if 0 <= record["block"] < n_blocks:
@@ -209,7 +213,10 @@ def committed_block_mask(store_path: Location, study: BlockStudy) -> np.ndarray:
 
 
 def read_permanent_failures(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
-    """Return the last failure record of each block that failed permanently and is not done."""
+    """Return failure records, by number, of blocks that failed permanently and are not done.
+
+    If a block failed in several runs, the last record counts.
+    """
     last_failures = {
         record["block"]: record
         for record in iter_log_records(store_path / JOURNAL_DIR / FAILURE_LOG_FILE)
@@ -229,7 +236,10 @@ class LastRun:
 
 
 def read_last_run(store_path: Location) -> LastRun:
-    """Return the start time and the number of threads of the last run of a store."""
+    """Return the start time and the number of threads of the last run of a store.
+
+    The start time is inf if there was no run.
+    """
     runs = iter_log_records(store_path / JOURNAL_DIR / SESSION_LOG_FILE)
     starts = [run for run in runs if run.get("event") == "begun"]
     if not starts:
@@ -242,15 +252,18 @@ def read_last_run(store_path: Location) -> LastRun:
 
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
-    """Replace a store's recipe in one step.
+    """Replace a store's recipe, the file of facts about how the store is made, in one step.
 
-    ``facts`` are its entries, such as the folder of the study's files, or the extended store.
+    ``facts`` are all entries of the new recipe, such as the folder of the study's files.
     """
     atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_log_record(facts))
 
 
 def read_recipe(store_path: Location) -> dict[str, Any]:
-    """Return a store's recipe, the facts about how it is made; empty if missing or damaged."""
+    """Return the entries of a store's recipe, by name; {} if the recipe is missing or damaged.
+
+    The recipe is the file of facts about how the store is made.
+    """
     records = [record for _, record in iter_log_lines(store_path / JOURNAL_DIR / RECIPE_FILE)]
     return records[0] or {} if len(records) == 1 else {}
 
@@ -267,7 +280,7 @@ def remove_predecessors_from_recipe(store_path: Path) -> None:
 
 
 def refuse_damaged_recipe(store_path: Location) -> None:
-    """Raise a StoreError if the recipe is damaged."""
+    """Raise a StoreError if a store's recipe (facts about how the store is made) is damaged."""
     recipe_path = store_path / JOURNAL_DIR / RECIPE_FILE
     if any(record is None for _, record in iter_log_lines(recipe_path)):
         raise StoreError(
@@ -309,9 +322,10 @@ class ChunkScan:
         return not wait(self._array_scans, timeout).not_done
 
     def complete_block_mask(self) -> np.ndarray:
-        """Return a mask (blocks,) of candidates that lack no chunk in the arrays searched so far.
+        """Return a mask (blocks,) of the candidate blocks of which no chunk is known to be missing.
 
-        OSError is raised if the store can't be read.
+        Only arrays whose search has ended are considered. OSError is raised if the store can't be
+        read.
         """
         is_complete = self._candidates.copy()
         for scan in self._array_scans:
@@ -338,7 +352,11 @@ def find_complete_block_mask(
 
 
 def find_existing_chunk_mask(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a mask, in the shape of an array's grid of chunks, of chunks that are not empty."""
+    """Return a mask of the chunks of an array that exist and are not empty.
+
+    `folder` contains the chunks. `shape` is the shape of the array's grid of chunks, and of the
+    mask.
+    """
     is_present = np.zeros(shape, bool)
     if isinstance(folder, ObjectPath):
         for position, size in _iter_chunk_sizes(folder, shape):
@@ -359,7 +377,10 @@ def _is_nonempty_file(status: os.stat_result) -> bool:
 def _iter_chunk_sizes(
     folder: ObjectPath, shape: tuple[int, ...]
 ) -> Iterator[tuple[tuple[int, ...], int]]:
-    """Yield the position and the size [bytes] of each chunk of an array in an object store."""
+    """Yield the position and the size [bytes] of each chunk of an array in an object store.
+
+    `folder` contains the chunks. `shape` is the shape of the array's grid of chunks.
+    """
     if not shape:
         yield (), max(0, folder.size())
         return
@@ -374,7 +395,7 @@ def _iter_chunk_sizes(
 def _mark_existing_chunks(
     folder_or_name: Path | str, is_present: np.ndarray, parent_descriptor: int | None = None
 ) -> None:
-    """Set `is_present` to True for each chunk that exists below a folder.
+    """Set elements of `is_present` to True, in place, for the non-empty chunks below a folder.
 
     `is_present` has the shape of the array's grid of chunks. `parent_descriptor` is the descriptor
     of the folder's parent if `folder_or_name` is a name.
@@ -415,9 +436,9 @@ class Checkpoint(NamedTuple):
 def write_checkpoint(
     store_path: Location, study_id: str, block: int, checkpoint: Checkpoint
 ) -> None:
-    """Save a block's checkpoint, unless the saved one has at least as many points done.
+    """Save a block's checkpoint, unless the stored one has at least as many points done.
 
-    OSError is raised if it can't be written.
+    OSError is raised if the checkpoint can't be written.
     """
     if read_checkpoint(store_path, study_id, block).n_points_done >= checkpoint.n_points_done:
         return  # written by another worker, which was believed to be lost
@@ -435,7 +456,11 @@ def write_checkpoint(
 
 
 def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoint:
-    """Return the checkpoint of a block of a study; an empty one if none is usable."""
+    """Return the checkpoint of a block of a study.
+
+    The result is empty if no checkpoint is stored, or if the stored one is damaged or of another
+    study.
+    """
     try:
         file_content = read_object(
             store_path, f"{JOURNAL_DIR}/{CHECKPOINT_FILE_PREFIX}{block}", ARRAY_FILE_BYTES_MAX
@@ -465,7 +490,10 @@ def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoi
 
 
 def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the arrays of a `numpy.savez` archive by name; raise ValueError if a size is wrong."""
+    """Yield the name and the values of each array in a `numpy.savez` archive, given as bytes.
+
+    ValueError is raised, before memory is allocated, if the archive declares a wrong size.
+    """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED or member.file_size > len(content):
@@ -485,7 +513,7 @@ def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def read_checkpoint_point_counts(store_path: Location, study_id: str) -> dict[int, float]:
-    """Return the number of points done in the checkpoint of each block that has one."""
+    """Return the number of points done in each checkpoint of a study, by block number."""
     block_names = [
         file.name.removeprefix(CHECKPOINT_FILE_PREFIX)
         for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_FILE_PREFIX}*")
@@ -503,7 +531,7 @@ def read_checkpoint_point_counts(store_path: Location, study_id: str) -> dict[in
 
 
 def delete_checkpoints(store_path: Location, block: int | str = "*") -> None:
-    """Remove the checkpoint of one block, or of all blocks."""
+    """Delete the checkpoint of the block with a number, or of all blocks by default."""
     for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_FILE_PREFIX}{block}"):
         file.unlink(missing_ok=True)
 
@@ -514,7 +542,7 @@ def _block_checkpoint_path(store_path: Location, block: int) -> Location:
 
 
 def _checkpoint_arrays(results: EarlierResults) -> dict[str, Any]:
-    """Return the arrays of a checkpoint, by the names in its archive."""
+    """Return the arrays of a block's results by their names in the archive of a checkpoint."""
     return {
         f"{part}/{name}": values
         for part, (points, arrays) in results._asdict().items()
@@ -523,7 +551,7 @@ def _checkpoint_arrays(results: EarlierResults) -> dict[str, Any]:
 
 
 def _content_digest(content: bytes) -> str:
-    """Return the digest of a checkpoint's content, which reveals damage."""
+    """Return the digest, in hex, of a checkpoint's content. Damage changes the digest."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
@@ -562,7 +590,7 @@ HARD_LINK_UNSUPPORTED_ERRNOS = {
 _released_tokens: set[str] = set()
 """Tokens (unique texts) of the locks that this process has released.
 
-Such a lock may still be in its store, if the store could not be reached on release.
+A released lock may still be in its store, if the store could not be reached on release.
 """
 
 _issued_warnings: set[str] = set()
@@ -620,7 +648,10 @@ def read_lock_holder(store_path: Location) -> LockHolder | None:
 
 
 def _parse_lock_holder(holder_json: str) -> LockHolder:
-    """Return the holder from the JSON of a lock; damaged or unknown fields have their defaults."""
+    """Return the process that a lock's JSON text describes.
+
+    Fields that are missing or damaged have their default values.
+    """
     try:
         record = parse_json(holder_json)
     except ValueError:
@@ -637,7 +668,8 @@ def _parse_lock_holder(holder_json: str) -> LockHolder:
 def is_holder_alive(store_path: Location, holder: LockHolder) -> bool:
     """Return True if the process that holds a lock still runs.
 
-    A process on this machine is looked up. One on another machine is judged by its last heartbeat.
+    A process on this machine is looked up. A process on another machine counts as alive if its last
+    heartbeat is younger than `HEARTBEAT_AGE_SECONDS_MAX`.
     """
     if (is_running := _is_running_here(holder)) is not None:
         return is_running
@@ -645,9 +677,9 @@ def is_holder_alive(store_path: Location, holder: LockHolder) -> bool:
 
 
 def _is_running_here(holder: LockHolder) -> bool | None:
-    """Return whether a lock's holder, a process of this machine, still runs.
+    """Return True if a lock's holder runs on this machine, and False if it has ended.
 
-    None if it is on another machine, or can't be seen from here.
+    The result is None if the holder is on another machine, or can't be seen by this process.
     """
     if not (holder.is_on_this_machine and holder.start):
         return None
@@ -656,9 +688,10 @@ def _is_running_here(holder: LockHolder) -> bool | None:
 
 
 def heartbeat_age(store_path: Location) -> float:
-    """Return the time since the holder of a lock last updated it [s]; inf if there is no lock.
+    """Return the time since the last heartbeat of a store's lock [s]; inf if there is no lock.
 
-    It is measured by the clock of the file system.
+    The present time is read from the clock of the store's file system, if this process can write to
+    the store.
     """
     lock_path = store_path / JOURNAL_DIR / LOCK_FILE
     probe = lock_path.with_name(f"clock-{os.getpid()}-{uuid.uuid4().hex[:8]}")
@@ -680,7 +713,7 @@ def heartbeat_age(store_path: Location) -> float:
 
 
 def _modification_time(path: Location) -> float | None:
-    """Return the modification time of a file [s since the epoch]; None if it is missing."""
+    """Return the time of the last write of a file [s since the epoch]; None if missing."""
     if isinstance(path, ObjectPath):
         return path.last_modified()
     try:
@@ -696,7 +729,7 @@ class _FileLock:
         self._lock_path = lock_path
 
     def read_holder_json(self) -> str | None:
-        """Return the JSON text of the holder; None if the lock is free."""
+        """Return the JSON text that describes the lock's holder; None if the lock is free."""
         return _read_lock_file(self._lock_path)
 
     def heartbeat_version(self) -> object:
@@ -716,10 +749,11 @@ class _FileLock:
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
-        """Acquire the lock for a holder. The lock of a dead holder is removed first.
+        """Acquire the lock for the holder that a JSON text describes.
 
-        `check_holder` raises an error if the present holder lives. On file systems with flock no
-        other process acquires the lock meanwhile. StoreBusyError is raised if another process was
+        A dead holder's lock is removed first. `check_holder` must raise an error if the present
+        holder lives. `say` gets warnings. On file systems with flock no other process can acquire
+        the lock between check and acquisition. StoreBusyError is raised if another process was
         quicker.
         """
         self._lock_path.parent.mkdir(exist_ok=True)
@@ -745,7 +779,10 @@ class _FileLock:
 
     @contextmanager
     def _acquisition_guard(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Context manager that keeps other processes from acquiring the lock, if there is flock."""
+        """Context manager in which no other process can acquire the lock, if the disk has flock.
+
+        Without flock, `say` gets a warning.
+        """
         guard_path = self._lock_path.with_name("lock.guard")
         open_flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         guard_descriptor = os.open(guard_path, open_flags, 0o666)
@@ -769,7 +806,11 @@ class _FileLock:
             os.close(guard_descriptor)
 
     def _remove_stale_lock(self, stale_json: str | None) -> None:
-        """Remove the lock file of a dead holder. Restore it if it is another holder's by now."""
+        """Remove the lock file of a dead holder, whose JSON text is `stale_json`.
+
+        The lock file is kept if another process has acquired the lock meanwhile. Nothing happens if
+        `stale_json` is None.
+        """
         if stale_json is None:
             return
         _log.debug("%s: taking over from %s", self._lock_path, escape_to_one_line(stale_json))
@@ -788,9 +829,11 @@ class _FileLock:
     def _create_lock_file(
         self, new_lock_path: Path, holder_json: str, say: Callable[[str], None]
     ) -> None:
-        """Move a new lock file into place.
+        """Create the lock file as a link to a complete file at `new_lock_path`.
 
-        FileExistsError is raised if another process has created the lock file meanwhile.
+        On a file system without hard links, `holder_json` is written to the lock file instead, and
+        `say` gets a warning. FileExistsError is raised if another process has created the lock file
+        meanwhile.
         """
         try:
             os.link(new_lock_path, self._lock_path)  # fails if the lock exists, on NFS too
@@ -820,7 +863,7 @@ class _FileLock:
         os.utime(self._lock_path)
 
     def release(self) -> None:
-        """Release the lock."""
+        """Release the lock: delete its file."""
         self._lock_path.unlink(missing_ok=True)
 
 
@@ -835,7 +878,7 @@ def _read_lock_file(lock_path: Path) -> str | None:
 
 
 def _warn_once(say: Callable[[str], None], kind: str, warning: str) -> None:
-    """Give a warning, unless one of the same kind was given in this process."""
+    """Pass a warning to `say`, unless this process has already issued one of the same kind."""
     if kind not in _issued_warnings:
         _issued_warnings.add(kind)
         say(f"warning: {warning}")
@@ -853,7 +896,7 @@ class _ObjectStoreLock:
         self._tag: ObjectVersion | None = None
 
     def read_holder_json(self) -> str | None:
-        """Return the JSON text of the holder; None if the lock is free."""
+        """Return the JSON text that describes the lock's holder; None if the lock is free."""
         lock_object = self._read_lock_object()
         return (
             _holder_json_of_content(lock_object.content)
@@ -862,10 +905,10 @@ class _ObjectStoreLock:
         )
 
     def _read_lock_object(self) -> VersionedContent | None:
-        """Return the content of the lock and its version, read once more if it is incomplete.
+        """Return content and version of the lock's object; None if it does not exist.
 
-        Incomplete content would be mistaken for another process's lock. ObjectStoreError is raised
-        if the content is incomplete twice.
+        Incomplete content is read once more, as it would be mistaken for another process's lock.
+        ObjectStoreError is raised if the content is incomplete twice.
         """
         for _ in range(2):
             lock_object = self._lock_path.read_with_version()
@@ -887,7 +930,11 @@ class _ObjectStoreLock:
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
-        """Acquire the lock for a holder; `check_holder` raises if the present holder lives."""
+        """Acquire the lock for the holder that a JSON text describes.
+
+        `check_holder` must raise an error if the present holder lives. ObjectStoreError is raised
+        if other processes were quicker `LOCK_ATTEMPTS_MAX` times.
+        """
         for _ in range(LOCK_ATTEMPTS_MAX):
             lock_object = self._read_lock_object()
             if (
@@ -917,11 +964,11 @@ class _ObjectStoreLock:
         self._n_heartbeats += 1
 
     def release(self) -> None:
-        """Release the lock."""
+        """Release the lock: make its object empty, if this process still holds the lock."""
         self._replace_content("")
 
     def _replace_content(self, content: str) -> None:
-        """Replace the content of the lock, if this process still holds it."""
+        """Write new content to the lock's object, if this process still holds the lock."""
         tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
         if tag is None:
             lock_object = self._read_lock_object()
@@ -932,7 +979,7 @@ class _ObjectStoreLock:
 
 
 def _holder_json_of_content(content: bytes) -> str:
-    """Return the first line of a lock's content, which names the holder."""
+    """Return the first line of a lock object's content: the JSON text of the holder."""
     return content.decode("utf-8", "replace").partition("\n")[0]
 
 
@@ -945,10 +992,11 @@ def _lock_of_store(store_path: Location) -> _FileLock | _ObjectStoreLock:
 
 
 def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
-    """Wait, if a process on another machine holds a lock, until its last heartbeat is too old.
+    """Wait until a lock, held by a process on another machine, is stale.
 
-    The wait ends early if a new heartbeat arrives. A job that was killed, and soon restarted on
-    another node, is thus not refused.
+    A lock is stale if its last heartbeat is older than `HEARTBEAT_AGE_SECONDS_MAX`. The wait ends
+    early if a new heartbeat arrives. A job that was killed, and soon restarted on another node, is
+    thus not refused. ``say`` gets a message about the wait.
     """
     other_holder, heartbeat_version = (
         read_lock_holder(store_path),
@@ -1018,10 +1066,10 @@ class StoreLock:
         self._heartbeat_thread.start()
 
     def _watch_other_holder(self, say: Callable[[str], None]) -> object:
-        """Watch the heartbeat of the lock's holder, if it is on another machine.
+        """Watch the heartbeat of the lock's holder, if the holder is on another machine.
 
-        Return the holder and the state of its heartbeat if no new one arrives; None if the lock has
-        no holder on another machine. StoreBusyError is raised if the holder lives.
+        Return the holder and the state of its heartbeat if no new heartbeat arrives. Return None if
+        no process of another machine holds the lock. StoreBusyError is raised if the holder lives.
         """
         other_holder, heartbeat_version = (
             read_lock_holder(self._store_path),
@@ -1041,7 +1089,7 @@ class StoreLock:
         raise self._make_busy_error(other_holder)
 
     def _refuse_living_holder(self) -> None:
-        """Raise a StoreBusyError if another process holds the lock, and is not known to be dead."""
+        """Raise a StoreBusyError if another process, not known to be dead, holds the lock."""
         other_holder = read_lock_holder(self._store_path)
         if (
             other_holder is None
@@ -1056,7 +1104,7 @@ class StoreLock:
             raise self._make_busy_error(other_holder)
 
     def _make_busy_error(self, other_holder: LockHolder) -> StoreBusyError:
-        """Return the error to raise if another process holds the lock."""
+        """Return an error whose message names the process that holds the lock."""
         holder_text = (
             f"process {escape_to_one_line(other_holder.pid)} on "
             f"{escape_to_one_line(other_holder.host)}"

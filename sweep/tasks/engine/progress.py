@@ -71,25 +71,26 @@ class Progress:
     """Base of listeners to the progress of a run. Its methods do nothing."""
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
-        """Start to show a run of `points` points.
+        """Start to show a run of a study with `points` points.
 
-        `done` points exist already, some of them in part. `unit` names the points, in the plural.
+        `done` is the number of points done before. A point that is computed in part counts as a
+        fraction. `unit` is the noun for points, in the plural.
         """
 
     def advance(self, *, points: float, failed: int) -> None:
-        """Add the numbers of points computed, and of blocks failed, since the last call.
+        """Report the numbers of points computed, and of blocks failed, since the last call.
 
-        Both are 0 if only time has passed.
+        Both numbers are 0 in calls that only mark the passing of time.
         """
 
     def update_workers(self, *, workers: int, stored: int) -> None:
-        """Set the number of workers and the size stored so far [bytes]. Called before `advance`."""
+        """Report the number of workers and the size stored so far [bytes], before `advance`."""
 
     def update_threads(self, *, threads: int, stored: int) -> None:
-        """Set the number of threads and the size stored so far [bytes]. Called before `advance`.
+        """Report the number of computing threads and the size stored so far [bytes].
 
-        These threads of the command's process compute instead of workers. A listener that does not
-        distinguish threads from workers need not define this method.
+        The engine calls this method in place of `update_workers` if threads of this process
+        compute. By default it calls `update_workers`.
         """
         self.update_workers(workers=threads, stored=stored)
 
@@ -97,11 +98,15 @@ class Progress:
         """Show a message to the user."""
 
     def end(self) -> None:
-        """End the run."""
+        """Show that the run has ended."""
 
 
 def make_progress(progress: bool | Progress) -> Progress:
-    """Return a progress listener: the given one, a silent one, or a display on standard error."""
+    """Return a progress listener, given True, False or a listener of the user's.
+
+    True stands for a display on standard error, and False for a silent listener. A listener of the
+    user's is wrapped, so that its errors do not end the run.
+    """
     if progress is True:
         return ProgressBar() if is_terminal(sys.stderr) else ProgressLines()
     if progress is False:
@@ -152,9 +157,9 @@ class _GuardedListener(Progress):
 
 @contextmanager
 def show_activity(activity: str, progress: Progress | None = None) -> Iterator[None]:
-    """Context manager that shows a text about the work in it if this takes more than two seconds.
+    """Context manager that shows the text `activity` if its body takes more than two seconds.
 
-    If kernels are being compiled, the text says so.
+    While kernels are compiled, the text says so instead.
     """
     from numba.core.event import install_recorder
 
@@ -228,21 +233,25 @@ class _CountingProgress(Progress):
         self._set_workers_text(number_with_noun(threads, "thread"), stored)
 
     def _set_workers_text(self, workers: str, stored: int) -> None:
-        """Set the text that names the workers or threads, and the size stored so far [bytes]."""
+        """Set the text that states workers and stored size, such as `3 workers, 1.2 MB stored`.
+
+        `workers` is text with the number of workers or threads. `stored` is the size so far
+        [bytes].
+        """
         from rich.filesize import decimal
 
         self._workers_text = f"{workers}, {decimal(stored)} stored"
 
     @property
     def _points_per_second(self) -> float:
-        """Points computed per second since this run began."""
+        """Number of points computed per second since this run began."""
         return (self._points_done - self._points_before) / max(
             time.monotonic() - self._start_time, 1e-9
         )
 
     @property
     def _column_texts(self) -> dict[str, Any]:
-        """Texts of the present state, by the names of the columns of a progress bar."""
+        """Texts that describe the present state, by the name of the progress bar's column."""
         return {
             "done": point_count_text(self._points_done),
             "rate": f"{point_count_text(self._points_per_second)} {self._points_noun}/s"
@@ -272,7 +281,7 @@ class ProgressLines(_CountingProgress):
         print(escape_unprintable(text), file=self._stream, flush=True)
 
     def end(self) -> None:
-        """Print the present state."""
+        """Print a line with the present state of the run."""
         self._printed_at = time.monotonic()
         done_text, rate_text, workers_text, failures_text = self._column_texts.values()
         seconds_left = (

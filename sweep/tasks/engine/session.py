@@ -191,9 +191,9 @@ class RunOptions:
 
     @classmethod
     def from_mapping(cls, options: Mapping[str, Any]) -> RunOptions:
-        """Return the options that a mapping of names to values contains.
+        """Return run options, given a mapping of option names to values.
 
-        TypeError is raised for an unknown name, with the most similar name.
+        TypeError is raised for an unknown name. The message suggests the most similar name.
         """
         names = [field.name for field in fields(cls)]
         for name in options.keys() - set(names):
@@ -203,10 +203,11 @@ class RunOptions:
         return cls(**options)
 
     def resolve_cluster(self, workload: Workload) -> AnyClusterConfig | None:
-        """Return the cluster that the options name, or else that of the spec's section `execution`.
+        """Return the configuration of the cluster whose workers compute the blocks.
 
-        The result is None if blocks are computed in this process. ClusterError is raised if both a
-        scheduler and a cluster are named, or a number of workers for a scheduler that runs already.
+        The options name the cluster, or else the spec's section `execution` does. The result is
+        None if blocks are computed in this process. ClusterError is raised if both a scheduler and
+        a cluster are named, or a number of workers for a scheduler that runs already.
         """
         if self.cluster is not None:
             if self.scheduler is not None:
@@ -246,7 +247,7 @@ class RunOptions:
         )
 
     def _with_dashboard(self, cluster: AnyClusterConfig) -> AnyClusterConfig:
-        """Return a cluster's configuration with Dask's dashboard enabled, if it is asked for."""
+        """Return a cluster's configuration, with Dask's dashboard if the options ask for it."""
         if not self.dashboard:
             return cluster
         if isinstance(cluster, ExistingSchedulerConfig | KubernetesClusterConfig):
@@ -260,9 +261,11 @@ class RunOptions:
         return cluster.model_copy(update={"scheduler": scheduler})
 
     def _prefers_threads(self, workload: Workload) -> bool:
-        """Return True if no option asks for workers, and no user's Python code is called.
+        """Return True if threads of this process are to compute the blocks, and not Dask workers.
 
-        Python code would hold Python's global lock, so that threads would compute in turns.
+        That is so if `threads` is set, or if neither options nor spec ask for workers and no Python
+        code of the user's is called. Python code would hold Python's global lock, so that threads
+        would compute in turns.
         """
         if self.threads is not None:
             return True
@@ -273,7 +276,7 @@ class RunOptions:
         return not needs_workers and execution == Execution()
 
     def _first_option_needing_workers(self) -> str:
-        """Return the name of the first option in use that requires Dask workers; '' if none is."""
+        """Return the name of the first option in use that needs Dask workers; '' if none does."""
         is_set = {
             "workers": self.workers is not None,
             "client": self.client is not None,
@@ -287,9 +290,9 @@ class RunOptions:
         return next((name for name, value in is_set.items() if value), "")
 
     def n_threads(self, workload: Workload) -> int:
-        """Return the number of threads of this process that compute blocks.
+        """Return the number of threads of this process that are to compute blocks.
 
-        1 means a plain loop over the blocks.
+        The result is 1 if the scheduler is "none", which stands for serial computation.
         """
         scheduler = self.scheduler or (self.workers is None and workload.execution.scheduler)
         if scheduler == SERIAL_SCHEDULER_OPTION:
@@ -309,7 +312,7 @@ def _is_scheduler_address(address: object) -> bool:
 
 
 def _with_worker_count(cluster: AnyClusterConfig, n_workers: int | None) -> AnyClusterConfig:
-    """Return a cluster's configuration with a given number of workers, if one is given.
+    """Return a cluster's configuration with `n_workers` workers; unchanged if that is None.
 
     ClusterError is raised if the workers belong to a scheduler that runs already.
     """
@@ -374,13 +377,14 @@ class ComputeBackend(ExitStack):
 
     @property
     def uses_running_scheduler(self) -> bool:
-        """True if the workers belong to a scheduler that runs already."""
+        """True if the workers belong to a scheduler that was started before this run."""
         return self.options.client is None and isinstance(self._cluster, ExistingSchedulerConfig)
 
     def connect(self) -> ClusterConnection:
-        """Connect to the workers. If they do not run yet, start at most `max_workers`.
+        """Return the connection to the workers, after connecting at the first call.
 
-        ClusterError is raised if no worker is available.
+        At most `max_workers` workers are started, if they do not run yet. ClusterError is raised if
+        no worker is available.
         """
         from sweep.tasks.engine.cluster_connection import (
             ClusterConnection,
@@ -420,9 +424,9 @@ class ComputeBackend(ExitStack):
         block_queue: BlockQueue,
         verify_receipt: ReceiptVerifier,
     ) -> Iterator[TaskResult]:
-        """Compute the blocks of a queue. Yield the results of tasks as they arrive.
+        """Compute the blocks of a queue. Return an iterator over the results of tasks.
 
-        `verify_receipt` tells whether the block of a receipt is in the store as this process sees
+        `verify_receipt` returns True if the block of a receipt is in the store as this process sees
         it.
         """
         options = self.options
@@ -473,7 +477,7 @@ class ComputeBackend(ExitStack):
         return dispatcher.iter_results(lambda: self.interrupts.is_stopping)
 
     def restart_workers(self) -> None:
-        """Start new workers on this machine in place of lost ones."""
+        """Start new workers on this machine in place of lost ones, if any were started before."""
         if self._connection is not None:
             self._connection.restart_workers()
 
@@ -521,7 +525,7 @@ class SessionOutcome:
 
 
 def _block_count_text(count: int) -> str:
-    """Return a number of blocks as text."""
+    """Return a number of blocks as text, such as `1 block`."""
     return f"{count:,} block{'' if count == 1 else 's'}"
 
 
@@ -536,9 +540,10 @@ class NoWorkerMonitor:
         )
 
     def warning_text(self, n_workers: int, *, has_receipts: bool = False) -> str:
-        """Return a warning if the cluster has had no worker for long, else ''.
+        """Return a warning if the cluster has had no worker for a long time, else ''.
 
-        `has_receipts` means that a worker has returned a result since the last call.
+        `n_workers` is the present number of workers. `has_receipts` is True if a worker has
+        returned a result since the last call.
         """
         if n_workers or has_receipts:
             self._last_seen, self._has_had_workers, self._warn_after = (
@@ -661,7 +666,7 @@ class Session:
         return outcome
 
     def _record_run_event(self, event: str, **details: Any) -> str:
-        """Append an event to the run log. Return an error message if it is unwritable, else ''."""
+        """Append an event to the log of runs. Return an error message if that fails, else ''."""
         try:
             self._journal.record_run_event(event, **details)
         except OSError as error:
@@ -669,8 +674,9 @@ class Session:
         return ""
 
     def _finish_chunk_scan(self, chunk_scan: ChunkScan, is_done: np.ndarray) -> str:
-        """Wait until the search for missing chunks ends, and compute the blocks that lack any.
+        """Wait for the end of the search for missing chunks. Compute the blocks that lack a chunk.
 
+        `is_done` is the mask (blocks,) of the blocks that counted as done before the search ended.
         Return the reason for stopping early, or ''.
         """
         if not chunk_scan.wait(CHUNK_SCAN_TIMEOUT_SECONDS):
@@ -729,7 +735,11 @@ class Session:
                 self._interrupts.is_computing = False
 
     def _compile_kernels(self) -> None:
-        """Compile the kernels of the study, which workers then load from the cache on disk."""
+        """Compile the kernels of the study. Workers load them from the cache on disk.
+
+        Errors are ignored: they occur again when a block is computed, and are recorded as its
+        failure.
+        """
         if self._backend.options.evaluate:  # the model is not used
             return
         gc_threshold = gc.get_threshold()
@@ -765,7 +775,10 @@ class Session:
         return "interrupted" if self._interrupts.is_stopping else ""
 
     def _commit_task_result(self, task_result: TaskResult, block_queue: BlockQueue) -> None:
-        """Append a task's receipts and failures to the journal, and report the progress."""
+        """Append a task's receipts and failures to the journal, and report the progress.
+
+        A block that failed for the first time is put back into `block_queue`.
+        """
         points_before, failures_before = self._n_points_so_far(), len(self._permanent_failures)
         self._journal.commit(*task_result.receipts)
         self._unflushed_receipts += task_result.receipts
@@ -790,9 +803,9 @@ class Session:
         )
 
     def _flush_receipts(self, *, force: bool = False) -> None:
-        """Write pending receipts that are due, or all if `force`.
+        """Write pending receipts. Once all are written, add them to the totals of the session.
 
-        Once all are written, add them to the totals of the session.
+        In an object store, receipts that are not due yet are written only if `force`.
         """
         if not self._journal.flush(force=force):
             return
@@ -807,7 +820,7 @@ class Session:
         self._unflushed_receipts.clear()
 
     def _n_points_so_far(self) -> float:
-        """Return the number of points done in this run, and of those in checkpoints."""
+        """Return the number of points committed in this run, plus those in checkpoints."""
         return self._receipt_totals["points"] + sum(self._checkpoint_points.values())
 
 

@@ -65,14 +65,14 @@ class StallMonitor:
             self._has_printed_state = False
 
     def restart_waiting(self) -> None:
-        """Measure the time without a result from now on, as nothing is being computed."""
+        """Count the time without a result from now on, as nothing is being computed."""
         with self._lock:
             self._last_result_at = time.monotonic()
 
     def report_if_stalled(self, *, explanation: str = "", explained_seconds: float = 0.0) -> None:
-        """Print a message and log the state of the run if no result has arrived for long.
+        """Print a message, and log the state of the run, if no result has arrived for a long time.
 
-        In the first ``explained_seconds`` after a result the message gives the ``explanation``
+        In the first ``explained_seconds`` [s] after a result, the message states ``explanation``
         instead of the state.
         """
         with self._lock:
@@ -129,13 +129,13 @@ class InProcessMonitor:
             del self._in_progress[threading.get_ident()]
 
     def record_result(self, n_blocks: int, work_seconds: float) -> None:
-        """Count the blocks of a result, with the time that they took [s]."""
+        """Add the number and the computing time [s] of a result's blocks to the run's totals."""
         self._n_blocks += n_blocks
         self._work_seconds += work_seconds
         self._stall_monitor.record_result(self._work_seconds / max(self._n_blocks, 1))
 
     def report_if_stalled(self) -> None:
-        """Print a message and log the state of the run if no result has arrived for long."""
+        """Print a message, and log the state of the run, if no result has arrived for long."""
         if self._in_progress:
             self._stall_monitor.report_if_stalled(
                 explanation="the model is being loaded, or compiled once, which takes minutes "
@@ -165,9 +165,9 @@ class InProcessMonitor:
 
     @contextmanager
     def watch_in_thread(self, interval_seconds: float) -> Iterator[None]:
-        """Context manager that checks for a stall at intervals, in a further thread.
+        """Context manager in which a thread checks for a stall every `interval_seconds` [s].
 
-        It serves the plain loop, whose own thread is busy with a block.
+        Serial computation needs this thread, as its main thread is busy with a block.
         """
         is_over = threading.Event()
 

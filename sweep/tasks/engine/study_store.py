@@ -110,12 +110,13 @@ def create_store(
     recipe: Mapping[str, Any] | None = None,
     durable: bool = False,
 ) -> Location:
-    """Create a store that holds metadata and arrays with known values, but no results.
+    """Create a store without results, and return its location.
 
-    On disk the store is built under a hidden name and then renamed, so that an interrupted creation
-    leaves no incomplete store. For an object store it is built on this machine and uploaded, its
-    root document last. StoreError is raised if something is at the path, or the path is not
-    writable.
+    The store has metadata and arrays with known values. ``recipe`` has facts about how the store is
+    made. On disk the store is built under a hidden name and then renamed, so that an interrupted
+    creation leaves no incomplete store. For an object store it is built on this machine and
+    uploaded, its root document last. StoreError is raised if something is at the path, or the path
+    is not writable.
     """
     store_path = parse_location(store_path)
     try:
@@ -150,7 +151,7 @@ def create_store(
 def _build_store(
     store_path: Path, template: StoreTemplate, recipe: Mapping[str, Any] | None
 ) -> None:
-    """Create a store without results on disk, with its recipe (the facts about how it is made)."""
+    """Create a store without results on disk, with its recipe (facts about how it is made)."""
     build_template(store_path, template, template_attributes(template))
     if recipe:
         write_recipe(store_path, **recipe)
@@ -174,7 +175,8 @@ def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
 def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
     """Context manager that reserves a path in an object store while a store is created there.
 
-    StoreError is raised if something else is at the path.
+    What an interrupted creation has left at the path is removed. StoreError is raised if anything
+    but that is at the path.
     """
     marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER_FILE
     with StoreLock(store_path):
@@ -195,9 +197,10 @@ def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
 
 
 def remove_store(store_path: Location) -> None:
-    """Remove a store in one step.
+    """Delete a store.
 
-    In an object store, the root document is removed first, without which there is no store.
+    On disk a single rename hides the store first. In an object store the root document is deleted
+    first; without it no store exists.
     """
     if isinstance(store_path, Path):
         remove_atomically(store_path)
@@ -218,10 +221,11 @@ def build_template(
     *,
     shard_shape_of: Callable[[ArrayLayout], tuple[int, ...] | None] = lambda layout: None,
 ) -> None:
-    """Create the template on disk: a store without results.
+    """Create a template on disk: a store without results.
 
-    `shard_shape_of` returns the shape of an array's shards, if each file holds a shard of many
-    chunks. It returns None if each file holds one chunk, which is the default.
+    `attributes` are the root attributes. `shard_shape_of` returns the shape of an array's shards,
+    if each file holds a shard of many chunks. It returns None if each file holds one chunk, which
+    is the default.
     """
     group = zarr.create_group(
         SingleWriterLocalStore(store_path), zarr_format=3, attributes=attributes
@@ -242,7 +246,7 @@ def build_template(
 
 
 def template_attributes(template: StoreTemplate) -> dict[str, Any]:
-    """Return the root attributes of a new store: those of the study, versions and processor."""
+    """Return the root attributes of a new store: the study's, software versions and processor."""
     return template.store_attributes() | {
         "Conventions": CF_CONVENTIONS_VERSION,
         "study_id": template.id,
@@ -256,7 +260,10 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
 def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
-    """Write the manifest: root attributes, and digests of all objects that hold no results."""
+    """Write a store's manifest: root attributes, and digests of all objects without results.
+
+    ``digests`` has the digest of each object by the object's path inside the store.
+    """
     records = [encode_log_record({"attributes": attributes, "objects": len(digests)})]
     records += [
         encode_log_record({"object": name, "digest": object_digest})
@@ -268,7 +275,7 @@ def write_manifest(
 def _create_array(
     group: zarr.Group, layout: ArrayLayout, shard_shape: tuple[int, ...] | None
 ) -> None:
-    """Create an array in a group, and write its values if they are known."""
+    """Create an array in a group, and write the array's values if they are known."""
     fill_option: dict[str, Any] = (
         {} if layout.fill_value is None else {"fill_value": layout.fill_value}
     )
@@ -288,9 +295,9 @@ def _create_array(
 
 
 def _consolidate_metadata(store_path: Path) -> None:
-    """Copy the metadata of all arrays into the root document.
+    """Copy the metadata of all arrays into the root document of a store.
 
-    Zarr's own function warns that this is not part of the standard.
+    Zarr's own function does the same, but warns that such a document is not part of the standard.
     """
     documents = {
         str(file.parent.relative_to(store_path)): json.loads(file.read_text())
@@ -339,7 +346,11 @@ class BlockWriter:
         self.store_path, self.study = parse_location(store_path), study
 
     def write(self, block: int, results: Mapping[str, np.ndarray]) -> BlockDigest:
-        """Write all chunks of one block. Raise ValueError if the results don't match its arrays."""
+        """Write all chunks of one block. Return the digest and the size of the block.
+
+        `results` has the values of the block's chunk of each array, by array name. ValueError is
+        raised if names or shapes don't match the block's arrays.
+        """
         positions = self.study.chunk_positions_of_block(block)
         if results.keys() != positions.keys():
             mismatched_names = sorted(results.keys() ^ positions.keys())
@@ -402,7 +413,9 @@ def make_chunk_size_limit(study: BlockStudy) -> Callable[[str], int]:
 
 
 def array_name_of_chunk(chunk_path: str) -> str:
-    """Return the path, inside the store, of the array of a chunk; '' if an object is no chunk.
+    """Return the path, inside the store, of the array that a chunk is part of.
+
+    The result is '' if the path is not that of a chunk.
 
     >>> [array_name_of_chunk(name) for name in ("east/wind/c/0/3", "weight/c", "wind/zarr.json")]
     ['east/wind', 'weight', '']
@@ -417,10 +430,10 @@ def chunk_name(array_name: str, position: tuple[int, ...]) -> str:
 
 
 def sync_file_system(store_path: Location) -> None:
-    """Write the operating system's cache of the store's file system to disk.
+    """Write all cached data of the file system that holds a store to disk.
 
-    OSError is raised if the disk fails. One call syncs the whole file system, which costs as much
-    as syncing a few files.
+    OSError is raised if the disk fails. Syncing the whole file system costs as much as syncing a
+    few files. Nothing happens for an object store.
     """
     if not isinstance(store_path, Path):
         return
@@ -468,7 +481,11 @@ def refuse_links(store_path: Location) -> None:
 def _exclude_foreign_files(
     store_path: Path, entries: Iterable[os.DirEntry[str]]
 ) -> list[os.DirEntry[str]]:
-    """Return the directory entries, of those below a store, that are not foreign."""
+    """Return those of the directory entries that are not foreign files of the store.
+
+    `entries` are files, folders and links below the store. Foreign files are those that sweep did
+    not make.
+    """
     entries = list(entries)
     if not entries:
         return []  # without a search for foreign files, which walks through the store
@@ -492,7 +509,7 @@ class Damage(NamedTuple):
 
 
 def read_manifest_digests(store_path: Location) -> dict[str, str]:
-    """Return the digests in a store's manifest, by the name of the object.
+    """Return the digests in a store's manifest, by the path of the object inside the store.
 
     Damaged lines are skipped.
     """
@@ -504,7 +521,7 @@ def read_manifest_digests(store_path: Location) -> dict[str, str]:
 
 
 def find_template_damages(store_path: Location) -> list[Damage]:
-    """Return the damaged objects of the template, and the damaged lines of the manifest.
+    """Return a list of damaged objects of a store's template, and damaged lines of the manifest.
 
     The template is everything that the store contained before the first result.
     """
@@ -529,7 +546,10 @@ def find_template_damages(store_path: Location) -> list[Damage]:
 def describe_template_object_damage(
     store_path: Location, object_name: str, expected_digest: str
 ) -> str:
-    """Return the damage of an object whose digest the manifest states; '' if it is undamaged."""
+    """Return what is wrong with an object of the manifest, in words; '' if it is undamaged.
+
+    `expected_digest` is the object's digest in the manifest.
+    """
     return damage_or_read_error(
         lambda: (
             ""
@@ -542,7 +562,7 @@ def describe_template_object_damage(
 def refuse_damaged_template(store_path: Location) -> None:
     """Raise a StoreError if an object that was written before the first result is damaged.
 
-    New results might not fit such a store.
+    New results might not fit a damaged store.
     """
     refuse_links(store_path)
     if problems := find_template_damages(store_path):
@@ -556,7 +576,10 @@ def refuse_damaged_template(store_path: Location) -> None:
 
 
 def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
-    """Raise a StoreError if a store has blocks of other shapes, or lacks an array of the study."""
+    """Raise a StoreError if a store lacks an array of a study's results, or has other block shapes.
+
+    The shapes of the store's blocks must be those of the study.
+    """
     nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
     for name in study.output_layout_by_name:
         if name not in nodes:
@@ -569,10 +592,11 @@ def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
 
 
 def refuse_other_block_shapes(store_path: Location, study: BlockStudy) -> None:
-    """Raise a StoreError if an unpacked store has blocks of another shape than the study.
+    """Raise a StoreError if a store's blocks have other shapes than those of the study.
 
-    Another version of this program may have cut the study otherwise. Its receipts and chunks would
-    then be attributed to the wrong points.
+    Another version of this program may have cut the study into other blocks. The store's receipts
+    and chunks would then be attributed to the wrong points. Arrays that the store lacks are not
+    checked. The store must not be a packed copy.
     """
     nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
     for layout in study.output_layout_by_name.values():
@@ -594,10 +618,10 @@ def _shape_text(shape: tuple[int, ...]) -> str:
 
 
 def damage_or_read_error(read_damage: Callable[[], str]) -> str:
-    """Return the damage that `read_damage` finds in an object, or why the object can't be read.
+    """Return what is wrong with an object, in words; '' if it is as it was written.
 
-    The text is empty if the object is as it was written. ObjectStoreError is raised if an object
-    store fails.
+    `read_damage` reads the object and returns its damage. If the object can't be read, the reason
+    is returned. ObjectStoreError is raised if an object store fails.
     """
     try:
         return read_damage()
@@ -651,7 +675,8 @@ def current_software_versions() -> dict[str, str]:
 def processor_description() -> str:
     """Return machine, processor and vector instructions as text.
 
-    The last bits of results may depend on them, as NumPy and LLVM choose machine code by them.
+    The last bits of results may depend on all three, as NumPy and LLVM choose machine code for
+    them.
     """
     import llvmlite.binding
     import numpy as np
@@ -663,7 +688,10 @@ def processor_description() -> str:
 
 
 def refuse_foreign_store(store_path: Location) -> None:
-    """Raise a StoreError if sweep did not make what is at a path. Damaged stores are accepted."""
+    """Raise a StoreError if there is no store at a path, or if sweep did not make it.
+
+    Damaged stores are accepted.
+    """
     if not any(
         any(iter_log_records(store_path / JOURNAL_DIR / name))
         for name in (MANIFEST_FILE, *LOG_FILE_NAMES)
@@ -672,7 +700,10 @@ def refuse_foreign_store(store_path: Location) -> None:
 
 
 def refuse_irreplaceable_store(store_path: Location) -> None:
-    """Raise a StoreError if sweep did not make what is at a path, or if it can't be renamed."""
+    """Raise a StoreError if a store is in an object store, or if sweep did not make it.
+
+    In an object store nothing can be renamed, and so no store can be replaced.
+    """
     if not isinstance(store_path, Path):
         raise StoreError(
             f"{store_path} can't be replaced or extended in its place, as an object store has no "
