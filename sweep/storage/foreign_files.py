@@ -54,7 +54,10 @@ def is_draft_file(name: str) -> bool:
 
 
 def list_foreign_files(store: Path) -> list[str]:
-    """Return the relative paths of a store's foreign files and folders; folders end in a slash."""
+    """Return the relative paths of files and folders in a store that sweep did not make, sorted.
+
+    The path of a folder ends in a slash, and stands for all of the folder's content.
+    """
     node_names = _read_node_names(store)
     return sorted(
         _iter_foreign_files(store, "", node_names, {*node_names, *_iter_parent_groups(node_names)})
@@ -62,7 +65,7 @@ def list_foreign_files(store: Path) -> list[str]:
 
 
 def _read_node_names(store: Path) -> set[str]:
-    """Return the names of a store's arrays and groups, as far as its metadata can be read."""
+    """Return the names of a store's arrays and groups, from whatever metadata can be read."""
     node_names: set[str] = set()
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         root_metadata = parse_json(read_file_below_root(store, "zarr.json", METADATA_BYTES_MAX))
@@ -80,7 +83,7 @@ def _read_node_names(store: Path) -> set[str]:
 
 
 def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
-    """Yield the names of all groups that contain one of the given arrays or groups."""
+    """Yield, for each array or group, the names of all groups that contain it."""
     for node in node_names:
         while node := node.rpartition("/")[0]:
             yield node
@@ -89,7 +92,11 @@ def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
 def _iter_foreign_files(
     folder: Path, prefix: str, node_names: set[str], known_folders: set[str]
 ) -> Iterator[str]:
-    """Yield the paths, relative to the store, of foreign files and folders below a folder."""
+    """Yield paths of files and folders below a folder of a store that sweep did not make.
+
+    The paths are relative to the store, and `prefix` is that of `folder` with a slash.
+    `known_folders` are names of arrays and groups.
+    """
     with os.scandir(folder) as entries:
         for entry in entries:
             name, is_folder = prefix + entry.name, entry.is_dir(follow_symlinks=False)
@@ -115,7 +122,11 @@ def _iter_foreign_journal_files(folder: str) -> Iterator[str]:
 
 
 def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
-    """Yield foreign files and folders among the chunk files of an array."""
+    """Yield paths of files and folders, among an array's chunk files, that sweep did not make.
+
+    `prefix` is the path of `folder` relative to the store, with a slash. It begins all yielded
+    paths.
+    """
     with os.scandir(folder) as entries:
         for entry in entries:
             is_folder = entry.is_dir(follow_symlinks=False)
@@ -127,9 +138,10 @@ def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
 
 
 def move_foreign_files(old_store: Path, new_store: Path) -> None:
-    """Move the foreign files of a store to its replacement; raise OSError if one can't be moved.
+    """Move the files that sweep did not make from a store to the store that replaces it.
 
-    If the replacement already has a file of the same path, a number is appended to the name.
+    If the new store already has a file of the same path, a number is appended to the name. OSError
+    is raised if a file can't be moved.
     """
     if not old_store.is_dir() or old_store.is_symlink():
         return

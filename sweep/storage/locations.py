@@ -93,7 +93,7 @@ class VersionedContent(NamedTuple):
 ItemT = TypeVar("ItemT")
 """Type of the items to which `map_concurrently` applies a function."""
 ResultT = TypeVar("ResultT")
-"""Type that a function called by this module returns."""
+"""Type that a function returns which is passed to a function of this module."""
 
 #: Error texts of obstore for a truncated response body and a truncated listing.
 _TRUNCATED_RESPONSE_TEXTS = ("body error", "invalid list response")
@@ -127,7 +127,7 @@ class ObjectPath:
         )
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """Return a path below this one: its key with further parts appended."""
+        """Return a path below this one. `others` are appended to its key, with slashes between."""
         return self / "/".join(others)
 
     @property
@@ -141,11 +141,11 @@ class ObjectPath:
         return ObjectPath(self.bucket_url, self.key.rpartition("/")[0])
 
     def with_name(self, name: str) -> ObjectPath:
-        """Return the path with its last part replaced."""
+        """Return the path with the last part of its key replaced."""
         return self.parent / name
 
     def absolute(self) -> ObjectPath:
-        """Return the path unchanged: every key is absolute."""
+        """Return the path unchanged, as every key is absolute."""
         return self
 
     @property
@@ -175,7 +175,7 @@ class ObjectPath:
             return self.client.head(self.key)
 
     def exists(self) -> bool:
-        """Return True if an object has this key, or if the key is that of a Zarr group or array."""
+        """Return True if the path is that of an object, or of a Zarr group or array."""
         return self.size() >= 0 or (self / "zarr.json").size() >= 0
 
     def size(self) -> int:
@@ -189,9 +189,9 @@ class ObjectPath:
         return None if metadata is None else float(metadata["last_modified"].timestamp())
 
     def read_bytes(self, bytes_max: int | None = None) -> bytes:
-        """Return the bytes of the object. Read it once more if the response body is truncated.
+        """Return the bytes of the object. Read it once more if the response is truncated.
 
-        Raise RefusedFileError if the object is larger than ``bytes_max``.
+        RefusedFileError is raised if the object is larger than ``bytes_max``.
         """
         from obstore.exceptions import BaseError
 
@@ -205,7 +205,7 @@ class ObjectPath:
                 return bytes(self.client.get(self.key).bytes())
 
     def write_bytes(self, content: bytes) -> None:
-        """Write a whole object; replace the existing one, if any."""
+        """Write an object, and replace the present one, if any."""
         with translate_object_store_errors(self):
             self.client.put(self.key, content)
 
@@ -246,7 +246,7 @@ class ObjectPath:
         return bool(self._list_child_names())
 
     def glob(self, pattern: str) -> list[ObjectPath]:
-        """Return the direct children of this key whose name matches a pattern."""
+        """Return the paths, directly below this one, whose name matches a shell pattern."""
         return [self / name for name in self._list_child_names() if fnmatch(name, pattern)]
 
     def read_with_version(self) -> VersionedContent | None:
@@ -261,7 +261,7 @@ class ObjectPath:
         return None
 
     def refuse_truncated_content(self, content: bytes) -> None:
-        """Raise ObjectStoreError if a response's content is shorter than the object.
+        """Raise ObjectStoreError if the content that was received is shorter than the object.
 
         The client can't notice this if a proxy sends a truncated body with a matching content
         length.
@@ -272,7 +272,7 @@ class ObjectPath:
     def put_if_unchanged(
         self, content: bytes, expected_version: ObjectVersion | None
     ) -> ObjectVersion | None:
-        """Write an object only if its version is still the expected one.
+        """Write an object only if its version is ``expected_version``.
 
         Return the new version, or None if another process has written the object meanwhile. If
         ``expected_version`` is None, the object must not exist yet.
@@ -287,7 +287,10 @@ class ObjectPath:
 
 
 def _retry_if_truncated(ask: Callable[[], ResultT]) -> ResultT:
-    """Send a request, once more if the response is truncated, and return the response."""
+    """Call `ask`, which sends a request, and return the response.
+
+    If the response is truncated, `ask` is called once more.
+    """
     from obstore.exceptions import BaseError
 
     try:
@@ -299,7 +302,7 @@ def _retry_if_truncated(ask: Callable[[], ResultT]) -> ResultT:
 
 
 def _is_truncation_error(error: Exception) -> bool:
-    """Return True if an error means that the body or the listing of a response was truncated."""
+    """Return True if an error means that a response's body or listing was truncated."""
     return any(words in str(error) for words in _TRUNCATED_RESPONSE_TEXTS)
 
 
@@ -352,9 +355,9 @@ def translate_object_store_errors(location: object) -> Iterator[None]:
 
 
 def to_object_store_error(error: Exception) -> Exception:
-    """Return an ObjectStoreError for an error that an object store raised through Zarr or xarray.
+    """Translate an error that the object-store library raised through Zarr or xarray.
 
-    Any other error is returned as it is.
+    Return an ObjectStoreError. An error of any other library is returned unchanged.
     """
     if type(error).__module__.partition(".")[0] != "obstore":
         return error
@@ -362,9 +365,9 @@ def to_object_store_error(error: Exception) -> Exception:
 
 
 def object_store_errno_and_message(error_text: str, bucket_url: str) -> tuple[int, str]:
-    """Return errno, and message with remedy, for an error text of the object-store library.
+    """Return errno and a message that explain an error text of the object-store library.
 
-    ``bucket_url``: scheme and bucket that the message names.
+    The message states the remedy, and names the service or the bucket of ``bucket_url``.
     """
     bucket, service = bucket_url.partition("://")[2], _service_name(bucket_url)
     error_summary = error_text.partition("\n\nDebug source")[0]
@@ -405,13 +408,17 @@ def object_store_errno_and_message(error_text: str, bucket_url: str) -> tuple[in
 
 
 Location = Path | ObjectPath
-"""Path of a store or file; both types have `/`, `name`, `parent`, `exists()`, `read_bytes()`."""
+"""Type of paths of stores and files: on disk, or in an object store.
+
+Both types have `/`, `name`, `parent`, `exists()` and `read_bytes()`.
+"""
 
 
 def parse_location(address: str | Location) -> Location:
-    """Parse the address of a store: a path, ``s3://bucket/key``, ``gs://...`` or ``az://...``.
+    """Return the path that an address names: a path on disk, or one in an object store.
 
-    Raise ObjectStoreError for any other address.
+    Addresses in an object store are ``s3://bucket/key``, ``gs://...`` and ``az://...``.
+    ObjectStoreError is raised for any other URL.
     """
     if isinstance(address, ObjectPath):
         return address
@@ -451,7 +458,10 @@ def to_zarr_store(location: Location) -> Any:
 def map_concurrently(
     location: Location, function: Callable[[ItemT], ResultT], items: Iterable[ItemT]
 ) -> list[ResultT]:
-    """Return a function's results for all items, in order; use threads for an object store."""
+    """Return a function's results for all items, in order.
+
+    If ``location`` is in an object store, several threads call the function.
+    """
     if isinstance(location, Path):
         return [function(item) for item in items]
     return list(_request_pool().map(function, items))
@@ -463,9 +473,9 @@ def _request_pool() -> ThreadPoolExecutor:
 
 
 def read_object(location: Location, object_name: str, bytes_max: int) -> bytes:
-    """Read a whole file below a location.
+    """Return the bytes of a file below a location.
 
-    Raise RefusedFileError if it is no regular file, or larger than ``bytes_max``.
+    RefusedFileError is raised if it is no regular file, or larger than ``bytes_max``.
     """
     if isinstance(location, ObjectPath):
         return (location / object_name).read_bytes(bytes_max)
@@ -578,11 +588,11 @@ PID_MAX = 2**31 - 1
 
 
 def process_start_id(pid: int) -> int:
-    """Return the start time of a process, which distinguishes it from others with the same number.
+    """Return a number that tells a process from earlier and later ones with the same pid.
 
-    The unit is clock ticks since the machine was booted on Linux, and 0.01 s since the epoch on
-    other systems. Changes of the clock do not alter it. Return 0 if no such process runs, and
-    `HIDDEN_PROCESS_START_ID` if it is hidden from this user.
+    It is the start time of the process: in clock ticks since boot on Linux, and in 0.01 s since the
+    epoch on other systems. Changes of the clock do not alter it. It is 0 if no such process runs,
+    and `HIDDEN_PROCESS_START_ID` if the process is hidden from this user.
     """
     import psutil
 
@@ -604,9 +614,9 @@ def process_start_id(pid: int) -> int:
 
 
 def resolve_links(location: Location) -> Location:
-    """Return a location with symbolic links resolved, so that renaming does not affect a link.
+    """Return a location with symbolic links resolved. Renaming it then renames no link.
 
-    Raise OSError if the links form a loop.
+    OSError is raised if the links form a loop. A location in an object store is returned unchanged.
     """
     if not isinstance(location, Path):
         return location
@@ -622,9 +632,10 @@ def resolve_links(location: Location) -> Location:
 
 
 def eyepoint_store_location(store: Location, geometry_id: str) -> Location:
-    """Return the path of the store with a flight's shot geometry (eyepoints).
+    """Return the path of the store that holds a flight's shot geometry (eyepoints).
 
-    It is in a folder next to the store of the study.
+    ``store`` is the study's store. The result is in a folder next to it. ``geometry_id`` identifies
+    the geometry.
     """
     return resolve_links(store).parent / "eyepoints" / f"{geometry_id}.zarr"
 
@@ -644,7 +655,7 @@ def final_path_for(path: Path) -> Path:
 
 
 def can_create_store(location: Location) -> bool:
-    """Return True if a store can be created at a location: nothing or an empty folder is there."""
+    """Return True if a store can be created at a location: it is free, or is an empty folder."""
     if isinstance(location, ObjectPath):
         return not location.exists()
     try:
@@ -674,7 +685,7 @@ def write_path_atomically(path: Path, *, replace: bool = False) -> Iterator[Path
 
 
 def replace_path(new_path: Path, path: Path) -> None:
-    """Replace a file or folder by a new one, and delete the old one."""
+    """Move the file or folder at ``new_path`` to ``path``, and delete what was at ``path``."""
     if new_path.is_file():
         os.replace(new_path, path)
         return
@@ -696,9 +707,10 @@ def replace_path(new_path: Path, path: Path) -> None:
 
 
 def remove_replaced_store(old_path: Path, new_path: Path) -> None:
-    """Delete a replaced store, after moving its foreign files to the new one.
+    """Delete the replaced store at ``old_path``, after moving its foreign files to ``new_path``.
 
-    If they can't be moved, the old store stays under its hidden name.
+    Foreign files are those that sweep did not make. If they can't be moved, the old store stays
+    where it is, under a hidden name.
     """
     from sweep.storage.foreign_files import move_foreign_files
 
@@ -718,11 +730,11 @@ def remove_atomically(path: Path) -> None:
 
 
 def recover_interrupted_replace(location: Location) -> None:
-    """Complete or undo replacements that dead processes have left in the folder of a store.
+    """Complete or undo what dead processes have left unfinished in the folder of a store.
 
     If the replacement of a store was interrupted, a complete new store takes its path; otherwise
     the old store is restored. Drafts of dead processes are deleted. Nothing happens if the folder
-    can't be written.
+    can't be written, or in an object store.
     """
     if not isinstance(location, Path):
         return
@@ -738,7 +750,7 @@ def recover_interrupted_replace(location: Location) -> None:
 def store_stat_fingerprint(location: Location) -> tuple[int, ...] | None:
     """Return device, inode, size and times of the root document of a store on disk.
 
-    Together they identify the store: no other store ever has the same. Return None for an object
+    They identify the store, as no other store ever has the same. The result is None for an object
     store, or if the document can't be opened.
     """
     if not isinstance(location, Path):
@@ -755,7 +767,10 @@ def store_stat_fingerprint(location: Location) -> tuple[int, ...] | None:
 
 
 def _recover_leftover(leftover: Path, leftover_match: re.Match[str]) -> None:
-    """Complete, restore or delete one leftover of a dead process."""
+    """Move into place, or delete, a hidden file or folder that a dead process has left.
+
+    ``leftover_match`` is the match of its name, with the state in which the process left it.
+    """
     path = leftover.with_name(leftover_match["name"])
     if leftover_match["state"] == "replaced":
         if not path.exists():
@@ -788,7 +803,7 @@ def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
 
 
 def _hidden_path(path: Path, state: str) -> Path:
-    """Return a unique hidden path next to ``path``, with a state and this process in its name."""
+    """Return a unique hidden path next to ``path``. Its name states this process and ``state``."""
     process_tag = f"{os.getpid()}.{process_start_id(os.getpid())}"
     unique_tag = f"{socket.gethostname()}-{process_tag}-{uuid.uuid4().hex[:8]}"
     name = (
@@ -824,9 +839,9 @@ WRITE_REMEDY_BY_ERRNO = {
 
 
 def os_error_reason(error: OSError, path: object) -> str:
-    """Return the reason why a path can't be read or written.
+    """Return the reason, in words, why a path can't be read or written.
 
-    It names a lack of inodes, which prevents new files, and which the system reports as "no space".
+    If the disk has no inodes for new files, the reason says so. The system would report "no space".
     """
     reason_text = error.strerror or str(error)
     if error.errno == errno.ENOSPC and isinstance(path, Path) and _has_no_free_inodes(path):
@@ -835,7 +850,7 @@ def os_error_reason(error: OSError, path: object) -> str:
 
 
 def remedy_for_write_error(error: OSError, place: object, otherwise: str) -> str:
-    """Return the remedy for an error of writing, as text; ``otherwise`` if none is known."""
+    """Return the remedy for an error of writing, in words; ``otherwise`` if none is known."""
     if NO_FREE_INODES_MESSAGE in (error.strerror, os_error_reason(error, place)):
         return "remove files from its disk, or have one with more inodes"
     return WRITE_REMEDY_BY_ERRNO.get(error.errno or 0, otherwise)

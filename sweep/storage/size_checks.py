@@ -58,7 +58,7 @@ class ArrayFileLayout(NamedTuple):
 
     @classmethod
     def from_metadata(cls, node: Mapping[str, Any]) -> ArrayFileLayout:
-        """Return the layout that the checked metadata of an array declare."""
+        """Return the layout that the metadata of an array, already checked, declare."""
         file_shape = chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
         is_string = node["data_type"] == "string"
         codec, chunks_per_shard = node["codecs"][0], 0
@@ -80,7 +80,7 @@ class ArrayFileLayout(NamedTuple):
 
     @property
     def file_bytes_max(self) -> int:
-        """Largest size of a file [bytes]."""
+        """Largest valid size of a file of the array [bytes], as stored."""
         if not self.chunks_per_shard:
             return compressed_bytes_max(self.uncompressed_chunk_bytes_max)
         compressed_chunk_bytes = compressed_bytes_max(self.uncompressed_chunk_bytes_max)
@@ -95,10 +95,10 @@ class ArrayFileLayout(NamedTuple):
             self.check_chunk_decoded_size(chunk, path_in_messages)
 
     def _iter_chunks(self, content: bytes) -> Iterator[bytes]:
-        """Yield the chunks in a file of an array.
+        """Yield the compressed chunks in a file of an array, given the content of the file.
 
-        In a shard (a file of many chunks), only the start of a numeric chunk is yielded, which
-        contains its zstd header.
+        If the file is a shard (a file of many chunks), only the first bytes of a numeric chunk are
+        yielded. They contain the chunk's zstd header.
         """
         if not self.chunks_per_shard:
             yield content
@@ -116,7 +116,7 @@ class ArrayFileLayout(NamedTuple):
     def check_chunk_decoded_size(self, content: bytes, path_in_messages: str) -> None:
         """Raise RefusedFileError if a compressed chunk would not decode to its expected size.
 
-        Content that is no zstd frame is left to the codecs, which refuse it.
+        Content that is no zstd frame is not checked: the codecs refuse it.
         """
         if not content.startswith(_ZSTD_MAGIC):
             return
@@ -187,7 +187,10 @@ class StoreFileSizeLimits:
         }
 
     def array_layout(self, file_name: str) -> ArrayFileLayout | None:
-        """Return the layout of the array that a file belongs to; None for a metadata document."""
+        """Return the layout of the array of which a file, given by name, is a part.
+
+        The result is None for a metadata document.
+        """
         return self._layouts.get(file_name.rpartition("/c/")[0] or file_name.removesuffix("/c"))
 
     def file_bytes_max(self, file_name: str) -> int:
@@ -200,7 +203,7 @@ class StoreFileSizeLimits:
     ) -> None:
         """Raise RefusedFileError if the content of a file would not decode to its expected size.
 
-        ``is_single_chunk``: the content is one chunk of a shard, not a whole file.
+        ``is_single_chunk`` is True if the content is one chunk of a shard, and not that of a file.
         """
         if layout := self.array_layout(file_name):
             (
@@ -214,7 +217,7 @@ class SingleWriterLocalStore(LocalStore):
     """Local Zarr store that only this process writes. Its disk need not have hard links."""
 
     async def set_if_not_exists(self, key: str, value: Any) -> None:
-        """Write a file unless it exists. Zarr's own method needs hard links."""
+        """Write a file unless it exists. Zarr's own method would need hard links."""
         if not await self.exists(key):
             await self.set(key, value)
 
@@ -233,7 +236,10 @@ class SizeCheckedLocalStore(LocalStore):
         return self
 
     def read(self, key: str, byte_range: Any) -> bytes | None:
-        """Return the bytes of a file, or of a part of it; None if the file does not exist."""
+        """Return the bytes of a file, or of a part of it; None if the file does not exist.
+
+        RefusedFileError is raised for an irregular file, or a file of a wrong size.
+        """
         bytes_max = self._limits.file_bytes_max(key)
         try:
             content = read_file_below_root(
@@ -254,16 +260,16 @@ class SizeCheckedLocalStore(LocalStore):
         return content
 
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-        """Return the checked bytes of a file."""
+        """Return the checked bytes of a file as a Zarr buffer; None if the file does not exist."""
         content = await asyncio.to_thread(self.read, key, byte_range)
         return _to_zarr_buffer(content, prototype)
 
     def get_sync(self, key: str, *, prototype: Any = None, byte_range: Any = None) -> Any:
-        """Return the checked bytes of a file, synchronously."""
+        """Return the checked bytes of a file as a Zarr buffer; None if it does not exist."""
         return _to_zarr_buffer(self.read(key, byte_range), prototype)
 
     async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
-        """Return the checked bytes of parts of files."""
+        """Return the checked bytes of several parts of files, as Zarr buffers."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
 
@@ -274,7 +280,7 @@ def _to_zarr_buffer(content: bytes | None, prototype: Any) -> Any:
 
 
 def _byte_range_to_slice(byte_range: Any) -> slice:
-    """Return a byte range of Zarr as a slice."""
+    """Return a byte range of Zarr as a slice. None stands for all bytes."""
     match byte_range:
         case RangeByteRequest():
             return slice(byte_range.start, byte_range.end)
@@ -300,7 +306,7 @@ class SizeCheckedObjectStore(ObjectStore[Any]):
         return self
 
     async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
-        """Return the checked bytes of an object."""
+        """Return the checked bytes of an object as a Zarr buffer; None if it does not exist."""
         import obstore
 
         file_name = key.removeprefix(f"{self._key_prefix}/")

@@ -105,7 +105,10 @@ _ARRAY_ATTRIBUTE_TYPES = {
     "flag_meanings": str, "flag_masks": list, "flag_values": list, "tolerance": float,
     "confidence": float,
 }  # fmt: skip
-"""Types of the permitted attributes of arrays. xarray would interpret others (`scale_factor`)."""
+"""Types of the attributes that an array may have, by the name of the attribute.
+
+A store with any other is refused, as xarray would interpret for example `scale_factor`.
+"""
 
 _FILL_VALUES_BY_DATA_TYPE: dict[str, tuple[Any, ...]] = {
     "float64": (0.0, "NaN"), "int64": (0, -1), "int32": (0, -1), "int16": (0, -1), "int8": (0, -1),
@@ -143,7 +146,10 @@ class NotAStoreError(StoreError, ValueError):
 
 
 def read_attributes(path: Location) -> dict[str, Any]:
-    """Return the checked attributes of a store; raise errors as :func:`read_root_metadata`."""
+    """Return the root attributes of a store, after a check of its root document.
+
+    NotAStoreError is raised if the document differs from what this program writes.
+    """
     attributes: dict[str, Any] = read_root_metadata(path)["attributes"]
     return attributes
 
@@ -182,9 +188,9 @@ def read_root_metadata(path: Location) -> dict[str, Any]:
 
 
 def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
-    """Return the attributes of a store after checking them.
+    """Check the root attributes of a store, and return them unchanged.
 
-    Raise NotAStoreError unless they are those of a store that this version writes.
+    NotAStoreError is raised unless they are those of a store that this version writes.
     """
     checked_attributes = _require_sweep_attributes(path, attributes)
     if (layout := checked_attributes.get("layout")) != LAYOUT_VERSION:
@@ -212,10 +218,10 @@ def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
 
 
 def format_software_versions(software: Any) -> Any:
-    """Return software versions as text, ``numba 0.60, numpy 2.1``; return non-mappings unchanged.
+    """Return a mapping of software versions as text, such as ``numba 0.60, numpy 2.1``.
 
-    Attributes that are text, numbers or lists of both can be written to any file format. Stores of
-    earlier versions have mappings.
+    Any other argument is returned unchanged: new stores have text, and stores of earlier versions
+    have mappings. Text can be written to any file format.
     """
     if not isinstance(software, dict):
         return software
@@ -229,7 +235,7 @@ def parse_software_versions(attributes: Mapping[Any, Any]) -> dict[str, str]:
 
 
 def refuse_foreign_store(path: Location) -> None:
-    """Raise NotAStoreError if no version of this program has made the store."""
+    """Raise NotAStoreError if there is no store at a path, or if sweep did not make it."""
     _require_sweep_attributes(path, _read_root_document(path)["attributes"])
 
 
@@ -242,9 +248,9 @@ def _require_sweep_attributes(path: Location, attributes: Any) -> dict[str, Any]
 
 
 def _read_root_document(path: Location) -> dict[str, Any]:
-    """Read and parse the root document of a store.
+    """Return the parsed root document of a store, not yet checked.
 
-    Raise NotAStoreError, with the likely cause and the remedy, if there is none.
+    NotAStoreError, with the likely cause and the remedy, is raised if there is none.
     """
     recover_interrupted_replace(path)
     detail = ""
@@ -302,7 +308,10 @@ def _first_file_names_text(path: Location) -> str:
 
 
 def _read_json(path: Location, name: str) -> Any:
-    """Parse a JSON document; read it again from an object store if the response was truncated."""
+    """Return a parsed JSON document of a store, given by its name.
+
+    In an object store it is read again if it can't be parsed, as the response may be truncated.
+    """
     try:
         return parse_json(read_object(path, name, METADATA_BYTES_MAX))
     except ValueError:
@@ -317,7 +326,7 @@ def objects_match_digest(
     expected_digest: str,
     bytes_max: Callable[[str], int] = lambda name: ARRAY_FILE_BYTES_MAX,
 ) -> bool:
-    """Return True if stored objects have the expected digest.
+    """Return True if stored objects, given by name, have the expected digest together.
 
     A mismatch in an object store is confirmed by a second read. ``bytes_max``, and the errors that
     are raised, are those of :func:`stored_objects_digest`.
@@ -367,7 +376,7 @@ def _nearby_stores_hint(path: Location) -> str:
 
 
 def _check_node_metadata(node_name: str, node: dict[str, Any]) -> None:
-    """Raise ValueError if metadata of a group or array differ from what this program writes."""
+    """Raise ValueError if a group or array has other metadata than this program writes."""
     if not all(map(_VALID_NAME_PATTERN.fullmatch, node_name.split("/"))):
         raise ValueError(f"an array has the name {node_name!r:.60}")
     if node["zarr_format"] != 3:
@@ -483,7 +492,10 @@ def _check_journal_files(path: Location) -> None:
 
 
 def find_irregular_journal_files(path: Location) -> dict[str, str]:
-    """Return the kind, in words, of each link, pipe and device in a store's journal, by name."""
+    """Return what each link, pipe and device in a store's journal is, in words, by its path.
+
+    The result is empty if there are none.
+    """
     if not isinstance(path, Path) or not (path / JOURNAL_DIR).is_dir():
         return {}
     modes = {JOURNAL_DIR: (path / JOURNAL_DIR).lstat().st_mode}
@@ -531,9 +543,10 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
 
 
 def open_size_checked_store(location: Location, study_id: str = "") -> Any:
-    """Return a read-only Zarr store with size checks; raise errors as :func:`read_root_metadata`.
+    """Return a read-only Zarr store that refuses files of a wrong size.
 
-    If ``study_id`` is given, reads fail once the store is no longer that of this study.
+    If ``study_id`` is not empty, reads fail once the store is no longer that of this study.
+    NotAStoreError is raised if the root document differs from what this program writes.
     """
     limits = StoreFileSizeLimits(read_root_metadata(location))
     if isinstance(location, ObjectPath):
@@ -584,7 +597,10 @@ def encode_log_record(record: dict[str, Any]) -> bytes:
 
 
 def log_line_with_digest(line_body: bytes) -> bytes:
-    """Return a log line, made of encoded fields without the closing brace, and their digest."""
+    """Return a complete log line: encoded fields, and a digest of them as the last field.
+
+    ``line_body`` is a JSON object without its closing brace.
+    """
     return line_body + _DIGEST_FIELD_START + _line_digest(line_body) + _LOG_RECORD_END
 
 
@@ -601,9 +617,9 @@ def decode_log_record(line: bytes) -> dict[str, Any] | None:
 
 
 def verified_line_body(line: bytes) -> bytes | None:
-    """Return the encoded fields of a line without the closing brace, or None if it is damaged.
+    """Return a log line without its digest and closing brace, or None if the digest is wrong.
 
-    The fields are not parsed; the digest is checked.
+    The fields of the line are not parsed.
     """
     line_body, digest_field, line_end = line.rpartition(_DIGEST_FIELD_START)
     return (
@@ -627,13 +643,13 @@ class LogLine(NamedTuple):
 
 
 def iter_log_lines(path: Location) -> Iterator[LogLine]:
-    """Yield each line of a log with its record; None in place of a damaged or truncated record."""
+    """Yield each line of a log with its record. The record of a damaged line is None."""
     for line in iter_raw_lines(path):
         yield LogLine(line, decode_log_record(line))
 
 
 def iter_log_records(path: Location) -> Iterator[dict[str, Any]]:
-    """Yield the records of a log, in order; skip damaged or truncated lines."""
+    """Yield the records of a log, in order. Damaged lines are skipped."""
     return (record for _, record in iter_log_lines(path) if record is not None)
 
 
@@ -663,7 +679,10 @@ def stored_objects_digest(
 
 
 def contents_digest(contents: Iterable[tuple[str, bytes]]) -> str:
-    """Return the digest as by :func:`stored_objects_digest`, from names and bytes of objects."""
+    """Return the digest of objects, given as pairs of name and bytes.
+
+    It equals the result of :func:`stored_objects_digest` for the same objects in a store.
+    """
     hasher = hashlib.blake2b(digest_size=16)
     for name, content in contents:
         hasher.update(f"{name}\0{len(content)}\0".encode())
@@ -681,7 +700,7 @@ class FileLog:
         self._path, self._durable = path, durable
 
     def append(self, lines: bytes) -> None:
-        """Append complete lines, all or none; raise OSError if they can't be written."""
+        """Append complete lines, all or none. Raise OSError if they can't be written."""
         log = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         try:
             size = os.fstat(log).st_size
@@ -694,11 +713,11 @@ class FileLog:
             os.close(log)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Return True: appended lines are already written."""
+        """Return True, as appended lines are written at once."""
         return True
 
     def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
-        """Write the log again, without the lines for which ``is_sound`` is false."""
+        """Remove the lines for which ``is_sound`` returns False, by writing the log again."""
         if self._path.is_dir() or not all(map(is_sound, iter_raw_lines(self._path))):
             lines = iter_raw_lines(self._path)
             atomic_write(self._path, b"".join(line for line in lines if is_sound(line)))
@@ -716,11 +735,11 @@ class ObjectStoreLog:
         self._last_put_time = 0.0
 
     def append(self, lines: bytes) -> None:
-        """Append complete lines; the next `flush` that writes stores them."""
+        """Add complete lines to the pending lines, which `flush` writes."""
         self._pending_lines.append(lines)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write the pending lines as one object. Return True if no lines are pending then.
+        """Write the pending lines as one object. Return True if no line is pending any more.
 
         Without ``force``, nothing is written within `LOG_OBJECT_INTERVAL_SECONDS` of the last
         write.
@@ -737,7 +756,7 @@ class ObjectStoreLog:
         return True
 
     def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
-        """Remove lines for which ``is_sound`` is false; merge the objects if they are many."""
+        """Remove lines for which ``is_sound`` returns False. Merge the objects if they are many."""
         object_names = list_log_objects(self._path)
         is_merging = len(object_names) > LOG_OBJECTS_MAX
         names_in_group: list[str] = []
@@ -758,9 +777,9 @@ class ObjectStoreLog:
     def _rewrite_objects(
         self, object_names: list[str], lines: list[bytes], is_sound: Callable[[bytes], bool]
     ) -> None:
-        """Write the sound lines of objects to one new object, and delete the old objects.
+        """Write the sound lines of several objects to one new object, and delete the several.
 
-        If this is interrupted, some lines are stored twice.
+        ``lines`` are all lines of the objects. If this is interrupted, some lines are stored twice.
         """
         sound_lines = [line for line in lines if is_sound(line)]
         if len(object_names) == 1 and len(sound_lines) == len(lines):
@@ -774,7 +793,10 @@ class ObjectStoreLog:
 
 
 def open_log(path: Location, *, durable: bool = False) -> FileLog | ObjectStoreLog:
-    """Open a log for appending; the caller ensures that no other process appends to it."""
+    """Return a log that is open for appending.
+
+    The caller ensures that no other process appends to it.
+    """
     if isinstance(path, ObjectPath):
         return ObjectStoreLog(path)
     path.parent.mkdir(exist_ok=True)
@@ -791,7 +813,10 @@ def list_log_objects(path: ObjectPath) -> list[str]:
 
 
 def _new_log_object_name(number: int) -> str:
-    """Return a name for a log object; it is unique even if two processes write despite the lock."""
+    """Return the name of a new log object, with its number and a random part.
+
+    Names are unique even if two processes write despite the lock.
+    """
     return f"{number:08d}-{uuid.uuid4().hex[:8]}"
 
 
@@ -801,7 +826,10 @@ def _log_object_number(object_name: str) -> int:
 
 
 def _iter_log_objects(path: ObjectPath, object_names: list[str]) -> Iterator[tuple[str, bytes]]:
-    """Yield the names and contents of objects of a log; only a batch is in memory at a time."""
+    """Yield the name and the content of each object of a log, given the names.
+
+    Only one batch of objects is in memory at a time.
+    """
     for batch_start in range(0, len(object_names), CONCURRENT_REQUESTS_MAX):
         batch = object_names[batch_start : batch_start + CONCURRENT_REQUESTS_MAX]
         yield from zip(
@@ -812,9 +840,9 @@ def _iter_log_objects(path: ObjectPath, object_names: list[str]) -> Iterator[tup
 
 
 def _read_log_object(log_object: ObjectPath) -> bytes:
-    """Read a log object; read it again if its last line is incomplete.
+    """Return the content of a log object. Read it again if its last line is incomplete.
 
-    The response may have been truncated.
+    The response of the object store may have been truncated.
     """
     for _ in range(2):
         content = log_object.read_bytes()
@@ -848,7 +876,10 @@ def iter_raw_lines(path: Location) -> Iterator[bytes]:
 
 
 def _iter_file_lines(log: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of a log file; split a line that exceeds the limit, and skip file holes."""
+    """Yield the lines of a log file, without file holes.
+
+    A line longer than `LOG_LINE_BYTES_MAX` is split.
+    """
     while line := log.readline(LOG_LINE_BYTES_MAX):
         yield line
         if len(line) == LOG_LINE_BYTES_MAX:
@@ -878,10 +909,10 @@ class ReceiptTotals:
 
 
 def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf) -> ReceiptTotals:
-    """Return the totals of the receipts in a store's log, without damaged lines.
+    """Return the totals of the receipts in a store's log. Damaged lines are skipped.
 
-    ``since`` is the time from which recent points and their workers are counted [s since the
-    epoch].
+    Points and workers count as recent if their receipt was written at or after ``since`` [s since
+    the epoch].
     """
     totals = ReceiptTotals(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
     for line in iter_raw_lines(store / JOURNAL_DIR / RECEIPTS_FILE):
@@ -901,7 +932,10 @@ def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf
 def _add_receipt_to_totals(
     totals: ReceiptTotals, line_body: bytes, points: int, receipt_time: float, since: float
 ) -> None:
-    """Add a receipt's time, and if recent its points and worker, to the totals in place."""
+    """Add the time of one receipt to ``totals``, in place.
+
+    If the time is at or after ``since``, the receipt's points and worker are added as recent.
+    """
     totals.first_receipt_time, totals.last_receipt_time = (
         min(totals.first_receipt_time, receipt_time),
         max(totals.last_receipt_time, receipt_time),

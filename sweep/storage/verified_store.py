@@ -57,7 +57,10 @@ class DamagedChunkError(ValueError):
 
 
 def describe_chunk_damage(content: bytes) -> str:
-    """Return what is wrong with a chunk, in words; '' if the CRC32C checksum at its end matches."""
+    """Return what is wrong with a chunk, given as stored bytes, in words; '' if it is undamaged.
+
+    The CRC32C checksum at the end of the chunk is checked.
+    """
     if not content:
         return "is empty"
     checksum = google_crc32c.value(content[:-_CHECKSUM_BYTES]).to_bytes(_CHECKSUM_BYTES, "little")
@@ -142,7 +145,7 @@ class ChunkBlockMap:
         return first_block + index
 
     def chunks_per_shard(self, chunk_name: str) -> int:
-        """Return how many chunks the file of a chunk (a shard) may hold; 0 if it is no shard."""
+        """Return the number of chunks in the file of a chunk; 0 if files hold one chunk each."""
         name_match = CHUNK_NAME_PATTERN.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         if node is None or node["codecs"][0]["name"] != "sharding_indexed":
@@ -156,7 +159,10 @@ class ChunkBlockMap:
 
 
 def _chunk_counts_by_dim(node: dict[str, Any]) -> dict[str, int]:
-    """Return the number of chunks of an array along each dimension."""
+    """Return the number of chunks of an array along each dimension, by dimension name.
+
+    The dimension `shot` is named `cycle`.
+    """
     chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
     lengths_by_dim = zip(_block_dim_names(node), node["shape"], chunk_shape, strict=True)
     return {dim: -(-length // chunk_length) for dim, length, chunk_length in lengths_by_dim}
@@ -191,7 +197,10 @@ class VerifiedStore(WrapperStore[Any]):
         return ChunkBlockMap(self._location)
 
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-        """Return the bytes of a file or of a part; raise DamagedChunkError for a damaged chunk."""
+        """Return the bytes of a file, or of a part of it, as a Zarr buffer; None if it is missing.
+
+        DamagedChunkError is raised for a chunk that is damaged, or missing though it was written.
+        """
         prototype = prototype or default_buffer_prototype()
         try:
             with translate_object_store_errors(self._location):
@@ -201,7 +210,10 @@ class VerifiedStore(WrapperStore[Any]):
             raise
 
     async def _get_verified(self, key: str, prototype: Any, byte_range: Any) -> Any:
-        """Return the bytes of a file. Chunks are checked, and read a second time if damaged."""
+        """Return the bytes of a file, or of a part of it, as a Zarr buffer; None if it is missing.
+
+        Chunks are checked. A damaged chunk is read once more before DamagedChunkError is raised.
+        """
         content = await self._fetch(key, prototype, byte_range)
         name = key.removeprefix(self._prefix).lstrip("/")
         if not CHUNK_NAME_PATTERN.fullmatch(name) or not (
@@ -218,7 +230,7 @@ class VerifiedStore(WrapperStore[Any]):
         return await self._fetch(key, prototype, byte_range)
 
     async def _fetch(self, key: str, prototype: Any, byte_range: Any) -> Any:
-        """Return the bytes of a file; repeat the request if the response was truncated."""
+        """Return the bytes of a file, unchecked. Repeat the request if an object store failed."""
         try:
             return await self._store.get(key, prototype, byte_range)
         except Exception as error:
@@ -227,11 +239,14 @@ class VerifiedStore(WrapperStore[Any]):
             return await self._store.get(key, prototype, byte_range)
 
     async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
-        """Return the checked bytes of parts of files."""
+        """Return the checked bytes of several parts of files, as Zarr buffers."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     def _describe_damage(self, name: str, content: Any, byte_range: Any) -> str:
-        """Return the damage of a chunk in words; '' if it is undamaged or not yet computed."""
+        """Return the damage of a chunk in words; '' if it is undamaged or not yet computed.
+
+        ``content`` holds the chunk's bytes, or is None if the chunk is missing.
+        """
         if content is None:
             return "is missing" if self._should_chunk_exist(name) else ""
         if byte_range is None and (n_chunks := self._block_map.chunks_per_shard(name)):
@@ -241,7 +256,7 @@ class VerifiedStore(WrapperStore[Any]):
         )  # a chunk, a chunk of a shard, or a shard index
 
     def _should_chunk_exist(self, name: str) -> bool:
-        """Return True if a chunk must exist: it was made with the store, or its block is done."""
+        """Return True if a chunk must exist, as it was made with the store or its block is done."""
         block_map = self._block_map
         if block_map.is_packed or name in block_map.template_objects:
             return True
@@ -304,23 +319,26 @@ def _cancel_pending_reads() -> None:
 
 
 def open_verified_store(location: Location, study_id: str) -> Any:
-    """Open the store of a study for Zarr and xarray, for lazy reading of checked chunks."""
+    """Return the store of a study as a read-only Zarr store, for xarray and Zarr.
+
+    Chunks are checked when they are read.
+    """
     return _wrap_in_verified_store(
         store_format.open_size_checked_store(location, study_id), location
     )
 
 
 def open_verified_group(location: Location) -> zarr.Group:
-    """Open a store as a Zarr group whose chunks are checked when they are read.
+    """Return a store as a Zarr group whose chunks are checked when they are read.
 
-    Errors are raised as by :func:`.store_format.read_root_metadata`.
+    NotAStoreError is raised if the root document differs from what this program writes.
     """
     store = _wrap_in_verified_store(store_format.open_size_checked_store(location), location)
     return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
 
 
 def _wrap_in_verified_store(store: Any, location: Location) -> Any:
-    """Wrap a Zarr store, or a path in one, so that its chunks are checked."""
+    """Return a Zarr store, or a path in one, wrapped so that its chunks are checked when read."""
     if isinstance(location, Path):
         return VerifiedStore(store, location)
     return StorePath(VerifiedStore(store.store, location, location.key), location.key)

@@ -51,10 +51,10 @@ def cpu_count() -> int:
 def connect_cluster(
     cluster: AnyClusterConfig, *, max_workers: int, processes: bool, say: Callable[[str], None]
 ) -> Iterator[ClusterConnection]:
-    """Context manager that connects a client to a cluster. A cluster started here ends with it.
+    """Context manager that yields a connection to a Dask cluster.
 
-    At most `max_workers` workers are started, as further ones would be idle. ClusterError is raised
-    if no scheduler responds or no worker starts.
+    A cluster that does not run yet is started, with at most `max_workers` workers, and is ended
+    with the context. ClusterError is raised if no scheduler responds or no worker starts.
     """
     from distributed import Client
 
@@ -94,16 +94,16 @@ def connect_cluster(
 
 
 def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:
-    """Return a cluster's least and largest number of workers, both limited to `max_workers`."""
+    """Return a cluster's least and largest number of workers, neither above `max_workers`."""
     requested = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
     return WorkerBounds(*(min(n_workers, max(1, max_workers)) for n_workers in requested))
 
 
 def _connect_client(address: str, cluster: AnyClusterConfig) -> Client:
-    """Connect a client that does not become Dask's default client.
+    """Return a Dask client that is connected to the scheduler at an address.
 
-    A client that fails to connect would remain the default. ClusterError is raised if no scheduler
-    responds.
+    It does not become Dask's default client, as a client that fails to connect would remain the
+    default. ClusterError is raised if no scheduler responds.
     """
     from distributed import Client
 
@@ -133,7 +133,10 @@ def _connect_client(address: str, cluster: AnyClusterConfig) -> Client:
 
 
 async def _check_scheduler(address: str, security: Security | None) -> None:
-    """Ask a scheduler for its identity. An exception is raised if it does not respond in time."""
+    """Ask the scheduler at an address for its identity.
+
+    An exception is raised if it does not respond in time.
+    """
     from distributed import Security, rpc
 
     connection_args = (security or Security()).get_connection_args("client")
@@ -190,7 +193,7 @@ def _keep_workers_in_bounds(
 
 
 def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
-    """Return how many workers there are and where they run, as text for a message."""
+    """Return number and place of workers as text, such as `4 workers on this machine`."""
     count_text = (
         f"{bounds.least} to {bounds.most}" if bounds.least < bounds.most else f"{bounds.most}"
     )
@@ -210,7 +213,10 @@ def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
 def write_performance_report(
     client: Client, report_path: Path, say: Callable[[str], None]
 ) -> Iterator[None]:
-    """Context manager: write Dask's report of the computations; a failure only prints a message."""
+    """Context manager that writes Dask's report of the computations in its body to a file.
+
+    If the report can't be written, `say` gets a message, and no error is raised.
+    """
     from distributed import performance_report
 
     report = performance_report(filename=str(report_path))

@@ -44,7 +44,7 @@ class ForgivingStream(io.TextIOBase):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """Encoding of the inner stream."""
+        """Encoding of the inner stream; `utf-8` if it has none."""
         return getattr(self._stream, "encoding", None) or "utf-8"
 
     def isatty(self) -> bool:
@@ -62,11 +62,11 @@ class ForgivingStream(io.TextIOBase):
             raise io.UnsupportedOperation("fileno") from None
 
     def writable(self) -> bool:
-        """Return True."""
+        """Return True, as text can always be passed to `write`."""
         return True
 
     def write(self, text: str) -> int:
-        """Write a text, or drop it if the stream has failed."""
+        """Write a text to the inner stream, or drop it after an error. Return its length."""
         if not isinstance(text, str):
             raise TypeError(f"a stream of text takes no {type(text).__name__}")
         if self._stream is None or self.failure is not None:
@@ -96,7 +96,10 @@ class ForgivingStream(io.TextIOBase):
                 self._go_silent(error)
 
     def finish_writing(self) -> None:
-        """Flush for the last time. After an error the stream is silent: no later flush can fail."""
+        """Flush the inner stream for the last time.
+
+        After an error the stream is silent, so that Python's own flush at exit can't fail.
+        """
         self.flush()
         try:
             if self._stream is not None:
@@ -132,7 +135,7 @@ class StallTolerantStream(ForgivingStream):
         self._handover_lock = threading.Lock()
 
     def write(self, text: str) -> int:
-        """Pass a text to the writer thread, or drop it if too many texts wait."""
+        """Queue a text for the writer thread, or drop it if too many wait. Return its length."""
         try:
             self.fileno()
         except io.UnsupportedOperation:
@@ -152,7 +155,10 @@ class StallTolerantStream(ForgivingStream):
         return len(text)
 
     def flush(self) -> None:
-        """Wait until all texts are written, but not for a reader that has stopped."""
+        """Wait until all queued texts are written, for at most `READER_PATIENCE_SECONDS`.
+
+        After such a timeout, flushes do not wait until the reader continues.
+        """
         if self._writer_thread is None:
             super().flush()
             return
@@ -166,9 +172,10 @@ class StallTolerantStream(ForgivingStream):
             self._is_reader_stopped = self._waiting_texts.unfinished_tasks > 0
 
     def _write_waiting_texts(self) -> None:
-        """Write the waiting texts to the stream's descriptor as they arrive.
+        """Write the queued texts to the stream's descriptor as they arrive.
 
-        Buffers of the stream are avoided, as the main thread needs their locks to exit.
+        Buffers of the stream are avoided, as the main thread needs their locks to exit. The thread
+        ends if no text arrives for `WRITER_IDLE_SECONDS_MAX`.
         """
         while True:
             try:

@@ -25,7 +25,7 @@ ALLOWED_MODULES_VARIABLE = "SWEEP_ALLOW_CODE"
 
 
 def allow_modules(modules: Iterable[str]) -> None:
-    """Allow this process, and the processes that it starts, to import modules.
+    """Allow this process, and processes that it starts, to import modules of the user's, by name.
 
     A module's name is the text before the colon in a spec. CodeError is raised for an invalid name.
     """
@@ -48,7 +48,7 @@ def allow_modules(modules: Iterable[str]) -> None:
 def _append_working_directory_to_path() -> None:
     """Append the working directory to Python's search path.
 
-    It comes last, as any user may have put files there.
+    It is searched last, as any user may have put files there.
     """
     if (working_directory := os.getcwd()) not in sys.path:
         sys.path.append(working_directory)
@@ -60,7 +60,7 @@ def allowed_modules() -> set[str]:
 
 
 def module_digests(modules: Iterable[str]) -> dict[str, str]:
-    """Return the digest of each module's file as imported here; '' for a module without a file."""
+    """Import modules. Return the digest of each one's file, by name; '' without a file."""
     return {name: _module_file_digest(import_module(name)) for name in modules}
 
 
@@ -72,10 +72,11 @@ def _module_file_digest(module: ModuleType) -> str:
 
 @lru_cache(maxsize=64)
 def allow_identical_module(module: str, digest: str) -> None:
-    """Allow a module in this worker if its file equals that of the process that started the run.
+    """Allow a module in this worker, if the module's file has the given digest.
 
-    CodeError is raised if the file differs. The file is checked once per process, as an imported
-    module does not change with its file.
+    The digest is that of the file of the process that started the run. CodeError is raised if the
+    file differs. The file is checked once per process, as an imported module does not change with
+    its file.
     """
     allow_modules([module])
     imported_module = import_user_module(module)
@@ -89,7 +90,10 @@ def allow_identical_module(module: str, digest: str) -> None:
 
 
 def import_user_module(name: str) -> ModuleType:
-    """Import a module of the user's; raise CodeError, with the reason, if that fails."""
+    """Import and return a module of the user's, given by name.
+
+    CodeError, with the reason, is raised if that fails.
+    """
     _append_working_directory_to_path()
     try:
         return import_module(name)
@@ -109,7 +113,7 @@ def import_user_module(name: str) -> ModuleType:
 
 
 def _import_error_place_text(error: BaseException) -> str:
-    """Return the file and line at which the import of a module failed, as text; '' if unknown."""
+    """Return file and line where the import of a module failed, as text; '' if unknown."""
     if isinstance(error, SyntaxError):
         return f" ({error.filename}:{error.lineno})"
     frames = traceback.extract_tb(error.__traceback__)

@@ -44,7 +44,7 @@ class WorkerMemory:
 
 
 def process_memory() -> WorkerMemory:
-    """Return the memory available to computation in this process."""
+    """Return the memory that this process may use to compute blocks."""
 
     def machine_limit() -> float:
         from distributed.system import MEMORY_LIMIT
@@ -55,7 +55,10 @@ def process_memory() -> WorkerMemory:
 
 
 def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
-    """Return the memory of the smallest worker of a client, or else of a cluster to be started."""
+    """Return the memory of the smallest worker of a Dask client, or of a cluster to be started.
+
+    The cluster counts only if `client` is None. The memory limit is read when it is first needed.
+    """
     if client is not None:
         return WorkerMemory(lambda: _smallest_worker_memory_limit(client), "a worker of the client")
     if isinstance(cluster, LocalClusterConfig):

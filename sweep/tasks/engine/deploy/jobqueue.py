@@ -22,7 +22,7 @@ from sweep.tasks.engine.deploy import local_ssh
 
 @contextmanager
 def _keep_signal_handlers() -> Iterator[None]:
-    """Keep this thread's signal handlers while dask_jobqueue is imported.
+    """Context manager that keeps this thread's signal handlers while dask_jobqueue is imported.
 
     dask_jobqueue sets a handler on import, so that Ctrl-C would end the program at once. Setting it
     raises an error in any thread but the main one.
@@ -101,9 +101,10 @@ class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
 
 
 def start_batch_cluster(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
-    """Start a cluster, and submit as many jobs as its least number of workers needs.
+    """Start a Dask cluster on a batch system, and return it.
 
-    RuntimeError is raised if the batch system rejects the jobs.
+    As many jobs are submitted as the least number of workers needs. RuntimeError is raised if the
+    batch system rejects the jobs.
     """
     cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
     dask_cluster = cluster_class(**jobqueue_options(cluster))
@@ -128,7 +129,7 @@ def keep_workers_in_bounds(
 
 
 async def _submit_jobs(dask_cluster: Any, n_jobs: int) -> None:
-    """Submit jobs, and wait for the batch system to accept them."""
+    """Submit jobs until there are `n_jobs`, and wait for the batch system to accept them."""
     while len(dask_cluster.worker_spec) < n_jobs:
         dask_cluster.worker_spec.update(dask_cluster.new_worker_spec())
     await dask_cluster
@@ -177,20 +178,20 @@ class WorkerLifetime(NamedTuple):
     mean: float
     """Mean time [s]."""
     deviation_max: float
-    """Largest deviation from the mean [s], by which workers leave at different times."""
+    """Largest deviation from the mean [s], at random, so that workers leave at different times."""
 
 
 def worker_lifetime(walltime: float) -> WorkerLifetime:
-    """Return the mean time after which a worker leaves its job, and the largest deviation [s].
+    """Return mean and largest deviation of the time after which a worker leaves its job.
 
-    `walltime` is the job's time limit [s]. The last worker leaves when 5 % of it is left, at least
-    a minute, but at most a quarter of the time limit.
+    `walltime` is the job's time limit [s]. The last worker leaves before the time limit, by 5 % of
+    the limit but at least 60 s, and by no more than a quarter of the limit.
     """
     reserve = max(0.05 * walltime, min(60.0, walltime / 4))
     return WorkerLifetime(mean=walltime - 1.5 * reserve, deviation_max=reserve / 2)
 
 
 def walltime_text(seconds: float) -> str:
-    """Return a duration as hours, minutes and seconds, the form that batch systems read."""
+    """Return a duration [s] as text `HH:MM:SS`, which batch systems read."""
     whole_seconds = int(seconds)
     return f"{whole_seconds // 3600:02d}:{whole_seconds // 60 % 60:02d}:{whole_seconds % 60:02d}"

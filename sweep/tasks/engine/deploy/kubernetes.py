@@ -31,9 +31,10 @@ SCHEDULER_HTTP_ROUTES = ["distributed.http.scheduler.api", "distributed.http.hea
 
 @contextmanager
 def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> Iterator[str]:
-    """Context manager: create a Dask cluster in Kubernetes, and yield its scheduler's address.
+    """Context manager that creates a Dask cluster in Kubernetes and yields its address.
 
-    ClusterError is raised on failure.
+    The address is that of the scheduler. The cluster is deleted at the end. ClusterError is raised
+    on failure.
     """
     try:
         from httpx import HTTPError
@@ -75,7 +76,10 @@ def _delete_resource(kubernetes_object: Any) -> None:
 
 
 def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> Any:
-    """Wait until the pod of the scheduler is ready. Return the scheduler's service."""
+    """Wait until the scheduler's pod is ready. Return the Kubernetes service of the scheduler.
+
+    ConnectionError is raised if the pod is not ready after `POD_READY_SECONDS_MAX`.
+    """
     from kr8s import NotFoundError
 
     deadline = time.monotonic() + POD_READY_SECONDS_MAX
@@ -90,10 +94,10 @@ def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> A
 
 @contextmanager
 def _open_service_address(service: Any, cluster: KubernetesClusterConfig) -> Iterator[str]:
-    """Yield an address at which a service can be reached.
+    """Context manager that yields an address at which the scheduler's service can be reached.
 
-    Inside the Kubernetes cluster this is the service's own address. Outside it is the address of a
-    port of this machine that is forwarded to the service.
+    Inside the Kubernetes cluster this is the service's own address. Outside the cluster it is the
+    address of a port of this machine, which is forwarded to the service.
     """
     if _is_resolvable_host(scheduler_host(cluster)):
         yield f"{connection_protocol(cluster)}://{scheduler_host(cluster)}:{SCHEDULER_PORT}"
@@ -119,7 +123,7 @@ def _is_resolvable_host(name: str) -> bool:
 
 
 def connection_protocol(cluster: KubernetesClusterConfig) -> str:
-    """Return the protocol of connections between scheduler, workers and client: TLS or TCP."""
+    """Return the protocol of connections between scheduler, workers and client: `tls` or `tcp`."""
     return "tls" if cluster.security else "tcp"
 
 
@@ -133,7 +137,7 @@ def autoscaler_resource(
 ) -> dict[str, Any] | None:
     """Return the Kubernetes resource that adapts the number of workers to the work.
 
-    None if the number of workers is fixed.
+    The result is None if the number of workers is fixed.
     """
     if bounds.least == bounds.most:
         return None

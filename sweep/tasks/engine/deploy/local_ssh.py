@@ -63,9 +63,10 @@ ADAPTIVE_TARGET_DURATION = "1s"
 
 
 def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of workers, with those of the user.
+    """Return the environment variables of workers, by name: sweep's, and those of the user.
 
-    They limit threads, remove the working directory from the import path, and configure Dask.
+    Sweep's variables limit threads, remove the working directory from the import path, and
+    configure Dask. A variable of the user's takes precedence.
     """
     dask_variables = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
@@ -77,7 +78,7 @@ def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
 def make_security(cluster: ClusterConfig) -> Security | None:
     """Return the TLS settings of client, scheduler and workers; None if there are no certificates.
 
-    With TLS all of them refuse connections without a certificate.
+    With TLS, all three refuse connections without a certificate.
     """
     from distributed import Security
 
@@ -160,7 +161,11 @@ def isolate_spawned_workers() -> Iterator[None]:
 def start_local_cluster(
     cluster: LocalClusterConfig, bounds: WorkerBounds, *, processes: bool
 ) -> Any:
-    """Start workers on this machine. OSError, RuntimeError or ImportError is raised on failure."""
+    """Start workers on this machine. Return the Dask cluster.
+
+    Workers are processes if `processes`, else threads. OSError, RuntimeError or ImportError is
+    raised on failure.
+    """
     import dask
     from distributed import LocalCluster, Security
 
@@ -201,9 +206,9 @@ def start_local_cluster(
 
 
 def _make_worker_class_without_pages() -> type:
-    """Return a class of Dask workers, for threads of this process, without web pages.
+    """Return a class of Dask workers without web pages, for threads of this process.
 
-    Dask starts an HTTP server for each worker, which here serves none.
+    Dask starts an HTTP server for each worker. The server of this class has no pages.
     """
     from distributed import Worker
 
@@ -241,7 +246,7 @@ def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> in
 
 
 def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
-    """Start workers on all machines by SSH.
+    """Start workers on all machines by SSH. Return the Dask cluster.
 
     OSError or RuntimeError is raised if a machine can't be reached.
     """
@@ -265,9 +270,10 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Return one Dask worker specification for each machine, by the machine's name.
+    """Return one Dask worker specification for each machine, by the machine's host name.
 
-    A specification starts all workers of its machine. Workers are distributed evenly over machines.
+    A specification starts all workers of its machine. The `n_workers` workers are distributed
+    evenly over machines.
     """
     from distributed.deploy.ssh import Worker
 
@@ -301,9 +307,9 @@ def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 
 
 def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
-    """Return the arguments of the nannies, the processes that start and watch workers.
+    """Return the arguments of Dask's nannies, the processes that start and watch workers.
 
-    They are sent to the machines as JSON.
+    The arguments are sent to the machines as JSON.
     """
     security = security_settings(cluster)
     return {
@@ -325,9 +331,9 @@ class Certificates(NamedTuple):
 
 
 def make_certificates(directory: Path) -> Certificates:
-    """Create a TLS certificate for Dask, valid for a year, in files that only their owner can read.
+    """Create a TLS certificate for Dask in a directory, and return the paths of its files.
 
-    ClusterError is raised if that fails.
+    It is valid for a year. Only the owner can read the files. ClusterError is raised on failure.
     """
     from distributed import Security
 
