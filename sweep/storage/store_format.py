@@ -100,7 +100,7 @@ _STUDY_ID_PATTERN = re.compile(r"[0-9a-f]{32}")
 _NON_STRING_ATTRIBUTE_TYPES = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
 """Types of the store attributes that are not text, by name."""
 
-_ARRAY_ATTRIBUTE_TYPES = {
+_ALLOWED_ARRAY_ATTRIBUTE_TYPES = {
     "units": str, "long_name": str, "comment": str, "standard_name": str, "path": str,
     "flag_meanings": str, "flag_masks": list, "flag_values": list, "tolerance": float,
     "confidence": float,
@@ -110,7 +110,7 @@ _ARRAY_ATTRIBUTE_TYPES = {
 A store with any other is refused, as xarray would interpret for example `scale_factor`.
 """
 
-_FILL_VALUES_BY_DATA_TYPE: dict[str, tuple[Any, ...]] = {
+_ALLOWED_FILL_VALUES_BY_TYPE: dict[str, tuple[Any, ...]] = {
     "float64": (0.0, "NaN"), "int64": (0, -1), "int32": (0, -1), "int16": (0, -1), "int8": (0, -1),
     "uint32": (0,), "uint8": (0,), "bool": (False,), "string": ("",),
 }  # fmt: skip
@@ -404,7 +404,7 @@ def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, 
     invalid.
     """
     data_type, attributes, fill_value = node["data_type"], node["attributes"], node["fill_value"]
-    if not isinstance(data_type, str) or fill_value not in _FILL_VALUES_BY_DATA_TYPE.get(
+    if not isinstance(data_type, str) or fill_value not in _ALLOWED_FILL_VALUES_BY_TYPE.get(
         data_type, ()
     ):
         raise ValueError(
@@ -412,7 +412,7 @@ def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, 
             "missing"
         )
     for name, value in attributes.items():
-        if type(value) is not _ARRAY_ATTRIBUTE_TYPES.get(name):
+        if type(value) is not _ALLOWED_ARRAY_ATTRIBUTE_TYPES.get(name):
             raise ValueError(f"{node_name} has the attribute {name!r:.40}")
     file_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
     value_bytes = np.dtype("u1" if data_type == "string" else data_type).itemsize

@@ -1010,10 +1010,10 @@ def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> Non
         return
     seconds_left = HEARTBEAT_AGE_SECONDS_MAX - heartbeat_age(store_path)
     if 0 < seconds_left <= HEARTBEAT_AGE_SECONDS_MAX:
-        _confirm_heartbeat_stopped(store_path, other_holder, heartbeat_version, seconds_left, say)
+        _has_heartbeat_stopped(store_path, other_holder, heartbeat_version, seconds_left, say)
 
 
-def _confirm_heartbeat_stopped(
+def _has_heartbeat_stopped(
     store_path: Location,
     other_holder: LockHolder,
     heartbeat_version: object,
@@ -1082,7 +1082,7 @@ class StoreLock:
         ):
             return None
         is_doubtful = not 0 <= heartbeat_age(self._store_path) < HEARTBEAT_AGE_SECONDS_MAX
-        if is_doubtful and _confirm_heartbeat_stopped(
+        if is_doubtful and _has_heartbeat_stopped(
             self._store_path, other_holder, heartbeat_version, HEARTBEAT_WATCH_SECONDS, say
         ):
             return other_holder, heartbeat_version

@@ -219,7 +219,7 @@ class RunOptions:
                     if isinstance(cluster, Mapping)
                     else load_cluster_config(cluster)
                 )
-            return self._with_dashboard(_with_worker_count(cluster, self.workers))
+            return self._enable_dashboard_if_asked(_with_worker_count(cluster, self.workers))
         scheduler, execution = self.scheduler, workload.execution
         if scheduler is None and self.workers is None:
             scheduler = execution.scheduler or None
@@ -242,11 +242,11 @@ class RunOptions:
         local_cluster = LocalClusterConfig(
             kind="local", worker=LocalWorkerConfig(threads=execution.threads)
         )
-        return self._with_dashboard(
+        return self._enable_dashboard_if_asked(
             _with_worker_count(local_cluster, self.workers or execution.workers or None)
         )
 
-    def _with_dashboard(self, cluster: AnyClusterConfig) -> AnyClusterConfig:
+    def _enable_dashboard_if_asked(self, cluster: AnyClusterConfig) -> AnyClusterConfig:
         """Return a cluster's configuration, with Dask's dashboard if the options ask for it."""
         if not self.dashboard:
             return cluster
@@ -624,7 +624,7 @@ class Session:
             stop_reason = (
                 stop_reason
                 or self._compute_blocks(is_settled, is_done)
-                or self._finish_chunk_scan(chunk_scan, is_done)
+                or self._compute_blocks_lacking_chunks(chunk_scan, is_done)
             )
             is_done &= chunk_scan.complete_block_mask()
         finally:
@@ -673,7 +673,7 @@ class Session:
             return store_write_error_text(self._store_path, error)
         return ""
 
-    def _finish_chunk_scan(self, chunk_scan: ChunkScan, is_done: np.ndarray) -> str:
+    def _compute_blocks_lacking_chunks(self, chunk_scan: ChunkScan, is_done: np.ndarray) -> str:
         """Wait for the end of the search for missing chunks. Compute the blocks that lack a chunk.
 
         `is_done` is the mask (blocks,) of the blocks that counted as done before the search ended.

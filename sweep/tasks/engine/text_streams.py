@@ -20,7 +20,7 @@ from typing import Any
 STANDARD_DESCRIPTORS = (0, 1, 2)
 
 #: Longest time that a flush waits for a reader that has stopped [s].
-READER_PATIENCE_SECONDS = 0.3
+STOPPED_READER_WAIT_SECONDS = 0.3
 
 #: Time without any text after which the writer thread ends [s].
 WRITER_IDLE_SECONDS_MAX = 5.0
@@ -122,9 +122,9 @@ class StallTolerantStream(ForgivingStream):
     """Text stream whose reader may stop for a while, as a terminal does after Ctrl-S.
 
     A thread writes to the descriptor of the inner stream. A flush waits for this thread for at most
-    `READER_PATIENCE_SECONDS`. After such a timeout, flushes do not wait until the reader continues.
-    If `WAITING_TEXTS_MAX` texts wait, further ones are dropped. If the inner stream has no
-    descriptor, texts are written to it at once.
+    `STOPPED_READER_WAIT_SECONDS`. After such a timeout, flushes do not wait until the reader
+    continues. If `WAITING_TEXTS_MAX` texts wait, further ones are dropped. If the inner stream has
+    no descriptor, texts are written to it at once.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -155,14 +155,16 @@ class StallTolerantStream(ForgivingStream):
         return len(text)
 
     def flush(self) -> None:
-        """Wait until all queued texts are written, for at most `READER_PATIENCE_SECONDS`.
+        """Wait until all queued texts are written, for at most `STOPPED_READER_WAIT_SECONDS`.
 
         After such a timeout, flushes do not wait until the reader continues.
         """
         if self._writer_thread is None:
             super().flush()
             return
-        deadline = time.monotonic() + (0.0 if self._is_reader_stopped else READER_PATIENCE_SECONDS)
+        deadline = time.monotonic() + (
+            0.0 if self._is_reader_stopped else STOPPED_READER_WAIT_SECONDS
+        )
         with self._waiting_texts.all_tasks_done:
             while (
                 self._waiting_texts.unfinished_tasks
@@ -192,7 +194,7 @@ class StallTolerantStream(ForgivingStream):
                     try:
                         data = data[os.write(self.fileno(), data) :]
                     except BlockingIOError:
-                        time.sleep(READER_PATIENCE_SECONDS)
+                        time.sleep(STOPPED_READER_WAIT_SECONDS)
             except Exception as error:
                 self._go_silent(error)
             finally:

@@ -50,7 +50,7 @@ with _keep_signal_handlers():
 RESUBMIT_PAUSE_SECONDS = 15.0
 
 
-class _JobWithStatus:
+class _RejectableJob:
     """Batch job whose status becomes `failed` if the batch system rejects it."""
 
     status: Status
@@ -84,11 +84,11 @@ class _ResubmittingCluster:
             raise
 
 
-class _SlurmJob(_JobWithStatus, SLURMJob):  # type: ignore[misc]
+class _SlurmJob(_RejectableJob, SLURMJob):  # type: ignore[misc]
     pass
 
 
-class _PBSJob(_JobWithStatus, PBSJob):  # type: ignore[misc]
+class _PBSJob(_RejectableJob, PBSJob):  # type: ignore[misc]
     pass
 
 
