@@ -135,7 +135,7 @@ class BlockStudy(StoreTemplate, ABC):
     * `id`, `model_version`, `store_attributes` and `group_attributes`: identity, and attributes of
       its store. Equal ids have equal results, to the bit.
     * `grids`: how its points are cut into blocks, one grid per group of the store.
-    * `constant_arrays`: layouts of the arrays whose values are known before any block is computed.
+    * `constant_arrays`: layouts of the arrays whose values are known when the store is made.
     * `output_layouts`: layouts of the arrays that blocks write.
     * `evaluate` and `compile_kernels`: computation of one block.
     * `supports_checkpoints` and `evaluate_until`, if blocks can stop at a deadline and be continued
