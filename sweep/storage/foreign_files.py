@@ -54,7 +54,7 @@ def is_draft_file(name: str) -> bool:
 
 
 def list_foreign_files(store: Path) -> list[str]:
-    """Return the relative paths of files and folders in a store that sweep did not make, sorted.
+    """Return relative paths, sorted, of a store's foreign files and folders (not made by sweep).
 
     The path of a folder ends in a slash, and stands for all of the folder's content.
     """
@@ -92,10 +92,10 @@ def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
 def _iter_foreign_files(
     folder: Path, prefix: str, node_names: set[str], known_folders: set[str]
 ) -> Iterator[str]:
-    """Yield paths of files and folders below a folder of a store that sweep did not make.
+    """Yield relative paths of foreign files and folders (not made by sweep) below a folder.
 
-    The paths are relative to the store, and `prefix` is that of `folder` with a slash.
-    `known_folders` are names of arrays and groups.
+    All paths are relative to the store. `prefix` is that of `folder`, with a slash at the end.
+    `known_folders` are the names of arrays, and of groups that contain arrays.
     """
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -122,10 +122,9 @@ def _iter_foreign_journal_files(folder: str) -> Iterator[str]:
 
 
 def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
-    """Yield paths of files and folders, among an array's chunk files, that sweep did not make.
+    """Yield relative paths of foreign files (not made by sweep) among an array's chunk files.
 
-    `prefix` is the path of `folder` relative to the store, with a slash. It begins all yielded
-    paths.
+    All paths are relative to the store. `prefix` is that of `folder`, with a slash at the end.
     """
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -138,7 +137,7 @@ def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
 
 
 def move_foreign_files(old_store: Path, new_store: Path) -> None:
-    """Move the files that sweep did not make from a store to the store that replaces it.
+    """Move foreign files (not made by sweep) from a store to the store that replaces it.
 
     If the new store already has a file of the same path, a number is appended to the name. OSError
     is raised if a file can't be moved.

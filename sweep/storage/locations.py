@@ -93,7 +93,7 @@ class VersionedContent(NamedTuple):
 ItemT = TypeVar("ItemT")
 """Type of the items to which `map_concurrently` applies a function."""
 ResultT = TypeVar("ResultT")
-"""Type that a function returns which is passed to a function of this module."""
+"""Type of the results of a function that is passed to a function of this module."""
 
 #: Error texts of obstore for a truncated response body and a truncated listing.
 _TRUNCATED_RESPONSE_TEXTS = ("body error", "invalid list response")
@@ -212,7 +212,7 @@ class ObjectPath:
     def unlink(self, missing_ok: bool = False) -> None:
         """Delete the object, or do nothing if it does not exist.
 
-        ``missing_ok`` has no effect; it exists because `pathlib.Path.unlink` has it.
+        ``missing_ok`` has no effect. The argument exists because `pathlib.Path.unlink` has it.
         """
         with translate_object_store_errors(self), suppress(FileNotFoundError):
             self.client.delete(self.key)

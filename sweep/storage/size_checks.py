@@ -41,7 +41,7 @@ _ZSTD_CODEC = Zstd()
 
 
 def compressed_bytes_max(raw_bytes: int) -> int:
-    """Return the largest size of a compressed chunk [bytes]: zstd's bound, plus the checksum.
+    """Return the largest size of a chunk of ``raw_bytes`` after compression, with checksum [bytes].
 
     >>> compressed_bytes_max(1_000_000)
     1003974
@@ -58,7 +58,10 @@ class ArrayFileLayout(NamedTuple):
 
     @classmethod
     def from_metadata(cls, node: Mapping[str, Any]) -> ArrayFileLayout:
-        """Return the layout that the metadata of an array, already checked, declare."""
+        """Return the layout of an array, given its metadata.
+
+        The caller has checked the metadata.
+        """
         file_shape = chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
         is_string = node["data_type"] == "string"
         codec, chunks_per_shard = node["codecs"][0], 0

@@ -134,7 +134,7 @@ _SHARD_INDEX_CONFIGURATION = {
     "index_codecs": [_LITTLE_ENDIAN_CODEC, _CHECKSUM_CODEC],
     "index_location": "end",
 }
-"""Zarr configuration of the index of a shard, the list of the chunks in a file."""
+"""Zarr configuration of shard indices. A shard's index lists the chunks in its file."""
 
 
 class StoreError(EscapedMessageError):
@@ -492,7 +492,7 @@ def _check_journal_files(path: Location) -> None:
 
 
 def find_irregular_journal_files(path: Location) -> dict[str, str]:
-    """Return what each link, pipe and device in a store's journal is, in words, by its path.
+    """Return a description of each link, pipe and device in a store's journal, by path.
 
     The result is empty if there are none.
     """
@@ -531,7 +531,7 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
             self._check_same_study()
 
     def _check_same_study(self) -> None:
-        """Raise StoreReplacedError if the store at the path has another study id."""
+        """Raise StoreReplacedError if the path no longer has the store of the same study."""
         fingerprint = store_stat_fingerprint(self.root)
         if fingerprint is None or fingerprint != self._last_fingerprint:  # repaired or replaced
             if read_study_id(self.root) != self._study_id:
@@ -777,9 +777,10 @@ class ObjectStoreLog:
     def _rewrite_objects(
         self, object_names: list[str], lines: list[bytes], is_sound: Callable[[bytes], bool]
     ) -> None:
-        """Write the sound lines of several objects to one new object, and delete the several.
+        """Write the sound lines of several log objects to a new object. Delete the old objects.
 
-        ``lines`` are all lines of the objects. If this is interrupted, some lines are stored twice.
+        ``lines`` are all lines of the objects. ``is_sound`` tells whether a line is undamaged. If
+        this is interrupted, some lines are stored twice.
         """
         sound_lines = [line for line in lines if is_sound(line)]
         if len(object_names) == 1 and len(sound_lines) == len(lines):
@@ -876,7 +877,7 @@ def iter_raw_lines(path: Location) -> Iterator[bytes]:
 
 
 def _iter_file_lines(log: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of a log file, without file holes.
+    """Yield the lines of a log file. Holes of the file are skipped.
 
     A line longer than `LOG_LINE_BYTES_MAX` is split.
     """

@@ -161,7 +161,7 @@ class ChunkBlockMap:
 def _chunk_counts_by_dim(node: dict[str, Any]) -> dict[str, int]:
     """Return the number of chunks of an array along each dimension, by dimension name.
 
-    The dimension `shot` is named `cycle`.
+    The dimension `shot` is named `cycle`, as blocks divide both in the same way.
     """
     chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
     lengths_by_dim = zip(_block_dim_names(node), node["shape"], chunk_shape, strict=True)

@@ -86,7 +86,7 @@ class StoreTemplate(Protocol):
 
     @property
     def id(self) -> str:
-        """Hash of everything that the results depend on."""
+        """Hash, as hexadecimal text, of everything on which the results depend."""
 
     @property
     def model_version(self) -> str:
@@ -155,9 +155,9 @@ class BlockStudy(StoreTemplate, ABC):
 
     @abstractmethod
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return layouts, with values, of the arrays that are known when the store is made.
+        """Return the layouts of the arrays whose values are known when the store is made.
 
-        Coordinates are such arrays.
+        Each layout holds the values of its array. Coordinates are an example.
         """
 
     @abstractmethod
@@ -251,7 +251,7 @@ class BlockStudy(StoreTemplate, ABC):
 
     @cached_property
     def _grid_by_group(self) -> dict[str, GroupGrid]:
-        """Grid of each group's blocks, with the number of its first block, by group path."""
+        """Grid of each group's blocks, and number of the group's first block, by group path."""
         last_blocks = np.cumsum([grid.n_blocks for grid in self.grids]).tolist()
         return {
             block_grid.group: GroupGrid(end - block_grid.n_blocks, block_grid)
@@ -268,7 +268,10 @@ class BlockStudy(StoreTemplate, ABC):
         return grid.count_block_points(block_in_grid)
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Return the total number of points in the blocks that a mask (blocks,) selects."""
+        """Return the total number of points in the blocks for which `is_included` is True.
+
+        `is_included` is a mask (blocks,).
+        """
         parts = np.split(is_included, np.cumsum([grid.n_blocks for grid in self.grids])[:-1])
         return sum(
             grid.count_points_in_blocks(part) for grid, part in zip(self.grids, parts, strict=True)

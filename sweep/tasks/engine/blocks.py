@@ -71,7 +71,7 @@ class ArrayLayout:
         *,
         fill_value: float | None = None,
     ) -> ArrayLayout:
-        """Return the layout of an array whose values are known. The array is one chunk."""
+        """Return the layout of an array whose values are known. One chunk holds the array."""
         is_text = values.dtype.kind in "UOT"
         return cls(
             name=name,
@@ -116,9 +116,9 @@ class PointLocations(NamedTuple):
     """Blocks that contain points of a grid, and indices of the points within these blocks."""
 
     blocks: np.ndarray
-    """Number (n,) of the block of each point."""
+    """Number of the block that contains each point, (n,) int64."""
     indices_in_block: np.ndarray
-    """Index (n,) of each point within its block, in C order."""
+    """Index of each point within its block, in C order, (n,) int64."""
 
 
 class BlockGrid:
@@ -161,7 +161,7 @@ class BlockGrid:
         return tuple(map(int, np.unravel_index(block, self.blocks_per_dim)))
 
     def block_at(self, block_position: tuple[int, ...]) -> int:
-        """Return the number of the block whose index along each dimension is `block_position`."""
+        """Return the number of a block, given its index along each dimension of the grid."""
         return (
             int(np.ravel_multi_index(block_position, self.blocks_per_dim)) if block_position else 0
         )
@@ -187,7 +187,10 @@ class BlockGrid:
         return math.prod(self.actual_block_shape(block)) * self.fine_steps
 
     def count_points_in_blocks(self, is_included: np.ndarray) -> int:
-        """Return the total number of points in the blocks that a mask (blocks,) selects."""
+        """Return the total number of points in the blocks for which `is_included` is True.
+
+        `is_included` is a mask (blocks,).
+        """
         counts = np.asarray(is_included, bool).reshape(self.blocks_per_dim)
         for size, chunk in zip(self.shape[::-1], self.block_shape[::-1], strict=True):
             counts = counts @ np.minimum(chunk, size - np.arange(0, size, chunk))
@@ -256,9 +259,9 @@ class BlockGrid:
         )
 
     def grid_dim_indices(self, layout: ArrayLayout) -> tuple[int | None, ...]:
-        """Return the index of the grid dimension along which each dimension of an array is cut.
+        """Return, for each dimension of an array, the grid dimension along which it is cut.
 
-        The index is None for dimensions that are not cut along the grid.
+        A grid dimension is stated as its index. None stands for a dimension that is not cut.
         """
         grid_dim_of: dict[str, int] = {self.fine_dim: len(self.dims) - 1} if self.fine_dim else {}
         grid_dim_of |= {dim: position for position, dim in enumerate(self.dims)}

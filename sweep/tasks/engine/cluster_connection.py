@@ -215,7 +215,7 @@ def write_performance_report(
 ) -> Iterator[None]:
     """Context manager that writes Dask's report of the computations in its body to a file.
 
-    If the report can't be written, `say` gets a message, and no error is raised.
+    The report is written at the end. If that fails, `say` gets a message, and no error is raised.
     """
     from distributed import performance_report
 

@@ -174,9 +174,9 @@ class TaskDispatcher:
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
         """Send all blocks of the queue in tasks. Yield the result of each task when the task ends.
 
-        While no task ends, an empty result is yielded every `IDLE_POLL_SECONDS`. Once
-        `is_stopping()` returns True, no more tasks are sent; the iteration ends when all sent tasks
-        have ended, or when no usable worker is connected. SchedulerLostError is raised if the
+        While no task ends, an empty result is yielded every `IDLE_POLL_SECONDS`. The iteration ends
+        when no task is left. Once `is_stopping()` returns True, no more tasks are sent, and the
+        iteration also ends if no usable worker is connected. SchedulerLostError is raised if the
         scheduler is gone. StoreError or OSError is raised if no worker can write to the store.
         """
         try:
@@ -308,7 +308,7 @@ class TaskDispatcher:
         return {"workers": self._usable_workers()} if self._excluded_workers else {}
 
     def _submit_task(self, task: _InFlightTask, **placement: Any) -> None:
-        """Submit a task to Dask. `placement` has arguments of `Client.submit` for its workers."""
+        """Submit a task to Dask, with arguments of `Client.submit` that select its workers."""
         first_block = task.blocks[0]
         key = task_key(
             self._settings,
@@ -373,7 +373,7 @@ class TaskDispatcher:
             self._submit_task(task, workers=idle_workers)
 
     def _seconds_until_resend(self, task: _InFlightTask) -> float:
-        """Return the time after sending a task at which the task counts as overdue [s].
+        """Return the time after which a task counts as overdue, from its last sending on [s].
 
         The time doubles with each sending of the task.
         """
@@ -529,7 +529,7 @@ def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
 def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
     """Return a result with a failure of every block, for a task that raised an error.
 
-    The error may be that the task killed its workers.
+    The error `KilledWorker` means that the workers of the task died.
     """
     from distributed.scheduler import KilledWorker
 

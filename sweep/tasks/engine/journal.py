@@ -170,7 +170,7 @@ class Journal:
         return all(is_flushed)
 
     def record_failure(self, failure: Failure) -> None:
-        """Append the error of a block that failed permanently.
+        """Append the error of a block that failed permanently to the log of failures.
 
         Later runs skip this block unless they are asked to retry.
         """
@@ -213,7 +213,7 @@ def committed_block_mask(store_path: Location, study: BlockStudy) -> np.ndarray:
 
 
 def read_permanent_failures(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
-    """Return failure records, by number, of blocks that failed permanently and are not done.
+    """Return records of blocks that failed permanently and are not done, by block number.
 
     If a block failed in several runs, the last record counts.
     """
@@ -531,7 +531,7 @@ def read_checkpoint_point_counts(store_path: Location, study_id: str) -> dict[in
 
 
 def delete_checkpoints(store_path: Location, block: int | str = "*") -> None:
-    """Delete the checkpoint of the block with a number, or of all blocks by default."""
+    """Delete the checkpoint of one block, given by its number, or by default of all blocks."""
     for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_FILE_PREFIX}{block}"):
         file.unlink(missing_ok=True)
 
@@ -779,9 +779,9 @@ class _FileLock:
 
     @contextmanager
     def _acquisition_guard(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Context manager in which no other process can acquire the lock, if the disk has flock.
+        """Context manager in which no other process can acquire the lock. It needs flock.
 
-        Without flock, `say` gets a warning.
+        If the file system has no flock, `say` gets a warning, and other processes are not kept out.
         """
         guard_path = self._lock_path.with_name("lock.guard")
         open_flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
@@ -1020,9 +1020,10 @@ def _has_heartbeat_stopped(
     watch_seconds: float,
     say: Callable[[str], None],
 ) -> bool:
-    """Watch a lock for `watch_seconds`. Return True if the holder sends no heartbeat in this time.
+    """Watch a lock for up to `watch_seconds` [s]. Return True if its holder sends no heartbeat.
 
-    The time is measured by this process's clock.
+    `heartbeat_version` is the state of the heartbeat at the start. The result is False as soon as
+    that state or the holder changes. The time is measured by this process's clock.
     """
     holder_text = f"process {other_holder.pid} on {escape_to_one_line(other_holder.host)}"
     _log.debug("%s: watching the heartbeat of %s", store_path, holder_text)
@@ -1135,7 +1136,7 @@ class StoreLock:
                     )
 
     def is_held_by_this_process(self) -> bool:
-        """Return True if this driver still holds the lock."""
+        """Return True if the lock still names this process as its holder."""
         current_holder = read_lock_holder(self._store_path)
         return current_holder is not None and current_holder.token == self._own_holder.token
 
@@ -1146,7 +1147,7 @@ class StoreLock:
         self.release()
 
     def release(self) -> None:
-        """Release the lock, if this driver still holds it."""
+        """End the heartbeats, and release the lock if this process still holds it."""
         self._is_released.set()
         self._heartbeat_thread.join()
         _released_tokens.add(self._own_holder.token)

@@ -55,7 +55,7 @@ class SchedulerLostError(Exception):
 
 @contextmanager
 def raise_as_store_error(problem: str) -> Iterator[None]:
-    """Context manager that raises errors of the disk or of an object store as a StoreError.
+    """Context manager that raises any OSError of its body as a StoreError.
 
     The message of the StoreError begins with `problem`.
     """
@@ -84,13 +84,16 @@ class Progress:
         """
 
     def update_workers(self, *, workers: int, stored: int) -> None:
-        """Report the number of workers and the size stored so far [bytes], before `advance`."""
+        """Report the number of workers and the size stored so far [bytes].
+
+        The engine calls this method before `advance`.
+        """
 
     def update_threads(self, *, threads: int, stored: int) -> None:
         """Report the number of computing threads and the size stored so far [bytes].
 
-        The engine calls this method in place of `update_workers` if threads of this process
-        compute. By default it calls `update_workers`.
+        If threads of this process compute, the engine calls this method before `advance` in place
+        of `update_workers`. By default it calls `update_workers`.
         """
         self.update_workers(workers=threads, stored=stored)
 

@@ -477,7 +477,7 @@ class ComputeBackend(ExitStack):
         return dispatcher.iter_results(lambda: self.interrupts.is_stopping)
 
     def restart_workers(self) -> None:
-        """Start new workers on this machine in place of lost ones, if any were started before."""
+        """Replace lost workers that were started on this machine by new ones."""
         if self._connection is not None:
             self._connection.restart_workers()
 
@@ -690,8 +690,8 @@ class Session:
     def _compute_blocks(self, is_settled: np.ndarray, is_done: np.ndarray) -> str:
         """Compute all blocks that are not settled. Return the reason for stopping early, or ''.
 
-        `is_settled` and `is_done` are masks (blocks,) of bool. Settled blocks are done, or failed
-        for good.
+        `is_settled` and `is_done` are masks (blocks,). A block is settled if it is done or has
+        failed permanently.
         """
         if is_settled.all():
             return ""

@@ -65,7 +65,7 @@ class StallMonitor:
             self._has_printed_state = False
 
     def restart_waiting(self) -> None:
-        """Count the time without a result from now on, as nothing is being computed."""
+        """Restart the count of the time without a result, as nothing is being computed."""
         with self._lock:
             self._last_result_at = time.monotonic()
 
@@ -120,7 +120,7 @@ class InProcessMonitor:
 
     @contextmanager
     def mark_in_progress(self, block: int) -> Iterator[None]:
-        """Context manager that lists a block as being computed by this thread."""
+        """Context manager that lists a block as being computed by the calling thread."""
         thread = threading.current_thread()
         self._in_progress[threading.get_ident()] = BlockInProgress(block, time.time(), thread.name)
         try:

@@ -175,8 +175,8 @@ def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
 def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
     """Context manager that reserves a path in an object store while a store is created there.
 
-    What an interrupted creation has left at the path is removed. StoreError is raised if anything
-    but that is at the path.
+    Files of an interrupted creation at the path are removed. StoreError is raised if anything else
+    is at the path.
     """
     marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER_FILE
     with StoreLock(store_path):
@@ -246,7 +246,7 @@ def build_template(
 
 
 def template_attributes(template: StoreTemplate) -> dict[str, Any]:
-    """Return the root attributes of a new store: the study's, software versions and processor."""
+    """Return the root attributes of a new store: of its study, software versions and processor."""
     return template.store_attributes() | {
         "Conventions": CF_CONVENTIONS_VERSION,
         "study_id": template.id,
@@ -316,11 +316,11 @@ def _consolidate_metadata(store_path: Path) -> None:
 
 
 def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
-    """Return the bytes of a chunk of numbers, as Zarr writes it.
+    """Return the bytes of a chunk of numbers, equal to those that Zarr writes.
 
-    `values` may be smaller than a chunk at the edge of the array; the rest is filled. The bytes are
-    compressed little-endian values in C order, and their crc32c. Zarr's own encoder takes ten times
-    as long: 20 ms for a block of 26 arrays.
+    `values` may be smaller than a chunk at the edge of the array; the rest of the chunk has fill
+    values. The bytes are compressed little-endian values in C order, and a CRC32C checksum. Zarr's
+    own encoder takes ten times as long: 20 ms for a block of 26 arrays.
     """
     dtype = np.dtype(layout.dtype).newbyteorder("<")
     if values.shape == layout.chunks:
@@ -464,7 +464,8 @@ def remove_draft_files(store_path: Location) -> None:
 def refuse_links(store_path: Location) -> None:
     """Raise a StoreError if a symbolic link would direct writes outside the store.
 
-    A link, or a pipe, in place of a file does no harm: a new file is renamed over it.
+    A link or a pipe in place of a file does no harm, as a new file is renamed over the link or
+    pipe.
     """
     if isinstance(store_path, Path):
         links = (
@@ -481,10 +482,9 @@ def refuse_links(store_path: Location) -> None:
 def _exclude_foreign_files(
     store_path: Path, entries: Iterable[os.DirEntry[str]]
 ) -> list[os.DirEntry[str]]:
-    """Return those of the directory entries that are not foreign files of the store.
+    """Return directory entries without those of foreign files, which sweep did not make.
 
-    `entries` are files, folders and links below the store. Foreign files are those that sweep did
-    not make.
+    `entries` are files, folders and links below the store.
     """
     entries = list(entries)
     if not entries:
@@ -576,9 +576,9 @@ def refuse_damaged_template(store_path: Location) -> None:
 
 
 def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
-    """Raise a StoreError if a store lacks an array of a study's results, or has other block shapes.
+    """Raise a StoreError if a store lacks an array of results, or has blocks of other shapes.
 
-    The shapes of the store's blocks must be those of the study.
+    Arrays and shapes must be those of `study`.
     """
     nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
     for name in study.output_layout_by_name:
@@ -729,9 +729,9 @@ def refuse_foreign_files(store_path: Location) -> None:
 def find_pending_replacement(store_path: Location) -> Path | None:
     """Return the path of an unfinished store that will replace the store at ``store_path``.
 
-    The result is None if there is none. Replacements that dead processes have left are first
-    completed or undone. StoreError is raised if the unfinished store was begun to replace the store
-    of another study than the one now at ``store_path``.
+    The result is None if no such store exists. First, replacements that dead processes have left
+    are completed or undone. StoreError is raised if the unfinished store is to replace the store of
+    another study than the one now at ``store_path``.
     """
     recover_interrupted_replace(store_path)
     if (

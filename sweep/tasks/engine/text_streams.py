@@ -66,7 +66,7 @@ class ForgivingStream(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        """Write a text to the inner stream, or drop it after an error. Return its length."""
+        """Write a text to the inner stream, or drop it after an error. Return the text's length."""
         if not isinstance(text, str):
             raise TypeError(f"a stream of text takes no {type(text).__name__}")
         if self._stream is None or self.failure is not None:

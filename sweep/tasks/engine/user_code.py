@@ -60,7 +60,7 @@ def allowed_modules() -> set[str]:
 
 
 def module_digests(modules: Iterable[str]) -> dict[str, str]:
-    """Import modules. Return the digest of each one's file, by name; '' without a file."""
+    """Import modules. Return the digests of their files, by module name; '' without a file."""
     return {name: _module_file_digest(import_module(name)) for name in modules}
 
 

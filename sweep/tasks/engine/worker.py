@@ -69,8 +69,7 @@ RESULTS_NOT_VISIBLE_MESSAGE = (
 ReceiptVerifier = Callable[[Receipt, bool], bool]
 """Function that returns True if a receipt's block is in the store as this process sees it.
 
-The first argument is the receipt. If the second is True, digests are compared; otherwise only sizes
-are.
+The first argument is the receipt. If the second is True, digests are compared, otherwise sizes.
 """
 
 
@@ -397,7 +396,7 @@ class BlockQueue:
     def requeue(self, blocks: list[int]) -> None:
         """Put blocks back into the queue that are unfinished, or whose task was lost.
 
-        Blocks that have failed before are computed alone again.
+        A block that has failed before is queued as failed again, and will be alone in its task.
         """
         for block in blocks:
             (self._failed_once if block in self.failed_blocks else self._requeued).append(block)

@@ -71,7 +71,10 @@ class _ResubmittingCluster:
     workers: dict[str, Any]
 
     async def _correct_state_internal(self) -> None:
-        """Start and end jobs as Dask does. After an error forget rejected jobs, and wait."""
+        """Start and end jobs as Dask does. After an error, forget rejected jobs, and wait.
+
+        The error is raised at the end of the wait.
+        """
         try:
             await super()._correct_state_internal()  # type: ignore[misc]
         except BaseException:
@@ -103,7 +106,7 @@ class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
 def start_batch_cluster(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
     """Start a Dask cluster on a batch system, and return it.
 
-    As many jobs are submitted as the least number of workers needs. RuntimeError is raised if the
+    Jobs are submitted for the least number of workers in `bounds`. RuntimeError is raised if the
     batch system rejects the jobs.
     """
     cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
@@ -176,16 +179,16 @@ class WorkerLifetime(NamedTuple):
     """Time after which a worker leaves its job."""
 
     mean: float
-    """Mean time [s]."""
+    """Mean time after which a worker leaves its job [s]."""
     deviation_max: float
-    """Largest deviation from the mean [s], at random, so that workers leave at different times."""
+    """Largest random deviation from the mean time [s]; it makes workers leave one by one."""
 
 
 def worker_lifetime(walltime: float) -> WorkerLifetime:
     """Return mean and largest deviation of the time after which a worker leaves its job.
 
-    `walltime` is the job's time limit [s]. The last worker leaves before the time limit, by 5 % of
-    the limit but at least 60 s, and by no more than a quarter of the limit.
+    `walltime` is the job's time limit [s]. The last worker leaves 5 % of the limit before the
+    limit, but at least 60 s before. For limits below 240 s it leaves a quarter of the limit before.
     """
     reserve = max(0.05 * walltime, min(60.0, walltime / 4))
     return WorkerLifetime(mean=walltime - 1.5 * reserve, deviation_max=reserve / 2)

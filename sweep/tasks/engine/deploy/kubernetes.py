@@ -197,7 +197,7 @@ def _configure_pod(
     variables: dict[str, str],
     cluster: KubernetesClusterConfig,
 ) -> None:
-    """Set the command, environment and volumes of the only container of a pod."""
+    """Set the command, environment and volumes of the only container of a pod, in place."""
     (container,) = pod["containers"]
     container["args"] = ["dask", *arguments, *_tls_arguments(cluster)]
     container["env"] = [{"name": name, "value": value} for name, value in variables.items()]
