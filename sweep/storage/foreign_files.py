@@ -58,13 +58,13 @@ def list_foreign_files(store: Path) -> list[str]:
 
     The path of a folder ends in a slash, and stands for all of the folder's content.
     """
-    node_names = _read_node_names(store)
+    node_names = _read_zarr_node_names(store)
     return sorted(
         _iter_foreign_files(store, "", node_names, {*node_names, *_iter_parent_groups(node_names)})
     )
 
 
-def _read_node_names(store: Path) -> set[str]:
+def _read_zarr_node_names(store: Path) -> set[str]:
     """Return the names of a store's arrays and groups, from whatever metadata can be read."""
     node_names: set[str] = set()
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):

@@ -172,7 +172,7 @@ def read_root_metadata(path: Location) -> dict[str, Any]:
         if declared_format != (3, "group", "inline"):
             raise ValueError("its root is another")
         for name, node in nodes.items():
-            _check_node_metadata(name, node)
+            _check_zarr_node_metadata(name, node)
         _check_dimension_lengths(nodes)
         flags_arrays = [f"{name}/flags" for name in attributes.get("scanners", ())]
         required_arrays = ["effects"] if attributes["kind"] == GRID_STORE_KIND else flags_arrays
@@ -375,7 +375,7 @@ def _nearby_stores_hint(path: Location) -> str:
     return f"; stores near it: {listed_names}" if names else ""
 
 
-def _check_node_metadata(node_name: str, node: dict[str, Any]) -> None:
+def _check_zarr_node_metadata(node_name: str, node: dict[str, Any]) -> None:
     """Raise ValueError if a group or array has other metadata than this program writes."""
     if not all(map(_VALID_NAME_PATTERN.fullmatch, node_name.split("/"))):
         raise ValueError(f"an array has the name {node_name!r:.60}")

@@ -206,7 +206,7 @@ class VerifiedStore(WrapperStore[Any]):
             with translate_object_store_errors(self._location):
                 return await self._get_verified(key, prototype, byte_range)
         except Exception:
-            _loops_with_failed_reads.add(asyncio.get_running_loop())
+            _event_loops_with_failed_reads.add(asyncio.get_running_loop())
             raise
 
     async def _get_verified(self, key: str, prototype: Any, byte_range: Any) -> Any:
@@ -294,7 +294,7 @@ class VerifiedStore(WrapperStore[Any]):
         return f"{chunk_text} {damage}: {remedy}"
 
 
-_loops_with_failed_reads: set[asyncio.AbstractEventLoop] = set()
+_event_loops_with_failed_reads: set[asyncio.AbstractEventLoop] = set()
 """Event loops of Zarr in which a read has failed.
 
 Other reads may still be pending in these loops when Python exits.
@@ -311,7 +311,7 @@ def _cancel_pending_reads() -> None:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    for loop in _loops_with_failed_reads:
+    for loop in _event_loops_with_failed_reads:
         with suppress(Exception):
             asyncio.run_coroutine_threadsafe(cancel_tasks(), loop).result(
                 PENDING_READS_TIMEOUT_SECONDS

@@ -30,7 +30,7 @@ BLOCKS_IN_SUMMARY_MAX = 10
 COMPILATION_SECONDS_MAX = 600.0
 
 #: Longest wait for the thread that watches the plain loop to end [s]; it may be printing.
-WATCHER_END_SECONDS_MAX = 1.0
+WATCHER_JOIN_TIMEOUT_SECONDS = 1.0
 
 MessagePrinter = Callable[[str], None]
 """Function that shows a message to the user."""
@@ -181,4 +181,4 @@ class InProcessMonitor:
             yield
         finally:
             is_over.set()
-            watcher.join(WATCHER_END_SECONDS_MAX)
+            watcher.join(WATCHER_JOIN_TIMEOUT_SECONDS)

@@ -29,7 +29,7 @@ WRITER_IDLE_SECONDS_MAX = 5.0
 WAITING_TEXTS_MAX = 1000
 
 #: Loggers of Dask and of its parts, whose handlers write to standard error.
-DASK_LOGGERS = ("distributed", "tornado", "bokeh")
+DASK_LOGGER_NAMES = ("distributed", "tornado", "bokeh")
 
 
 class ForgivingStream(io.TextIOBase):
@@ -208,7 +208,9 @@ def make_dask_logs_stall_tolerant() -> None:
     """
     streams: dict[int, StallTolerantStream] = {}
     for name, logger in [*logging.root.manager.loggerDict.items()]:
-        if name.partition(".")[0] not in DASK_LOGGERS or not isinstance(logger, logging.Logger):
+        if name.partition(".")[0] not in DASK_LOGGER_NAMES or not isinstance(
+            logger, logging.Logger
+        ):
             continue
         for handler in logger.handlers:
             if not isinstance(handler, logging.StreamHandler):
