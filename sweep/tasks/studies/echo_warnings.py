@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 ECHO_LOSS_WARNING_DB = 3.0
 """Loss of an echo's power above which a warning is given [dB].
 
-Power is lost if the echo arrives after its record has begun.
+Power is lost if the echo arrives after the record has begun.
 """
 
 PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MIN = 0.125, 0.3
@@ -47,9 +47,9 @@ laser's phase over the delay, or over the record if that is shorter [rad^2].
 """
 
 ECHO_POINTS_SAMPLED_MAX = 200_000
-"""Largest number of points of a grid whose echoes are checked.
+"""Largest number of points of a grid study whose echoes are checked.
 
-Of points with equal `ECHO_PARAMETERS` only one is checked.
+Only one of several points with equal `ECHO_PARAMETERS` is checked.
 """
 
 SAMPLED_TILES_PER_SCANNER = 16
@@ -98,46 +98,51 @@ ECHO_PARAMETERS = (
     beam.FOCUS_PATH,
     beam.COUPLING_PATH,
 )
-"""Dotted paths of the parameters that determine when echoes arrive and how beats are used."""
+"""Dotted paths of parameters that determine when an echo arrives and how its beats are read."""
 
 
 PHASE_BASED_WINDOW_FRACTION_LOST_MAX = 0.03
-"""Largest fraction of the window's sum before the echo at which phase-based estimators are valid.
+"""Largest fraction of the window that an echo may miss if its frequency is found from phases.
 
-Their errors are then below some 0.02 bin. They reach 0.6 bin if the echo begins in the middle of
-the record.
+The fraction is the sum of the window's samples before the echo begins, over the sum of all its
+samples. At this fraction, errors of phase-based estimators are below some 0.02 bin. They reach 0.6
+bin if the echo begins in the middle of the record.
 """
 
 PHASE_BASED_FREQUENCY_ESTIMATORS = ("jacobsen", "candan")
-"""Frequency estimators that rely on the phases that a complete record gives to adjacent bins."""
+"""Names of the frequency estimators that use phases of adjacent bins, as in complete records."""
 
 
 class EchoDiagnosis(NamedTuple):
     """Arrival of the echoes of n points, and whether their beats give a false range or velocity."""
 
     range: np.ndarray
-    """Range of the target (n,) [m]."""
+    """Range (n,) of the target at each point [m]."""
     window_fraction_lost: np.ndarray
-    """Fraction (n,) of the window's sum that precedes the echo, 0..1; 1 if no echo arrives."""
-    is_misread: np.ndarray
-    """True (n,) where the measured beats would be interpreted as another range or velocity."""
-    has_large_phase_walk: np.ndarray
-    """True (n,) where the laser's phase walks too far for the model of detection."""
-    is_range_velocity_exchanged: np.ndarray
-    """True (n,) where up and down beat, under the spec's assumption, give exchanged values.
+    """Fraction (n,) of the window before the echo begins, 0..1; 1 if no echo arrives in the record.
 
-    The spec assumes a far or a fast target. With the wrong assumption, range and velocity are
-    exchanged; the opposite one would give both correctly.
+    It is the sum of the window's samples before the echo begins, over the sum of all its samples.
+    """
+    is_misread: np.ndarray
+    """True (n,) where the measured beats would be read as a false range or velocity."""
+    has_large_phase_walk: np.ndarray
+    """True (n,) where the laser's phase walks too far for the model of detection to be accurate."""
+    is_range_velocity_exchanged: np.ndarray
+    """True (n,) where the spec's assumption exchanges range and velocity.
+
+    Up and down beat alone have two readings: one for a far and one for a fast target. The spec
+    assumes one of them. A point is marked if this reading is wrong and the opposite one is right.
     """
     is_exchanged_by_other_assumption: np.ndarray
-    """True (n,) where the opposite of the spec's assumption would exchange range and velocity.
+    """True (n,) where the assumption opposite to the spec's would exchange range and velocity.
 
-    Points at which the spec's own assumption exchanges them too are not marked.
+    The spec assumes either a far or a fast target. A point is marked if the spec's assumption is
+    right and the opposite one is wrong.
     """
     crosses_spectrum_edge: np.ndarray
     """True (n,) where an echo in developed speckle spreads across DC or Nyquist.
 
-    Only echoes that any bin may detect are marked.
+    Points are marked only if records are real and an echo may be detected in any bin.
     """
 
 
@@ -145,15 +150,16 @@ class FootprintSpreads(NamedTuple):
     """Standard deviations of range and radial velocity over the illuminated spots of n points."""
 
     range: np.ndarray
-    """Standard deviation of the range (n,) [m]."""
+    """Standard deviation (n,) of the range over the footprint at each point [m]."""
     radial_velocity: np.ndarray
-    """Standard deviation of the radial velocity (n,) [m/s]."""
+    """Standard deviation (n,) of the radial velocity over the footprint at each point [m/s]."""
 
     @classmethod
     def from_plane_footprint(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintSpreads:
-        """Return the standard deviations over footprints on a plane at ranges `range_` (n,) [m].
+        """Return the standard deviations of range and radial velocity over footprints on a plane.
 
-        `p` are parameters by dotted path. Its text parameters are the same at all points.
+        `p` maps dotted paths to parameters; a text parameter has one value for all points. `range_`
+        (n,) are the ranges of the targets [m].
         """
         with np.errstate(all="ignore"):
             places, directions = beam.footprint_full_angles(p, range_)
@@ -163,10 +169,10 @@ class FootprintSpreads(NamedTuple):
 
     @classmethod
     def from_eyepoints(cls, eyepoints: Eyepoints) -> FootprintSpreads:
-        """Return the standard deviations over ray-traced footprints.
+        """Return the standard deviations of range and radial velocity over ray-traced footprints.
 
-        They are 0 for a footprint on several surfaces: surfaces at different ranges are separate
-        echoes.
+        `eyepoints` is the ray-traced geometry of n shots. Both deviations are 0 for a footprint on
+        several surfaces, because surfaces at different ranges are separate echoes.
         """
         weight = eyepoints.weight / eyepoints.weight.sum()
         deviations = []
@@ -178,7 +184,7 @@ class FootprintSpreads(NamedTuple):
         return cls(*(np.where(has_one_surface, v, 0.0) for v in deviations))
 
     def select(self, points: np.ndarray) -> FootprintSpreads:
-        """Return the standard deviations at points with given indices."""
+        """Return a new record with the standard deviations at the points of an index array."""
         return FootprintSpreads(self.range[points], self.radial_velocity[points])
 
 
@@ -187,8 +193,9 @@ def diagnose_echoes(
 ) -> EchoDiagnosis:
     """Check when the echoes of n points arrive, and which range and velocity their beats give.
 
-    ``parameters`` are by dotted path: one value, or an array (n,). ``footprint`` has the standard
-    deviations of range and velocity over the footprints; by default those of footprints on a plane.
+    ``parameters`` maps dotted paths to one value or an array (n,). ``footprint`` has the standard
+    deviations of range and radial velocity over the footprints; by default, footprints on a plane
+    are assumed.
     """
     relevant = {
         path: parameter for path, parameter in parameters.items() if path in ECHO_PARAMETERS
@@ -253,6 +260,7 @@ def _crosses_spectrum_edge(
 ) -> np.ndarray:
     """Return a mask (n,) of the echoes in developed speckle that spread across DC or Nyquist.
 
+    `p` maps dotted paths to parameters. `range_` [m] and `velocity` [m/s] are those of n targets.
     The result is :attr:`EchoDiagnosis.crosses_spectrum_edge`.
     """
     is_speckled = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
@@ -294,10 +302,10 @@ def _crosses_spectrum_edge(
 def _is_misread(
     p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, assumption: str | None = None
 ) -> np.ndarray:
-    """Return True (n,) where the beats, folded as in spectra, give another range or velocity.
+    """Return a mask (n,) of the targets whose beats give a false range or velocity.
 
-    All three beats are used. If ``assumption`` is given, only up and down beat are used, and the
-    target is assumed to be ``far`` or ``fast``.
+    Beats are folded at Nyquist as in spectra. If ``assumption`` is ``far`` or ``fast``, only up and
+    down beat are read, under this assumption. If it is None, all beats of the shot are read.
     """
     budget = LinkBudget(p)
     settings, record, slopes = budget.waveform, budget.record, waveform.chirp_rate_ratios(p)
@@ -353,7 +361,7 @@ def _is_misread(
 
 
 def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
-    """Yield warnings about echoes that a study misses, records in part, or interprets wrongly."""
+    """Yield warnings about echoes that a study misses, records in part, or reads wrongly."""
     is_flight = isinstance(study, FlightStudy)
     diagnosis = _diagnose_flight(study) if isinstance(study, FlightStudy) else _diagnose_grid(study)
     if not diagnosis.range.size:
@@ -458,7 +466,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
 
 
 def _used_phase_based_estimators(study: GridStudy | FlightStudy) -> list[str]:
-    """Return the frequency estimators of a study that use the phases of neighbouring bins."""
+    """Return the names of the `PHASE_BASED_FREQUENCY_ESTIMATORS` that a study uses."""
     path = f"{ESTIMATOR_PREFIX}kind"
     values = [
         member.values
@@ -473,7 +481,7 @@ def _used_phase_based_estimators(study: GridStudy | FlightStudy) -> list[str]:
 
 
 def _reads_two_beats(study: GridStudy | FlightStudy) -> bool:
-    """Return True if range and velocity are computed, always or at times, from only two beats."""
+    """Return True if a study reads range and velocity of some or all shots from only two beats."""
     spec = study.spec
     p = PARAMETER_DEFAULTS | dict(spec.parameters())
     has_no_doppler = "doppler" not in waveform.existing_segments(
@@ -492,12 +500,13 @@ def _iter_exchange_warnings(
     is_absent: np.ndarray,
     points_noun: str,
 ) -> Iterator[str]:
-    """Yield a warning about points at which range and velocity are exchanged.
+    """Yield a warning if range and velocity are exchanged at some points; yield nothing otherwise.
 
-    An up and a down beat that no Doppler beat confirms have two readings, for a far and for a fast
-    target. The wrong one gives range and velocity exchanged. The setting processing.two_beats,
-    ``far`` or ``fast``, chooses the reading. No warning is given if it is ``fast``, and ``far``
-    would exchange range and velocity at other points.
+    An up and a down beat that no Doppler beat confirms have two readings: one for a far and one for
+    a fast target. The wrong reading exchanges range and velocity. The setting processing.two_beats,
+    ``far`` or ``fast``, chooses the reading. If it is ``fast``, and ``far`` would exchange range
+    and velocity at some points, no warning is given. Points marked in ``is_absent`` (n,) are
+    ignored.
     """
     is_range_velocity_exchanged, is_exchanged_by_other_assumption = (
         diagnosis.is_range_velocity_exchanged & ~is_absent,
@@ -538,14 +547,14 @@ def _iter_exchange_warnings(
 
 
 def _fraction_text(mask: np.ndarray) -> str:
-    """Return the fraction of True elements in per cent, as text."""
+    """Return the fraction of True elements of a mask as text in per cent."""
     return f"{100 * np.count_nonzero(mask) / mask.size:.3g} %"
 
 
 def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
-    """Return the ranges of marked points as text: 'from x on' if all larger ranges are marked.
+    """Return the ranges of the points in a mask as text, such as 'from 500 m on'.
 
-    Points that are ``is_absent`` are ignored.
+    `ranges` (n,) are the ranges of all points [m]. Points marked in ``is_absent`` (n,) are ignored.
     """
     if is_absent is not None and is_absent.any():
         mask, ranges = mask[~is_absent], ranges[~is_absent]
@@ -560,7 +569,11 @@ def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | No
 
 
 def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
-    """Diagnose the echoes of a grid at points that differ in `ECHO_PARAMETERS`."""
+    """Return the diagnosis of the echoes of a grid study.
+
+    Only one of several points with equal `ECHO_PARAMETERS` is checked, and at most
+    `ECHO_POINTS_SAMPLED_MAX` points.
+    """
     axes = study.spec.axes
     sizes = [axis.size for axis in axes]
     used_indices = [
@@ -587,7 +600,11 @@ def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
 
 
 def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
-    """Diagnose the echoes of sampled shots, at the first and the last point of a flight's axes."""
+    """Return the diagnosis of the echoes of sampled shots of a flight.
+
+    Shots are diagnosed at the first and the last point of the flight's axes. The diagnosis has no
+    points if no sampled shot hits anything.
+    """
     from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
     from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 

@@ -30,39 +30,42 @@ class ExtendableStudy(BlockStudy):
 
     @cached_property
     def reuse_source(self) -> Any:
-        """Results of a smaller study, or None; opened when the first block is computed."""
+        """Results of the smaller study that this study extends; None if it extends none.
+
+        The smaller study's store is opened when this attribute is first read.
+        """
         return self.find_reuse_source()
 
     @property
     def id(self) -> str:
-        """Hash of everything in the spec that results depend on."""
+        """Hash of all entries of the spec that results depend on."""
         return str(self.spec.id)
 
     @abstractmethod
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True for the points of a block whose numerical accuracy is set by the tolerance.
+        """Return True for each point of a block whose numerics depend on the tolerance.
 
-        The result is a mask (points,), or one bool for all points. The choice of effects, which
-        always depends on the tolerance, does not count.
+        The result is a mask (points,), or one bool for all points. Numerics are numbers of rays and
+        error limits. The choice of effects, which always depends on the tolerance, does not count.
         """
 
     def block_of_first_draws(self, block: int) -> int:
-        """Return the block with the first draws of a block's points.
+        """Return the number of the block that holds the first draws of the points in block `block`.
 
-        It also holds the results that do not depend on draws.
+        The block with the first draws also holds the results that do not depend on draws.
         """
         return block
 
     def pop_reused_point_count(self, block: int) -> int:
-        """Return how many points of a block came from the smaller study's store.
+        """Return how many points of a block were taken from the smaller study's store.
 
-        The number is deleted, so that a second call returns 0.
+        The count is deleted, so that a second call returns 0.
         """
         reuse_source = self.reuse_source
         return reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0
 
     def count_reusable_points_of_block(self, block: int) -> int:
-        """Count the points of a block that the smaller study's store has, damaged or not."""
+        """Return how many points of a block are in the smaller study's store, damaged or not."""
         shared_point_groups = (
             self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
         )

@@ -43,30 +43,39 @@ BEAMLETS_PER_BLOCK_MAX = 1 << 20
 DEFAULT_BLOCK_BEAMLETS_MIN = 1 << 17
 """Number of beamlets (rays) above which a study is divided into several blocks.
 
-All cores then have work. Casting this number takes about half a second.
+Several blocks give work to all cores. Casting this number of rays takes about half a second.
 """
 
 RAYS_PER_CAST_MAX = 1 << 18
-"""Largest number of beamlets (rays) that are cast at once. It limits memory if cycles are long."""
+"""Largest number of beamlets (rays) that are cast at once.
+
+The limit bounds the memory of blocks with long measurement cycles.
+"""
 
 SAMPLED_RAYS_MAX = 1 << 19
-"""Largest number of beamlets (rays) of the shots that sample a flight before it runs."""
+"""Largest number of rays that are cast to sample a flight's shots before the flight is computed."""
 
 TERRAIN_MAP_LONG_SIDE_NODES = 256
-"""Number of nodes along the longer side of a scene's map."""
+"""Number of grid nodes along the longer side of the map of a scene's heights."""
 TERRAIN_MAP_SHORT_SIDE_NODES_MIN = 16
-"""Smallest number of nodes along the shorter side of a scene's map."""
+"""Smallest number of grid nodes along the shorter side of the map of a scene's heights."""
 
 N_SAMPLED_FLIGHT_TIMES = 512
-"""Number of times, or of shots of each scanner, that sample where a flight and its beams go."""
+"""Number of instants at which the positions of a flight are sampled.
+
+It is also the number of shots by which each scanner's hits are sampled.
+"""
 TERRAIN_MAP_MARGIN_FRACTION = 0.08
-"""Margin of a scene's map around the sampled positions, as a fraction of their extent."""
+"""Margin of a scene's map around the sampled positions, as a fraction of their larger extent."""
 
 TERRAIN_MAP_VIEWPOINT_CLEARANCE = 1.0
-"""Height above scene and flight from which rays are cast down to map the ground [m]."""
+"""Height above the highest point of scene and path, from which rays map the ground below [m]."""
 
 GROUND_CONTACT_DISTANCE_MAX = 1e-6
-"""Largest height of ground above a platform at which the platform counts as standing on it [m]."""
+"""Largest height of the ground above a platform that still counts as standing on the ground [m].
+
+Rounding may place the ground slightly above such a platform.
+"""
 
 VECTOR_DIM_SIZES = {"xyz": 3, "xyz_again": 3}
 """Sizes of the dimensions of vectors and matrices in stores, by the dimension's name."""
@@ -107,7 +116,7 @@ class EyepointStudy(BlockStudy):
 
     @property
     def grids(self) -> tuple[BlockGrid]:
-        """Grid of the measurement cycles, in a tuple of one."""
+        """Grid that divides the measurement cycles into blocks, as the only element of a tuple."""
         return (self._grid,)
 
     @cached_property
@@ -117,15 +126,22 @@ class EyepointStudy(BlockStudy):
 
     @property
     def n_rays(self) -> int:
-        """Number of rays of all blocks: one per beamlet, and one straight down per cycle."""
+        """Number of rays of all shots: one per beamlet of a shot, and one down per cycle."""
         return self.count_rays(self.n_points)
 
     def count_rays(self, n_shots: int) -> int:
-        """Return the number of rays of `n_shots` shots, which make complete measurement cycles."""
+        """Return the number of rays of `n_shots` shots that make complete measurement cycles.
+
+        A shot has a ray for each beamlet. A cycle has one more ray, straight down.
+        """
         return n_shots * self.n_beamlets + n_shots // self.shots_per_cycle
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return the description of the geometry, from which the study's id is hashed."""
+        """Return the attributes of the store by name.
+
+        The attribute ``geometry`` describes the geometry; the study's id is a hash of this
+        description.
+        """
         return {
             "kind": "eyepoints",
             "geometry": json.dumps(self.spec.geometry_identity(self.scanner), sort_keys=True),
@@ -133,7 +149,10 @@ class EyepointStudy(BlockStudy):
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the power fractions of the beamlets, the only array known before rays are cast."""
+        """Return a list with the layout of the only array known before rays are cast.
+
+        The array holds the power fractions of the beamlets.
+        """
         weight_attributes = cf_attributes(
             BEAMLET_WEIGHT_VARIABLE.units, BEAMLET_WEIGHT_VARIABLE.long_name
         )
@@ -149,13 +168,13 @@ class EyepointStudy(BlockStudy):
 
     @cached_property
     def beamlet_weights(self) -> np.ndarray:
-        """Power fractions of the beamlets, (beamlets,)."""
+        """Power fraction of each beamlet, of shape (beamlets,)."""
         from sweep.model.beamlets import place_beamlets
 
         return place_beamlets(self.n_beamlets, self.spec.beamlet_pattern)[1]
 
     def output_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of the arrays by shot, by beamlet and by measurement cycle."""
+        """Return the layouts of the arrays that have values per shot, per beamlet, or per cycle."""
         sizes = VECTOR_DIM_SIZES | {"beamlet": self.n_beamlets}
         return [
             make_output_layout(self._grid, name, output, output.dims, sizes)
@@ -165,26 +184,27 @@ class EyepointStudy(BlockStudy):
         ]
 
     def evaluate(self, block: int) -> Results:
-        """Cast the rays of a block. Return the geometry of its shots and cycles."""
+        """Cast the rays of a block. Return the geometry of shots and cycles as arrays by name."""
         (cycles,) = self._grid.block_slices(block)
         return self.cast_cycles(
             np.arange(cycles.start * self.shots_per_cycle, cycles.stop * self.shots_per_cycle)
         )
 
     def compile_kernels(self) -> None:
-        """Compile the ray caster, by casting the first measurement cycle."""
+        """Compile the ray caster, by casting the rays of the first measurement cycle."""
         self.cast_cycles(np.arange(self.shots_per_cycle))
 
     def cast_cycles(self, shot_numbers: np.ndarray) -> Results:
-        """Cast the shots (n,) of complete measurement cycles.
+        """Cast the rays of complete measurement cycles. Return arrays by shot and by cycle.
 
-        Return the arrays by shot and by cycle.
+        `shot_numbers` (n,) are the numbers of all shots in these cycles. The result maps names to
+        arrays.
         """
         shot_arrays = self.cast_shots(shot_numbers)
         return shot_arrays | self._cycle_arrays(shot_arrays)
 
     def cast_shots(self, shot_numbers: np.ndarray) -> Results:
-        """Cast the shots with given numbers (n,). Return their arrays by name."""
+        """Cast the rays of shots with given numbers (n,). Return the geometry as arrays by name."""
         from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 
         shots_per_cast = max(1, RAYS_PER_CAST_MAX // self.n_beamlets)
@@ -199,8 +219,9 @@ class EyepointStudy(BlockStudy):
     def shot_numbers_of_sampled_tiles(self, n_tiles: int) -> np.ndarray:
         """Return the numbers of shots in up to `n_tiles` tiles spread over the flight.
 
-        A tile is a run of consecutive shots whose effects are planned together. All its shots are
-        taken, or fewer, evenly spaced, if they have more than `SAMPLED_RAYS_MAX` rays.
+        A tile is a run of consecutive shots whose effects are planned together. The result contains
+        every k-th shot of these tiles, with the smallest k for which the shots have at most
+        `SAMPLED_RAYS_MAX` rays.
         """
         last_tile = (self.n_points - 1) // SHOTS_PER_TILE
         first_shots = (
@@ -211,9 +232,10 @@ class EyepointStudy(BlockStudy):
         return shot_numbers[:: -(-shot_numbers.size * self.n_beamlets // SAMPLED_RAYS_MAX)]
 
     def shot_numbers_of_sampled_cycles(self, n_tiles: int) -> np.ndarray:
-        """Return the numbers of all shots in cycles that overlap `n_tiles` tiles of the flight.
+        """Return the numbers of all shots in the cycles that overlap sampled tiles.
 
-        A tile is a run of consecutive shots whose effects are planned together.
+        A tile is a run of consecutive shots whose effects are planned together. Up to `n_tiles`
+        tiles, spread over the flight, are sampled.
         """
         return self._shot_numbers_of_cycles(
             np.unique(self.shot_numbers_of_sampled_tiles(n_tiles) // self.shots_per_cycle)
@@ -222,16 +244,19 @@ class EyepointStudy(BlockStudy):
     def shot_numbers_of_spread_cycles(self, n_cycles: int) -> np.ndarray:
         """Return the numbers of all shots in `n_cycles` cycles spread evenly over the flight.
 
-        If `n_cycles` is 1, the cycle in the middle is taken.
+        A single cycle is the one in the middle of the flight.
         """
         return self._shot_numbers_of_cycles(_middles_of_equal_parts(self.n_cycles, n_cycles))
 
     def evenly_spaced_shot_numbers(self, n_shots: int) -> np.ndarray:
-        """Return the numbers of `n_shots` shots spread evenly over the flight."""
+        """Return the numbers of `n_shots` shots spread evenly over the flight.
+
+        If the flight has fewer shots, the result contains all of them.
+        """
         return _middles_of_equal_parts(self.n_points, n_shots)
 
     def _shot_numbers_of_cycles(self, cycle_numbers: np.ndarray) -> np.ndarray:
-        """Return the numbers of all shots in the cycles with given numbers (n,)."""
+        """Return the numbers of all shots in the measurement cycles with given numbers (n,)."""
         return np.asarray(
             (
                 cycle_numbers[:, None] * self.shots_per_cycle + np.arange(self.shots_per_cycle)
@@ -239,10 +264,9 @@ class EyepointStudy(BlockStudy):
         )
 
     def cast_eyepoints(self, shot_numbers: np.ndarray) -> Eyepoints:
-        """Cast the rays of the shots with the given numbers (n,) and return their eyepoints.
+        """Cast the rays of shots with given numbers (n,). Return the eyepoints of the shots.
 
-        Eyepoints are the geometry of the shots, as the rays have found it. All rays are cast
-        together.
+        Eyepoints are the geometry of shots as found by rays. All rays are cast in one call.
         """
         from sweep.model.pointcloud.eyepoints import compute_eyepoints
 
@@ -255,7 +279,10 @@ class EyepointStudy(BlockStudy):
         )
 
     def _cycle_arrays(self, shot_arrays: Results) -> Results:
-        """Return the arrays of cycles from those of their shots."""
+        """Return time, true velocity and true altitude of each measurement cycle as arrays by name.
+
+        `shot_arrays` are the arrays of all shots of complete cycles, by name.
+        """
         cycle_starts = slice(None, None, self.shots_per_cycle)
         time, position = (
             shot_arrays["time"][cycle_starts],
@@ -270,12 +297,12 @@ class EyepointStudy(BlockStudy):
 
     @property
     def built_scene(self) -> BuiltScene:
-        """Scene of the study, built when it is first needed."""
+        """Meshes, bodies and surfaces of the study's scene, built when first needed."""
         return self._built_scene or get_built_scene(self.spec)
 
     @cached_property
     def _compute_eyepoints_keywords(self) -> dict[str, Any]:
-        """Arguments of :func:`compute_eyepoints` for the instrument and its flight."""
+        """Keyword arguments of `compute_eyepoints` that follow from the spec and the scanner."""
         return {
             "flight": self.spec.build_flight(),
             "scanner": self.spec.scan_pattern(self.scanner),
@@ -289,24 +316,30 @@ class EyepointStudy(BlockStudy):
 
 
 def _middles_of_equal_parts(n_items: int, n_parts: int) -> np.ndarray:
-    """Return the index in the middle of each of `n_parts` equal parts of `n_items` items."""
+    """Return the index of the middle item of each part, if items are cut into equal parts.
+
+    There are `n_items` items and `n_parts` parts, or as many parts as items if `n_parts` is larger.
+    """
     n_parts = min(n_parts, n_items)
     return np.asarray((2 * np.arange(n_parts) + 1) * n_items // (2 * n_parts))
 
 
 @lru_cache(maxsize=1)
 def get_built_scene(spec: SceneSpec) -> BuiltScene:
-    """Return the scene of a study, built or from the cache; the last one is kept in memory."""
+    """Return the scene of a spec, from the cache on disk or newly built.
+
+    The scene of the last call is kept in memory.
+    """
     return load_or_build_scene(spec, spec.build_scene)
 
 
 def height_above_surface(
     built_scene: BuiltScene, position: np.ndarray, time: float | np.ndarray
 ) -> np.ndarray:
-    """Return the height of positions (n, 3) above the surface straight below them [m].
+    """Return the heights (n,) of positions above the surface straight below them [m].
 
-    `time` [s] is one time for all positions, or (n,). The result is inf if nothing is below a
-    position.
+    `position` (n, 3) is in world coordinates [m]. `time` [s] is one time for all positions, or
+    (n,). The height is inf if nothing is below a position.
     """
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(
@@ -315,7 +348,7 @@ def height_above_surface(
 
 
 def below_surface_warning(spec: SceneSpec) -> str:
-    """Return a warning if the flight is below its scene at times; '' if it is not."""
+    """Return a warning if the platform is beneath a surface of the scene at times; '' otherwise."""
     built_scene, flight = get_built_scene(spec), spec.build_flight()
     time = np.linspace(flight.start_time, flight.stop_time, N_SAMPLED_FLIGHT_TIMES)
     position = flight.state(time).position
@@ -337,7 +370,7 @@ def below_surface_warning(spec: SceneSpec) -> str:
 
 
 def _body_poses(built_scene: BuiltScene, time: float | np.ndarray) -> list[Any]:
-    """Return position and attitude of each body of the scene; None for bodies at rest.
+    """Return the pose (position and attitude) of each body of a scene; None for a body at rest.
 
     `time` [s] is one time, or one time per ray.
     """
@@ -356,7 +389,7 @@ def refine_rays(
     accuracy: ErrorBudget,
     cast_more_rays: Callable[[np.ndarray, int], np.ndarray],
 ) -> None:
-    """Cast shots again with more rays, until the error of each is within the tolerance.
+    """Cast shots again with more rays, until the error of each shot is within the tolerance.
 
     Parameters
     ----------
@@ -382,9 +415,10 @@ def refine_rays(
 
 
 def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
-    """Return the arrays of a map of the scene's heights at the start of the flight.
+    """Return the layouts of a map of the scene's heights: its x, its y and its heights.
 
-    It covers the flight path and what the beams hit.
+    The heights are those at the start of the flight. The map covers the flight path and sampled
+    points that the beams hit.
     """
     built_scene = get_built_scene(spec)
     positions = np.concatenate(
@@ -423,7 +457,7 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
 
 
 def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -> np.ndarray:
-    """Return sampled positions of the platform, and of points that its beams hit, (n, 3) [m]."""
+    """Return positions (n, 3) [m] of the platform at sampled shots, and of the points hit."""
     from sweep.model.geometry.quaternion import rotate
 
     n_shots = spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)
@@ -442,7 +476,10 @@ def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -
 
 
 def _terrain_map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the x and y coordinates of the nodes of square cells that cover a rectangle [m]."""
+    """Return the x and the y coordinates of grid nodes whose square cells cover a rectangle [m].
+
+    `low` and `high` are opposite corners (x, y) of the rectangle [m].
+    """
     step = float((high - low).max()) / (TERRAIN_MAP_LONG_SIDE_NODES - 1)
     count = np.maximum(
         np.ceil((high - low) / step).astype(int) + 1, TERRAIN_MAP_SHORT_SIDE_NODES_MIN

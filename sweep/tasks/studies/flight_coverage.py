@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
 SAMPLED_RAYS_PER_SCANNER = 1 << 17
-"""Number of rays per scanner, spread over the flight, that sample what the scanner hits."""
+"""Largest number of rays, spread over the flight, that sample what a scanner hits."""
 
 MISSED_SHOTS_FRACTION_MAX = 0.01
 """Largest fraction of a scanner's shots that may hit nothing without a warning."""
 
 _N_SAMPLED_TIMES = 65
-"""Number of times in a flight at which platform and moving objects are located."""
+"""Number of instants in a flight at which platform and moving bodies are located."""
 
 
 class ScannerHits(NamedTuple):
@@ -34,9 +34,9 @@ class ScannerHits(NamedTuple):
     n_shots: int
     """Number of shots in the sample."""
     hit_fraction: float
-    """Fraction of the shots with at least one beamlet that hits something."""
+    """Fraction of the sampled shots with at least one beamlet that hits something."""
     partial_hit_fraction: float
-    """Fraction of the shots with some beamlets that hit something, and others that do not."""
+    """Fraction of the sampled shots of which some beamlets hit something and some hit nothing."""
     beams_without_hits: tuple[int, ...]
     """Numbers of the beams whose sampled shots all hit nothing."""
 
@@ -57,14 +57,14 @@ class FlightCoverage(NamedTuple):
     """Sampled hits of each scanner of a flight, and the bounding boxes of path and scene."""
 
     scanner_hits: tuple[ScannerHits, ...]
-    """Sampled hits of each scanner."""
+    """Hits of sampled shots, one record for each scanner."""
     path_bounding_box: np.ndarray
     """Smallest and largest coordinates of the platform along its path, (2, 3) [m]."""
     scene_bounding_box: np.ndarray
     """Smallest and largest coordinates of the scene's bodies, (2, 3) [m]."""
 
     def extents_text(self) -> str:
-        """Return a text with the ranges of coordinates that the path and the scene span."""
+        """Return a text with the ranges of x, y and z that the path and the scene span."""
         return (
             f"the path spans {_box_text(self.path_bounding_box)}, "
             f"and the scene {_box_text(self.scene_bounding_box)}"
@@ -73,7 +73,7 @@ class FlightCoverage(NamedTuple):
     def warnings(self) -> Iterator[str]:
         """Yield a warning for each scanner with too many shots that hit nothing.
 
-        The limit is `MISSED_SHOTS_FRACTION_MAX`.
+        More than `MISSED_SHOTS_FRACTION_MAX` of a scanner's sampled shots are too many.
         """
         mostly_missing = [
             scanner
@@ -86,9 +86,9 @@ class FlightCoverage(NamedTuple):
 
 @lru_cache(maxsize=1)
 def sample_coverage(spec: SceneSpec) -> FlightCoverage:
-    """Cast sampled shots of each scanner. Return their hits, and the extents of path and scene.
+    """Cast sampled shots of each scanner of a flight. Return hits, and extents of path and scene.
 
-    The result is cached.
+    The result of the last call is cached.
     """
     built_scene, flight = get_built_scene(spec), spec.build_flight()
     times = np.linspace(flight.start_time, flight.stop_time, _N_SAMPLED_TIMES)
@@ -100,7 +100,7 @@ def sample_coverage(spec: SceneSpec) -> FlightCoverage:
 
 
 def refuse_flight_without_hits(spec: SceneSpec) -> None:
-    """Raise a SceneError, which states the reason, if none of the sampled beams hits anything."""
+    """Raise a SceneError with reason and remedy if no sampled beam of a flight hits anything."""
     flight_coverage = sample_coverage(spec)
     if any(scanner.hit_fraction for scanner in flight_coverage.scanner_hits):
         return
@@ -117,7 +117,7 @@ def refuse_flight_without_hits(spec: SceneSpec) -> None:
 
 
 def _sample_scanner_hits(spec: SceneSpec, name: str) -> ScannerHits:
-    """Cast a sample of the shots of one scanner. Return its hits."""
+    """Cast a sample of the shots of one scanner. Return the scanner's hits."""
     study = EyepointStudy(spec, name)
     n_shots_max, shots_per_cycle = (
         max(1, SAMPLED_RAYS_PER_SCANNER // study.n_beamlets),
@@ -149,7 +149,10 @@ def _sample_scanner_hits(spec: SceneSpec, name: str) -> ScannerHits:
 
 
 def _body_corners(built_scene: BuiltScene, times: np.ndarray) -> np.ndarray:
-    """Return corners (n, 3) [m] of boxes that contain all bodies, moving ones at all times."""
+    """Return opposite corners (n, 3) [m] of boxes that contain the bodies of a scene.
+
+    A moving body has a box at each of the given times (k,) [s]; a body at rest has one box.
+    """
     corners = []
     for mesh, body in zip(built_scene.caster.meshes, built_scene.body_motions, strict=True):
         box = _bounding_box(mesh.vertices) + mesh.origin
@@ -162,7 +165,7 @@ def _body_corners(built_scene: BuiltScene, times: np.ndarray) -> np.ndarray:
 
 
 def _bounding_box(points: np.ndarray) -> np.ndarray:
-    """Return the least and largest coordinates of points (n, 3), as (2, 3)."""
+    """Return the smallest and the largest coordinates of points (n, 3), as an array (2, 3)."""
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
@@ -176,7 +179,10 @@ def _box_text(box: np.ndarray) -> str:
 
 
 def _percent_text(fraction: float) -> str:
-    """Return a fraction in per cent, never rounded to 0 or 100 %."""
+    """Return a fraction as text in per cent, such as '12 %'.
+
+    Fractions near 0 or 1 give 'under 0.1 %' or 'over 99.9 %', unless they are exactly 0 or 1.
+    """
     if 0.0 < fraction < 0.001:
         return "under 0.1 %"
     return "over 99.9 %" if 0.999 < fraction < 1.0 else f"{100 * fraction:.3g} %"
