@@ -41,7 +41,7 @@ class ScannerHits(NamedTuple):
     """Numbers of the beams whose sampled shots all hit nothing."""
 
     def hits_text(self) -> str:
-        """Return the hits as a sentence."""
+        """Return a sentence on the fraction of shots with hits, and on beams without hits."""
         sentence = f"{_percent_text(self.hit_fraction)} of the shots hit something"
         if self.partial_hit_fraction:
             sentence += f", {_percent_text(self.partial_hit_fraction)} with a part of their light"

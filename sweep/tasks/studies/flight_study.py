@@ -78,16 +78,22 @@ if TYPE_CHECKING:
 FLIGHT_RANDOM_KEY_DOMAIN = "sweep.flight"
 """Text that, with the seed and a shot's number, determines the random numbers of the shot's draws.
 
-The draws are the same at every point of the axes and for every instrument.
+These random numbers are the same at every point of the axes and for every instrument.
 """
 
 GEOMETRY_OUTPUTS = SHOT_GEOMETRY_VARIABLES | CYCLE_VARIABLES
-"""Output variables of the geometry of shots and cycles, which do not depend on the axes."""
+"""Output variables, by name, of the geometry of shots and of cycles.
+
+The geometry does not depend on the axes of a flight study.
+"""
 
 
 @cache
 def flag_array_attributes() -> dict[str, dict[str, Any]]:
-    """Return CF convention attributes of arrays of flags and of categories, by array name."""
+    """Return the CF attributes of arrays of flags or categories, by array name.
+
+    CF are the Climate and Forecast conventions for metadata.
+    """
     from sweep.model.pointcloud.navigation import (
         STATUS_EXCLUDED,
         STATUS_SOLVED,
@@ -116,11 +122,11 @@ class FlightBlock(NamedTuple):
     scanner: str
     """Name of the scanner."""
     axis_indices: tuple[int, ...]
-    """Index along each axis of the point of the axes."""
+    """Indices of the block's point along the study's axes, one index per axis."""
     draws: range
-    """Numbers of the draws."""
+    """Numbers of the draws in the block."""
     cycles: range
-    """Numbers of the measurement cycles."""
+    """Numbers of the measurement cycles in the block."""
 
 
 class ScannerBlockGrid(ParameterGrid, BlockGrid):
@@ -168,9 +174,10 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Return the values along each dimension of the grid.
+        """Return a list with a dict for each dimension of the grid: the values along it, by name.
 
-        The keys are parameter paths for axes, and `draw` and `cycle` for the other dimensions.
+        The names are dotted parameter paths for an axis, `draw` for the draws, and `cycle` for the
+        cycles.
         """
         draw_values = {"draw": np.arange(self.n_draws)}
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
@@ -181,7 +188,7 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
         return self.shots_per_cycle >= NAVIGATION_SHOTS_PER_CYCLE_MIN
 
     def flight_block(self, block_in_grid: int) -> FlightBlock:
-        """Return the block of this scanner with a given number, as axis point, draws and cycles."""
+        """Return the axis point, draws and cycles of a block, given its number in this grid."""
         *axis_ranges, draws, cycles = (
             range(block_slice.start, block_slice.stop)
             for block_slice in self.block_slices(block_in_grid)
@@ -191,16 +198,23 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
         )
 
     def first_block_at_axes_point(self, axis_indices: tuple[int, ...]) -> FlightBlock:
-        """Return the block with the first draws and cycles at a point of the axes."""
+        """Return the block with the first draws and first cycles at a point of the axes.
+
+        `axis_indices` are the indices of the point along the axes.
+        """
         return self.flight_block(self.block_at((*axis_indices, 0, 0)))
 
 
 DRAWN_SHOTS_MAX = 10**10
-"""Largest product of a scanner's shots, draws and points of the axes."""
+"""Largest permitted number of a scanner's shots, in all draws and at all points of the axes."""
 
 
 def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
-    """Raise a SpecError for too many shots, before any array of them is made."""
+    """Raise a SpecError if a scanner makes more than `DRAWN_SHOTS_MAX` shots in all draws.
+
+    `n_shots` is the scanner's number of shots at one point of the axes and in one draw. Arrays of
+    all shots are only made after this check.
+    """
     n_draws = int(spec.draws.number)
     all_shots = n_shots * n_draws * math.prod(int(axis.size) for axis in spec.axes)
     if all_shots > DRAWN_SHOTS_MAX:
@@ -215,7 +229,7 @@ class LocatedFlightBlock(NamedTuple):
     """Block of a flight, with the grid of its scanner."""
 
     grid: ScannerBlockGrid
-    """Grid of the scanner's blocks."""
+    """Grid of all blocks of the block's scanner."""
     flight_block: FlightBlock
     """Scanner, point of the axes, draws and cycles of the block."""
 
@@ -224,18 +238,21 @@ class SimulatedGroup(NamedTuple):
     """Results of shots that were simulated together."""
 
     shot_rows: np.ndarray
-    """Indices (m,) of the shots among all shots that are to be simulated."""
+    """Indices (m,) of the group's shots among the shots passed to the simulation."""
     results: Results
-    """Arrays (m, ...) of results by the name of the output variable."""
+    """Results of the m shots: arrays (m, ...) by the name of the output variable."""
 
 
 class ReusedCloud(NamedTuple):
     """Results of a flight's block that are taken from the store of a smaller study."""
 
     is_reused: np.ndarray
-    """True (shots, draws) where the results are taken from the smaller study."""
+    """True (shots, draws) where results are taken from the smaller study's store."""
     results: Results
-    """Arrays of results by name: (shots or cycles, draws, ...), or (shots, ...) without draws."""
+    """Arrays by output variable: (shots or cycles, draws, ...), or (shots, ...) if without draws.
+
+    Results that are not reused have fill values, or values that are replaced later.
+    """
 
 
 class FlightStudy(ExtendableStudy):
@@ -254,41 +271,43 @@ class FlightStudy(ExtendableStudy):
 
     @property
     def grids(self) -> list[ScannerBlockGrid]:
-        """Grids of blocks, one for each scanner."""
+        """Grids that divide the flight into blocks, one grid for each scanner."""
         return list(self.scanner_grids.values())
 
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True if the tolerance sets the number of rays, or other numerics of shots."""
+        """Return True if the tolerance sets the number of rays or other numerics of shots.
+
+        The answer is the same for all blocks.
+        """
         return bool(
             self.spec.is_ray_number_set_by_tolerance
             or has_numerics_set_by_tolerance(self.spec.parameters())
         )
 
     def locate_flight_block(self, block: int) -> LocatedFlightBlock:
-        """Return the grid of a block's scanner, and the block within this grid.
+        """Return a block, given its number in the study, and the grid of its scanner.
 
-        IndexError is raised if there is no such block.
+        IndexError is raised if the study has no block with this number.
         """
         grid, block_in_grid = self.locate_block(block)
         scanner_grid = self.scanner_grids[grid.group]
         return LocatedFlightBlock(scanner_grid, scanner_grid.flight_block(block_in_grid))
 
     def block_of_first_draws(self, block: int) -> int:
-        """Return the block with the first draws of a block's shots.
+        """Return the number of the block that holds the first draws of the shots in block `block`.
 
-        It also holds the results that do not depend on draws.
+        The block with the first draws also holds the results that do not depend on draws.
         """
         grid, block_in_grid = self.locate_block(block)
         *axis_positions, _, cycle_position = grid.block_position(block_in_grid)
         return block - block_in_grid + grid.block_at((*axis_positions, 0, cycle_position))
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return title, question, spec, names of scanners and surfaces, and origins.
+        """Return the attributes of the store by name: title, spec, scanners, surfaces, origins.
 
         ``projection`` is the WKT of the coordinates in the scene's files, or empty. ``origin`` [m]
-        is the position in these coordinates that has the coordinates 0 in the store.
-        ``time_origin`` [s], a decimal with all its digits, is the time in these files at which time
-        is 0 in the store.
+        is the position, in these coordinates, of the store's coordinates 0. ``time_origin`` [s], a
+        decimal with all its digits, is the time in these files that is time 0 in the store.
         """
         return {
             "kind": "scene",
@@ -303,7 +322,11 @@ class FlightStudy(ExtendableStudy):
         }
 
     def group_attributes(self) -> dict[str, dict[str, Any]]:
-        """Return the attributes of each scanner's group, and of the group of the map."""
+        """Return the attributes, by name, of each group of the store.
+
+        The store has a group for each scanner, and a group without attributes for the map of
+        heights.
+        """
         coordinate_names = " ".join(
             member.coordinate_name for axis in self.spec.axes for member in axis.parameters
         )
@@ -317,7 +340,10 @@ class FlightStudy(ExtendableStudy):
         } | {TERRAIN_MAP_GROUP: {}}
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the map of the scene, and the axis coordinates in the group of each scanner."""
+        """Return the layouts of the arrays known in advance: map of heights, and axis coordinates.
+
+        The axis coordinates are repeated in the group of each scanner.
+        """
         return terrain_map_layouts(self.spec) + [
             replace(layout, name=f"{scanner}/{layout.name}")
             for scanner in self.scanner_grids
@@ -325,7 +351,10 @@ class FlightStudy(ExtendableStudy):
         ]
 
     def output_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of geometry, statistics, points and navigation of each scanner."""
+        """Return the layouts of the arrays that blocks write.
+
+        Each scanner has arrays of geometry, statistics, points, and perhaps navigation.
+        """
         axis_names = tuple(axis.name for axis in self.spec.axes)
         sizes = VECTOR_DIM_SIZES | {"return_number": int(self.spec.draws.returns)}
         layouts = []
@@ -349,9 +378,10 @@ class FlightStudy(ExtendableStudy):
         return layouts
 
     def evaluate(self, block: int) -> Results:
-        """Compute point cloud, statistics and navigation of a block.
+        """Compute point cloud, statistics and navigation of a block. Return arrays by name.
 
-        Effects are selected for complete tiles, which may extend beyond the block.
+        Effects are selected for complete tiles (runs of consecutive shots), which may extend beyond
+        the block.
         """
         scanner_grid, flight_block = self.locate_flight_block(block)
         first_shot, shots_end = (
@@ -398,7 +428,7 @@ class FlightStudy(ExtendableStudy):
         return chunks
 
     def compile_kernels(self) -> None:
-        """Compile radiometry and navigation, by the first cycle of each scanner."""
+        """Compile all kernels, by simulating the first measurement cycle of each scanner."""
         for scanner_grid in self.grids:
             flight_block = scanner_grid.flight_block(0)._replace(draws=range(1))
             shot_range = range(scanner_grid.shots_per_cycle)
@@ -414,7 +444,10 @@ class FlightStudy(ExtendableStudy):
     def select_effects(
         self, flight_block: FlightBlock, eyepoints: Eyepoints, shot_numbers: np.ndarray
     ) -> SelectedEffects:
-        """Return the effects simulated at shots with rising numbers `shot_numbers` (n,)."""
+        """Return the effects that are simulated at each of n shots.
+
+        `shot_numbers` (n,) are the rising numbers of the shots, `eyepoints` is their geometry.
+        """
         n_shots = len(shot_numbers)
         effect_plan = self.plan_effects(flight_block, eyepoints, shot_numbers // SHOTS_PER_TILE)
         no_effects = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
@@ -423,9 +456,10 @@ class FlightStudy(ExtendableStudy):
     def plan_effects(
         self, flight_block: FlightBlock, eyepoints: Eyepoints, tile_numbers: np.ndarray
     ) -> ShotEffectPlan | None:
-        """Choose the effects of shots, given the rising numbers (n,) of their tiles.
+        """Choose the effects of n shots, given their geometry and their rising tile numbers (n,).
 
-        A tile is a run of consecutive shots whose effects are chosen together.
+        A tile is a run of consecutive shots whose effects are chosen together. The result is None
+        if no shot hits anything.
         """
         return plan_shot_effects(
             eyepoints,
@@ -448,10 +482,11 @@ class FlightStudy(ExtendableStudy):
         *,
         solves_navigation: bool = True,
     ) -> Results:
-        """Simulate radiometry, draws and navigation of shots that make complete measurement cycles.
+        """Simulate radiometry, draws and navigation of complete measurement cycles.
 
-        Results that ``reused_cloud`` holds are not simulated again. If ``solves_navigation`` is
-        False, the shots need not make complete cycles.
+        Return arrays by name. Results that ``reused_cloud`` holds are not simulated again. If
+        ``solves_navigation`` is False, the shots need not make complete cycles, and navigation gets
+        fill values.
         """
         scanner_grid = self.scanner_grids[flight_block.scanner]
         n_draws, shots_per_cycle = len(flight_block.draws), scanner_grid.shots_per_cycle
@@ -482,7 +517,7 @@ class FlightStudy(ExtendableStudy):
     def _empty_cloud(
         self, scanner_grid: ScannerBlockGrid, n_shots: int, n_draws: int
     ) -> ReusedCloud:
-        """Return a cloud without reused results: arrays that contain their fill values."""
+        """Return a `ReusedCloud` in which nothing is reused, and all results are fill values."""
         outputs = (
             SHOT_STATISTIC_VARIABLES
             | POINT_CLOUD_VARIABLES
@@ -504,9 +539,10 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         simulate_cloud: CloudSimulator,
     ) -> Iterator[SimulatedGroup]:
-        """Yield indices and results of shots, in groups that are simulated together.
+        """Yield the results of the shots at indices `rows`, in groups that are simulated together.
 
-        Shots that need more rays are cast and simulated again.
+        A shot whose error by the number of rays exceeds the tolerance is simulated again with more
+        rays.
         """
         for members, effect_names, effect_flags in selected_effects.subset(
             rows
@@ -531,7 +567,11 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         effect_flags: np.ndarray,
     ) -> Results:
-        """Return the points of shots, given their geometry (eyepoints), numbers and effects."""
+        """Return the points and statistics of shots as arrays by name, for some draws of a block.
+
+        `draw_slice` are the draws in the block. The effects to simulate are `effect_names`, or for
+        each shot the bits of `effect_flags`.
+        """
         from sweep.model.pointcloud.error_floor import apply_error_floor
         from sweep.model.pointcloud.point_cloud import simulate_cloud
         from sweep.model.sampling.philox import point_keys
@@ -575,7 +615,7 @@ class FlightStudy(ExtendableStudy):
         results: Results,
         simulate_group: Callable[[Eyepoints, np.ndarray, np.ndarray], Results],
     ) -> None:
-        """Replace the results of shots that need more rays."""
+        """Simulate shots that need more rays again, and replace their `results` in place."""
         assert self.ray_error_budget is not None
 
         def cast_more_rays(rows: np.ndarray, n_rays_now: int) -> np.ndarray:
@@ -599,7 +639,11 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         draw_slice: slice,
     ) -> Results:
-        """Return velocity and altitude of complete measurement cycles, for some draws."""
+        """Return velocity and altitude of measurement cycles as arrays by name, for some draws.
+
+        `rows` are the indices of the cycles' shots in `shot_arrays` and `results`; the cycles are
+        complete. `draw_slice` are the draws.
+        """
         from sweep.model.pointcloud.navigation import solve_navigation
 
         row_index = slice(None) if rows.size == len(results["flags"]) else rows
@@ -620,7 +664,10 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _read_reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
-        """Read results of a block that the smaller study has computed with the same effects."""
+        """Return the results of a block that the smaller study has computed with equal effects.
+
+        A shot with other effects, or without readable results, is marked as not reused.
+        """
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
             self.reuse_source,
@@ -683,7 +730,7 @@ class FlightStudy(ExtendableStudy):
         return reused_cloud
 
     def parameters_at(self, flight_block: FlightBlock) -> Mapping[str, Any]:
-        """Return the SI values of all parameters at a block's point of the axes, by dotted path."""
+        """Return the SI values of all parameters, by dotted path, at the axis point of a block."""
         scanner_grid = self.scanner_grids[flight_block.scanner]
         return scanner_grid.fixed_parameters | {
             path: axis_values[index].item()
@@ -709,7 +756,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def motion_priors(self) -> MotionPriors:
-        """Standard deviations, from the spec, of motion that the instrument does not measure."""
+        """Standard deviations, from the spec, of motions that the instrument does not measure."""
         from sweep.model.pointcloud.ego_motion import MotionPriors
 
         navigation_section = self.spec.navigation
@@ -721,12 +768,12 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
-        """Materials of the scene's surfaces, in the order of the surface numbers."""
+        """Materials of the scene's surfaces; the surface number is the index."""
         return tuple(self.spec.surface_materials())
 
     @cached_property
     def ray_error_budget(self) -> ErrorBudget | None:
-        """Accuracy from which each shot's number of rays follows; None if the number is given."""
+        """Error budget that sets each shot's number of rays; None if the spec states the number."""
         return (
             ErrorBudget.from_parameters(self.spec.parameters())
             if self.spec.is_ray_number_set_by_tolerance
@@ -734,9 +781,9 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
-        """Open a scanner's store of shot geometry (eyepoints).
+        """Open the store of a scanner's shot geometry (eyepoints). Return its arrays by name.
 
-        Return its arrays by name, and the power fractions of the beamlets.
+        Only the power fractions of the beamlets, ``weight``, are read at once.
         """
         group = open_verified_group(
             eyepoint_store_location(self.store_path, self.spec.geometry_id(scanner))
@@ -750,7 +797,7 @@ class FlightStudy(ExtendableStudy):
     def _read_eyepoint_arrays(
         self, scanner: str, names: Mapping[str, Any], index_range: range
     ) -> Results:
-        """Read arrays of a scanner's shot geometry (eyepoints) for some shots or cycles."""
+        """Read named arrays of a scanner's shot geometry, for a range of shots or cycles."""
         arrays = self._get_eyepoint_arrays(scanner)
         return {
             name: np.asarray(arrays[name][index_range.start : index_range.stop]) for name in names
@@ -759,7 +806,10 @@ class FlightStudy(ExtendableStudy):
     def _read_shots_and_eyepoints(
         self, scanner: str, shot_range: range
     ) -> tuple[Results, Eyepoints]:
-        """Read the stored geometry of some shots. Return it as arrays and as `Eyepoints`."""
+        """Read the geometry of a range of shots.
+
+        Return the same shots as arrays by name and as `Eyepoints`.
+        """
         from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
         shot_arrays = self._read_eyepoint_arrays(scanner, SHOT_GEOMETRY_VARIABLES, shot_range)
@@ -769,12 +819,15 @@ class FlightStudy(ExtendableStudy):
         )
 
     def eyepoint_studies(self) -> list[EyepointStudy]:
-        """Return the studies that cast the eyepoints of this one, one per scanner."""
+        """Return the studies that compute the shot geometry of this flight, one per scanner."""
         return [self.get_eyepoint_study(scanner) for scanner in self.scanner_grids]
 
 
 def _iter_shots_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
-    """Yield the indices of shots that lack the same run of draws, and the slice of these draws."""
+    """Yield indices of shots that lack the same consecutive draws, and the slice of these draws.
+
+    `is_missing` (shots, draws) is True for each draw that a shot lacks.
+    """
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):
         rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)
@@ -786,7 +839,10 @@ def _iter_shots_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarr
 def _insert_results(
     results: Results, rows: np.ndarray, draw_index: slice | np.ndarray, part_results: Results
 ) -> None:
-    """Copy the results of some shots and draws into the arrays of all of them."""
+    """Copy the results of some shots and draws into `results`, the arrays of all shots, in place.
+
+    `rows` are the indices of the shots or cycles, `draw_index` those of the draws.
+    """
     for name, values in part_results.items():
         results[name][rows if name in SHOT_STATISTIC_VARIABLES else (rows, draw_index)] = values
 
@@ -797,14 +853,14 @@ class ShotEffectPlan(NamedTuple):
     hitting_shots: np.ndarray
     """Indices (m,) of the shots that hit something."""
     tile_index: np.ndarray
-    """Index (m,) in `tile_plan` of the tile of each shot that hits something."""
+    """Index (m,) in `tile_plan` of the tile of each shot in `hitting_shots`."""
     tile_plan: EffectPlan
-    """Plan of the tiles (runs of shots with common effects)."""
+    """Plan of effects for each tile, a run of shots with common effects."""
 
     def selected_effects(self, n_shots: int) -> SelectedEffects:
-        """Return the effects simulated at each of `n_shots` shots.
+        """Return the effects that are simulated at each of `n_shots` shots.
 
-        Shots without a hit have none.
+        A shot that hits nothing has no effects.
         """
         selected = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
         selected.effect_flags[self.hitting_shots] = pack_effect_flags(self.tile_plan.is_kept)[
@@ -857,9 +913,10 @@ def plan_shot_effects(
 
 
 def _find_tile_runs(tile_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges of runs of equal tile numbers, and the run to which each element belongs.
+    """Return the edges of runs of equal tile numbers, and the run of each element.
 
-    There is at least one run.
+    The tile numbers are (n,). The edges (runs + 1,) are the indices of the first element of each
+    run, and n. The run of each element is an index (n,).
     """
     starts_new_run = np.diff(tile_numbers) != 0
     run_edges = np.concatenate([[0], np.flatnonzero(starts_new_run) + 1, [tile_numbers.size]])

@@ -74,10 +74,10 @@ if TYPE_CHECKING:
 
 
 def canonical_point_rows(parameters: Mapping[str, ParameterValue], n_points: int) -> np.ndarray:
-    """Return rows of float64 (n_points, parameters) that identify points by their parameters alone.
+    """Return a float64 row for each point, (n_points, parameters), made of its parameters.
 
-    A row contains all parameters of a point, sorted by path. Strings are represented by 62 bits of
-    their hash.
+    Points have equal rows if their parameters are equal. The parameters are sorted by dotted path.
+    A string is represented by 62 bits of its hash.
     """
     rows = np.empty((n_points, len(parameters)), dtype=np.uint64)
     for column, path in enumerate(sorted(parameters)):
@@ -86,7 +86,7 @@ def canonical_point_rows(parameters: Mapping[str, ParameterValue], n_points: int
 
 
 def _value_bits(value: ParameterValue) -> np.ndarray:
-    """Return values as uint64, for comparison: bits of their float64, or hashes of strings."""
+    """Return values as uint64 for comparison: bits of float64 numbers, or hashes of strings."""
     array = np.asarray(value)
     if array.dtype.kind == "U":
         names, inverse = np.unique(array, return_inverse=True)
@@ -97,7 +97,7 @@ def _value_bits(value: ParameterValue) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _text_hash(word: str) -> int:
-    """Return the first 62 bits of a string's hash, as an integer."""
+    """Return a hash of a string as an integer of 62 bits."""
     # 62 bits: as a float64 with the upper two bits clear the hash is never nan
     digest = hashlib.blake2b(word.encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 2
@@ -107,9 +107,9 @@ EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY = "effects", "effects_error"
 """Names of the arrays with the simulated effects, and with the error bound of the omitted ones."""
 
 POINTS_PER_TILE_MAX = 1024
-"""Largest number of points of a tile, a box of points whose effects are chosen together.
+"""Largest number of points of a tile, a box of grid points whose effects are chosen together.
 
-It is small enough for similar points, and large enough for cheap planning.
+The limit keeps the points of a tile similar, and the planning of effects cheap.
 """
 
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
@@ -126,39 +126,42 @@ PARAMETERS_CONSTANT_IN_TILE = (
     LOOKS_VOTES_PATH,
     TOLERANCE_PARAMETER,
 )
-"""Numeric parameters whose values must be equal in a tile: sizes of records, and the tolerance."""
+"""Dotted paths of numeric parameters that must be equal at all points of a tile.
+
+They set the sizes of records, the number of beamlets or looks, or the tolerance.
+"""
 
 
 class PointsWithSameEffects(NamedTuple):
     """Points at which the same effects are simulated."""
 
     point_indices: np.ndarray
-    """Indices (m,) of the points."""
+    """Indices (m,) of these points among all points whose effects were selected."""
     effect_names: tuple[str, ...]
-    """Names of the effects."""
+    """Names of the effects that are simulated at all these points."""
 
 
 class PointsComputedTogether(NamedTuple):
     """Points that are computed together though their effects may differ."""
 
     point_indices: np.ndarray
-    """Indices (m,) of the points."""
+    """Indices (m,) of these points among all points whose effects were selected."""
     effect_names: tuple[str, ...]
-    """Names of the effects that are simulated at any of the points."""
+    """Names of the effects that are simulated at one or more of these points."""
     effect_flags: np.ndarray
-    """Effects of each point, (m,) of uint32: bit k for the k-th effect of the catalogue."""
+    """Effects of each point as a bit mask (m,) uint32: bit k is effect k of the catalogue."""
 
 
 class SelectedEffects(NamedTuple):
     """Effects that are simulated at each of n points, one bit per effect."""
 
     effect_flags: np.ndarray
-    """Effects of each point, (n,) of uint32: bit k for the k-th effect of the catalogue."""
+    """Effects of each point as a bit mask (n,) uint32: bit k is effect k of the catalogue."""
     error_bound: np.ndarray
-    """Upper bound (n,) of the change that all omitted effects together would cause."""
+    """Upper bound (n,) of the change by all effects that are omitted at a point."""
 
     def subset(self, index: slice | np.ndarray) -> SelectedEffects:
-        """Return the effects of some of the points."""
+        """Return the effects of the points at an index or slice, as a new record."""
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
     def iter_groups_by_effects(self) -> Iterator[PointsWithSameEffects]:
@@ -172,7 +175,11 @@ class SelectedEffects(NamedTuple):
     def iter_groups_computed_together(
         self,
     ) -> Iterator[PointsComputedTogether]:
-        """Yield groups of points that are computed together though their effects may differ."""
+        """Yield groups of points that are computed together, with the effects of each point.
+
+        The points of a group share those effects that need a batch of their own; other effects may
+        differ.
+        """
         separating_flags = self.effect_flags & SEPARATE_BATCHES_MASK
         for shared_flags in np.unique(separating_flags):
             index = np.flatnonzero(separating_flags == shared_flags)
@@ -188,13 +195,15 @@ class TileGroup(NamedTuple):
     """
 
     group_number: int
-    """Number of the group in the grid."""
+    """Number that distinguishes the group from other groups of the grid."""
     requested_indices: np.ndarray
-    """Indices (m,) of the tiles among those that were requested from `TileGrid.group_tiles`."""
+    """Indices (m,) of the group's tiles in the array of tiles passed to `TileGrid.group_tiles`."""
     parameters: dict[str, ParameterValue]
-    """Parameters by dotted path: strings, numbers, and arrays that broadcast over (m, *tile).
+    """Parameters of the tiles' points by dotted path.
 
-    Tiles that are cut by the edge of the grid repeat their last points.
+    Values are strings, numbers, or arrays that broadcast over (m, k1, k2, ...), with k1, k2, ...
+    points of a tile along the axes. A tile that is cut by the edge of the grid repeats its last
+    points.
     """
 
 
@@ -202,18 +211,18 @@ class BlockTiles(NamedTuple):
     """Tiles that overlap a block."""
 
     tile_numbers: np.ndarray
-    """Numbers (m,) of the tiles in the grid."""
+    """Numbers (m,) in the grid of the tiles that overlap the block."""
     tile_index: np.ndarray
-    """Index (n,) in `tile_numbers` for each point of the block, in C order."""
+    """Index (n,) in `tile_numbers` of the tile of each point of the block, in C order."""
 
 
 class TilePlans(NamedTuple):
     """Effects that were chosen for a batch of tiles."""
 
     requested_indices: np.ndarray
-    """Indices (m,) of the tiles among those that were requested from the planner."""
+    """Indices (m,) of these tiles in the array of tiles passed to the planner."""
     effect_plan: EffectPlan
-    """Plan of the m tiles."""
+    """Choice of effects for these m tiles."""
 
 
 class TileGrid(BlockGrid):
@@ -231,7 +240,7 @@ class TileGrid(BlockGrid):
         super().__init__(grid.dims, grid.shape, fit_tile_shape(grid.shape, self._is_constant_axis))
 
     def tiles_of_block(self, block: int) -> BlockTiles:
-        """Return the tiles that overlap a block, and for each point the index of its tile."""
+        """Return the numbers of the tiles that overlap a block, and the tile of each point."""
         tile_indices = [
             np.arange(block_slice.start, block_slice.stop) // tile_length
             for block_slice, tile_length in zip(
@@ -248,10 +257,11 @@ class TileGrid(BlockGrid):
         return BlockTiles(tiles, tile_index.ravel())
 
     def group_tiles(self, tiles: np.ndarray, stride: int = 1) -> Iterator[TileGroup]:
-        """Yield the groups of tiles that can be planned together, with their points' parameters.
+        """Yield groups of tiles that can be planned together, with the parameters of their points.
 
-        ``tiles`` are the numbers of the tiles. With a ``stride`` n only some points are sampled:
-        every n-th along each axis, and the point with the largest value of each parameter.
+        ``tiles`` are the numbers of the tiles. With ``stride`` 1 all points of a tile are included.
+        With a larger ``stride`` n, only some points are included: every n-th along each axis, and
+        the point with the largest value of each parameter.
         """
         positions = np.unravel_index(tiles, self.blocks_per_dim) if self.blocks_per_dim else ()
         group_codes = np.zeros(len(tiles), np.int64)
@@ -268,7 +278,7 @@ class TileGrid(BlockGrid):
             yield TileGroup(int(group_code), members, parameters)
 
     def _is_constant_in_tile(self, axis: int) -> bool:
-        """Return True if an axis must have a single value within a tile.
+        """Return True if a tile must have one value along the axis with number `axis`.
 
         Such an axis varies a text parameter or a :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the
         FFT size.
@@ -283,11 +293,11 @@ class TileGrid(BlockGrid):
     def _values_along_axis(
         self, axis: int, tile_index_along: np.ndarray, stride: int
     ) -> dict[str, ParameterValue]:
-        """Return the values along an axis at the points of m tiles, by parameter path.
+        """Return the parameter values along an axis at the points of m tiles, by dotted path.
 
-        ``tile_index_along`` (m,) are the positions of the tiles along the axis. The arrays have the
-        shape (m, 1, ..., k, ..., 1), with k points of a tile along the axis. If the axis is
-        constant in a tile, the values are scalars.
+        ``tile_index_along`` (m,) are the positions of the tiles along the axis. The values have the
+        shape (m, 1, ..., k, ..., 1), with k points of a tile along the axis. They are scalars if
+        the axis has one value per tile. ``stride`` is that of `group_tiles`.
         """
         members = self.grid.values_by_axis[axis]
         if self._is_constant_axis[axis]:
@@ -314,9 +324,11 @@ class TileGrid(BlockGrid):
 
 
 def fit_tile_shape(sizes: tuple[int, ...], is_constant: tuple[bool, ...]) -> tuple[int, ...]:
-    """Return the number of points of a tile along each axis.
+    """Return the number of points of a tile along each axis of a grid.
 
-    The numbers are about equal, but 1 along axes that must be constant within a tile.
+    `sizes` are the numbers of points of the grid along the axes. The numbers of a tile are about
+    equal, but 1 along an axis that `is_constant` marks: a tile has a single value along such an
+    axis.
     """
     shape, points_left = [1] * len(sizes), POINTS_PER_TILE_MAX
     divisible_axes = sorted(
@@ -343,10 +355,10 @@ class EffectPlanner:
     def select_for_block(
         self, block: int, indices_in_block: np.ndarray | None = None
     ) -> SelectedEffects:
-        """Return the effects simulated at a block's points, in C order, or at some of them.
+        """Return the effects that are simulated at each point of a block, in C order.
 
-        `indices_in_block` (m,) are indices of points in the block; by default all. Only their tiles
-        are planned.
+        If `indices_in_block` (m,) is given, only the points of the block with these indices are
+        considered, and only their tiles are planned.
         """
         tiles, tile_index = self.tiles.tiles_of_block(block)
         parameters = self.tiles.grid.parameters_of_block(block)
@@ -379,9 +391,10 @@ class EffectPlanner:
     def absent_effect_flags(
         self, parameters: Mapping[str, ParameterValue], n_points: int
     ) -> np.ndarray:
-        """Return the effects that are absent at each point (n,), one bit each.
+        """Return the effects that are absent at each point as a bit mask (n_points,) uint32.
 
-        They stay absent there even if they are chosen for the point's tile.
+        Bit k is effect k of the catalogue. An absent effect has no cause at the point. It is not
+        simulated at the point even if it is chosen for the point's tile.
         """
         inactive_bits = np.zeros(n_points, np.uint32)
         for bit, effect in enumerate(EFFECT_CATALOGUE):
@@ -390,9 +403,9 @@ class EffectPlanner:
         return inactive_bits
 
     def iter_tile_plans(self, tiles: np.ndarray) -> Iterator[TilePlans]:
-        """Yield batches of tiles: their indices in the array `tiles`, and their effect plan.
+        """Yield the effects chosen for batches of tiles; every tile in `tiles` is in one batch.
 
-        A tile is planned from a few of its points first. If that plan simulates every optional
+        A tile is first planned from a few of its points. If this plan simulates every optional
         effect, it is final. Otherwise the tile is planned again from all its points.
         """
         tile_lengths = [tile_length for tile_length in self.tiles.block_shape if tile_length > 1]
@@ -427,7 +440,7 @@ class EffectPlanner:
             )
 
     def _plan_group(self, tile_group: TileGroup) -> EffectPlan:
-        """Return the choice of effects for the tiles of a group."""
+        """Return the effects chosen for each tile of a group."""
         from sweep.model.effects.planning import plan_effects
 
         parameters, n_tiles = tile_group.parameters, len(tile_group.requested_indices)
@@ -449,7 +462,7 @@ class EffectPlanner:
 def block_output_variables(spec: GridSpec) -> dict[str, OutputVariable]:
     """Return the output variables that blocks write, by name in sorted order.
 
-    Their dimensions do not include the study's axes.
+    The dimensions of a variable do not include the study's axes.
     """
     error_output = replace(
         EFFECT_VARIABLES[EFFECTS_ERROR_ARRAY],
@@ -485,18 +498,18 @@ class GridStudy(ExtendableStudy):
 
     @property
     def grids(self) -> tuple[ParameterBlockGrid]:
-        """Grid of the study's points, in a tuple of one."""
+        """Grid that divides the study's points into blocks, as the only element of a tuple."""
         return (self.grid,)
 
     def has_numerics_set_by_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True for the points of a block whose numerical accuracy is set by the tolerance.
+        """Return True for each point of a block whose numerics depend on the tolerance.
 
         The result is a mask (points,), or one bool for all points.
         """
         return has_numerics_set_by_tolerance(self.grid.parameters_of_block(block))
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return title, question, spec and shape of blocks."""
+        """Return the attributes of the store by name, such as title, spec and shape of blocks."""
         coordinate_names = [
             member.coordinate_name for axis in self.spec.axes for member in axis.parameters
         ]
@@ -512,7 +525,10 @@ class GridStudy(ExtendableStudy):
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the arrays known in advance: axis coordinates, and sizes of batches of draws."""
+        """Return the layouts of arrays known in advance: axis coordinates and batch sizes.
+
+        A batch is a run of draws of a point whose detections are counted together.
+        """
         arrays = axis_coordinate_layouts(self.spec.axes)
         if draws_per_batch := draw_batch_sizes(self.spec):
             batch_attributes = cf_attributes("1", "draws in the batch")
@@ -527,7 +543,7 @@ class GridStudy(ExtendableStudy):
         return arrays
 
     def output_layouts(self) -> list[ArrayLayout]:
-        """Return the layouts of the model's outputs, and of the arrays of effects."""
+        """Return the layouts of the arrays that blocks write: outputs of the model, and effects."""
         sizes = {DRAW_BATCH_DIM: len(draw_batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
         off_axes = self.spec.parameters_off_axes()
         promised_accuracy = {  # accuracy that the half-widths of intervals are compared with
@@ -554,10 +570,11 @@ class GridStudy(ExtendableStudy):
         checkpoint_results: EarlierResults = EarlierResults(),  # noqa: B008
         deadline: Deadline | None = None,
     ) -> Results:
-        """Compute a block. Points that the model does not support get fill values.
+        """Compute a block. Return arrays in the block's shape by name.
 
-        Finished points in `checkpoint_results` are not computed again; unfinished points are
-        continued. `UnfinishedBlockException` is raised at the deadline.
+        Points that the model does not support get fill values. Finished points in
+        `checkpoint_results` are not computed again; unfinished points are continued.
+        `UnfinishedBlockException` is raised at the deadline.
         """
         selected_effects = self.effect_planner.select_for_block(block)
         reused_results = self._read_reused_results(block, selected_effects)
@@ -592,7 +609,7 @@ class GridStudy(ExtendableStudy):
 
     @property
     def supports_checkpoints(self) -> bool:
-        """True if the study makes random draws: a block can stop between two draws."""
+        """True if the study makes random draws, so that a block can stop between two draws."""
         return self.spec.draws.has_draws
 
     def evaluate_until(
@@ -602,7 +619,11 @@ class GridStudy(ExtendableStudy):
         return self.evaluate(block, checkpoint_results, deadline)
 
     def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
-        """Return the smaller study's results of a block's points: final results, or first draws."""
+        """Return the smaller study's results of a block's points with the same effects.
+
+        They are finished results if the studies have the same draws. They are unfinished results,
+        to be continued, if the smaller study has only the first draws.
+        """
         if (reuse_source := self.reuse_source) is None:
             return EarlierResults()
         parts = []
@@ -639,7 +660,7 @@ class GridStudy(ExtendableStudy):
         )
 
     def count_reusable_points_of_block(self, block: int) -> int:
-        """Count the points of a block that the smaller study has with the same effects."""
+        """Return how many points of a block the smaller study's store has with the same effects."""
         if (reuse_source := self.reuse_source) is None:
             return 0
         selected_effects, n_reusable = self.effect_planner.select_for_block(block), 0
@@ -655,7 +676,10 @@ class GridStudy(ExtendableStudy):
         return n_reusable
 
     def compile_kernels(self) -> None:
-        """Compile the kernels: compute a point with all possible effects, and one without any."""
+        """Compile all kernels, by computing a point with all effects, and a point with none.
+
+        Effects that are off in the spec are left out.
+        """
         effect_modes, single_draw_spec = self.spec.effect_modes(), limit_draws(self.spec, 1)
         possible_effects = [
             effect.name
@@ -673,7 +697,7 @@ class GridStudy(ExtendableStudy):
 
 
 def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
-    """Return the layouts of the coordinate arrays of axes, with values in the units of the spec."""
+    """Return the layouts of the coordinate arrays of axes. Values are in the units of the spec."""
     return [
         ArrayLayout.from_values(
             member.coordinate_name,
@@ -692,23 +716,26 @@ def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
 POINTS_PER_CALL_MAX = 1 << 16
 """Largest number of points per call of the model.
 
-It is large enough for negligible overhead, and small enough that memory does not grow with the
-block. The model divides the draws of the points further.
+The number makes the overhead of calls negligible. The limit keeps memory from growing with the
+block.
 """
 
 DRAW_COUNTS_PER_CALL_MAX = 1 << 19
-"""Largest number of stored counts of draws per call of the model: one per point and batch."""
+"""Largest number of draw counts per call of the model, which returns one per point and batch.
+
+A batch is a run of draws of a point whose detections are counted together.
+"""
 
 NON_PHYSICAL_PARAMETER_PREFIXES = (
     "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.",
     REPORTED_PEAKS_PATH
 )  # fmt: skip
-"""Prefixes of parameters that change how draws are evaluated, but not what is drawn."""
+"""Beginnings of paths of parameters that change how draws are evaluated, not what is drawn."""
 
 GRID_RANDOM_KEY_DOMAIN = "sweep.draws"
 """Text that, with the seed and a point's parameters, determines the random numbers of its draws.
 
-They differ from all other random numbers of the same seed.
+These random numbers differ from all others of the same seed.
 """
 
 
@@ -721,13 +748,14 @@ def iter_block_results(
     checkpoint_results: EarlierResults,
     deadline: Deadline,
 ) -> Iterator[PartialResults]:
-    """Yield the results of a block's points that are not done, in groups with the same effects.
+    """Yield the results of a block's points that are not finished, in groups with the same effects.
 
-    ``reused_results`` are from another study, ``checkpoint_results`` from an earlier task. Finished
-    points in them are not computed again, and unfinished points are continued.
+    ``reused_results`` are from the store of a smaller study, ``checkpoint_results`` from an earlier
+    task. Their finished points are not computed again, and their unfinished points are continued.
 
     At the deadline `UnfinishedBlockException` is raised, which holds the results so far. A later
-    call that continues from them gives bit for bit the results of a call without a deadline.
+    call that continues from these results gives bit for bit the results of a call without a
+    deadline.
     """
     parameters, order = grid.parameters_of_block(block), grid.point_order_by_geometry(block)
     order = order[
@@ -777,7 +805,7 @@ def iter_block_results(
 def _make_unfinished_block(
     spec: GridSpec, finished: list[PartialResults], unfinished: PartialResults
 ) -> UnfinishedBlockException:
-    """Return the exception of a block that stops at its deadline, with the results so far."""
+    """Return the exception that ends a block at its deadline, and that holds the results so far."""
     results = EarlierResults(
         concatenate_results([part for part in finished if part.indices_in_block.size]), unfinished
     )
@@ -796,12 +824,11 @@ def evaluate_points(
     prior_draws: PriorDraws | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Results:
-    """Return the results of points as arrays by name: (n_points,), or with further dimensions.
+    """Return the results of points as arrays by name, of shape (n_points,) or (n_points, ...).
 
-    Counts of draws have the shape (n_points, batches).
-
-    Parameters are scalars, strings or arrays (n_points,). Draws continue from ``prior_draws`` until
-    all are made or ``should_stop`` returns True.
+    Parameters are scalars, strings or arrays (n_points,). Draws continue after ``prior_draws``
+    until all are made or ``should_stop`` returns True. Numbers of draws have the shape (n_points,
+    batches).
     """
     if spec.draws.has_draws:
         return _simulate_draws(spec, parameters, n_points, effects, prior_draws, should_stop)
@@ -819,7 +846,7 @@ def evaluate_points(
 def select_parameters_of_points(
     parameters: Mapping[str, ParameterValue], indices: np.ndarray
 ) -> dict[str, ParameterValue]:
-    """Return the parameters of some of the points; scalars stay as they are."""
+    """Return the parameters by dotted path of the points at `indices`; scalars are unchanged."""
     return {
         path: value[indices] if isinstance(value, np.ndarray) else value
         for path, value in parameters.items()
@@ -827,14 +854,17 @@ def select_parameters_of_points(
 
 
 def _points_per_call(spec: GridSpec) -> int:
-    """Return how many points one call of the model computes at once."""
+    """Return the number of points that one call of the model computes."""
     return max(
         1, min(POINTS_PER_CALL_MAX, DRAW_COUNTS_PER_CALL_MAX // max(1, len(draw_batch_sizes(spec))))
     )
 
 
 def draw_batch_sizes(spec: GridSpec) -> list[int]:
-    """Return the size of each batch of a point's `draws.number` draws; the last may be smaller."""
+    """Return the number of draws in each batch of a point; the last batch may be smaller.
+
+    All batches together have `draws.number` draws; the list is empty if this number is 0.
+    """
     n_draws, draws_per_batch = spec.draws.number, spec.draws.batch
     return [min(draws_per_batch, n_draws - first) for first in range(0, n_draws, draws_per_batch)]
 
@@ -842,9 +872,9 @@ def draw_batch_sizes(spec: GridSpec) -> list[int]:
 def random_keys_of_points(
     spec: GridSpec, parameters: Mapping[str, ParameterValue], n_points: int
 ) -> np.ndarray:
-    """Return the random keys (n_points, 2) uint64 of points.
+    """Return the keys (n_points, 2) uint64 of the points' random numbers.
 
-    They do not depend on the `NON_PHYSICAL_PARAMETER_PREFIXES`, such as settings of accuracy.
+    A key does not depend on the `NON_PHYSICAL_PARAMETER_PREFIXES`, such as settings of accuracy.
     """
     from sweep.model.sampling.philox import point_keys
 
@@ -861,7 +891,10 @@ def random_keys_of_points(
 def extract_prior_draws(
     spec: GridSpec, previous: PartialResults, indices_in_block: np.ndarray
 ) -> PriorDraws | None:
-    """Return the earlier draws of some points of a block; None if there are none."""
+    """Return the draws that `previous` results hold of some points of a block.
+
+    The result is None if they hold none. A point without previous results gets 0 draws.
+    """
     from sweep.model.sampling.samplers import PriorDraws
 
     _, previous_rows, rows = np.intersect1d(
@@ -897,7 +930,11 @@ def _simulate_draws(
     prior_draws: PriorDraws | None,
     should_stop: Callable[[], bool] | None,
 ) -> Results:
-    """Draw points until all draws are made, the tolerance is met, or `should_stop` is True."""
+    """Simulate draws of points. Return results as arrays by name.
+
+    Draws end if all are made, the tolerance is met, or `should_stop` returns True. They continue
+    after `prior_draws`.
+    """
     from sweep.model.sampling.samplers import never_stop, simulate_draws
     from sweep.tasks.studies.user_functions import spectrum_methods
 
@@ -919,13 +956,16 @@ def _simulate_draws(
 
 
 def initial_running_sums(spec: GridSpec, n_points: int) -> Results:
-    """Return running sums of 0 (n_points, sums); an empty dict if the study stores no sums."""
+    """Return running sums of 0, as an array (n_points, sums) by name.
+
+    The result is an empty dict if the study stores no running sums.
+    """
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
     return {RUNNING_SUMS_NAME: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:
-    """Return a copy of the spec that makes at most `draws_max` draws of a point."""
+    """Return a copy of a spec with at most `draws_max` draws of a point."""
     draw_counts = {
         "number": min(spec.draws.number, draws_max),
         "limit": min(spec.draws.limit, draws_max),

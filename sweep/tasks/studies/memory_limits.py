@@ -33,7 +33,7 @@ It was measured with FFTs of 2^20 and 2^22 samples.
 
 
 def fft_size_max(spec: GridSpec | SceneSpec) -> int:
-    """Return the largest FFT size (number of samples) in a study."""
+    """Return the largest FFT size (number of samples) at any point of a study."""
     sizes = [
         member.values
         for axis in spec.axes
@@ -44,7 +44,7 @@ def fft_size_max(spec: GridSpec | SceneSpec) -> int:
 
 
 def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
-    """Return the peak memory that the computation of one grid point, or one shot, needs [bytes]."""
+    """Return the peak memory of computing one grid point, or one shot of a flight [bytes]."""
     draws_spectra = getattr(spec.draws, "draws_whole_spectra", False)
     return fft_size_max(spec) * (
         PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA if draws_spectra else PEAK_BYTES_PER_FFT_POINT
@@ -52,12 +52,15 @@ def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
 
 
 def block_peak_bytes(study: GridStudy | FlightStudy) -> int:
-    """Return the peak memory that a thread needs to compute and write one block [bytes]."""
+    """Return the peak memory of a thread that computes and writes one block [bytes]."""
     return point_memory_bytes(study.spec) + 2 * study.block_nbytes_max
 
 
 def scene_memory_bytes(spec: SceneSpec) -> int:
-    """Return the size of a scene's triangles and search trees [bytes]. Each process has a copy."""
+    """Return the size of a scene's triangles and search trees [bytes].
+
+    Each process has a copy of them.
+    """
     from sweep.tasks.studies.eyepoint_study import get_built_scene
 
     return get_built_scene(spec).caster.nbytes
@@ -115,7 +118,10 @@ def _available_memory_phrase(worker_memory: WorkerMemory) -> str:
 
 
 def _fewer_workers_remedy(worker_memory: WorkerMemory, bytes_needed: float) -> str:
-    """Return a remedy such as ', or --workers 4' if fewer workers would suffice, else ''."""
+    """Return a remedy such as ', or --workers 4' if a smaller number of workers would suffice.
+
+    The result is '' if no number would suffice. `bytes_needed` is the memory that a worker needs.
+    """
     n_workers = int(worker_memory.bytes_max * worker_memory.n_workers_sharing_memory / bytes_needed)
     return (
         f", or {option_text('workers', n_workers)}"

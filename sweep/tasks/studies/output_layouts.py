@@ -21,14 +21,17 @@ CF_STANDARD_NAMES = {
     "sun_elevation": "solar_elevation_angle",
     "wavelength": "radiation_wavelength",
 }
-"""Standard names of the Climate and Forecast (CF) conventions, for arrays and coordinates.
+"""CF standard names, by the name of the array or coordinate.
 
-They are from version 90 of the table of standard names.
+CF are the Climate and Forecast conventions; the names are from version 90 of their table.
 """
 
 
 def cf_attributes(units: str, long_name: str, comment: str = "", name: str = "") -> dict[str, Any]:
-    """Return the non-empty attributes of an array or coordinate by the CF conventions."""
+    """Return the attributes of an array or coordinate by the Climate and Forecast (CF) conventions.
+
+    Empty attributes are left out. `name` is the name of the array, which may have a standard name.
+    """
     attributes = {"units": units, "long_name": long_name}
     optional = {"comment": comment, "standard_name": CF_STANDARD_NAMES.get(name, "")}
     return attributes | {key: value for key, value in optional.items() if value}
@@ -42,9 +45,9 @@ def make_output_layout(
     sizes: Mapping[str, int],
     attributes: Mapping[str, Any] | None = None,
 ) -> ArrayLayout:
-    """Return the layout of an output of the model, cut into chunks by a grid of blocks.
+    """Return the layout of the array of an output variable, with one chunk per block of a grid.
 
-    `sizes` has the sizes of the dimensions that do not follow the grid. `attributes` are added to
+    `sizes` maps dimensions that do not follow the grid to their sizes. `attributes` are added to
     those of the CF conventions.
     """
     all_attributes = cf_attributes(output.units, output.long_name, output.comment, name)

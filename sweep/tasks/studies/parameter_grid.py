@@ -12,7 +12,7 @@ from sweep.spec.specs import GridSpec, SceneSpec
 from sweep.tasks.engine.blocks import BLOCKS_PER_STUDY_MAX, BlockGrid
 
 ParameterValue = float | int | str | np.ndarray
-"""Value of a parameter: one for all points, or an array with the value of each point."""
+"""Value of a parameter: one value for all points, or an array with the value of each point."""
 
 GEOMETRIC_PARAMETERS = (
     "target.range",
@@ -21,19 +21,22 @@ GEOMETRIC_PARAMETERS = (
     "target.transverse_velocity",
     "target.pointing_jitter",
 )
-"""Parameters that change the frequencies of spectral lines.
+"""Dotted paths of parameters that change the frequencies of spectral lines.
 
-Any other parameter, except those of `GEOMETRIC_PARAMETER_PREFIXES`, only scales lines or changes
-how they are evaluated, which is cheap once their frequencies are known.
+Parameters that begin with `GEOMETRIC_PARAMETER_PREFIXES` change the frequencies, too. All others
+only scale lines or change how lines are evaluated, which is cheap once frequencies are known.
 """
 GEOMETRIC_PARAMETER_PREFIXES = (
     "instrument.laser.beam_", "instrument.laser.focus", "instrument.telescope.coupling",
     "instrument.receiver.local_oscillator_waist", "footprint.",
 )  # fmt: skip
-"""Prefixes of further parameters that change the frequencies of spectral lines."""
+"""Beginnings of dotted paths of parameters that change the frequencies of spectral lines.
+
+They complement `GEOMETRIC_PARAMETERS`, which lists complete paths.
+"""
 
 TOLERANCE_PARAMETER = "accuracy.tolerance"
-"""Dotted path of the tolerance."""
+"""Dotted path of the parameter that sets the tolerance of numerical errors."""
 
 SHOTS_PER_TILE = 256
 """Number of consecutive shots of a flight whose effects are planned together."""
@@ -41,49 +44,49 @@ SHOTS_PER_TILE = 256
 BLOCK_CPU_SECONDS_MAX = 60.0
 """Largest time of a block on one core, estimated by `worst_cpu_seconds_per_point` [s].
 
-This time is lost if a worker dies. The limit also keeps the counts of draws in a block, one per
-point and batch, below some 100 MB.
+A block's time is lost if its worker dies. The limit also keeps the counts of draws in a block, one
+per point and batch, below some 100 MB.
 """
 
 DEFAULT_BLOCK_POINTS = 1 << 16
-"""Largest default number of points of a block.
+"""Largest number of points of a block if the spec states none.
 
-Studies with more than `BLOCKS_OF_DEFAULT_SIZE_MAX` such blocks have larger blocks instead.
+It does not hold for a study that would have more than `BLOCKS_OF_DEFAULT_SIZE_MAX` such blocks.
 """
 BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
-"""Largest number of blocks of `DEFAULT_BLOCK_POINTS` points.
+"""Largest number of blocks of `DEFAULT_BLOCK_POINTS` points; a larger study has larger blocks.
 
-A block is some 25 files, which are listed, copied and removed one by one.
+A block has some 25 files, which are listed, copied and removed one by one.
 """
 
 POINT_DRAW_CPU_SECONDS = 4e-5
-"""Time of a grid point without draws, or of one draw of a point, on one core [s]."""
+"""Time of one draw of a grid point, or of a grid point without draws, on one core [s]."""
 SPECKLE_CPU_SECONDS = 1.6e-4
-"""Additional time of a point in developed speckle, on one core [s]."""
+"""Time that developed speckle adds to that of a grid point, on one core [s]."""
 
 SHOT_CPU_SECONDS = 7e-5
-"""Time of a flight's shot without its draws, on one core [s]."""
+"""Time of a flight's shot, without that of its draws, on one core [s]."""
 SHOT_DRAW_CPU_SECONDS = 2e-5
 """Time of one draw of a flight's shot, on one core [s]."""
 
 DEFAULT_BLOCKS_MIN = 32
-"""Smallest default number of blocks of a study.
+"""Smallest number of blocks of a study if the spec states no size of blocks.
 
-It gives all cores of a machine work from the first second on. It does not hold if blocks would take
-less than `DEFAULT_BLOCK_CPU_SECONDS_MIN`.
+It gives work to all cores of a machine at once. It does not hold if blocks would take less than
+`DEFAULT_BLOCK_CPU_SECONDS_MIN`.
 """
 DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
-"""Smallest estimated time of a default block on one core [s]."""
+"""Smallest estimated time, on one core, of a block whose size the spec does not state [s]."""
 
 DEFAULT_BLOCK_DRAWS_MAX = 128
-"""Largest number of draws in a block of a flight, if the spec does not state one."""
+"""Largest number of draws of a shot in a flight's block, if the spec states none."""
 
 
 def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
     """Return an upper estimate of the time of one draw of a point or shot on one core [s].
 
-    The constants were measured on one machine and rounded up, as the content of a block must not
-    depend on the machine.
+    The estimate uses constants that were measured on one machine and rounded up, because the
+    content of a block must not depend on the machine.
     """
     worst_parameters = {
         path: value for path, value in spec.parameters().items() if not isinstance(value, str)
@@ -102,9 +105,9 @@ def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
 
 
 def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
-    """Return an upper estimate of the time of any point of a study on one core [s].
+    """Return an upper estimate of the time of any point of a grid study on one core [s].
 
-    If draws continue until a tolerance is met, their largest permitted number is assumed.
+    If draws continue until a tolerance is met, the largest permitted number of draws is assumed.
     """
     n_draws = max(spec.draws.number, spec.draws.limit, 1)
     speckle_modes = {spec.parameters()["footprint.speckle"]}
@@ -117,7 +120,10 @@ def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
 
 
 def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
-    """Return the default time of a block on one core [s], given the time of the whole study."""
+    """Return the time on one core of a block, if the spec states no size of blocks [s].
+
+    `study_cpu_seconds` is the time of all blocks together on one core [s].
+    """
     return max(study_cpu_seconds / DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_CPU_SECONDS_MIN)
 
 
@@ -181,11 +187,13 @@ def flight_block_size_max(
 def fit_block_shape(
     sizes: tuple[int, ...], is_geometric: tuple[bool, ...], block_points: int
 ) -> tuple[int, ...]:
-    """Return the number of points of a block along each axis.
+    """Return the number of points of a block along each axis of a grid.
 
-    `is_geometric` is True for axes that change the geometry of beam and target; the other axes are
-    radiometric. Radiometric axes are filled first, then geometric axes, each time beginning with
-    the last axis. A block thus contains all radiometric variations of its geometries.
+    `sizes` are the numbers of points of the grid along its axes, `block_points` is the largest
+    number of points of a block. `is_geometric` is True for an axis that changes the geometry of
+    beam and target. Blocks first extend along axes that are not geometric, from the last axis to
+    the first, and after that along geometric axes in the same order. A block thus contains all
+    points of a geometry.
     """
     order = sorted(range(len(sizes)), key=lambda k: (is_geometric[k], -k))
     shape, points_left = [1] * len(sizes), block_points
@@ -196,14 +204,17 @@ def fit_block_shape(
 
 
 def default_block_points(n_points: int, cpu_seconds_per_point: float) -> int:
-    """Return the default number of points per block of a study with `n_points` points."""
+    """Return the number of points per block if the spec states none.
+
+    `n_points` is the number of points of the study.
+    """
     block_cpu_seconds = default_block_cpu_seconds(n_points * cpu_seconds_per_point)
     block_points = min(DEFAULT_BLOCK_POINTS, math.ceil(block_cpu_seconds / cpu_seconds_per_point))
     return max(block_points, -(-n_points // BLOCKS_OF_DEFAULT_SIZE_MAX))
 
 
 def block_points_limit(spec: GridSpec, n_points: int) -> int:
-    """Return the largest number of points of a block.
+    """Return the largest permitted number of points of a block.
 
     It is the number that the spec states, or a smaller one if points take long.
     """
@@ -227,7 +238,10 @@ class ParameterGrid:
         """Values along each axis, one dict per axis, by the dotted paths of the parameters."""
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Return the values along each dimension of the grid, by dotted paths of the parameters."""
+        """Return the values along each dimension of the grid.
+
+        The list has a dict for each dimension, with arrays of values by dotted path.
+        """
         return self.values_by_axis
 
 
@@ -258,15 +272,18 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
             raise SpecError([Mistake("axes", rule, "", remedy)])
 
     def parameters_of_block(self, block: int) -> dict[str, ParameterValue]:
-        """Return the parameters of a block's points by path: scalars, or arrays (n,) in C order."""
+        """Return the parameters of a block's points by dotted path: scalars, or arrays (n,).
+
+        Points are in C order.
+        """
         return self.parameters_at(
             self.point_indices_in_grid(block, np.arange(self.count_block_points(block)))
         )
 
     def parameters_at(self, grid_indices: np.ndarray) -> dict[str, ParameterValue]:
-        """Return the parameters of points by path: scalars, or arrays (n,).
+        """Return the parameters of some points by dotted path: scalars, or arrays (n,).
 
-        `grid_indices` (n,) are indices in C order over the whole grid.
+        `grid_indices` (n,) are the indices of the points in C order over the grid.
         """
         parameters: dict[str, ParameterValue] = dict(self.fixed_parameters)
         indices = np.unravel_index(grid_indices, self.shape) if self.shape else ()
@@ -277,8 +294,8 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
     def point_order_by_geometry(self, block: int) -> np.ndarray:
         """Return the indices (n,) of a block's points, with points of equal geometry adjacent.
 
-        Radiometric axes vary fastest, and velocities slowest, as the change of a spectral line
-        within a record depends on velocity.
+        Axes that do not change the geometry vary fastest, and velocities slowest, because the
+        change of a spectral line within a record depends on velocity.
         """
         indices_in_block = np.arange(self.count_block_points(block)).reshape(
             self.actual_block_shape(block)

@@ -35,23 +35,32 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
 CACHED_BUILD_SECONDS_MIN = 1.0
-"""Smallest processor time of building a scene for which the scene is cached [s]."""
+"""Processor time that building a scene must take at least for the scene to be cached [s]."""
 
 CACHE_BYTES_MAX = 2 << 30
-"""Largest size of all cached scenes together [bytes]. The least recently used ones are deleted."""
+"""Largest size of all cached scenes together [bytes].
+
+Beyond this size the least recently used scenes are deleted.
+"""
 
 DRAFT_AGE_MAX = 86400.0
-"""Largest age of an unfinished file [s]. An older file is deleted: its writer must have died."""
+"""Largest age of an unfinished file in the cache [s].
+
+An older file is deleted, because the process that wrote it must have died.
+"""
 
 SCENE_BUILDING_LIBRARIES = (
     "numpy", "scipy", "trimesh", "rasterio", "pyproj", "pillow", "matplotlib", "pint",
 )  # fmt: skip
-"""Libraries whose version may change the arrays of a scene."""
+"""Names of the libraries whose version may change the arrays of a scene."""
 
 _DRAFT_PREFIX = "draft-"
 """Beginning of the names of unfinished files."""
 _HEADER_BYTES = 8
-"""Size of the header of a file: the CRC-32 of the rest of the file, as hexadecimal digits."""
+"""Size of the header of a cached file [bytes].
+
+The header is the CRC-32 of the rest of the file, as hexadecimal digits.
+"""
 _READ_BUFFER_BYTES = 1 << 20
 """Number of bytes of a file that are read at once."""
 
@@ -59,7 +68,9 @@ _log = logging.getLogger("sweep")
 
 
 def load_or_build_scene(spec: SceneSpec, build: Callable[[], BuiltScene]) -> BuiltScene:
-    """Return the scene of a spec from the cache, or build it and cache it if that takes long.
+    """Return the scene of a spec: read it from the cache, or build it.
+
+    A newly built scene is cached if building took `CACHED_BUILD_SECONDS_MIN` or longer.
 
     Parameters
     ----------
@@ -86,7 +97,10 @@ def load_or_build_scene(spec: SceneSpec, build: Callable[[], BuiltScene]) -> Bui
 
 @cache
 def _cache_root() -> Path | None:
-    """Return the folder of cached scenes, beside the cache of kernels; None if there is none."""
+    """Return the folder of cached scenes, which lies beside the folder of compiled kernels.
+
+    The result is None if no such folder can be made.
+    """
     from sweep.kernel_cache import cache_folder, create_private_folder  # imports the compiler
 
     kernel_folder = cache_folder().path
@@ -150,13 +164,13 @@ class _ChecksumWriter:
         self._file, self.checksum = file, 0
 
     def write(self, data: Any) -> int:
-        """Write bytes, or an object with a buffer of bytes. Return the number of bytes."""
+        """Write bytes, or an object with a buffer of bytes. Return the number of bytes written."""
         self.checksum = zlib.crc32(data, self.checksum)
         return self._file.write(data)
 
 
 def _read_scene(path: Path) -> BuiltScene | None:
-    """Return the scene of a cached file; None if the file is absent, damaged or unreadable."""
+    """Return the scene in a cached file; None if the file is absent, damaged or unreadable."""
     try:
         with path.open("rb") as file:
             expected_checksum, checksum = int(file.read(_HEADER_BYTES), 16), 0
@@ -174,9 +188,9 @@ def _read_scene(path: Path) -> BuiltScene | None:
 
 
 def _write_scene(path: Path, scene: BuiltScene) -> None:
-    """Write a scene to an unfinished file, and rename it. A failure leaves no file behind.
+    """Write a scene to a cache file at `path`: first to a draft, which is renamed when complete.
 
-    A scene larger than CACHE_BYTES_MAX is not written.
+    A failure leaves no file behind. A scene larger than CACHE_BYTES_MAX is not written.
     """
     draft = None
     if scene.caster.nbytes > CACHE_BYTES_MAX:
@@ -203,7 +217,10 @@ def _write_scene(path: Path, scene: BuiltScene) -> None:
 
 
 def _delete_least_recently_used(root: Path) -> None:
-    """Delete the least recently used scenes beyond the size limit, and abandoned drafts."""
+    """Delete old drafts, and the least recently used scenes beyond the size limit.
+
+    The limits are `DRAFT_AGE_MAX` and `CACHE_BYTES_MAX`.
+    """
     with suppress(OSError):
         statuses = sorted(
             ((path.stat(), path) for path in root.iterdir()), key=lambda pair: -pair[0].st_mtime

@@ -123,7 +123,7 @@ VARIABLE_ATTRIBUTES = {
     "segment": ("", "segment of the waveform"),
     "frequency": ("Hz", "frequency of the bin"),
 }
-"""Units and meaning of the exported variables."""
+"""Unit and description of each exported variable, by the variable's name."""
 
 
 def _spectra_dataset(
@@ -133,7 +133,7 @@ def _spectra_dataset(
     signals_by_draw: list[list[Any]],
     draw_numbers: np.ndarray,
 ) -> xr.Dataset:
-    """Return drawn spectra, noise-free signals and true quantities as an xarray Dataset."""
+    """Return an xarray Dataset of drawn spectra, signals without noise, and true quantities."""
     import xarray as xr
 
     bin_width = float(shots.sample_rate[0]) / shots.fft_size
@@ -185,7 +185,10 @@ def _spectra_dataset(
 
 
 def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies [Hz] and amplitudes [V] of the beamlets' lines, (segments, lines)."""
+    """Return the frequencies [Hz] and amplitudes [V] of the beamlets' spectral lines.
+
+    Both arrays have the shape (segments, lines).
+    """
     from sweep.model.pointcloud.returns import beamlet_line_positions
 
     line_bins = beamlet_line_positions(shots)[-1, list(shots.has_segment)]
@@ -234,7 +237,7 @@ def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -
 
 
 def _is_spectra_file(path: Path) -> bool:
-    """Return True if a file or folder contains the names that `write_spectra` writes."""
+    """Return True if a file or folder contains the variables that `write_spectra` writes."""
     expected_names = {*VARIABLE_ATTRIBUTES, "attributes"}
     try:
         if path.suffix == ".npz":
