@@ -28,7 +28,7 @@ _EYEPOINT_FIELD_BY_ARRAY = {
     "platform_acceleration": "platform_acceleration",
     **dict(zip(BEAMLET_GEOMETRY_VARIABLES, BEAMLET_GEOMETRY_VARIABLES, strict=True)),
 }
-"""Names of the fields of :class:`Eyepoints`, by the names of the store's arrays."""
+"""Names of fields of :class:`Eyepoints`, by the names of the arrays in the store."""
 
 
 def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:

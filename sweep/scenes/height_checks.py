@@ -12,7 +12,7 @@ from sweep.scenes.scene_files import SceneError
 PLAUSIBLE_HEIGHT_MAX = 1e6
 """Largest magnitude that a height in a file may have [unit of the file].
 
-Larger values must be declared as missing.
+A larger value must be declared as one that marks missing heights.
 """
 
 _CUSTOMARY_NO_DATA_VALUES = (
@@ -26,35 +26,41 @@ _CUSTOMARY_NO_DATA_VALUES = (
     9999.0,
     99999.0,
 )
-"""Values by which files customarily mark missing heights."""
+"""Values with which files customarily mark missing heights."""
 
 _CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN = 0.1
-"""Gap between a customary no-data value and the next height, above which a warning is given.
+"""Smallest gap between a customary no-data value and the nearest height that causes a warning.
 
 The gap is relative to the difference between the largest and the smallest of all other heights.
 """
 
 _REPEATED_EXTREME_RELATIVE_GAP_MIN = 1.0
-"""Gap between a repeated extreme height and the next height, above which a warning is given.
+"""Smallest gap between a repeated extreme height and the nearest height that causes a warning.
 
-The extreme is the smallest or largest height, and several cells share it. The gap is relative to
-the difference between the largest and the smallest of all other heights.
+A repeated extreme is the smallest or largest height of a file, if several cells have it. The gap is
+relative to the difference between the largest and the smallest of all other heights.
 """
 
 _REPEATED_EXTREME_CELLS_MIN = 4
-"""Smallest number of cells with the same extreme height for which a warning is given."""
+"""Smallest number of cells with the same extreme height that causes a warning."""
 
 _NO_DATA_WARNINGS_PER_FILE_MAX = 3
-"""Maximum number of warnings about suspicious heights of a file."""
+"""Largest number of warnings about suspicious heights of one file."""
 
 _CLIFF_SEARCH_STRIP_ROWS = 256
-"""Number of grid rows that the search for cliffs reads at a time."""
+"""Number of grid rows that the search for cliffs examines at a time."""
 
 CLIFF_SLOPE_MIN = 20.0
-"""Height difference over distance of neighbouring cells, above which a step counts as a cliff."""
+"""Slope (height difference over distance) of neighbouring cells above which a step is a cliff.
+
+The height difference must exceed `CLIFF_HEIGHT_MIN` as well.
+"""
 
 CLIFF_HEIGHT_MIN = 100.0
-"""Height difference of neighbouring cells above which a step counts as a cliff [m]."""
+"""Height difference of neighbouring cells above which a step is a cliff [m].
+
+The slope must exceed `CLIFF_SLOPE_MIN` as well.
+"""
 
 
 def set_missing_heights_to_nan(
@@ -107,7 +113,7 @@ def set_missing_heights_to_nan(
 def _shortest_decimal_text(value: float) -> str:
     """Return the shortest decimal text that reads back as the number.
 
-    A number that is exact in single precision has the text of the single-precision number.
+    A number that is exact in single precision gets the shorter text of the single-precision number.
     """
     with np.errstate(over="ignore"):
         single_precision = np.float32(value)
@@ -115,10 +121,11 @@ def _shortest_decimal_text(value: float) -> str:
 
 
 def _undeclared_no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
-    """Return warnings about extreme heights that may stand for missing data.
+    """Return warnings about the smallest or largest heights of a file that may mark missing data.
 
-    An extreme height is suspicious if it is a customary no-data value and differs clearly from all
-    other heights, or if several cells share it and it differs from all others still more.
+    An extreme height is suspicious in two cases. Either it is a customary no-data value, and
+    differs from all other heights by a small part of their span or more. Or several cells share it,
+    and it differs from all other heights by more than their span.
     """
     warnings: list[str] = []
     low, high = -np.inf, np.inf
@@ -162,7 +169,7 @@ def _undeclared_no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
 
 
 def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]) -> list[str]:
-    """Return a list with one warning about implausible cliffs, or an empty list.
+    """Return a list with one warning if heights have implausible cliffs, or an empty list.
 
     A no-data value that is not declared makes cliffs in the grid, even after resampling has blended
     it with heights.

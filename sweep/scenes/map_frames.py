@@ -20,23 +20,26 @@ from sweep.scenes.scene_files import SceneError
 from sweep.units import QuantityError, read_unit
 
 MAP_SCALE_ERROR_MAX = 1e-3
-"""Largest relative error of distances on a map, compared with the ground, without a warning."""
+"""Largest relative error of distances on a map that is accepted without a warning or an error.
+
+The error is that of metres per unit of the map against distances on the ground.
+"""
 
 STATED_SCALE_ERROR_MAX = 5e-2
-"""Largest relative error of a map scale (metres per unit) that a user states.
+"""Largest relative error of a map scale (metres per unit) that a user may state.
 
 A scale with a larger error counts as a mistake.
 """
 
 DEGREE_CELL_SIZE_MAX = 0.1
-"""Largest cell size of a raster whose coordinates may be degrees [unit of the coordinates].
+"""Cell size of a raster below which its coordinates may be degrees [unit of the coordinates].
 
-It is used for rasters without a reference system, whose coordinates are within 360 degrees of
-longitude and 90 of latitude.
+It is used for rasters without a reference system, if coordinates are within 360 of longitude and 90
+of latitude.
 """
 
 MapBounds = tuple[float, float, float, float]
-"""West, south, east and north end of an area, in the coordinates of a map."""
+"""West, south, east and north bound of an area, in the coordinates of a map."""
 
 _METRES_BY_HEIGHT_UNIT = (
     dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0)
@@ -46,7 +49,7 @@ _METRES_BY_HEIGHT_UNIT = (
     )
     | dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048)
 )
-"""Metres per unit of height, by the names that rasters give to the unit."""
+"""Length of a unit of height [m], by the names that raster files give to the unit."""
 
 
 class MetresPerUnit(NamedTuple):
@@ -62,11 +65,11 @@ class UserStatedUnits(NamedTuple):
     """Units of a raster's coordinates and heights that the user states; None if not stated."""
 
     metres_per_degree: tuple[float, float] | None = None
-    """Metres on the ground per degree eastwards and northwards."""
+    """Metres on the ground per degree, east and north; None if not stated."""
     metres_per_unit: tuple[float, float] | None = None
-    """Metres on the ground per unit of the coordinates eastwards and northwards."""
+    """Metres on the ground per unit of the coordinates, east and north; None if not stated."""
     height_unit: str | None = None
-    """Unit of the heights."""
+    """Name of the unit of heights; None if not stated."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +77,16 @@ class MapFrame:
     """Reference system and scale of a raster's map coordinates."""
 
     metres_per_unit: MetresPerUnit
-    """Factors by which the raster's coordinates are multiplied to give metres."""
+    """Metres on the ground per unit of the raster's coordinates, eastwards and northwards."""
     wkt: str = ""
-    """Coordinate reference system as WKT; empty if the raster states none."""
+    """Coordinate reference system as WKT (well-known text); empty if the raster states none."""
     warnings: tuple[str, ...] = ()
     """Warnings about the map's scale, as sentences."""
 
     def is_same_map(self, other: MapFrame) -> bool:
         """Return True if this and another map have the same horizontal reference system.
 
-        The result is also True if one of the maps states none.
+        The result is also True if one of the two maps states no reference system.
         """
         if not (self.wkt and other.wkt) or self.wkt == other.wkt:
             return True
@@ -93,26 +96,30 @@ class MapFrame:
         return bool(horizontal_crs.equals(other_horizontal_crs, ignore_axis_order=True))
 
     def has_same_height_reference(self, other: MapFrame) -> bool:
-        """Return True if the heights of two maps refer to the same surface, or one states none."""
+        """Return True if the heights of this and another map refer to the same surface.
+
+        The result is also True if one of the two maps states no surface.
+        """
         return not (self.wkt and other.wkt) or _is_same_height_reference(
             _crs_from_wkt(self.wkt), _crs_from_wkt(other.wkt)
         )
 
     @property
     def height_reference_name(self) -> str:
-        """Name of the surface from which heights are measured; empty if it is not stated."""
+        """Name of the surface from which heights are measured; empty if the map states none."""
         return _height_reference_name(_crs_from_wkt(self.wkt)) if self.wkt else ""
 
     @property
     def crs_name(self) -> str:
-        """Name of the coordinate reference system; 'none' if it is not stated."""
+        """Name of the coordinate reference system; 'none' if the map states none."""
         return str(_crs_from_wkt(self.wkt).name) if self.wkt else "none"
 
 
 def metric_projection_wkt_of_crs(wkt: str) -> str:
-    """Return a reference system as WKT if it is a map projection in metres, else ''.
+    """Return the WKT of a reference system if it is a map projection in metres, else ''.
 
-    `wkt` is the reference system. Its vertical part is removed if heights are not in metres.
+    The argument `wkt` is that of the reference system. The result lacks the vertical part if
+    heights are not in metres.
     """
     crs = _crs_from_wkt(wkt)
     horizontal = _horizontal_crs(crs)
@@ -125,7 +132,10 @@ def metric_projection_wkt_of_crs(wkt: str) -> str:
 
 
 def metres_per_height_unit(unit: str) -> float:
-    """Return how many metres a unit of height has; raise `QuantityError` for an unknown unit."""
+    """Return the length of a unit of height [m], given its name.
+
+    `QuantityError` is raised for an unknown unit.
+    """
     word = unit.strip().lower()
     if word in _METRES_BY_HEIGHT_UNIT:
         return _METRES_BY_HEIGHT_UNIT[word]
@@ -184,7 +194,7 @@ def resolve_metres_per_height_unit(
 
 
 def _declared_height_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
-    """Return the name of the unit of heights that a raster file states, and its length [m].
+    """Return the name and the length [m] of the unit of heights that a raster file states.
 
     The result is None if the file states no unit.
     """
@@ -213,7 +223,7 @@ def _declared_height_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, fl
 
 
 def _short_unit_name(unit: str) -> str:
-    """Return the short name of a unit of length, such as 'ft' for 'foot'."""
+    """Return the short name of a unit of length, such as 'ft', given a name such as 'foot'."""
     return {"us survey foot": "sft", "foot": "ft"}.get(unit.lower(), unit)
 
 
@@ -268,8 +278,8 @@ def _map_frame_without_crs(
 ) -> MapFrame:
     """Return the map frame of a raster without a reference system.
 
-    Its unit is the metre, unless the user states metres per unit. Raise `SceneError` if the
-    coordinates could be degrees.
+    Coordinates are in metres unless the user has `stated` metres per unit. `SceneError` is raised
+    if the coordinates could be degrees.
     """
     if stated is not None:
         return MapFrame(MetresPerUnit(*stated))
@@ -300,8 +310,9 @@ def _checked_map_frame(
 ) -> MapFrame:
     """Return the map frame of a raster with a reference system, after a check of its scale.
 
-    The factors to metres are compared with distances on the ground. `stated` are the factors that
-    the user states, and `field_name` is their field in the spec.
+    The metres per unit of the map are compared with distances on the ground. `stated` are the
+    metres per unit that the user states, or None; `field_name` is the field of the spec that states
+    them.
     """
     unit = "degree" if crs.is_geographic else "unit of its coordinates"
     if stated is None and not crs.is_geographic:
@@ -342,10 +353,10 @@ def _checked_map_frame(
 
 
 def _largest_scale_error(factors: MetresPerUnit, scales: np.ndarray) -> float:
-    """Return the largest relative error of the metres per unit that are assumed for a map.
+    """Return the largest relative error of a map's assumed metres per unit.
 
-    `factors` are assumed. `scales` (n, 2) are metres on the ground per unit eastwards and
-    northwards, measured at n points.
+    `factors` are the assumed metres per unit. `scales` (n, 2) are metres on the ground per unit
+    eastwards and northwards, measured at n points.
     """
     return float(np.abs(np.array(factors) / scales - 1).max())
 
@@ -407,7 +418,7 @@ def _measure_scale_and_skew(
 
 
 def _reprojection_remedy(crs: Any, bounds: MapBounds) -> str:
-    """Return the advice to reproject a map, with a suitable projection for its centre."""
+    """Return the advice to reproject a map, as text with a projection that suits its centre."""
     from pyproj import Transformer
 
     geographic = crs if crs.is_geographic else crs.geodetic_crs
@@ -433,7 +444,7 @@ def _reprojection_remedy(crs: Any, bounds: MapBounds) -> str:
 
 
 def _crs_from_wkt(wkt: str) -> Any:
-    """Return the pyproj reference system that a WKT describes."""
+    """Return the pyproj reference system that a WKT (well-known text) describes."""
     from pyproj import CRS
 
     return CRS.from_wkt(wkt)
@@ -458,7 +469,7 @@ def _horizontal_crs(crs: Any) -> Any:
 
 
 def _vertical_crs(crs: Any) -> Any:
-    """Return the part of a pyproj reference system that defines heights; None if there is none.
+    """Return the part of a pyproj reference system that defines heights; None if it has none.
 
     The part is a vertical reference system, or one with three axes.
     """
@@ -474,7 +485,7 @@ def _vertical_crs(crs: Any) -> Any:
 
 
 def _vertical_axis(crs: Any) -> Any:
-    """Return the height axis of a pyproj reference system; None if there is none."""
+    """Return the height axis of a pyproj reference system; None if it has none."""
     vertical = _vertical_crs(crs)
     axes = vertical.axis_info if vertical is not None else []
     return axes[-1] if axes else None
@@ -494,7 +505,8 @@ def _height_reference_name(crs: Any) -> str:
 def _is_same_height_reference(crs: Any, other_crs: Any) -> bool:
     """Return True if two reference systems measure heights from the same surface.
 
-    The result is also True if one of them has no heights. Their units may differ.
+    The units of the heights may differ. The result is also True if one of the systems has no
+    heights.
     """
     first, second = _vertical_crs(crs), _vertical_crs(other_crs)
     if first is None or second is None:
@@ -514,7 +526,7 @@ class LengthUnit(NamedTuple):
 
 
 _METRE = LengthUnit("metre", 1.0)
-"""The unit of maps that state none, or that are in degrees."""
+"""Unit of the coordinates of a map that states no unit, or that is in degrees."""
 
 
 def _horizontal_axis_unit(crs: Any) -> LengthUnit:
@@ -529,7 +541,7 @@ def _horizontal_axis_unit(crs: Any) -> LengthUnit:
 
 
 UTM_LATITUDE_MAX = 80.0
-"""Largest latitude at which UTM zones are defined on both hemispheres [deg]."""
+"""Largest latitude, north or south, at which UTM zones are defined [deg]."""
 
 WGS84_RADIUS, WGS84_FLATTENING = 6_378_137.0, 1 / 298.257223563
 """Semi-major axis [m] and flattening of the WGS84 ellipsoid."""

@@ -11,11 +11,11 @@ from sweep.scenes.scene_files import require_file
 
 
 def metric_projection_wkt(path: str | Path, metres_per_unit: Sequence[float] | None = None) -> str:
-    """Return the map projection of a raster as WKT, or '' if it is not that of the scene.
+    """Return the map projection of a raster as WKT if scene coordinates belong to it, else ''.
 
-    A scene is in metres. Map coordinates in feet, degrees or units of a stated size are multiplied
-    by that size, and the products belong to no map projection. If only the heights are in feet, the
-    result is the projection of the map without its vertical part.
+    Coordinates of a scene are in metres. Map coordinates in feet, degrees or units of a stated size
+    are converted to metres, after which they belong to no map projection. If only the heights are
+    in feet, the result is the map projection without its vertical part.
 
     Parameters
     ----------

@@ -23,13 +23,13 @@ from sweep.scenes.scene_files import SceneError, read_companion_file, require_fi
 from sweep.units import QuantityError, read_unit
 
 IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
-"""Quaternion (w, x, y, z) of no rotation."""
+"""Quaternion (w, x, y, z) that rotates nothing."""
 
 _RELATIVE_NORMAL_ROUNDING_ERROR_MAX = 1e-12
-"""Largest rounding error of the normal of a triangle without area.
+"""Largest relative rounding error of the normal vector of a triangle without area.
 
-The normal is the cross product of two edges. The error is relative to the product of the edges'
-lengths.
+The normal is the cross product of two edges. Its error is relative to the product of the lengths of
+the edges.
 """
 
 _Y_UP_FORMATS = {".glb", ".gltf"}
@@ -51,10 +51,10 @@ VERTEX_COORDINATE_MAX = 1e9
 """Largest magnitude of a vertex coordinate [m]."""
 
 _MESH_READER_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
-"""Packages that reading a mesh requires; pip installs them with the extra `scenes`."""
+"""Names of packages needed to read a mesh; pip installs them with the extra `scenes`."""
 
 MESH_FACES_MAX = 100_000_000
-"""Maximum number of triangles of a mesh file."""
+"""Largest number of triangles that a mesh file may have."""
 
 _MEMORY_PER_FILE_BYTE_BY_SUFFIX = {
     ".obj": 40,
@@ -64,7 +64,7 @@ _MEMORY_PER_FILE_BYTE_BY_SUFFIX = {
     ".gltf": 20,
     ".glb": 20,
 }
-"""Upper bound of the memory needed to read a mesh, in bytes per byte of its file, by suffix."""
+"""Memory needed to read a mesh, at most, in bytes per byte of its file, by the file's suffix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +84,11 @@ class Facets:
     origin: np.ndarray
     """Origin (3,) of the vertices in world coordinates [m]."""
     reader_notes: tuple[str, ...] = ()
-    """Changes that the reader of the file made, as sentences."""
+    """Sentences about changes that the reader of the mesh file made."""
     is_clean: bool = False
     """True if the triangles need no cleaning.
 
-    All vertices and faces are then distinct, all vertices are used, and all faces have an area.
+    Vertices and faces are distinct, all vertices are used, and all faces have an area.
     """
 
     @classmethod
@@ -100,7 +100,7 @@ class Facets:
         surface: int = 0,
         origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     ) -> Facets:
-        """Make facets that all belong to one surface.
+        """Return facets that all belong to one surface.
 
         Parameters
         ----------
@@ -124,7 +124,7 @@ class Facets:
     def transform(
         self, *, rotation: Sequence[float] | np.ndarray = IDENTITY_QUATERNION, scale: float = 1.0
     ) -> Facets:
-        """Return the facets scaled, and then rotated about their origin.
+        """Return scaled facets that are rotated about their origin after scaling.
 
         Parameters
         ----------
@@ -136,7 +136,7 @@ class Facets:
         return replace(self, vertices=rotate(np.asarray(rotation, float), self.vertices * scale))
 
     def to_cleaned_mesh(self) -> CleanedMesh:
-        """Clean the triangles; return a mesh for ray casting, and the report of the cleaning.
+        """Clean the triangles. Return a mesh for ray casting, and a report of the cleaning.
 
         Raises
         ------
@@ -165,7 +165,7 @@ class Facets:
 
 
 def join_facets(facets_list: Sequence[Facets]) -> Facets:
-    """Join one or more sets of facets. The result has the origin of the first set."""
+    """Join one or more sets of facets into one, which has the origin of the first set."""
     origin = facets_list[0].origin
     index_shifts = np.cumsum([0, *(len(facets.vertices) for facets in facets_list)])[:-1]
     return Facets(
@@ -189,7 +189,7 @@ _REPAIR_TEXT_BY_REPORT_FIELD = {
     "n_merged_vertices": "{} coincident vertices merged",
     "n_unreferenced_vertices": "{} unused vertices dropped",
 }
-"""Templates of texts about repairs, by the field of `MeshCleaningReport` that counts them."""
+"""Templates of sentences about repairs, by the field of `MeshCleaningReport` with their number."""
 
 
 @dataclass(frozen=True)
@@ -211,10 +211,10 @@ class MeshCleaningReport:
     n_unreferenced_vertices: int = 0
     """Number of vertices dropped because no face uses them."""
     reader_notes: tuple[str, ...] = ()
-    """Changes that the reader of the file made, as sentences."""
+    """Sentences about changes that the reader of the mesh file made."""
 
     def summary(self) -> str:
-        """Return one line of text: numbers of faces and vertices before cleaning, and repairs."""
+        """Return a text with the numbers of faces and vertices before cleaning, and of repairs."""
         counts = [
             (template, getattr(self, name))
             for name, template in _REPAIR_TEXT_BY_REPORT_FIELD.items()
@@ -228,9 +228,9 @@ class CleanedMesh(NamedTuple):
     """Mesh that is ready for ray casting, and the report of its cleaning."""
 
     mesh: Mesh
-    """Mesh with the faces that are left, in the given order."""
+    """Mesh with the faces that cleaning has left, in the order in which they were passed."""
     report: MeshCleaningReport
-    """Numbers of vertices and faces, and of repairs."""
+    """Numbers of vertices and faces before cleaning, and numbers of repairs."""
 
 
 def clean_mesh(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> CleanedMesh:
@@ -300,20 +300,20 @@ def clean_mesh(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> Cle
 
 
 def _require_faces(n_left: int, n_given: int) -> None:
-    """Raise `ValueError` if no face is left."""
+    """Raise `ValueError` if cleaning has left none of `n_given` faces."""
     if n_left == 0:
         raise ValueError(f"of {n_given} faces none is left that a ray could hit")
 
 
 def _find_unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the distinct rows of an array.
+    """Find the distinct rows of an array (n, columns).
 
     Returns
     -------
     kept : ndarray
         Indices of the first occurrence of each distinct row, in rising order.
     index_in_kept : ndarray
-        Position in `kept` of the row equal to each row.
+        For each of the n rows, the position in `kept` of the equal row.
     """
     order = np.lexsort(rows.T)  # stable: the first of equal rows is kept
     is_new = np.ones(len(rows), dtype=bool)
@@ -325,7 +325,10 @@ def _find_unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nonzero_area_mask(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return a mask (m,) of the faces with an area above 0; doubtful cases are computed exactly."""
+    """Return a mask (m,) of the triangles with an area above 0.
+
+    Areas close to rounding errors are computed exactly.
+    """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     b, c = b - a, c - a
     longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
@@ -341,7 +344,7 @@ def _nonzero_area_mask(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def read_mesh_facets(
     path: str | Path, *, unit: str | None = None, up: str | None = None, scale: float = 1.0
 ) -> Facets:
-    """Read all parts of a mesh file as facets, which are not cleaned yet.
+    """Read all parts of a mesh file as facets, which are not cleaned.
 
     Polygons are cut into triangles (:mod:`sweep.scenes.polygons`).
 
@@ -451,9 +454,9 @@ def _read_triangle_facets(path: Path) -> tuple[list[Facets], str | None]:
 
 
 def _make_companion_resolver(path: Path) -> Any:
-    """Return an object by which trimesh reads the further files that a mesh file names.
+    """Return an object through which trimesh reads the files that a mesh file refers to.
 
-    It reads nothing but plain files, by paths relative to the mesh file.
+    The object reads plain files only. Their paths are relative to the mesh file.
     """
     from trimesh.resolvers import Resolver
 
@@ -483,17 +486,17 @@ def _make_companion_resolver(path: Path) -> Any:
 
 
 _STL_HEADER_STRUCT = struct.Struct("<80sI")
-"""Header of a binary STL: 80 bytes of text and the number of triangles."""
+"""Layout of the header of a binary STL: 80 bytes of text, and the number of triangles."""
 _STL_TRIANGLE_BYTES = 50
-"""Bytes per triangle of a binary STL."""
+"""Number of bytes of one triangle in a binary STL."""
 _STL_PROBE_BYTES = 1000
-"""Number of bytes at the start of an STL file that distinguish text from binary files."""
+"""Number of bytes at the start of an STL file from which text and binary files are told apart."""
 
 
 def _check_stl(path: Path) -> None:
-    """Raise `ValueError` if the size of a binary STL does not match its number of triangles.
+    """Raise `ValueError` if the size of a binary STL file does not match its number of triangles.
 
-    A text STL has no zero bytes.
+    A text STL is not checked. It is recognised by its keywords and by the absence of zero bytes.
     """
     with path.open("rb") as file:
         first_bytes = file.read(_STL_PROBE_BYTES)
@@ -512,13 +515,13 @@ def _check_stl(path: Path) -> None:
 
 
 _GLB_HEADER_STRUCT = struct.Struct("<4sIIII")
-"""Header of a binary glTF, with the header of its first chunk."""
+"""Layout of the header of a binary glTF, followed by the header of its first chunk."""
 _GLTF_ACCESSOR_ELEMENT_BYTES_MAX = 64
-"""Size of the largest element of a glTF array, a matrix of 16 floats [bytes]."""
+"""Size of the largest possible element of a glTF array, a matrix of 16 floats [bytes]."""
 
 
 def _check_gltf(path: Path) -> None:
-    """Raise an error if a glTF is invalid, or its arrays exceed its data or the free memory."""
+    """Raise an error if a glTF file is invalid, or its arrays exceed its data or the memory."""
     content = path.read_bytes()
     if path.suffix.lower() == ".glb":
         if len(content) < _GLB_HEADER_STRUCT.size:
@@ -543,9 +546,9 @@ def _check_gltf(path: Path) -> None:
 
 
 def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
-    """Yield the facets of a node of a file's scene graph, in the coordinates of the file.
+    """Yield the facets of a node of a mesh file's scene graph, in the coordinates of the file.
 
-    Nodes of points and curves have none.
+    A node of points or curves yields nothing.
     """
     matrix, name = scene.graph[node]
     mesh = scene.geometry[name]
@@ -559,7 +562,7 @@ def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
 
 
 def _metres_per_unit(path: Path, unit: str | None) -> float:
-    """Return the length of a unit [m]; 1 if no unit is given."""
+    """Return the length of a unit [m], given its name; 1 if `unit` is None."""
     if unit is None:
         return 1.0
     try:
@@ -569,7 +572,7 @@ def _metres_per_unit(path: Path, unit: str | None) -> float:
 
 
 def sphere_facets(*, radius: float, subdivisions: int) -> Facets:
-    """Return a sphere: a refined icosahedron whose vertices lie on the sphere.
+    """Return a sphere as facets: a refined icosahedron whose vertices lie on the sphere.
 
     Parameters
     ----------
@@ -585,7 +588,7 @@ def sphere_facets(*, radius: float, subdivisions: int) -> Facets:
 
 
 def box_facets(*, size: Sequence[float]) -> Facets:
-    """Return a box of 12 outward-facing triangles, centred at its origin.
+    """Return a box as 12 outward-facing triangles, centred at its origin.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ def read_polygon_file(path: Path) -> Polygons:
 
 
 def _make_polygons(vertices: Any, faces: list[list[int]]) -> Polygons:
-    """Return the `Polygons` of vertices and lists of vertex indices."""
+    """Return a `Polygons` record of vertices and faces, which are lists of vertex indices."""
     counts = np.array([len(face) for face in faces], np.int64)
     corners = np.array([corner for face in faces for corner in face], np.int64)
     return Polygons(np.asarray(vertices, float).reshape(-1, 3), corners, counts)
@@ -87,7 +87,7 @@ def _read_off(path: Path) -> Polygons:
 def _iter_required_lines(
     lines: Iterator[tuple[int, list[str]]], number: int, element_name: str
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield the next `number` lines; raise `ValueError` if the file has fewer.
+    """Yield the next `number` of a file's `lines`; raise `ValueError` if the file has fewer.
 
     `element_name` is what the lines describe, for the error.
     """
@@ -99,9 +99,9 @@ def _iter_required_lines(
 
 
 def _iter_line_words(path: Path, continuation_mark: str = "") -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number and words of each line that is not empty; '#' begins a comment.
+    """Yield the line number and the words of each line of a text file that is not empty.
 
-    A line that ends with the continuation mark is joined to the next one.
+    A comment begins with '#'. A line that ends with `continuation_mark` is joined to the next one.
     """
     continued_text = ""
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -147,9 +147,9 @@ def _read_ply(path: Path) -> Polygons:
 
 
 _PLY_HEADER_BYTES_MAX = 1 << 20
-"""Maximum size of a PLY header [bytes]."""
+"""Largest permitted size of a PLY header [bytes]."""
 _INTEGER_PATTERN = re.compile(rb"[-+]?\d{1,4000}")
-"""Pattern of an integer in a PLY header."""
+"""Regular expression for an integer in a PLY header."""
 
 
 def _check_ply_row_counts(path: Path) -> None:
@@ -179,6 +179,6 @@ def _check_ply_row_counts(path: Path) -> None:
 
 
 _READER_BY_SUFFIX = {".obj": _read_obj, ".ply": _read_ply, ".off": _read_off}
-"""Readers of the file formats, by suffix."""
+"""Functions that read polygons from a file, by the file's suffix."""
 POLYGON_FORMATS = frozenset(_READER_BY_SUFFIX)
-"""Suffixes of the file formats that this module reads."""
+"""Suffixes of the polygon file formats that can be read."""

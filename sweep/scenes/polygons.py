@@ -15,28 +15,28 @@ from typing import NamedTuple
 import numpy as np
 
 NON_PLANARITY_REPORTED_MIN = 1e-3
-"""Distance of a polygon's corner from its mean plane above which the distance is reported.
+"""Relative distance of a corner from a polygon's mean plane above which it is reported.
 
-It is relative to the square root of the polygon's area.
+The distance is relative to the square root of the polygon's area.
 """
 
 NON_PLANARITY_MAX = 0.25
-"""Distance of a polygon's corner from its mean plane above which the polygon is refused.
+"""Relative distance of a corner from a polygon's mean plane above which the polygon is refused.
 
-It is relative to the square root of the polygon's area. The corners of such a polygon do not
-determine its surface.
+The distance is relative to the square root of the polygon's area. Corners farther from the plane do
+not determine a surface.
 """
 
 _RELATIVE_AREA_ROUNDING_ERROR_MAX = 1e-12
-"""Largest rounding error of the area of a polygon without area.
+"""Largest relative rounding error of the area of a polygon whose true area is 0.
 
-It is relative to the square of the polygon's extent.
+The error is relative to the square of the polygon's extent.
 """
 
 _AREA_SUM_TOLERANCE = 1e-9
 """Largest relative difference between a polygon's area and the sum of its triangles' areas.
 
-Larger differences do not come from rounding, and the polygon is refused.
+A larger difference does not come from rounding: the polygon is refused.
 """
 
 
@@ -53,7 +53,7 @@ class Polygons(NamedTuple):
     vertices: np.ndarray
     """Vertices (n, 3), float64."""
     corner_vertices: np.ndarray
-    """Vertex indices of the corners of all polygons, one polygon after the other, int64."""
+    """Vertex indices (int64) of the corners of all polygons, polygon after polygon."""
     corner_counts: np.ndarray
     """Number of corners (m,) int64 of each polygon."""
 
@@ -62,23 +62,26 @@ class Triangulation(NamedTuple):
     """Triangles into which polygons were cut, with the order and winding of the polygons."""
 
     faces: np.ndarray
-    """Vertex indices (k, 3) int64 of the triangles."""
+    """Vertex indices (k, 3) int64 of the corners of the triangles."""
     n_triangulated_polygons: int
-    """Number of polygons with more than three corners."""
+    """Number of polygons with more than three corners, which were cut into triangles."""
     n_concave_polygons: int
     """Number of polygons with more than three corners that are not convex."""
     n_non_planar_polygons: int
-    """Number of polygons whose departure from a plane exceeds `NON_PLANARITY_REPORTED_MIN`."""
+    """Number of polygons with a corner farther from their mean plane than is reported.
+
+    The limit is `NON_PLANARITY_REPORTED_MIN`.
+    """
     largest_plane_departure: float
-    """Largest departure of a corner from the mean plane of its polygon [unit of the vertices].
+    """Largest distance of a corner from the mean plane of its polygon [unit of the vertices].
 
     Only the polygons counted by `n_non_planar_polygons` are considered.
     """
 
     def summary_sentences(self) -> tuple[str, ...]:
-        """Return sentences about the polygons that were cut into triangles.
+        """Return sentences about the polygons that were cut into triangles, for the user.
 
-        Lengths are in the unit of the file.
+        Lengths in them are in the unit of the file.
         """
         if not self.n_triangulated_polygons:
             return ()
@@ -98,15 +101,16 @@ class Triangulation(NamedTuple):
 
 
 def _polygon_count_text(polygons: int) -> str:
-    """Return a number of polygons as text, such as '1 polygon'."""
+    """Return a number of polygons as text, such as '1 polygon' or '2 polygons'."""
     return f"{polygons:,} polygon{'s' * (polygons != 1)}"
 
 
 def triangulate_polygons(polygons: Polygons) -> Triangulation:
     """Cut polygons into triangles.
 
-    A polygon without area, or with a vertex that is not finite, becomes triangles of the same kind,
-    which :func:`sweep.scenes.meshes.clean_mesh` drops and counts.
+    A polygon without area becomes triangles without area. A polygon with a vertex that is not
+    finite becomes triangles with such a vertex. :func:`sweep.scenes.meshes.clean_mesh` drops and
+    counts them.
 
     Parameters
     ----------
@@ -205,10 +209,10 @@ class _FlatPolygons(NamedTuple):
 
 
 def _project_to_mean_planes(points: np.ndarray, polygon_numbers: np.ndarray) -> _FlatPolygons:
-    """Project polygons to their mean planes.
+    """Project m polygons with n corners each to their mean planes. Return the flat polygons.
 
-    `points` (m, n, 3) are the corners of m polygons. `polygon_numbers` (m,) are the indices of
-    these polygons in the file, for errors.
+    `points` (m, n, 3) are the corners. `polygon_numbers` (m,) are the indices of the polygons in
+    the file, for errors.
     """
     has_data = np.isfinite(points).all(axis=(1, 2))
     points = np.where(has_data[:, None, None], points, 0.0)
@@ -253,10 +257,10 @@ def _project_to_mean_planes(points: np.ndarray, polygon_numbers: np.ndarray) -> 
 
 
 def _collinear_polygon_mask(points: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """Return a mask (m,) of the polygons whose corners all lie on a line.
+    """Return a mask (m,) of the polygons whose corners all lie on a straight line.
 
-    `points` (m, n, 3) are the corners relative to the first one. `extent` (m,) are their largest
-    distances from it.
+    `points` (m, n, 3) are the corners relative to the polygon's first corner. `extent` (m,) is the
+    largest distance of a corner from the first corner.
     """
     squared_distance = (points * points).sum(axis=2)
     farthest = points[np.arange(len(points)), squared_distance.argmax(axis=1)]
@@ -313,13 +317,13 @@ def _triangulate_by_earcut(
 
 
 _EDGE_POINT_PAIRS_PER_BATCH_MAX = 1 << 22
-"""Maximum number of pairs of an edge and a point for which winding numbers are computed at once."""
+"""Largest number of pairs of edge and point for which winding numbers are computed at once."""
 
 
 def _polygon_winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
     """Return True if a polygon winds once and counter-clockwise about each of its triangles.
 
-    `corners` (n, 2) are the polygon's corners, `triangles` (k, 3) indices into them.
+    `corners` (n, 2) are the corners of the polygon. `triangles` (k, 3) are indices into `corners`.
     """
     edge_ends = np.roll(corners, -1, axis=0)
     centres = corners[triangles].mean(axis=1)
@@ -339,17 +343,20 @@ def _polygon_winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
 
 
 def _signed_triangle_areas(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the areas (k,) of triangles in a plane; positive if they are counter-clockwise."""
+    """Return the areas (k,) of triangles in a plane; positive if counter-clockwise, else negative.
+
+    `triangles` (k, 3) are indices into `corners` (n, 2).
+    """
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     b, c = b - a, c - a
     return np.asarray(0.5 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]))
 
 
 def _split_triangles_at_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Split triangles at the polygon's corners that lie on straight edges.
+    """Return triangles that are split at those corners of a polygon that lie on straight edges.
 
-    Earcut leaves such corners out. The polygon would then not share its edges with a neighbour that
-    has the same corner. `triangles` (k, 3) are indices into `corners` (n, 2).
+    Earcut leaves these corners out. The polygon would then lack edges in common with a neighbour
+    that has the same corner. `triangles` (k, 3) are indices into `corners` (n, 2).
     """
     used = np.zeros(len(corners), bool)
     used[triangles] = True
@@ -384,7 +391,7 @@ def _split_triangles_at_collinear_corners(triangles: np.ndarray, corners: np.nda
 def _triangle_by_directed_edge(
     triangle: tuple[int, ...], number: int
 ) -> dict[tuple[int, int], int]:
-    """Return the three edges of a triangle as keys, with the triangle's number as value.
+    """Return a dict that maps each of the three edges of a triangle to the triangle's number.
 
     An edge is a pair of corner indices, in the order of the winding.
     """

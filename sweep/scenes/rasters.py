@@ -28,19 +28,19 @@ from sweep.scenes.scene_files import SceneError, require_file, require_memory
 from sweep.scenes.terrain import AreaBounds, Terrain
 
 GRID_CELLS_MAX = 50_000_000
-"""Maximum number of heights of a terrain. Each height makes about two triangles."""
+"""Largest number of heights of a terrain. Each height makes about two triangles."""
 
 RASTER_FILE_CELLS_MAX = 1_000_000_000
-"""Maximum number of heights in a raster file. All of them are read to compute the file's digest."""
+"""Largest number of heights in a raster file. All are read to compute the file's digest."""
 
 TRIANGULATION_BYTES_PER_CELL = 220
-"""Upper bound of the memory per height for building triangles and their ray-casting tree [bytes].
+"""Memory per height for building triangles and their ray-casting tree, at most [bytes].
 
-It was measured.
+The value was measured.
 """
 
 _READ_STRIP_CELLS = 1 << 22
-"""Number of heights that are read from a raster file at once."""
+"""Number of heights that are read from a raster file in one strip."""
 
 _GDAL_OFFLINE_OPTIONS = {
     "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none",
@@ -50,14 +50,17 @@ _GDAL_OFFLINE_OPTIONS = {
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_VRT_ENABLE_RAWRASTERBAND": "NO",
 }
-"""Options of GDAL that keep it from fetching or running anything that a raster file names."""
+"""Options that keep GDAL from fetching or running anything that a raster file names."""
 
 _GDAL_DRIVERS = (
     "GTiff", "AAIGrid", "GRASSASCIIGrid", "EHdr", "ENVI", "HFA", "PNG", "JPEG", "BMP", "SRTMHGT",
     "USGSDEM", "DTED", "GSAG", "GSBG", "GS7BG", "XYZ", "SAGA", "RST", "PDS", "ISIS2", "ISIS3",
     "VICAR", "JP2OpenJPEG", "netCDF",
 )  # fmt: skip
-"""GDAL drivers of the raster formats that can be read: local files without references to others."""
+"""Names of the GDAL drivers of raster formats that can be read.
+
+Files of these formats are local, and refer to no other files.
+"""
 
 _IMAGE_FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
 """Formats of grey images that can be read.
@@ -66,9 +69,9 @@ Readers of other formats may run programs.
 """
 
 _VRT_BYTES_MAX = 1 << 26
-"""Maximum size of a virtual raster's file [bytes]."""
+"""Largest permitted size of a virtual raster's file [bytes]."""
 _VRT_NESTING_MAX = 8
-"""Maximum depth to which virtual rasters may be nested."""
+"""Largest permitted depth to which virtual rasters are nested."""
 
 
 def read_raster_terrain(
@@ -178,7 +181,7 @@ def _raster_crs_wkt(path: Path, raster: Any) -> str:
 def _terrain_with_warnings(
     path: Path, terrain: Terrain, no_data_warnings: tuple[str, ...]
 ) -> Terrain:
-    """Return a terrain with warnings about its map scale, suspicious heights and cliffs added."""
+    """Return a copy of a terrain with warnings about its scale, heights and cliffs added."""
     _require_enough_heights(path, terrain.heights)
     map_warnings = () if terrain.map_frame is None else terrain.map_frame.warnings
     cliff_texts = cliff_warnings(path, terrain.heights, terrain.spacing)
@@ -242,7 +245,7 @@ def open_raster(path: Path) -> Iterator[Any]:
 def _require_raster_block_memory(path: Path, raster: Any) -> None:
     """Raise `SceneError` if a block of a raster file does not fit into the free memory.
 
-    A block is the part of a file that is decompressed at once.
+    A block is a part of the raster that is decompressed as one.
     """
     for (rows, columns), dtype in zip(raster.block_shapes, raster.dtypes, strict=True):
         bytes_needed = 2 * rows * columns * np.dtype(dtype).itemsize
@@ -250,7 +253,7 @@ def _require_raster_block_memory(path: Path, raster: Any) -> None:
 
 
 def _open_raster_file(path: Path) -> Any:
-    """Open a raster file with rasterio, if its format is supported."""
+    """Open a raster file with rasterio; raise `SceneError` if its format is not supported."""
     from rasterio.io import DatasetReader
 
     for sidecar in path.parent.glob(f"{glob.escape(path.stem)}.*"):
@@ -279,7 +282,7 @@ def _gdal_without_network() -> Iterator[None]:
 
 
 def _is_virtual_raster(path: Path) -> bool:
-    """Return True if a file begins like a virtual raster of GDAL."""
+    """Return True if a file begins as a virtual raster (VRT) of GDAL does."""
     with path.open("rb") as file:
         return b"<vrtdataset" in file.read(1 << 16).lower()
 
@@ -287,8 +290,8 @@ def _is_virtual_raster(path: Path) -> bool:
 def _check_vrt_sources(path: Path, enclosing_files: tuple[Path, ...]) -> None:
     """Raise `SceneError` if a source file of a virtual raster is no raster on this machine.
 
-    GDAL would read zeros for a missing source, and would fetch a remote one. `enclosing_files` are
-    the virtual rasters in which this one is nested.
+    GDAL would read zeros for a missing source, and would fetch a remote source. `enclosing_files`
+    are the virtual rasters in which the one at `path` is nested.
     """
     if not _is_virtual_raster(path):
         return
@@ -300,9 +303,9 @@ def _check_vrt_sources(path: Path, enclosing_files: tuple[Path, ...]) -> None:
 
 
 def _read_vrt_source_paths(path: Path) -> list[Path]:
-    """Return the source files that a virtual raster names, without duplicates.
+    """Return the paths of the source files that a virtual raster names, without duplicates.
 
-    Raise `SceneError` if one does not exist.
+    `SceneError` is raised if a source file does not exist.
     """
     if path.stat().st_size > _VRT_BYTES_MAX:
         raise SceneError(path, "is no raster that can be read (too large)", "make it a GeoTIFF")
@@ -342,10 +345,10 @@ def _require_supported_format(path: Path) -> None:
 
 
 def _unrotated_geotransform(path: Path, raster: Any, pixel: float | None) -> Any:
-    """Return the transform from pixels to map coordinates of a raster.
+    """Return the transform from the pixels of a raster to map coordinates.
 
-    Raise `SceneError` if the raster is rotated against its map, or has no scale. `pixel` is the
-    stated size of a pixel [m] of a raster without a scale.
+    `SceneError` is raised if the raster is rotated against its map, or has no scale. `pixel` is the
+    pixel size [m] that the user states for a raster without a scale.
     """
     from rasterio import Affine
 
@@ -364,9 +367,10 @@ def _unrotated_geotransform(path: Path, raster: Any, pixel: float | None) -> Any
 
 
 def _pixel_window(path: Path, raster: Any, transform: Any, window: AreaBounds | None) -> Any:
-    """Convert a window in map coordinates to a window of pixels; None stands for the whole raster.
+    """Return the window of a raster's pixels that covers a window in map coordinates.
 
-    Raise `SceneError` if the window is empty or too large.
+    If `window` is None, the result covers all of the raster. `SceneError` is raised if the result
+    has too few pixels for ground, or too many.
     """
     from rasterio.windows import Window as PixelWindow
 
@@ -400,15 +404,15 @@ def _iter_pixel_windows(width: int, height: int) -> Iterator[Any]:
 
 
 def _read_band_window(raster: Any, band: int, window: Any) -> np.ndarray:
-    """Return the stored values (rows, columns) of a band in a pixel window; NaN if missing."""
+    """Return the stored values (rows, columns) of a band in a window of pixels; NaN if missing."""
     values = raster.read(band, window=window, masked=True)
     return np.asarray(np.ma.filled(values.astype(float), np.nan))
 
 
 def _read_band_window_in_strips(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
-    """Return the stored values (rows, columns) of a band in a pixel window.
+    """Return the stored values (rows, columns) of a band in a window of pixels; NaN if missing.
 
-    The values are read in strips to save memory.
+    The values are read strip by strip, to save memory.
     """
     from rasterio.windows import Window as PixelWindow
 
@@ -427,13 +431,16 @@ def _read_band_window_in_strips(raster: Any, band: int, pixel_window: Any) -> np
 
 
 def _require_enough_heights(path: Path, heights: np.ndarray) -> None:
-    """Raise `SceneError` if a grid has too few heights for a triangle."""
+    """Raise `SceneError` if a grid of heights has too few of them for a triangle."""
     if min(heights.shape) < 2 or np.isfinite(heights).sum() < 3:
         raise SceneError(path, "has too few heights for a triangle", "check its no-data value")
 
 
 def refuse_too_large_grid(path: Path, rows: int, columns: int, remedy: str) -> None:
-    """Raise `SceneError` if a grid has too many heights for a scene or for the free memory."""
+    """Raise `SceneError` if a grid has too many heights for a scene or for the free memory.
+
+    `remedy` is the advice in the error.
+    """
     if rows * columns > GRID_CELLS_MAX:
         problem = f"has {columns:,} x {rows:,} heights, more than {GRID_CELLS_MAX:.0e}"
         raise SceneError(path, problem, remedy)
@@ -538,7 +545,7 @@ def _read_npy_data(path: Path, file: Any, size: int) -> np.ndarray:
 def _terrain_from_heights(
     path: Path, values: np.ndarray, spacing: tuple[float, float], no_data: float | None = None
 ) -> Terrain:
-    """Return a terrain with an array of heights, and with its first node at the world's origin."""
+    """Return a terrain with given heights, and with its first node at the world's origin."""
     if min(values.shape) < 2:
         problem = f"holds {values.dtype} of shape {values.shape}"
         raise SceneError(path, problem, "heights are a two-dimensional array of numbers")
@@ -557,9 +564,8 @@ def read_image_terrain(
 ) -> Terrain:
     """Read a grey image of 8 or 16 bits as a terrain.
 
-    The first pixel lies at the world's origin. Row 0 is the northernmost row.
-
-    Heights are linear in the grey level, and therefore quantised: smooth them before using slopes.
+    The first pixel lies at the world's origin. Row 0 is the northernmost row. Heights are linear in
+    the grey level, and therefore have steps: smooth them before using slopes.
 
     Parameters
     ----------

@@ -21,10 +21,10 @@ class MinimumOfPowerLaws:
     """
 
     coefficients_and_exponents: tuple[tuple[float, float], ...]
-    """Coefficient and exponent of each power law, for N in 1/m^2 and D in m."""
+    """Coefficient c and exponent p of each power law N(>D) = c D**-p, for N in 1/m^2 and D in m."""
 
     def cumulative_number_density(self, diameter: np.ndarray) -> np.ndarray:
-        """Return the number per area of objects that are at least as large as a diameter.
+        """Return the number per area of objects with a diameter above each of `diameter`.
 
         Parameters
         ----------
@@ -40,7 +40,7 @@ class MinimumOfPowerLaws:
         return np.min([c * d**-b for c, b in self.coefficients_and_exponents], axis=0)
 
     def diameter_at_number_density(self, density: np.ndarray) -> np.ndarray:
-        """Return the diameters (n,) [m] at which the number per area is `density` (n,) [1/m^2].
+        """Return the diameters (n,) [m] above which the law gives `density` (n,) objects per m^2.
 
         This is the inverse of `cumulative_number_density`.
         """
@@ -49,15 +49,15 @@ class MinimumOfPowerLaws:
 
 
 LUNAR_CRATER_EQUILIBRIUM_LAW = (10**-1.1, 2.0)
-"""Coefficient and exponent of the number of old craters on the Moon per m^2 above a diameter.
+"""Coefficient c and exponent p of the number c D**-p of old lunar craters above diameter D.
 
-In equilibrium, new craters destroy as many old craters. Trask gives the number per 10^6 km^2 as
-``10**10.9 D**-2``, with the diameter D in metres: Ranger VIII and IX, part II, JPL Technical Report
-32-800 (1966).
+The number is per m^2, and D is in m. Old craters are in equilibrium: each new crater destroys an
+old one. Trask gives the number per 10^6 km^2 as ``10**10.9 D**-2``: Ranger VIII and IX, part II,
+JPL Technical Report 32-800 (1966).
 """
 
 CRATER_PRODUCTION_EXPONENT = 2.8
-"""Exponent by which the number of young craters of 1 to 100 m falls with their diameter.
+"""Exponent p of the number D**-p of young lunar craters above diameter D, for D of 1 to 100 m.
 
 Young craters have not yet worn each other down. Moore, Boyce and Hahn, The Moon and the Planets 23,
 231 (1980): "near 2.8".
@@ -106,19 +106,18 @@ class MartianRockLaw:
     """
 
     area_fraction: float
-    """Fraction of the ground that rocks of all sizes cover."""
+    """Fraction of the ground that rocks of all sizes together cover."""
 
     @property
     def area_fraction_decay_rate(self) -> float:
-        """Rate at which the covered fraction falls with the smallest diameter counted [1/m].
+        """Rate q [1/m] at which the fraction of ground under rocks falls with their diameter.
 
-        The fraction under rocks of at least diameter D is proportional to ``exp(-q D)``, with this
-        rate q.
+        The fraction under rocks of at least diameter D is proportional to ``exp(-q D)``.
         """
         return 1.79 + 0.152 / self.area_fraction
 
     def cumulative_number_density(self, diameter: np.ndarray) -> np.ndarray:
-        """Return the number per area of rocks that are at least as large as a diameter.
+        """Return the number per area of rocks with a diameter above each of `diameter`.
 
         Parameters
         ----------
@@ -137,7 +136,7 @@ class MartianRockLaw:
         )
 
     def diameter_at_number_density(self, density: np.ndarray) -> np.ndarray:
-        """Return the diameters (n,) [m] at which the number per area is `density` (n,) [1/m^2].
+        """Return the diameters (n,) [m] above which the law gives `density` (n,) rocks per m^2.
 
         This is the inverse of `cumulative_number_density`, by Newton's method on its logarithm.
         """
@@ -162,7 +161,7 @@ class MartianRockLaw:
 
 
 SizeFrequencyLaw = MinimumOfPowerLaws | MartianRockLaw
-"""Size-frequency law: converts a diameter to the number of objects per area, and back."""
+"""Size-frequency law: relates a diameter to the number per area of objects above the diameter."""
 
 
 def draw_positions_and_diameters(
@@ -220,9 +219,9 @@ def draw_positions_and_diameters(
 
 
 EJECTA_CUTOFF_CRATER_RADII = 4.0
-"""Distance from the crater's centre beyond which the model has no ejecta [crater radii].
+"""Distance from a crater's centre beyond which the crater has no ejecta [crater radii].
 
-At this distance the ejecta are 1/64 as high as at the rim.
+At this distance a cubic law would give ejecta 1/64 as high as at the rim.
 """
 
 
@@ -230,13 +229,13 @@ class CraterArrays(NamedTuple):
     """Positions, diameters and freshness of n craters."""
 
     x: np.ndarray
-    """World x of the centres [m]."""
+    """World x (n,) of the centres [m]."""
     y: np.ndarray
-    """World y of the centres [m]."""
+    """World y (n,) of the centres [m]."""
     diameter: np.ndarray
-    """Diameter from rim crest to rim crest [m]."""
+    """Diameter (n,) from rim crest to rim crest [m]."""
     freshness: np.ndarray
-    """Depth and rim height as a fraction of those of a fresh crater, 0..1."""
+    """Depth and rim height (n,), relative to those of a fresh crater of equal diameter, 0..1."""
 
 
 def fresh_crater_depth(diameter: np.ndarray) -> np.ndarray:
@@ -362,7 +361,7 @@ def draw_craters(
 
 
 def carve_craters(terrain: Terrain, craters: CraterArrays) -> Terrain:
-    """Add craters to the heights of a terrain.
+    """Return a terrain with craters added to its heights.
 
     Raises
     ------
@@ -487,7 +486,7 @@ def draw_boulders(
 
 
 def unit_dome(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a triangulated unit dome above z = 0, with a skirt down to z = -1.
+    """Return a triangulated dome of unit radius above z = 0, with a skirt down to z = -1.
 
     Parameters
     ----------
@@ -556,19 +555,19 @@ class MeanTreeDimensions:
     crown_diameter: float = 7.0
     """Diameter of the crown [m]."""
     crown_base: float = 3.0
-    """Height of the crown's lower end [m]."""
+    """Height of the crown's lower end above the ground [m]."""
     trunk_diameter: float = 0.4
-    """Diameter of the trunk at the ground [m]. At the top it is a third of that."""
+    """Diameter of the trunk at the ground [m]; at the top it is a third of this value."""
     leaf_length: float = 0.30
-    """Long diagonal of a leaf [m]. A leaf is a rhombus."""
+    """Long diagonal of a leaf, which is a rhombus [m]."""
     leaf_width: float = 0.20
-    """Short diagonal of a leaf [m]."""
+    """Short diagonal of a leaf, which is a rhombus [m]."""
     leaf_area_index: float = 2.0
-    """Area of one side of all leaves of a tree, over the crown's area seen from above."""
+    """Area of one side of all leaves of a tree, over the area of its crown seen from above."""
     variation: float = 0.25
     """Largest relative deviation of a tree's size from the mean size.
 
-    Sizes are uniformly distributed up to this deviation on both sides.
+    Sizes are uniform between the mean less this deviation and the mean plus this deviation.
     """
 
     def __post_init__(self) -> None:
@@ -686,7 +685,8 @@ def _draw_trunk_positions(
 def trunk_facets(tree: MeanTreeDimensions, size_factor: float = 1.0) -> Facets:
     """Return the trunk of a tree whose foot is at the origin, as a tapered prism.
 
-    It reaches from half a metre below the foot to the middle of the crown.
+    The prism reaches from half a metre below the foot to the middle of the crown. `size_factor` is
+    the size of this tree over the mean size.
     """
     sides = 8
     top_height = (tree.crown_base + tree.height) / 2
@@ -739,6 +739,6 @@ def draw_crown_leaves(
 
 
 def _draw_unit_vectors(generator: np.random.Generator, number: int) -> np.ndarray:
-    """Draw unit vectors (number, 3), uniform over the sphere."""
+    """Draw `number` unit vectors, uniform over the sphere, as an array (number, 3)."""
     vectors = generator.standard_normal((number, 3))
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -60,7 +60,9 @@ def _is_link_loop(path: Path) -> bool:
 
 
 def file_digest(path: str | Path) -> str:
-    """Return the digest of a file's content; for a glTF, also of the files to which it refers.
+    """Return the digest of a file's content; for a glTF, of its companion files as well.
+
+    Companion files are those to which a glTF refers.
 
     Returns
     -------
@@ -155,22 +157,22 @@ WAYPOINT_COLUMN_UNITS = {
     "qw": "", "qx": "", "qy": "", "qz": "",
     "heading": "rad", "pitch": "rad", "roll": "rad",
 }  # fmt: skip
-"""SI units of the columns of a table of waypoints, by name; empty for pure numbers."""
+"""SI units of the columns of a table of waypoints, by column name; '' for pure numbers."""
 
 _REQUIRED_WAYPOINT_COLUMNS = ("time", "x", "y", "z")
-"""Columns that every table of waypoints must have."""
+"""Names of the columns that every table of waypoints must have."""
 _QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
-"""Columns of an attitude as a quaternion, body to world."""
+"""Names of the columns of an attitude as a quaternion from body to world."""
 _ATTITUDE_ANGLE_COLUMNS = ("heading", "pitch", "roll")
-"""Columns of an attitude as three angles."""
+"""Names of the columns of an attitude as three angles."""
 _HEADER_CELL_PATTERN = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
-"""Pattern of a header cell: a name, followed by an optional unit in brackets."""
+"""Regular expression for a header cell: a name, and an optional unit in brackets."""
 _EXAMPLE_WAYPOINT_HEADER = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
-"""Example of a header of a table of waypoints, shown in error messages."""
+"""Example of the header of a table of waypoints, for error messages."""
 
 
 NumberedRow = tuple[int, list[str]]
-"""Line number and texts of the cells of a row of a CSV file."""
+"""Line number of a row of a CSV file, and the texts of its cells."""
 
 
 class WaypointTable(NamedTuple):
@@ -313,11 +315,11 @@ def read_csv_columns(
 
 
 _MISTAKES_SHOWN_MAX = 10
-"""Maximum number of mistakes in a file that an error message lists. The others are only counted."""
+"""Largest number of mistakes in a file that an error message lists; more are only counted."""
 
 
 def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
-    """Combine several errors about a file into one."""
+    """Return one error that combines several errors about a file."""
     shown_mistakes = mistakes[:_MISTAKES_SHOWN_MAX]
     rule = ", and ".join(mistake.problem for mistake in shown_mistakes)
     if len(mistakes) > len(shown_mistakes):
@@ -328,15 +330,15 @@ def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
 
 
 def _too_few_rows_error(path: Path, example: str) -> SceneError:
-    """Return the error for a table with fewer than two lines of numbers."""
+    """Return the error for a table with fewer than two rows of numbers."""
     remedy = f"write a header ({example}) and a line for each"
     return SceneError(path, "holds fewer than two lines of numbers", remedy)
 
 
 def _exact_times(rows: Sequence[NumberedRow], factors: Mapping[str, float]) -> list[Decimal]:
-    """Return the times [s] of table rows in decimal arithmetic, without rounding.
+    """Return the times [s] of table rows as decimal numbers, without rounding.
 
-    `factors` are the factors from the columns to SI units, by column name.
+    `factors` maps the name of each column to the factor from its unit to the SI unit.
     """
     column, factor = list(factors).index("time"), Decimal(repr(factors["time"]))
     with localcontext(prec=_DECIMAL_TIME_DIGITS):
@@ -344,15 +346,15 @@ def _exact_times(rows: Sequence[NumberedRow], factors: Mapping[str, float]) -> l
 
 
 _DECIMAL_TIME_DIGITS = 60
-"""Number of significant digits with which times of a table are computed."""
+"""Number of significant digits with which the times of a table are computed."""
 
 
 def _time_order_error(
     path: Path, earlier: tuple[int, Decimal], later: tuple[int, Decimal]
 ) -> SceneError:
-    """Return the error for a time that does not exceed the previous one.
+    """Return the error for a time in a table that does not exceed the time of the row before.
 
-    `earlier` and `later` are the line number and the time [s] of both rows, in the file's order.
+    `earlier` and `later` are the line number and the time [s] of the two rows, in the file's order.
     """
     (line, time), (next_line, next_time) = earlier, later
     if next_time == time:
@@ -374,7 +376,7 @@ def _header_si_factors(
     required_columns: Collection[str],
     example: str,
 ) -> dict[str, float]:
-    """Return the factor from each column's unit to SI by column name, in the order of the header.
+    """Return the factor from each column's unit to SI, by column name in the header's order.
 
     If the header has mistakes, one `SceneError` lists all of them.
     """
@@ -411,7 +413,10 @@ def _header_si_factors(
 
 
 def _read_csv_rows(path: Path) -> list[NumberedRow]:
-    """Return line number and cells of each row of a CSV file, except empty lines and comments."""
+    """Return the line number and the cells of each row of a CSV file.
+
+    Empty lines and comments are left out.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -441,7 +446,10 @@ def _column_si_factor(path: Path, name: str, si_unit: str, unit: str) -> float:
 
 
 def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str]) -> list[float]:
-    """Return the numbers in a row of a table; raise `SceneError` if a cell has no finite number."""
+    """Return the numbers in a row of a table.
+
+    `SceneError` is raised if a cell has no finite number.
+    """
     line_number, cells = numbered_row
     if len(cells) != len(column_names):
         problem = (
@@ -460,7 +468,7 @@ def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str
 
 
 def _parse_finite_number(cell: str) -> float | None:
-    """Return the number in a cell; None if the cell has no finite number."""
+    """Return the number in the text of a cell; None if it is no finite number."""
     try:
         value = float(cell)
     except ValueError:
@@ -471,7 +479,7 @@ def _parse_finite_number(cell: str) -> float | None:
 def _attitude_from_columns(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """Return the attitudes in a table of waypoints as quaternions (n, 4) from body to world.
 
-    The result is None if the table has no columns of attitude.
+    The result is None if the table has no columns of attitude. `table` maps names to columns.
     """
     quaternion_columns = [name for name in _QUATERNION_COLUMNS if name in table]
     angle_columns = {name: table[name] for name in _ATTITUDE_ANGLE_COLUMNS if name in table}

@@ -22,13 +22,13 @@ from sweep.scenes.map_frames import MapFrame
 from sweep.scenes.meshes import Facets
 
 _NEGATIVE_VARIANCE_FRACTION_MAX = 1e-6
-"""Largest sum of negative values in a power spectrum of relief, relative to the total variance.
+"""Largest sum of negative values in a power spectrum of relief, over the total variance.
 
-Rounding may cause it. A larger sum means that the covariance is not valid.
+Rounding may cause a smaller sum. A larger sum means that the covariance is not valid.
 """
 
 _COVARIANCE_BATCH_NODES = 1 << 20
-"""Number of grid nodes at which the covariance of random relief is computed at once."""
+"""Number of grid nodes at which the covariance of random relief is computed in one batch."""
 
 AreaBounds = tuple[float, float, float, float]
 """Smallest x, smallest y, largest x and largest y of an area in world coordinates [m]."""
@@ -45,7 +45,7 @@ class Terrain:
     origin: np.ndarray
     """World position (3,) of node (0, 0) at height 0 [m]."""
     map_frame: MapFrame | None = None
-    """Map to which the coordinates belong; None if the terrain is not from a map."""
+    """Map to which the coordinates belong; None if the terrain does not come from a map."""
     warnings: tuple[str, ...] = ()
     """Warnings about heights that may be wrong, as sentences."""
 
@@ -58,7 +58,7 @@ class Terrain:
 
     @property
     def bounds(self) -> AreaBounds:
-        """Bounds of the grid in world coordinates [m]."""
+        """Smallest x, smallest y, largest x and largest y of the grid in world coordinates [m]."""
         rows, columns = self.heights.shape
         x = sorted((0.0, (columns - 1) * self.spacing[0]))
         y = sorted((0.0, (rows - 1) * self.spacing[1]))
@@ -67,7 +67,7 @@ class Terrain:
 
     @property
     def centre(self) -> np.ndarray:
-        """World position (3,) of the centre of the grid, on the ground [m]."""
+        """World position (3,) of the centre of the grid, at the height of the ground [m]."""
         west, south, east, north = self.bounds
         x, y = (west + east) / 2, (south + north) / 2
         return np.array([x, y, self.height_at(np.array(x), np.array(y))])
@@ -90,7 +90,7 @@ class Terrain:
         return np.asarray(_interpolate_on_triangles(self.heights, row, column) + self.origin[2])
 
     def to_facets(self) -> Facets:
-        """Return the upward-facing triangles of the ground with the nodes that they use."""
+        """Return the ground as facets: upward-facing triangles, and the nodes that they use."""
         z, (dx, dy) = self.heights, self.spacing
         has_height = np.isfinite(z)
         faces = _grid_triangles(has_height)
@@ -115,9 +115,9 @@ class Terrain:
 def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
     """Return the triangles of all cells of a grid, as node indices (m, 3) int32.
 
-    `has_height` (rows, columns) is true for nodes with a height. The triangles are
-    counter-clockwise for positive grid steps. A complete cell is cut along the diagonal from node
-    (i, j) to (i+1, j+1). The lower triangles of all cells come first, then the upper triangles.
+    `has_height` (rows, columns) is True for a node with a height. Triangles are counter-clockwise
+    for positive grid steps. A cell with four heights is cut along the diagonal from node (i, j) to
+    (i+1, j+1). The lower triangles of all cells come first, and the upper triangles last.
     """
     node = np.arange(has_height.size, dtype=np.int32).reshape(has_height.shape)
     # Corners of each cell, counter-clockwise from (i, j).
@@ -149,10 +149,10 @@ def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
 def _interpolate_on_triangles(
     heights: np.ndarray, row: np.ndarray, column: np.ndarray
 ) -> np.ndarray:
-    """Interpolate heights linearly on the triangles of a grid.
+    """Return heights that are interpolated linearly on the triangles of a grid.
 
     `row` and `column` are the positions, in grid steps from the first node. The result is NaN
-    outside the grid.
+    outside the grid and in holes.
     """
     rows, columns = heights.shape
     i = np.clip(np.floor(row), 0, rows - 2).astype(np.int64)
@@ -172,7 +172,7 @@ def _interpolate_on_triangles(
 def refine_terrain(terrain: Terrain, *, factor: int) -> Terrain:
     """Return a terrain on a finer grid, interpolated by a cubic spline through all heights.
 
-    Slopes of the spline are continuous, so that a narrow beam does not see the facets of the
+    Slopes of the spline are continuous, so that a narrow beam does not resolve the facets of the
     original grid. A new node has a height if all original nodes around it have heights.
 
     Parameters
@@ -218,7 +218,9 @@ def refine_terrain(terrain: Terrain, *, factor: int) -> Terrain:
 
 
 def smooth_terrain(terrain: Terrain, *, standard_deviation: float) -> Terrain:
-    """Smooth a terrain by a Gaussian filter. Holes stay holes, and have no weight.
+    """Return a terrain smoothed by a Gaussian filter.
+
+    Holes stay holes, and have no weight.
 
     Parameters
     ----------
@@ -252,7 +254,7 @@ def smooth_terrain(terrain: Terrain, *, standard_deviation: float) -> Terrain:
 
 
 def crop_to_square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
-    """Cut a square out of a terrain.
+    """Return the part of a terrain that covers a square.
 
     Parameters
     ----------
@@ -300,7 +302,7 @@ def clipped_square_bounds(terrain: Terrain, *, centre: Sequence[float], size: fl
 
 
 def _no_ground_error(centre: Sequence[float], size: float) -> ValueError:
-    """Return the error for a square without terrain."""
+    """Return the error for a square that contains no terrain."""
     return ValueError(
         f"there is no ground within {size / 2:g} m of ({centre[0]:g}, {centre[1]:g}) m"
     )
@@ -368,7 +370,7 @@ def draw_fractal_relief(
 
 
 def _stein_covariance(alpha: float):  # type: ignore[no-untyped-def]  # returns a function with the constants
-    """Return the covariance of Stein's method for fractal relief.
+    """Return the covariance function of Stein's method for fractal relief, with its parameters.
 
     `alpha` is twice the Hurst exponent. Distances are in units of the grid's diagonal.
 
@@ -453,7 +455,7 @@ def draw_hills(
 def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
     """Draw a stationary Gaussian field with a given covariance.
 
-    The field is drawn on a torus, of which a corner is returned.
+    The field is drawn on a torus; the result is a corner of the torus.
 
     Parameters
     ----------

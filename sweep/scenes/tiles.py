@@ -24,9 +24,9 @@ import numpy as np
 from sweep.scenes.terrain import Terrain
 
 _ALIGNMENT_TOLERANCE_CELLS = 1e-3
-"""Largest deviation of the offset of two grids from a whole number of cells [cells].
+"""Largest deviation of the offset between two grids from a multiple of the cell size [cells].
 
-Up to this deviation the grids count as parts of one grid.
+Up to this deviation, two grids count as parts of one grid.
 """
 
 _ADJACENT_GAP_MAX_CELLS = 2.0
@@ -37,13 +37,13 @@ class ExtendedTiles(NamedTuple):
     """Rasters that meet their neighbours without gaps, as far as their grids agree."""
 
     terrains: dict[str, Terrain]
-    """Extended tiles by name."""
+    """Tiles after extension, by name."""
     warnings: list[str]
-    """Sentences about gaps that remain between adjacent rasters with different grids."""
+    """Sentences about gaps that remain between adjacent tiles with different grids."""
 
 
 def extend_tiles_to_neighbours(tiles: Mapping[str, Terrain]) -> ExtendedTiles:
-    """Extend each tile by the first row and column of its neighbours' nodes, which closes gaps.
+    """Extend each tile by the first row and column of nodes of its neighbours, to close gaps.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def extend_tiles_to_neighbours(tiles: Mapping[str, Terrain]) -> ExtendedTiles:
 
 
 def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
-    """Return the row and column of a tile's grid at which another tile has its first node.
+    """Return the row and column, in the grid of a tile, of another tile's first node.
 
     The result is None if the two tiles are on different grids.
     """
@@ -89,9 +89,10 @@ def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
 
 
 def _extend_tile(tile: Terrain, others: list[Terrain]) -> Terrain:
-    """Return a tile with one more row and one more column, taken from adjacent tiles.
+    """Return a tile extended by one row and one column of heights from adjacent tiles.
 
-    A row or column without any height is not added.
+    A row or column without any height is not added. A tile that gains neither is returned
+    unchanged.
     """
     rows, columns = tile.heights.shape
     heights = np.full((rows + 1, columns + 1), np.nan)

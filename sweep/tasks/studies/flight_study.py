@@ -742,7 +742,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
-        """Standard deviations of the instrument errors that a stronger echo does not reduce."""
+        """Standard deviations of instrument errors that do not fall as the echo gets stronger."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
         floor_section = self.spec.error_floor

@@ -165,7 +165,7 @@ class SelectedEffects(NamedTuple):
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
     def iter_groups_by_effects(self) -> Iterator[PointsWithSameEffects]:
-        """Yield the groups of points with the same simulated effects."""
+        """Yield groups of points with equal simulated effects, and the names of these effects."""
         for group_flags in np.unique(self.effect_flags):
             yield PointsWithSameEffects(
                 np.flatnonzero(self.effect_flags == group_flags),

@@ -37,18 +37,18 @@ if TYPE_CHECKING:
     from sweep.spec import Axis
 
 DETECTED_PD_MIN = 0.9
-"""Probability of detection above which a point counts as detected."""
+"""Probability of detection (pd) above which a point counts as detected."""
 
 SUMMARY_ROWS_MAX = 10
-"""Largest number of rows of the table of detection, without the row for the whole grid."""
+"""Largest number of rows of the detection table, not counting the row for all points."""
 
 SAMPLED_POINTS_MAX = 1 << 23
-"""Largest number of points that are read. Larger studies are sampled at random."""
+"""Largest number of a store's points that a summary reads; more points are sampled at random."""
 SAMPLED_BLOCKS_MAX = 1000
-"""Largest number of blocks that are read. Larger studies are sampled at random."""
+"""Largest number of a store's blocks that a summary reads; more blocks are sampled at random."""
 
 AXIS_POINTS_LISTED_MAX = 12
-"""Largest number of points of a flight's axes for which the summary has a row per point."""
+"""Largest number of points of a flight's axes for which a summary has a row per point."""
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,23 @@ class DetectionRow:
     """
 
     label: str
-    """Values of the axis in this part, as text."""
+    """Values of the slowest axis in this part of the grid, as text."""
     n_points: int
-    """Number of computed points."""
+    """Number of points that are computed in this part of the grid."""
     detected_fraction: float
-    """Fraction of the points with pd_shot above `DETECTED_PD_MIN`."""
+    """Fraction of these points with pd_shot above `DETECTED_PD_MIN`."""
     median_pd_shot: float
-    """Median of pd_shot."""
+    """Median of pd_shot, the probability of detection in both chirps, over these points."""
     median_pd_doppler: float
-    """Median of pd_doppler; nan without a Doppler segment."""
+    """Median of pd_doppler over these points; nan without a Doppler segment."""
 
     @classmethod
     def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
-        """Return the row for n points. ``pd_doppler`` (n,) is nan without a Doppler segment."""
+        """Return the row that summarises `pd_shot` (n,) and `pd_doppler` (n,) of n points.
+
+        ``pd_doppler`` is nan without a Doppler segment. Points that are not computed (nan) do not
+        count.
+        """
         is_computed = ~np.isnan(pd_shot)
         pd_shot, pd_doppler = (
             pd_shot[is_computed],
@@ -92,13 +96,16 @@ class DetectionSummary(NamedTuple):
     axis_heading: str
     """Name and units of the slowest axis; '' for a grid without axes."""
     rows: list[DetectionRow]
-    """A row for each part of this axis, and a last row for the whole grid."""
+    """Rows for the parts of the slowest axis, and a last row for the grid as one."""
     sampled_block_fraction: float
-    """Fraction of the stored blocks that were read."""
+    """Fraction of the stored blocks that were read for the summary."""
 
 
 def detection_summary(store: str | Location) -> DetectionSummary:
-    """Summarise detection in the stored blocks of a grid, or in a sample of them."""
+    """Return a summary of detection in the stored blocks of a grid study.
+
+    If there are many blocks, a random sample of them is summarised.
+    """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
     if not isinstance(study, GridStudy):
@@ -137,9 +144,9 @@ class UnsupportedPoints(NamedTuple):
     """Points in a sample of a store that the model does not support."""
 
     n_points: int
-    """Number of these points."""
+    """Number of points in the sample that the model does not support."""
     first_reason: str
-    """Why the first of them is not supported; '' if there is none."""
+    """Reason why the model does not support the first of the unsupported points; '' without any."""
 
 
 def count_unsupported_points(
@@ -147,7 +154,7 @@ def count_unsupported_points(
 ) -> UnsupportedPoints:
     """Count the points in a sample of a store's blocks that the model does not support.
 
-    Return the number, and why the first of them is not supported.
+    Return the number, and the reason for the first of these points. A flight has no such points.
     """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
@@ -166,7 +173,10 @@ def count_unsupported_points(
 
 
 def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) -> str:
-    """Return the reason why the model does not support one point of a block, as text."""
+    """Return the reason why the model does not support one point of a block, as text.
+
+    `local_index` (1,) is the index of the point in the block.
+    """
     ((_, effects),) = (
         study.effect_planner.select_for_block(block).subset(local_index).iter_groups_by_effects()
     )
@@ -190,9 +200,10 @@ class _BlockSample(NamedTuple):
 def _sample_blocks(
     store: Location, study: BlockStudy, done_block_numbers: np.ndarray | None
 ) -> _BlockSample:
-    """Return a random sample of the stored blocks, and the fraction of them that it holds.
+    """Return a random sample of the stored blocks, and the fraction that the sample has of them.
 
-    Equal calls give equal samples.
+    Equal calls give equal samples. `done_block_numbers` are the stored blocks; by default those
+    with a receipt.
     """
     done_block_numbers = (
         np.flatnonzero(receipted_block_mask(store, study))
@@ -209,16 +220,16 @@ def _sample_blocks(
 
 
 def _axis_range_label(axis: Axis, start: int, end: int) -> str:
-    """Return the range of values that a part of an axis covers, as text.
+    """Return the values of an axis from index `start` to index `end` - 1 as text.
 
-    Indices stand for the values if the axis sets several parameters.
+    Indices take the place of values if the axis sets several parameters.
     """
     values = range(axis.size) if len(axis.parameters) > 1 else axis.parameters[0].display_values
     return "..".join(dict.fromkeys([_format_value(values[start]), _format_value(values[end - 1])]))
 
 
 def _format_value(value: object) -> str:
-    """Return a value of an axis as text."""
+    """Return a value of an axis as text, numbers with four digits or more."""
     if not isinstance(value, float):
         return str(value)
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
@@ -228,15 +239,18 @@ class BlockValues(NamedTuple):
     """Values that a block wrote in some arrays with equal chunks."""
 
     region: tuple[slice, ...]
-    """Slices of these arrays that the block covers."""
+    """Slices of the arrays that the block covers, one slice per dimension."""
     values: list[np.ndarray]
-    """Values in this region, one array for each name."""
+    """Values in these slices, one array for each array name."""
 
 
 def iter_block_values(
     store: Location, study: BlockStudy, array_names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[BlockValues]:
-    """Yield the slices and values that each stored block wrote in arrays with equal chunks."""
+    """Yield, for each of `blocks`, the slices that the block covers in arrays, and its values.
+
+    `array_names` are arrays with equal chunks. A block without a chunk in them is left out.
+    """
     group = open_verified_group(store)
     arrays: list[Any] = [group[array_name] for array_name in array_names]
     for block in blocks:
@@ -252,28 +266,34 @@ class ScannerRow:
     """
 
     label: str
-    """Name of the scanner, and values at the point of the axes, as text."""
+    """Name of the scanner, and values of the axes at the row's point, as text."""
     n_shots: int = 0
-    """Number of shots times draws."""
+    """Number of shots times number of draws."""
     n_shots_with_true_return: int = 0
-    """Number of shots (times draws) with at least one true return."""
+    """Number of shots with at least one true return, summed over draws."""
     n_false_points: int = 0
-    """Number of points of the clouds that are not true returns."""
+    """Number of points of the point clouds that are no true returns, summed over draws."""
     n_cycles: int = 0
-    """Number of cycles times draws; 0 if a cycle has too few shots for navigation."""
+    """Number of measurement cycles times number of draws; 0 if a cycle has too few shots.
+
+    A cycle needs enough shots to compute a velocity vector.
+    """
     n_solved_cycles: int = 0
-    """Number of cycles (times draws) with a velocity vector."""
+    """Number of measurement cycles with a velocity vector, summed over draws."""
     pd_of_shots_by_block: list[np.ndarray] = field(default_factory=list, repr=False)
-    """Probabilities of detection of the shots that hit something, by block."""
+    """Probabilities of detection of the shots that hit something: one array for each block."""
 
     @property
     def mean_pd(self) -> float:
-        """Mean probability of detection of the shots that hit something; nan if no shot does."""
+        """Mean probability of detection of the shots that hit something; nan if none does."""
         all_pd = np.concatenate([*self.pd_of_shots_by_block, np.empty(0)])
         return float(all_pd.mean()) if all_pd.size else float("nan")
 
     def add_block(self, block_arrays: Mapping[str, np.ndarray]) -> None:
-        """Add a block, given the part of each array that it wrote."""
+        """Add the counts of a block to this row, in place.
+
+        `block_arrays` are the block's values by array name.
+        """
         from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
         from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
@@ -296,9 +316,10 @@ class ScannerRow:
 
 
 def flight_summary(store: str | Location) -> list[ScannerRow]:
-    """Return a row for each scanner and point of the axes.
+    """Return a row of counts for each scanner and each point of a flight's axes.
 
-    If there are more than `AXIS_POINTS_LISTED_MAX` points, each scanner has one row.
+    If there are more than `AXIS_POINTS_LISTED_MAX` points, each scanner has one row for all of
+    them.
     """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
@@ -332,9 +353,10 @@ def flight_summary(store: str | Location) -> list[ScannerRow]:
 
 
 def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list[str]:
-    """Return the values at a point of the axes as texts.
+    """Return the values at a point of the axes as texts, such as 'range 500 m'.
 
-    `axis_point` may have fewer indices than there are axes: the last axes are then left out.
+    `axis_point` are the indices of the point. The last axes are left out if it has fewer indices
+    than there are axes.
     """
     return [
         f"{member.coordinate_name} "
@@ -353,15 +375,15 @@ class AccuracyRow:
     """
 
     name: str
-    """Name of the probability or of the scanner; empty for the beamlets of a grid."""
+    """Name of the probability, or of the scanner; empty for the beamlets of a grid."""
     n_points: int = 0
-    """Number of points with a known error; for a flight, shots times points of the axes."""
+    """Number of points with a known error; in a flight, shots count at each point of the axes."""
     n_points_within_tolerance: int = 0
     """Number of points whose error is within the tolerance."""
     worst_error: float = math.nan
-    """Error, as a half-width, at the worst point: that of the largest excess over the tolerance."""
+    """Half-width of the error at the worst point, at which error less tolerance is largest."""
     tolerance_at_worst_point: float = math.nan
-    """Tolerance at the worst point."""
+    """Tolerance of the error at the worst point."""
     worst_point_label: str = ""
     """Values of the axes at the worst point, as text."""
     n_samples_at_worst_point: int = 0
@@ -369,16 +391,16 @@ class AccuracyRow:
     n_total_samples: int = 0
     """Number of draws, or of rays, at all points together."""
     n_samples_max: int = 0
-    """Largest number of draws, or of rays, at a point."""
+    """Largest number of draws, or of rays, of any point."""
     worst_point_index: tuple[int, ...] = ()
-    """Index of the worst point in the stored array."""
+    """Indices of the worst point in the stored array of errors, one per dimension."""
     sampled_block_fraction: float = 1.0
-    """Fraction of the stored blocks that were read."""
+    """Fraction of the stored blocks that were read for this row."""
     _worst_excess: float = -math.inf
 
     @property
     def excess(self) -> float:
-        """Excess of the error over the tolerance at the worst point; 0 if no point exceeds it."""
+        """Error less tolerance at the worst point; 0 if the error is within the tolerance."""
         return max(0.0, self.worst_error - self.tolerance_at_worst_point)
 
     @property
@@ -390,7 +412,7 @@ class AccuracyRow:
     def n_draws_needed(self) -> float:
         """Approximate number of draws that would meet the tolerance at the worst point.
 
-        nan if it is met, inf if no number would meet it.
+        It is nan if the tolerance is met already, and inf if the tolerance is 0.
         """
         if not self.excess:
             return math.nan
@@ -407,10 +429,10 @@ class AccuracyRow:
         samples: np.ndarray,
         start_index: tuple[int, ...],
     ) -> None:
-        """Count points by their errors, tolerances and samples, and keep the worst point.
+        """Add points to the counts of this row in place, and keep the worst point.
 
-        Points of unknown error are not counted. ``start_index`` is the index of the first point in
-        the stored array of errors, and ``samples`` are numbers of draws or rays.
+        Points of unknown (nan) error are not counted. ``start_index`` is the index of the first
+        point in the stored array of errors. ``samples`` are numbers of draws or rays.
         """
         is_known = np.isfinite(errors)
         samples = np.where(is_known, np.nan_to_num(samples), 0)
@@ -434,9 +456,9 @@ class AccuracyRow:
 def accuracy_rows_of_draws(
     store: str | Location, done_block_numbers: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row of statistical errors for each probability of detection.
+    """Return a row for each probability of detection with its statistical errors.
 
-    The result is empty without draws or results.
+    The list is empty for a study without draws or results.
     """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
@@ -460,10 +482,10 @@ def accuracy_rows_of_draws(
 def accuracy_rows_of_rays(
     store: str | Location, done_block_numbers: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row of errors by the finite number of rays for each scanner.
+    """Return a row for each scanner with the errors by its finite number of rays.
 
-    For a grid, the result is one row if the largest number of beamlets does not suffice, and empty
-    otherwise.
+    For a grid, the list has one row if the largest number of beamlets does not suffice, and is
+    empty otherwise.
     """
     store_path = parse_location(store)
     study = study_loading.read_study_and_check_blocks(store_path).study
@@ -514,9 +536,10 @@ def _accuracy_rows(
     samples_array: str,
     tolerance: np.ndarray,
 ) -> list[AccuracyRow]:
-    """Return a row for each array of errors.
+    """Return a row for each array of errors in a store.
 
-    ``samples_array`` holds the numbers of draws or rays.
+    ``error_arrays`` maps names of rows to names of these arrays. ``samples_array`` is the name of
+    the array with the numbers of draws or rays.
     """
     sample, axes = _sample_blocks(store_path, study, done_block_numbers), study.spec.axes
     rows = [
@@ -539,7 +562,7 @@ def _accuracy_rows(
 
 
 def _tolerance_over_grid(study: GridStudy) -> np.ndarray:
-    """Return the tolerance at each point, in a shape that broadcasts over the grid."""
+    """Return the tolerance at each point of a grid, in a shape that broadcasts over the grid."""
     for n_trailing_axes, values in enumerate(reversed(study.grid.values_by_axis)):
         if TOLERANCE_PARAMETER in values:
             return values[TOLERANCE_PARAMETER].reshape(-1, *(1,) * n_trailing_axes)
@@ -572,14 +595,14 @@ class Status:
 
     @property
     def complete(self) -> bool:
-        """True if every block is committed."""
+        """True if every block of the study is committed."""
         return self.blocks_done == self.blocks
 
     @property
     def seconds_left(self) -> float:
         """Estimated time to compute the missing points [s], at the speed of the last run.
 
-        The result is inf if that speed is 0.
+        It is inf if the last run committed nothing.
         """
         return (
             (self.points - self.points_done) / self.points_per_second

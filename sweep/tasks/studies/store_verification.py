@@ -76,9 +76,9 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
 BLOCKS_PER_READ_BATCH = 256
-"""Number of blocks that are read for checking at once."""
+"""Number of blocks of a store that are read in one batch for checking."""
 N_READER_THREADS = 4
-"""Number of threads that read blocks or shards."""
+"""Number of threads that read blocks or shards of a store."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,10 +163,10 @@ def verify(
 
 
 def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> AnyStudy | None:
-    """Return the study in a store, or that of ``spec``; raise StoreError if it can't be read.
+    """Return the study in a store, or the study of ``spec`` if given.
 
-    The result is None for a store whose blocks can't be checked: one without a study, a packed one,
-    or one of eyepoints that does not name their study.
+    StoreError is raised if it can't be read. The result is None for a store whose blocks can't be
+    checked: one without a study, a packed one, or one of eyepoints that does not name their study.
     """
     try:
         attributes = _undamaged_attributes(store_path)
@@ -202,7 +202,7 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
 def _verify_store(
     store_path: Location, study: AnyStudy | None, repair: bool, progress: Progress
 ) -> VerificationReport:
-    """Verify one store; restore its template if `repair`."""
+    """Check one store, and restore its template if `repair` is True. Return the report."""
     template_damage, restored_names = study_store.find_template_damages(store_path), []
     if template_damage and study and repair:
         study_store.refuse_foreign_store(store_path)  # a lock would be its first file made by sweep
@@ -229,16 +229,17 @@ def _verify_store(
 
 
 def _count_undamaged_blocks(store_path: Location, study: BlockStudy, damages: list[Damage]) -> int:
-    """Count the committed blocks without damage."""
+    """Return the number of committed blocks of a store without damage."""
     is_undamaged = journal.receipted_block_mask(store_path, study)
     is_undamaged[[damage.block for damage in damages]] = False
     return int(np.count_nonzero(is_undamaged))
 
 
 def _find_log_damages(store_path: Location) -> list[Damage]:
-    """Return the damaged lines of the journal.
+    """Return the damaged lines of a store's journal.
 
-    The last line of a log that is being written may be unfinished, and does not count.
+    The last line of a journal to which a process still writes may be unfinished, and does not
+    count.
     """
     unreadable = store_format.find_irregular_journal_files(store_path)
     holder = None if unreadable else journal.read_lock_holder(store_path)
@@ -254,7 +255,7 @@ def _find_log_damages(store_path: Location) -> list[Damage]:
 
 
 def _foreign_object_names(store_path: Location) -> list[str]:
-    """Return the names of the objects in a store that were not made by sweep."""
+    """Return the names of the objects (files) in a store that sweep did not make."""
     if isinstance(store_path, Path):
         return list_foreign_files(store_path)
     manifest = study_store.read_manifest_digests(store_path)
@@ -271,7 +272,10 @@ def _foreign_object_names(store_path: Location) -> list[str]:
 
 
 def _iter_surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Damage]:
-    """Yield chunk files outside the bounds of their arrays, except drafts of killed writers."""
+    """Yield a damage for each chunk file outside the bounds of its array.
+
+    Drafts that killed processes left behind do not count.
+    """
     manifest = study_store.read_manifest_digests(store_path)
     chunk_grid_shapes = (
         {name: owner_blocks.shape for name, owner_blocks in study.chunk_owner_blocks().items()}
@@ -297,7 +301,7 @@ def _iter_surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterat
 def _iter_block_damages(
     store_path: Location, study: BlockStudy, progress: Progress
 ) -> Iterator[Damage]:
-    """Yield the damages of committed blocks."""
+    """Yield the damages of all committed blocks of a store."""
     committed_digests = journal.read_committed_digests(store_path, study.n_blocks)
     blocks = np.flatnonzero(committed_digests != b"")
     progress = (
@@ -323,7 +327,10 @@ def _iter_block_damages(
 def _find_block_damages(
     store_path: Location, study: BlockStudy, block: int, expected_digest: bytes
 ) -> list[Damage]:
-    """Return the damages of a block's chunks, found by the digest in the block's receipt."""
+    """Return the damages of the chunks of one block.
+
+    `expected_digest` is the digest of the block's chunks in the block's receipt.
+    """
     chunk_paths, bytes_max = (
         study_store.chunk_names_of_block(study, block),
         study_store.make_chunk_size_limit(study),
@@ -363,7 +370,7 @@ def _read_chunk_damage(store_path: Location, chunk_path: str, bytes_max: int) ->
 
 
 def _withdraw_receipts(store_path: Location, damages: list[Damage], progress: Progress) -> str:
-    """Withdraw the receipts of damaged blocks. Return an error message if that fails, else ''."""
+    """Withdraw the receipts of damaged blocks. Return why this fails, or '' if it succeeds."""
     try:
         with (
             journal.StoreLock(store_path, progress.say),
@@ -384,7 +391,10 @@ def _withdraw_receipts(store_path: Location, damages: list[Damage], progress: Pr
 
 
 def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
-    """Return the attributes of a store from its manifest, or from its root if undamaged."""
+    """Return the attributes of a store from its manifest, or else from its root metadata.
+
+    StoreError is raised if the root is needed and damaged.
+    """
     if manifest_attributes := store_format.read_manifest_attributes(store_path):
         return store_format.check_attributes(store_path, manifest_attributes)
     attributes = store_format.read_attributes(store_path)
@@ -396,7 +406,7 @@ def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
 
 
 def _is_root_damaged(store_path: Location) -> bool:
-    """Return True if the root metadata of a store differ from what its manifest says."""
+    """Return True if the root metadata of a store differ from their digest in the manifest."""
     expected_digest = study_store.read_manifest_digests(store_path).get("zarr.json")
     return expected_digest is not None and bool(
         describe_template_object_damage(store_path, "zarr.json", expected_digest)
@@ -404,7 +414,7 @@ def _is_root_damaged(store_path: Location) -> bool:
 
 
 def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
-    """Restore damaged objects of the template, each in one step. Return their names.
+    """Restore damaged objects of a store's template, each in one step. Return their names.
 
     The template is everything that the store contained before the first result. The caller holds
     the store's lock. StoreError is raised if this machine can't make the same objects.
@@ -448,9 +458,9 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
 
 
 def _refuse_unreproducible_template(store_path: Location, template_path: Path) -> None:
-    """Raise a StoreError if newly made objects differ from the digests in the manifest.
+    """Raise a StoreError if newly made objects of a template differ from the manifest's digests.
 
-    Only undamaged lines of the manifest count.
+    Damaged lines of the manifest are ignored. `template_path` is the folder of the new objects.
     """
     for name, expected_digest in study_store.read_manifest_digests(store_path).items():
         if describe_template_object_damage(template_path, name, expected_digest):
@@ -464,9 +474,9 @@ def _refuse_unreproducible_template(store_path: Location, template_path: Path) -
 def _refuse_unproven_study(
     store_path: Location, study: BlockStudy, template_path: Path, altered_names: list[str]
 ) -> None:
-    """Raise a StoreError if an object of the store, or its first block, belongs to another study.
+    """Raise a StoreError if an object of a store, or its first block, belongs to another study.
 
-    It is called if the recorded digests of the template are lost.
+    This check replaces digests of the template that are lost.
     """
     if other_names := set(altered_names) - {"zarr.json", study_store.MANIFEST_PATH}:
         raise StoreError(
@@ -488,7 +498,7 @@ def _refuse_unproven_study(
 SHARD_BYTES_MAX = 64 << 20
 """Largest size of a shard (file of several chunks) before compression [bytes].
 
-Each thread holds one in memory.
+A thread that writes a shard holds all of it in memory.
 """
 
 
@@ -545,7 +555,7 @@ def pack_store(
 def _write_packed_store(
     store_path: Location, output: Location, study: BlockStudy, progress: Progress
 ) -> None:
-    """Write a copy of a store in few large files (shards), its root metadata last."""
+    """Write a copy of a store in few large files (shards). The root metadata are written last."""
     attributes = {**study_loading.read_study(store_path).attributes, PACKED_ATTRIBUTE: True}
     with tempfile.TemporaryDirectory() as directory:
         template = Path(directory) / "template"
@@ -581,7 +591,10 @@ def _write_packed_store(
 
 
 def _pack_array(source: Any, output: Location) -> None:
-    """Copy an array shard by shard (file by file). Compare each shard after reading it back."""
+    """Copy an array shard by shard (file by file). Compare each shard with its source.
+
+    OSError is raised if a shard reads back differently.
+    """
     target = zarr.open_array(to_zarr_store(output), mode="r+")
     target = target.with_config({"write_empty_chunks": True})  # else chunks of fill values are lost
     dims = tuple(map(str, range(target.ndim)))
@@ -597,9 +610,9 @@ def _pack_array(source: Any, output: Location) -> None:
 def _copy_region(
     source: zarr.Array[Any], target: zarr.Array[Any], region: tuple[slice, ...]
 ) -> None:
-    """Copy a region of an array, and compare it after reading it back.
+    """Copy a region of an array to another array, and compare it after reading it back.
 
-    OSError is raised if it differs.
+    OSError is raised if the copy differs.
     """
     values = np.asarray(source[region or ...])
     target[region or ...] = values

@@ -60,7 +60,7 @@ def make_study(
 ) -> GridOrFlightStudy:
     """Return the study of a spec, whose results are stored at ``store_path``.
 
-    If ``source_path`` is given, the study takes results over from the store there.
+    If ``source_path`` is given, the study reuses results of the store at that path.
     """
     study = FlightStudy(spec, store_path) if isinstance(spec, SceneSpec) else GridStudy(spec)
     if source_path:
@@ -71,7 +71,7 @@ def make_study(
 def _find_reuse_source(
     source_path: Location, target_study: GridOrFlightStudy
 ) -> ReuseSource | None:
-    """Return the results in a store that a study can take over; None if the store is unusable."""
+    """Return the results in a store that a study can reuse; None if the store is unusable."""
     try:
         attributes = store_format.read_attributes(source_path)
         study_store.refuse_other_versions(
@@ -98,7 +98,7 @@ def _find_reuse_source(
 
 
 def read_study(store_path: Location) -> StoredStudy[AnyStudy]:
-    """Return the attributes of a store, and its study; raise StoreError if it can't be read."""
+    """Return the attributes of a store, and its study; raise StoreError if it is unreadable."""
     attributes = store_format.read_attributes(store_path)
     if attributes["kind"] == store_format.ACCURACY_STORE_KIND:
         figures_command = shell_command("figures", store_path)
@@ -109,11 +109,10 @@ def read_study(store_path: Location) -> StoredStudy[AnyStudy]:
 
 
 def read_study_and_check_blocks(store_path: Location) -> StoredStudy[AnyStudy]:
-    """Return the same as :func:`read_study`, after a check of the shape of the store's blocks.
+    """Return the attributes and the study of a store, after a check of its shape of blocks.
 
-    It is for readers of receipts, which are numbered by blocks: with blocks of another shape than
-    the study has here, receipts would be taken for those of other points. StoreError is then
-    raised.
+    StoreError is raised if the store's blocks have another shape than those of the study. Receipts
+    are numbered by block, and would be taken for receipts of other points.
     """
     stored_study = read_study(store_path)
     if PACKED_ATTRIBUTE not in stored_study.attributes:  # a packed copy joins blocks in its chunks
@@ -122,7 +121,10 @@ def read_study_and_check_blocks(store_path: Location) -> StoredStudy[AnyStudy]:
 
 
 def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
-    """Return the study of a store from its attributes; raise StoreError if it can't be read."""
+    """Return the study that the attributes of a store describe.
+
+    StoreError is raised if the study can't be read.
+    """
     recipe = read_recipe(store_path)
     if attributes["kind"] == store_format.EYEPOINTS_STORE_KIND:
         if "spec" not in recipe:
@@ -140,7 +142,10 @@ def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
 
 
 def _read_spec(store_path: Location, recipe: dict[str, Any], spec_json: str) -> Any:
-    """Return the spec of a store; raise StoreError if this version of sweep can't read it."""
+    """Return the spec in the attributes of a store.
+
+    StoreError is raised if this version of sweep can't read the spec.
+    """
     try:
         return from_stored(spec_json, base=Path(recipe["base"]) if "base" in recipe else None)
     except (SpecError, ValueError) as error:
@@ -155,7 +160,10 @@ def refuse_other_study(
     stored_spec: GridSpec | SceneSpec,
     requested_spec: GridSpec | SceneSpec,
 ) -> None:
-    """Raise a StoreError if a store holds another study than the requested one."""
+    """Raise a StoreError if a store holds another study than the requested one.
+
+    `stored_spec` is the spec in the store, `requested_spec` that of the requested study.
+    """
     if attributes["study_id"] == requested_spec.id:
         return
     study_store.refuse_other_versions(
@@ -173,24 +181,24 @@ FIELDS_THAT_MAY_GROW = ("draws.number", "draws.limit")
 FIELDS_THAT_MAY_SHRINK = (TOLERANCE_PARAMETER,)
 """Fields of a spec that an extension may decrease."""
 FIELDS_THAT_MAY_CHANGE = ("storage.block_points", "storage.block_shots", "storage.block_draws")
-"""Fields of a spec that an extension may change at will."""
+"""Fields of a spec that an extension may increase or decrease."""
 
 LOST_VALUES_LISTED_MAX = 5
-"""Largest number of lost values of an axis that an error message lists."""
+"""Largest number of an axis's lost values that an error message lists."""
 
 CACHED_SOURCE_BLOCKS_MAX = 2
-"""Largest number of blocks of the smaller study that a process keeps in memory."""
+"""Largest number of the smaller study's blocks that a process keeps in memory."""
 
 
 class SharedPoints(NamedTuple):
     """Points that a block of the larger study and a block of the smaller one have in common."""
 
     source_block: int
-    """Block of the smaller study."""
+    """Number of the block of the smaller study."""
     indices_in_block: np.ndarray
-    """Indices (m,) int64 of the points in the larger study's block, in C order."""
+    """Indices (m,) int64 of the shared points in the larger study's block, in C order."""
     source_local_indices: np.ndarray
-    """Indices (m,) int64 of the same points in `source_block`, in C order."""
+    """Indices (m,) int64 of the shared points in the block `source_block`, in C order."""
 
 
 class ReuseSource:
@@ -223,7 +231,11 @@ class ReuseSource:
         self._matching_of_group = cache(self._match_points_of_group)
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
-        """Yield the points of a block that are also in committed blocks of the smaller study."""
+        """Yield the points of a block that committed blocks of the smaller study contain.
+
+        Each item has the points in one block of the smaller study. `block` is a number in the
+        larger study.
+        """
         target_grid, block_in_grid = self._target_study.locate_block(block)
         source_grids = {grid.group: grid for grid in self.source_study.grids}
         if (
@@ -262,7 +274,7 @@ class ReuseSource:
                 )
 
     def _match_points_of_group(self, group: str) -> PointMatching:
-        """Return which points of a group's grid are also in the grid of the smaller study."""
+        """Return the mapping of points from the grid of a group to the smaller study's grid."""
         source_grid, target_grid = (
             next(grid for grid in study.grids if grid.group == group)
             for study in (self.source_study, self._target_study)
@@ -274,7 +286,7 @@ class ReuseSource:
         )
 
     def _read_block(self, source_block: int) -> Results | None:
-        """Return the results of a block of the smaller study, by the name of the array.
+        """Return the results of a block of the smaller study as arrays by name.
 
         The result is None if a chunk is damaged or missing.
         """
@@ -293,7 +305,10 @@ class ReuseSource:
             return None
 
     def read_chunk(self, name: str, source_block: int) -> np.ndarray:
-        """Return a chunk of a block of the smaller study, without checking its digest."""
+        """Return the chunk of an array that holds a block of the smaller study, unchecked.
+
+        The digest of the block is not compared with its receipt.
+        """
         return np.asarray(
             self._source_arrays[name].blocks[
                 self.source_study.chunk_positions_of_block(source_block)[name]
@@ -302,11 +317,11 @@ class ReuseSource:
 
     @cached_property
     def _source_arrays(self) -> Any:
-        """Arrays of the smaller study's store, opened once."""
+        """Arrays of the smaller study's store by name, opened once."""
         return open_verified_group(self._source_path)
 
     def reuse_obstacle_remark(self) -> str:
-        """Return a remark if some of the stored results can't be reused as they are; else ''."""
+        """Return a remark on stored results that can't be reused as they are; '' if all can."""
         if not (self.has_final_results or self.has_first_draws):
             return "whole spectra are drawn anew"
         remarks = ["points that are there are drawn further"] if self.has_first_draws else []
@@ -330,7 +345,10 @@ class ReuseSource:
 
 
 def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
-    """Return a message on how many points are done, in this store or in the one it extends."""
+    """Return a message on how many points of a study need not be computed.
+
+    They are in the study's store, or in the store of the smaller study that it extends.
+    """
     is_done = committed_block_mask(store_path, study)
     n_points_there, remark = study.count_points_in_blocks(is_done), ""
     if study.reuse_source is not None:
@@ -344,9 +362,9 @@ def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
 
 
 def parameters_ignored_in_matching(source_spec: AnySpec, target_spec: AnySpec) -> tuple[str, ...]:
-    """Return the parameters that may differ between points with the same results.
+    """Return the dotted paths of parameters that may differ between points with the same results.
 
-    These are the tolerance, if neither study varies it, and detector and estimator, if no spectra
+    They are the tolerance, if neither study varies it, and detector and estimator, if no spectra
     are drawn.
     """
     draws_spectra = target_spec.draws.draws_whole_spectra
@@ -362,7 +380,7 @@ def parameters_ignored_in_matching(source_spec: AnySpec, target_spec: AnySpec) -
 
 
 def have_different_tolerances(source_spec: AnySpec, target_spec: AnySpec) -> bool:
-    """Return True if the two studies have different tolerances, each the same at all points."""
+    """Return True if two studies have different tolerances, both the same at all points."""
     source_tolerance, target_tolerance = (
         _fixed_tolerance(source_spec),
         _fixed_tolerance(target_spec),
@@ -375,7 +393,7 @@ def have_different_tolerances(source_spec: AnySpec, target_spec: AnySpec) -> boo
 
 
 def have_equal_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
-    """Return True if equal points of two studies have equal results at equal accuracy."""
+    """Return True if two studies give equal results where parameters and numerics are equal."""
     if isinstance(target_spec, SceneSpec) or isinstance(source_spec, SceneSpec):
         return True
     if not target_spec.draws.has_draws:
@@ -386,7 +404,7 @@ def have_equal_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
 
 
 def continues_draws(source_spec: GridSpec, target_spec: GridSpec) -> bool:
-    """Return True if the draws of the source are the first draws of the target.
+    """Return True if the draws of the source study are the first draws of the target study.
 
     The result is False for studies that draw whole spectra.
     """
@@ -404,7 +422,7 @@ def continues_draws(source_spec: GridSpec, target_spec: GridSpec) -> bool:
 
 
 def _fixed_tolerance(spec: AnySpec) -> float | None:
-    """Return the tolerance of all points; None if an axis varies it."""
+    """Return the tolerance at all points of a study; None if an axis varies it."""
     value = spec.parameters_off_axes().get(TOLERANCE_PARAMETER)
     return None if value is None else float(value)
 
@@ -435,7 +453,7 @@ def apply_changes(spec: AnySpec, changes: Mapping[str, Any]) -> AnySpec:
 def refuse_not_larger_study(
     source_path: Location, source_spec: AnySpec, target_spec: AnySpec
 ) -> None:
-    """Raise a StoreError if a study is not larger than the one in a store."""
+    """Raise a StoreError if the target study is not larger than the source study in a store."""
     if type(source_spec) is not type(target_spec):
         raise StoreError(
             f"{source_path} can't be extended to this study: a flight over a scene and a study "
@@ -457,7 +475,10 @@ def refuse_not_larger_study(
 
 
 def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]:
-    """Return the reasons why a study is not larger than another of its kind, one for each field."""
+    """Return the reasons why a target study is not larger than a source study, one per field.
+
+    Both are studies over a grid, or both are flights. The list is empty if the target is larger.
+    """
     return [
         *_iter_disallowed_changes(source_spec, target_spec),
         *_iter_lost_axis_values(source_spec, target_spec),
@@ -465,7 +486,7 @@ def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]
 
 
 def _iter_disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
-    """Yield a text for each change of a field that an extension does not allow."""
+    """Yield a text for each difference between two specs that an extension does not allow."""
     on_axes = {
         member.path
         for any_spec in (source_spec, target_spec)
@@ -495,12 +516,12 @@ def _iter_disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iter
 
 
 def _scanner_names(spec: AnySpec) -> Collection[str]:
-    """Return the names of a flight's scanners; empty for a grid."""
+    """Return the names of the scanners of a flight; an empty collection for a grid."""
     return getattr(spec, "scanners", ())
 
 
 def _field_value(spec: AnySpec, path: str) -> float:
-    """Return a numeric field of a spec by dotted path."""
+    """Return the value of a numeric field of a spec, given its dotted path."""
     section, _, name = path.partition(".")
     return float(getattr(getattr(spec, section), name))
 
@@ -527,7 +548,10 @@ def _iter_lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterat
 
 
 def _lost_values_text(grid: ParameterGrid, path: str, indices: np.ndarray) -> str:
-    """Return the values of a parameter at grid indices (axes, n) as text."""
+    """Return the values of a parameter at some points of a grid as text.
+
+    `indices` (axes, n) are the indices of the n points along the axes.
+    """
     values: list[object] = [grid.fixed_parameters[path]]
     for axis_values, index in zip(grid.values_by_axis, indices, strict=True):
         if path in axis_values:
@@ -546,11 +570,11 @@ class AxisLookup(NamedTuple):
     """
 
     paths: tuple[str, ...]
-    """Dotted paths of the parameters."""
+    """Dotted paths of the parameters whose values are looked up."""
     axis: int | None
-    """Axis of the other study; None if the parameters are fixed there."""
+    """Number of the axis of the other study that varies these parameters; None if none does."""
     index_along_axis: np.ndarray
-    """Index of each value along the other study's axis, int64; -1 if that axis lacks the value.
+    """Index along the other study's axis of each value in this study, int64; -1 if missing.
 
     The shape is that of this study's grid, with length 1 along axes without any of the parameters.
     """
@@ -575,9 +599,9 @@ class PointMatching:
         ]
 
     def match_slices(self, grid_slices: tuple[slice, ...]) -> np.ndarray:
-        """Return the indices of points in the other grid, in C order, for slices of this grid.
+        """Return the index in the other grid of each point in slices of this grid.
 
-        -1 stands for points that the other grid lacks.
+        Indices and points are in C order. The index is -1 for a point that the other grid lacks.
         """
         grid_indices = np.zeros((1,) * len(grid_slices), np.int64)
         is_missing = np.zeros((1,) * len(grid_slices), bool)
@@ -602,10 +626,10 @@ class PointMatching:
 def _iter_parameter_groups(
     other_grid: ParameterGrid, grid: ParameterGrid
 ) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
-    """Yield groups of the other grid's parameters that are matched together, by dotted path.
+    """Yield the other grid's parameters in groups, each with the number of an axis.
 
-    A group has the parameters of one axis of the other grid, or fixed ones. It comes with the
-    number of the axis; None for fixed parameters.
+    The parameters of one axis make a group, with the values along the axis by dotted path. Fixed
+    parameters make groups whose number of the axis is None.
     """
     yield from enumerate(other_grid.values_by_dim())
     on_axes = {path for values in other_grid.values_by_dim() for path in values}
@@ -622,9 +646,10 @@ def _iter_parameter_groups(
 def _make_axis_lookup(
     grid: ParameterGrid, axis: int | None, other_values: dict[str, np.ndarray]
 ) -> AxisLookup:
-    """Find the values of a group of parameters of a grid among those of the other grid.
+    """Return where the values of some parameters in `grid` occur in the other grid.
 
-    ``other_values`` are the values in the other grid, by path, along its axis ``axis``.
+    ``other_values`` are the values of these parameters along ``axis`` of the other grid, by dotted
+    path. ``axis`` is None for parameters that the other grid does not vary.
     """
     varying_axes = [
         axis_number
@@ -654,7 +679,7 @@ def _make_axis_lookup(
 
 
 def _find_row_indices(known_rows: np.ndarray, wanted_rows: np.ndarray) -> np.ndarray:
-    """Return the index (m,) of each wanted row in `known_rows` (n, columns); -1 if missing."""
+    """Return the index (m,) in `known_rows` of each row of `wanted_rows`; -1 if it is missing."""
     if not known_rows.shape[1]:
         return np.zeros(len(wanted_rows), np.int64)
     all_rows = np.concatenate([known_rows, wanted_rows]).view(np.uint64)

@@ -45,58 +45,61 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
 POINT_TIMING_SECONDS = 1.0
-"""Approximate time for which the points of a grid are timed [s]."""
+"""Approximate duration of timing the points of a grid study [s]."""
 TIMED_BLOCKS_MAX = 16
-"""Largest number of blocks whose points are timed."""
+"""Largest number of blocks of a grid whose points are timed."""
 
 FLIGHT_TIMING_SECONDS = 1.0
-"""Approximate time for which the shots of all scanners of a flight are timed [s]."""
+"""Approximate duration of timing the shots of all scanners of a flight [s]."""
 
 TIMED_RAYS_MAX = 1 << 17
-"""Largest number of rays of a scanner's timed shots."""
+"""Largest number of rays of the shots that are timed, per scanner."""
 TIMED_SHOT_DRAWS_MAX = 1 << 14
-"""Largest product of the numbers of a scanner's timed shots and of their draws."""
+"""Largest product of timed shots and timed draws per shot, per scanner."""
 
 WARM_UP_SHOTS_MAX = 32
-"""Largest number of shots, spread over the flight, by which kernels and tables are loaded first.
+"""Largest number of shots that are simulated to load kernels and tables before shots are timed.
 
-The time per shot is measured afterwards.
+They are spread over the flight.
 """
 
 TIMED_CYCLE_SHOTS_MAX = 128
-"""Largest number of shots per cycle for which complete cycles and their navigation are timed."""
+"""Largest number of shots per measurement cycle for which complete cycles are timed.
+
+Navigation is timed with complete cycles only.
+"""
 
 TIMED_AXIS_POINTS_MAX = 3
 """Largest number of points of a flight's axes at which shots are timed."""
 
 TIMED_DRAWS_MAX = 1000
-"""Largest number of draws of a point or shot that are timed, without whole spectra."""
+"""Largest number of draws of a point or shot that are timed, if no whole spectra are drawn."""
 
 TIMED_SPECTRA_MAX = 10
-"""Largest number of draws of a point or shot that are timed, of whole spectra."""
+"""Largest number of draws of a point or shot that are timed, if whole spectra are drawn."""
 
 WORKER_START_SECONDS = 3.0
 """Estimated time of starting worker processes [s]."""
 CHUNK_WRITE_SECONDS = 2e-3
 """Estimated time of writing a chunk [s]."""
 COMMAND_START_CPU_SECONDS = 1.5
-"""Estimated time of starting the command [s]."""
+"""Estimated processor time of starting the command [s]."""
 FLIGHT_STORE_CPU_SECONDS = 1.0
-"""Estimated time of creating a flight's stores and of summing up its results [s]."""
+"""Estimated processor time of creating a flight's stores and summarising its results [s]."""
 FLIGHT_COMPILE_CPU_SECONDS = 100.0
-"""Estimated time of compiling the kernels of a flight [s]."""
+"""Estimated processor time of compiling the kernels of a flight [s]."""
 
 MODEL_LOADING_CPU_SECONDS = 3.0
-"""Assumed time of loading the model of a flight whose kernels are not compiled yet [s]."""
+"""Assumed processor time of loading a flight's model if its kernels are not compiled yet [s]."""
 UNMEASURED_RAY_CPU_SECONDS = 1e-6
-"""Assumed time of a ray if kernels are not compiled yet [s]."""
+"""Assumed processor time of a ray if kernels are not compiled yet [s]."""
 UNMEASURED_SHOT_CPU_SECONDS, UNMEASURED_DRAW_CPU_SECONDS = 5e-4, 3e-5
 """Assumed times of a shot, and of each of its draws, if kernels are not compiled yet [s]."""
 
 WALL_TO_CPU_TIME_RATIO_MAX = 10.0
 """Largest ratio of wall time to processor time that a plan assumes.
 
-The measured ratio is above 1 if other programs keep the processors busy.
+The ratio exceeds 1 if other programs keep the processors busy.
 """
 
 
@@ -107,7 +110,7 @@ class TimePart:
     name: str
     """Name of the work, such as 'rays' or 'writing'."""
     cpu_seconds: float
-    """Processor time [s]."""
+    """Processor time of this part, in all threads or workers together [s]."""
     n_parallel: int = 1
     """Number of threads or workers that share the work."""
 
@@ -131,13 +134,13 @@ class ScannerPlan:
     seconds_per_draw: float
     """Measured time of one draw of a shot, with navigation [s]."""
     n_timed_shots: int
-    """Number of different shots that were timed; 0 if times are assumed."""
+    """Number of different shots that were timed; 0 if times are assumed, not measured."""
     loading_seconds: float = 0.0
     """Time of loading kernels and tables before the first shot [s]."""
 
     @property
     def casting_seconds(self) -> float:
-        """Processor time of casting the rays [s]; 0 if the eyepoints exist."""
+        """Processor time of casting all rays [s]; 0 if the eyepoints are already stored."""
         return 0.0 if self.has_eyepoints else self.n_rays * self.seconds_per_ray
 
 
@@ -165,12 +168,12 @@ class StudyPlan:
 
     @property
     def cpu_seconds(self) -> float:
-        """Estimated processor time of the run: the sum of its parts [s]."""
+        """Estimated processor time of the run [s]: the sum over its parts."""
         return sum(part.cpu_seconds for part in self.time_parts)
 
     @property
     def wall_seconds(self) -> float:
-        """Estimated wall time of the run, with the processors as busy as now [s]."""
+        """Estimated wall time of the run [s], if the processors stay as busy as now."""
         start_seconds = WORKER_START_SECONDS if self.has_workers else 0.0
         return start_seconds + self.wall_to_cpu_time_ratio * sum(
             part.cpu_seconds / part.n_parallel for part in self.time_parts
@@ -265,7 +268,7 @@ def plan_study(
 def _plan_flight(
     study: FlightStudy, n_workers: int
 ) -> tuple[tuple[ScannerPlan, ...], tuple[TimePart, ...], tuple[str, ...]]:
-    """Return plans of a flight's scanners, parts of its time, and reports of its scene."""
+    """Return the plans of a flight's scanners, the parts of its time, and the reports on meshes."""
     spec, eyepoint_studies = study.spec, study.eyepoint_studies()
     times = [time.process_time()]
     built_scene = get_built_scene(spec)
@@ -313,7 +316,7 @@ def _plan_flight(
 
 
 def are_flight_kernels_compiled(spec: SceneSpec) -> bool:
-    """Return True if kernels of casting and of simulating shots are in memory or in the cache."""
+    """Return True if the kernels that cast and simulate shots are in memory or in the cache."""
     from sweep.kernel_cache import is_compiled  # imports the compiler
     from sweep.model.geometry.bvh import find_nearest_triangles
     from sweep.model.pointcloud.returns import store_peak
@@ -324,10 +327,11 @@ def are_flight_kernels_compiled(spec: SceneSpec) -> bool:
 
 
 def measure_seconds_per_point(study: GridStudy) -> float:
-    """Return the processor time of a point [s], measured at points spread over the grid.
+    """Return the processor time per point of a grid study [s], measured at some points.
 
-    Complete sets of points that share a geometry are computed, as in a run. If a point misses the
-    accuracy after the timed draws, the time of the largest number of draws is assumed for it.
+    The points are spread over the grid. Complete sets of points that share a geometry are computed,
+    as in a run. If a point misses the accuracy after the timed draws, the time of the largest
+    number of draws is assumed for the point.
     """
     study.compile_kernels()
     blocks = _choose_timed_blocks(study)
@@ -348,10 +352,10 @@ def measure_seconds_per_point(study: GridStudy) -> float:
 
 
 def _choose_timed_blocks(study: GridStudy) -> list[int]:
-    """Return the numbers of blocks spread over the grid; fewer if points take long.
+    """Return the numbers of blocks, spread over the grid, whose points are to be timed.
 
-    Points of one geometry are computed in each block. This loads compiled kernels, which takes
-    longer than many points.
+    Points of one geometry are computed in each block to load compiled kernels. There are fewer
+    blocks if this takes long.
     """
     blocks: list[int] = []
     last_block, start = study.grid.n_blocks - 1, time.process_time()
@@ -371,15 +375,19 @@ class TimedRound(NamedTuple):
     """Number of points in one round of time measurement, and the time that they took."""
 
     n_points: int
-    """Number of points."""
+    """Number of points computed in the round."""
     seconds_by_part: tuple[float, ...]
-    """Time of each part of the work [s]."""
+    """Time of each part of the round's work [s]."""
 
 
 def _time_growing_rounds(
     time_round: Callable[[int], TimedRound], n_points_max: int, seconds_max: float
 ) -> TimedRound:
-    """Time rounds of increasing size. Return the first that is long enough, or covers the study."""
+    """Call `time_round` with rising numbers, until a round is long enough. Return that round.
+
+    A round is long enough if all rounds took a third of `seconds_max` [s], or if the round has
+    `n_points_max` points. Rounds that compile kernels do not count.
+    """
     from numba.core.event import install_recorder
 
     n_samples, start = 1, time.perf_counter()
@@ -396,7 +404,10 @@ def _time_growing_rounds(
 
 
 def _sampled_indices_of_block(study: GridStudy, block: int, n_geometries: int) -> np.ndarray:
-    """Return indices of points in a block: complete sets that share a geometry."""
+    """Return the indices of sampled points in a block.
+
+    The points are `n_geometries` complete sets that each share a geometry, spread over the block.
+    """
     grid, points_per_geometry = study.grid, 1
     for length, is_geometric in zip(
         grid.actual_block_shape(block), grid.is_geometric_axis, strict=True
@@ -410,7 +421,7 @@ def _sampled_indices_of_block(study: GridStudy, block: int, n_geometries: int) -
 
 
 def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
-    """Compute points to measure their time.
+    """Compute sampled points of a block, so that the caller can measure the time.
 
     Return the number of points, and the estimated time of draws that were left out [s].
     """
@@ -432,11 +443,11 @@ class PointTimes(NamedTuple):
     """Processor time that some points took, and an estimate for draws that were left out."""
 
     measured_seconds: float
-    """Measured time [s]."""
+    """Measured processor time of the computed draws [s]."""
     extrapolated_seconds: float
-    """Estimated time of the draws that were left out [s].
+    """Estimated processor time of the draws that were left out [s].
 
-    If the number of draws is adaptive, only points that miss their accuracy have such draws.
+    If the number of draws is adaptive, only points that miss their accuracy have draws left out.
     """
 
 
@@ -448,9 +459,9 @@ def time_points(
     *,
     draws_max: int,
 ) -> PointTimes:
-    """Time `n_points` points with at most `draws_max` draws each.
+    """Measure the time of `n_points` points with at most `draws_max` draws each.
 
-    The arguments are those of :func:`evaluate_points`.
+    The other arguments are those of :func:`evaluate_points`.
     """
     limited_spec = limit_draws(spec, draws_max)
     if spec.draws.draws_whole_spectra:
@@ -483,15 +494,15 @@ class TimedShots(NamedTuple):
     """Processor times of some shots."""
 
     n_shots: int
-    """Number of shots."""
+    """Number of shots that were timed."""
     casting_seconds: float
-    """Time of casting the rays of all of them together [s]."""
+    """Time of casting the rays of these shots [s], the total of all."""
     simulation_seconds: float
-    """Time of simulating their draws [s], averaged over points of the axes."""
+    """Time of simulating the draws of these shots [s], averaged over points of the axes."""
 
     @property
     def total_seconds(self) -> float:
-        """Time of casting and of simulating [s]."""
+        """Time of casting and of simulating these shots [s]."""
         return self.casting_seconds + self.simulation_seconds
 
 
@@ -528,9 +539,10 @@ class _ScannerTimer:
         )
 
     def time_shots(self, n_shots: int) -> TimedShots:
-        """Time some shots. Return their number, and times of casting and of simulating [s].
+        """Cast and simulate about `n_shots` shots.
 
-        The time of simulating is that of ``n_draws`` draws, averaged over points of the axes.
+        Return their number, and the times of both steps [s]. The time of simulating is that of the
+        timer's ``n_draws`` draws, averaged over points of the axes.
         """
         start = time.process_time()
         if self._takes_cycles:
@@ -558,8 +570,8 @@ class _ScannerTimer:
 def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     """Return the plan of a scanner, with times measured on shots spread over its flight.
 
-    A call takes a fixed time, and a time for each shot. Both follow from the measured times of two
-    calls with different numbers of shots.
+    The time of a call is a constant plus a time per shot. Both follow from the times of two calls
+    with different numbers of shots.
     """
     timer = _ScannerTimer(study, eyepoints)
     seconds_max = FLIGHT_TIMING_SECONDS / len(study.spec.scanners)
@@ -601,7 +613,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
 
 
 def _plan_scanner_unmeasured(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
-    """Return the plan of a scanner from assumed times, as measuring them would compile kernels."""
+    """Return the plan of a scanner with assumed times, because measuring would compile kernels."""
     shot_seconds = UNMEASURED_SHOT_CPU_SECONDS / study.scanner_grids[eyepoints.scanner].n_draws
     return ScannerPlan(
         name=eyepoints.scanner,
@@ -617,7 +629,10 @@ def _plan_scanner_unmeasured(study: FlightStudy, eyepoints: EyepointStudy) -> Sc
 
 
 GRID_TILES_SAMPLED_MAX = 1024
-"""Largest number of tiles of a grid that are planned; in larger grids they are spread evenly."""
+"""Largest number of tiles of a grid that are planned for the table of effects.
+
+Of a larger grid, tiles spread evenly over the grid are planned.
+"""
 
 SCANNER_TILES_SAMPLED, AXIS_POINTS_SAMPLED = 16, 12
 """Number of tiles of each scanner of a flight that are planned, and of points of the axes."""
@@ -632,13 +647,16 @@ EFFECT_COST_ROUNDS_MAX, EFFECT_COST_ROUNDS_MIN = 5, 3
 """Largest number of rounds of measuring the cost of an effect, and smallest if they take long."""
 
 EFFECT_COST_SPREAD_MAX = 0.1
-"""Largest relative spread of an effect's cost over the rounds for which the cost is reported.
+"""Largest relative spread of an effect's measured cost for which the cost is reported.
 
-It is about twice the error of the median.
+The spread is that between rounds of measurement, about twice the error of their median.
 """
 
 EFFECT_COST_ROUND_SECONDS = 0.1
-"""Duration of a round of measuring an effect's cost above which no more work is added [s]."""
+"""Duration that one round of measuring an effect's cost should reach [s].
+
+Tiles are added to the round until it takes longer.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -652,13 +670,13 @@ class EffectRow:
     simulated_fraction: float
     """Fraction of the points at which the effect is simulated."""
     simulated_region: str
-    """Region of the study that contains these points, as text."""
+    """Region of the study that contains all points at which the effect is simulated, as text."""
     change_bound: float
-    """Upper bound of the change of pd, log10 pfa or relative |X| by the effect at any point."""
+    """Upper bound of the change of pd, log10 pfa or relative |X| by the effect, over all points."""
     largest_change_region: str
-    """Region of the study with the largest bound, as text."""
+    """Region of the study in which the upper bound of the change is largest, as text."""
     time_fraction: float
-    """Effect's share of the computing time of points where it is simulated; nan if unknown."""
+    """Fraction of computing time that the effect takes where it is simulated; nan if unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -666,16 +684,19 @@ class EffectsTable:
     """Table of all effects of a study: where each is simulated, what it changes, and its cost."""
 
     rows: tuple[EffectRow, ...]
-    """A row for each effect."""
+    """Rows of the table, one for each effect."""
     tolerance: float
-    """Tolerance of the study."""
+    """Tolerance of the study, to be compared with the upper bounds of changes."""
     error_bound: float
-    """Upper bound of the change by all omitted effects together, at any point."""
+    """Upper bound of the change by all omitted effects together, over all points."""
     planned_tile_fraction: float
-    """Fraction of the tiles that were planned."""
+    """Fraction of the study's tiles on which the table is based."""
 
     def warnings(self) -> Iterator[str]:
-        """Yield a warning for each disabled effect that changes results beyond the tolerance."""
+        """Yield a warning for each effect that is off in the spec and may change results too much.
+
+        A change above the tolerance is too much.
+        """
         for row in self.rows:
             if row.mode == "off" and row.change_bound > self.tolerance:
                 yield (
@@ -708,7 +729,10 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
 
 
 def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
-    """Return the table of effects of a grid, from a sample of its tiles."""
+    """Return the table of effects of a grid study, based on a sample of its tiles.
+
+    If `costs` is True, each effect's share of the computing time is measured.
+    """
     spec, effect_planner = study.spec, study.effect_planner
     n_tiles = effect_planner.tiles.n_blocks
     tiles = np.unique(
@@ -754,7 +778,7 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
 
 
 def _flight_effects_table(study: FlightStudy) -> EffectsTable:
-    """Return the table of effects of a flight, from tiles spread over it and its axes."""
+    """Return the table of effects of a flight, based on a sample of its tiles and axis points."""
     tile_effects, tile_times, n_shots = [], [], 0
     axes = tuple(int(axis.size) for axis in study.spec.axes)
     axis_points = list(np.ndindex(axes))
@@ -811,11 +835,11 @@ class _TileEffects(NamedTuple):
     """Simulated and omitted effects of m tiles (boxes of points, or runs of shots)."""
 
     n_simulated: np.ndarray
-    """Number (effects, m) of points at which an effect is simulated."""
+    """Number of points of each tile at which each effect is simulated, (effects, m)."""
     change_bounds: np.ndarray
-    """Upper bound (effects, m) of the change by an effect."""
+    """Upper bound of the change by each effect in each tile, (effects, m)."""
     error_bounds: np.ndarray
-    """Upper bound (m,) of the change by all omitted effects together."""
+    """Upper bound of the change by all omitted effects together in each tile, (m,)."""
 
 
 def _make_effects_table(
@@ -827,7 +851,11 @@ def _make_effects_table(
     effect_cost: Callable[[str, np.ndarray], float],
     planned_tile_fraction: float,
 ) -> EffectsTable:
-    """Return the table of effects, given the simulated and omitted effects of each tile."""
+    """Return the table of effects, given the simulated and omitted effects of each tile.
+
+    `region_text` and `effect_cost` are functions of a mask of tiles: they return the tiles' region
+    as text, and an effect's share of their computing time.
+    """
     effect_modes = spec.effect_modes()
     rows = tuple(
         EffectRow(
@@ -855,13 +883,13 @@ def _make_effects_table(
 
 
 def _time_range_text(times: np.ndarray) -> str:
-    """Return the first and the last of some times in a flight as text."""
+    """Return the earliest and the latest of some times in a flight as text."""
     first, last = times.min(), times.max()
     return f"time {first:.4g} s" if first == last else f"time {first:.4g}..{last:.4g} s"
 
 
 def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarray) -> str:
-    """Return the smallest box of the grid that contains given tiles, as text in the user's units.
+    """Return the smallest box of the grid that contains some tiles, as text in the spec's units.
 
     A tile is a box of neighbouring points whose effects are chosen together.
     """
@@ -895,7 +923,10 @@ class _PointSample(NamedTuple):
 def _make_tile_sampler(
     spec: GridSpec, effect_planner: EffectPlanner
 ) -> Callable[[int], _PointSample]:
-    """Return a cached function that samples points of a tile: one point if points take long."""
+    """Return a cached function from the number of a tile to a sample of the tile's points.
+
+    The sample is a single point if points take long.
+    """
 
     @cache
     def sample_tile(tile: int) -> _PointSample:
@@ -923,20 +954,20 @@ def _seconds_of_points(
     n_points: int,
     effect_names: Collection[str],
 ) -> float:
-    """Return the time of some points with some effects [s]."""
+    """Return the time of computing some points with given effects [s]."""
     return sum(
         time_points(spec, parameters, n_points, effect_names, draws_max=EFFECT_COST_DRAWS_MAX)
     )
 
 
 Stopwatch = Callable[[], float]
-"""Function that does some work once and returns the time that it took [s]."""
+"""Function that does some work once, and returns the time that the work took [s]."""
 
 
 def _grid_effect_cost(
     spec: GridSpec, sample_tile: Callable[[int], _PointSample], tiles: np.ndarray, effect_name: str
 ) -> float:
-    """Return an effect's share of the computing time of grid points, measured on tiles."""
+    """Return an effect's share of the computing time of points, measured on tiles of a grid."""
 
     def stopwatches_of_tile(tile: int) -> tuple[Stopwatch, Stopwatch]:
         parameters, n_points, effect_names = sample_tile(tile)
@@ -990,7 +1021,7 @@ def reproducible_time_fraction(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]
 
 
 def _select_evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
-    """Return at most `n_max` of the items, evenly spaced from the first to the last."""
+    """Return at most `n_max` items of a sequence, evenly spaced from the first to the last."""
     positions = np.linspace(0, len(sequence) - 1, min(n_max, len(sequence))).astype(int)
     return [sequence[k] for k in positions]
 
@@ -998,9 +1029,10 @@ def _select_evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> l
 def _tile_grid_indices(
     effect_planner: EffectPlanner, tile: int, n_max: int | None = None
 ) -> np.ndarray:
-    """Return the indices of a tile's points, or of `n_max` of them, in C order over the grid.
+    """Return the indices in the grid, in C order, of the points of a tile.
 
-    A tile is a box of neighbouring points whose effects are chosen together.
+    If `n_max` is given, at most this number of points, evenly spaced, are included. A tile is a box
+    of neighbouring points whose effects are chosen together.
     """
     tile_size = effect_planner.tiles.count_block_points(tile)
     local_indices = np.unique(np.linspace(0, tile_size - 1, n_max or tile_size).astype(np.int64))

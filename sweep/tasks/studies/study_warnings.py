@@ -33,7 +33,7 @@ class StudyWarning(UserWarning):
 
 
 def iter_spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
-    """Yield warnings about a study's beam, scene, path and threshold.
+    """Yield warnings about a study's beam, scene, flight path and threshold, given its spec.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def iter_spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
 
 
 def iter_result_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
-    """Yield warnings about late or ambiguous echoes, and about disabled effects that matter."""
+    """Yield warnings about late or ambiguous echoes, and about effects that are off but matter."""
     yield from echo_warnings(study)
     if "off" in study.spec.effect_modes().values():
         from sweep.tasks.studies.study_plan import effects_table
@@ -61,10 +61,10 @@ def iter_result_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
 
 
 def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], None]) -> None:
-    """Issue the warnings about a study, and notes on sources of error of unstated size.
+    """Issue the warnings about a study, and pass notes on errors of unstated size to `say`.
 
-    Each warning is a `StudyWarning` at the line of the caller's program; the command passes it to
-    `say` instead. Notes are passed to `say`, too.
+    Each warning is a `StudyWarning` at the line of the caller's program. If the command runs, it is
+    passed to `say` instead.
     """
     stack_level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_TASKS_PACKAGE_FOLDER):
@@ -82,8 +82,8 @@ def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], No
 def issue_study_warning(sentence: str, stack_level: int) -> None:
     """Issue a `StudyWarning` at the line of the frame with a given level of the call stack.
 
-    It is raised as an exception only if a warning filter of the user's asks for it. A closed or
-    broken standard error does not end the computation.
+    An exception is raised only if a warning filter of the user turns the warning into one. A closed
+    or broken standard error does not end the computation.
     """
     try:
         warnings.warn(sentence, StudyWarning, stacklevel=stack_level)

@@ -9,12 +9,12 @@ SPECTRUM_METHOD_PARAMETERS = {
 }
 """Dotted paths of the parameters that name the detector and the estimator for whole spectra.
 
-The value of each is a built-in method or a function of the user's.
+A parameter's value is the name of a built-in method or of a user's function.
 """
 
 
 def iter_user_functions(spec: Any) -> Iterator[tuple[str, str]]:
-    """Yield the role (detector or estimator) and the name of each user function in a spec."""
+    """Yield the role (detector or estimator) and the name of each user's function in a spec."""
     draws = getattr(spec, "draws", None)
     if not getattr(draws, "draws_whole_spectra", False):
         return
@@ -27,5 +27,5 @@ def iter_user_functions(spec: Any) -> Iterator[tuple[str, str]]:
 
 
 def user_module_names(spec: Any) -> tuple[str, ...]:
-    """Return the names of the modules of a spec's user functions, without duplicates."""
+    """Return the names of the modules of the user's functions in a spec, without duplicates."""
     return tuple(dict.fromkeys(name.partition(":")[0] for _, name in iter_user_functions(spec)))

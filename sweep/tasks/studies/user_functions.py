@@ -31,7 +31,10 @@ DETECTOR_ROLE, ESTIMATOR_ROLE = SPECTRUM_METHOD_PARAMETERS
 
 
 def check_user_functions(spec: GridSpec | SceneSpec) -> None:
-    """Import the functions that a study names, and test each; raise CodeError if one fails."""
+    """Import the user's functions that a spec names, and test each of them.
+
+    CodeError is raised if a function can't be imported or fails the test.
+    """
     for role, name in iter_user_functions(spec):
         _test_user_function(role, name)
 
@@ -39,7 +42,7 @@ def check_user_functions(spec: GridSpec | SceneSpec) -> None:
 def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
     """Return the detectors and estimators that parameters may name: built-in ones and the user's.
 
-    CodeError is raised if a function of the user's is not allowed, or can't be imported.
+    CodeError is raised if a user's function is not allowed, or can't be imported.
     """
     from sweep.model.sampling.noisy_spectra import SpectrumMethods
 
@@ -79,7 +82,10 @@ def load_checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
 
 
 def _call_user_function(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a user's function; raise CodeError, with file and line, if it fails."""
+    """Call a user's function and return its result; raise CodeError if the function fails.
+
+    The message of the error has file and line.
+    """
     try:
         return function(*arguments)
     except Exception as error:
@@ -88,13 +94,16 @@ def _call_user_function(name: str, function: Callable[..., Any], *arguments: Any
 
 
 def _definition_text(function: Callable[..., Any]) -> str:
-    """Return file and line of a function's definition; '' if it is not in Python."""
+    """Return the file and line of a function's definition as text; '' if it is not in Python."""
     code_object = getattr(getattr(function, "py_func", function), "__code__", None)
     return f" ({code_object.co_filename}:{code_object.co_firstlineno})" if code_object else ""
 
 
 def _error_place_text(error: BaseException, module: ModuleType) -> str:
-    """Return file, line and function of the user's code that raised an error; '' if unknown."""
+    """Return file, line and function, as text, of a user's code that raised an error.
+
+    The text is '' if the error was not raised in the user's module.
+    """
     frames = traceback.extract_tb(error.__traceback__)
     file = getattr(module, "__file__", None)
     module_frames = [frame for frame in frames if frame.filename == file]
@@ -129,7 +138,7 @@ def _import_user_function(name: str) -> Callable[..., Any]:
 
 
 def _read_only_view(array: np.ndarray) -> np.ndarray:
-    """Return a view of an array that can't be written."""
+    """Return a read-only view of an array, which shares its memory."""
     view = array.view()
     view.flags.writeable = False
     return view
@@ -138,9 +147,9 @@ def _read_only_view(array: np.ndarray) -> np.ndarray:
 def _check_returned_array(
     name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype
 ) -> np.ndarray:
-    """Return the array that a function returned, after a check.
+    """Return the result of a user's function as an array, after a check of type, shape and values.
 
-    CodeError is raised for a wrong type, shape or value.
+    CodeError is raised if the check fails.
     """
     if not isinstance(answer, np.ndarray):
         raise CodeError(f"{name} gives a {type(answer).__name__}, and must give a numpy array")
@@ -154,7 +163,7 @@ def _check_returned_array(
 
 
 def _test_user_function(role: str, name: str) -> None:
-    """Call a function on three test spectra: a tone at bin 40.25 of 128 in weak noise.
+    """Call a user's function on three test spectra: a tone at bin 40.25 of 128 in weak noise.
 
     CodeError is raised if the call fails or its result is invalid.
     """
