@@ -68,10 +68,10 @@ def _read_off(path: Path) -> Polygons:
         # Normals and colours follow the position; texture coordinates too, in most files.
         vertices = [
             [float(word) for word in line[:3]]
-            for _, line in _iter_required_lines(lines, n_vertices, "vertices")
+            for _, line in _iter_next_lines(lines, n_vertices, "vertices")
         ]
         faces = []
-        for _, line in _iter_required_lines(lines, n_faces, "faces"):
+        for _, line in _iter_next_lines(lines, n_faces, "faces"):
             count = int(line[0])
             corners = [int(word) for word in line[1 : 1 + count]]
             if count < 1 or len(corners) < count:
@@ -84,7 +84,7 @@ def _read_off(path: Path) -> Polygons:
     return _make_polygons(vertices, faces)
 
 
-def _iter_required_lines(
+def _iter_next_lines(
     lines: Iterator[tuple[int, list[str]]], number: int, element_name: str
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the next `number` of a file's `lines`; raise `ValueError` if the file has fewer.

@@ -132,7 +132,7 @@ def read_raster_terrain(
             raise SceneError(
                 path, f"has {raster.count} band(s), not a band {band}", "choose another"
             )
-        transform = _unrotated_geotransform(path, raster, pixel)
+        transform = _require_unrotated_geotransform(path, raster, pixel)
         pixel_window = _pixel_window(path, raster, transform, window)
         x, y = (
             sorted((first, first + step * number))
@@ -344,7 +344,7 @@ def _require_supported_format(path: Path) -> None:
         raise SceneError(path, problem, "convert it to a GeoTIFF") from None
 
 
-def _unrotated_geotransform(path: Path, raster: Any, pixel: float | None) -> Any:
+def _require_unrotated_geotransform(path: Path, raster: Any, pixel: float | None) -> Any:
     """Return the transform from the pixels of a raster to map coordinates.
 
     `SceneError` is raised if the raster is rotated against its map, or has no scale. `pixel` is the

@@ -363,7 +363,11 @@ def _is_misread(
 def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
     """Yield warnings about echoes that a study misses, records in part, or reads wrongly."""
     is_flight = isinstance(study, FlightStudy)
-    diagnosis = _diagnose_flight(study) if isinstance(study, FlightStudy) else _diagnose_grid(study)
+    diagnosis = (
+        _diagnose_flight_echoes(study)
+        if isinstance(study, FlightStudy)
+        else _diagnose_grid_echoes(study)
+    )
     if not diagnosis.range.size:
         return
     points_noun, has_overlap = (
@@ -379,8 +383,8 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
         yield (
             f"no echo arrives before its record ends at {_fraction_text(is_absent)} of the "
             f"{points_noun}, "
-            f"{_range_text(is_absent, diagnosis.range)}: nothing is detected there. A record lasts "
-            "from "
+            f"{_target_ranges_text(is_absent, diagnosis.range)}: nothing is detected there. "
+            "A record lasts from "
             "processing.acquisition_delay for processing.fft_size samples, up to chirp.duration, "
             "and an echo arrives after 2R/c"
         )
@@ -398,7 +402,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
             "echoes that arrive after their record has begun lose more than "
             f"{ECHO_LOSS_WARNING_DB:g} dB at "
             f"{_fraction_text(is_weak)} of the {points_noun}, "
-            f"{_range_text(is_weak, diagnosis.range, is_absent)}: raise "
+            f"{_target_ranges_text(is_weak, diagnosis.range, is_absent)}: raise "
             "processing.acquisition_delay to the largest 2R/c, and chirp.duration with it"
         )
     is_shifted = (
@@ -411,8 +415,8 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
             f"instrument.processing.estimator.kind {' and '.join(kinds)} takes echoes for whole "
             f"records, and echoes begin within theirs at {_fraction_text(is_shifted)} of the "
             f"{points_noun}, "
-            f"{_range_text(is_shifted, diagnosis.range, is_absent)}: places there are off by up to "
-            "half a bin. "
+            f"{_target_ranges_text(is_shifted, diagnosis.range, is_absent)}: places there are off "
+            "by up to half a bin. "
             "Take maximum_likelihood or chirp_z, or raise processing.acquisition_delay to the "
             "largest 2R/c, and chirp.duration with it"
         )
@@ -424,8 +428,8 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
         yield (
             f"the peaks are read as another range or velocity at {_fraction_text(is_wrong)} of the "
             f"{points_noun}, "
-            f"{_range_text(is_wrong, diagnosis.range, is_absent)} (misread): beats beyond half the "
-            "sample rate "
+            f"{_target_ranges_text(is_wrong, diagnosis.range, is_absent)} (misread): beats beyond "
+            "half the sample rate "
             "fold, and two beats are read by processing.two_beats. What is detected there has a "
             "wrong range or velocity: raise processing.sample_rate, or lower chirp.bandwidth over "
             "chirp.duration"
@@ -442,7 +446,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
             "the laser's phase walks so far within the delay of the echo at "
             f"{_fraction_text(has_large_phase_walk)} of "
             f"the {points_noun}, "
-            f"{_range_text(has_large_phase_walk, diagnosis.range, is_absent)}, that "
+            f"{_target_ranges_text(has_large_phase_walk, diagnosis.range, is_absent)}, that "
             "probabilities of detection "
             "may be off by up to 0.1: take draws.method: spectra, which draws the walk, or lower "
             "instrument.laser.line_width"
@@ -458,7 +462,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
         yield (
             "the speckle of the footprint spreads an echo over bins on both sides of DC or half "
             f"the sample rate at {_fraction_text(crosses_edge)} of the {points_noun}, "
-            f"{_range_text(crosses_edge, diagnosis.range, is_absent)}: its probability of "
+            f"{_target_ranges_text(crosses_edge, diagnosis.range, is_absent)}: its probability of "
             "detection by any_bin may "
             "be up to 0.06 too high. Take draws.method: noise or spectra, which draw the bins, or "
             "instrument.processing.detection: peak_bin"
@@ -539,7 +543,7 @@ def _iter_exchange_warnings(
     yield (
         f"the Doppler shift {relation} the beat of the range at "
         f"{_fraction_text(is_range_velocity_exchanged)} of the {points_noun}, "
-        f"{_range_text(is_range_velocity_exchanged, diagnosis.range, is_absent)}, and "
+        f"{_target_ranges_text(is_range_velocity_exchanged, diagnosis.range, is_absent)}, and "
         f"processing.two_beats is {'far' if assumes_far else 'fast'}: an up and a down "
         "beat that no Doppler beat confirms are read "
         f"there with range and velocity exchanged (misread): {remedy}"
@@ -551,7 +555,9 @@ def _fraction_text(mask: np.ndarray) -> str:
     return f"{100 * np.count_nonzero(mask) / mask.size:.3g} %"
 
 
-def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
+def _target_ranges_text(
+    mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None
+) -> str:
     """Return the ranges of the points in a mask as text, such as 'from 500 m on'.
 
     `ranges` (n,) are the ranges of all points [m]. Points marked in ``is_absent`` (n,) are ignored.
@@ -568,7 +574,7 @@ def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | No
     return f"at ranges of {low:,.6g} to {high:,.6g} m"
 
 
-def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
+def _diagnose_grid_echoes(study: GridStudy) -> EchoDiagnosis:
     """Return the diagnosis of the echoes of a grid study.
 
     Only one of several points with equal `ECHO_PARAMETERS` is checked, and at most
@@ -599,7 +605,7 @@ def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
     return diagnose_echoes(study.grid.parameters_at(grid_indices))
 
 
-def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
+def _diagnose_flight_echoes(study: FlightStudy) -> EchoDiagnosis:
     """Return the diagnosis of the echoes of sampled shots of a flight.
 
     Shots are diagnosed at the first and the last point of the flight's axes. The diagnosis has no

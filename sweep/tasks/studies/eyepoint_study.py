@@ -201,7 +201,7 @@ class EyepointStudy(BlockStudy):
         arrays.
         """
         shot_arrays = self.cast_shots(shot_numbers)
-        return shot_arrays | self._cycle_arrays(shot_arrays)
+        return shot_arrays | self._cycle_arrays_from_shots(shot_arrays)
 
     def cast_shots(self, shot_numbers: np.ndarray) -> Results:
         """Cast the rays of shots with given numbers (n,). Return the geometry as arrays by name."""
@@ -275,10 +275,10 @@ class EyepointStudy(BlockStudy):
             shot_numbers,
             caster=built_scene.caster,
             body_motions=built_scene.body_motions,
-            **self._compute_eyepoints_keywords,
+            **self._keywords_of_compute_eyepoints,
         )
 
-    def _cycle_arrays(self, shot_arrays: Results) -> Results:
+    def _cycle_arrays_from_shots(self, shot_arrays: Results) -> Results:
         """Return time, true velocity and true altitude of each measurement cycle as arrays by name.
 
         `shot_arrays` are the arrays of all shots of complete cycles, by name.
@@ -301,7 +301,7 @@ class EyepointStudy(BlockStudy):
         return self._built_scene or get_built_scene(self.spec)
 
     @cached_property
-    def _compute_eyepoints_keywords(self) -> dict[str, Any]:
+    def _keywords_of_compute_eyepoints(self) -> dict[str, Any]:
         """Keyword arguments of `compute_eyepoints` that follow from the spec and the scanner."""
         return {
             "flight": self.spec.build_flight(),
@@ -422,7 +422,7 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
     """
     built_scene = get_built_scene(spec)
     positions = np.concatenate(
-        [_sampled_positions(spec, built_scene, name) for name in spec.scanners]
+        [_sampled_platform_and_hit_positions(spec, built_scene, name) for name in spec.scanners]
     )
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
     margin = TERRAIN_MAP_MARGIN_FRACTION * max(*(high - low), 1.0)
@@ -456,7 +456,9 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
     ]
 
 
-def _sampled_positions(spec: SceneSpec, built_scene: BuiltScene, scanner: str) -> np.ndarray:
+def _sampled_platform_and_hit_positions(
+    spec: SceneSpec, built_scene: BuiltScene, scanner: str
+) -> np.ndarray:
     """Return positions (n, 3) [m] of the platform at sampled shots, and of the points hit."""
     from sweep.model.geometry.quaternion import rotate
 

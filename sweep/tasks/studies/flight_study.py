@@ -234,7 +234,7 @@ class LocatedFlightBlock(NamedTuple):
     """Scanner, point of the axes, draws and cycles of the block."""
 
 
-class SimulatedGroup(NamedTuple):
+class SimulatedShotGroup(NamedTuple):
     """Results of shots that were simulated together."""
 
     shot_rows: np.ndarray
@@ -538,7 +538,7 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         rows: np.ndarray,
         simulate_cloud: CloudSimulator,
-    ) -> Iterator[SimulatedGroup]:
+    ) -> Iterator[SimulatedShotGroup]:
         """Yield the results of the shots at indices `rows`, in groups that are simulated together.
 
         A shot whose error by the number of rays exceeds the tolerance is simulated again with more
@@ -556,7 +556,7 @@ class FlightStudy(ExtendableStudy):
                 self._refine_rays(
                     scanner, n_rays, shot_numbers[group_rows], effect_flags, results, simulate_group
                 )
-            yield SimulatedGroup(group_rows, results)
+            yield SimulatedShotGroup(group_rows, results)
 
     def _simulate_cloud(
         self,

@@ -621,8 +621,8 @@ class GridStudy(ExtendableStudy):
     def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
         """Return the smaller study's results of a block's points with the same effects.
 
-        They are finished results if the studies have the same draws. They are unfinished results,
-        to be continued, if the smaller study has only the first draws.
+        The results are finished, or unfinished ones to be continued if they have only the first
+        draws.
         """
         if (reuse_source := self.reuse_source) is None:
             return EarlierResults()
@@ -720,7 +720,7 @@ The number makes the overhead of calls negligible. The limit keeps memory from g
 block.
 """
 
-DRAW_COUNTS_PER_CALL_MAX = 1 << 19
+DRAW_COUNTS_PER_MODEL_CALL_MAX = 1 << 19
 """Largest number of draw counts per call of the model, which returns one per point and batch.
 
 A batch is a run of draws of a point whose detections are counted together.
@@ -767,7 +767,7 @@ def iter_block_results(
             ],
         )
     ]
-    finished, points_per_call = [checkpoint_results.finished], _points_per_call(spec)
+    finished, points_per_call = [checkpoint_results.finished], _points_per_model_call(spec)
     pending = deque(
         (effects, indices_in_block)
         for members, effects in selected_effects.subset(order).iter_groups_by_effects()
@@ -853,10 +853,14 @@ def select_parameters_of_points(
     }
 
 
-def _points_per_call(spec: GridSpec) -> int:
+def _points_per_model_call(spec: GridSpec) -> int:
     """Return the number of points that one call of the model computes."""
     return max(
-        1, min(POINTS_PER_CALL_MAX, DRAW_COUNTS_PER_CALL_MAX // max(1, len(draw_batch_sizes(spec))))
+        1,
+        min(
+            POINTS_PER_CALL_MAX,
+            DRAW_COUNTS_PER_MODEL_CALL_MAX // max(1, len(draw_batch_sizes(spec))),
+        ),
     )
 
 
@@ -930,10 +934,9 @@ def _simulate_draws(
     prior_draws: PriorDraws | None,
     should_stop: Callable[[], bool] | None,
 ) -> Results:
-    """Simulate draws of points. Return results as arrays by name.
+    """Simulate draws of points after `prior_draws`. Return results as arrays by name.
 
-    Draws end if all are made, the tolerance is met, or `should_stop` returns True. They continue
-    after `prior_draws`.
+    Draws end if all are made, the tolerance is met, or `should_stop` returns True.
     """
     from sweep.model.sampling.samplers import never_stop, simulate_draws
     from sweep.tasks.studies.user_functions import spectrum_methods

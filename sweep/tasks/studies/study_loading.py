@@ -592,7 +592,7 @@ class PointMatching:
     ) -> None:
         self._other_grid = other_grid
         self.lookups = [
-            _make_axis_lookup(
+            _match_values_to_other_axis(
                 grid, axis, {path: array for path, array in values.items() if path not in ignored}
             )
             for axis, values in _iter_parameter_groups(other_grid, grid)
@@ -643,7 +643,7 @@ def _iter_parameter_groups(
     yield None, fixed_values
 
 
-def _make_axis_lookup(
+def _match_values_to_other_axis(
     grid: ParameterGrid, axis: int | None, other_values: dict[str, np.ndarray]
 ) -> AxisLookup:
     """Return where the values of some parameters in `grid` occur in the other grid.

@@ -768,8 +768,8 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
         _TileEffects(is_kept * n_active_points, change_bounds, error_bounds),
         n_points=int(n_points_by_tile.sum()),
         region_text=lambda is_in_region: _region_text(spec, effect_planner, tiles[is_in_region]),
-        effect_cost=lambda name, is_simulated: (
-            _grid_effect_cost(timed_spec, sample_tile, tiles[is_simulated], name)
+        effect_time_fraction=lambda name, is_simulated: (
+            _grid_effect_time_fraction(timed_spec, sample_tile, tiles[is_simulated], name)
             if costs
             else math.nan
         ),
@@ -826,7 +826,7 @@ def _flight_effects_table(study: FlightStudy) -> EffectsTable:
         ),
         n_points=n_shots,
         region_text=lambda is_in_region: _time_range_text(time_of_tile[is_in_region]),
-        effect_cost=lambda name, is_in_region: math.nan,
+        effect_time_fraction=lambda name, is_in_region: math.nan,
         planned_tile_fraction=n_shots * study.spec.draws.number / study.n_points,
     )
 
@@ -848,13 +848,13 @@ def _make_effects_table(
     *,
     n_points: int,
     region_text: Callable[[np.ndarray], str],
-    effect_cost: Callable[[str, np.ndarray], float],
+    effect_time_fraction: Callable[[str, np.ndarray], float],
     planned_tile_fraction: float,
 ) -> EffectsTable:
     """Return the table of effects, given the simulated and omitted effects of each tile.
 
-    `region_text` and `effect_cost` are functions of a mask of tiles: they return the tiles' region
-    as text, and an effect's share of their computing time.
+    `region_text` and `effect_time_fraction` are functions of a mask of tiles: they return the
+    tiles' region as text, and an effect's share of their computing time.
     """
     effect_modes = spec.effect_modes()
     rows = tuple(
@@ -865,7 +865,7 @@ def _make_effects_table(
             simulated_region=region_text(n_simulated > 0) if n_simulated.any() else "",
             change_bound=float(bounds.max()),
             largest_change_region=region_text(np.arange(bounds.size) == bounds.argmax()),
-            time_fraction=effect_cost(effect.name, n_simulated > 0)
+            time_fraction=effect_time_fraction(effect.name, n_simulated > 0)
             if n_simulated.any()
             else math.nan,
         )
@@ -964,7 +964,7 @@ Stopwatch = Callable[[], float]
 """Function that does some work once, and returns the time that the work took [s]."""
 
 
-def _grid_effect_cost(
+def _grid_effect_time_fraction(
     spec: GridSpec, sample_tile: Callable[[int], _PointSample], tiles: np.ndarray, effect_name: str
 ) -> float:
     """Return an effect's share of the computing time of points, measured on tiles of a grid."""
