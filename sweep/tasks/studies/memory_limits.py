@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 FFT_SIZE_PARAMETER = "instrument.processing.fft_size"
 """Dotted path of the FFT size (number of samples)."""
 
-PEAK_BYTES_PER_FFT_POINT = 250
+PEAK_MEMORY_BYTES_PER_FFT_POINT = 250
 """Peak memory of computing one grid point without whole spectra, per sample of its FFT [bytes].
 
 It was measured with FFTs of 2^20 and 2^22 samples.
 """
-PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA = 300
+PEAK_MEMORY_BYTES_PER_FFT_POINT_OF_SPECTRA = 300
 """Peak memory of drawing whole spectra of one grid point, per sample of its FFT [bytes].
 
 It was measured with FFTs of 2^20 and 2^22 samples.
@@ -47,7 +47,9 @@ def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
     """Return the peak memory of computing one grid point, or one shot of a flight [bytes]."""
     draws_spectra = getattr(spec.draws, "draws_whole_spectra", False)
     return fft_size_max(spec) * (
-        PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA if draws_spectra else PEAK_BYTES_PER_FFT_POINT
+        PEAK_MEMORY_BYTES_PER_FFT_POINT_OF_SPECTRA
+        if draws_spectra
+        else PEAK_MEMORY_BYTES_PER_FFT_POINT
     )
 
 
