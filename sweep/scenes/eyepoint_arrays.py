@@ -56,7 +56,7 @@ def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
 
 
 def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
-    """Return the eyepoints that arrays of a store hold.
+    """Return eyepoints (ray-traced geometry of shots), given the arrays in a store.
 
     Parameters
     ----------

@@ -123,9 +123,9 @@ def _shortest_decimal_text(value: float) -> str:
 def _undeclared_no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
     """Return warnings about the smallest or largest heights of a file that may mark missing data.
 
-    An extreme height is suspicious in two cases. Either it is a customary no-data value, and
-    differs from all other heights by a small part of their span or more. Or several cells share it,
-    and it differs from all other heights by more than their span.
+    A height is suspicious in two cases, by its gap to the nearest height over the span of all other
+    heights. A customary no-data value is suspicious above `_CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN`. A
+    value of several cells is suspicious above `_REPEATED_EXTREME_RELATIVE_GAP_MIN`.
     """
     warnings: list[str] = []
     low, high = -np.inf, np.inf

@@ -652,7 +652,9 @@ def _draw_trunk_positions(
     number: int,
     distance_min: float,
 ) -> list[tuple[float, float]]:
-    """Draw positions in a disc by rejection sampling.
+    """Draw random positions (x, y) in a disc, at least `distance_min` apart. Return them as a list.
+
+    Positions too close to earlier ones are drawn again (rejection sampling).
 
     Parameters
     ----------

@@ -136,18 +136,18 @@ class PointsWithSameEffects(NamedTuple):
     """Points at which the same effects are simulated."""
 
     point_indices: np.ndarray
-    """Indices (m,) of these points among all points whose effects were selected."""
+    """Indices (m,) of the group's points among all points whose effects were selected."""
     effect_names: tuple[str, ...]
-    """Names of the effects that are simulated at all these points."""
+    """Names of the effects that are simulated at all points of the group."""
 
 
 class PointsComputedTogether(NamedTuple):
     """Points that are computed together though their effects may differ."""
 
     point_indices: np.ndarray
-    """Indices (m,) of these points among all points whose effects were selected."""
+    """Indices (m,) of the group's points among all points whose effects were selected."""
     effect_names: tuple[str, ...]
-    """Names of the effects that are simulated at one or more of these points."""
+    """Names of the effects that are simulated at one or more points of the group."""
     effect_flags: np.ndarray
     """Effects of each point as a bit mask (m,) uint32: bit k is effect k of the catalogue."""
 
@@ -220,9 +220,9 @@ class TilePlans(NamedTuple):
     """Effects that were chosen for a batch of tiles."""
 
     requested_indices: np.ndarray
-    """Indices (m,) of these tiles in the array of tiles passed to the planner."""
+    """Indices (m,) of the batch's tiles in the array of tiles passed to the planner."""
     effect_plan: EffectPlan
-    """Choice of effects for these m tiles."""
+    """Choice of effects for the m tiles of the batch."""
 
 
 class TileGrid(BlockGrid):

@@ -72,8 +72,8 @@ SHOT_DRAW_CPU_SECONDS = 2e-5
 DEFAULT_BLOCKS_MIN = 32
 """Smallest number of blocks of a study if the spec states no size of blocks.
 
-It gives work to all cores of a machine at once. It does not hold if blocks would take less than
-`DEFAULT_BLOCK_CPU_SECONDS_MIN`.
+This number gives work to all cores of a machine at once. A study has fewer blocks if they would
+otherwise take less than `DEFAULT_BLOCK_CPU_SECONDS_MIN`.
 """
 DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
 """Smallest estimated time, on one core, of a block whose size the spec does not state [s]."""
@@ -147,8 +147,8 @@ def flight_block_size_max(
       take less than DEFAULT_BLOCK_CPU_SECONDS_MIN.
     * A block contains complete tiles, because the effects of a tile's shots are chosen together.
     * The draws of a shot are divided among blocks only if a tile with all draws takes longer than
-      such a block, and longer than twice DEFAULT_BLOCK_CPU_SECONDS_MIN. The reason is that each of
-      these blocks computes the spectra of the shot again.
+      the study's time over DEFAULT_BLOCKS_MIN, and longer than twice DEFAULT_BLOCK_CPU_SECONDS_MIN.
+      The reason is that each of the blocks computes the spectra of the shot again.
     * A block has at most DEFAULT_BLOCK_DRAWS_MAX draws of a shot.
 
     Parameters

@@ -37,7 +37,7 @@ def draw_point_spectra(
     n_draws: int,
     first_draw: int = 0,
 ) -> xr.Dataset:
-    """Draw the spectra of one point of a study, as the study draws them.
+    """Draw random spectra of one point of a study, with the random numbers of the study.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarr
 
 
 def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
-    """Write spectra as a Zarr store or as a NumPy archive, by the suffix of the path.
+    """Write spectra to a Zarr store or a NumPy archive, depending on the suffix of the path.
 
     Parameters
     ----------

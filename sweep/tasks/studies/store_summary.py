@@ -63,11 +63,11 @@ class DetectionRow:
     n_points: int
     """Number of points that are computed in this part of the grid."""
     detected_fraction: float
-    """Fraction of these points with pd_shot above `DETECTED_PD_MIN`."""
+    """Fraction of the row's points with pd_shot above `DETECTED_PD_MIN`."""
     median_pd_shot: float
-    """Median of pd_shot, the probability of detection in both chirps, over these points."""
+    """Median of pd_shot, the probability of detection in both chirps, over the row's points."""
     median_pd_doppler: float
-    """Median of pd_doppler over these points; nan without a Doppler segment."""
+    """Median of pd_doppler over the row's points; nan without a Doppler segment."""
 
     @classmethod
     def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
@@ -96,7 +96,7 @@ class DetectionSummary(NamedTuple):
     axis_heading: str
     """Name and units of the slowest axis; '' for a grid without axes."""
     rows: list[DetectionRow]
-    """Rows for the parts of the slowest axis, and a last row for the grid as one."""
+    """Rows for the parts of the slowest axis, and a last row for the entire grid."""
     sampled_block_fraction: float
     """Fraction of the stored blocks that were read for the summary."""
 

@@ -113,8 +113,8 @@ def verify(
 ) -> list[VerificationReport]:
     """Check every byte of a store, and of the eyepoint stores that its study uses.
 
-    Receipts of damaged blocks are withdrawn, so that `resume` computes them again, unless another
-    process writes to the store.
+    Receipts of damaged blocks are withdrawn, so that `resume` computes the blocks again. They are
+    not withdrawn while another process writes to the store.
 
     Parameters
     ----------

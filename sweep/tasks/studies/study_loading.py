@@ -428,9 +428,10 @@ def _fixed_tolerance(spec: AnySpec) -> float | None:
 
 
 def apply_changes(spec: AnySpec, changes: Mapping[str, Any]) -> AnySpec:
-    """Return a spec with values changed by dotted path: ``{"axes.target.range": ["1 km"]}``.
+    """Return a copy of a spec with new values.
 
-    SpecError is raised if the result is no valid spec.
+    ``changes`` maps dotted paths to values, such as ``{"axes.target.range": ["1 km"]}``. SpecError
+    is raised if the result is no valid spec.
     """
     mapping = spec.to_yaml_mapping()
     for path, value in changes.items():
@@ -527,7 +528,7 @@ def _field_value(spec: AnySpec, path: str) -> float:
 
 
 def _iter_lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
-    """Yield a text for each axis of the source with values that the target lacks."""
+    """Yield a text for each axis of the source study with values that the target study lacks."""
     source_grid, target_grid = ParameterGrid(source_spec), ParameterGrid(target_spec)
     varying_paths = {
         path

@@ -53,9 +53,9 @@ FLIGHT_TIMING_SECONDS = 1.0
 """Approximate duration of timing the shots of all scanners of a flight [s]."""
 
 TIMED_RAYS_MAX = 1 << 17
-"""Largest number of rays of the shots that are timed, per scanner."""
+"""Largest number of rays of the timed shots, for each scanner."""
 TIMED_SHOT_DRAWS_MAX = 1 << 14
-"""Largest product of timed shots and timed draws per shot, per scanner."""
+"""Largest number of timed shots times number of timed draws per shot, for each scanner."""
 
 WARM_UP_SHOTS_MAX = 32
 """Largest number of shots that are simulated to load kernels and tables before shots are timed.
@@ -195,7 +195,7 @@ def plan_study(
     spec
         Study to plan.
     store_path
-        Path of its store; eyepoints that exist there need not be cast.
+        Path of the study's store. Eyepoints that are already stored beside it are not cast.
     n_workers
         Number of worker processes; by default the number in the spec's section `execution`. If both
         are missing, threads on all cores compute, provided the study allows it.
@@ -496,13 +496,13 @@ class TimedShots(NamedTuple):
     n_shots: int
     """Number of shots that were timed."""
     casting_seconds: float
-    """Time of casting the rays of these shots [s], the total of all."""
+    """Time of casting the rays of all timed shots [s]."""
     simulation_seconds: float
-    """Time of simulating the draws of these shots [s], averaged over points of the axes."""
+    """Time of simulating the draws of all timed shots [s], averaged over points of the axes."""
 
     @property
     def total_seconds(self) -> float:
-        """Time of casting and of simulating these shots [s]."""
+        """Time of casting and simulating all timed shots [s]."""
         return self.casting_seconds + self.simulation_seconds
 
 
