@@ -248,8 +248,9 @@ def make_map_frame(
     Raises
     ------
     SceneError
-        If the size of a unit on the ground is unknown, or varies over the bounds by more than
-        `MAP_SCALE_ERROR_MAX`.
+        If the size of a unit on the ground is unknown, or is wrong within the bounds by more than
+        `MAP_SCALE_ERROR_MAX`. A size that the user states may be wrong by up to
+        `STATED_SCALE_ERROR_MAX`, and gives a warning.
     """
     per_degree, per_unit = stated.metres_per_degree, stated.metres_per_unit
     for name, sizes in (("degree", per_degree), ("unit", per_unit)):
