@@ -1357,7 +1357,7 @@ def _measurement_shifts_by_motion(
     m/s. The slip is the radial velocity minus the speed at which the range falls.
     """
     coefficients = shots.beat_coefficients
-    by_acceleration, by_slip = _beat_change_by_motion(shots)
+    by_acceleration, by_slip = _beat_shifts_by_motion(shots)
     point = listed_returns.point
     point_index: np.ndarray | slice = point
     if (

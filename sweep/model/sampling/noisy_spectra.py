@@ -477,9 +477,9 @@ def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
     (of the record [s]).
     """
     return {
-        "line_width": _value_at(shots.laser_line.lorentzian_fwhm, point),
-        "delay": waveform.round_trip_delay(_value_at(shots.range, point)),
-        "duration": _value_at(shots.record.duration, point),
+        "line_width": _value_of_point(shots.laser_line.lorentzian_fwhm, point),
+        "delay": waveform.round_trip_delay(_value_of_point(shots.range, point)),
+        "duration": _value_of_point(shots.record.duration, point),
     }
 
 
