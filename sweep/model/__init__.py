@@ -10,6 +10,6 @@ University, 2017. Points of one category share all settings that are words or si
 (:func:`sweep.model.preparation.split_by_category`). Sigma is the noise of a bin per quadrature.
 """
 
-MODEL_VERSION = "51"
+MODEL_VERSION = "52"
 """Version of the physics model. It is part of a study's identity and is raised when any result can
 change."""

@@ -217,7 +217,9 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
             "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
         )
     line_fraction, in_phase_pedestal = _line_fraction_and_pedestal(shots, timing)
-    line_power = (shots.echo_scales.beat_amplitude_scale / 2) ** 2 * shots.total_relative_echo
+    echo = shots.total_relative_echo  # with direct detection the beat's amplitude, else its power
+    beat_power = echo**2 if shots.waveform.architecture == "direct" else echo
+    line_power = (shots.echo_scales.beat_amplitude_scale / 2) ** 2 * beat_power
     side_pedestal = pedestal_power_under_line(window=shots.window, **timing)
     if shots.echo_record.n_samples_before_echo is not None:
         side_pedestal = (

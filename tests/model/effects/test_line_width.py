@@ -134,12 +134,24 @@ def test_the_walk_of_a_phase_has_the_lag_and_the_growth_of_a_wiener_process(dela
             assert phase_variance == pytest.approx(expected, rel=5 * np.sqrt(2 / number))
 
 
-@pytest.mark.parametrize("g", [0.4, pytest.param(1.3, marks=pytest.mark.slow), 3.8])
-def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1, g):
+@pytest.mark.parametrize(
+    ("g", "architecture"),
+    [
+        (0.4, "homodyne"),
+        pytest.param(1.3, "homodyne", marks=pytest.mark.slow),
+        (3.8, "homodyne"),
+        (0.4, "direct"),
+    ],
+)
+def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1, g, architecture):
     """A delay of a sixteenth of the record, at thresholds below and above the line."""
     length, rate, number, rng = 4096, 600e6, 3000, np.random.default_rng(6)
     delay = length // 16
-    point = table_4_1(range=SPEED_OF_LIGHT * delay / rate / 2, fft_size=length, power=1e-4) | {
+    target_range, power = SPEED_OF_LIGHT * delay / rate / 2, 1e-4
+    amplitude_exponent = 1.0 if architecture == "direct" else 0.5  # of the beat, by power
+    point = table_4_1(
+        range=target_range, fft_size=length, power=power, architecture=architecture
+    ) | {
         "target.radial_velocity": 0.0,
         "footprint.beamlets": 1,
     }
@@ -152,13 +164,12 @@ def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1
     noise = rng.standard_normal(number) + 1j * rng.standard_normal(number)
     for line in (0.7, 1.0, 1.3):  # over the threshold, by the pure line's power
         factor = line * shots.threshold[0] * np.exp(g / 2) / abs(record.sum())
-        is_detected = (
-            np.abs(factor * signal + shots.bin_noise_sigma[0] * noise) >= shots.threshold[0]
-        )
         changes = {
-            "instrument.laser.power": 1e-4 * factor**2,
+            "instrument.laser.power": power * factor ** (1 / amplitude_exponent),
             "instrument.laser.line_width": g * rate / (2 * np.pi * delay),
             "instrument.laser.line_shape": "lorentzian",
         }
+        ((_, lit),) = prepare_shots(point | changes, ("doppler",))  # with the echo's shot noise
+        is_detected = np.abs(factor * signal + lit.line_noise_sigma[0] * noise) >= lit.threshold[0]
         pd = float(evaluate(point | changes, ("doppler", "line_width"))["pd_up"][0])
         assert is_detected.mean() == pytest.approx(pd, abs=5 * np.sqrt(pd * (1 - pd) / number))
