@@ -38,7 +38,7 @@ _MODULE_BY_NAME = {
     "verify": "sweep.tasks.studies.store_verification",
     "StudyWarning": "sweep.tasks.studies.study_warnings",
 }
-"""Module of each public name."""
+"""Module that defines each public name of `sweep`, by that name."""
 
 __all__ = [
     "StudyWarning", "__version__", "export", "extend", "load", "open", "open_scene", "reports",

@@ -8,11 +8,11 @@ EXTRA_BY_MODULE = {
     "asyncssh": "clusters", "dask_jobqueue": "clusters",
     "dask_kubernetes": "kubernetes", "httpx": "kubernetes", "kr8s": "kubernetes",
 }  # fmt: skip
-"""Extra in `pyproject.toml` that installs a module, by the module's name."""
+"""Name of the extra in `pyproject.toml` that installs an optional module, by the module's name."""
 
 
 def install_hint(error: BaseException) -> str:
-    """Return the command that installs the module that an import lacked; '' for any other error.
+    """Return how to install the module that an import lacked; '' for an error of another kind.
 
     Examples
     --------

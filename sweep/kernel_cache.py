@@ -44,16 +44,17 @@ from numba.extending import intrinsic
 from platformdirs import user_cache_dir
 
 UNUSED_CACHE_AGE_MAX = 30 * 86400.0
-"""Time without use after which the kernels of another fingerprint are deleted [s]."""
+"""Time without use [s] after which another fingerprint's folder of compiled kernels is deleted."""
 
 USE_DATE_RENEWAL_INTERVAL = 86400.0
-"""Age of a cache folder's modification time at which a use renews it [s]."""
+"""Age [s] of a cache folder's modification time above which a process that uses it renews the time.
+"""
 
 NUMBA_SETTINGS_OUTSIDE_FINGERPRINT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
-"""Numba settings that do not change the compiled code, so the fingerprint leaves them out."""
+"""Names of numba settings that do not change compiled code. The cache's fingerprint omits them."""
 
 DEFAULT_NJIT_OPTIONS = {"nogil": True, "no_cfunc_wrapper": True}
-"""Options that `numba.njit` gets for every kernel, unless the kernel sets them itself."""
+"""Default options of `numba.njit` for all kernels; a kernel's own options override them."""
 
 _numba_settings: Any = numba.config
 _MODEL_DIR = Path(__file__).parent / "model"
@@ -67,7 +68,7 @@ class CacheFolder(NamedTuple):
     """Folder in which this process caches compiled kernels."""
 
     path: Path | None
-    """The folder; None if kernels are not cached."""
+    """Folder of compiled kernels; None if kernels are not cached."""
     not_cached_reason: str = ""
     """Why kernels are not cached; empty if they are."""
 
@@ -76,9 +77,9 @@ class _CacheState:
     """Flags of this process: whether it may still read and write the kernel cache."""
 
     can_read = True
-    """False once a model file has changed since the fingerprint was computed."""
+    """True until a model file changes after the fingerprint was computed."""
     can_write = True
-    """False once a model file has changed, or the cache folder can't be written."""
+    """True until a model file changes, or writing to the cache folder fails."""
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -136,7 +137,7 @@ class KernelCache(FunctionCache):
     """True if the kernel was declared, by `njit`, to neither create nor return arrays."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the kernel compiled for a signature, or None if it is not cached."""
+        """Return the kernel compiled for the signature `sig`, or None if the cache has none."""
         if not _CacheState.can_read:
             return None
         if _had_changed_at_first_load():
@@ -153,7 +154,7 @@ class KernelCache(FunctionCache):
         return result
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save a compiled kernel; log a warning once if it can't be saved."""
+        """Save the compiled kernel `data` of the signature `sig`; log one warning if that fails."""
         if self.borrows_arrays and _holds_arrays(data.signature.return_type):
             name = data.fndesc.qualname
             raise TypeError(f"{name} borrows arrays, and returns {data.signature.return_type}")
@@ -182,7 +183,7 @@ class KernelCache(FunctionCache):
 
 
 def is_compiled(kernel: Any) -> bool:
-    """Return True if a kernel is compiled, in this process or in the cache, for some signature."""
+    """Return True if a kernel is compiled for at least one signature, in memory or in the cache."""
     if not isinstance(kernel, Dispatcher) or kernel.signatures:
         return True  # no Dispatcher: NUMBA_DISABLE_JIT is set, and nothing is compiled
     cache_path, name = kernel.stats.cache_path, kernel.py_func.__name__
@@ -190,15 +191,15 @@ def is_compiled(kernel: Any) -> bool:
 
 
 def _holds_arrays(kind: Any) -> bool:
-    """Return True if a numba type is an array type, or a tuple type that contains one."""
+    """Return True if a numba type is an array type, or a tuple type that contains an array type."""
     parts = getattr(kind, "types", ())  # member types of a tuple
     return isinstance(kind, types.Array) or any(map(_holds_arrays, parts))
 
 
 def _enable_cache(kernel: Any, borrows: bool) -> None:
-    """Let numba cache a kernel in this process's cache folder, if there is one.
+    """Let numba cache a kernel in this process's cache folder; do nothing if no folder can be used.
 
-    `borrows` declares that the kernel neither creates nor returns arrays, as in `njit`.
+    `borrows` declares that the kernel neither creates nor returns arrays.
     """
     folder = cache_folder()
     if folder.path is None:
@@ -222,7 +223,10 @@ def _enable_cache(kernel: Any, borrows: bool) -> None:
 
 @contextmanager
 def _numba_cache_dir(path: str) -> Iterator[None]:
-    """Set numba's cache folder while a kernel is declared, and restore it for other functions."""
+    """Context manager that sets numba's cache folder to `path`, and restores the former at its end.
+
+    A kernel that is declared inside is cached in `path`.
+    """
     previous_dir = _numba_settings.CACHE_DIR
     _numba_settings.CACHE_DIR = path
     try:
@@ -233,10 +237,11 @@ def _numba_cache_dir(path: str) -> Iterator[None]:
 
 @cache
 def cache_folder() -> CacheFolder:
-    """Return the folder in which this process caches compiled kernels.
+    """Return the folder in which this process caches compiled kernels, as a :class:`CacheFolder`.
 
-    The first base directory that can be made private is used: `NUMBA_CACHE_DIR`, the user's cache
-    directory, the directory for temporary files.
+    Three base directories are tried: `NUMBA_CACHE_DIR`, the user's cache directory, and the
+    directory for temporary files. The first one that can hold a private folder is used. If none
+    can, `path` is None and `not_cached_reason` says why.
     """
     with _declaration_lock:
         if not (fingerprint := _model_fingerprint()):
@@ -262,13 +267,16 @@ def cache_folder() -> CacheFolder:
 
 
 def _configured_cache_base() -> str:
-    """Return numba's configured cache directory as an absolute path; '' if none is set."""
+    """Return the setting `NUMBA_CACHE_DIR` as an absolute path; '' if it is not set."""
     cache_dir = _numba_settings.CACHE_DIR
     return os.path.abspath(cache_dir) if cache_dir else ""
 
 
 def create_private_folder(root: Path) -> None:
-    """Create a folder that no other user can write to; raise OSError if that is impossible."""
+    """Create a folder that no other user can write to; raise OSError if that is impossible.
+
+    An existing folder is accepted if no other user can write to it.
+    """
     root.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
         root.mkdir(mode=0o700)
@@ -284,7 +292,7 @@ def create_private_folder(root: Path) -> None:
 
 @cache
 def _model_file_stats() -> dict[str, tuple[str, int, int]]:
-    """Return each model file's name, size [bytes] and modification time [ns], by its full path."""
+    """Return (name, size [bytes], modification time [ns]) of each model file, by its full path."""
     return {
         str(path): (path.relative_to(_MODEL_DIR).as_posix(), status.st_size, status.st_mtime_ns)
         for path in sorted(_MODEL_DIR.rglob("*.py"))
@@ -294,7 +302,10 @@ def _model_file_stats() -> dict[str, tuple[str, int, int]]:
 
 @cache
 def _model_fingerprint() -> str:
-    """Return a digest of everything that determines compiled kernels; '' without source files."""
+    """Return a digest of all that determines compiled kernels: model files, libraries and settings.
+
+    The digest is '' if the model has no source files.
+    """
     digest = hashlib.sha256()
     parts = [numba.__version__, llvmlite.__version__, np.__version__, repr(DEFAULT_NJIT_OPTIONS)]
     parts += [
@@ -311,9 +322,9 @@ def _model_fingerprint() -> str:
 
 
 def _file_has_changed(path: str) -> bool:
-    """Return True if a model file has changed since the fingerprint was computed.
+    """Return True if the model file at `path` has changed since the fingerprint was computed.
 
-    Files outside the model count as unchanged.
+    The result is False for a file outside the model.
     """
     if (fingerprinted := _model_file_stats().get(path)) is None:
         return False
@@ -325,21 +336,24 @@ def _file_has_changed(path: str) -> bool:
 
 
 def _any_file_has_changed() -> bool:
-    """Return True if any model file has changed since the fingerprint was computed."""
+    """Return True if at least one model file has changed since the fingerprint was computed."""
     return any(map(_file_has_changed, _model_file_stats()))
 
 
 @cache
 def _had_changed_at_first_load() -> bool:
-    """Return True if any model file had changed when this process first loaded a kernel."""
+    """Return whether a model file had changed by the time this process first loaded a kernel.
+
+    The files are checked once; later calls repeat the first result.
+    """
     return _any_file_has_changed()
 
 
 @cache
 def _renew_use_date(folder: Path) -> None:
-    """Renew a cache folder's modification time, so that no process deletes it as unused.
+    """Set a cache folder's modification time to now, so that no process deletes it as unused.
 
-    Each process does this once per folder.
+    A process does this once for each folder.
     """
     with suppress(OSError):
         if time.time() - folder.stat().st_mtime > USE_DATE_RENEWAL_INTERVAL:
@@ -348,9 +362,10 @@ def _renew_use_date(folder: Path) -> None:
 
 @cache
 def _remove_unused_caches(used_folder: Path) -> None:
-    """Delete the caches of other fingerprints that were not used for a month; once per process.
+    """Delete cache folders of other fingerprints that were not used for a month; once per process.
 
-    A process that still uses a deleted folder has its kernels in memory, or compiles them again.
+    `used_folder` is this process's cache folder, which is kept. A process that still uses a deleted
+    folder has its kernels in memory, or compiles them again.
     """
     with suppress(OSError):
         folders = {
@@ -365,7 +380,7 @@ def _remove_unused_caches(used_folder: Path) -> None:
 
 @cache
 def _warn_not_cached(reason: str) -> None:
-    """Warn in the log that every process compiles its kernels anew, with reason and remedy."""
+    """Log a warning, with `reason` and remedy, that every process compiles its kernels anew."""
     _log.warning(
         "compiled kernels are not cached, so that each start takes a minute more: %s. "
         "NUMBA_CACHE_DIR names another folder for them, of your own and with room",

@@ -55,7 +55,7 @@ def escape_to_one_line(text: object) -> str:
 
 
 def number_with_noun(number: int, thing: str) -> str:
-    """Return a number with a noun, in the plural unless the number is 1.
+    """Return a number and a noun as text, with a plural s unless the number is 1.
 
     Examples
     --------
@@ -66,9 +66,9 @@ def number_with_noun(number: int, thing: str) -> str:
 
 
 class EscapedMessageError(Exception):
-    """Base of errors whose text quotes stores, specs and file names.
+    """Base class of errors whose messages quote stores, specs and file names.
 
-    Unprintable characters are escaped.
+    Unprintable characters in a message are replaced by escape sequences.
     """
 
     def __str__(self) -> str:
@@ -76,11 +76,11 @@ class EscapedMessageError(Exception):
 
 
 class EscapingStream:
-    """Text stream that escapes unprintable characters.
+    """Text stream that writes unprintable characters as escape sequences to a wrapped stream.
 
-    It has no attribute `buffer`, so that no output bypasses it. Rich writes escape sequences of its
-    own, and therefore to the wrapped stream, `rich_proxied_file`. Text must be escaped before rich
-    prints it.
+    It has no attribute `buffer`, so that no output bypasses it. The library rich prints control
+    sequences and therefore writes to the wrapped stream, `rich_proxied_file`. Text must be escaped
+    before rich prints it.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -94,7 +94,7 @@ class EscapingStream:
         return len(text)
 
     def writelines(self, lines: Any) -> None:
-        """Write several texts."""
+        """Write several texts, with unprintable characters escaped."""
         for line in lines:
             self.write(line)
 
@@ -107,7 +107,7 @@ class EscapingStream:
 # Suggestions to users
 
 _runs_as_command = False
-"""True while the `sweep` command runs."""
+"""True while the `sweep` command runs; False if a Python program has called the package."""
 
 EXIT_MISTAKE, EXIT_INCOMPLETE = 2, 3
 """Exit codes of the command: for a user's mistake, and for a run that ended before all blocks were
@@ -124,7 +124,7 @@ NEW_PLACEHOLDER = Placeholder("NEW")
 
 @contextmanager
 def suggest_shell_commands() -> Iterator[None]:
-    """Context manager in which suggestions are shell commands, because the `sweep` command runs."""
+    """Context manager in which suggestions to the user are shell commands, not Python calls."""
     global _runs_as_command
     previous, _runs_as_command = _runs_as_command, True
     try:
@@ -134,7 +134,7 @@ def suggest_shell_commands() -> Iterator[None]:
 
 
 def is_run_as_command() -> bool:
-    """Return True while the `sweep` command runs; its process ends with the command."""
+    """Return True if this process runs the `sweep` command, False if a Python program."""
     return _runs_as_command
 
 
@@ -164,13 +164,18 @@ def shell_command(name: str, *arguments: object, **options: object) -> str:
 
 
 def _shell_word(value: object) -> str:
-    """Quote a value for the shell; put './' before a leading '-', so that it is no option."""
+    """Return a value as a quoted word of a shell command.
+
+    A word that begins with '-' gets './' in front, so that the shell command takes it as a path.
+    """
     word = str(value)
     return shlex.quote(f"./{word}" if word.startswith("-") else word)
 
 
 def suggested_call(name: str, *arguments: object, **options: object) -> str:
-    """Return a command to type or a Python call to make, in backquotes.
+    """Return a shell command to type, or a Python call to make, as text in backquotes.
+
+    The text is a shell command while the `sweep` command runs, else a Python call.
 
     Parameters
     ----------
@@ -195,7 +200,9 @@ def suggested_call(name: str, *arguments: object, **options: object) -> str:
 
 
 def option_text(name: str, value: object = True) -> str:
-    """Return an option to add to the user's command, or an argument to add to the user's call.
+    """Return an option with its value as text: for a shell command, or as an argument of a call.
+
+    The text is that of a shell command while the `sweep` command runs, else of a Python call.
 
     Examples
     --------
@@ -214,7 +221,7 @@ def option_text(name: str, value: object = True) -> str:
 
 
 def option_name(name: str) -> str:
-    """Return the name of an option as in a shell command, or of an argument as in a Python call.
+    """Return an option's name as text: ``--store`` in a shell command, ``store=`` in a Python call.
 
     Examples
     --------
@@ -230,7 +237,7 @@ def _option_flag(option: str) -> str:
 
 
 def _python_literal(value: object) -> str:
-    """Return the Python source text that stands for a value in an example of a call.
+    """Return the Python source text of a value, for an example of a call.
 
     A placeholder such as STORE becomes the name of a variable, ``store``. Values other than
     booleans, numbers and lists become string literals.

@@ -19,21 +19,21 @@ _FILE_TYPE_NAMES = {
     stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket", stat.S_IFLNK: "a symbolic link", stat.S_IFDIR: "a directory",
 }  # fmt: skip
-"""Name of each type of file other than regular files."""
+"""Name of a type of irregular file, such as "a device", by the type bits of its `st_mode`."""
 
 READ_BUFFER_BYTES = 1 << 20
-"""Number of bytes read at a time from a file whose content is not kept in memory."""
+"""Number of bytes per read of a file whose content is not kept in memory."""
 
 
 class RefusedFileError(OSError):
-    """Error of a path that is no regular file, is too large, or leaves its directory."""
+    """Error for a path that is no regular file, is too large, or leads out of its directory."""
 
     def __str__(self) -> str:
         return f"{self.filename} {self.strerror}"
 
 
 def file_type(mode: int) -> str:
-    """Return the name of a file's type, given the mode of its stat result.
+    """Return the name of a file's type, given the `st_mode` of its stat result.
 
     Examples
     --------
@@ -109,9 +109,11 @@ def open_file_below_root(root: str | Path, name: str) -> int:
 def _open_refusing_irregular(
     name: str, path_in_messages: str, flags: int, folder_descriptor: int | None
 ) -> int:
-    """Open a regular file, or a directory if `flags` include O_DIRECTORY.
+    """Open a regular file and return its descriptor; refuse any other type of file.
 
-    Errors name the file as `path_in_messages`.
+    `flags` are those of `os.open`; with O_DIRECTORY a directory is opened instead. `name` is
+    relative to the directory `folder_descriptor`, if one is passed. Errors name the file as
+    `path_in_messages`.
     """
     descriptor = -1
     try:
@@ -171,7 +173,10 @@ def read_file_below_root(
 def _read_slice_and_close(
     descriptor: int, bytes_max: int, path_in_messages: str, byte_slice: slice = slice(None)
 ) -> bytes:
-    """Return a slice of an open file, and close it."""
+    """Return the bytes `byte_slice` of an open file, and close its descriptor.
+
+    Raise `RefusedFileError`, naming `path_in_messages`, if the file exceeds `bytes_max`.
+    """
     with open(descriptor, "rb", buffering=0) as file:
         start, stop, _ = byte_slice.indices(
             checked_file_size(descriptor, bytes_max, path_in_messages)
@@ -191,14 +196,15 @@ class FileStream(NamedTuple):
     size_bytes: int
     """Size of the file [bytes]."""
     content_pieces: Iterator[bytes]
-    """Content of the file in pieces; each is read when the iterator advances."""
+    """Iterator over the file's content in pieces; a piece is read when the iterator reaches it."""
 
 
 @contextmanager
 def stream_file_below_root(root: str | Path, name: str, bytes_max: int) -> Iterator[FileStream]:
-    """Context manager: yield the size of a file below a directory and its content in pieces.
+    """Context manager that opens a file below the directory ``root``; yields a :class:`FileStream`.
 
-    The file is opened as by :func:`open_file_below_root` and has at most ``bytes_max`` bytes.
+    The file is opened by :func:`open_file_below_root`. `RefusedFileError` is raised if it has more
+    than ``bytes_max`` bytes.
     """
     descriptor = open_file_below_root(root, name)
     with open(descriptor, "rb", buffering=0) as file:
@@ -209,7 +215,7 @@ def stream_file_below_root(root: str | Path, name: str, bytes_max: int) -> Itera
 def checked_file_size(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
     """Return the size of an open file [bytes].
 
-    Raise `RefusedFileError` if the size exceeds ``bytes_max``.
+    `RefusedFileError`, naming ``path_in_messages``, is raised if the size exceeds ``bytes_max``.
     """
     size = os.fstat(descriptor).st_size
     check_file_size(size, bytes_max, path_in_messages)
@@ -217,7 +223,10 @@ def checked_file_size(descriptor: int, bytes_max: int, path_in_messages: str) ->
 
 
 def check_file_size(size: int, bytes_max: int, path_in_messages: str) -> None:
-    """Raise `RefusedFileError` if the size of a file or object exceeds ``bytes_max``."""
+    """Raise `RefusedFileError` if ``size`` [bytes], of a file or object, exceeds ``bytes_max``.
+
+    The error names the file or object as ``path_in_messages``.
+    """
     if size > bytes_max:
         problem = f"has {size:,} bytes, and can have no more than {bytes_max:,}"
         raise RefusedFileError(errno.EFBIG, problem, path_in_messages)

@@ -10,18 +10,18 @@ import json
 from typing import Any
 
 JSON_DEPTH_MAX = 60
-"""Maximum depth of nested lists and objects; the document of a store has ten levels."""
+"""Maximum depth of nested lists and objects in a JSON document; that of a store has ten levels."""
 
 
 def parse_json(content: bytes | str, *, allow_non_utf8: bool = False) -> Any:
-    """Parse JSON and check its nesting and text.
+    """Parse a JSON document, and refuse deep nesting and text that UTF-8 can't encode.
 
     Parameters
     ----------
     content : bytes or str
         JSON document.
     allow_non_utf8 : bool
-        True if text may be no valid UTF-8, such as names of files.
+        True accepts text that UTF-8 can't encode, such as names of files.
 
     Raises
     ------
@@ -37,7 +37,10 @@ def parse_json(content: bytes | str, *, allow_non_utf8: bool = False) -> Any:
 
 
 def _refuse_unsafe_values(parsed: Any, allow_non_utf8: bool) -> None:
-    """Raise `ValueError` for deep nesting and lone surrogates, level by level."""
+    """Raise `ValueError` if parsed JSON is nested too deeply or contains half of a surrogate pair.
+
+    `allow_non_utf8` accepts halves of surrogate pairs.
+    """
     level, depth = [parsed], 0
     while level:
         depth += 1
@@ -56,7 +59,7 @@ def _refuse_unsafe_values(parsed: Any, allow_non_utf8: bool) -> None:
 
 
 def is_utf8_encodable(text: str) -> bool:
-    """Return True if a text can be encoded as UTF-8: it contains no half of a surrogate pair.
+    """Return True if a text can be encoded as UTF-8, so that it has no half of a surrogate pair.
 
     Examples
     --------

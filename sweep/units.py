@@ -31,44 +31,44 @@ LOGARITHMIC_UNITS = {
     "dBm": ("W", Fraction(1, 1000)),
     "dBW": ("W", Fraction(1)),
 }
-"""Logarithmic units of power. Each has an SI unit, and the value of 0 dB in that SI unit.
+"""Logarithmic units of power, by symbol: the SI unit, and the value of 0 dB in that SI unit.
 
 30 dBm is 1 W, and -155 dB/Hz is 10^-15.5 /Hz. For the noise of a laser dB/Hz is also written as
 dBc/Hz.
 """
 
 NO_VALUE_TEXT = "none"
-"""Text that stands for nan, such as the quotient 0 / 0."""
+"""Text that messages and tables show for nan, such as the quotient 0 / 0."""
 
 _NUMBER_PATTERN = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
-"""Pattern of a number in decimal notation."""
+"""Regular expression of a number in decimal notation, such as ``-1.5e3``."""
 _INTEGER_POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
-"""Pattern of a power of two integers, such as ``2^17``."""
+"""Regular expression of a power of two integers, such as ``2^17``."""
 _POWER_EXPONENT_MAX = 999
-"""Largest magnitude of the exponent in a written power, such as ``10^-3``."""
+"""Largest magnitude of the exponent in a written power, such as 3 in ``10^-3``."""
 _UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
-"""Pattern of text after a number, if that text may be a unit."""
+"""Regular expression of the text after a number that may be a unit."""
 _QUANTITY_PATTERN = re.compile(
     rf"\s*(?:{_INTEGER_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?",
     re.ASCII,
 )
-"""Pattern of a number or power with an optional unit."""
+"""Regular expression of a number or power, followed by an optional unit."""
 _EXPONENT_PATTERN = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
-"""Pattern of the exponent of a unit, such as ``^2``, ``^0.5`` or ``^(2/3)``."""
+"""Regular expression of a unit's exponent, such as ``^2``, ``^0.5`` or ``^(2/3)``."""
 _GROUPED_NUMBER_PATTERN = re.compile(
     r"\s*[+-]?\d+(?:[.]\d+)*(?:,\d+|(?:[_' ]\d{3}(?!\d|\s*/))+(?:[.,]\d+)?)+", re.ASCII
 )
-"""Pattern of a number with grouped digits or a decimal comma, which is refused."""
+"""Regular expression of refused numbers: with grouped digits, ``1,000``, or a decimal comma."""
 _UNIT_FACTOR_PATTERN = re.compile(rf"(?P<name>[A-Za-z]+|%)(?:{_EXPONENT_PATTERN})?")
-"""Pattern of one factor of a unit: a name with an optional exponent."""
+"""Regular expression of one factor of a unit: a name with an optional exponent, such as ``m^2``."""
 _UNIT_OPERATOR_PATTERN = re.compile(r"(\*(?!\*)|/(?![^(]*\))|(?<=[A-Za-z0-9)]) +(?=[A-Za-z]))")
-"""Pattern of the operator between two factors of a unit."""
+"""Regular expression of the operator between two factors of a unit: ``*``, ``/`` or a space."""
 _NOT_FINITE_PATTERN = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
-"""Pattern of nan and infinity."""
+"""Regular expression of a text that begins with nan or infinity."""
 _SQUARE_ROOT_PATTERN = re.compile(r"(?:√\s*|rt|sqrt\s*)(?:\(\s*([A-Za-z]+)\s*\)|([A-Za-z]+))")
-"""Pattern of a square root of a unit, such as ``rtHz`` or ``√Hz``."""
+"""Regular expression of the square root of a unit, such as ``rtHz`` or ``√Hz``."""
 _ASCII_SPELLINGS = {"μ": "u", "Ω": "ohm", "°": "deg", "−": "-", "·": "*", "⋅": "*", "×": "*"}
-"""ASCII spelling of special characters in units."""
+"""ASCII spelling of special characters in units, by character: ``ohm`` for ``Ω``."""
 
 # Units that are suggested for a misspelt unit, by the SI unit of the field.
 _USUAL_UNITS_BY_SI_UNIT = {
@@ -95,10 +95,11 @@ _USUAL_UNITS_BY_SI_UNIT = {
 _PI = Fraction("3.1415926535897932384626433832795028841971693993751")
 _LN_10 = Fraction("2.3025850929940456840179914546843642076011014886288")
 _ATTENUATION_UNITS = {"dB/m": _LN_10 / 10, "dB/km": _LN_10 / 10_000, "dB/cm": 10 * _LN_10}
-"""Attenuation of power with distance: value in 1/m of one decibel per metre, kilometre or
-centimetre."""
+"""Value in 1/m of each unit of attenuation, by unit: of one decibel of power per metre, per
+kilometre and per centimetre.
+"""
 _WATT_DIMENSION = {"gram": 1, "meter": 2, "second": -3}
-"""Exponents of pint's root units in a watt."""
+"""Exponents of pint's root units (gram, meter, second) in a watt, by root unit."""
 _BASE_UNIT_CONVERSIONS: dict[str, tuple[Fraction, dict[str, int]]] = {
     "m": (Fraction(1), {"meter": 1}),
     "s": (Fraction(1), {"second": 1}),
@@ -112,13 +113,15 @@ _BASE_UNIT_CONVERSIONS: dict[str, tuple[Fraction, dict[str, int]]] = {
     "sr": (Fraction(1), {"radian": 2}),
     "deg": (_PI / 180, {"radian": 1}),
 }
-"""Factor to pint's root units, and exponents of the root units, of each unit known without pint."""
+"""Conversion of units without prefix to pint's root units, by symbol: the factor, and the exponent
+of each root unit.
+"""
 _PREFIX_EXPONENTS = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
-"""Power of ten of each metric prefix."""
+"""Power of ten of each metric prefix, by prefix: 3 for ``k``."""
 BUILT_IN_UNITS = frozenset(_BASE_UNIT_CONVERSIONS) | {
     prefix + base for prefix in _PREFIX_EXPONENTS for base in _BASE_UNIT_CONVERSIONS
 }
-"""Units that this module converts without the library pint.
+"""Symbols of units that this module converts without the library pint, with metric prefixes.
 
 Their factors and root units equal those of pint.
 """
@@ -152,17 +155,17 @@ class Unit:
     symbol: str
     """The unit as text; empty for a pure number."""
     factor: Fraction = Fraction(1)
-    """Value of one such unit in SI units; for a logarithmic unit the value of 0 dB."""
+    """Value of one unit in SI units; for a logarithmic unit the SI value of 0 dB."""
     offset: Fraction = Fraction(0)
     """SI value of 0 in this unit, such as 273.15 K for degC."""
 
     @property
     def is_logarithmic(self) -> bool:
-        """True if values in this unit are logarithms of power ratios."""
+        """True if values in this unit are decibels, logarithms of power ratios."""
         return self.symbol in LOGARITHMIC_UNITS
 
     def to_si(self, value: Fraction) -> float:
-        """Return the SI value of `value` in this unit, correctly rounded.
+        """Convert `value` in this unit to a float in SI units, correctly rounded.
 
         Raises
         ------
@@ -182,14 +185,14 @@ class ExactQuantity(NamedTuple):
     """A written quantity, before its conversion to SI units."""
 
     number: Fraction
-    """Exact number in `unit`."""
+    """Exact number, in the unit `unit`."""
     unit: Unit
-    """Unit as written; ``Unit("")`` for a pure number."""
+    """Unit as the user wrote it; ``Unit("")`` for a pure number."""
 
     def to_si(self) -> float:
-        """Return the SI value, correctly rounded.
+        """Return the quantity as a float in SI units, correctly rounded.
 
-        QuantityError is raised if it exceeds the range of floats.
+        QuantityError is raised if the value exceeds the range of floats.
         """
         return self.unit.to_si(self.number)
 
@@ -241,7 +244,10 @@ def read_number(
 def _pure_number_suggestion(
     value: Fraction, unit: str, is_valid: Callable[[Fraction], bool]
 ) -> str:
-    """Suggest the pure number that a number with a unit probably means; '' if none is valid."""
+    """Suggest the pure number that a user probably meant by `value` with the text `unit`.
+
+    Only numbers for which `is_valid` returns True are suggested; '' if there is none.
+    """
     if unit == DECIBEL:
         ratios = {
             "powers": _power_ratio_from_decibels(value),
@@ -349,7 +355,7 @@ def read_unit(unit_text: str, *, si_unit: str, example: str) -> Unit:
 
 
 def _wrong_dimension_error(unit_text: str, si_unit: str, example: str) -> tuple[str, str]:
-    """Return rule and suggestion of the error for a unit of the wrong dimension."""
+    """Return the error for a unit of the wrong dimension: the rule's text, and a suggestion."""
     dbm_example = " or '30 dBm'" if (si_unit, unit_text) == ("W", DECIBEL) else ""
     return (
         f"needs a unit like {si_unit}, and '{unit_text}' is none",
@@ -358,10 +364,9 @@ def _wrong_dimension_error(unit_text: str, si_unit: str, example: str) -> tuple[
 
 
 def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
-    """Return the exact number and the text of the unit of a written quantity.
+    """Split a written quantity into its exact number and the text of its unit, '' without a unit.
 
-    The text is empty if the quantity has no unit. Raise a `QuantityError` with the text `rule` if
-    the value is unreadable.
+    Raise a `QuantityError` with the text `rule` if the number can't be read.
     """
     if isinstance(raw_value, bool) or not isinstance(raw_value, int | float | str):
         raise QuantityError(rule)
@@ -382,7 +387,7 @@ def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
 
 
 def _parse_integer_power(base: int, exponent: str) -> Fraction:
-    """Return an exact power, such as ``2^17`` or ``10^-3``, with an integer exponent."""
+    """Return the exact value of a power with an integer exponent, such as ``2^17`` or ``10^-3``."""
     if "." in exponent:
         raise QuantityError("has an exponent that is no whole number")
     if abs(int(exponent)) > _POWER_EXPONENT_MAX:
@@ -393,7 +398,7 @@ def _parse_integer_power(base: int, exponent: str) -> Fraction:
 
 
 def _grouped_digits_error(text: str, number: str) -> tuple[str, str]:
-    """Return rule and suggestion of the error for grouped digits or a decimal comma."""
+    """Return the error for grouped digits or a decimal comma: the rule's text, and a suggestion."""
     *groups, last_group = re.split(r"[,_'\s]", number)
     remedies = []
     if "," not in number or (len(last_group) == 3 and "." not in number):
@@ -418,7 +423,7 @@ def _to_ascii_spelling(text: str) -> str:
 
 
 def _format_number(value: Fraction) -> str:
-    """Return a number as a user would write it."""
+    """Return the text of an exact number as a user would write it, such as ``0.25``."""
     try:
         return f"{float(value):.4g}"
     except OverflowError:
@@ -426,7 +431,7 @@ def _format_number(value: Fraction) -> str:
 
 
 def _parse_unit_factors(unit_text: str) -> list[tuple[str, Fraction]] | None:
-    """Return names and exponents of a unit's factors; None if the text is no unit."""
+    """Return (name, exponent) of each factor of a written unit; None if the text is no unit."""
     factors = []
     sign = 1
     unit_text = re.sub(r"^1\s*/", "/", unit_text.replace("**", "^"))
@@ -445,7 +450,7 @@ def _parse_unit_factors(unit_text: str) -> list[tuple[str, Fraction]] | None:
 
 
 def _format_unit(factors: list[tuple[str, Fraction]]) -> str:
-    """Return the normal spelling of a unit: ``W/m^2/nm``, ``pW/Hz^0.5``, ``1/km``, ``m^(-2/3)``."""
+    """Return the usual spelling of a unit from its (name, exponent) factors: ``W/m^2/nm``."""
     if [exponent for _, exponent in factors] == [-1]:
         return f"1/{factors[0][0]}"
     unit_text = ""
@@ -461,7 +466,7 @@ def _format_unit(factors: list[tuple[str, Fraction]]) -> str:
 
 @cache
 def _pint_registry() -> Any:
-    """Return pint's registry of units with exact fractions."""
+    """Return the registry of units of the library pint, with exact fractions (cached)."""
     import pint
 
     return pint.UnitRegistry(non_int_type=Fraction)
@@ -471,7 +476,11 @@ def _pint_registry() -> Any:
 def _root_unit_conversion(
     name: str,
 ) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
-    """Return factor, offset and dimension of a unit in pint's root units; None if it is unknown."""
+    """Return the conversion of a unit to pint's root units; None if the unit is unknown.
+
+    The conversion is (factor, offset, exponents of root units): root value = factor * value +
+    offset.
+    """
     if name in BUILT_IN_UNITS:
         base = name if name in _BASE_UNIT_CONVERSIONS else name[1:]
         factor, powers = _BASE_UNIT_CONVERSIONS[base]
@@ -485,7 +494,7 @@ def _root_unit_conversion(
 def root_unit_conversion_by_pint(
     name: str,
 ) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
-    """Return factor, offset and dimension of a unit in root units according to pint.
+    """Return the conversion of a unit to pint's root units, as the library pint computes it.
 
     Parameters
     ----------
@@ -495,7 +504,7 @@ def root_unit_conversion_by_pint(
     Returns
     -------
     (Fraction, Fraction, tuple of (str, Fraction)) or None
-        None if pint does not know the unit.
+        Factor, offset and exponents of root units; None if pint does not know the unit.
     """
     registry = _pint_registry()
     try:
@@ -511,7 +520,11 @@ def root_unit_conversion_by_pint(
 def _multiply_unit_factors(
     factors: list[tuple[str, Fraction]],
 ) -> tuple[Fraction, Fraction, dict[str, Fraction]]:
-    """Return factor, offset and dimension of a product of known units, in pint's root units."""
+    """Return the conversion of a product of known units to pint's root units.
+
+    `factors` are (name, exponent) of each unit. The conversion is (factor, offset, exponents by
+    root unit).
+    """
     scale, offset = Fraction(1), Fraction(0)
     dimension: dict[str, Fraction] = {}
     for name, exponent in factors:
@@ -530,7 +543,7 @@ def _multiply_unit_factors(
 
 
 def _raise_to_power(factor: Fraction, exponent: Fraction) -> Fraction:
-    """Return a power of a positive fraction, exact for integer exponents, else to 50 digits."""
+    """Return a positive fraction raised to a power, exact for an integer, else to 50 digits."""
     if exponent.denominator == 1:
         return factor ** int(exponent)
     with localcontext() as context:
@@ -544,7 +557,7 @@ def _raise_to_power(factor: Fraction, exponent: Fraction) -> Fraction:
 
 
 def _power_ratio_from_decibels(decibels: Fraction) -> Fraction:
-    """Return the power ratio of decibels to 50 digits, clipped to 1e-400 and 1e400."""
+    """Convert decibels to a power ratio, to 50 digits; the ratio is clipped to 1e-400..1e400."""
     with localcontext() as context:
         context.prec = 50
         exponent = Decimal(decibels.numerator) / decibels.denominator / 10
@@ -552,7 +565,7 @@ def _power_ratio_from_decibels(decibels: Fraction) -> Fraction:
 
 
 def _unit_suggestion(name: str, si_unit: str, example: str) -> str:
-    """Suggest a usual unit that resembles an unknown unit, else an example."""
+    """Suggest, as text, a usual unit that resembles the unknown unit `name`, else the `example`."""
     usual_units = _to_ascii_spelling(_USUAL_UNITS_BY_SI_UNIT.get(si_unit, si_unit))
     names = sorted(set(re.findall(r"[A-Za-z%]+", usual_units)))
     case_variants = [usual_name for usual_name in names if usual_name.lower() == name.lower()]
@@ -562,7 +575,7 @@ def _unit_suggestion(name: str, si_unit: str, example: str) -> str:
 
 
 def number_text(value: float, format_spec: str = ".4g") -> str:
-    """Return a number as text; ``none`` for nan.
+    """Return a number as text in the given format; ``none`` for nan.
 
     Examples
     --------

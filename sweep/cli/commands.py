@@ -72,21 +72,24 @@ class _StderrLogHandler(logging.StreamHandler[Any]):
 
     @property
     def stream(self) -> Any:
-        """Standard error; None if it is closed."""
+        """Current standard error stream; None if it is closed."""
         return sys.stderr
 
     @stream.setter
     def stream(self, value: Any) -> None:
-        """Ignore the stream that the base class assigns."""
+        """Ignore the stream that the base class assigns; the getter looks up standard error."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a log record, unless standard error is closed."""
+        """Write a log record to standard error; do nothing if standard error is closed."""
         if self.stream is not None:
             super().emit(record)
 
 
 def _enable_logging(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
-    """Write the package's log to standard error: steps with -v, and each task with -vv."""
+    """Click callback of --verbose: write the package's log to standard error.
+
+    `verbosity` 1 (-v) writes the steps, 2 (-vv) each task as well, 0 nothing.
+    """
     if not verbosity:
         return
     log, handler = logging.getLogger("sweep"), _StderrLogHandler()
@@ -105,10 +108,13 @@ def _enable_logging(ctx: click.Context, _: click.Parameter, verbosity: int) -> N
 
 
 class CommandGroup(click.Group):
-    """Group of commands that reports users' mistakes in plain words, with exit code 2."""
+    """Click group of commands that reports a user's mistake in plain words, with exit code 2."""
 
     def add_command(self, cmd: click.Command, name: str | None = None) -> None:
-        """Add a command with the option --verbose; list it with its first paragraph of help."""
+        """Add a command to the group, with the option --verbose.
+
+        The group's help lists the command with the first paragraph of its help.
+        """
         cmd.short_help = " ".join((cmd.help or "").split("\n\n")[0].split())
         cmd.params.append(
             click.Option(
@@ -122,10 +128,10 @@ class CommandGroup(click.Group):
         super().add_command(cmd, name)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run the command line; escape unprintable characters in all output, also in tracebacks.
+        """Run the command line, with unprintable characters escaped in all output and tracebacks.
 
-        The exit code is the same if output streams are closed. Streams stay wrapped, as Python
-        prints the traceback of an error after this function.
+        Closed output streams do not change the exit code. Standard output and error stay wrapped
+        after this function, because Python prints an error's traceback later.
         """
         try:
             with silence_failing_output():
@@ -136,7 +142,7 @@ class CommandGroup(click.Group):
             _escape_output_streams()
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; report a user's mistake as a message, and let other errors pass."""
+        """Run a command; print a user's mistake as a message, and let all other errors pass."""
         try:
             Path.cwd()
         except FileNotFoundError:
@@ -176,7 +182,7 @@ class CommandGroup(click.Group):
 
 
 def _unusable_path_message(error: OSError) -> str:
-    """Return a message for a file, folder or disk that can't be used; '' for any other error."""
+    """Return the message for an error of a file, folder or disk that can't be used; else ''."""
     from sweep.storage.locations import os_error_reason
 
     if error.errno in (errno.EMFILE, errno.ENFILE):
@@ -272,7 +278,7 @@ def run(
 
 
 def _default_store_path(spec: Path) -> Path:
-    """Return the path of the store of a spec file, if the user names none."""
+    """Return the path of the store for a spec file, for a command without the option --store."""
     return Path("results") / f"{spec.stem}.zarr"
 
 
@@ -375,7 +381,7 @@ def shot(
 
 
 def _print_paths(files: Sequence[Location]) -> None:
-    """Print the path of each file on its own line, relative to the current folder if below it."""
+    """Print the path of each file on its own line; relative for files below the current folder."""
     for file in files:
         click.echo(shorten_path(file))
 

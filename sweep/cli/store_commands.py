@@ -99,7 +99,7 @@ def status(store: Location) -> None:
 
 
 def _print_pending_replacement(store: Location) -> None:
-    """Print that a store is being extended or replaced, if so."""
+    """Print that a store is being extended or replaced; print nothing if it is not."""
     from sweep.storage.locations import resolve_links
     from sweep.tasks.engine.journal import EXTENDED_STORE_KEY, read_recipe
     from sweep.tasks.engine.progress import StoreError
@@ -188,7 +188,7 @@ def finalize(store: Location, output: Location | None) -> None:
 
 
 def _print_verify_report(report: VerificationReport) -> None:
-    """Print restored, damaged and foreign objects of a store, and its number of sound blocks."""
+    """Print a store's restored, damaged and foreign objects, and its number of undamaged blocks."""
     store = shorten_path(report.store)
     for name in report.restored_objects:
         click.echo(f"{store}: {name} put back")
@@ -321,7 +321,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
 
 def _open_store(path: Location) -> OpenedStore:
-    """Open a store: a dataset for a grid, a data tree for a flight."""
+    """Open the results of a store: an xarray Dataset for a grid, a DataTree for a flight."""
     from sweep.analysis.datasets import open as open_grid
     from sweep.analysis.datasets import open_scene, read_attributes_of_kind
     from sweep.storage.store_format import SCENE_STORE_KIND

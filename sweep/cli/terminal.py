@@ -43,10 +43,10 @@ They are the number of points, the size of the results [bytes], and the time on 
 """
 
 WALL_TO_CPU_TIME_RATIO_NOTED_MIN = 1.3
-"""Ratio of wall time to processor time above which a plan notes that the processors are busy."""
+"""Ratio of wall time to processor time above which `sweep plan` notes that processors are busy."""
 
 MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
-"""Number of points times draws of a study above which a run first estimates its time."""
+"""Number of points times draws of a study above which its time is measured before it starts."""
 
 SENTENCE_COLUMN_WIDTH_MIN, COLUMN_GAP, UNBROKEN_CELL_WIDTH_MAX = 14, 3, 36
 """Widths in a printed table [characters].
@@ -63,7 +63,7 @@ class LocalPathType(click.Path):
         super().__init__(path_type=Path, **options)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path, checked by click; if it is missing, the error suggests a similar one."""
+        """Return the path after click's checks; an error for a missing path suggests another."""
         path = Path(os.path.expanduser(value))
         if self.exists and not path.exists():
             self.fail(
@@ -78,9 +78,9 @@ class LocalPathType(click.Path):
 
 
 def _missing_file_hint(path: Path) -> str:
-    """Return a hint for a missing file: a similar name, or the YAML files of its folder.
+    """Return a hint for a path without a file: a similar name, or the YAML files of its folder.
 
-    A dangling link exists, so the hint names its target instead.
+    If the path is a link to a missing target, the hint names the target instead.
     """
     from sweep.spec.yaml_document import suggest_similar_file
 
@@ -105,18 +105,18 @@ class StoreLocationType(click.ParamType):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> Location:
-        """Return the location that a path or address names."""
+        """Convert a path or an address to the store's location."""
         return parse_location(str(value))
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Let the shell complete paths."""
+        """Return completions that let the shell complete the typed text as a path."""
         return [CompletionItem(incomplete, type="file")]
 
 
 def shorten_path(path: Location) -> Location:
-    """Return a path relative to the current folder, if it lies below that folder."""
+    """Return a path relative to the current folder if it lies below; any other path unchanged."""
     try:
         current_dir = Path.cwd()
     except OSError:  # the current folder was removed
@@ -129,7 +129,10 @@ def shorten_path(path: Location) -> Location:
 def parse_assignments(
     assignment_texts: tuple[str, ...], option: str = "--at", example: str = "range=2km"
 ) -> dict[str, str]:
-    """Return values by name from texts NAME=VALUE; raise BadParameter for any other text."""
+    """Parse texts of the form NAME=VALUE; return the values by name.
+
+    Raise click's BadParameter, naming `option` and `example`, for a text of another form.
+    """
     values = {}
     for text in assignment_texts:
         name, separator, value = text.partition("=")
@@ -201,19 +204,19 @@ FIGURE_FORMAT_OPTION = click.option(
 
 
 def at_option(help: str) -> Callable[..., Any]:
-    """Return the option --at, which takes NAME=VALUE; :func:`parse_assignments` parses it."""
+    """Return click's decorator for --at NAME=VALUE, which :func:`parse_assignments` parses."""
     return click.option("--at", "at", multiple=True, metavar="NAME=VALUE", help=help)
 
 
 def output_dir_option(help: str) -> Callable[..., Any]:
-    """Return the option --output, which takes the folder for output files."""
+    """Return click's decorator for the option --output, the folder for output files."""
     return click.option("--output", type=LocalPathType(file_okay=False), help=help)
 
 
 def _allow_modules(
     context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]
 ) -> None:
-    """Allow studies to import the user's modules that --allow-code names."""
+    """Click callback of --allow-code: allow studies to import the named modules of the user."""
     if modules:
         from sweep.tasks.engine.user_code import allow_modules
 
@@ -231,9 +234,9 @@ ALLOW_CODE_OPTION = click.option(
 
 
 def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add to a command the options that all computing commands share.
+    """Add the options of all computing commands to a command, and return the command.
 
-    They are passed to the command as keyword arguments.
+    The command receives the options as keyword arguments.
     """
     options = (
         THREADS_OPTION,
@@ -276,9 +279,10 @@ def echo_wrapped(text: str, *, err: bool = False) -> None:
 
 
 def instrument_yaml_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of a library instrument as a YAML file that a spec may name.
+    """Yield the lines of a YAML file that describes an instrument and can be named in a spec.
 
-    Descriptive text becomes comments of the YAML.
+    `instrument_file` is the content of an instrument's file, by section. Its descriptive text
+    becomes comments.
     """
     import yaml
 
@@ -313,9 +317,9 @@ def instrument_yaml_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
 
 
 def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
-    """Print the outcome of a run; exit with code 3 if the run is incomplete.
+    """Print the outcome of a run; exit with code 3 if the run is incomplete, else return.
 
-    ``store`` is the path that the user named. A store that is being extended is built next to it.
+    ``store`` is the path that the user named.
     """
     from sweep.tasks.engine.progress import duration_text
 
@@ -362,7 +366,7 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
 
 
 def _error_text(error: Exception) -> str:
-    """Return the text of an error, with its type unless it is an error of this program."""
+    """Return an error's message, preceded by its type unless it is an error of this program."""
     from sweep.storage.store_format import StoreError
     from sweep.storage.verified_store import DamagedChunkError
 
@@ -371,7 +375,7 @@ def _error_text(error: Exception) -> str:
 
 
 def _print_summary(store: Location) -> None:
-    """Print the table of results of a store, and its false alarms."""
+    """Print a store's table of results, and its probabilities of false alarms."""
     from sweep.tasks.studies import study_loading
 
     attributes, study = study_loading.read_study(store)
@@ -381,7 +385,7 @@ def _print_summary(store: Location) -> None:
 
 
 def _print_grid_summary(store: Location) -> None:
-    """Print the table of detection probabilities by part of a grid."""
+    """Print a grid's detection probabilities in a table, with a row for each part of the grid."""
     from sweep.tasks.studies.store_summary import DETECTED_PD_MIN, detection_summary
 
     summary = detection_summary(store)
@@ -410,12 +414,12 @@ def _print_grid_summary(store: Location) -> None:
 
 
 def _sampled_share_text(block_share: float) -> str:
-    """Return a note that a table covers only a part of the store's blocks; '' if it covers all."""
+    """Return a note that a table covers this fraction of a store's blocks; '' if it covers all."""
     return f", by {100 * block_share:.2g} % of the blocks" if block_share < 1 else ""
 
 
 def _print_scene_summary(store: Location) -> None:
-    """Print the table of shots and points by scanner."""
+    """Print a table of a flight with the numbers of shots and points of each scanner."""
     from sweep.tasks.studies.store_summary import flight_summary
 
     print_table(
@@ -438,9 +442,9 @@ def _print_scene_summary(store: Location) -> None:
 
 
 def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
-    """Return what is not checked about the number of beamlets, and why.
+    """Return, as text, why the error due to the number of beamlets is not estimated.
 
-    The text is empty if the error is estimated, or if no footprint is simulated.
+    The text is empty if that error is estimated, or if no footprint is simulated.
     """
     from sweep.model.beamlet_counts import BEAMLETS_PATH, beamlets_converge
 
@@ -467,7 +471,10 @@ def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
 
 
 def print_inconsistency_warnings(store: Location, scanner: str | None = None) -> None:
-    """Warn of quantities of a flight whose errors far exceed their standard errors."""
+    """Print warnings about quantities of a flight whose errors far exceed their standard errors.
+
+    `scanner` limits the warnings to one scanner; by default all scanners are checked.
+    """
     from sweep.tasks.studies import study_loading
 
     if study_loading.read_study(store).attributes["kind"] != "scene":
@@ -479,7 +486,11 @@ def print_inconsistency_warnings(store: Location, scanner: str | None = None) ->
 
 
 def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None) -> None:
-    """Print points without results, the uncertainty of draws, and the error of few beamlets."""
+    """Print the accuracy of a store's results, and the number of points without results.
+
+    The accuracy is the uncertainty due to random draws, and the error due to the number of
+    beamlets. `done_block_numbers` are the numbers of the computed blocks, if the caller knows them.
+    """
     from sweep.tasks.studies import study_loading
     from sweep.tasks.studies.store_summary import (
         accuracy_rows_of_draws,
@@ -538,10 +549,10 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
 def print_table(
     title: str, headings: list[str], rows: list[list[str]], sentence_heading: str = ""
 ) -> None:
-    """Print a table, wrapped to the terminal's width; without a terminal nothing is wrapped.
+    """Print a table to the terminal's width, or at its natural width without a terminal.
 
-    ``sentence_heading`` names the column that contains sentences. Numbers are never broken or
-    truncated. If the terminal is too narrow for the table, each row is printed as a list.
+    ``sentence_heading`` is the heading of the column whose cells are sentences. Numbers are never
+    broken or truncated. If the terminal is too narrow for the table, each row is printed as a list.
     """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -594,9 +605,9 @@ def _print_rows_as_lists(title: str, headings: list[str], rows: list[list[str]])
 
 
 def _column_width_min(column: list[str], *, is_sentences: bool) -> int:
-    """Return the least width of a column at which no word is broken [characters].
+    """Return the least width [characters] of a table column at which no word is broken.
 
-    Cells with numbers are not broken either, except in a column of sentences.
+    `is_sentences` is True for a column of sentences. In other columns no number is broken either.
     """
     heading, *cells = column
     numbers = [] if is_sentences else [cell for cell in cells if any(map(str.isdigit, cell))]
@@ -611,7 +622,7 @@ def _column_width_min(column: list[str], *, is_sentences: bool) -> int:
 def plan_rows(
     spec: GridSpec | SceneSpec, store: Location, workers: int | None
 ) -> Iterator[tuple[str, str]]:
-    """Yield heading and text of each line of a study's plan."""
+    """Yield heading and text of each line that `sweep plan` prints about a study."""
     from sweep.spec import GridSpec, SceneSpec
     from sweep.tasks.engine.progress import duration_text
     from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
@@ -657,9 +668,9 @@ def plan_rows(
 
 
 def _time_parts_text(study_plan: StudyPlan) -> str:
-    """Return the processor time of a run and of its parts in words.
+    """Return the processor time of a planned run, and of its parts, as text.
 
-    The text mentions compilation if that is still to be done.
+    The text includes the time of compilation if kernels still have to be compiled.
     """
     from sweep.tasks.engine.progress import duration_text
 
@@ -681,7 +692,7 @@ def _time_parts_text(study_plan: StudyPlan) -> str:
 
 
 def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[str, str]]:
-    """Yield heading and text of the lines of a plan that only flights have."""
+    """Yield heading and text of the lines that `sweep plan` prints only for flights."""
     from sweep.model.beamlet_counts import BEAMLETS_PATH
     from sweep.model.error_budget import ErrorBudget
     from sweep.tasks.studies.flight_coverage import sample_coverage
@@ -748,7 +759,10 @@ def print_effects(table: EffectsTable) -> None:
 
 
 def confirm_large_study(spec: GridSpec | SceneSpec, store: Location, *, yes: bool) -> None:
-    """Ask for confirmation before a very large study starts; exit if the user declines."""
+    """Ask the user for confirmation before a very large study starts; exit if the user declines.
+
+    Nothing is asked if `yes` is True or the study is not very large.
+    """
     if yes or not (excess := _excessive_size_text(*_study_size(spec, store))):
         return
     if not (is_terminal(sys.stdin) and is_terminal(sys.stderr)):
@@ -769,9 +783,10 @@ class _StudySize(NamedTuple):
 
 
 def _study_size(spec: GridSpec | SceneSpec, store: Location) -> _StudySize:
-    """Return the size of a study.
+    """Return the size of a study in points, bytes and processor time.
 
-    The time is estimated only for many draws, and only if points and bytes raise no question.
+    The time is 0 unless the study has many draws, and points and bytes below the limits above
+    which the user is asked for confirmation.
     """
     from sweep.spec import GridSpec
     from sweep.tasks.studies.study_loading import make_study
@@ -788,7 +803,7 @@ def _study_size(spec: GridSpec | SceneSpec, store: Location) -> _StudySize:
 
 
 def _excessive_size_text(n_points: int, size_bytes: int, cpu_seconds: float) -> str:
-    """Return the sizes of a study that exceed the limits for asking, in words; '' for none."""
+    """Return as text the sizes of a study that exceed the limits for confirmation; '' for none."""
     from sweep.tasks.engine.progress import duration_text
 
     excess_parts = [f"{n_points:,} points"] if n_points > ASK_ABOVE_POINTS else []
@@ -802,7 +817,7 @@ def _excessive_size_text(n_points: int, size_bytes: int, cpu_seconds: float) -> 
 
 
 def false_alarm_text(spec: GridSpec | SceneSpec) -> str:
-    """Return the false-alarm probabilities of a shot in words; '' if they are not known."""
+    """Return a text with the false-alarm probabilities of a shot; '' if they are not known."""
     from sweep.spec.noise_alarms import false_alarm_probabilities
 
     if not (alarms := false_alarm_probabilities(spec)):
@@ -819,7 +834,7 @@ def false_alarm_text(spec: GridSpec | SceneSpec) -> str:
 
 
 def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
-    """Print warnings about a spec: its beam, scene, path and false alarms.
+    """Print warnings about a spec's beam, scene, path and false alarms.
 
     Raise SceneError for a flight whose beams never hit the scene.
     """
@@ -832,7 +847,7 @@ def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
 
 
 def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
-    """Warn of echoes that arrive after their record, and of ambiguous ones."""
+    """Print warnings about echoes that arrive after their record, and about ambiguous echoes."""
     from sweep.tasks.studies.echo_warnings import echo_warnings
     from sweep.tasks.studies.study_loading import make_study
 
@@ -843,7 +858,7 @@ def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
 def study_effects_table(
     spec: GridSpec | SceneSpec, store: Location, *, costs: bool = True
 ) -> EffectsTable:
-    """Return the table of effects of a study; ``costs`` adds each effect's share of the time."""
+    """Return the table of a study's effects; ``costs`` adds their fractions of the time."""
     from sweep.tasks.studies.study_loading import make_study
     from sweep.tasks.studies.study_plan import effects_table
 
@@ -851,13 +866,13 @@ def study_effects_table(
 
 
 def print_effects_warnings(table: EffectsTable) -> None:
-    """Warn of switched-off effects that change results by more than the tolerance."""
+    """Print warnings about disabled effects that change results by more than the tolerance."""
     for warning in table.warnings():
         echo_wrapped(f"warning: {warning}", err=True)
 
 
 def _effect_row_cells(row: EffectRow) -> list[str]:
-    """Return the cells of one effect's row in the table of effects."""
+    """Return the texts of the cells of one effect's row in the table of effects."""
     cost, mode_text = row.time_fraction, "" if row.mode == "auto" else f" ({row.mode})"
     return [
         row.name.replace("_", " ") + mode_text,
@@ -880,15 +895,15 @@ class PrintedMeasurement(NamedTuple):
     """Files of a printed measurement of accuracy, and whether the measurement is complete."""
 
     files: list[Location]
-    """Store, figure and tables."""
+    """Paths of the measurement's store, figure and tables."""
     is_complete: bool
-    """True if the user has not interrupted the measurement."""
+    """True if the measurement ended by itself, False if the user interrupted it."""
 
 
 def print_accuracy_measurement(store: Location, *, has_results: bool) -> PrintedMeasurement:
-    """Print the measured settings and draw their figure.
+    """Print the settings that `sweep accuracy` has measured, and draw their figure.
 
-    Exit with the code for incomplete results if nothing was measured.
+    Return the files. If `has_results` is False, exit with the code for incomplete results.
     """
     if not has_results:
         click.echo("Interrupted before any point was through: nothing is kept.", err=True)
