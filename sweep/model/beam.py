@@ -42,11 +42,12 @@ from scipy.special import j0
 from sweep.model.constants import SPEED_OF_LIGHT
 
 SINGLE_MODE_COUPLING = "single_mode"
-"""Name of the coupling law by which a receiver detects light of a single spatial mode."""
+"""Name of the coupling law by which the receiver detects only light of one spatial mode, that of
+the local oscillator."""
 APERTURE_COUPLING = "aperture"
 """Name of the coupling law by which all light in the aperture mixes with the local oscillator."""
 COUPLING_LAWS = (SINGLE_MODE_COUPLING, APERTURE_COUPLING)
-"""Names of the coupling laws, which determine what fraction of the echo mixes."""
+"""Names of the laws that determine what fraction of the echo mixes with the local oscillator."""
 
 COUPLING_PATH = "instrument.telescope.coupling"
 """Parameter path of the coupling law, one of `COUPLING_LAWS`."""
@@ -61,7 +62,8 @@ WAIST_PATH = "instrument.laser.beam_waist"
 BEAM_QUALITY_PATH = "instrument.laser.beam_quality"
 """Parameter path of the beam quality M^2 of the transmitted beam; 1 for an ideal beam."""
 FOCUS_PATH = "instrument.laser.focus"
-"""Parameter path of the distance at which the beam is focused [m]; 0 for a collimated beam."""
+"""Parameter path of the distance at which the transmitted beam is focused [m]; 0 for a collimated
+beam."""
 OSCILLATOR_WAIST_PATH = "instrument.receiver.local_oscillator_waist"
 """Parameter path of the 1/e^2 radius of the local oscillator's beam at the telescope [m]."""
 ARCHITECTURE_PATH = "instrument.receiver.architecture"
@@ -79,15 +81,15 @@ BEAM_DEFAULTS: dict[str, float | str] = {
     FOCUS_PATH: 0.0,
     OSCILLATOR_WAIST_PATH: 0.0,
 }
-"""Default values of the beam parameters, by dotted path. A divergence or a waist of 0 means that it
-is not stated. A focus of 0 means a collimated beam. A local oscillator's waist of 0 means that of
-the transmitted beam."""
+"""Default values of the beam parameters, by dotted path. A divergence or waist of 0 is not stated.
+A focus of 0 means a collimated beam. A local oscillator's waist of 0 means that of the transmitted
+beam."""
 
 FOOTPRINT_ANGLE_MAX = math.pi / 2
-"""Upper limit of the full angle of a footprint, seen from the instrument [rad]."""
+"""Upper limit of the full angle that a footprint subtends at the instrument [rad]."""
 
 Parameters = Mapping[str, Any]
-"""Type of a mapping of dotted paths to the parameters of points, (n,) arrays or scalars."""
+"""Type of parameters of n points: a mapping from dotted path to an (n,) array or a scalar."""
 
 
 class GaussianBeam(NamedTuple):
@@ -105,9 +107,8 @@ class GaussianBeam(NamedTuple):
     quality M^2.
     """
     wavefront_curvature: np.ndarray | float = 0.0
-    """Curvature of the wavefront at the telescope [1/m], 1 over the distance of the focus; 0 for a
-    collimated beam.
-    """
+    """Curvature of the wavefront at the telescope [1/m], the reciprocal of the focus distance; 0
+    for a collimated beam."""
 
     @classmethod
     def from_waist(
@@ -118,7 +119,7 @@ class GaussianBeam(NamedTuple):
         quality: ArrayLike = 1.0,
         focus: ArrayLike = 0.0,
     ) -> "GaussianBeam":
-        """Return the beam with a given radius at the telescope.
+        """Return the beam that has a given 1/e^2 radius at the telescope.
 
         Parameters
         ----------
@@ -140,7 +141,9 @@ class GaussianBeam(NamedTuple):
         return cls(w, np.asarray(math.pi * w**2 / (np.asarray(quality) * wavelength)), curvature)
 
     def full_angle(self, range: ArrayLike) -> np.ndarray:
-        """Return the full angle 2 w(R) / R that the beam's cross-section subtends at the telescope.
+        """Return the full 1/e^2 angle 2 w(R) / R [rad] that the beam subtends at the telescope.
+
+        w(R) is the 1/e^2 radius at the range R.
 
         Parameters
         ----------
@@ -154,7 +157,8 @@ class GaussianBeam(NamedTuple):
 
         Notes
         -----
-        w(R)^2 = w_a^2 ((1 - R/f)^2 + (R/z_R)^2).
+        w(R)^2 = w_a^2 ((1 - R/f)^2 + (R/z_R)^2), with the radius w_a at the telescope, the distance
+        f of the focus and the Rayleigh range z_R.
         """
         defocus = 1 / np.asarray(range, float) - self.wavefront_curvature
         return np.asarray(2 * self.radius_at_telescope * np.hypot(defocus, 1 / self.rayleigh_range))
@@ -165,9 +169,9 @@ class GaussianBeam(NamedTuple):
 
 
 def is_single_mode(parameters: Parameters) -> bool:
-    """Return True if the receiver detects light of a single spatial mode.
+    """Return True if the receiver's coupling law is that of a single spatial mode.
 
-    All points must have the same text parameters.
+    `parameters` are those of points that share all text values.
     """
     return (
         str(parameters[COUPLING_PATH]) == SINGLE_MODE_COUPLING
@@ -178,7 +182,7 @@ def is_single_mode(parameters: Parameters) -> bool:
 def divergence_from_waist(
     waist: ArrayLike, wavelength: ArrayLike, quality: ArrayLike = 1.0
 ) -> np.ndarray:
-    """Convert the waist of a collimated beam to its full far-field angle, or the reverse.
+    """Convert a collimated beam's waist radius to its full far-field angle, or angle to radius.
 
     Parameters
     ----------
@@ -198,7 +202,7 @@ def divergence_from_waist(
 
 
 def far_field_divergence(parameters: Parameters) -> np.ndarray:
-    """Return the full 1/e^2 angle [rad] of the transmitted beam in the far field, without focus."""
+    """Return the full 1/e^2 angle [rad] of the unfocused transmitted beam in the far field."""
     stated_divergence, waist = (
         np.asarray(parameters[DIVERGENCE_PATH], float),
         np.asarray(parameters[WAIST_PATH], float),
@@ -212,10 +216,10 @@ def far_field_divergence(parameters: Parameters) -> np.ndarray:
 
 
 def transmitted_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBeam, GaussianBeam]:
-    """Return the transmitted beam, and the beam of the local oscillator, which has M^2 = 1.
+    """Return the transmitted beam and the local oscillator's beam, each a :class:`GaussianBeam`.
 
-    The oscillator's beam is propagated from the telescope to the target. Its waist is by default
-    that of the transmitted beam.
+    The local oscillator's beam is taken as propagated from the telescope to the target. It has the
+    beam quality M^2 = 1, and by default the waist of the transmitted beam.
     """
     waist, oscillator_waist = (
         np.asarray(parameters[WAIST_PATH], float),
@@ -241,19 +245,18 @@ class FootprintAngles(NamedTuple):
     """Full 1/e^2 angles of the effective footprint [rad], by position and by light direction."""
 
     position_spread_angle: np.ndarray
-    """Full 1/e^2 angle [rad] of the illuminated positions on the target, seen from the lidar."""
+    """Full 1/e^2 angle [rad] that the illuminated positions on the target subtend at the lidar."""
     direction_spread_angle: np.ndarray
-    """Full 1/e^2 angle of the spread of light directions [rad], from which the spread of Doppler
-    shifts follows.
-    """
+    """Full 1/e^2 angle of the spread of light directions [rad], which determines the spread of
+    Doppler shifts."""
 
 
 def footprint_full_angles(
     parameters: Parameters, range: ArrayLike | None = None
 ) -> FootprintAngles:
-    """Compute the full 1/e^2 angles of the effective footprint, seen from the instrument.
+    """Compute the full 1/e^2 angles that the effective footprint subtends at the instrument.
 
-    All points must have the same text parameters.
+    All points must share their text parameters.
 
     Parameters
     ----------
@@ -302,7 +305,7 @@ def footprint_full_angles(
 
 
 def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
-    """Select the parameters, by dotted path, that determine a beam's width at every range."""
+    """Return the parameters, by dotted path, that determine a beam's width at every range."""
     paths = (
         WAVELENGTH_PATH,
         DIVERGENCE_PATH,
@@ -317,7 +320,7 @@ def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
 def has_constant_divergence(parameters: Parameters) -> bool:
     """Return True if the footprint's width is the beam divergence times the range, as in [T].
 
-    All points must have the same text parameters.
+    `parameters` are those of points that share all text values.
     """
     return not (
         is_single_mode(parameters)
@@ -329,7 +332,9 @@ def has_constant_divergence(parameters: Parameters) -> bool:
 def range_loss_coefficients(
     parameters: Parameters, range: ArrayLike | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients b and c of the range loss 1 + b x + c x^2 for a relative range change x.
+    """Return the coefficients b and c of the range loss 1 + b x + c x^2.
+
+    The range loss is the echo of a surface at the range R, divided by its echo at R (1 + x).
 
     Parameters
     ----------
@@ -341,7 +346,7 @@ def range_loss_coefficients(
     Returns
     -------
     b, c : ndarray
-        The echo of a surface at R (1 + x) is that at R divided by 1 + b x + c x^2.
+        Coefficients of the relative range change x, and of its square.
 
     Notes
     -----
@@ -373,7 +378,7 @@ def range_loss_coefficients(
 
 
 def effective_collecting_area(parameters: Parameters) -> np.ndarray:
-    """Return the area [m^2] of an equivalent aperture that collects all light that mixes.
+    """Return the area A [m^2] of an aperture that collects as much light as the receiver mixes.
 
     An aperture of area A collects light of a diffuse echo at the range R, ``target.range``, in
     proportion to A / R^2. For the coupling law ``aperture``, A is the area of the real aperture.
@@ -407,7 +412,7 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
 
 
 def receiver_diameter_and_view_angle(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diameter and the full angle of view of the receiver for background light.
+    """Return the diameter of the receiver's area, and its full angle of view, for background light.
 
     Returns
     -------
@@ -444,9 +449,9 @@ def beam_axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
 
     Notes
     -----
-    All three contributions lie in one plane. A scan of rate omega has turned by omega 2R/c when the
-    light returns. The axes of a bistatic pair are separated at the instrument. Axes that are not
-    parallel diverge with range, or meet where the signs differ.
+    The offset is the sum of three contributions in one plane. A scan of rate omega turns by omega
+    2R/c before the light returns. The axes of a bistatic pair are separated at the instrument. Axes
+    at an angle diverge with range, or meet if this angle has the opposite sign.
     """
     distance = np.asarray(range, float)
     angle_between_axes = (
@@ -457,9 +462,10 @@ def beam_axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
 
 
 def beam_axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
-    """Return the fraction of a single mode's echo that remains with offset beam axes, 0..1.
+    """Return the echo power with offset beam axes, relative to that with coinciding axes, 0..1.
 
-    The axes are those of the transmitted and the received beam at the target.
+    The receiver detects a single spatial mode. The axes are those of the transmitted beam and of
+    the local oscillator's beam.
 
     Parameters
     ----------
@@ -470,7 +476,8 @@ def beam_axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> n
 
     Notes
     -----
-    exp(-2 d^2 / (w_T^2 + w_L^2)), with the offset d of :func:`beam_axis_offset`.
+    exp(-2 d^2 / (w_T^2 + w_L^2)), with the offset d of :func:`beam_axis_offset` and the 1/e^2 radii
+    w_T of the transmitted and w_L of the local oscillator's beam at the target.
     """
     squared_radii = sum(
         beam.radius(range) ** 2 for beam in transmitted_and_oscillator_beams(parameters)
@@ -479,27 +486,29 @@ def beam_axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> n
 
 
 _UNTRUNCATED_FILL_RATIO_MAX = 0.25
-"""Ratio of beam radius to aperture radius up to which truncation by the aperture is neglected. Up
-to this ratio truncation takes at most 5e-7 of the echo."""
+"""Largest ratio of beam radius to aperture radius at which truncation by the aperture is neglected.
+At this ratio truncation takes 5e-7 of the echo."""
 _RIM_PHASE_MAX = 60.0
-"""Largest defocus phase at the aperture's rim [rad] in the truncation table. Beyond it the
-efficiency changes by less than 2 %."""
+"""Largest defocus phase at the aperture's rim [rad] in the truncation table. For larger phases the
+efficiency differs by less than 2 % from that at this phase."""
 _FILL_RATIO_STEPS, _RIM_PHASE_STEPS = 16, 100
 """Numbers of steps of the truncation table over the angle of the fill ratio, and over the root of
 the defocus phase."""
 _ROOT_PHASE_STEP = math.sqrt(_RIM_PHASE_MAX) / _RIM_PHASE_STEPS
-"""Step of the truncation table in the root of the defocus phase [sqrt(rad)]."""
+"""Step, in the square root of the defocus phase, between columns of the truncation table
+[sqrt(rad)]."""
 
 
 def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0) -> np.ndarray:
-    """Return the echo of a beam truncated by its aperture, relative to that of the full beam.
+    """Return the echo power of a beam truncated by its aperture, relative to the full beam's.
 
     Parameters
     ----------
     fill_ratio : array_like
         w_a / a: 1/e^2 radius of the beam divided by the radius of the aperture, up to 1.
     defocus_phase : array_like
-        Phase at the rim [rad], pi a^2 / lambda (1/R - 1/f).
+        Defocus phase at the aperture's rim [rad], pi a^2 / lambda (1/R - 1/f), with the aperture's
+        radius a, the range R and the distance f of the focus.
 
     Returns
     -------
@@ -544,16 +553,19 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
 
 @lru_cache(maxsize=1)
 def _truncation_table() -> np.ndarray:
-    """Return cubic spline coefficients of :func:`truncation_efficiency`, (fill ratios, phases).
+    """Return spline coefficients of :func:`truncation_efficiency`, (fill ratios, defocus phases).
 
-    Rows have equal steps of an angle whose cosine falls from 1 to -1 over the fill ratios. Columns
-    have equal steps of the root of the defocus phase. The efficiency is even about both ends of the
-    angle and about phase 0, as ``mode="mirror"`` assumes. It is not even about the largest phase,
-    so the table has further columns. Interpolation errs by 8e-5.
+    The fill ratio is the beam's 1/e^2 radius over the aperture's radius. Rows have equal steps of
+    an angle; its cosine falls linearly from 1 to -1 as the fill ratio rises. Columns have equal
+    steps of the square root of the defocus phase. Cubic interpolation errs by 8e-5.
 
-    The field exp(-c r^2) in the unit circle, with c = (a/w)^2 - i defocus, becomes its Hankel
-    transform in the far field. The integral of the fourth power of the untruncated beam is 1 / (32
-    |c|^2 Re c).
+    Interpolation with ``mode="mirror"`` assumes a function that is even about each edge of the
+    table. The efficiency is even about all edges except the largest phase, so four columns are
+    added beyond that phase.
+
+    The field at the aperture is exp(-c r^2) for radii r up to the aperture's radius 1, with c =
+    (1 / fill ratio)^2 - i defocus phase. In the far field it becomes its Hankel transform. The
+    integral of the fourth power of the untruncated transform is 1 / (32 |c|^2 Re c).
     """
     from scipy.ndimage import spline_filter  # slow to import, and rarely needed
 

@@ -62,76 +62,81 @@ from sweep.model.window import window_samples
 from sweep.model.window_response import WindowResponse, window_response
 
 BEAMLETS_PATH = "footprint.beamlets"
-"""Parameter path of the number of beamlets of a footprint; 0 if it follows from the tolerance."""
+"""Parameter path of the number of beamlets of a footprint; a value of 0 means that the number
+follows from the tolerance."""
 PATTERN_PATH = "footprint.pattern"
-"""Parameter path of the arrangement of the beamlets in a footprint."""
+"""Parameter path of the name of the pattern in which a footprint's beamlets are arranged."""
 
 _RAY_GROWTH_MIN, _RAY_GROWTH_MAX = 2, 10
 """Smallest and largest factor by which a shot's number of rays increases when it is cast again."""
 
 _UNRELIABLE_ERROR_RAY_COUNT_MAX = 19
-"""Number of rays up to which the estimated error is unreliable. So few rays make smooth ground look
-far rougher than it is."""
+"""Largest number of rays per shot at which the estimated error is unreliable. So few rays make
+smooth ground look far rougher than it is."""
 
 _N_SEGMENTS = 3
-"""Number of segments of a shot, over which errors of the detection probability are summed."""
+"""Number of segments of a shot; errors of the detection probability are summed over them."""
 
 NODE_COUNTS_ALONG_SLOPE = np.array([
     2, 3, 4, 5, 6, 7, 9, 11, 15, 22, 33, 49, 73, 109, 163, 244, 366, 549, 823, 1234, 1851, 2776,
     4096,
 ])  # fmt: skip
-"""Possible numbers of quadrature nodes along the slope. Steps are wide, because points with
-different numbers are computed separately."""
+"""Possible numbers of quadrature nodes (beamlets) along the slope. Steps are wide, because points
+with different numbers are computed separately."""
 
 NODE_COUNTS_ACROSS_SLOPE = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
-"""Possible numbers of parallel lines of quadrature nodes, side by side across the slope."""
+"""Possible numbers of parallel rows of quadrature nodes, side by side across the slope."""
 
 _UNIFORM_QUADRATURE_ERROR = 1e-10
-"""Relative error of evenly spaced quadrature nodes, from the Gaussian's tails outside them."""
+"""Relative error of a quadrature with evenly spaced nodes. Its cause is the part of the Gaussian
+outside the outermost nodes."""
 _N_TABLE_WINDOW_SAMPLES = 1024
 """Number of samples of the windows from which tables of quadrature errors are computed."""
 _N_LAGS = 4096
-"""Number of lags of a window's autocorrelation for quadrature errors by spread of the lines."""
+"""Number of lags of a window's autocorrelation in the table of quadrature errors by the spread of
+line frequencies."""
 _N_CURVATURE_LAGS = 512
-"""Number of lags of a window's autocorrelation for quadrature errors by curvature of the range."""
+"""Number of lags of a window's autocorrelation in the table of quadrature errors by curvature."""
 _TABULATED_CURVATURES = np.geomspace(1e-6, 100.0, 97)
-"""Curvatures for which quadrature errors are tabulated [bins of fs/L]. A curvature c shifts a line
-by c x^2, with x in standard deviations of the beam."""
+"""Curvatures c for which quadrature errors are tabulated [bins of fs/L, sample rate over number of
+samples]. A beamlet's line is shifted by c x^2, with its position x in the beam [standard
+deviations]."""
 _TABULATED_QUADRATIC_PHASES = np.geomspace(1e-6, 1e3, 512)
-"""Coefficients t [rad] of the phase t x^2 for which quadrature errors are tabulated. x is the
-position in the beam [standard deviations]."""
+"""Coefficients t for which quadrature errors of the mean of exp(i t x^2) are tabulated [rad]. x is
+the position in the beam [standard deviations]."""
 _TABULATED_SPREAD_RATIOS = np.geomspace(1e-6, 1e3, 97)
-"""Ratios of the lines' quadratic to their linear spread for which quadrature errors are tabulated.
-"""
+"""Ratios c / s for which quadrature errors are tabulated. c is the quadratic and s the linear
+spread of line frequencies over the beam."""
 _CHEBYSHEV_DISTANCES_SIGMA = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
-"""Distances from the mean [standard deviations] at which Chebyshev's inequality is evaluated. The
-best of the resulting bounds is used."""
+"""Distances from the mean [standard deviations] at which Chebyshev's inequality gives a bound; the
+best bound is used."""
 
 
 class LineSpreadCoefficients(NamedTuple):
     """Spread of the frequencies of a footprint's lines, s y + c (x^2 + y^2) [bins of fs/L].
 
     x and y are the two coordinates in the beam, in its standard deviations, y along the slope. s is
-    the linear and c the quadratic spread.
+    the linear and c the quadratic spread. fs is the sample rate, L the number of samples.
     """
 
     line_deviation: np.ndarray
-    """(n,): largest standard deviation of line frequencies of any segment [bins of fs/L]."""
+    """(n,): standard deviation of a footprint's line frequencies [bins of fs/L], the largest of all
+    segments."""
     linear_spread: np.ndarray
-    """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. If the target has
-    a roughness, a further row holds twice the spread of the phase difference between segments
-    [cycles].
-    """
+    """(rows, n): magnitude of the linear spread s [bins of fs/L], one row for each segment. If the
+    target has a roughness, one more row holds twice the spread of the phase difference between
+    segments [cycles]."""
     quadratic_spread: np.ndarray
-    """(rows, n): magnitude of the quadratic spread c [bins of fs/L], with the rows of
+    """(rows, n): magnitude of the quadratic spread c [bins of fs/L], in the same rows as
     `linear_spread`."""
 
     @property
     def smoothing_deviation(self) -> np.ndarray:
-        """Standard deviation of the Gaussian that smooths errors across the slope, (rows, n).
+        """Deviation of the Gaussian by which the linear spread reduces errors across the slope.
 
-        With the linear spread s, the quadratic spread c and t <= 2 pi, |E exp(i t (s y + c y^2))|
-        <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)).
+        The array is (rows, n), with the rows of `linear_spread`. With the linear spread s, the
+        quadratic spread c and |t| <= 2 pi, the mean over the beam is bounded:
+        |E exp(i t (s y + c y^2))| <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)).
         """
         return np.asarray(
             self.linear_spread / np.sqrt(1 + (4 * np.pi * self.quadratic_spread) ** 2)
@@ -141,10 +146,10 @@ class LineSpreadCoefficients(NamedTuple):
 def split_by_category_and_beamlet_count(
     parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points into categories, and choose the number of beamlets where none is stated.
+    """Split points into categories, with a number of beamlets for each category.
 
-    Points of a category share text parameters and array sizes. The chosen number follows from the
-    tolerance.
+    Points of a category share text parameters and array sizes. A number of beamlets that is not
+    stated follows from the tolerance.
 
     Parameters
     ----------
@@ -153,13 +158,13 @@ def split_by_category_and_beamlet_count(
     effects : collection of str
         Names of the effects to simulate; without ``footprint`` one beamlet is enough.
     further_paths : collection of str
-        Numeric parameters that points must share, as in
+        Paths of additional numeric parameters that points of a category must share, as in
         :func:`sweep.model.preparation.split_by_category`.
 
     Yields
     ------
     indices : ndarray (m,)
-        Points of a category.
+        Indices of the points of a category.
     category_parameters : dict
         Parameters of these points, with number, pattern and error of the beamlets.
     """
@@ -190,7 +195,7 @@ def split_by_category_and_beamlet_count(
 
 
 def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[int, str]:
-    """Return the largest number of beamlets of any point, and the name of their pattern.
+    """Return the largest number of beamlets among the points, and the name of their pattern.
 
     All points share text parameters and array sizes.
     """
@@ -200,9 +205,10 @@ def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[in
 
 
 def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) -> int:
-    """Return the number of rays of each shot of a flight in the first of several casts.
+    """Return the number of rays per shot in the first cast of a flight.
 
-    This number is used for flights whose number of rays follows from the tolerance.
+    The number is used if the number of rays follows from the tolerance. Later casts repeat some of
+    the shots with more rays.
 
     Parameters
     ----------
@@ -215,9 +221,8 @@ def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) 
     Returns
     -------
     int
-        Number of rays from `ErrorBudget.min_rays_by_tolerance`. It is
-        `ErrorBudget.thesis_beamlet_count` if errors do not fall to 0 as the number of beamlets
-        increases.
+        Number of rays, from `ErrorBudget.min_rays_by_tolerance`. If errors do not fall to 0 as the
+        number of beamlets increases, it is `ErrorBudget.thesis_beamlet_count`.
     """
     if not beamlets_converge(parameters):
         return error_budget.thesis_beamlet_count
@@ -230,22 +235,22 @@ def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) 
 
 
 def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-    """Choose the number of rays with which each shot is cast again, by its estimated error.
+    """Return the number of rays for the next cast of each shot, from its estimated error.
 
     Parameters
     ----------
     n_rays : int
         Number of rays of the last cast, one of `ErrorBudget.ray_counts`.
     error : ndarray (n,)
-        Estimated error, as in :func:`sweep.model.pointcloud.ray_error.estimate_ray_error`; nan
-        where nothing is hit. It falls about as the reciprocal of the number of rays.
+        Estimated error, as in :func:`sweep.model.pointcloud.ray_error.estimate_ray_error`; nan for
+        shots that hit nothing. The error is about proportional to 1 / number of rays.
     error_budget : ErrorBudget
         Accuracy of the study.
 
     Returns
     -------
     ndarray (n,) int64
-        Number of rays; 0 for shots that have enough.
+        Number of rays; 0 for shots that need no more rays.
     """
     larger_counts = np.array(
         [n for n in error_budget.ray_counts if n > _RAY_GROWTH_MIN * n_rays], np.int64
@@ -261,7 +266,7 @@ def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -
 
 
 def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
-    """Return the tolerated error of probabilities due to effects that are not simulated.
+    """Return the tolerated error of probabilities due to all effects that are not simulated.
 
     Parameters
     ----------
@@ -286,16 +291,16 @@ def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
 
 
 def has_numerics_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return True where the number of beamlets, or an error of lines or leakage, is not stated.
+    """Return where the tolerance determines the number of beamlets or an error of lines or leakage.
 
-    The value then follows from the tolerance. The result is (n,) or a scalar.
+    The result is (n,) bool or a scalar: False where all these are stated.
     """
     counts_beamlets = ~(parameters[BEAMLETS_PATH] > np.asarray(0))
     return counts_beamlets | ErrorBudget.from_parameters(parameters).has_errors_set_by_tolerance
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
-    """Return True if errors fall to 0 as the number of beamlets increases.
+    """Return True if the error due to the number of beamlets falls to 0 as that number increases.
 
     All points share text parameters.
     """
@@ -308,7 +313,7 @@ def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
 def required_beamlet_count_and_pattern(
     parameters: Mapping[str, np.ndarray], n_points: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the number of beamlets needed for the tolerance, for points whose powers add.
+    """Compute the number of beamlets that keeps the tolerance, where the beamlets' powers add.
 
     Parameters
     ----------
@@ -322,7 +327,7 @@ def required_beamlet_count_and_pattern(
     number : ndarray (n,)
         Number of beamlets.
     pattern : ndarray (n,)
-        Pattern, ``line`` or a number of lines.
+        Name of the pattern: ``line``, or parallel lines such as ``3 lines``.
     error : ndarray (n,)
         Remaining error of the probabilities of detection, summed over the segments.
     """
@@ -341,8 +346,7 @@ def required_beamlet_count_and_pattern(
 def _pd_change_per_relative_power(budget: LinkBudget) -> np.ndarray:
     """Return a bound on the change of pd per relative change of a bin's power, (n,).
 
-    The changes of pd, the probability of detection, are summed over all segments. See the module's
-    description.
+    pd is the probability of detection of a segment. Its changes are summed over all segments.
     """
     b = budget.looks.amplitude_gain_max * budget.threshold_ratio
     a = 0.5 * (b + np.sqrt(b * b + 2))
@@ -353,10 +357,10 @@ def _pd_change_per_relative_power(budget: LinkBudget) -> np.ndarray:
 def _line_spread_coefficients(
     budget: LinkBudget, n_points: int, beamlets_max: int
 ) -> LineSpreadCoefficients:
-    """Compute the :class:`LineSpreadCoefficients` of the footprints of n points [bins of fs/L].
+    """Compute the :class:`LineSpreadCoefficients` of the footprints of n points.
 
-    `beamlets_max` is the largest number of beamlets. It determines the largest distance of a
-    beamlet from the axis.
+    `beamlets_max` is the largest number of beamlets, which sets the largest distance of a beamlet
+    from the axis.
     """
     parameters = budget.parameters
     grazing_angle, radial_velocity = (
@@ -459,7 +463,7 @@ def _line_spread_coefficients(
 
 
 def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
-    """Return the largest difference of mid-record optical frequencies between segments [Hz].
+    """Return the largest difference between segments' optical frequencies in mid-record [Hz].
 
     See equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
@@ -481,29 +485,32 @@ def required_node_counts(
     tolerance: np.ndarray,
     error_budget: ErrorBudget,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the number of quadrature nodes, and of parallel lines of nodes, by tolerance.
+    """Choose numbers of quadrature nodes, in parallel rows, that keep a tolerance.
 
-    A node is a beamlet. The tolerance is that of the largest bin's power.
+    A node is a beamlet. A row of nodes runs along the slope. The tolerance is that of the largest
+    bin's power.
 
     Parameters
     ----------
     window_name : str
         Name of the window.
     spread : LineSpreadCoefficients
-        Positions of the footprint's lines.
+        Spread of the frequencies of the footprint's lines.
     tolerance : ndarray (n,)
-        Tolerated error of the largest bin's power relative to that power, wherever the lines lie.
+        Tolerated relative error of the largest bin's power, at any position of the lines between
+        bins.
     error_budget : ErrorBudget
         Accuracy of the study.
 
     Returns
     -------
     n_lines : ndarray (n,)
-        Number of parallel lines of nodes, 1 for most points.
+        Number of parallel rows of nodes, 1 for most points.
     n_nodes : ndarray (n,)
-        Number of nodes of each line, at least 2; the best possible if none meets the tolerance.
+        Number of nodes of each row, at least 2. If no number meets the tolerance, it is that of
+        least error.
     error : ndarray (n,)
-        Bound of the relative error; 1 if there is no bound.
+        Upper bound on the relative error of the largest bin's power; 1 if no bound is known.
     """
     tabulated_spreads, tabulated_errors, largest_bin_powers = _quadrature_errors_by_spread(
         window_name
@@ -541,21 +548,21 @@ def required_node_counts(
 def _choose_cheapest_within_tolerance(
     error: np.ndarray, cost: np.ndarray, tolerance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose, for each of n points, the cheapest of several alternatives within a tolerance.
+    """Choose the cheapest alternative whose error is within the tolerance, for each of n points.
 
     Parameters
     ----------
     error, cost : ndarray (rows, n)
-        Error and cost of each alternative; costs broadcast.
+        Error and cost of each alternative, one row for each; costs broadcast.
     tolerance : ndarray (n,)
         Tolerated error.
 
     Returns
     -------
     row : ndarray (n,)
-        Chosen alternative; that of least error if none is within the tolerance.
+        Index of the chosen alternative; that of least error if none is within the tolerance.
     error : ndarray (n,)
-        Its error.
+        Error of the chosen alternative.
     """
     allowed_cost = np.where(error <= tolerance, cost, np.inf)
     row = np.where(
@@ -567,18 +574,19 @@ def _choose_cheapest_within_tolerance(
 def _choose_node_lines(
     window_name: str, spread: LineSpreadCoefficients, tolerance: np.ndarray, beamlets_max: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the numbers of nodes and lines of nodes where a single line is too inaccurate.
+    """Choose numbers of rows and nodes for points at which one row of nodes is too inaccurate.
 
-    A node is a beamlet. The parameters are those of :func:`required_node_counts`.
+    A node is a beamlet. A row of nodes runs along the slope. The parameters are those of
+    :func:`required_node_counts`.
 
     Returns
     -------
     count_index : ndarray (n,)
-        Index of the number of nodes in NODE_COUNTS_ALONG_SLOPE.
+        Index in NODE_COUNTS_ALONG_SLOPE of the number of nodes of each row.
     n_lines : ndarray (n,)
-        Number of lines of nodes.
+        Number of parallel rows of nodes.
     error : ndarray (n,)
-        Bound of the relative error.
+        Upper bound on the relative error of the largest bin's power.
     """
     tabulated_spreads, tabulated_errors, largest_bin_powers = _quadrature_errors_by_spread(
         window_name
@@ -623,10 +631,10 @@ def _choose_node_lines(
 
 
 def _single_line_quadrature_error(window_name: str, spread: LineSpreadCoefficients) -> np.ndarray:
-    """Return the quadrature error of a single line of nodes due to curvature, (n,).
+    """Return a bound on the error of a single row of nodes along the slope due to curvature, (n,).
 
-    The error is in units of the power of a bin on which a spectral line is centred. The factor 2
-    includes the equal error along the slope with the fewest nodes.
+    The error is in units of the power of a bin on which a spectral line is centred. The bound is
+    twice the error across the slope: the error along it is at most as large.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         density = _autocorrelation_peak_density(window_name) / (
@@ -648,17 +656,20 @@ def _single_line_quadrature_error(window_name: str, spread: LineSpreadCoefficien
 
 @lru_cache(maxsize=32)
 def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate the error of each number of nodes by the standard deviation of line frequencies.
+    """Tabulate the quadrature error of each number of nodes by the spread of line frequencies.
+
+    Numbers of nodes are NODE_COUNTS_ALONG_SLOPE. fs is the sample rate, L the number of samples.
 
     Returns
     -------
     spreads : ndarray (m,)
-        Standard deviations [bins of fs/L].
+        Standard deviations of line frequencies [bins of fs/L].
     errors : ndarray (counts, m + 1)
         Largest error up to each standard deviation, relative to the power of the largest bin. The
-        last column is for larger standard deviations.
+        last column is for standard deviations above all of `spreads`.
     largest_bin_powers : ndarray (m + 1,)
-        Power of the largest bin, relative to that of one line centred on a bin.
+        Power of the largest bin at each standard deviation, relative to the power with all lines
+        centred on one bin.
     """
     spreads = np.geomspace(1e-3, 400.0, 96)
     largest_bin_powers = _largest_bin_power(
@@ -685,28 +696,28 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
 
 
 def _substitute_for_unbounded_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
-    """Return the number that tables hold where the error of a quadrature has no bound, at least 1.
+    """Return a number, at least 1, that stands for a quadrature's error where no bound is known.
 
-    It is the distance between ``n_nodes`` nodes that are spread over lines of the standard
-    deviation or curvature ``spread`` [bins of fs/L]. It falls as nodes are added, so that more
-    nodes are preferred.
+    ``spread`` is the standard deviation or curvature of the lines [bins of fs/L]. The number is the
+    distance between nodes [bins], if ``n_nodes`` nodes are spread evenly over the lines. It falls
+    as nodes are added, so that a choice of least error prefers more nodes.
     """
     return np.maximum(1.0, 2 * UNIFORM_QUADRATURE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
 
 
 @lru_cache(maxsize=32)
 def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate the quadrature errors of numbers of nodes and of node lines by curvature.
+    """Tabulate the quadrature error of each number of nodes and of node rows by curvature.
 
-    Errors are relative to the power of a bin on which a spectral line is centred.
+    Curvatures are _TABULATED_CURVATURES; the last column is for all larger ones. Errors are
+    relative to the power of a bin on which a spectral line is centred.
 
     Returns
     -------
     along : ndarray (counts, m + 1)
-        Errors of NODE_COUNTS_ALONG_SLOPE along the slope, at _TABULATED_CURVATURES and beyond the
-        largest.
-    across : ndarray (lines, m + 1)
-        Errors of NODE_COUNTS_ACROSS_SLOPE across the slope.
+        Errors along the slope of each number in NODE_COUNTS_ALONG_SLOPE.
+    across : ndarray (rows, m + 1)
+        Errors across the slope of each number in NODE_COUNTS_ACROSS_SLOPE.
     """
     lag = (np.arange(_N_CURVATURE_LAGS) + 0.5) / _N_CURVATURE_LAGS
     weight = _normalised_autocorrelation(window_name, lag)
@@ -740,10 +751,12 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
 
 @lru_cache(maxsize=1)
 def _smoothed_quadrature_errors() -> np.ndarray:
-    """Tabulate errors of node lines by curvature, smoothed by a linear spread.
+    """Tabulate the quadrature error across the slope that remains after smoothing, (rows, m + 1).
 
-    Rows are NODE_COUNTS_ACROSS_SLOPE. Columns are _TABULATED_SPREAD_RATIOS and one for larger
-    ratios. Each error is the mean over the Gaussian distribution of the linear spread.
+    Array rows belong to NODE_COUNTS_ACROSS_SLOPE, the numbers of node rows. Columns belong to
+    _TABULATED_SPREAD_RATIOS, the quadratic over the linear spread of line frequencies; the last
+    column, for larger ratios, is inf. Each error is the integral over phases t of the Gaussian
+    exp(-t^2 / 2), which the linear spread causes, times the error at t.
     """
     phase = np.linspace(0.0, 8.0, 801)[1:]
     weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])
@@ -760,10 +773,10 @@ def _smoothed_quadrature_errors() -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
-    """Return the largest error of a quadrature's mean of exp(i t x^2) up to each phase t.
+    """Return the error of a quadrature's mean of exp(i t x^2) for normal x, (phases,).
 
-    x is normally distributed. The phases t are _TABULATED_QUADRATIC_PHASES. The exact mean is 1 /
-    sqrt(1 - 2 i t).
+    The phases t are _TABULATED_QUADRATIC_PHASES. The result is the largest error up to each phase.
+    The exact mean is 1 / sqrt(1 - 2 i t).
     """
     x, w = normal_distribution_quadrature(n_nodes)
     rule_mean = np.array(
@@ -775,9 +788,10 @@ def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
 
 
 def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.ndarray:
-    """Return a lower bound on the largest bin's power, relative to that of lines all at its centre.
+    """Return a lower bound on the power of the largest bin of a footprint's lines.
 
-    `deviation` is the standard deviation of line frequencies [bins of fs/L]. See
+    The power is relative to that with all lines at the bin's centre. `deviation` is the standard
+    deviation of line frequencies [bins of fs/L]. See
     :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for_spread`.
     """
     narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.power_curvature_max * deviation**2
@@ -791,9 +805,9 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
 
 
 def _normalised_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
-    """Return the magnitude of a window's autocorrelation at lags [record lengths].
+    """Return the magnitude of a window's autocorrelation at lags [record lengths], like `lag`.
 
-    The magnitude is divided by the signed sum of the autocorrelation over all lags.
+    The magnitudes are divided by the sum of the signed autocorrelation over these lags.
     """
     w = window_samples(window_name, _N_TABLE_WINDOW_SAMPLES)
     r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _N_TABLE_WINDOW_SAMPLES)) ** 2)[
@@ -805,7 +819,10 @@ def _normalised_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray
 
 @lru_cache(maxsize=32)
 def _autocorrelation_peak_density(window_name: str) -> float:
-    """Return the largest density of a window's autocorrelation over lags [1/record length]."""
+    """Return the largest density of a window's autocorrelation over lags [1/record length].
+
+    The density has the integral 1 over lags of 0..1 record length.
+    """
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
     return float(_normalised_autocorrelation(window_name, lag).max()) * _N_LAGS
 
@@ -813,7 +830,7 @@ def _autocorrelation_peak_density(window_name: str) -> float:
 def _quadrature_error_for_cosine(n_nodes: int, phase: np.ndarray) -> np.ndarray:
     """Return the error of a quadrature's mean of cos(phase x) for normal x, (phases,).
 
-    The exact mean is exp(-phase^2 / 2).
+    `phase` is (phases,) [rad]. The exact mean is exp(-phase^2 / 2).
     """
     if n_nodes <= GAUSS_HERMITE_NODES_MAX:
         x, w = normal_distribution_quadrature(n_nodes)

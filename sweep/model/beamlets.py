@@ -28,38 +28,38 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 
 BEAMLET_PATTERNS = ("hexagonal", "sunflower", "line", "square")
-"""Names of beamlet patterns. ``3 lines``, or another number of lines, is a further pattern:
-parallel lines of beamlets."""
+"""Names of beamlet patterns. A text such as ``3 lines`` also names a pattern: parallel lines of
+beamlets, as many as the number says."""
 
 PATTERN_RADIUS_SIGMA = 3.0
-"""Radius of a pattern [standard deviations of the beam], before it is mapped to the beam's
-covariance. The beam has 98.9 % of its power within this radius."""
+"""Radius of a beamlet pattern [standard deviations of the beam], before the pattern is scaled to
+the beam's covariance. 98.9 % of the beam's power lies within this radius."""
 
 SQUARED_RADIUS_GROWTH = 2.9
-"""Increase of a lattice's squared radius per natural logarithm of its number of beamlets. It
-applies from 19 beamlets on.
+"""Increase of a hexagonal lattice's squared radius [variances of the beam] when the number of
+beamlets grows by the factor e. It applies from 19 beamlets on.
 
 A lattice's error depends on the power outside its radius and on its spacing. A radius that grows
 with the number of beamlets reduces both: 3.3 standard deviations for 37 beamlets, 3.8 for 109, 4.7
 for 2,029."""
 
 _LATTICE_ROTATION = 0.191
-"""Rotation [rad] of the lattice relative to the slope, so that no two rows have the same coordinate
-along it."""
+"""Rotation [rad] of the hexagonal lattice relative to the slope. With it no two rows of beamlets
+have the same coordinate along the slope."""
 
 
 GAUSS_HERMITE_NODES_MAX = 15
-"""Largest number of nodes for which a Gauss-Hermite quadrature is used. Quadratures with more nodes
-have evenly spaced ones."""
+"""Largest number of nodes of a Gauss-Hermite quadrature. With more nodes a quadrature of evenly
+spaced nodes is used."""
 
 UNIFORM_QUADRATURE_RADIUS_SIGMA = 7.0
-"""Distance of the outermost evenly spaced node from the middle [standard deviations]. A fraction of
-3e-12 of the normal distribution lies outside."""
+"""Distance of the outermost evenly spaced quadrature nodes from the mean [standard deviations]. A
+fraction of 3e-12 of the normal distribution lies beyond these nodes."""
 
 
 @lru_cache(maxsize=64)
 def normal_distribution_quadrature(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of a quadrature for means over the standard normal distribution.
+    """Return nodes and weights of a quadrature over the standard normal distribution.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def normal_distribution_quadrature(n_nodes: int) -> tuple[np.ndarray, np.ndarray
     Returns
     -------
     nodes, weights : ndarray (n_nodes,)
-        The weights sum to 1. The mean is 0 and, with two nodes or more, the variance is 1.
+        Weights sum to 1. The nodes have the mean 0 and, if there are two or more, the variance 1.
     """
     if n_nodes <= GAUSS_HERMITE_NODES_MAX:
         nodes, weights = np.polynomial.hermite_e.hermegauss(n_nodes)
@@ -99,16 +99,16 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
     Returns
     -------
     directions : ndarray (2, n_beamlets)
-        Angles off the axis in standard deviations of the beam (Theta/4): across the plane's slope,
-        and along it.
+        Angles off the axis [standard deviations of the beam, Theta/4]: across the plane's slope in
+        the first row, along the slope in the second. Theta is the full 1/e^2 divergence.
     weights : ndarray (n_beamlets,)
         Fractions of the power; they sum to 1.
 
     Notes
     -----
     The weighted mean of directions is 0 and, with three beamlets or more, their covariance is the
-    identity. Lines are an exception: they all lie on the same side of the axis, with the mean
-    square of both sides. [T 3.3.1] uses 109 beamlets, a full hexagonal lattice.
+    identity. Parallel lines are an exception: all lie on one side of the axis, with the mean square
+    that lines on both sides would have. [T 3.3.1] uses 109 beamlets, a full hexagonal lattice.
     """
     if n_beamlets == 1:
         return np.zeros((2, 1)), np.ones(1)
@@ -127,7 +127,7 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
 
 
 def _hexagonal_lattice(n_points: int) -> np.ndarray:
-    """Return the `n_points` points of a hexagonal lattice nearest to one of them, (2, n_points).
+    """Return a point of a hexagonal lattice and the points nearest to it, (2, n_points).
 
     Coordinates are in standard deviations of the beam.
     """
@@ -146,9 +146,9 @@ def _hexagonal_lattice(n_points: int) -> np.ndarray:
 
 
 def lattice_radius(n_beamlets: int) -> float:
-    """Return the radius of a hexagonal lattice before it is mapped to the beam's covariance.
+    """Return the radius of a hexagonal lattice of beamlets [standard deviations of the beam].
 
-    The radius is in standard deviations of the beam.
+    The radius is that before the lattice is scaled to the beam's covariance.
     """
     return math.sqrt(
         PATTERN_RADIUS_SIGMA**2 + SQUARED_RADIUS_GROWTH * math.log(max(n_beamlets, 19) / 19)
@@ -158,7 +158,8 @@ def lattice_radius(n_beamlets: int) -> float:
 def _sunflower_pattern(n_points: int) -> np.ndarray:
     """Return the points of a sunflower pattern, (2, n_points) [standard deviations of the beam].
 
-    All points represent equal areas of a circle. Successive points differ by the golden angle.
+    Every point represents the same area of a circle. Directions to successive points differ by the
+    golden angle.
     """
     k = np.arange(n_points) + 0.5
     radius, angle = PATTERN_RADIUS_SIGMA * np.sqrt(k / n_points), k * math.pi * (3 - math.sqrt(5))
@@ -166,10 +167,10 @@ def _sunflower_pattern(n_points: int) -> np.ndarray:
 
 
 def _product_quadrature(pattern: str, n_beamlets: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return beamlet directions and weights of a product of two quadratures.
+    """Return directions and weights of beamlets at the nodes of a product of two quadratures.
 
-    One quadrature runs along the slope, the other across it. The results are as in
-    `place_beamlets`.
+    One quadrature runs along the slope, the second across it. The arrays are those of
+    :func:`place_beamlets`.
     """
     if pattern == "square":
         nodes_per_side = max(math.isqrt(n_beamlets), 2)
@@ -199,7 +200,7 @@ def plane_footprint(
     transverse_velocity: ArrayLike = 0.0,
     direction_spread_angle: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Compute where the beamlets of a beam meet a flat plane, relative to the range on its axis.
+    """Compute where the beamlets of a beam meet a flat plane, relative to the point on its axis.
 
     Parameters
     ----------
@@ -219,19 +220,19 @@ def plane_footprint(
     Returns
     -------
     relative_range_offset : ndarray (n, n_beamlets)
-        (R_b - R_0) / R_0, computed without subtracting the two ranges.
+        (R_b - R_0) / R_0, with the ranges R_b of a beamlet and R_0 on the axis.
     cos_incidence : ndarray (n, n_beamlets)
         Cosine of the incidence angle.
     weights : ndarray (n, n_beamlets)
-        Power fractions.
+        Fractions of the beam's power.
     closing_offset : ndarray (n, n_beamlets)
-        Closing speed minus that on the beam's axis [m/s].
+        Closing speed of a beamlet minus that on the beam's axis [m/s].
 
     Notes
     -----
     A plane's footprint scales with range, so one row serves every range. A beamlet y off the axis
     towards the near side, and x across, sees the closing speed (v_r + v_t y) / |d| with |d|^2 = 1 +
-    x^2 + y^2. A beamlet that passes over the horizon has fraction 0 and offset 0.
+    x^2 + y^2. A beamlet that passes over the horizon has the power fraction 0 and offsets 0.
     """
     (across, along), weights = place_beamlets(n_beamlets, pattern)
     sigma = np.asarray(beam_divergence, float)[:, None] / 4
@@ -266,23 +267,23 @@ class OffsetMoments(NamedTuple):
     """
 
     mean: np.ndarray | float
-    """Magnitude of the mean offset from the axis, in the unit of the offsets."""
+    """Magnitude of the mean offset from the axis, in the offsets' unit."""
     rms: np.ndarray | float
-    """Root mean square offset from the axis, in the unit of the offsets."""
+    """Root mean square of the offsets from the axis, in the offsets' unit."""
     largest_magnitude: np.ndarray | float
-    """Largest magnitude of an offset from the axis, in the unit of the offsets."""
+    """Largest magnitude of an offset from the axis, in the offsets' unit."""
 
     def scaled_by(self, factor: np.ndarray) -> "OffsetMoments":
-        """Return the moments of the offsets times a factor.
+        """Return the moments that result if every offset is multiplied by `factor`.
 
         An infinite moment times 0 gives 0.
         """
         return OffsetMoments(*(np.minimum(value, 1e200) * factor for value in self))
 
     def bound_on_summed_offsets(self, other: "OffsetMoments") -> "OffsetMoments":
-        """Return upper bounds on the moments of the sum of two offsets.
+        """Return upper bounds on the moments of the sum of two kinds of offset.
 
-        ``other`` are the moments of the second offset.
+        The moments of the first kind are these, those of the second kind are ``other``.
         """
         return OffsetMoments(
             *(value + other_value for value, other_value in zip(self, other, strict=True))
@@ -290,11 +291,11 @@ class OffsetMoments(NamedTuple):
 
 
 ZERO_OFFSET_MOMENTS = OffsetMoments(0.0, 0.0, 0.0)
-"""Moments of offsets that are all 0, as for a single beamlet on the axis."""
+"""Moments of offsets that are all 0, as those of a single beamlet on the axis."""
 
 
 def pattern_radius(n_beamlets: int, pattern: str) -> float:
-    """Return the largest angle between a beamlet and the axis [standard deviations of the beam].
+    """Return the largest angle between the axis and a beamlet [standard deviations of the beam].
 
     Parameters
     ----------
@@ -322,7 +323,9 @@ def plane_offset_moment_bounds(
     pattern: str,
     direction_spread_angle: ArrayLike | None = None,
 ) -> tuple[OffsetMoments, OffsetMoments]:
-    """Return upper bounds on the moments of beamlets' offsets in range and velocity on a plane.
+    """Return upper bounds on the moments of beamlets' range and velocity offsets on a flat plane.
+
+    An offset is a beamlet's value minus that on the beam's axis.
 
     Parameters
     ----------
@@ -341,9 +344,10 @@ def plane_offset_moment_bounds(
     Returns
     -------
     range_moments : OffsetMoments
-        Bounds for (R_b - R_0) / R_0; infinite if a beamlet may pass over the horizon.
+        Bounds for (R_b - R_0) / R_0, with the ranges R_b of a beamlet and R_0 on the axis; infinite
+        if a beamlet may pass over the horizon.
     velocity_moments : OffsetMoments
-        Bounds for radial velocities minus the axis's [m/s].
+        Bounds for radial velocities minus that on the axis [m/s].
 
     Notes
     -----
@@ -404,7 +408,7 @@ def plane_echo_ratio_bound(
     n_beamlets: int,
     pattern: str,
 ) -> np.ndarray:
-    """Return an upper bound on the echo of all beamlets on a plane, relative to the axis, (n,).
+    """Return an upper bound on the echo of all beamlets on a plane, relative to the axis's, (n,).
 
     Parameters
     ----------
@@ -417,9 +421,9 @@ def plane_echo_ratio_bound(
 
     Notes
     -----
-    u of the module's description has mean 0 and a known rms, so the ratio differs from 1 in second
-    order. The slope increases it, and the beamlets' greater length reduces it. The bound takes both
-    as increases.
+    Let u be a beamlet's angle along the slope times cot(grazing angle). It has the mean 0 and a
+    known rms, so the ratio differs from 1 in second order. The slope increases the ratio, the
+    greater length of beamlets off the axis reduces it. The bound takes both as increases.
     """
     echo_exponent, sigma = 3 if law == "lambert" else 2, beam_divergence / 4
     range_rms = sigma / np.tan(grazing_angle)
@@ -437,7 +441,7 @@ def plane_echo_ratio_bound(
 def bins_per_velocity(
     *, range: ArrayLike, carrier: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
 ) -> np.ndarray:
-    """Return the shift of a line [bins] per radial velocity of 1 m/s.
+    """Return the shift of a spectral line [FFT bins] per radial velocity of 1 m/s.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = (
 
 @njit(inline="always")
 def exact_product(a, b):
-    """Compute a * b exactly as the sum of two doubles.
+    """Return the exact product a * b as the sum of two doubles.
 
     Parameters
     ----------
@@ -51,18 +51,18 @@ def exact_product(a, b):
 
 @njit(inline="always")
 def fraction_of_cycle(x):
-    """Return the phase ``x`` [cycles] minus the nearest whole number of cycles, in [-1/2, 1/2]."""
+    """Return the phase ``x`` [cycles] minus its nearest integer, in [-1/2, 1/2]."""
     return x - math.floor(x + 0.5)
 
 
 @njit(inline="always")
 def product_cycle_fraction(high, low, x):
-    """Return the phase of (high + low) * x cycles without its whole cycles, in [-1/2, 1/2].
+    """Return the product (high + low) * x [cycles] minus its nearest integer, in [-1/2, 1/2].
 
     Parameters
     ----------
     high, low : float
-        First factor, as the sum of two doubles, as :func:`exact_product` returns it.
+        First factor as the sum of two doubles, such as the result of :func:`exact_product`.
     x : float
         Second factor.
 
@@ -83,7 +83,7 @@ def product_cycle_fraction(high, low, x):
 
 @njit(inline="always")
 def double_double_quotient(numerator, denominator):
-    """Compute the quotient of two doubles as the sum of two doubles.
+    """Return the quotient of two doubles as the sum of two doubles.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def double_double_quotient(numerator, denominator):
     Returns
     -------
     high, low : float
-        Rounded quotient, and its rounding error, rounded to a double.
+        Quotient rounded to a double, and the rounding error, itself a double.
     """
     high = numerator / denominator
     product, remainder = exact_product(high, denominator)
@@ -103,7 +103,7 @@ def double_double_quotient(numerator, denominator):
 
 @njit(inline="always")
 def sincos_cycles(x):
-    """Compute sin(2 pi x) and cos(2 pi x), without branches so that loops vectorise.
+    """Return sin(2 pi x) and cos(2 pi x). The code has no branches, so that loops vectorise.
 
     Parameters
     ----------

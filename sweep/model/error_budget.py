@@ -64,7 +64,8 @@ from numpy.typing import ArrayLike
 from scipy.special import betaincinv, ndtri, stdtrit
 
 SET_BY_TOLERANCE = -1.0
-"""Value of an error setting in :class:`ErrorBudget` that means: compute it from the tolerance."""
+"""Value of an error setting in :class:`ErrorBudget` which means that the error follows from the
+tolerance."""
 
 
 THESIS_BEAMLET_COUNT = 109
@@ -80,26 +81,24 @@ class ErrorBudget:
 
     tolerance: ArrayLike = 1e-3
     """Largest error of a probability of detection, of log10 of a probability of false alarm, or of
-    a relative magnitude. For points with draws it is the largest half-width of the confidence
-    interval. At 0 nothing is skipped. A ten times smaller tolerance rarely doubles the time of a
-    point. With draws it takes a hundred times as many draws."""
+    a relative magnitude. For points with draws the error is the half-width of the confidence
+    interval. With a tolerance of 0 nothing is skipped. A ten times smaller tolerance rarely doubles
+    the time of a point; with draws it takes a hundred times as many draws."""
 
     confidence: ArrayLike = 0.95
-    """Confidence level of intervals for probabilities that are estimated by random draws. The
-    number of draws is proportional to the square of the normal quantile: 0.99 takes 1.7 times the
-    draws of 0.95.
-    """
+    """Confidence level, 0..1, of intervals for probabilities that are estimated by random draws.
+    The number of draws is proportional to the square of the normal quantile: 0.99 takes 1.7 times
+    the draws of 0.95."""
 
     line_error: ArrayLike = SET_BY_TOLERANCE
-    """Tolerated error of a bin's magnitude, relative to the noise sigma, if few lines represent all
-    beamlets. By default it is `lines_fraction` of the tolerance. A smaller error slowly increases
-    the number of lines of a segment."""
+    """Tolerated error of a bin's magnitude, relative to the noise sigma, when few spectral lines
+    represent all beamlets. By default it is `lines_fraction` times the tolerance. A smaller error
+    slowly increases the number of lines of a segment."""
 
     leakage_error: ArrayLike = SET_BY_TOLERANCE
-    """Tolerated probability of a false peak due to the echo's signal in bins far from its lines.
-    This part of the leakage is then not evaluated. By default it is `leakage_fraction` of the
-    tolerance. With a smaller value more bins are evaluated.
-    """
+    """Tolerated probability of a false peak due to the echo's signal in bins that are far from its
+    lines and not evaluated. By default it is `leakage_fraction` times the tolerance. With a smaller
+    value more bins are evaluated."""
 
     leakage_floor: ArrayLike = SET_BY_TOLERANCE
     """Magnitude of leaked signal in a bin, relative to the noise sigma, below which the bin counts
@@ -107,70 +106,63 @@ class ErrorBudget:
     `leakage_error`. With a lower value more bins are evaluated."""
 
     count_interval_name: str = "clopper_pearson"
-    """Kind of confidence interval for a probability that is estimated by counting draws, one of
+    """Name of the confidence interval for a probability that is estimated by counting draws, one of
     :data:`COUNT_INTERVAL_FUNCTIONS`. The interval of Clopper and Pearson has at least the stated
-    coverage. Wilson's takes fewer draws, and has the stated coverage on average."""
+    coverage. Wilson's needs fewer draws, and has the stated coverage on average."""
 
     stopping_check_growth: float = 1.25
-    """Ratio of the numbers of draws at successive checks of the confidence intervals. With a ratio
-    nearer 1 fewer draws are wasted, but the more frequent checks reduce the coverage of the
-    intervals.
-    """
+    """Factor by which the number of draws grows from one check of the confidence intervals to the
+    next. A factor nearer 1 wastes fewer draws, but more frequent checks reduce the coverage of the
+    intervals."""
 
     effects_fraction: float = 0.8
-    """Fraction of the tolerance for effects that are not simulated and for the number of beamlets
-    together. With a larger fraction more effects can be skipped.
-    """
+    """Fraction of the tolerance for two errors together: effects that are not simulated, and the
+    number of beamlets. With a larger fraction more effects can be skipped."""
 
     beamlets_fraction: float = 0.25
-    """Fraction of the tolerance for the number of beamlets, if that number follows from the
-    tolerance. It is included in `effects_fraction`. Halving it costs most points one more step of
-    `NODE_COUNTS_ALONG_SLOPE`.
-    """
+    """Fraction of the tolerance for the number of beamlets, if this number follows from the
+    tolerance. The fraction is part of `effects_fraction`. Half of it costs most points one more
+    step of `NODE_COUNTS_ALONG_SLOPE`."""
 
     lines_fraction: float = 1.0
-    """Fraction of the tolerance that is the default of `line_error`. It is 1, because bounds on
-    this error are worst cases over lines and bins.
-    """
+    """Default of `line_error`, as a fraction of the tolerance. It is 1, because bounds on this
+    error are worst cases over lines and bins."""
 
     leakage_fraction: float = 0.5
-    """Fraction of the tolerance that is the default of `leakage_error`."""
+    """Default of `leakage_error`, as a fraction of the tolerance."""
 
     single_line_error_fraction: float = 0.1
-    """Fraction of the beamlets' tolerance up to which the error of a single line of beamlets is
-    accepted. The error is that across the slope. If it is larger, several parallel lines are
-    tried. With a smaller fraction they are tried at more points. The accuracy is the same.
-    """
+    """Fraction of the beamlets' tolerance up to which one row of beamlets along the slope is
+    accepted. The error compared with it is that across the slope. If this error is larger, several
+    parallel rows are tried. The fraction does not affect the accuracy."""
 
     beamlets_max: int = 4096
-    """Largest number of beamlets of a footprint on a plane. Points that need more use the number of
-    least error, and their output ``beamlets_error`` states the error.
-    """
+    """Largest number of beamlets of a footprint on a plane. Points that would need more use the
+    number of least error, and their output ``beamlets_error`` states the error."""
 
     thesis_beamlet_count: int = THESIS_BEAMLET_COUNT
-    """Number of beamlets of the thesis. It is used where amplitudes add over a smooth plane. Their
-    sum almost cancels, so that no number of beamlets is enough for the tolerance.
-    """
+    """Number of beamlets of the thesis. It is used if amplitudes add over a smooth plane: their sum
+    almost cancels, so that no number of beamlets is enough for the tolerance."""
 
     min_rays_by_tolerance: tuple[tuple[float, int], ...] = ((1e-2, 19), (1e-5, 37), (0.0, 109))
-    """Pairs of a tolerance and the smallest number of rays per shot of a flight. A pair applies
-    from its tolerance up to that of the previous pair. Estimates of the error cannot include
-    objects that no ray hits, and fewer rays miss more small objects.
-    """
+    """Pairs (tolerance, smallest number of rays per shot of a flight). A pair applies to tolerances
+    from its own up to that of the previous pair. Estimates of the error cannot include objects that
+    no ray hits, and fewer rays miss more small objects."""
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
-    """Numbers of rays that may be cast for a shot. They fill whole shells of the lattice, which are
-    symmetric. Symmetry makes results on smooth ground a hundred times more exact. The first number
-    is the smallest from which an error can be estimated. Each ray costs some 80 ns."""
+    """Possible numbers of rays per shot. They fill whole shells of the lattice, whose symmetry
+    makes results on smooth ground a hundred times more exact. The first number is the smallest from
+    which an error can be estimated. Each ray costs some 80 ns."""
 
     rays_tolerance_min: float = 1e-6
-    """Tolerance below which the number of rays per shot does not increase further."""
+    """Smallest tolerance that affects the number of rays per shot. A lower tolerance has the same
+    number."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any], **overrides: Any) -> "ErrorBudget":
-        """Return the budget that the parameters under ``accuracy.`` state.
+        """Return the budget from parameters by dotted path; those under ``accuracy.`` are used.
 
-        `parameters` has dotted paths as keys. `overrides` are values of further fields, by name.
+        `overrides` are values of fields that ``accuracy.`` does not state, by field name.
         """
         names = ("tolerance", "confidence", "line_error", "leakage_error", "leakage_floor")
         stated_values = {name: parameters[f"accuracy.{name}"] for name in names
@@ -178,7 +170,7 @@ class ErrorBudget:
         return cls(**stated_values, **overrides)
 
     def select_points(self, point_indices: np.ndarray, n_points: int) -> "ErrorBudget":
-        """Return the budget of selected points; tolerance and confidence have one value for each.
+        """Return the budget of selected points.
 
         Parameters
         ----------
@@ -203,7 +195,7 @@ class ErrorBudget:
     def allowed_line_error(self) -> np.ndarray:
         """Tolerated error of a bin's magnitude, relative to the noise sigma, due to few lines.
 
-        The few lines represent all beamlets.
+        A few spectral lines are computed in place of the lines of all beamlets.
         """
         return self._stated_or_tolerance_fraction(self.line_error, self.lines_fraction)
 
@@ -214,31 +206,31 @@ class ErrorBudget:
 
     @property
     def allowed_beamlets_error(self) -> np.ndarray:
-        """Tolerated error of the detection probability due to the number of beamlets."""
+        """Tolerated error of the detection probability due to the finite number of beamlets."""
         return self.beamlets_fraction * np.asarray(self.tolerance, float)
 
     def allowed_effects_error(self, *, counts_beamlets: bool) -> np.ndarray:
         """Return the tolerated error of a probability due to all effects that are not simulated.
 
-        `counts_beamlets` is True if the number of beamlets follows from the tolerance. Its part of
-        the tolerance is then subtracted.
+        `counts_beamlets` is True if the number of beamlets follows from the tolerance. The part of
+        the tolerance for the number of beamlets is then subtracted.
         """
         beamlets_part = self.beamlets_fraction if counts_beamlets else 0.0
         return (self.effects_fraction - beamlets_part) * np.asarray(self.tolerance, float)
 
     @property
     def allowed_rays_error(self) -> float:
-        """Tolerated error of the detection probability due to the rays per shot of a flight."""
+        """Tolerated error of the detection probability due to the number of rays per shot."""
         return max(float(np.asarray(self.tolerance)), self.rays_tolerance_min)
 
     @property
     def has_errors_set_by_tolerance(self) -> np.ndarray:
-        """True where the error of lines or of leakage follows from the tolerance."""
+        """True where the tolerance determines the error of lines or leakage, (n,) or a scalar."""
         errors = (np.asarray(self.line_error), np.asarray(self.leakage_error))
         return np.logical_or(*(error == SET_BY_TOLERANCE for error in errors))
 
     def _stated_or_tolerance_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
-        """Return a stated error, or a fraction of the tolerance where it is `SET_BY_TOLERANCE`."""
+        """Return `stated`; where that is `SET_BY_TOLERANCE`, `fraction` times the tolerance."""
         allowed = fraction * np.asarray(self.tolerance, float)
         return np.where(np.asarray(stated, float) == SET_BY_TOLERANCE, allowed, stated)
 
@@ -255,7 +247,7 @@ class ConfidenceInterval(NamedTuple):
 def wilson_interval(
     *, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Compute Wilson's score interval for the probability of a success, from counts [1]_.
+    """Return Wilson's score interval for the probability of a success, from counts [1]_.
 
     Parameters
     ----------
@@ -282,7 +274,7 @@ def wilson_interval(
 def clopper_pearson_interval(
     *, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Compute Clopper and Pearson's interval for the probability of a success, from counts [1]_.
+    """Return Clopper and Pearson's interval for the probability of a success, from counts [1]_.
 
     Parameters
     ----------
@@ -293,8 +285,8 @@ def clopper_pearson_interval(
 
     Notes
     -----
-    If the true probability were at an end of the interval, the observed count, or one still
-    farther from the expectation, would have the probability (1 - confidence) / 2.
+    Each end is the probability at which the observed count, or one farther from the expected count,
+    has the probability (1 - confidence) / 2.
 
     References
     ----------
@@ -315,21 +307,21 @@ COUNT_INTERVAL_FUNCTIONS: dict[str, Callable[..., ConfidenceInterval]] = {
     "clopper_pearson": clopper_pearson_interval,
     "wilson": wilson_interval,
 }
-"""Functions that compute a probability's confidence interval from counts, by the interval's name.
-"""
+"""Functions that compute a probability's confidence interval from counts of successes and trials,
+by the interval's name."""
 
 
 def bounded_mean_interval(
     *, mean: ArrayLike, variance: ArrayLike, n_values: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Compute a confidence interval for the expectation of values within 0..1, from their mean.
+    """Return a confidence interval for the expectation of values within 0..1, from their mean.
 
     Parameters
     ----------
     mean : array_like
         Mean of independent values.
     variance : array_like
-        Unbiased variance of a single value; it is not used with one value only.
+        Unbiased estimate of the variance of a single value; ignored if there is only one value.
     n_values : array_like
         Number of values.
     confidence : array_like
@@ -364,20 +356,24 @@ def grouped_mean_half_width(
     group_size: int,
     confidence: ArrayLike,
 ) -> np.ndarray:
-    """Compute the half-width of an interval for an expectation from evenly spread groups of values.
+    """Return the half-width of a confidence interval for a mean of values drawn in spread groups.
+
+    Values within a group are spread evenly, so that means of groups vary less than those of
+    independent values.
 
     Parameters
     ----------
     variance : array_like
         Unbiased variance of a single value within 0..1.
     n_values : array_like
-        Number of values, in whole groups and in one that is not yet whole.
+        Number of all values, in complete groups and in the last, incomplete one.
     group_variance : array_like
-        Unbiased variance of the mean of a whole group; it is not used with fewer than two groups.
+        Unbiased estimate of the variance of a complete group's mean; ignored with fewer than two
+        groups.
     n_groups : array_like
-        Number of whole groups.
+        Number of complete groups.
     group_size : int
-        Number of values in a whole group.
+        Number of values in a complete group.
     confidence : array_like
         Confidence, two-sided, 0..1.
 
@@ -401,9 +397,9 @@ def grouped_mean_half_width(
 
 
 GROUPED_VARIANCE_RATIO_MAX = 0.25
-"""Ratio of the variance per draw estimated from the means of groups to that of independent draws,
-below which the estimate from groups is used. With a limit nearer to 1 the lesser of both estimates
-would be too small on average."""
+"""Largest ratio of two estimates of the variance per draw at which the first is used: the one from
+means of groups of draws, over that of independent draws. With a limit nearer 1, the lesser of both
+estimates would be too small on average."""
 
 
 def variance_of_grouped_draws(
@@ -414,25 +410,28 @@ def variance_of_grouped_draws(
     group_size: int,
     confidence: ArrayLike,
 ) -> np.ndarray:
-    """Return the effective variance of a draw in a whole group, for the variance of the total mean.
+    """Return the variance T^2 with which a draw in a complete group contributes to the total mean.
+
+    Draws within a group are spread evenly, so that means of groups vary less than those of
+    independent draws.
 
     Parameters
     ----------
     variance : array_like
         Unbiased variance s^2 of a single value.
     group_variance : array_like
-        Unbiased variance of the mean of a whole group; nan if it is not known.
+        Unbiased estimate V of the variance of a complete group's mean; nan if it is not known.
     n_groups : array_like
-        Number R of whole groups.
+        Number R of complete groups.
     group_size : int
-        Number g of values in a whole group.
+        Number g of values in a complete group.
     confidence : array_like
         Confidence, two-sided, 0..1.
 
     Returns
     -------
     ndarray
-        T^2 = t^2 g V / z^2 with the variance V of a group's mean, if that is less than
+        T^2 = t^2 g V / z^2, if that is less than
         :data:`GROUPED_VARIANCE_RATIO_MAX` times s^2, else s^2. t and z are the two-sided quantiles
         of Student's distribution with R - 1 degrees of freedom and of the normal distribution.
     """
@@ -446,21 +445,21 @@ def variance_of_grouped_draws(
 
 
 def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np.ndarray:
-    """Return the half-widths of intervals: the distance from the estimate to the farther end.
+    """Return the distance from each estimate to the farther end of its confidence interval.
 
     Parameters
     ----------
     estimate : array_like
         Estimated probabilities, 0..1.
     interval : ConfidenceInterval
-        Their intervals.
+        Confidence intervals of the estimates.
     """
     estimate = np.asarray(estimate, float)
     return np.maximum(interval.high - estimate, estimate - interval.low)
 
 
 def two_sided_normal_quantile(confidence: ArrayLike) -> np.ndarray:
-    """Return the z for which a standard normal variable lies within +-z with a given probability.
+    """Return z, such that a standard normal variable lies within -z..z with a given probability.
 
     ``confidence`` is this probability, 0..1.
     """
@@ -468,5 +467,5 @@ def two_sided_normal_quantile(confidence: ArrayLike) -> np.ndarray:
 
 
 def _clip_interval(low: np.ndarray, high: np.ndarray) -> ConfidenceInterval:
-    """Return the confidence interval with its ends clipped to 0..1."""
+    """Return a confidence interval with the ends `low` and `high`, each clipped to 0..1."""
     return ConfidenceInterval(np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0))

@@ -64,27 +64,30 @@ def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
 
 
 def effects_use_beamlet_velocities(names: Collection[str]) -> bool:
-    """Return True if any of the named effects uses the radial velocities of single beamlets."""
+    """Return True if at least one named effect uses a separate radial velocity for each beamlet."""
     return any(effect.uses_beamlet_velocities for effect in EFFECTS if effect.name in names)
 
 
 def prepare_shots(
     parameters: Parameters, effects: Collection[str] = DEFAULT_EFFECTS
 ) -> Iterator[tuple[np.ndarray, Shots]]:
-    """Yield prepared shots on a flat plane, in groups of points that share strings and sizes.
+    """Yield prepared shots on a flat plane, for one category of points at a time.
+
+    Points of a category share all text parameters and array sizes.
 
     Parameters
     ----------
     parameters : mapping
-        SI scalars, strings or (n,) arrays by dotted path: all of instrument, target, footprint and
-        accuracy, and those of effects that differ from their defaults.
+        Parameters by dotted path: SI scalars, strings or (n,) arrays. All parameters of instrument,
+        target, footprint and accuracy are needed, those of effects if they differ from the
+        defaults.
     effects : collection of str
         Names of the effects to simulate.
 
     Yields
     ------
     point_indices : ndarray (m,)
-        Indices of the points of a group.
+        Indices of the points of a category.
     shots : Shots
         Prepared shots of these points.
     """
@@ -109,7 +112,9 @@ def prepare_ray_traced_shots(
     effects: Collection[str] = DEFAULT_EFFECTS,
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Prepare shots whose footprints are given by ray tracing; all share strings and sizes.
+    """Return prepared shots with ray-traced footprints.
+
+    All points share text parameters and array sizes.
 
     Parameters
     ----------
@@ -121,8 +126,8 @@ def prepare_ray_traced_shots(
     effects : collection of str
         Names of the effects to simulate.
     effect_flags : ndarray (n,) uint32, optional
-        Bit mask of each shot's enabled effects, if shots differ. They may differ in effects that do
-        not need separate batches, as :class:`~sweep.model.effects.effect.Effect` states.
+        Bit mask of each shot's enabled effects, if shots differ. Shots may differ only in effects
+        with `Effect.needs_separate_batches` False (:class:`~sweep.model.effects.effect.Effect`).
     """
     parameter_arrays = parameters_as_arrays(PARAMETER_DEFAULTS | dict(parameters))
     return apply_effects(
@@ -137,9 +142,9 @@ def apply_effects(
     effects: Collection[str],
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Prepare shots, and apply all effects that are not random.
+    """Return prepared shots with all effects that are not random.
 
-    Before the effects each shot has a single line, that on the beam's axis.
+    Shots first get a single line, on the beam's axis. Effects are then applied one by one.
 
     Parameters
     ----------
@@ -166,9 +171,10 @@ def apply_effects(
 
 
 def _effect_masks(effects: Collection[str], effect_flags: np.ndarray) -> dict[str, np.ndarray]:
-    """Return masks (n,) of the effects that only some shots have: 1.0 where enabled, else 0.0.
+    """Return masks of effects, (n,) by effect name: 1.0 for shots with the effect, else 0.0.
 
-    ``effect_flags`` (n,) is the bit mask of each shot's enabled effects.
+    Effects that all shots have are left out. ``effect_flags`` (n,) is the bit mask of each shot's
+    enabled effects.
     """
     missing_bits = int(np.bitwise_or.reduce(~effect_flags)) if effect_flags.size else 0
     return {
@@ -184,7 +190,7 @@ def evaluate(
     *,
     segment_evaluator: Callable[[Shots], SegmentResults] = evaluate_segments,
 ) -> dict[str, np.ndarray]:
-    """Compute detection, false-alarm and other statistics of n shots on a flat plane.
+    """Compute statistics of detection and false alarms, and other outputs, of n shots on a plane.
 
     Parameters
     ----------
@@ -272,7 +278,7 @@ def shot_statistics(
 
 
 def measure_range_velocity(shots: Shots, segment_results: SegmentResults) -> waveform.RangeVelocity:
-    """Return the range and radial velocity that the strongest bins of the segments give.
+    """Return the range and radial velocity that follow from the segments' strongest bins.
 
     Parameters
     ----------
@@ -280,6 +286,11 @@ def measure_range_velocity(shots: Shots, segment_results: SegmentResults) -> wav
         Prepared shots.
     segment_results : SegmentResults
         Result of :func:`evaluate_segments`.
+
+    Returns
+    -------
+    RangeVelocity
+        Range [m] and radial velocity [m/s], (n,) each.
     """
     peak_frequencies, weights = segment_results.frequency, segment_results.magnitude**2
     if shots.waveform.chirp_rate_ratios != waveform.DEFAULT_CHIRP_RATE_RATIOS:
@@ -304,12 +315,12 @@ def measure_range_velocity(shots: Shots, segment_results: SegmentResults) -> wav
 
 
 MISREAD_TOLERANCE_BINS = 4
-"""Tolerated error of a measured range or velocity [bins], before it counts as misread. Causes are
-rounding of three peaks to bins, and motion between and within records."""
+"""Error of a measured range or velocity [FFT bins] above which it counts as misread. Smaller errors
+may be due to rounding of three peaks to bins, and to motion between and within records."""
 
 
 def find_misread_values(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
-    """Return whether noiseless spectra give a wrong range or radial velocity of the echo.
+    """Return masks of points at which noiseless spectra give a wrong range or radial velocity.
 
     Parameters
     ----------
@@ -321,7 +332,8 @@ def find_misread_values(shots: Shots, measured: waveform.RangeVelocity) -> np.nd
     Returns
     -------
     ndarray (2, n) bool
-        True where the range, and where the radial velocity, is misread.
+        First row: True where the range is wrong. Second row: True where the radial velocity is
+        wrong.
 
     Notes
     -----
@@ -380,7 +392,7 @@ def fit_range_velocity_to_peaks(
     weights: np.ndarray,
     point_indices: np.ndarray | slice = slice(None),
 ) -> waveform.RangeVelocity:
-    """Fit range and radial velocity at the start of the shot to the peak frequencies.
+    """Return the range and radial velocity at the shot's start that fit the peak frequencies best.
 
     Parameters
     ----------
@@ -392,7 +404,7 @@ def fit_range_velocity_to_peaks(
         Inverse variances of the frequencies up to a common factor; 0 where a segment is not
         detected.
     point_indices : ndarray (m,) or slice
-        Points to which the columns belong.
+        Points of `shots` to which the columns of the arrays belong.
     """
     coefficients = shots.beat_coefficients.select_points(point_indices)
     sample_rate = np.broadcast_to(shots.sample_rate, (shots.size,))[point_indices]
@@ -409,9 +421,10 @@ def fit_range_velocity_to_peaks(
 
 
 def _false_alarm_probabilities(shots: Shots, n_exempt: np.ndarray) -> dict[str, np.ndarray]:
-    """Compute the false-alarm probabilities of noise, and their decimal logarithms.
+    """Return the probabilities that noise raises a false alarm, and their log10, by output name.
 
-    The probabilities refer to a bin, the up-chirp, both chirps and any segment of the shot.
+    The probabilities, (n,) each, are those of one bin, the up-chirp, both chirps, and any segment
+    of the shot.
 
     Parameters
     ----------

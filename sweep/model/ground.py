@@ -39,7 +39,7 @@ REFLECTANCE_LAWS = ("thesis", "lambert", "lommel_seeliger")
 
 
 def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
-    """Return the backscattered fraction per steradian of a surface of reflectance 1.
+    """Return the fraction of power that a surface of reflectance 1 scatters back [1/sr].
 
     Parameters
     ----------
@@ -57,8 +57,8 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
     -----
     ``thesis`` is the diffuse law of [T 4.4], 1/(2 pi) at any incidence. ``lambert`` is
     cos(incidence)/pi. ``lommel_seeliger`` is 1/pi at any incidence. Its reflectance is the normal
-    albedo w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition surge). At
-    normal incidence this is Lambert's reflectance.
+    albedo w p(0) (1 + B(0)) / 8, with the single-scattering albedo w, the phase function p and the
+    opposition surge B. At normal incidence the normal albedo equals Lambert's reflectance.
     """
     if law == "thesis":
         return np.full_like(cos_incidence, 0.5 / math.pi)
@@ -74,17 +74,16 @@ class BeamletTable(NamedTuple):
     """
 
     row_of_point: np.ndarray
-    """(n,) int64: index of the row of each point."""
+    """(n,) int64: index of each point's row in the table."""
     relative_range_offset: np.ndarray
     """(rows, beamlets): range of a beamlet minus that on the axis, divided by the range on the
     axis."""
     doppler_ratio_offset: np.ndarray
-    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis. v_r is the
-    radial velocity.
-    """
+    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis, with the
+    radial velocity v_r."""
     relative_echo: np.ndarray
-    """(rows, beamlets): echo of a beamlet for reflectance 1 [1/sr]. It is the power fraction times
-    the backscatter, divided by the range loss between the axis's range and the beamlet's."""
+    """(rows, beamlets): echo of a beamlet for reflectance 1 [1/sr]: its power fraction times the
+    backscatter, divided by the range loss. The range loss is relative to the range on the axis."""
 
 
 class BeamGradients(NamedTuple):
@@ -94,11 +93,12 @@ class BeamGradients(NamedTuple):
     """
 
     doppler_ratio: np.ndarray
-    """(n,): change of the Doppler ratio 2 v_r / c per standard deviation of the beam."""
+    """(n,): change of the Doppler ratio 2 v_r / c per standard deviation of the beam, with the
+    radial velocity v_r."""
     relative_range: np.ndarray
-    """(n,): relative change of the range per standard deviation of the beam."""
+    """(n,): relative change of the range over one standard deviation of the beam."""
     relative_echo: np.ndarray
-    """(n,): relative change of the echo power per standard deviation of the beam."""
+    """(n,): relative change of the echo power over one standard deviation of the beam."""
 
 
 class _PlaneGeometry(NamedTuple):
@@ -108,24 +108,27 @@ class _PlaneGeometry(NamedTuple):
     """
 
     grazing_angle: np.ndarray
-    """Angle between beam and plane [rad], pi/2 at normal incidence."""
+    """Angle between the beam and the plane [rad], pi/2 at normal incidence."""
     position_spread_angle: np.ndarray
-    """Full 1/e^2 angle [rad] of the illuminated positions on the target, seen from the lidar."""
+    """Full 1/e^2 angle [rad] that the illuminated positions on the target subtend at the lidar."""
     radial_velocity: np.ndarray
-    """Radial velocity on the beam's axis [m/s], positive when closing; 0 if beamlets have no
-    velocities of their own."""
+    """Radial velocity on the beam's axis [m/s], positive when closing; 0 if all beamlets share one
+    velocity."""
     transverse_velocity: np.ndarray
-    """Velocity across the beam [m/s]; 0 if beamlets have no velocities of their own."""
+    """Velocity across the beam [m/s]; 0 if all beamlets share one velocity."""
     direction_spread_angle: np.ndarray | None = None
-    """Full 1/e^2 angle of the spread of light directions [rad]."""
+    """Full 1/e^2 angle of the spread of light directions [rad]; None if it is
+    `position_spread_angle`."""
     range_loss_linear_coefficient: np.ndarray | None = None
-    """Coefficient b of the range loss 1 + b x + c x^2 for a relative range change x."""
+    """Coefficient b of the range loss 1 + b x + c x^2 for a relative range change x. None stands
+    for the loss (1 + x)^2."""
     range_loss_quadratic_coefficient: np.ndarray | None = None
-    """Coefficient c of the range loss 1 + b x + c x^2 for a relative range change x."""
+    """Coefficient c of the range loss 1 + b x + c x^2 for a relative range change x. None stands
+    for the loss (1 + x)^2."""
 
     @property
     def direction_sigma(self) -> np.ndarray:
-        """Standard deviation of the directions of the light, per axis [rad]."""
+        """Standard deviation of the light directions along each axis of the beam [rad]."""
         angle = (
             self.position_spread_angle
             if self.direction_spread_angle is None
@@ -150,8 +153,7 @@ class FlatGround:
 
     is_on_other_surface = None
     """Mask of beamlets that hit another surface than the beam's axis does. It is None, because a
-    plane is a single surface.
-    """
+    plane is a single surface."""
 
     def __init__(
         self, parameters: Mapping[str, np.ndarray], n_points: int, *, has_velocities: bool = True
@@ -179,17 +181,16 @@ class FlatGround:
     def mean_phasor(self, doppler_cycles: np.ndarray, delay_cycles: np.ndarray) -> np.ndarray:
         """Return the mean phasor of the echo over the beam, (n,) complex.
 
-        The phasor at a position of the beam is exp(2 pi i (doppler_cycles dbeta - delay_cycles dR /
-        R)).
+        The phasor at a position of the beam is exp(2 pi i (doppler_cycles db - delay_cycles dR /
+        R)). db is the Doppler ratio minus that on the axis, dR the range minus the range R on the
+        axis.
 
         Parameters
         ----------
         doppler_cycles : array_like
-            Cycles per unit of Doppler ratio, (n,) or scalar; dbeta is the Doppler ratio minus that
-            on the axis.
+            Cycles per unit of the Doppler ratio, (n,) or scalar.
         delay_cycles : array_like
-            Cycles per unit of relative range, (n,) or scalar; dR / R is the range minus that on the
-            axis, divided by the range on the axis.
+            Cycles per unit of the relative range dR / R, (n,) or scalar.
 
         Notes
         -----
@@ -229,9 +230,9 @@ class FlatGround:
 
     @property
     def gradients(self) -> "BeamGradients":
-        """Changes of Doppler ratio, range and echo towards the near side of the plane.
+        """Changes of Doppler ratio, range and echo per standard deviation of the beam.
 
-        The changes are per standard deviation of the beam.
+        The changes are towards the near side of the plane.
         """
         geometry = self._geometry
         range_gradient = (geometry.position_spread_angle / 4) / np.tan(geometry.grazing_angle)
@@ -244,9 +245,9 @@ class FlatGround:
         return BeamGradients(*(np.broadcast_to(column, self._n_points) for column in columns))
 
     def axis_beamlet(self, n_points: int) -> BeamletTable:
-        """Return a table with one beamlet per footprint, which lies on the beam's axis.
+        """Return a table with one beamlet per footprint, on the beam's axis.
 
-        The table has one row for each distinct grazing angle and `n_points` points.
+        The table has a row for each distinct grazing angle, which the `n_points` points share.
         """
         grazing_angles, angle_index = np.unique(self._geometry.grazing_angle, return_inverse=True)
         relative_echo = backscatter(self._reflectance_law, np.sin(grazing_angles))[:, None]
@@ -257,7 +258,7 @@ class FlatGround:
 
     @cached_property
     def beamlets(self) -> BeamletTable:
-        """Table of all beamlets of the footprints, with one row for each distinct geometry."""
+        """Table of all beamlets of the footprints; points of equal geometry share a row."""
         columns = [column for column in self._geometry if column is not None]
         first, geometry_of_point = find_distinct_rows(columns)
         geometry = _PlaneGeometry(*np.stack(columns)[:, first])
@@ -307,7 +308,7 @@ class RayTracedGround:
     def axis_beamlet(self, n_points: int) -> BeamletTable:
         """Return a table with one beamlet per footprint, on the beam's axis, for `n_points` points.
 
-        The beamlet has the total echo of the point's beamlets.
+        The beamlet has the summed echo of all beamlets of the footprint.
         """
         total_echo = self.beamlets.relative_echo.sum(axis=1)[:, None]
         zeros = np.zeros_like(total_echo)
@@ -315,13 +316,13 @@ class RayTracedGround:
 
 
 Ground = FlatGround | RayTracedGround
-"""Type of the ground that the beams of n points meet."""
+"""Type of the ground that the beams of n points meet: a plane or ray-traced footprints."""
 
 
 def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
-    """Return True if beamlets add as powers, False if as amplitudes.
+    """Return True if the powers of beamlets add, False if their amplitudes do.
 
-    All points must have the same text parameters.
+    All points must share their text parameters.
     """
     incoherent = str(parameters["footprint.phases"]) == "incoherent"
     return incoherent and str(parameters["instrument.receiver.architecture"]) != "direct"
@@ -330,7 +331,8 @@ def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
 def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
     """Return the name of the beamlets' pattern, one of `sweep.model.beamlets.BEAMLET_PATTERNS`.
 
-    By default it is hexagonal where powers add, otherwise a sunflower, which has no symmetry.
+    A pattern that is not stated is hexagonal if powers add. It is a sunflower, which has no
+    symmetry, if amplitudes add.
     """
     stated = str(parameters["footprint.pattern"])
     if stated != "auto":
@@ -339,40 +341,40 @@ def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
 
 
 def _table_rows_of_points(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
-    """Return the table row of each of n points, (n,) int64.
+    """Return the index of each point's table row, (n,) int64.
 
-    ``row_of_point`` is (n,), or one row for all points.
+    ``row_of_point`` is (n,), or the one row that all points share.
     """
     return np.broadcast_to(row_of_point.ravel(), n_points).astype(np.int64)
 
 
 class FootprintExtent(NamedTuple):
-    """Echoes of n points' footprints, and spread of their ranges and velocities, (n,) each."""
+    """Echoes of n points' footprints, and moments of their ranges and velocities, (n,) each."""
 
     axis_echo: np.ndarray
     """Echo of a single line on the beam's axis for reflectance 1 [1/sr]."""
     total_to_axis_echo_ratio: np.ndarray | float
-    """Ratio of the echo of all beamlets to that of a single line on the beam's axis."""
+    """Echo of all beamlets, divided by that of a single line on the beam's axis."""
     range_offset_moments: OffsetMoments
-    """Moments of the beamlets' relative range offsets: range minus that on the axis, divided by the
-    range on the axis."""
+    """Moments of the beamlets' relative range offsets: the range minus that on the axis, divided by
+    the range on the axis."""
     axis_surface_range_offset_moments: OffsetMoments
-    """Moments of the relative range offsets of those beamlets on the same surface as the axis."""
+    """Moments of relative range offsets, as `range_offset_moments`, of only those beamlets that hit
+    the same surface as the axis."""
     velocity_offset_moments: OffsetMoments
     """Moments of the beamlets' radial velocities minus that on the beam's axis [m/s]."""
     amplitude_gain_max: np.ndarray | float = 1.0
-    """Largest ratio of the beamlets' total amplitude to that of the single line on the axis.
-    Beamlets are in phase, or add as powers.
-    """
+    """Largest ratio of the beamlets' total amplitude to that of the single line on the axis, with
+    beamlets in phase or with powers that add."""
     other_surface_echo_fraction: np.ndarray | float = 0.0
-    """Fraction of the echo from other surfaces than the one on the beam's axis, 0..1."""
+    """Fraction of the echo that comes from surfaces which the beam's axis does not hit, 0..1."""
     other_surface_range_offset_max: np.ndarray | float = 0.0
-    """Largest relative range offset, as a magnitude, of beamlets on other surfaces than the axis's.
-    """
+    """Largest magnitude of the relative range offset of beamlets on surfaces that the axis does not
+    hit."""
 
 
 def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
-    """Compute the :class:`FootprintExtent` of footprints by ray tracing."""
+    """Return the :class:`FootprintExtent` of ray-traced footprints."""
     _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
     is_on_other_surface = ground.is_on_other_surface
     total_echo = relative_echo.sum(axis=1)
@@ -414,7 +416,7 @@ def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
 
 
 def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
-    """Return the :class:`OffsetMoments` (n,) of ``values`` (n, m).
+    """Return the weighted :class:`OffsetMoments` (n,) of ``values`` (n, m).
 
     ``weights`` (n, m) sum to 1 in each row.
     """
@@ -426,7 +428,7 @@ def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
 
 
 def find_distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Find the distinct rows of a table that is given by its columns.
+    """Find the distinct rows of a table whose columns are separate arrays.
 
     Parameters
     ----------
@@ -436,9 +438,9 @@ def find_distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.nd
     Returns
     -------
     first_rows : ndarray (distinct,)
-        Index of one row for each distinct row.
+        Indices of table rows that all differ, one for each distinct row.
     distinct_of_row : ndarray (n,)
-        For each row of the table, the index in `first_rows` of the row that equals it.
+        For each row of the table, the index in `first_rows` of the equal row.
     """
     order = np.lexsort(columns)
     rows = np.stack(columns)[:, order]

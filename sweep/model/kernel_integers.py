@@ -13,8 +13,8 @@ import numpy as np
 INTEGER_ZERO, INTEGER_ONE = np.int64(0), np.int64(1)
 """The integers 0 and 1."""
 NO_INDEX = np.int64(-1)
-"""Index that stands for none."""
+"""Value of an index that means: there is none."""
 THREE_BINS = np.int64(3)
-"""Number of bins of a peak and its two neighbours."""
+"""Number of bins of a peak and its two neighbours, 3."""
 STEP_UP, STEP_DOWN = np.int64(1), np.int64(-1)
 """Steps from a bin to the next one above and below."""

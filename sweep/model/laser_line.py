@@ -47,50 +47,53 @@ DEVIATION_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 """Ratio of a Gaussian's standard deviation to its full width at half maximum (FWHM)."""
 
 MEAN_POWER_TOLERANCE = 1e-12
-"""Error of a mean power computed as a sum over frequency shifts, relative to the power at the
-line's peak."""
+"""Tolerated error of a mean power that is computed as a sum over frequency shifts, relative to the
+power at the line's peak."""
 
 LINE_DEVIATION_MAX_WINDOW_BINS = 500
-"""Largest standard deviation of a Gaussian laser line [bins of fs/L] that can be simulated. fs is
+"""Largest standard deviation of a Gaussian laser line that can be simulated [bins of fs/L]. fs is
 the sample rate, L the number of samples."""
 
 
 _gauss_legendre = lru_cache(maxsize=1)(np.polynomial.legendre.leggauss)
 
 _DECAY_EXPONENT_MAX = 40.0
-"""Exponent x above which the factor exp(-x), by which the laser loses coherence, counts as 0."""
+"""Exponent x above which the decay exp(-x) of the laser's coherence counts as 0."""
 
 _DECAY_PER_SAMPLE_MIN = 0.1
-"""Decay exponent of the laser's coherence per sample above which lags are summed one by one. After
-400 lags the remaining terms are negligible."""
+"""Decay exponent of the laser's coherence per sample above which the pedestal's power is a sum over
+single lags. After 400 lags the remaining terms are negligible."""
 
 _N_PHASE_NODES = 256
-"""Number of positions in the record for computing the phase's mean under the window, which is
-subtracted."""
+"""Number of positions in the record at which phases are evaluated for the pedestal that |X| shows.
+"""
 
 _LINE_POWER_FRACTION_MIN = 1e-100
-"""Lower limit of the fraction of power in the pure line. It keeps divisions by the fraction finite.
-"""
+"""Lower limit of the fraction of power in the pure line, so that divisions by the fraction stay
+finite."""
 
 
 class LaserLine(NamedTuple):
-    """Line width of the laser and noise of its phase-noise pedestal; a pure tone by default."""
+    """Width of the laser's line, and power of its phase-noise pedestal; a pure tone by default."""
 
     gaussian_fwhm: np.ndarray | None = None
-    """(n,): full width at half maximum [Hz] of the beat's Gaussian line; None without a Gaussian
-    line.
-    """
+    """(n,): full width at half maximum of the beat's Gaussian line [Hz]; None if the line is not
+    Gaussian."""
     lorentzian_fwhm: np.ndarray | float = 0.0
-    """(n,): full width at half maximum [Hz] of the laser's Lorentzian line, from a random walk of
-    its phase.
-    """
+    """(n,): full width at half maximum of the laser's Lorentzian line [Hz], whose cause is a random
+    walk of the phase; 0 without one."""
     pedestal_variance_beside_line: np.ndarray | float = 0.0
-    """Phase-noise pedestal as noise variance at the ADC [V^2], in bins next to the lines."""
+    """(n,): variance of noise at the ADC [V^2] that equals the phase-noise pedestal in bins next to
+    the lines."""
     pedestal_variance_under_line: np.ndarray | float = 0.0
-    """Phase-noise pedestal as noise variance at the ADC [V^2], only in bins that contain lines."""
+    """(n,): variance of noise at the ADC [V^2] that equals the phase-noise pedestal in bins that
+    contain lines."""
 
     def scale_pedestal(self, power_factor: np.ndarray) -> "LaserLine":
-        """Return the laser line with a pedestal for an echo whose power changes by a factor."""
+        """Return a copy whose pedestal variances are multiplied by ``power_factor``.
+
+        The factor is that on the echo's power.
+        """
         return self._replace(
             pedestal_variance_beside_line=self.pedestal_variance_beside_line * power_factor,
             pedestal_variance_under_line=self.pedestal_variance_under_line * power_factor,
@@ -98,16 +101,19 @@ class LaserLine(NamedTuple):
 
 
 class FrequencyShifts(NamedTuple):
-    """Frequency shifts of all lines, with weights, over which the power spectrum is averaged."""
+    """Shifts of a footprint's lines, with weights, over which the power spectrum is averaged."""
 
     shift_window_bins: np.ndarray
-    """(n, k): shift of all lines [bins of fs/L, sample rate over number of samples]."""
+    """(n, k): frequency shift, common to all lines of a point [bins of fs/L, sample rate over
+    number of samples]."""
     weight: np.ndarray
-    """(n, k): weight of the power spectrum at each shift, >= 0; the sum is 1."""
+    """(n, k): weight, >= 0, of the power spectrum at each shift; weights of a point sum to 1."""
 
 
 def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> FrequencyShifts:
-    """Return frequency shifts whose weighted mean power equals that of a Gaussian laser line.
+    """Return frequency shifts that replace a Gaussian laser line in a mean of power spectra.
+
+    The weighted mean of the power spectrum over the shifts equals that over the Gaussian line.
 
     Parameters
     ----------
@@ -129,8 +135,9 @@ def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Freq
 
     Notes
     -----
-    With step h the error is exp(-2 pi^2 s^2 (1/h - 1)^2) at the record's longest lag, by Poisson's
-    summation formula. The Gaussian's tails are cut where they hold as much.
+    With the step h and the standard deviation s of the line, in bins, the error at the record's
+    longest lag is exp(-2 pi^2 s^2 (1/h - 1)^2), by Poisson's summation formula. The Gaussian is cut
+    where its tails hold the same fraction.
     """
     deviation = np.atleast_1d(DEVIATION_PER_FWHM * np.asarray(fwhm, float) * duration)
     if deviation.max(initial=0.0) > LINE_DEVIATION_MAX_WINDOW_BINS:
@@ -159,7 +166,9 @@ def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Freq
 def pure_line_power_fraction(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray
 ) -> np.ndarray:
-    """Return the fraction of the beat's power in the pure line of a Lorentzian laser, 0..1.
+    """Return the fraction, 0..1, of the beat's power in the pure line of a Lorentzian laser.
+
+    The rest of the power is in the phase-noise pedestal.
 
     Parameters
     ----------
@@ -182,7 +191,9 @@ def pure_line_power_fraction(
 
 
 def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """Return the power density of the phase-noise pedestal under a line of power 1 [1/Hz].
+    """Return the power density [1/Hz] of the phase-noise pedestal under a line.
+
+    The total power of line and pedestal is 1.
 
     Parameters
     ----------
@@ -206,7 +217,9 @@ def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) ->
 def pedestal_power_under_line(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
 ) -> np.ndarray:
-    """Return the pedestal's mean power in its line's bin, relative to the squared line amplitude.
+    """Return the mean power of the phase-noise pedestal in the bin of its line, relative to |C|^2.
+
+    |C| is half the amplitude of the beat, the weight of its line.
 
     Parameters
     ----------
@@ -218,9 +231,9 @@ def pedestal_power_under_line(
     Returns
     -------
     ndarray (n,)
-        >= 0. A line of weight C (|C| = a/2) has the mean bin power |C|^2 times (coherent fraction x
-        |W(0)|^2 + this). The pedestal adds as noise does: circular, and independent in every
-        record.
+        Pedestal power p >= 0. The mean power of the bin is |C|^2 (F |W(0)|^2 + p), with the
+        fraction F of :func:`pure_line_power_fraction` and the window's sum W(0). The pedestal adds
+        as noise does: circular, and independent in every record.
 
     Notes
     -----
@@ -245,10 +258,10 @@ def pedestal_power_under_line(
 
 
 def _pedestal_power_by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """Return the pedestal's power as a sum over lags, up to where the terms have decayed.
+    """Return the power of :func:`pedestal_power_under_line`, (n,), as a sum over lags.
 
-    ``gamma`` is the decay exponent of the laser's coherence over a record, ``lag`` the largest lag
-    [record lengths].
+    The sum ends where its terms have decayed. ``gamma`` is the decay exponent of the laser's
+    coherence over a record, ``lag`` the largest lag [record lengths].
     """
     j = np.arange(min(int(_DECAY_EXPONENT_MAX / _DECAY_PER_SAMPLE_MIN), window.length))
     decay = (gamma / window.length)[:, None] * j
@@ -259,10 +272,12 @@ def _pedestal_power_by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) 
 
 
 def _pedestal_power_by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """Return the pedestal's power as an integral over the lag, with a correction for sampling.
+    """Return the power of :func:`pedestal_power_under_line`, (n,), as an integral over the lag.
 
-    The correction is for the aliasing of the integrand's kinks. The sum over m != 0 of cos(2 pi m
-    x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with the Bernoulli polynomial B_2(x) = x^2 - x + 1/6.
+    ``gamma`` is the decay exponent of the laser's coherence over a record, ``lag`` the largest lag
+    [record lengths]. A correction makes the integral equal the sum over sampled lags. It follows
+    from the kinks of the integrand, where the sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is
+    B_2(x - floor(x)) / 2, with the Bernoulli polynomial B_2(x) = x^2 - x + 1/6.
     """
     length = window.length
     lag_max = np.minimum(lag, _DECAY_EXPONENT_MAX / np.maximum(gamma, 1e-300))
@@ -294,10 +309,10 @@ def apparent_line_and_pedestal(
     window: Window,
     looks: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power of line and phase-noise pedestal as the spectrum's magnitude shows it.
+    """Return the powers of line and phase-noise pedestal that appear in a bin's magnitude.
 
-    Both are powers in the line's bin. A phase common to the full record does not change the
-    magnitude and is excluded.
+    Both are powers in the line's bin, relative to the line's weight C, half the beat's amplitude. A
+    phase common to the full record does not change the magnitude and is excluded.
 
     Parameters
     ----------
@@ -306,23 +321,24 @@ def apparent_line_and_pedestal(
     window : Window
         Window of the record.
     looks : int
-        Number of looks that are added in amplitude. With several, the phase of each record counts
-        as well.
+        Number of looks whose amplitudes are added. With several, the phase of each record is
+        included.
 
     Returns
     -------
     line_fraction : ndarray (n,)
         Fraction of the power |C W(0)|^2 in the line; larger than :func:`pure_line_power_fraction`.
     in_phase_pedestal : ndarray (n,)
-        Mean square of the pedestal in phase with the line, relative to |C|^2. As noise, half of
-        this counts.
+        Mean square of the pedestal in phase with the line, relative to |C|^2. Its noise variance
+        per quadrature is half of this.
 
     Notes
     -----
-    C(t, s) is the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
-    window w. The line is m = sum w E, and the pedestal sum w E w E cosh C - m^2. C(t, s) is c(t -
-    s) - q(t) - q(s), with the triangle c = Gamma (tau - |t|). So each exponential is a product of
-    functions of the lag, of t and of s: autocorrelations of w and of w exp(2 q), at 256 positions.
+    Let phi(t) be the phase less its mean under the window w, K(t, s) its covariance, and E_t =
+    exp(-K(t, t) / 2). The line is m = sum_t w_t E_t, the pedestal sum_t,s w_t E_t w_s E_s cosh K(t,
+    s) - m^2. K(t, s) is c(t - s) - q(t) - q(s), with the triangle c(t) = Gamma (tau - |t|). So each
+    exponential is a product of functions of the lag t - s, of t and of s, and the sums are
+    autocorrelations of w and of w exp(2 q), at 256 positions.
     """
     power = pedestal_power_under_line(
         line_width=line_width, delay=delay, duration=duration, window=window
@@ -386,8 +402,8 @@ def apparent_line_and_pedestal(
 def _window_samples_and_double_integral(window: Window) -> "tuple[np.ndarray, CubicSpline]":
     """Return samples of the window, and its double integral over the position in the record.
 
-    The samples, (n,), are at evenly spaced positions and have the sum 1. The integral is a spline
-    of the position in record lengths, 0..1. It is scaled so that its slope at 1 is 1.
+    The samples, (:data:`_N_PHASE_NODES`,), are at evenly spaced positions and have the sum 1. The
+    double integral is a spline of the position in record lengths, 0..1. Its slope at 1 is 1.
     """
     from scipy.interpolate import CubicSpline  # slow to import
 
@@ -403,7 +419,7 @@ def _window_samples_and_double_integral(window: Window) -> "tuple[np.ndarray, Cu
 
 
 def n_beat_phase_noise_steps(*, delay: float, length: int) -> int:
-    """Return the even number of steps that :func:`beat_phase_noise` takes.
+    """Return the number of random steps, an even number, that :func:`beat_phase_noise` needs.
 
     Parameters
     ----------
@@ -419,25 +435,26 @@ def n_beat_phase_noise_steps(*, delay: float, length: int) -> int:
 def beat_phase_noise(
     steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
 ) -> np.ndarray:
-    """Return a laser's phase minus its phase one delay earlier [rad], over a record.
+    """Return a random laser's phase minus its phase one delay earlier [rad], for each sample.
 
     The laser's phase theta(t) is a random walk. The result is theta(t) - theta(t - tau).
 
     Parameters
     ----------
     steps : ndarray (n_steps,)
-        Standard normal numbers; :func:`n_beat_phase_noise_steps` gives their number.
+        Standard normal numbers, as many as :func:`n_beat_phase_noise_steps` returns.
     variance_per_sample : float
         Variance of theta's change from sample to sample, Gamma / fs [rad^2].
     delay : float
         Delay tau [samples].
     from_first_sample : bool
-        True to include the first sample's phase, for a delay shorter than the record. Otherwise the
-        phase is relative to the first sample's.
+        True to include the phase of the first sample, for a delay shorter than the record. False
+        for phases relative to that of the first sample.
 
     Returns
     -------
     ndarray (L,)
+        Phase [rad] at each of the record's L samples.
 
     Notes
     -----
@@ -460,9 +477,9 @@ def beat_phase_noise(
 
 @lru_cache(maxsize=16)
 def window_autocorrelation(window: Window) -> "CubicSpline":
-    """Return the sum over n of w_n w_(n+j) as a spline over the lag j, 0..L [samples].
+    """Return the autocorrelation of a window as a spline over the lag j, 0..L [samples].
 
-    w are the L samples of the window.
+    It is the sum over n of w_n w_(n+j), with the L samples w of the window.
     """
     from scipy.interpolate import CubicSpline  # slow to import
 

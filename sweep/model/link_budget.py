@@ -30,15 +30,15 @@ from sweep.model.shot_settings import (
 from sweep.model.threshold import tnr_from_parameters
 
 BEAM_ELEVATION_PATH = "path.elevation"
-"""Parameter path of the beam's angle below the horizon [rad], one value per shot. It is present
-only in scenes."""
+"""Parameter path of the beam's angle below the horizon [rad], one value per shot. Only shots of a
+scene have it."""
 
 ADC_NOISE_SOURCE = "quantisation"
-"""Name of the noise source that is added after the receiver: the ADC's quantisation."""
+"""Name of the ADC's noise source, quantisation, which the receiver's filters do not affect."""
 
 ECHO_NOISE_SOURCES = frozenset({"signal_shot"})
-"""Names of noise sources that are present only with an echo. The threshold does not depend on them.
-"""
+"""Names of noise sources that exist only with an echo, so that the threshold does not depend on
+them."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,16 +52,15 @@ class ReceiverFilter:
     sample_rate: np.ndarray
     """Sample rate of the ADC [Hz]."""
     noise_shape: str
-    """Spectrum of the noise: ``receiver``, filtered as signals are, or ``white``, unfiltered, as in
-    [T].
-    """
+    """Spectrum of the noise: ``receiver``, filtered as signals are; or ``white``, unfiltered, as in
+    [T]."""
     antialias_parameters: dict[str, np.ndarray] = field(default_factory=dict)
-    """Bandwidth [Hz] and order of the anti-alias filter by parameter name; empty without a filter.
-    """
+    """Bandwidth [Hz] and order of the anti-alias filter, by parameter name; empty if there is no
+    filter."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "ReceiverFilter":
-        """Return the filter from a mapping of dotted paths to parameter values."""
+        """Return the receiver's filter from parameters by dotted path."""
         return cls(
             detector_bandwidth=parameters[RECEIVER_PREFIX + "detector_bandwidth"],
             amplifier_bandwidth=parameters[RECEIVER_PREFIX + "amplifier_bandwidth"],
@@ -73,7 +72,7 @@ class ReceiverFilter:
         )
 
     def pole_amplitude_gain(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the amplitude gain of detector and amplifier for a signal, relative to DC.
+        """Return the amplitude gain of detector and amplifier at a frequency, relative to DC.
 
         Parameters
         ----------
@@ -85,7 +84,7 @@ class ReceiverFilter:
     def _pole_transfer(self, frequency: np.ndarray) -> np.ndarray:
         """Return the complex transfer function of detector and amplifier, relative to DC.
 
-        ``frequency`` is signed [Hz].
+        ``frequency`` is that of a signal, with its sign [Hz].
         """
         return receiver_chain.receiver_transfer(
             frequency,
@@ -94,7 +93,7 @@ class ReceiverFilter:
         )
 
     def antialias_amplitude_gain(self, frequency: np.ndarray) -> np.ndarray | float:
-        """Return the amplitude gain of the anti-alias filter for a signal; 1 without a filter.
+        """Return the amplitude gain of the anti-alias filter at a frequency; 1 without a filter.
 
         Parameters
         ----------
@@ -108,7 +107,7 @@ class ReceiverFilter:
         )
 
     def amplitude_gain(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the amplitude gain of poles and anti-alias filter for a signal, relative to DC.
+        """Return the amplitude gain of detector, amplifier and anti-alias filter, relative to DC.
 
         Parameters
         ----------
@@ -119,6 +118,8 @@ class ReceiverFilter:
 
     def relative_noise_density(self, frequency: np.ndarray) -> np.ndarray | float:
         """Return the receiver's noise density, relative to white noise of the same variance.
+
+        The result is 1 if the noise is taken as white.
 
         Parameters
         ----------
@@ -141,7 +142,7 @@ class ReceiverFilter:
         adc_noise_fraction: np.ndarray | float,
         bin_frequency: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the amplitude gain of a line in a spectrum whose noise is whitened.
+        """Return the factor on a line's amplitude in a spectrum whose noise is whitened.
 
         Whitening divides the spectrum by the square root of the noise's relative density, so that
         all bins have the same noise.
@@ -153,8 +154,8 @@ class ReceiverFilter:
         adc_noise_fraction : ndarray or float
             Fraction of the noise variance that the ADC adds, which is white already.
         bin_frequency : ndarray, optional
-            Frequency [Hz] of the bins whose noise density applies, for skirts of the line; by
-            default that of the line.
+            Frequency [Hz] of the bins in which the line is observed, whose noise density applies;
+            by default the line's frequency.
 
         Returns
         -------
@@ -178,60 +179,59 @@ class ReceiverFilter:
 
 @dataclass(frozen=True, eq=False)
 class NoiseBudget:
-    """Noise variance at the ADC by source, and its later changes."""
+    """Noise variance of a sample at the ADC by source, and a factor on the total variance."""
 
     variances: dict[str, np.ndarray]
-    """Noise variance of a sample [V^2] by name of the source."""
+    """Noise variance of a sample [V^2] by the source's name."""
     variance_factor: np.ndarray | float = 1.0
-    """Factor on the total noise variance. It accounts for changes of the record after the threshold
-    was set.
-    """
+    """Factor on the total noise variance, for changes of the record that the threshold does not
+    follow."""
 
     def with_sources(self, **variances: np.ndarray) -> "NoiseBudget":
-        """Return the budget with sources added or replaced.
+        """Return a copy of the budget with noise sources added or replaced.
 
-        ``variances`` are noise variances [V^2] by name of the source.
+        ``variances`` are noise variances [V^2] by the source's name.
         """
         return NoiseBudget(self.variances | variances, self.variance_factor)
 
     @cached_property
     def variance_without_echo(self) -> np.ndarray:
-        """Noise variance of a sample without an echo [V^2]; the threshold depends on it."""
+        """Noise variance of a sample without an echo [V^2], which determines the threshold."""
         variances = (v for name, v in self.variances.items() if name not in ECHO_NOISE_SOURCES)
         return np.asarray(sum(variances))
 
     @cached_property
     def variance(self) -> np.ndarray:
-        """Noise variance of a sample [V^2], sum over all sources."""
+        """Noise variance of a sample [V^2], the sum over all sources times `variance_factor`."""
         echo_variances = (v for name, v in self.variances.items() if name in ECHO_NOISE_SOURCES)
         return (self.variance_without_echo + sum(echo_variances)) * self.variance_factor
 
     @property
     def adc_noise_fraction(self) -> np.ndarray | float:
-        """ADC's fraction of the noise variance without an echo, 0..1."""
+        """Fraction, 0..1, of the noise variance without an echo that the ADC adds."""
         return self.variances.get(ADC_NOISE_SOURCE, 0.0) / self.variance_without_echo
 
 
 class EchoScales(NamedTuple):
     """Echo power [W] and beat amplitude [V] of a target whose relative echo is 1/sr.
 
-    The relative echo is the backscatter of the beamlets [1/sr]. Effects multiply the power, the
-    amplitude, and the transmission of other light from the ground.
+    The relative echo [1/sr] is the sum over beamlets of power fraction times backscatter. Effects
+    multiply the fields by factors.
     """
 
     echo_power_scale: np.ndarray
-    """Echo power on the detector [W] for a relative echo of 1/sr."""
+    """Echo power on the detector [W] if the relative echo is 1/sr."""
     beat_amplitude_scale: np.ndarray
-    """Amplitude of the beat at the ADC [V] for a relative amplitude of 1, before the receiver's
-    poles.
-    """
+    """Amplitude of the beat at the ADC [V] if the relative amplitude is 1, before the low-pass
+    poles of the receiver."""
     ground_light_transmission: np.ndarray | float = 1.0
-    """Fraction of light from the ground, such as sunlight, that reaches the receiver."""
+    """Fraction, 0..1, of light from the ground other than the echo, such as sunlight, that reaches
+    the receiver."""
 
     def scale_echo(
         self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
     ) -> "EchoScales":
-        """Return these scales with factors on the echo's power and on the beat's amplitude.
+        """Return a copy with factors on the echo's power and on the beat's amplitude.
 
         Parameters
         ----------
@@ -266,12 +266,12 @@ class LinkBudget:
 
     @cached_property
     def waveform(self) -> WaveformSettings:
-        """Waveform of a shot: chirp rates, frequencies and times of its segments."""
+        """Chirp rates, frequencies and times of a shot's segments."""
         return WaveformSettings.from_parameters(self.parameters)
 
     @cached_property
     def record(self) -> RecordSettings:
-        """Recorded samples of a segment: window, FFT size and sample rate."""
+        """Window, FFT size, sample rate and start of the record of a segment."""
         return RecordSettings.from_parameters(self.parameters)
 
     @cached_property
@@ -286,7 +286,7 @@ class LinkBudget:
 
     @cached_property
     def looks(self) -> Looks:
-        """Number of looks, the records of each segment, and the way they are combined."""
+        """Number of looks (records of each segment), and how they are combined."""
         return Looks.from_parameters(self.parameters)
 
     @cached_property
@@ -308,21 +308,20 @@ class LinkBudget:
 
     @cached_property
     def noise(self) -> NoiseBudget:
-        """Noise budget at the ADC of the receiver's own sources."""
+        """Noise budget of the receiver's own sources, before effects add sources."""
         return NoiseBudget(self.receiver_noise.variances)
 
     @cached_property
     def tnr(self) -> np.ndarray:
-        """Threshold-to-noise ratio, as set by the processing parameters.
+        """Threshold-to-noise ratio that the processing parameters set.
 
-        The ratio is the threshold divided by the standard deviation of a bin's magnitude with noise
-        alone.
+        It is the threshold divided by the standard deviation of the magnitude of a noise-only bin.
         """
         return tnr_from_parameters(self.parameters)
 
     @cached_property
     def threshold_ratio(self) -> np.ndarray:
-        """Ratio of the threshold on a bin's magnitude to the noise sigma per quadrature.
+        """Threshold on a bin's magnitude, divided by the noise sigma per quadrature.
 
         The noise is that of a bin without an echo.
         """
@@ -330,7 +329,9 @@ class LinkBudget:
 
 
 def threshold(tnr: np.ndarray, bin_noise_sigma: np.ndarray) -> np.ndarray:
-    """Return the threshold on a bin's magnitude [V].
+    """Return the threshold on a bin's magnitude [V] for a threshold-to-noise ratio.
+
+    The ratio is the threshold over the standard deviation of a noise-only bin's magnitude.
 
     Parameters
     ----------
@@ -345,7 +346,7 @@ def threshold(tnr: np.ndarray, bin_noise_sigma: np.ndarray) -> np.ndarray:
 
 
 def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the noise variance [V^2] that quantisation adds at the ADC."""
+    """Return the variance of the ADC's quantisation noise [V^2], (n,) or a scalar."""
     full_scale, bits = (parameters[PROCESSING_PREFIX + name] for name in ("full_scale", "bits"))
     return receiver_chain.quantisation_variance(
         full_scale=full_scale, bits=bits, is_iq_sampled=is_iq_sampled(parameters)
@@ -353,7 +354,9 @@ def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarray:
-    """Return the beat amplitude, divided by its scale, for a relative echo [1/sr].
+    """Return the beat amplitude that a relative echo causes, divided by its scale.
+
+    The scale is :attr:`EchoScales.beat_amplitude_scale`.
 
     Parameters
     ----------
@@ -374,7 +377,7 @@ def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarr
 def echo_power_and_beat_current(
     architecture: str, parameters: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the echo power [W] and the beat photocurrent [A] for a backscatter of 1/sr.
+    """Return the echo power [W] and the beat photocurrent [A] for a backscatter of 1/sr.
 
     Parameters
     ----------
@@ -418,7 +421,7 @@ def echo_power_and_beat_current(
 def beat_current(
     architecture: str, parameters: Mapping[str, np.ndarray], power: np.ndarray
 ) -> np.ndarray:
-    """Return the amplitude of the beat photocurrent [A] of received light.
+    """Return the amplitude of the beat photocurrent [A] that received light causes.
 
     Parameters
     ----------
@@ -431,10 +434,12 @@ def beat_current(
 
     Notes
     -----
-    Coherent architectures: 2 M Re sqrt(eta P_lo P), with the heterodyne efficiency eta, a fraction
-    of power. Direct detection: m M Re P, hence 2 dB of SNR for each dB of light. [T 2.22] takes 2
-    Re^2 P^2 as the mean square current, which is the peak of a fully modulated echo. With the mean
-    echo power P the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
+    M is the gain and Re the responsivity of the detector. Coherent architectures: 2 M Re sqrt(eta
+    P_lo P), with the power P_lo of the local oscillator and the heterodyne efficiency eta, a
+    fraction of power. Direct detection: m M Re P, with the modulation depth m; hence 2 dB of SNR
+    for each dB of light. [T 2.22] takes 2 Re^2 P^2 as the mean square current, which is the peak of
+    a fully modulated echo. With the mean echo power P the mean square is m^2 Re^2 P^2 / 2, a
+    quarter of it.
     """
     gain, responsivity = (
         parameters[RECEIVER_PREFIX + "apd_gain"],

@@ -6,20 +6,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 NO_DOPPLER_NOTE = "nan without a Doppler segment, which direct detection never has"
-"""Comment stored with outputs of the Doppler segment."""
+"""Comment stored with output variables of the Doppler segment: where they are nan."""
 NO_ECHO_NOTE = "nan where no light comes back"
-"""Comment stored with outputs that need an echo."""
+"""Comment stored with output variables that need an echo: where they are nan."""
 NO_FREE_BIN_NOTE = (
     "-inf where the detection occupies every bin, so that none is left to raise an alarm"
 )
-"""Comment stored with logarithms of false-alarm probabilities."""
+"""Comment stored with logarithms of false-alarm probabilities: where they are -inf."""
 CLOSING_SIGN_NOTE = "positive when closing"
-"""Comment stored with radial velocities; it states their sign."""
+"""Comment stored with radial velocities that states which sign means closing."""
 
 XYZ_DIM = "xyz"
-"""Name of the store dimension of the world's axes x, y, z."""
+"""Name of a store's dimension over the world's axes x, y, z."""
 SECOND_XYZ_DIM = "xyz_again"
-"""Name of the second dimension of the world's axes in covariance matrices."""
+"""Name of a covariance matrix's second dimension over the world's axes x, y, z."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,15 @@ class OutputVariable:
     long_name: str
     """Name of the variable in words, for readers of the store."""
     comment: str = ""
-    """Further explanation of the variable in words; empty if there is none."""
+    """Explanation of the variable in addition to `long_name`; empty if there is none."""
     dtype: str = "float64"
     """NumPy name of the data type, such as ``float64``."""
     dims: tuple[str, ...] = ()
-    """Names of dimensions in addition to the study's axes. ``shot``, ``beamlet``, ``cycle``,
-    ``draw`` and ``return_number`` count from 0; ``xyz`` are the axes of the world.
-    """
+    """Names of the variable's dimensions besides the study's axes. ``shot``, ``beamlet``,
+    ``cycle``, ``draw`` and ``return_number`` count from 0; ``xyz`` are the axes of the world."""
 
     def empty_array(self, sizes: Mapping[str, int]) -> np.ndarray:
-        """Return an uninitialised array for the variable.
+        """Return an array of the variable's data type and dimensions, with undefined values.
 
         `sizes` has the length of each dimension, by name.
         """
@@ -55,18 +54,18 @@ def _segment_variables(
     separator: str = " ",
     shot_comment: str | None = "",
 ) -> dict[str, OutputVariable]:
-    """Return an output variable for each segment and one for the shot, by name.
+    """Return output variables of one quantity by name: one for each segment, and one for the shot.
 
     Parameters
     ----------
     name_template
-        Name with ``{}`` in the place of ``up``, ``down``, ``doppler`` or ``shot``.
+        Name of a variable, with ``{}`` in place of ``up``, ``down``, ``doppler`` or ``shot``.
     quantity_label
         Quantity in words.
     comment
         Comment on all variables.
     separator
-        Text between this comment and that of a single variable.
+        Text between `comment` and the additional comment of one variable.
     shot_comment
         Comment on the variable of the shot; None for no such variable.
     """
@@ -159,7 +158,7 @@ GRID_OUTPUTS: dict[str, OutputVariable] = {
         f"What is detected then has a wrong range or velocity; {NO_ECHO_NOTE}",
     ),
 }
-"""Output variables of a grid study, by name; one float for each point."""
+"""Output variables of a grid study, by name. Each has one float for each point."""
 
 STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "p_wrong_range_{}",
@@ -169,13 +168,13 @@ STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     shot_comment="both chirps report a peak, and one of the echo not both; or both do and are "
     "misread",
 )
-"""Additional output variables of studies in which a segment reports only its strongest peak. Keys
-are names; each variable has one float for each point."""
+"""Additional output variables, by name, of studies in which a segment reports only its strongest
+peak. Each has one float for each point."""
 
 NAN_WITHOUT_ECHO_OUTPUTS = tuple(
     name for name, output in GRID_OUTPUTS.items() if NO_ECHO_NOTE in output.comment
 )
-"""Names of outputs that are nan if no light returns to the receiver."""
+"""Names of those GRID_OUTPUTS that are nan if no light returns to the receiver."""
 
 _SEGMENT_PHRASES = {
     "up": "the up-chirp segment",
@@ -183,7 +182,7 @@ _SEGMENT_PHRASES = {
     "doppler": "the Doppler segment",
 }
 DRAW_BATCH_DIM = "batch"
-"""Name of the array dimension in a store along which draws are counted in batches."""
+"""Name of a store's dimension over batches of draws; draws are counted in each batch."""
 
 DRAW_COUNT_OUTPUTS: dict[str, OutputVariable] = {
     f"n_{name}_{segment}": OutputVariable(
@@ -196,7 +195,7 @@ DRAW_COUNT_OUTPUTS: dict[str, OutputVariable] = {
     for segment, segment_phrase in {**_SEGMENT_PHRASES, joint_name: "both chirp segments"}.items()
     if (name, segment) != ("false_alarm", "doppler")
 }
-"""Numbers of draws with a detection or a false alarm: output variables by name."""
+"""Output variables, by name, that count draws with a detection or a false alarm."""
 
 STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "pd_{}_error",
@@ -204,11 +203,12 @@ STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "over draws; 0 where nothing random is simulated, nan with a single draw",
     separator="; ",
 )
-"""Standard errors of outputs in studies with draws: output variables by name. The name is that of
-the output with ``_error``. Each has one float for each point."""
+"""Output variables, by name, of standard errors over draws. A name is that of the estimated output
+with ``_error`` added. Each variable has one float for each point."""
 
 PD_OUTPUT_NAMES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
-"""Names of the detection probabilities that a study's tolerance applies to when draws are made."""
+"""Names of the detection probabilities whose error over draws must be within a study's tolerance.
+"""
 
 ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
     "n_draws": OutputVariable("1", "number of draws", dtype="int64"),
@@ -224,30 +224,32 @@ ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
         "1", "largest half-width less the tolerance", "0 where the tolerance is met"
     ),
 }
-"""Accuracy of estimates by random draws: output variables by name, one value for each point."""
+"""Output variables, by name, that state the accuracy of estimates by random draws. Each has one
+value for each point."""
 
 RUNNING_SUMS_NAME = "running_sums"
-"""Name of the output with the sums over draws, to which later draws can be added."""
+"""Name of the output variable that stores sums over draws, so that later draws can be added."""
 
 RUNNING_SUM_OUTPUTS: dict[str, OutputVariable] = {
     RUNNING_SUMS_NAME: OutputVariable(
         "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
     ),
 }
-"""The one output variable, by its name, that stores sums over draws of random effects. It has one
-row for each point, and later draws can be added to these sums."""
+"""Output variable, by its name, that stores sums over draws of random effects, one row for each
+point. Later draws can be added to these sums. It is the only entry."""
 
 OUTPUT_IS_LOGARITHM = np.array([name.startswith("log10_") for name in GRID_OUTPUTS])
-"""(outputs,) bool: True for those of GRID_OUTPUTS that are logarithms."""
+"""(outputs,) bool, in the order of GRID_OUTPUTS: True for outputs that are logarithms."""
 OUTPUT_HAS_SQUARED_DEVIATIONS = OUTPUT_IS_LOGARITHM | np.array(
     [f"{name}_error" in STANDARD_ERROR_OUTPUTS for name in GRID_OUTPUTS]
 )
-"""(outputs,) bool: True for those of GRID_OUTPUTS whose squared deviations from the mean are summed
-over draws."""
+"""(outputs,) bool, in the order of GRID_OUTPUTS: True for outputs whose squared deviations from the
+mean are summed over draws."""
 
 N_GROUP_SUMS = 3 * len(PD_OUTPUT_NAMES)
-"""Number of columns of a row of running sums that describe the means of groups of draws: mean, sum
-of squared deviations, and sum over the unfinished group, of each probability of detection."""
+"""Number of columns of a row of running sums that describe groups of draws. For each of
+PD_OUTPUT_NAMES they are the mean over groups, the sum of squared deviations, and the sum over the
+unfinished group."""
 
 N_RUNNING_SUMS = (
     len(GRID_OUTPUTS)
@@ -255,9 +257,9 @@ N_RUNNING_SUMS = (
     + int(OUTPUT_IS_LOGARITHM.sum())
     + N_GROUP_SUMS
 )
-"""Number of values in a row of running sums. The row contains what further draws need in addition
-to the stored means: numbers of values, sums of squared deviations, the largest logarithms, and the
-sums over groups of draws."""
+"""Number of columns of a row of running sums. The row contains numbers of values, sums of squared
+deviations, largest logarithms and sums over groups of draws. With the stored means they are all
+that later draws need to be added."""
 
 DETECTOR_INDEPENDENT_OUTPUTS = (
     "snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance", "misread",
@@ -270,10 +272,10 @@ _FALSE_ALARM_GROUP_NOTE = "adjacent flagged bins, none of them among those that 
 def _measurement_variables(
     quantity: str, quantity_label: str, units: str
 ) -> dict[str, OutputVariable]:
-    """Return a measured quantity's output variables by name: bias, its error, RMSE, bound.
+    """Return output variables by name for a measured quantity: its bias, errors and error bound.
 
-    `quantity` is the beginning of their names, `quantity_label` the quantity in words, `units` its
-    units.
+    `quantity` is the beginning of the variables' names, `quantity_label` the quantity in words,
+    `units` its units.
     """
     detection_note = "over draws in which every segment has a detection; nan with none"
     bound_note = (
@@ -318,14 +320,14 @@ SPECTRA_STUDY_OUTPUTS: dict[str, OutputVariable] = {
     **_measurement_variables("range", "range", "m"),
     **_measurement_variables("radial_velocity", f"radial velocity, {CLOSING_SIGN_NOTE}", "m s-1"),
 }
-"""Outputs of studies that draw full spectra: output variables by name, one float for each point.
-ACCURACY_OUTPUTS and DRAW_COUNT_OUTPUTS are stored as well."""
+"""Output variables, by name, of studies that draw full spectra. Each has one float for each point.
+Such studies also store ACCURACY_OUTPUTS and DRAW_COUNT_OUTPUTS."""
 
 
 def _with_dims(
     dims: tuple[str, ...], variables: dict[str, OutputVariable]
 ) -> dict[str, OutputVariable]:
-    """Return output variables with the dimensions `dims` placed before their own."""
+    """Return copies of output variables with the dimensions `dims` placed before their own."""
     return {
         name: replace(variable, dims=(*dims, *variable.dims))
         for name, variable in variables.items()
@@ -380,7 +382,8 @@ SHOT_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""True geometry of each shot of a flight: output variables by name. All draws share it."""
+"""Output variables, by name, of the true geometry of each shot of a flight, which all draws share.
+"""
 
 CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
     "cycle_time": OutputVariable("s", "start of the measurement cycle"),
@@ -392,7 +395,7 @@ CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
         "at the cycle's start; inf where there is none",
     ),
 })  # fmt: skip
-"""True motion of the instrument in each measurement cycle: output variables by name."""
+"""Output variables, by name, of the instrument's true motion in each measurement cycle."""
 
 BEAMLET_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "offset": OutputVariable("m", "range less that of the reference beamlet"),
@@ -402,12 +405,12 @@ BEAMLET_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "bea
     "cos_incidence": OutputVariable("1", "cosine of the incidence angle"),
     "surface": OutputVariable("1", "surface hit", dtype="int16"),
 })  # fmt: skip
-"""Geometry of each beamlet of each shot: output variables by name. They belong to an eyepoint
-store, which holds the ray-traced geometry of a flight's shots, and also SHOT_GEOMETRY_VARIABLES and
+"""Output variables, by name, of the geometry of each beamlet of each shot. They are stored in an
+eyepoint store, the ray-traced geometry of a flight's shots, beside SHOT_GEOMETRY_VARIABLES and
 CYCLE_VARIABLES."""
 
 BEAMLET_WEIGHT_VARIABLE = OutputVariable("1", "power fraction of the beamlet", dims=("beamlet",))
-"""Power fraction of each beamlet, an output variable of an eyepoint store. Such a store holds the
+"""Output variable of each beamlet's power fraction. It is stored in an eyepoint store, the
 ray-traced geometry of a flight's shots."""
 
 SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
@@ -443,12 +446,12 @@ SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""Probabilities and other statistics of each shot that do not depend on draws, by name.
+"""Output variables, by name, of each shot's probabilities and other statistics that do not depend
+on draws.
 
 They are nan with a detector other than the fixed threshold, or if only the strongest peak of a
-segment is reported. If nothing is hit, false alarms are those of noise alone and all else is nan.
-``pd_doppler`` is nan without a Doppler segment.
-"""
+segment is reported. If a shot's rays hit nothing, false-alarm probabilities are those of noise
+alone, and the other variables are nan. ``pd_doppler`` is nan without a Doppler segment."""
 
 EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
     "effects": OutputVariable("1", "effects that were simulated", dtype="uint32"),
@@ -459,8 +462,8 @@ EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
         "overlap leaves of beamlets farther and nearer than the beam's axis",
     ),
 })  # fmt: skip
-"""Effects that were simulated in each shot, by name. A shot whose rays hit nothing has no effects.
-"""
+"""Output variables, by name, that state which effects were simulated in each shot. A shot whose
+rays hit nothing has no effects."""
 
 _NAN_FOR_FALSE_POINT_NOTE = "nan: a false one"
 
@@ -519,8 +522,8 @@ POINT_CLOUD_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""Points of a point cloud: output variables by name. Each shot and draw has at most as many points
-as the study's number of returns."""
+"""Output variables, by name, of the points of a point cloud. Each shot and draw has at most as many
+points as the study's number of returns."""
 
 NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), {
     "velocity": OutputVariable("m s-1", "velocity vector of the instrument", dims=_VECTOR_DIMS),
@@ -534,8 +537,8 @@ NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), 
     "altitude_status": OutputVariable("1", "how the altitude was solved", dtype="int8"),
     "altitude_beams": OutputVariable("1", "beams in the altitude's solution", dtype="int16"),
 })  # fmt: skip
-"""Velocity and altitude of each measurement cycle and draw: output variables by name. They are
-stored if a cycle has three shots or more."""
+"""Output variables, by name, of the velocity and altitude estimated in each measurement cycle and
+draw. They are stored if a cycle has three shots or more."""
 
 GRID_VARIABLE_NAMES = frozenset().union(
     GRID_OUTPUTS,
@@ -547,4 +550,4 @@ GRID_VARIABLE_NAMES = frozenset().union(
     SPECTRA_STUDY_OUTPUTS,
     EFFECT_VARIABLES,
 )
-"""Names of all output variables that the store of a grid may have."""
+"""Names of all output variables that a grid's store may contain."""
