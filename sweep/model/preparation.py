@@ -56,10 +56,11 @@ Parameters = Mapping[str, float | int | str | np.ndarray]
 
 BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
 """Parameter path of the error of the detection probability due to the number of beamlets. It is
-present if that number follows from the tolerance."""
+present only if the tolerance determines that number."""
 
 CHIRP_RATE_RATIO_PATHS = waveform.DOPPLER_CHIRP_RATE_RATIO_PATH, waveform.DOWN_CHIRP_RATE_RATIO_PATH
-"""Parameter paths of the chirp rates of Doppler and down segment, relative to the up-chirp's."""
+"""Parameter paths of the chirp rates of the Doppler and the down segment, each relative to the
+up-chirp's."""
 SHARED_PARAMETER_PATHS = (
     PROCESSING_PREFIX + "fft_size",
     "footprint.beamlets",
@@ -68,30 +69,32 @@ SHARED_PARAMETER_PATHS = (
     LOOKS_VOTES_PATH,
     *CHIRP_RATE_RATIO_PATHS,
 )
-"""Paths of numeric parameters that points must share to be computed together. They must share all
-text parameters as well."""
+"""Paths of numeric parameters that points of one category must share. They must also share all text
+parameters."""
 
 LINE_APPROXIMATIONS_MAX = 2
-"""Largest number of approximations in one sum of lines. The tolerated error of a bin's magnitude is
-divided equally among them."""
+"""Largest number of approximations that a sum of lines may contain. The tolerated error of a bin's
+magnitude is divided equally among so many."""
 
 
 class _PedestalShapes(NamedTuple):
     """Shapes of the pedestals that laser phase noise leaves around the lines of n points."""
 
     reach_bins: np.ndarray
-    """(n,): distance from the lines up to which the pedestal counts as echo [FFT bins]."""
+    """(n,): distance from the lines up to which the pedestal counts as part of the echo [FFT bins].
+    """
     line_width_bins: np.ndarray
     """(n,): line width of the laser [FFT bins]."""
     delay_times_bin_width: np.ndarray
-    """(n,): delay of the echo, at most the duration of the record [N/fs, FFT size over sample
-    rate]."""
+    """(n,): delay of the echo times the width of an FFT bin [cycles]; the delay is at most the
+    record's duration."""
 
 
 class BeatCoefficients(NamedTuple):
-    """Coefficients of the linear equation of n points' beats, (3, n) each, by segment.
+    """Carriers and chirp rates from which the beats of n points follow, (3, n) each.
 
     A beat [Hz] is the carrier times the Doppler ratio, minus the chirp rate times the delay 2R/c.
+    Rows are the segments up, Doppler and down.
     """
 
     carrier: np.ndarray
@@ -100,7 +103,7 @@ class BeatCoefficients(NamedTuple):
     """(3, n): signed chirp rate of the segment [Hz/s]."""
 
     def select_points(self, point_indices: np.ndarray | slice) -> "BeatCoefficients":
-        """Return the coefficients of some points, (m,) indices or a slice."""
+        """Return the coefficients of selected points: (m,) indices or a slice."""
         return BeatCoefficients(self.carrier[:, point_indices], self.chirp_rate[:, point_indices])
 
 
@@ -127,39 +130,39 @@ class Shots:
     receiver_filter: ReceiverFilter
     """Low-pass poles and anti-alias filter of the receiver."""
     target: TargetState
-    """Range and velocity of the target on the beam's axis at the shot's start, (n,) each. Lines use
-    the Doppler ratio of :attr:`motion` instead.
-    """
+    """Range and velocity of the target on the beam's axis at the shot's start, (n,) each. Spectral
+    lines use the Doppler ratio of :attr:`motion` instead of this velocity."""
     echo_scales: EchoScales
-    """Echo power on the detector [W] and beat amplitude at the ADC [V] of a target with a relative
-    echo of 1/sr, (n,) or scalars.
-    """
+    """Echo power on the detector [W] and beat amplitude at the ADC [V] of a target whose relative
+    echo is 1/sr, (n,) or scalars."""
     receiver_noise: ReceiverNoise
-    """Noise at the ADC: variances of the receiver's own sources [V^2], and variances per noise
-    current in the detector [V^2/A^2] and per power of light [V^2/W].
-    """
+    """Noise variances at the ADC: of the receiver's own sources [V^2], per square of a noise
+    current in the detector [V^2/A^2], and per power of light [V^2/W]."""
     noise: NoiseBudget
-    """Noise variance at the ADC by source."""
+    """Noise variance of a sample at the ADC by source, and a factor on the total variance."""
     footprint: FootprintLines
     """Ranges, Doppler ratios and amplitudes of the beamlets, relative to the beam's axis."""
     detection_settings: DetectionSettings
     """Detection threshold, searched bins, and rules of detection."""
     looks: Looks
-    """Number of looks, the records of each segment, and the way they are combined."""
+    """Number of looks (records of each segment), and how they are combined."""
     tolerances: SpectrumTolerances
-    """Errors of magnitudes and probabilities that the evaluation of spectra may cause."""
+    """Tolerated errors of bin magnitudes and of leakage in the evaluation of spectra."""
     motion: LineMotion = LineMotion()  # noqa: RUF009  # a tuple, as all records below
-    """Motion of the target during a shot that affects lines and measured values."""
+    """Motion of the target during a shot, as far as it is simulated; none by default."""
     echo_record: EchoRecord = EchoRecord()  # noqa: RUF009
-    """Number of samples before the echo arrives, and phase errors of the echo over the record."""
+    """Number of samples before the echo arrives, and phase errors of the echo over the record; none
+    by default."""
     line_images: LineImages = LineImages()  # noqa: RUF009
-    """Images of lines at their negative frequencies, and their amplitudes."""
+    """Amplitudes of the images of lines, which lie at the negative frequencies; no images by
+    default."""
     laser_line: LaserLine = LaserLine()  # noqa: RUF009
-    """Line width of the laser and its phase-noise pedestal."""
+    """Width of the laser's line, and power of its phase-noise pedestal; a pure tone by default."""
     speckle: EchoSpeckle = EchoSpeckle()  # noqa: RUF009
-    """Speckle of an echo that fades; none by default."""
+    """Developed speckle of the echo; none by default."""
     permanent_line: PermanentLine | None = None
-    """Line of light other than the echo's, which is in every record; None if there is none."""
+    """Line of light other than the echo, such as leaked light, that is in every record; None
+    without one."""
 
     @property
     def range(self) -> np.ndarray:
@@ -191,7 +194,7 @@ class Shots:
 
     @property
     def has_segment(self) -> np.ndarray:
-        """(3,) bool: true for existing segments, in the order up, Doppler, down."""
+        """(3,) bool: True for segments that exist, in the order up, Doppler, down."""
         return self.waveform.has_segment
 
     @property
@@ -203,16 +206,16 @@ class Shots:
     def n_bins(self) -> int:
         """Number of bins of a spectrum.
 
-        Bins are 0 .. N/2 of a real record and -N/2 .. N/2 - 1 of a complex one, with the FFT size
-        N.
+        With the FFT size N the bins are 0 .. N/2 of a real record, and -N/2 .. N/2 - 1 of a complex
+        one.
         """
         return self.fft_size if self.complex_record else self.fft_size // 2 + 1
 
     def to_signed_bins(self, bin_numbers: np.ndarray) -> np.ndarray:
-        """Return bin numbers 0 .. N/2, or -N/2 .. N/2 - 1 of a complex record.
+        """Return bin numbers within the spectrum that are equivalent to any integers.
 
-        N is the FFT size. Bin numbers of a complex record are periodic in N, so that any integer is
-        accepted.
+        The range is -N/2 .. N/2 - 1 for a complex record, whose bins are periodic in the FFT size
+        N. Bin numbers of a real record, 0 .. N/2, are returned unchanged.
         """
         if not self.complex_record:
             return np.asarray(bin_numbers)
@@ -220,22 +223,22 @@ class Shots:
         return np.asarray((np.asarray(bin_numbers) + nyquist_bin) % self.fft_size - nyquist_bin)
 
     def bin_indices(self, bin_numbers: np.ndarray) -> np.ndarray:
-        """Return the indices of bins in an array of the spectrum sorted by frequency.
+        """Return the positions of bins in an array of the spectrum that is sorted by frequency.
 
-        The bin of frequency 0 has the index 0; in a complex record it has the index N/2, with the
-        FFT size N.
+        Bin 0, of frequency 0, is at position 0 in a real record and at N/2 in a complex one, with
+        the FFT size N.
         """
         zero_frequency_index = self.fft_size // 2 if self.complex_record else 0
         return self.to_signed_bins(bin_numbers) + zero_frequency_index
 
     @property
     def all_signed_bins(self) -> np.ndarray:
-        """Numbers of all bins of a spectrum in the order of their frequencies, (bins,)."""
+        """Numbers of all bins of a spectrum, sorted by frequency, (bins,)."""
         return self.to_signed_bins(np.arange(self.n_bins) - self.bin_indices(np.zeros((), int)))
 
     @property
     def echo_interval_in_record(self) -> dict[str, Any]:
-        """Start and duration [s] of the part of the record that contains the echo.
+        """``start`` and ``duration`` [s] of the part of the record with the echo, in a dict.
 
         ``start`` counts from the segment's start. Both are (n,) or scalars. If the echo does not
         fill the record, both are tuples by segment.
@@ -255,7 +258,10 @@ class Shots:
         }
 
     def echo_window_energy(self, segment: int) -> np.ndarray:
-        """Return the sum of the squared window over one segment's samples with the echo, (n,)."""
+        """Return the sum of the squared window over the samples with the echo, (n,).
+
+        `segment` is the index of the segment.
+        """
         if self.echo_record.n_samples_before_echo is None:
             return np.full(self.size, self.window.energy)
         return window_energy_from_sample(self.window)[
@@ -266,7 +272,7 @@ class Shots:
     def total_relative_echo(self) -> np.ndarray:
         """Sum of the relative echoes of all beamlets [1/sr], (n,).
 
-        The echo power on the detector is proportional to it.
+        The echo power on the detector is proportional to the sum.
         """
         relative_echo = (
             self.footprint.relative_amplitude
@@ -282,16 +288,16 @@ class Shots:
 
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
-        """Noise variance of a sample without an echo [V^2], (n,); the threshold depends on it."""
+        """Noise variance of a sample without an echo [V^2], (n,); it determines the threshold."""
         return self.noise.variance_without_echo + np.zeros(self.size)
 
     @cached_property
     def whitening_gain(self) -> np.ndarray:
-        """Factor on the amplitude of each segment's lines when noise is whitened, (segments, n).
+        """Factor on the amplitude of each segment's lines by whitening of the noise, (segments, n).
 
         Whitening divides the spectrum by the square root of the noise density, relative to white
-        noise. Noise added by the ADC is white already. The factor varies little across an echo. It
-        is computed for the line on the beam's axis.
+        noise. The ADC's noise is white already. The factor is that of the line on the beam's axis,
+        because it varies little across an echo.
         """
         return broadcast_rows(
             [
@@ -303,21 +309,21 @@ class Shots:
 
     @property
     def beat_frequencies(self) -> tuple[np.ndarray, ...]:
-        """Signed beat frequencies [Hz] of the line on the beam's axis, one array per segment."""
+        """Signed beat frequencies [Hz] of the line on the beam's axis, (n,) for each segment."""
         return tuple(segment.beat_frequency(self.range) for segment in self.waveform_segments)
 
     def whitening_gain_at_frequency(
         self, beat_frequency: np.ndarray, bin_frequency: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the amplitude gain of a line in a spectrum whose noise is whitened.
+        """Return the factor on a line's amplitude in a spectrum whose noise is whitened, (n,).
 
         Parameters
         ----------
         beat_frequency : ndarray (n,)
             Beat frequency of the line [Hz].
         bin_frequency : ndarray (n,), optional
-            Frequency [Hz] of the bins whose noise density applies, for skirts of the line; by
-            default that of the line.
+            Frequency [Hz] of the bins in which the line is observed, whose noise density applies;
+            by default the line's frequency.
 
         Returns
         -------
@@ -336,19 +342,19 @@ class Shots:
 
     @cached_property
     def bin_noise_sigma(self) -> np.ndarray:
-        """Noise standard deviation per quadrature of a bin [V, FFT not normalised], (n,)."""
+        """Noise standard deviation per quadrature of a bin of the unscaled FFT [V], (n,)."""
         return self._bin_noise_sigma_from_variance(self.noise_variance)
 
     @cached_property
     def line_noise_sigma(self) -> np.ndarray:
-        """Noise standard deviation per quadrature of a bin with lines [V], (n,)."""
+        """Noise standard deviation per quadrature of a bin that contains lines [V], (n,)."""
         return self._bin_noise_sigma_from_variance(
             self.noise_variance + self.laser_line.pedestal_variance_under_line
         )
 
     @cached_property
     def bin_thresholds(self) -> "BinThresholds":
-        """Thresholds and noise sigmas of each point's bins."""
+        """Thresholds and noise sigmas of each point's bins, as a record of arrays."""
         from sweep.model.detection.echo_detection import BinThresholds
 
         side_noise_sigma = self._bin_noise_sigma_from_variance(
@@ -368,7 +374,7 @@ class Shots:
 
     @property
     def _pedestal_shapes(self) -> _PedestalShapes:
-        """Shapes of phase-noise pedestals; the reach is 0 where they add no bins to an echo."""
+        """Shapes of phase-noise pedestals; `reach_bins` is 0 where they add no bins to an echo."""
         if (
             self.detection_settings.echo_bin_rule == "peak_bin"
             or self.looks.is_noncoherent
@@ -392,7 +398,7 @@ class Shots:
         )
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the signal-to-noise ratio of a bin, the ratio of mean signal to mean noise power.
+        """Return the ratio of mean signal power to mean noise power in a bin.
 
         Parameters
         ----------
@@ -412,7 +418,7 @@ class Shots:
 
     @cached_property
     def threshold(self) -> np.ndarray:
-        """Threshold on a bin's magnitude [V, FFT not normalised], (n,)."""
+        """Threshold on a bin's magnitude in the unscaled FFT [V], (n,)."""
         return threshold(
             self.detection_settings.tnr,
             self._bin_noise_sigma_from_variance(self.noise_variance_without_echo),
@@ -420,7 +426,7 @@ class Shots:
 
     @property
     def negligible_signal_ratio(self) -> np.ndarray:
-        """Leaked signal, relative to the noise sigma, below which a bin counts as noise alone.
+        """Leaked signal in a bin, over the noise sigma, below which the bin counts as noise.
 
         It applies to bins that are evaluated one by one.
         """
@@ -445,7 +451,7 @@ class Shots:
 
     @property
     def detects_by_any_two_segments(self) -> bool:
-        """True if a shot counts as detected when any two of its three segments detect it."""
+        """True if any two segments that detect are enough; False if both chirps have to detect."""
         return (
             self.detection_settings.shot_detection_rule == waveform.ANY_TWO
             and len(self.waveform.segment_order) == 3
@@ -478,14 +484,15 @@ class Shots:
 
     @cached_property
     def waveform_segments(self) -> tuple[WaveformSegment, ...]:
-        """The three segments of a shot, with the target's range and velocity at their starts."""
+        """Segments up, Doppler and down, with the target's range and velocity at their starts."""
         return self.waveform.segments(self.target, self.motion)
 
     @property
     def range_and_velocity_by_segment(self) -> dict[str, Any]:
-        """Range [m] and radial velocity [m/s] of the target, (n,).
+        """``range`` [m] and ``radial_velocity`` [m/s] of the target, (n,) each, in a dict.
 
-        They are tuples by segment where the target moves between segments.
+        If the target moves between segments, ``range`` is a tuple by segment. If it also
+        accelerates, ``radial_velocity`` is a tuple by segment as well.
         """
         motion: dict[str, Any] = {
             "range": self.range,
@@ -519,7 +526,10 @@ class Shots:
 
     @property
     def mid_record_frequency_drifts(self) -> tuple[np.ndarray, ...]:
-        """Frequency drift [Hz] of each segment's lines from its start to mid-record, (n,) each."""
+        """Change of the frequency of each segment's lines from its start to mid-record [Hz].
+
+        The result is a tuple by segment of (n,).
+        """
         return tuple(
             self._frequency_drift(segment, self.record_middle_time, self.motion.velocity_drift_time)
             for segment in self.waveform_segments
@@ -527,7 +537,10 @@ class Shots:
 
     @property
     def frequency_drift_rates(self) -> tuple[np.ndarray, ...]:
-        """Frequency drift per time [Hz/s] of each segment's lines within its record, (n,) each."""
+        """Rate at which the frequency of each segment's lines changes in its record [Hz/s].
+
+        The result is a tuple by segment of (n,).
+        """
         walk_sign, drift_sign = (
             np.sign(self.record_middle_time),
             np.sign(self.motion.velocity_drift_time),
@@ -540,9 +553,9 @@ class Shots:
     def _frequency_drift(
         self, segment: WaveformSegment, walk_time: np.ndarray, drift_time: np.ndarray | float
     ) -> np.ndarray:
-        """Return the frequency drift [Hz] of a segment's lines in given times.
+        """Return the change of a segment's line frequencies [Hz] by the target's motion, (n,).
 
-        `walk_time` [s] is the time of range walk, `drift_time` [s] that of acceleration.
+        Range walk acts for `walk_time` [s], acceleration for `drift_time` [s].
         """
         closing_speed = self.target.radial_velocity + self.target.approach_speed
         closing_speed = closing_speed + self.target.acceleration * (
@@ -555,12 +568,12 @@ class Shots:
 
     @property
     def beat_coefficients(self) -> BeatCoefficients:
-        """Coefficients of the linear equation of the beats.
+        """Carriers f [Hz] and chirp rates S [Hz/s] from which each segment's beat follows.
 
-        Delay and Doppler ratio are those at the shot's start, of a target at constant speed. The
-        phase is quadratic in the delay, so that a beat at the time t in a segment depends on the
-        delay at 2 t. The time from a segment's start to the middle of its record therefore counts
-        twice.
+        The beat is f beta - S tau, with the Doppler ratio beta and the delay tau = 2R/c of a target
+        of constant speed at the shot's start. Each f is the segment's carrier, shifted by S times a
+        time. This time is the segment's start plus twice the time to the middle of its record. The
+        factor 2 arises because the phase is quadratic in the delay.
         """
         starts, chirp_rate_ratios, carriers, walk_time, chirp_rate = (
             np.array([np.broadcast_to(v, self.size) for v in values])
@@ -579,10 +592,10 @@ class Shots:
         )
 
     def split_by_look(self) -> "list[Shots]":
-        """Return one set of shots for each look, with the lines where that look observes them.
+        """Return copies of these shots, one for each look, with the lines at the time of that look.
 
-        A look is one of several records of a segment. If lines do not drift, every set is these
-        shots, unchanged.
+        A look is one of several records of a segment. If lines do not drift, the list holds these
+        shots themselves, once for each look.
         """
         if not np.any(self.motion.line_drift_per_look):
             return [self] * self.looks.number
@@ -607,7 +620,7 @@ class Shots:
         return any(np.any(start) for start in self.motion.segment_starts)
 
     def point_parameters(self) -> "PointParameters":
-        """Return the parameters of points that all segments share, for the compiled kernels."""
+        """Return the parameters of points that all segments share, in a record for kernels."""
         from sweep.model.spectrum.lines import PointParameters
 
         up_carrier, _, down_carrier = self.waveform.carriers
@@ -638,7 +651,7 @@ class Shots:
         return PointParameters(*broadcast_rows(values, (self.size,)))
 
     def segment_parameters(self) -> "SegmentParameters":
-        """Return the parameters of points that differ by segment, for the compiled kernels."""
+        """Return the parameters of points that differ by segment, in a record for kernels."""
         from sweep.model.spectrum.lines import SegmentParameters
 
         rows_by_segment = [
@@ -663,7 +676,7 @@ class Shots:
     def real_ends_fft_size(self) -> int:
         """FFT size N if the noise in bins 0 and N/2 is real-valued; 0 if it is complex.
 
-        It is real-valued in a real record whose noise bins are correlated.
+        The noise is real-valued in a real record, if noise bins are simulated as correlated.
         """
         is_real = (
             self.detection_settings.noise_bin_model == "correlated" and not self.complex_record
@@ -672,7 +685,7 @@ class Shots:
 
     @cached_property
     def searched_bins(self) -> SearchedBins:
-        """Bins of each segment that are searched for false alarms, and their noise correlation."""
+        """Bins of each segment that are searched for false alarms, with their noise correlation."""
         return SearchedBins.from_record(
             self.record,
             noise_bins=self.detection_settings.noise_bin_model,
@@ -682,12 +695,15 @@ class Shots:
 
     @property
     def first_searched_bin(self) -> int:
-        """Distance of the first bin searched for false alarms from DC and from Nyquist [bins]."""
+        """Distance [bins] from DC of the first bin that is searched for false alarms.
+
+        The last searched bin is as far from Nyquist.
+        """
         return self.searched_bins.first_bin
 
     @property
     def noise_bin_correlation(self) -> float:
-        """Correlation coefficient of the noise of adjacent bins, 0..1."""
+        """Correlation coefficient of the noise in adjacent bins, 0..1."""
         return self.searched_bins.neighbour_noise_correlation
 
     @property
@@ -754,14 +770,14 @@ class Shots:
     def n_searched_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Return the number of bins that can raise a false alarm, by segment.
+        """Return the number of bins of each segment in which noise can raise a false alarm.
 
         Parameters
         ----------
         n_exempt : ndarray (3, m)
-            Bins that the detection occupies, which are subtracted.
+            Number of bins of each segment that belong to an echo, which are subtracted.
         point_indices : ndarray (m,) or slice
-            Points to which the columns belong.
+            Points to which the columns of the arrays belong.
 
         Returns
         -------
@@ -773,16 +789,17 @@ class Shots:
     def n_alarm_equivalent_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Return the number of independent bins that are equivalent to the searched bins.
+        """Return the number of independent bins that are equivalent to the searched bins, (3, m).
 
-        Noise raises a false alarm in both with the same probability.
+        Noise raises a false alarm in the searched bins as probably as in this number of independent
+        bins.
 
         Parameters
         ----------
         n_exempt : ndarray (3, m)
-            Bins that the detection occupies, as in :meth:`n_searched_bins`.
+            Number of bins of each segment that belong to an echo.
         point_indices : ndarray (m,) or slice
-            Points to which the columns belong.
+            Points to which the columns of the arrays belong.
         """
         n_searched = self.n_searched_bins(n_exempt, point_indices)
         if self.detection_settings.noise_bin_model == "independent":
@@ -801,21 +818,23 @@ class Shots:
 def split_by_category(
     parameters: Parameters, further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points into categories whose points share strings and sizes.
+    """Split points into categories; points of a category share text parameters and array sizes.
 
     Parameters
     ----------
     parameters : mapping
         Parameters by dotted path: scalars or (n,) arrays.
     further_paths : collection of str
-        Numeric parameters that points must share besides :data:`SHARED_PARAMETER_PATHS`.
+        Paths of numeric parameters that points of a category must share, besides
+        :data:`SHARED_PARAMETER_PATHS`.
 
     Yields
     ------
     point_indices : ndarray (m,)
-        Points of a category.
+        Indices of the points of a category.
     category_parameters : dict
-        Parameters of these points as arrays, including ``record``, the record's length in samples.
+        Parameters of the category's points as arrays, and ``record``, the record's length
+        [samples].
     """
     arrays = parameters_as_arrays(parameters)
     n_points = max((a.size for a in arrays.values() if a.ndim), default=1)
@@ -848,7 +867,7 @@ def split_by_category(
 
 
 def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...]) -> np.ndarray:
-    """Return values, each broadcast to a shape, as the rows of one array.
+    """Return one array whose rows are the values, each broadcast to one shape.
 
     Parameters
     ----------
@@ -869,14 +888,16 @@ def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...])
 
 
 def parameters_as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
-    """Return the parameters as arrays, with the number of samples of the record as ``record``."""
+    """Return the parameters as arrays, and add ``record``, the number of samples of the record."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
     arrays["record"] = waveform.n_record_samples(arrays)
     return arrays
 
 
 def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, ground: Ground) -> Shots:
-    """Return shots of one category with only the axis's echo and the receiver's noise.
+    """Return shots of one category with a single line, on the beam's axis, in the receiver's noise.
+
+    No effect is applied. Points of a category share text parameters and array sizes.
 
     Parameters
     ----------
@@ -923,7 +944,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
 def window_energy_from_sample(window: Window) -> np.ndarray:
     """Return the sum of the squared window from each sample to the last, (L + 1,).
 
-    L is the number of samples of the window.
+    L is the number of samples of the window. The last value is 0.
     """
     return np.append(np.cumsum(window.samples()[::-1] ** 2)[::-1], 0.0)
 
@@ -938,24 +959,24 @@ _LABEL_BY_POINT_FIELD = {
     "bin_noise_sigma": "noise",
     "threshold": "threshold",
 }
-"""Fields of `Shots` that must be finite, with one value for each point. Keys are dotted paths to
-them, and values their names in error messages."""
+"""Names, for error messages, of fields of `Shots` that must be finite, by the field's dotted path.
+These fields have one value for each point."""
 _LABEL_BY_BEAMLET_FIELD = {
     "footprint.relative_range_offset": "beamlets' ranges",
     "footprint.doppler_ratio_offset": "beamlets' velocities",
     "footprint.relative_amplitude": "beamlets' echoes",
 }
-"""Fields of `Shots` that must be finite, with one value for each beamlet. Keys are dotted paths to
-them, and values their names in error messages."""
+"""Names, for error messages, of fields of `Shots` that must be finite, by the field's dotted path.
+These fields have one value for each beamlet."""
 
 
 def require_finite(shots: Shots) -> None:
-    """Raise an error if any value of the shots is not finite: their spectra would have no peak.
+    """Raise an error if any value of the shots is not finite, because spectra would have no peak.
 
     Raises
     ------
     UnsupportedShotError
-        Error that names the quantity that is not finite, and the shot.
+        If a value is not finite. The error names the quantity and the shot.
     """
     for name, label in (_LABEL_BY_POINT_FIELD | _LABEL_BY_BEAMLET_FIELD).items():
         values = np.asarray(attrgetter(name)(shots))

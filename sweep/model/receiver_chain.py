@@ -28,7 +28,7 @@ def shot_noise_current_variance(
     responsivity: np.ndarray,
     electrical_bandwidth: np.ndarray,
 ) -> np.ndarray:
-    """Compute the variance of the shot-noise current that light makes in the detector.
+    """Return the variance of the shot-noise current [A^2] that light causes in the detector.
 
     Parameters
     ----------
@@ -56,12 +56,13 @@ class ReceiverNoise(NamedTuple):
     electrical_bandwidth: np.ndarray
     """Noise bandwidth B_e of the receiver [Hz] (:func:`electrical_bandwidth`)."""
     variance_per_square_ampere: np.ndarray
-    """Variance of the voltage at the ADC per variance of a noise current in the detector [V^2/A^2].
-    """
+    """Variance of the voltage at the ADC, divided by that of the noise current in the detector
+    [V^2/A^2]."""
     shot_noise_variance_per_watt: np.ndarray
-    """Variance of the shot noise at the ADC per power of light on the detector [V^2/W]."""
+    """Variance of the shot noise at the ADC, divided by the power of light on the detector [V^2/W].
+    """
     variances: dict[str, np.ndarray]
-    """Variance at the ADC [V^2] of each noise source of the receiver itself, by name."""
+    """Noise variance at the ADC [V^2] by name of the source, for the receiver's own sources."""
 
 
 ANTIALIAS_DEFAULTS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
@@ -69,17 +70,19 @@ ANTIALIAS_DEFAULTS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
 means no filter."""
 
 _N_ALIASES_PER_SIDE = 32
-"""Number of aliases on each side over which the noise after an anti-alias filter is summed. With
-order 3 and a bandwidth of the full sample rate, further aliases have 1e-8 of the noise density."""
+"""Number of aliases on each side of a frequency over which the noise after an anti-alias filter is
+summed. With order 3 and a bandwidth of the full sample rate, omitted aliases have 1e-8 of the noise
+density."""
 
 _LOG_ATTENUATION_MAX = 345.0
-"""Natural logarithm of the filter's largest power attenuation. The limit keeps powers above 0."""
+"""Limit of the natural logarithm of the anti-alias filter's power attenuation. It keeps the
+transmitted power above 0."""
 
 
 def receiver_noise(
     architecture: str, receiver: Mapping[str, np.ndarray], is_iq_sampled: bool = False
 ) -> ReceiverNoise:
-    """Compute the noise variances of a receiver at the ADC.
+    """Return the noise variances at the ADC that the receiver's own sources cause.
 
     Parameters
     ----------
@@ -163,15 +166,15 @@ def receiver_noise(
 def quantisation_variance(
     *, full_scale: ArrayLike, bits: ArrayLike, is_iq_sampled: bool = False
 ) -> np.ndarray:
-    """Return the noise variance [V^2] that rounding to ADC steps adds.
+    """Return the noise variance [V^2] that the ADC adds by rounding to steps.
 
     Parameters
     ----------
     full_scale : array_like
-        Largest voltage V to either side [V].
+        Largest magnitude V of the voltage [V].
     bits : array_like
-        Effective number of bits, not necessarily an integer; 0 for no rounding. It is chosen so
-        that rounding makes all of the noise of the real ADC.
+        Effective number of bits, not necessarily an integer; 0 for no rounding. With it, rounding
+        causes as much noise as all noise sources of the real ADC.
     is_iq_sampled : bool
         True for two ADCs that sample I and Q.
 
@@ -223,7 +226,7 @@ def receiver_transfer(
     detector_bandwidth: np.ndarray,
     amplifier_bandwidth: np.ndarray,
 ) -> np.ndarray:
-    """Return the complex transfer function of the receiver relative to DC.
+    """Return the complex transfer function of detector and amplifier, relative to DC.
 
     Parameters
     ----------
@@ -246,9 +249,9 @@ def receiver_transfer(
 
 
 def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the noise bandwidth [Hz], the smallest bandwidth of the receiver's stages.
+    """Return the receiver's noise bandwidth [Hz]: the smallest bandwidth of its stages.
 
-    The stages are detector, amplifier and anti-alias filter, if there is one. [T] states one
+    The stages are detector, amplifier and, if there is one, the anti-alias filter. [T] states one
     bandwidth for detector and amplifier, and uses it as the noise bandwidth.
     """
     narrowest_pole = np.minimum(receiver["detector_bandwidth"], receiver["amplifier_bandwidth"])
@@ -261,7 +264,7 @@ def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the receiver's parameters by their names, without the prefix RECEIVER_PREFIX."""
+    """Return the receiver's parameters by name, the dotted path without RECEIVER_PREFIX."""
     return {
         path.removeprefix(RECEIVER_PREFIX): value
         for path, value in parameters.items()
@@ -270,7 +273,10 @@ def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.nd
 
 
 def antialias_filter_parameters(receiver: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the anti-alias filter's parameters from the receiver's; empty without a filter."""
+    """Return bandwidth and order of the anti-alias filter by name; an empty dict without a filter.
+
+    `receiver` are the receiver's parameters by name.
+    """
     filter_parameters = {
         name: np.asarray(receiver.get(name, default))
         for name, default in ANTIALIAS_DEFAULTS.items()
@@ -281,7 +287,7 @@ def antialias_filter_parameters(receiver: Mapping[str, np.ndarray]) -> dict[str,
 def antialias_power_transmission(
     frequency: np.ndarray, *, antialias_bandwidth: np.ndarray, antialias_order: np.ndarray
 ) -> np.ndarray:
-    """Return the power transmission of the anti-alias filter.
+    """Return the power transmission of the anti-alias filter at a frequency, 0..1.
 
     Parameters
     ----------
@@ -317,7 +323,7 @@ def antialias_power_transmission(
 def relative_noise_density(
     frequency: np.ndarray, *, sample_rate: np.ndarray, **filters: np.ndarray
 ) -> np.ndarray:
-    """Return the noise density of a record, relative to white noise of the same sources.
+    """Return the noise density of a record, relative to white noise of the same variance.
 
     Parameters
     ----------
@@ -379,7 +385,7 @@ def relative_noise_density(
 
 
 def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sum of a single-pole low-pass's power transmission over all aliases.
+    """Return the power transmission of a single-pole low-pass, summed over all aliases.
 
     Parameters
     ----------
@@ -391,7 +397,7 @@ def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarra
     Returns
     -------
     alias_sum : ndarray
-        The sum s.
+        Sum s over all aliases of the frequency.
     derivative : ndarray
         (a / 2) ds/da.
     """

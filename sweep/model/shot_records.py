@@ -32,28 +32,25 @@ class FootprintLines(NamedTuple):
     """
 
     row_of_point: np.ndarray
-    """(n,) int64: index of each point's row in the arrays."""
+    """(n,) int64: index of each point's row in the arrays of this record."""
     relative_range_offset: np.ndarray
     """(rows, beamlets): range of a beamlet minus that on the beam's axis, divided by the range on
     the axis."""
     doppler_ratio_offset: np.ndarray
-    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the beam's axis. v_r is
-    the radial velocity.
-    """
+    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the beam's axis, with
+    the radial velocity v_r."""
     relative_amplitude: np.ndarray
     """(rows, beamlets): amplitude of each beamlet's beat, divided by
     :attr:`sweep.model.link_budget.EchoScales.beat_amplitude_scale`. It is the square root of the
-    relative echo [1/sr], or with direct detection the relative echo itself."""
+    relative echo [1/sr]; with direct detection it is the relative echo itself."""
     adds_powers: bool = True
     """True if the powers of beamlets add, False if their amplitudes do."""
     phase_cycles: np.ndarray = np.empty((3, 0, 0))  # never written to
-    """(3, rows, beamlets): random phases of beamlets [cycles] in up, Doppler and down segment; or
-    empty.
-    """
+    """(3, rows, beamlets): random phase of each beamlet in the up, Doppler and down segment
+    [cycles]; of size 0 without random phases."""
     beamlets_error: np.ndarray | float = math.nan
     """Error of the detection probability due to the number of beamlets; nan where it is not
-    estimated.
-    """
+    estimated."""
 
     @property
     def n_beamlets(self) -> int:
@@ -68,34 +65,30 @@ class DetectionSettings(NamedTuple):
     """
 
     tnr: np.ndarray
-    """Threshold-to-noise ratio: threshold divided by the standard deviation of a noise-only bin's
-    magnitude."""
+    """Threshold-to-noise ratio: threshold divided by the standard deviation of the magnitude of a
+    noise-only bin."""
     echo_bin_rule: str
-    """Bins that can detect an echo: ``any_bin`` of the echo, or ``peak_bin``, only its largest, as
-    in [T].
-    """
+    """Name of the bins that can detect an echo: ``any_bin`` of the echo, or ``peak_bin``, only its
+    largest, as in [T]."""
     shot_detection_rule: str
-    """Segments that must detect an echo for the shot to be detected: ``both_chirps``, or
-    ``any_two``.
-    """
+    """Name of the segments that must detect an echo for the shot to be detected: ``both_chirps``,
+    or ``any_two`` segments."""
     reported_peaks_option: str
-    """Peaks that a segment reports: ``all`` above the threshold, or only the ``strongest``."""
+    """Name of the peaks that a segment reports: ``all`` above the threshold, or only the
+    ``strongest``."""
     two_beat_assumption: str
-    """Assumption that resolves two beats of unknown sign: ``far``, the range beat exceeds the
-    Doppler shift, or ``fast``, the opposite.
-    """
+    """Name of the assumption that resolves two beats of unknown sign: ``far``, the range beat
+    exceeds the Doppler shift; or ``fast``, the Doppler shift exceeds the range beat."""
     noise_bin_model: str
-    """Treatment of noise in adjacent bins: ``correlated``, as in a record, or ``independent``, as
-    in [T].
-    """
+    """Name of the model of noise in adjacent bins: ``correlated``, as in a record, or
+    ``independent``, as in [T]."""
     counted_bins_rule: str
-    """Bins that count for false alarms: ``half``, those of a real spectrum, or ``all`` N bins of
-    the FFT.
-    """
+    """Name of the bins that count for false alarms: ``half``, those of a real spectrum, or ``all``
+    N bins of the FFT."""
     search_band: SearchBand | None = None
-    """Bins that are searched, (3, n) by segment. It is None if all bins are searched."""
+    """Bins of each segment that are searched, (3, n); None if all bins are searched."""
     includes_leakage: bool = False
-    """True if the echo's signal far from its lines (leakage) can raise false alarms."""
+    """True if leakage, the echo's signal far from its lines, can raise false alarms."""
 
     @classmethod
     def from_budget(cls, budget: LinkBudget, n_points: int) -> "DetectionSettings":
@@ -125,20 +118,20 @@ class SpectrumTolerances(NamedTuple):
     """Tolerated errors of bin magnitudes and leakage in the evaluation of spectra."""
 
     line_error: np.ndarray
-    """Tolerated error of a bin's magnitude, relative to the noise sigma, if few lines represent all
-    beamlets."""
+    """Tolerated error of a bin's magnitude, relative to the noise sigma, when few lines represent
+    all beamlets."""
     leakage_probability: np.ndarray
     """Tolerated probability of false alarms due to leaked signal that is not evaluated."""
     leakage_floor: np.ndarray
-    """Leaked signal in a bin, relative to the noise sigma, below which the bin counts as noise
-    alone. The value :data:`sweep.model.error_budget.SET_BY_TOLERANCE` means that it follows from
-    ``leakage_probability``."""
+    """Magnitude of leaked signal in a bin, relative to the noise sigma, below which the bin counts
+    as noise alone. The value :data:`sweep.model.error_budget.SET_BY_TOLERANCE` means that it
+    follows from ``leakage_probability``."""
 
     @classmethod
     def from_parameters(
         cls, parameters: Mapping[str, np.ndarray], looks: "Looks"
     ) -> "SpectrumTolerances":
-        """Return the tolerances for parameters by dotted path, and for the looks of a shot.
+        """Return the tolerances that parameters and looks determine.
 
         Parameters
         ----------
@@ -163,14 +156,14 @@ class SpectrumTolerances(NamedTuple):
 
 
 class PhaseError(NamedTuple):
-    """Deterministic phase error over the record, common to all lines of a footprint."""
+    """Phase error of the echo over the record, not random, common to all lines of a footprint."""
 
     phase_function: Callable[..., np.ndarray]
-    """Function that returns the phase error [cycles], (n, m). It takes positions x (m,) in the
-    record, -1 .. 1, ``sign`` and `arguments`.
-    """
+    """Function that returns the phase error (n, m) [cycles] at positions x (m,) in the record, -1
+    .. 1. It is called with x, ``sign`` and `arguments`."""
     arguments: dict[str, Any]
-    """Arguments of ``phase_function`` by name, (n,) or scalars; tuples hold one per segment."""
+    """Arguments of ``phase_function`` by name, (n,) or scalars; a tuple has one value per segment.
+    """
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
         """Return the arguments of ``phase_function`` for selected points in one segment.
@@ -185,7 +178,7 @@ class PhaseError(NamedTuple):
         Returns
         -------
         dict
-            Arguments by name, (m,) each; scalars are repeated for each point.
+            Arguments by name, (m,) each; scalars are repeated m times.
         """
         selected = {}
         for name, value in self.arguments.items():
@@ -202,23 +195,22 @@ class EchoRecord(NamedTuple):
     """Number of samples before the echo arrives, and phase errors of the echo over the record."""
 
     n_samples_before_echo: np.ndarray | None = None
-    """(3, n) int64: number of the record's samples before the echo arrives, at most all. It is None
-    if echoes fill their records.
-    """
+    """(3, n) int64: number of samples of each segment's record that precede the echo; None if
+    echoes fill their records."""
     phase_errors: tuple[PhaseError, ...] = ()
-    """Deterministic phase errors of the echo; their phases are summed."""
+    """Phase errors of the echo over the record; their phases are summed."""
     shares_phase_errors: bool = False
-    """True if many shots have the same phase errors, as on a grid; False for shots of a flight."""
+    """True if many shots have equal phase errors, as on a grid; False for shots of a flight."""
 
 
 class LineImages(NamedTuple):
-    """Images of lines at their negative frequencies, and their amplitudes."""
+    """Amplitudes of the images of lines, which lie at the negative frequencies."""
 
     are_summed: bool = False
-    """True if the images in a real record's spectrum are summed with its lines."""
+    """True if spectra of real records include the images of lines."""
     iq_image_gain: np.ndarray | float = 0.0
-    """(n,): amplitude of a line's image, relative to that of the line, 0..1, in a complex record.
-    It is due to imbalance of I and Q."""
+    """(n,): amplitude of a line's image in a complex record, relative to the line's, 0..1. Its
+    cause is imbalance of I and Q."""
 
 
 class PermanentLine(NamedTuple):
@@ -230,21 +222,23 @@ class PermanentLine(NamedTuple):
     amplitude: np.ndarray
     """Amplitude of the beat at the ADC [V], before the receiver's poles."""
     delay: np.ndarray
-    """Delay of the light against the local oscillator [s]."""
+    """Delay of the light relative to the local oscillator [s]."""
 
 
 class EchoSpeckle(NamedTuple):
-    """Developed speckle of an echo that fades; by default there is none."""
+    """Developed speckle of an echo, by which its power fades; by default there is none."""
 
     segment_correlations: "SegmentCorrelations | None" = None
     """Correlations of the speckle between the segments of a shot; None without speckle."""
     line_deviation_bins: np.ndarray | float = 0.0
-    """(3, n): standard deviation of the frequencies of an echo's lines [bins of fs/N]."""
+    """(3, n): standard deviation of the frequencies of an echo's lines in each segment [bins of
+    fs/N, sample rate over FFT size]."""
     line_gradients: "LineGradients | None" = None
-    """Changes of an echo's lines across the footprint, for random draws of speckle."""
+    """Changes of an echo's lines across the footprint, from which speckle is drawn; None without
+    speckle."""
     look_speckle: "LookSpeckle | None" = None
-    """Speckle of looks that share it in part; None if looks have equal or independent speckle. A
-    look is one of several records of a segment.
-    """
+    """Speckle that looks share in part; None if all looks have the same speckle or independent
+    speckle. A look is one of several records of a segment."""
     phase_cycles_per_look: np.ndarray | None = None
-    """(3, n): phase [cycles] by which a line advances from one look to the next."""
+    """(3, n): phase [cycles] by which a line of each segment advances from one look to the next;
+    None without speckle."""

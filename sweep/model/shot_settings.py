@@ -24,11 +24,11 @@ LASER_PREFIX, CHIRP_PREFIX, TELESCOPE_PREFIX, RECEIVER_PREFIX, PROCESSING_PREFIX
     for section in ("laser", "chirp", "telescope", "receiver", "processing")
 )
 RECORD_TYPE_PATH = RECEIVER_PREFIX + "record"
-"""Parameter path of the record's kind of samples: ``real``, or ``complex`` from I and Q."""
+"""Parameter path of the type of the record's samples: ``real``, or ``complex`` from I and Q."""
 
 APPROACH_SPEED_PATH = "target.approach"
-"""Parameter path of the speed [m/s] at which the range along the beam decreases. It is present only
-if ray tracing has computed the speed."""
+"""Parameter path of the speed [m/s] at which the range along the beam decreases. Only ray-traced
+shots have it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,13 +40,13 @@ class TargetState:
     radial_velocity: np.ndarray
     """Radial velocity [m/s], positive when closing."""
     acceleration: np.ndarray
-    """Increase of the radial velocity per time [m/s^2]."""
+    """Rate of change of the radial velocity [m/s^2]."""
     approach_speed: np.ndarray
     """Speed [m/s] at which the range along the beam decreases (:func:`approach_speed`)."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, np.ndarray]) -> "TargetState":
-        """Return the target's state from a mapping of dotted paths to parameter values."""
+        """Return the target's state from parameters by dotted path."""
         return cls(
             range=parameters["target.range"],
             radial_velocity=parameters["target.radial_velocity"],
@@ -72,25 +72,22 @@ class LineMotion(NamedTuple):
     """
 
     doppler_ratio: np.ndarray | float = 0.0
-    """Doppler ratio 2 v_r / c of the line on the beam's axis at the start of the shot."""
+    """Doppler ratio 2 v_r / c of the line on the beam's axis at the start of the shot, with the
+    radial velocity v_r."""
     segment_starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
-    """Time [s] from the start of the shot to that of each segment, during which the target moves.
-    The values are 0 if motion between segments is neglected.
-    """
+    """Time [s] from the shot's start to each segment's start, in the order up, Doppler, down. All
+    are 0 if motion between segments is not simulated."""
     line_drift_per_look: np.ndarray | float = 0.0
-    """(3, n): frequency shift of each segment's lines from one look to the next [bins of fs/N]. A
-    look is one of several records of the same segment.
-    """
+    """(3, n): frequency shift of each segment's lines from one look to the next [bins of fs/N,
+    sample rate over FFT size]. A look is one of several records of the same segment."""
     range_reference_time: np.ndarray | float = 0.0
-    """Time [s] from the start of the shot to the instant whose range the beats measure. The target
-    closes in this time.
-    """
+    """Time [s] from the start of the shot to the instant whose range the beats measure; 0 if motion
+    is not simulated."""
     velocity_drift_time: np.ndarray | float = 0.0
-    """Time [s] from the start of a segment to the instant whose velocity its beat measures. The
-    target accelerates in this time.
-    """
+    """Time [s] from the start of a segment to the instant whose velocity its beat measures; 0 if
+    acceleration is not simulated."""
     velocity_bias_fraction: np.ndarray | float = 0.0
-    """Fraction of the radial velocity by which beats underestimate it."""
+    """Fraction of the radial velocity by which the velocity from the beats is too low."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -102,10 +99,11 @@ class WaveformSettings:
     segment_order: tuple[str, ...]
     """Names of the existing segments, in the order of time."""
     chirp_rate_ratios: tuple[Any, ...]
-    """Signed chirp rates of up, Doppler and down segment, each divided by the up-chirp's
-    :attr:`chirp_rate`. They are numbers, or arrays if points differ."""
+    """Signed chirp rates of up, Doppler and down segment, divided by the up-chirp's
+    :attr:`chirp_rate`: numbers, or arrays if points differ."""
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """Frequency at the start of each segment [Hz]; its product with the echo's delay is a phase."""
+    """Frequency at the start of the up, Doppler and down segment [Hz]. Times the echo's delay, it
+    gives a phase [cycles]."""
     chirp_bandwidth: np.ndarray
     """Bandwidth of the up-chirp [Hz]."""
     chirp_duration: np.ndarray
@@ -115,9 +113,9 @@ class WaveformSettings:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "WaveformSettings":
-        """Return the waveform from a mapping of dotted paths to parameter values.
+        """Return the waveform from parameters by dotted path.
 
-        Chirp slopes may differ by point. Segments, gap and slopes that are not given have the
+        Chirp rate ratios may differ by point. Segments, gap and ratios that are not stated have the
         values of :data:`sweep.model.waveform.WAVEFORM_DEFAULTS`.
         """
         parameters = waveform.WAVEFORM_DEFAULTS | dict(parameters)
@@ -158,12 +156,12 @@ class WaveformSettings:
 
     @property
     def has_segment(self) -> np.ndarray:
-        """(3,) bool: true for existing segments, in the order up, Doppler, down."""
+        """(3,) bool: True for segments that exist, in the order up, Doppler, down."""
         return np.array([name in self.segment_order for name in waveform.SEGMENT_NAMES])
 
     @property
     def segment_starts(self) -> tuple[np.ndarray, ...]:
-        """Times [s] from the start of a look to the start of each of its segments.
+        """Times [s] from the start of a look to the start of its up, Doppler and down segment.
 
         A look is one pass through all segments of the shot.
         """
@@ -173,36 +171,40 @@ class WaveformSettings:
 
     @property
     def look_period(self) -> np.ndarray:
-        """Time [s] from the start of one look to that of the next.
+        """Time [s] from the start of one look to the start of the next.
 
-        The time is the duration of all segments and gaps of the shot.
+        A look is one pass through all segments of the shot, with the gaps between them.
         """
         return len(self.segment_order) * (self.chirp_duration + self.segment_gap)
 
     def middle_look_delay(self, looks: Looks) -> np.ndarray | float:
-        """Return the time [s] from the start of the first look to that of the middle look.
+        """Return the time [s] from the start of the first look to the start of the middle look.
 
-        A look is one pass through all segments of the shot.
+        A look is one pass through all segments of the shot. With an even number of looks, the
+        middle lies between two of them.
         """
         return 0.5 * (looks.number - 1) * self.look_period if looks.number > 1 else 0.0
 
     def middle_look_starts(self, looks: Looks) -> tuple[np.ndarray, ...]:
-        """Return the times [s] from the shot's start to each segment's start in the middle look.
+        """Return the times [s] from the shot's start to the segments of the middle look.
 
-        A look is one pass through all segments of the shot.
+        A look is one pass through all segments of the shot. The tuple is in the order up, Doppler,
+        down.
         """
         delay = self.middle_look_delay(looks)
         return tuple(start + delay for start in self.segment_starts)
 
     def segments(self, target: TargetState, motion: LineMotion) -> tuple[WaveformSegment, ...]:
-        """Return the three segments, with range and velocity of the target at their starts.
+        """Return the three segments, with the target's range and velocity at their starts.
+
+        The tuple is in the order up, Doppler, down.
 
         Parameters
         ----------
         target : TargetState
             Target at the start of the shot.
         motion : LineMotion
-            Motion that the lines include.
+            Motion during the shot that is simulated.
 
         Notes
         -----
@@ -244,15 +246,14 @@ class RecordSettings:
     acquisition_delay: np.ndarray
     """Time from a segment's start to the start of its record [s]."""
     is_complex: bool
-    """True if the record consists of complex samples I + iQ. Its spectrum then has bins of signed
-    frequency and no images of lines.
-    """
+    """True if the record consists of complex samples I + iQ. Its spectrum has bins of signed
+    frequency, and no images of lines."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "RecordSettings":
-        """Return the record's settings for parameters by dotted path.
+        """Return the record's settings from parameters by dotted path.
 
-        All points must have the same number of samples and the same FFT size.
+        All points must share the number of samples and the FFT size.
         """
         length = waveform.n_record_samples(parameters)
         window_name = canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"]))
@@ -299,7 +300,7 @@ class RecordSettings:
     def count_samples_before_echo(
         self, segment: WaveformSegment, range: np.ndarray | float
     ) -> np.ndarray:
-        """Return the number of samples in a segment's record before the echo arrives.
+        """Return the number of samples in a segment's record that precede the echo, int64.
 
         Parameters
         ----------
@@ -318,14 +319,15 @@ class RecordSettings:
 
 
 def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the speed at which the range along the beam falls [m/s], (n,) or scalar.
+    """Return the speed [m/s] at which the range along the beam decreases, (n,) or a scalar.
 
-    This speed differs from the radial velocity if the beam slides over sloping ground.
+    The speed differs from the radial velocity if the beam slides over sloping ground.
 
     Notes
     -----
-    Let V = v d + u e, with d along the beam and e across it towards the near side. The range of a
-    plane of normal n at the grazing angle g then falls at V.n / d.n = v + u cot g.
+    Let the velocity be V = v d + u e, with the unit vector d along the beam and e across it,
+    towards the near side. The range of a plane of normal n at the grazing angle g decreases at V.n
+    / d.n = v + u cot g.
     """
     if APPROACH_SPEED_PATH in parameters:
         return parameters[APPROACH_SPEED_PATH]
@@ -339,10 +341,13 @@ def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
-    """Return the Doppler ratio 2 v_r / c of a radial velocity v_r [m/s]."""
+    """Return the Doppler ratio 2 v_r / c of a radial velocity v_r [m/s].
+
+    c is the speed of light.
+    """
     return 2 * radial_velocity / SPEED_OF_LIGHT
 
 
 def is_iq_sampled(parameters: Mapping[str, Any]) -> bool:
-    """Return True if two receivers sample the I and Q parts of a complex record."""
+    """Return True if the record is complex, sampled by two receivers for I and Q."""
     return str(parameters.get(RECORD_TYPE_PATH, "real")) == "complex"

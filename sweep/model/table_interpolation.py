@@ -9,14 +9,14 @@ from numpy.typing import ArrayLike
 def interpolate_tables(
     grids: Sequence[np.ndarray], tables: Sequence[np.ndarray], positions: Sequence[ArrayLike]
 ) -> tuple[np.ndarray, ...]:
-    """Interpolate tables linearly in each of their coordinates.
+    """Return the values of several tables at points, interpolated linearly along each axis.
 
     Parameters
     ----------
     grids : sequence of ndarray
-        Increasing coordinates at which the tables are given, one array for each axis.
+        Increasing coordinates of the tables' nodes, one array for each axis.
     tables : sequence of ndarray
-        Tables; the shape of each is that of the grids.
+        Tables of equal shape, one axis for each array of `grids`.
     positions : sequence of array_like
         Coordinates of the points, one array for each axis; the arrays broadcast. Points beyond a
         grid take the value at its end.

@@ -43,14 +43,14 @@ from sweep.model.waveform import SEGMENT_NAMES
         "design_pfa_shot",
     )
 )
-"""Parameter paths of five ways to set the detection threshold; exactly one of them is given."""
+"""Parameter paths of five ways to set the detection threshold; a spec must state exactly one."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
-"""Mean magnitude of a noise-only bin, relative to the noise standard deviation per quadrature."""
+"""Mean magnitude of a noise-only bin, divided by the noise standard deviation per quadrature."""
 
 
 def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the threshold-to-noise ratio from the parameter that sets the threshold.
+    """Return the threshold-to-noise ratio from the one parameter that sets the threshold.
 
     Parameters
     ----------
@@ -60,12 +60,12 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
     Returns
     -------
     ndarray
-        Threshold divided by the standard deviation of |X| in a bin of noise.
+        Threshold divided by the standard deviation of |X| in a noise-only bin.
 
     Raises
     ------
     ValueError
-        If not exactly one of :data:`THRESHOLD_PATHS` is given.
+        If the number of parameters of :data:`THRESHOLD_PATHS` is not one.
 
     Examples
     --------
@@ -113,10 +113,10 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
 def _common_threshold_ratio(
     log_pfa: float, looks: Looks, bins_by_segment: tuple[SearchedBins, ...]
 ) -> np.ndarray:
-    """Return the ratio of threshold to noise sigma for a probability of false alarm (cached).
+    """Return the threshold over the noise sigma that a probability of false alarm needs (cached).
 
-    ``log_pfa`` is the natural logarithm of the probability that noise raises an alarm in any
-    segment.
+    ``log_pfa`` is the natural logarithm of the probability that noise raises an alarm in at least
+    one segment. ``bins_by_segment`` are the bins in which noise can raise alarms.
     """
     return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_function(looks, bins_by_segment))
 
@@ -124,10 +124,10 @@ def _common_threshold_ratio(
 def _log_pfa_function(
     looks: Looks, bins_by_segment: Sequence[SearchedBins]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that gives the log probability of a false alarm in any segment.
+    """Return a function of the ratio of threshold to noise sigma per quadrature.
 
-    Its argument is the ratio of threshold to noise sigma. ``bins_by_segment`` are the bins of each
-    segment in which noise may raise an alarm.
+    Its values are the natural logarithm of the probability that noise raises a false alarm in at
+    least one segment. ``bins_by_segment`` are the bins in which noise can raise alarms.
     """
     from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 
@@ -146,7 +146,9 @@ def _log_pfa_function(
 def n_segment_alarm_bins(
     parameters: Mapping[str, Any], threshold_ratio: np.ndarray, segment: str = "up"
 ) -> np.ndarray:
-    """Return the number of independent bins that together have a segment's false-alarm probability.
+    """Return the number of independent noise bins with the false-alarm probability of a segment.
+
+    At least one of these bins crosses the threshold as probably as one of the segment's.
 
     Parameters
     ----------
@@ -159,7 +161,7 @@ def n_segment_alarm_bins(
 
     See Also
     --------
-    sweep.model.preparation.Shots.n_alarm_equivalent_bins : The number less the bins of a detection.
+    sweep.model.preparation.Shots.n_alarm_equivalent_bins : The number without the echo's bins.
     """
     looks = Looks.from_parameters(parameters)
     segment_bins = _searched_bins(parameters).select_segment(SEGMENT_NAMES.index(segment))
@@ -168,7 +170,7 @@ def n_segment_alarm_bins(
 
 
 def _searched_bins(parameters: Mapping[str, Any]) -> SearchedBins:
-    """Return the bins in which noise may raise false alarms, for parameters by dotted path."""
+    """Return the bins in which noise can raise false alarms, from parameters by dotted path."""
     record = RecordSettings.from_parameters(parameters)
     waveform = WaveformSettings.from_parameters(parameters)
     return SearchedBins.from_record(

@@ -31,7 +31,7 @@ def time_domain_spectrum(
     with_acceleration: bool = False,
     laser_phase: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Compute the magnitudes of the noiseless spectrum of one segment of one point.
+    """Return the magnitudes |X| of the noiseless spectrum of one segment of one point.
 
     Parameters
     ----------
@@ -45,7 +45,8 @@ def time_domain_spectrum(
     with_acceleration : bool
         True to include the drift of the frequency while the target's velocity changes.
     laser_phase : ndarray (L,) or float
-        Phase noise theta(t) - theta(t - tau) of the laser in each sample [rad].
+        Phase noise theta(t) - theta(t - tau) of the laser in each sample [rad]; tau is the echo's
+        delay.
 
     Returns
     -------
@@ -90,7 +91,7 @@ def time_domain_spectrum(
 def evaluate_segments_in_time_domain(
     shots: Shots, *, with_range_walk: bool = True
 ) -> SegmentResults:
-    """Detect echoes in spectra that are computed in the time domain.
+    """Return results of all segments, such as pd, from spectra computed in the time domain.
 
     Parameters
     ----------
@@ -151,7 +152,7 @@ def beamlet_analytic_signal(
     with_range_walk: bool = True,
     with_acceleration: bool = False,
 ) -> np.ndarray:
-    """Compute the record of one beamlet's voltage at the ADC, as a complex (analytic) signal.
+    """Return the record of one beamlet's voltage at the ADC as a complex (analytic) signal.
 
     Parameters
     ----------
@@ -170,8 +171,9 @@ def beamlet_analytic_signal(
     Notes
     -----
     From the shot's start on, the range of the ground along the beam falls at ``approach_speed``,
-    and that of its scatterers at their own radial velocity. If the two differ, the beam slides over
-    the ground. Scatterers then replace each other, and the beat has the delay of those in the beam.
+    and that of its scatterers at their own radial velocity. If these speeds differ, the beam slides
+    over the ground: scatterers in the beam are replaced by new ones, and the beat has the delay of
+    the scatterers in the beam.
     """
     chirp_rate_ratio, carrier = (
         shots.waveform.chirp_rate_ratios[segment],
@@ -252,7 +254,7 @@ def _start_phase_cycles(
     range_offset: float,
     range_decrease_since_shot_start: float,
 ) -> float:
-    """Compute the phase of a beamlet's beat at the segment's start [cycles], in exact fractions.
+    """Return the phase of a beamlet's beat at the segment's start [cycles], by exact fractions.
 
     The phase is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is
     ``carrier``, s ``chirp_rate_ratio``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR
@@ -270,6 +272,6 @@ def _start_phase_cycles(
 
 
 def _value_of_point(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Return a point's value from an array (n,), or the one number that all points share."""
+    """Return one point's value from an array (n,), or from a number that all points share."""
     column = np.asarray(column)
     return column[point] if column.ndim else column

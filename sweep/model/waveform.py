@@ -34,16 +34,17 @@ from sweep.model.constants import SPEED_OF_LIGHT
 _FloatOrArray = TypeVar("_FloatOrArray", float, np.ndarray)
 
 SEGMENT_NAMES = ("up", "doppler", "down")
-"""Names of the segments, in the order of the rows of arrays by segment."""
+"""Names of the three segments, in the order of rows in arrays that have a row per segment."""
 SEGMENT_ORDER_PATH = "instrument.chirp.segments"
-"""Parameter path of the names and order of a shot's segments, one of `SEGMENT_ORDERS`."""
+"""Parameter path of the names of a shot's segments in the order of time, one of `SEGMENT_ORDERS`.
+"""
 SEGMENT_GAP_PATH = "instrument.chirp.gap"
 """Parameter path of the time between the end of a segment and the start of the next one [s]."""
 SEGMENT_ORDERS = (
     "up doppler down", "up down", "down up", "down doppler up", "doppler up down",
     "doppler down up", "up down doppler", "down up doppler",
 )  # fmt: skip
-"""Possible sets of segments of a shot, each in the order of time."""
+"""Possible sequences of a shot's segments, in the order of time."""
 DOPPLER_CHIRP_RATE_RATIO_PATH = "instrument.chirp.doppler_slope"
 """Parameter path of the chirp rate of the Doppler segment, relative to that of the up-chirp."""
 DOWN_CHIRP_RATE_RATIO_PATH = "instrument.chirp.down_slope"
@@ -51,18 +52,20 @@ DOWN_CHIRP_RATE_RATIO_PATH = "instrument.chirp.down_slope"
 SHOT_DETECTION_PATH = "instrument.processing.shot_detection"
 """Parameter path of the rule by which a shot is detected, one of `SHOT_DETECTION_OPTIONS`."""
 BOTH_CHIRPS, ANY_TWO = SHOT_DETECTION_OPTIONS = ("both_chirps", "any_two")
-"""Names of detection rules: a shot is detected if both chirps detect the echo, or any two segments.
-"""
+"""Names of the rules by which a shot counts as detected: both chirps detect the echo, or any two
+segments do."""
 TWO_BEAT_ASSUMPTION_PATH = "instrument.processing.two_beats"
-"""Parameter path of the assumption that gives range and velocity from two beats of unknown sign. It
-is one of `TWO_BEAT_ASSUMPTIONS`."""
+"""Parameter path of the assumption by which range and velocity follow from two beats of unknown
+sign, one of `TWO_BEAT_ASSUMPTIONS`."""
 REPORTED_PEAKS_PATH = "instrument.processing.peaks"
-"""Parameter path of the choice of peaks that a segment reports, one of `REPORTED_PEAKS_OPTIONS`."""
+"""Parameter path of the option for which peaks a segment reports, one of `REPORTED_PEAKS_OPTIONS`.
+"""
 ALL_PEAKS, STRONGEST_PEAK = REPORTED_PEAKS_OPTIONS = ("all", "strongest")
-"""Names of the peaks that a segment reports: all above the threshold, or the strongest alone."""
+"""Names of the options for which peaks a segment reports: all above the threshold, or only the
+strongest."""
 FAR_TARGET, FAST_TARGET = TWO_BEAT_ASSUMPTIONS = ("far", "fast")
-"""Names of assumptions on two beats of unknown sign. Either the range beat exceeds the Doppler
-shift (``far``), or the Doppler shift exceeds the range beat (``fast``)."""
+"""Names of the assumptions that resolve two beats of unknown sign: the range beat exceeds the
+Doppler shift (``far``), or the Doppler shift exceeds the range beat (``fast``)."""
 DEFAULT_CHIRP_RATE_RATIOS = (1, 0, -1)
 """Default chirp rates of up, Doppler and down segment, each relative to that of the up-chirp."""
 WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
@@ -86,8 +89,8 @@ SEARCH_VELOCITY_LIMIT_PATHS = (
 )
 """Parameter paths of the smallest and the largest radial velocity of searched echoes [m/s]."""
 SEARCH_BAND_PATHS = SEARCH_RANGE_LIMIT_PATHS + SEARCH_VELOCITY_LIMIT_PATHS
-"""Parameter paths of the search band's four limits in range and velocity. Either all four are given
-or none."""
+"""Parameter paths of the search band's limits in range and velocity. A spec states all four or
+none."""
 
 
 class WaveformSegment(NamedTuple):
@@ -99,27 +102,27 @@ class WaveformSegment(NamedTuple):
     name: str
     """Name of the segment, one of :data:`SEGMENT_NAMES`."""
     chirp_rate_ratio: float
-    """Chirp rate of the segment relative to that of the up-chirp. By default it is 1, 0 and -1 for
-    up, Doppler and down segment."""
+    """Chirp rate of the segment, divided by that of the up-chirp. By default it is 1, 0 and -1 for
+    the up, Doppler and down segment."""
     chirp_rate: np.ndarray
     """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Optical frequency at the segment's start [Hz]. Times a delay, it gives the echo's phase
-    [cycles]."""
+    """Frequency at the segment's start [Hz], optical unless detection is direct. Times a delay, it
+    gives the echo's phase [cycles]."""
     evaluates_leakage: bool
-    """True if leakage, false alarms due to the echo's signal far from its line, is evaluated
-    here."""
+    """True if leakage is evaluated in this segment: false alarms due to the echo's signal far from
+    its line."""
     range_decrease_since_shot_start: np.ndarray | float
     """Decrease of the target's range from the start of the shot to that of the segment [m]."""
     doppler_ratio: np.ndarray | float
-    """Doppler ratio 2 v_r / c of the line on the beam's axis at the start of the segment."""
+    """Doppler ratio 2 v_r / c of the line on the beam's axis at the start of the segment, with the
+    radial velocity v_r."""
     start_time: np.ndarray | float
-    """Time from the start of the shot to that of the segment [s]. It is 0 if the target's motion
-    between segments is neglected.
-    """
+    """Time [s] from the start of the shot to that of the segment; 0 if motion between segments is
+    not simulated."""
 
     def delay(self, range: np.ndarray | float) -> np.ndarray:
-        """Return the delay of the echo at the segment's start [s].
+        """Return an echo's delay at the segment's start [s], from its range at the shot's start.
 
         Parameters
         ----------
@@ -129,12 +132,12 @@ class WaveformSegment(NamedTuple):
         return np.asarray(2 / SPEED_OF_LIGHT * (range - self.range_decrease_since_shot_start))
 
     def beat_frequency(self, range: np.ndarray | float) -> np.ndarray:
-        """Return the signed beat frequency [Hz] of a line at a range [m] at the shot's start.
+        """Return the signed beat frequency [Hz] of an echo, from its range [m] at the shot's start.
 
         Notes
         -----
-        f_seg beta - S tau (1 + beta), with the delay tau and the Doppler ratio beta at the
-        segment's start, and the segment's signed chirp rate S.
+        f_seg beta - S tau (1 + beta), with the carrier f_seg, the delay tau and the Doppler ratio
+        beta at the segment's start, and the segment's signed chirp rate S.
         """
         beat_of_delay = self.chirp_rate * (self.delay(range) * (1 + self.doppler_ratio))
         return self.carrier * self.doppler_ratio - beat_of_delay
@@ -153,7 +156,7 @@ def carrier_frequencies(
     architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray,
     bandwidth: np.ndarray, chirp_rate_ratios: Sequence[ArrayLike] = DEFAULT_CHIRP_RATE_RATIOS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the frequency at the start of each segment [Hz]; times a delay it is a phase.
+    """Return the frequency at the start of each segment [Hz]; its product with a delay is a phase.
 
     Parameters
     ----------
@@ -192,9 +195,9 @@ def carrier_frequencies(
 
 
 def chirp_rate_ratios(parameters: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the chirp rates of up, Doppler and down segment, relative to that of the up-chirp.
+    """Return the chirp rates of up, Doppler and down segment, divided by that of the up-chirp.
 
-    All points share them.
+    All points share these numbers.
     """
     doppler, down = (
         float(np.ravel(parameters.get(path, WAVEFORM_DEFAULTS[path]))[0])
@@ -204,12 +207,12 @@ def chirp_rate_ratios(parameters: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
-    """Return the names of a shot's segments in the order of time.
+    """Return the names of a shot's segments that exist, in the order of time.
 
     Parameters
     ----------
     architecture : str
-        Receiver architecture; direct detection has no optical Doppler segment.
+        Receiver architecture; with direct detection there is no Doppler segment.
     segments : str
         One of :data:`SEGMENT_ORDERS`.
     """
@@ -220,7 +223,7 @@ def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     segment_order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Return the times [s] from the shot's start to the start of up, Doppler and down segment.
+    """Return the times [s] from the shot's start to the starts of the up, Doppler and down segment.
 
     Parameters
     ----------
@@ -251,7 +254,7 @@ def beat_frequency(
     range: np.ndarray,
     radial_velocity: np.ndarray,
 ) -> np.ndarray:
-    """Return the signed beat frequency [Hz] of a segment.
+    """Return the signed beat frequency of a segment [Hz].
 
     Parameters
     ----------
@@ -286,15 +289,15 @@ def round_trip_delay(range: _FloatOrArray) -> _FloatOrArray:
 
 
 TIME_TOLERANCE_SAMPLES = 1e-6
-"""Tolerance for time limits of samples [sample intervals]. A sample outside a limit by less than
-this counts as inside."""
+"""Time [sample intervals] by which a sample may lie outside a time limit and still count as inside.
+"""
 
 
 def n_record_samples(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the number of samples in the record, (n,) int64, for parameters by dotted path.
+    """Return the number of samples of the record, (n,) int64, from parameters by dotted path.
 
-    The number is the FFT size, or the number of samples between the acquisition delay and the
-    chirp's end, if that is smaller.
+    It is the lesser of two numbers: the FFT size, and the number of samples from the acquisition
+    delay to the chirp's end.
     """
     time_left = (
         parameters["instrument.chirp.duration"]
@@ -310,7 +313,7 @@ def count_samples_before_echo(
     *, delay: np.ndarray, doppler_ratio: np.ndarray | float, record_start: np.ndarray,
     sample_rate: np.ndarray, length: int,
 ) -> np.ndarray:  # fmt: skip
-    """Count the samples of a record that are taken before the echo arrives.
+    """Return the number of samples of a record that are taken before the echo arrives.
 
     Parameters
     ----------
@@ -337,7 +340,7 @@ def count_samples_before_echo(
 
 
 def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
-    """Return the frequency at which a real record shows a signal, 0 to half the sample rate.
+    """Return the frequency, from 0 to half the sample rate, at which a real record shows a signal.
 
     Parameters
     ----------
@@ -355,50 +358,51 @@ def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray
 
 
 FOLD_PENALTY_BINS = 4.0
-"""Penalty [bins] of interpretations of the peaks in which a peak is folded at Nyquist. Such an
-interpretation is chosen only if its mismatch of the third peak is smaller by more than the
-penalty."""
+"""Penalty [bins] for readings of the peaks in which a peak is folded at Nyquist. A reading is one
+way to read peaks as range beat and Doppler frequency. The penalty is added to the mismatch between
+the third peak and its prediction."""
 
 N_POSSIBLE_BEAT_READINGS = 16
-"""Number of interpretations (readings) of peaks of unknown sign. They differ in which peaks are
-folded at Nyquist, and in whether half the sum or half the difference is the Doppler frequency.
-:func:`doppler_and_range_beat` defines their numbers."""
+"""Number of readings of peaks of unknown sign: ways to read them as range beat and Doppler
+frequency. Readings differ in which peaks are folded at Nyquist, and in whether half the sum or half
+the difference is the Doppler frequency. :func:`doppler_and_range_beat` defines their numbers."""
 
 FAR_TARGET_READING = 1
-"""Number, for :func:`doppler_and_range_beat`, of the interpretation for far targets. The range beat
-exceeds the Doppler frequency, and no peak is folded at Nyquist. Half the difference of the up and
-down peak is the Doppler frequency."""
+"""Number of the reading for far targets in :func:`doppler_and_range_beat`: the range beat exceeds
+the Doppler frequency, and no peak is folded at Nyquist. Half the difference of up and down peak is
+the Doppler frequency."""
 
 FAST_TARGET_READING = 0
-"""Number, for :func:`doppler_and_range_beat`, of the interpretation for fast targets. The Doppler
-frequency exceeds the range beat, and no peak is folded at Nyquist. Half the sum of the up and down
-peak is the Doppler frequency."""
+"""Number of the reading for fast targets in :func:`doppler_and_range_beat`: the Doppler frequency
+exceeds the range beat, and no peak is folded at Nyquist. Half the sum of up and down peak is the
+Doppler frequency."""
 
 
 SIGNED_BEATS_READING = 16
-"""Number, for :func:`doppler_and_range_beat`, of the interpretation of signed peaks, which complex
-records have. With the up peak u and the down peak d, the range beat is (d - u) / 2. The Doppler
-frequency is u plus the range beat. Twice the range beat, and the Doppler frequency, are modulo the
-sample rate. Range beats are positive, up to half the sample rate; Doppler shifts have either sign,
-up to half of it."""
+"""Number of the reading of signed peaks in :func:`doppler_and_range_beat`. Complex records have
+signed peaks. The range beat is half the down peak minus half the up peak. The Doppler frequency is
+the up peak plus the range beat. Both follow from values modulo the sample rate: range beats are
+from 0 to half the sample rate, Doppler frequencies have either sign, up to half of it."""
 
 NEGATIVE_BEAT_FRACTION_MAX = 1 / 64
-"""Limit up to which a negative difference of down and up peak, relative to the sample rate, stays
-negative. Rounding of peaks to bins may make this difference, twice the range beat, slightly
+"""Largest magnitude, relative to the sample rate, at which a negative down peak minus up peak stays
+negative. The difference is twice the range beat; rounding of peaks to bins may make it slightly
 negative. Larger negative differences are taken modulo the sample rate."""
 
 
 def doppler_and_range_beat(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
-    """Convert the peaks of both chirps to Doppler frequency and range beat, by one interpretation.
+    """Convert the up and down peak to a Doppler frequency and a range beat, by one reading.
+
+    A reading is one of several ways to read the two peaks, which are known up to signs and folds.
 
     Parameters
     ----------
     reading : int
-        Number of the reading. Bits 8, 4 and 2 mean that the up, Doppler and down peak is folded.
-        Bit 1 exchanges half sum and half difference. :data:`SIGNED_BEATS_READING` is the number for
-        signed peaks.
+        Number of the reading. Bits 8, 4 and 2 are set if the up, Doppler and down peak is folded at
+        Nyquist. Bit 1 is set if half the difference of the peaks is the Doppler frequency, not half
+        the sum. :data:`SIGNED_BEATS_READING` is the number for signed peaks.
     up, down : float or ndarray
-        Peaks of up- and down-chirp, in any unit of frequency.
+        Peak frequencies of up- and down-chirp, in any unit.
     sample_rate : float or ndarray
         Sample rate in the same unit.
 
@@ -428,7 +432,7 @@ def doppler_and_range_beat(reading, up, down, sample_rate):  # type: ignore[no-u
 def range_velocity_of_beats(  # type: ignore[no-untyped-def]  # of arrays, or compiled
     f_d, f_r, carrier, bandwidth, duration
 ):
-    """Convert a Doppler frequency and a range beat to range [m] and radial velocity [m/s].
+    """Return the range [m] and radial velocity [m/s] of a range beat and a Doppler frequency.
 
     Parameters
     ----------
@@ -460,7 +464,9 @@ def resolve_range_velocity(
     has_signs: bool = False,
     two_beat_assumption: str = FAR_TARGET,
 ) -> RangeVelocity:
-    """Resolve range and velocity from the peak frequencies of up, Doppler and down segment.
+    """Return range and velocity from the peak frequencies of up, Doppler and down segment.
+
+    A reading is one way to read the peaks as range beat and Doppler frequency.
 
     Parameters
     ----------
@@ -532,7 +538,7 @@ def fit_range_velocity(
     has_signs: bool = False,
     two_beat_assumption: str = FAR_TARGET,
 ) -> RangeVelocity:
-    """Fit range and velocity by weighted least squares to the peaks of two or more segments.
+    """Fit range and velocity to the peaks of two or more segments by weighted least squares.
 
     Parameters
     ----------
@@ -610,7 +616,10 @@ def fit_range_velocity(
 def _fit_signed_beats(
     beats: np.ndarray, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the Doppler ratio and the delay to signed beats by weighted least squares.
+    """Return Doppler ratio and delay that fit signed beats best, by weighted least squares.
+
+    The fitted equation is beat = carrier * beta - chirp rate * x, with the Doppler ratio beta and
+    x = tau (1 + beta) of the delay tau.
 
     Parameters
     ----------
@@ -645,7 +654,7 @@ def _fit_signed_beats(
 def range_velocity_response(
     beats: np.ndarray, *, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes of the fitted range and radial velocity for given changes of the beats.
+    """Return the changes of fitted range and radial velocity that changes of the beats cause.
 
     Parameters
     ----------
@@ -670,11 +679,10 @@ def range_velocity_response(
 def _fit_unsigned_peaks(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """Fit Doppler ratio and delay to peaks of unknown sign, (2, n).
+    """Return Doppler ratio beta and x = tau (1 + beta) that fit peaks of unknown sign best, (2, n).
 
-    Signs and folds at Nyquist are those that fit best. The second row is tau (1 + beta), with the
-    delay tau and the Doppler ratio beta. The parameters are those of :func:`fit_range_velocity` for
-    segments that are all detected.
+    tau is the delay [s]. Signs and folds at Nyquist are those that fit best. The parameters are
+    those of :func:`fit_range_velocity`; all segments are detected.
     """
     n_peaks = len(peaks)
     least_cost, solutions = np.full(peaks.shape[1:], np.inf), np.full((2, *peaks.shape[1:]), np.nan)
@@ -708,10 +716,10 @@ def _fit_unsigned_peaks(  # type: ignore[no-untyped-def]  # seven arrays and a w
 def _fit_signed_peaks(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """Fit Doppler ratio and delay to signed peaks, which are known modulo the sample rate.
+    """Return Doppler ratio beta and x = tau (1 + beta) that fit signed peaks best, (n,) each.
 
-    The second result is tau (1 + beta), with the delay tau and the Doppler ratio beta. The
-    parameters are those of :func:`fit_range_velocity` for segments that are all detected.
+    tau is the delay [s]. Peaks are known modulo the sample rate. The parameters are those of
+    :func:`fit_range_velocity`; all segments are detected.
     """
     point_index = np.arange(peaks.shape[1])
     lowest_segment, highest_segment = chirp_rates.argmin(axis=0), chirp_rates.argmax(axis=0)

@@ -16,23 +16,24 @@ COSINE_SUM_COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "blackmanharris": ("0.35875", "0.48829", "0.14128", "0.01168"),
     "flattop": ("0.21557895", "0.41663158", "0.277263158", "0.083578947", "0.006947368"),
 }
-"""Coefficients c_m >= 0 of cosine-sum windows, by name, as written in scipy.signal.windows.
+"""Coefficients c_m >= 0 of cosine-sum windows, by window name, as texts.
 
-The window is the sum over m of (-1)^m c_m cos(2 pi m n / L).
-"""
+Sample n of a window of L samples is the sum over m of (-1)^m c_m cos(2 pi m n / L). The digits are
+those of scipy.signal.windows."""
 
 WINDOW_NAME_ALIASES = {"boxcar": "rectangular", "rect": "rectangular", "hanning": "hann"}
-"""Canonical window names by alternative name."""
+"""Canonical name of a window, by alternative name."""
 
 ENVELOPE_SAMPLES_PER_BIN = 16
-"""Number of samples per bin of fs/L in the FFT for the envelope of a window's transform. It is used
-for windows without a closed form."""
+"""Number of samples per bin of fs/L (sample rate over number of samples) at which a window's
+transform is computed for its sidelobe envelope. It is used for windows without a closed form."""
 
 _CLOSED_FORM_LENGTH_MIN = 64
-"""Smallest number of samples for which the closed form of a cosine sum's transform is used."""
+"""Smallest number of samples of a cosine-sum window at which its transform is computed in closed
+form."""
 _WEIGHT_SAMPLES_MAX = 256
 """Largest number of window samples from which :meth:`Window.weights_by_record_position` is
-computed. Longer windows are sampled more coarsely."""
+computed; longer windows are sampled more coarsely."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,19 +47,20 @@ class Window:
     first_value: float
     """Value of the window's first sample."""
     sum: float
-    """Sum of the window's samples, which is the peak of its transform."""
+    """Sum of the window's samples, equal to its transform at frequency 0."""
     energy: float
     """Sum of the squares of the window's samples."""
     envelope_distances: np.ndarray
-    """(m,): distance from a line at which the envelope is tabulated [bins of fs/L]."""
+    """(m,): distances from a line at which `sidelobe_envelope` is tabulated [bins of fs/L, sample
+    rate over number of samples]."""
     sidelobe_envelope: np.ndarray
-    """(m,): largest magnitude of the window's transform at or beyond each distance, relative to its
-    peak."""
+    """(m,): largest magnitude of the window's transform at or beyond each of `envelope_distances`,
+    relative to the peak."""
     n_missing: int = 0
-    """Number of samples at the start that :func:`zero_first_samples` has set to 0."""
+    """Number of samples at the record's start that are set to 0, because they precede the echo."""
 
     def samples(self) -> np.ndarray:
-        """Return the samples of the window (L,), of which the first `n_missing` may be 0."""
+        """Return the samples of the window, (L,); the first `n_missing` are 0."""
         w = window_samples(self.name, self.length)
         if self.n_missing:
             w = w.copy()
@@ -66,19 +68,21 @@ class Window:
         return w
 
     def weights_by_record_position(self, adds_powers: bool) -> tuple[float, ...]:
-        """Return the distribution of the window's magnitude or autocorrelation over the record.
+        """Return how the window's magnitude, or its autocorrelation, is distributed over |t|.
+
+        |t| is the distance from the record's middle, or the lag, relative to its largest value.
 
         Parameters
         ----------
         adds_powers : bool
-            False for |w| by the distance t from the record's middle, where 1 is the record's end.
-            True for the autocorrelation of |w|, whose transform is |W|^2, by the lag t over L.
+            False for the samples' magnitude |w| at the distance t from the record's middle; t is 1
+            at the record's end. True for the autocorrelation of |w| at the lag t [record lengths].
 
         Returns
         -------
         tuple of float
-            Fractions of the sum at |t| evenly spaced over 0..1. For windows other than cosine sums
-            all of it is at t = 1, which gives upper bounds.
+            Fractions of the sum over |t|, at |t| evenly spaced over 0..1. For windows other than
+            cosine sums the fraction at |t| = 1 is 1, which leads to upper bounds.
         """
         if self.name not in COSINE_SUM_COEFFICIENTS or self.length < _CLOSED_FORM_LENGTH_MIN:
             return 0.0, 1.0
@@ -93,11 +97,11 @@ class Window:
         return tuple(map(float, weights / weights.sum()))
 
     def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
-        """Return how wide a group of lines may be that J equivalent lines represent.
+        """Return the largest half-width of a group of lines that J equivalent lines can represent.
 
-        The widths are half-widths times pi [rad], by tolerance and by J, as in
-        :func:`sweep.model.spectrum.lines.node_phase_limits`. Tolerances are those of sums of
-        amplitudes or, with `adds_powers`, of sums of powers.
+        Half-widths are times pi [rad], by tolerance and by J, as in
+        :func:`sweep.model.spectrum.lines.node_phase_limits`. With `adds_powers` the tolerances are
+        those of sums of powers, else those of sums of amplitudes.
         """
         from sweep.model.spectrum.lines import (
             AMPLITUDE_TOLERANCES,
@@ -110,9 +114,9 @@ class Window:
 
     @property
     def equivalent_noise_bandwidth(self) -> float:
-        """Equivalent noise bandwidth [bins of fs/L].
+        """Equivalent noise bandwidth [bins of fs/L, sample rate over number of samples].
 
-        The bandwidth is L times the sum of squared samples, divided by the squared sum of samples.
+        It is L times the sum of squared samples, divided by the squared sum of samples.
         """
         return self.length * self.energy / self.sum**2
 
@@ -124,7 +128,7 @@ def canonical_window_name(name: str) -> str:
 
 
 def window_samples(name: str, length: int) -> np.ndarray:
-    """Return the DFT-even (periodic) samples of a window, whose largest value is about 1.
+    """Return the samples of a window, in the periodic (DFT-even) form; the largest is about 1.
 
     Parameters
     ----------
@@ -158,7 +162,7 @@ def window_samples(name: str, length: int) -> np.ndarray:
 
 
 def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
-    """Return the samples (length,) of a cosine-sum window, identical to those of scipy.signal."""
+    """Return the samples (length,) of a cosine-sum window, bit for bit those of scipy.signal."""
     c = [float(t) for t in COSINE_SUM_COEFFICIENTS[name]]
     if len(c) == 2:
         constant_term, _ = c
@@ -174,7 +178,7 @@ def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def get_window(name: str, length: int) -> Window:
-    """Return the :class:`Window` of a name and a number of samples; it is cached.
+    """Return the :class:`Window` with a given name and number of samples (cached).
 
     Parameters
     ----------
@@ -200,12 +204,12 @@ def get_window(name: str, length: int) -> Window:
 
 
 ZEROING_STEPS_PER_RECORD = 32
-"""Number of equal steps of a record, to which :func:`zero_first_samples` rounds the missing
-samples."""
+"""Number of equal steps into which a record is divided; :func:`zero_first_samples` zeroes whole
+steps."""
 
 
 def zero_first_samples(window: Window, n_missing: int) -> Window:
-    """Return a window whose first samples are 0, for a record that begins before the echo.
+    """Return a copy of a window with zeros in its first samples, which precede the echo.
 
     Parameters
     ----------
@@ -218,7 +222,7 @@ def zero_first_samples(window: Window, n_missing: int) -> Window:
     Returns
     -------
     Window
-        Window with its own sums; the envelope is that of the full window.
+        Window with the sums of the remaining samples, and the sidelobe envelope of the full window.
     """
     step = min(
         round(ZEROING_STEPS_PER_RECORD * n_missing / window.length), ZEROING_STEPS_PER_RECORD - 1
@@ -228,9 +232,9 @@ def zero_first_samples(window: Window, n_missing: int) -> Window:
 
 @lru_cache(maxsize=2 * ZEROING_STEPS_PER_RECORD)
 def _zero_first_steps(window: Window, step: int) -> Window:
-    """Return a window whose first steps are 0; a record has :data:`ZEROING_STEPS_PER_RECORD`.
+    """Return a copy of a window with zeros in the first ``step`` steps of the record (cached).
 
-    ``step`` is the number of zeroed steps.
+    A record has :data:`ZEROING_STEPS_PER_RECORD` steps.
     """
     shortened = replace(window, n_missing=step * window.length // ZEROING_STEPS_PER_RECORD)
     w = shortened.samples()
@@ -238,7 +242,7 @@ def _zero_first_steps(window: Window, step: int) -> Window:
 
 
 def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
-    """Compute the window's Fourier transform by a direct sum over samples; slow, for tests.
+    """Return the window's Fourier transform by a direct sum over samples; slow, for tests.
 
     Parameters
     ----------
@@ -259,18 +263,18 @@ def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
 
 
 def centred_transform(window: Window, y: np.ndarray, *, squared: bool = False) -> np.ndarray:
-    """Return the transform about the record's middle of a window, or of its square.
+    """Return the Fourier transform of a window, or of its square, about the record's middle.
 
     Cosine sums of many samples are transformed in closed form, other windows by a direct sum.
 
     Parameters
     ----------
     window : Window
-        Window of L samples; missing first samples are not left out.
+        Window of L samples; samples that :func:`zero_first_samples` has set to 0 are included.
     y : ndarray (n,)
         Frequencies [bins of fs/L], less than L/2 in modulus.
     squared : bool
-        Whether the squared window is transformed.
+        True to transform the squared window.
 
     Returns
     -------
@@ -314,7 +318,7 @@ def centred_transform(window: Window, y: np.ndarray, *, squared: bool = False) -
 
 
 def _cosine_sum_window(name: str, length: int) -> Window:
-    """Return a cosine-sum :class:`Window`, computed from closed forms."""
+    """Return the :class:`Window` of a cosine sum; its sums and envelope are closed forms."""
     coefficients = tuple(float(t) for t in COSINE_SUM_COEFFICIENTS[name])
     envelope_distances, sidelobe_envelope = _cosine_sum_envelope(coefficients, length)
     first_value = math.fsum((-1) ** m * coefficient for m, coefficient in enumerate(coefficients))
@@ -336,12 +340,12 @@ def _cosine_sum_window(name: str, length: int) -> Window:
 def _cosine_sum_envelope(
     coefficients: tuple[float, ...], length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the envelope of a cosine-sum window's transform, computed from its closed form.
+    """Return the sidelobe envelope of a cosine-sum window, computed in closed form.
 
     Parameters
     ----------
     coefficients : tuple of float
-        Coefficients c_m.
+        Coefficients c_m of :data:`COSINE_SUM_COEFFICIENTS`, as numbers.
     length : int
         Length [samples].
 
@@ -374,11 +378,11 @@ def _cosine_sum_envelope(
 def _decimate_envelope(
     distances: np.ndarray, envelope: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an envelope reduced to distances that differ by some 2 %.
+    """Return a sidelobe envelope at fewer distances, which differ by some 2 %.
 
-    `envelope` (m,) is the largest magnitude of a window's transform at and beyond each of
-    `distances` (m,), relative to its peak. The factor 1.03 covers sidelobes whose peaks lie between
-    samples.
+    `envelope` (m,) is the largest magnitude of a window's transform at or beyond each of
+    `distances` (m,), relative to the peak. The result is (distances, envelope). The envelope is
+    raised by 3 %, because sidelobes may have their peaks between samples.
     """
     kept_indices = np.unique(
         np.searchsorted(distances, np.geomspace(distances[0], distances[-1], 512)).clip(
@@ -389,7 +393,7 @@ def _decimate_envelope(
 
 
 def _window_from_samples(name: str, length: int) -> Window:
-    """Return the :class:`Window` of any name, computed from its samples and their FFT."""
+    """Return the :class:`Window` of any name, with its envelope from the FFT of its samples."""
     w = window_samples(name, length)
     fft_size = ENVELOPE_SAMPLES_PER_BIN * length
     distances = np.arange(fft_size // 2 + 1) / ENVELOPE_SAMPLES_PER_BIN

@@ -23,67 +23,70 @@ import numpy as np
 from sweep.model.window import Window, get_window, window_samples
 
 _MAIN_LOBE_ROUNDING_MARGIN = 1e-6
-"""Relative margin for rounding errors of the smallest main-lobe magnitude within half a bin."""
+"""Relative margin by which the smallest magnitude within half a bin is lowered for rounding errors.
+"""
 _N_MAIN_LOBE_SERIES_TERMS = 28
 """Number of terms of the power series of a window's main lobe."""
 _N_MAIN_LOBE_STEPS = 1024
-"""Number of steps of the main-lobe table, from 0 to half an FFT bin."""
+"""Number of steps of the table of main-lobe magnitudes, from 0 to half an FFT bin."""
 _ENVELOPE_CELLS, _ENVELOPE_KNEE_WINDOW_BINS = 8192, 16.0
 """Number of cells of the sidelobe table, and the distance at its middle [bins of fs/L]. Cells are
 equally spaced in d / (d + middle distance) of the distance d."""
 _TABLE_CELLS_PER_OCTAVE = 64
-"""Number of cells per factor of 2 in magnitude, in the table of distances by magnitude."""
+"""Number of cells per factor of 2 in magnitude, in the table of distances from a line by magnitude.
+"""
 _MAGNITUDE_OCTAVE_MIN = -80
-"""Smallest magnitude in the table of distances by magnitude [octaves relative to the peak]."""
+"""Smallest magnitude in the table of distances from a line by magnitude [octaves relative to the
+peak]."""
 
 
 class WindowResponse(NamedTuple):
     """Magnitude of a window's transform at the FFT bins around a line, relative to its peak."""
 
     main_lobe: np.ndarray
-    """(m,): magnitude at distances from a line of 0..1/2 FFT bin, in equal steps."""
+    """(m,): magnitude, relative to the peak, at distances of 0..1/2 FFT bin from a line, in equal
+    steps."""
     power_slope_max: float
-    """Upper bound on the magnitude of the relative power's derivative by distance [1/bin]."""
+    """Upper bound on the slope of the power over distance from a line, as a magnitude, relative to
+    the peak power [1/bin]."""
     power_curvature_max: float
-    """Upper bound on the magnitude of the relative power's second derivative by distance [1/bin^2].
-    """
+    """Upper bound on the second derivative of the power by distance from a line, as a magnitude,
+    relative to the peak power [1/bin^2]."""
     padding_factor: float
-    """FFT size divided by number of samples, the number of FFT bins per bin of fs/L.
-    ``central_energy_min`` includes as many FFT bins on each side."""
+    """FFT size N divided by the number of samples L, which is the number of FFT bins per bin of
+    fs/L."""
     central_energy_min: float
-    """Smallest sum of relative powers of the FFT bins within ``padding_factor`` bins of a line. It
-    is the minimum over positions of the line between bins.
-    """
+    """Sum of the powers, relative to the peak, of the FFT bins within ``padding_factor`` bins of a
+    line. It is the smallest sum for any position of the line between two bins."""
     sidelobe_envelope: np.ndarray
-    """(cells + 1,): largest magnitude at or beyond tabulated distances d. The distances are equally
-    spaced in d / (d + knee), where the knee is a fixed distance.
-    """
+    """(cells + 1,): largest magnitude, relative to the peak, at or beyond tabulated distances d
+    from a line. d / (d + knee) has equal steps, with a fixed distance called knee."""
     distance_by_octave: np.ndarray
-    """(cells,): distance [bins] beyond which all magnitudes are smaller than a tabulated one.
-    Tabulated magnitudes are equally spaced in octaves.
-    """
+    """(cells,): distance from a line [FFT bins] beyond which all magnitudes are smaller than a
+    tabulated magnitude. The tabulated magnitudes fall in equal steps of octaves."""
     scalloping_gain_min: float
-    """Smallest magnitude of the FFT bin nearest to a line, which is up to half a bin away."""
+    """Smallest magnitude, relative to the peak, that the FFT bin nearest to a line can have: that
+    at half a bin."""
 
     def scalloping_gain(self, distance: np.ndarray) -> np.ndarray:
-        """Return a bin's magnitude, relative to the peak, at ``distance`` from a line.
+        """Return the magnitude, relative to the peak, of a bin at ``distance`` from a line.
 
-        The distance is 0..1/2 [bins].
+        The distance is 0..1/2 FFT bin; larger distances count as 1/2.
         """
         clipped_distance = np.fmin(distance, 0.5)
         return self.main_lobe[(clipped_distance * (2 * _N_MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
 
     def magnitude_max_beyond(self, distance: np.ndarray) -> np.ndarray:
-        """Return the largest magnitude, relative to the peak, at ``distance`` [bins] or farther.
+        """Return the largest magnitude, relative to the peak, at or beyond a distance from a line.
 
-        ``distance`` is from a line.
+        ``distance`` is in FFT bins.
         """
         knee = _ENVELOPE_KNEE_WINDOW_BINS * self.padding_factor
         table_position = 1 - knee / (np.fmax(distance, 0.0) + knee)
         return self.sidelobe_envelope[(table_position * _ENVELOPE_CELLS).astype(np.int64)]
 
     def reach_of_magnitude(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the distance [bins] from a line beyond which all bins are below ``magnitude``.
+        """Return the distance from a line [FFT bins] beyond which all bins are below ``magnitude``.
 
         Magnitudes are relative to the peak. The result is inf if no distance is known.
         """
@@ -148,10 +151,10 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
 
 
 def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the power series of a window's cosine transform in the squared distance.
+    """Return coefficients of the power series of a window's main lobe in y^2.
 
-    The transform is relative to the window's sum. The coefficients follow from the even moments of
-    the window ``w``.
+    y is the distance from the line [bins of fs/L]. The series is that of the window's cosine
+    transform over the window's sum. `w` are the samples, `position` their places in the record.
     """
     moments = np.empty(_N_MAIN_LOBE_SERIES_TERMS)
     weighted_power = w / w.sum()
@@ -164,14 +167,16 @@ def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the main-lobe magnitude of a window's transform from its power series.
+    """Return the magnitude of a window's transform in its main lobe, relative to the peak.
+
+    It is computed from a power series.
 
     Parameters
     ----------
     fft_window : Window
         Window of the record.
     coefficients : ndarray
-        Coefficients of the series in y^2.
+        Coefficients of the power series in y^2, from :func:`_main_lobe_series`.
     y : ndarray
         Distance from the line [bins of fs/L], |y| <= 1.5.
 
@@ -189,9 +194,10 @@ def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndar
 def _central_energy_min(
     fft_window: Window, coefficients: np.ndarray, record_fraction: float, power_slope_max: float
 ) -> float:
-    """Return the smallest sum of relative powers over bins within one bin of fs/L of a line.
+    """Return the smallest sum of powers, relative to the peak, of the bins near a line.
 
-    The minimum is over positions of the line between FFT bins.
+    Bins within one bin of fs/L (sample rate over number of samples) are near. The minimum is over
+    positions of the line between FFT bins.
     """
     reach_bins = math.floor(1 / record_fraction) + 1
     bin_offset = np.arange(64) / 64
@@ -209,23 +215,24 @@ def _central_energy_min(
 
 
 class MissingSampleBounds(NamedTuple):
-    """Effect of the samples that are taken before the echo arrives, by segment."""
+    """Bounds on the effect of samples that precede the echo in a record."""
 
     lost_fraction: np.ndarray
-    """Sum of the window's magnitude at the missing samples, divided by the window's sum."""
+    """Sum of the window's magnitude over the missing samples, divided by the window's sum."""
     step_sidelobe_factor: np.ndarray
-    """Ratio of a bound on the sidelobes that missing samples add to the sidelobes of a rectangular
-    window. Both are relative to the window's sum."""
+    """Bound on the sidelobes that missing samples add, divided by the sidelobes of a rectangular
+    window. Both are relative to the sum of their window."""
     n_missing: np.ndarray
-    """Number of samples that are taken before the echo arrives."""
+    """Number of samples that precede the echo."""
     centroid_bound: np.ndarray
-    """Upper bound on the mean position of the remaining samples in the record, -1..1."""
+    """Upper bound on the magnitude of the mean position of the remaining samples in the record,
+    -1..1."""
     all_missing: np.ndarray
-    """True where all samples are taken before the echo arrives."""
+    """True where all samples precede the echo."""
 
 
 def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampleBounds:
-    """Compute bounds on the effect of samples at the record's start that lack the echo.
+    """Return bounds on the effect of samples at the record's start that precede the echo.
 
     Parameters
     ----------
@@ -236,8 +243,9 @@ def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampl
 
     Notes
     -----
-    The transform of the missing samples is at most their variation over 2 sin(pi y / L). The same
-    holds for the remaining samples, and bounds the sidelobes where these are fewer.
+    The transform of the missing samples at y bins of fs/L from the line is at most their total
+    variation divided by 2 sin(pi y / L). The same holds for the remaining samples. The lesser of
+    both bounds is used.
     """
     lost_fraction_by_count, bound_by_missing, bound_by_remaining = _bounds_by_missing_count(window)
     lost_fraction = lost_fraction_by_count[n_missing]
@@ -254,10 +262,10 @@ def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampl
 
 @lru_cache(maxsize=8)
 def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate bounds of :func:`missing_sample_bounds` by number of missing samples, (L + 1,) each.
+    """Return bounds of :func:`missing_sample_bounds` by number of missing samples, (L + 1,) each.
 
-    The bounds are the lost fraction, and the factors by the variation of missing and of remaining
-    samples.
+    They are the lost fraction, the bound on sidelobes from the variation of the missing samples,
+    and that from the variation of the remaining samples.
     """
     w = window_samples(window.name, window.length)
     magnitude = np.abs(w)
@@ -282,7 +290,7 @@ def window_max_near(
     window : Window
         Window of the record.
     first_sample : ndarray of int
-        Number of the sample.
+        Index of the sample.
     reach_samples : ndarray
         Distance from the sample [samples], rounded up to a power of two.
     """
@@ -299,9 +307,9 @@ def window_max_near(
 
 @lru_cache(maxsize=64)
 def _window_max_within(window: Window, exponent: int) -> np.ndarray:
-    """Return the largest magnitude of a window near each position, divided by its sum, (L + 1,).
+    """Return the largest magnitude of a window near each sample, divided by its sum, (L + 1,).
 
-    Near means within 2^``exponent`` samples.
+    Near are samples at distances up to 2^``exponent``.
     """
     from scipy.ndimage import maximum_filter1d  # slow to import
 
