@@ -347,8 +347,8 @@ def read_unit(unit_text: str, *, si_unit: str, example: str) -> Unit:
             raise QuantityError(
                 f"has an unknown unit '{name}'", _unit_suggestion(name, si_unit, example)
             )
-    scale, offset, dimension = _multiply_unit_factors(factors)
-    si_scale, _, si_dimension = _multiply_unit_factors(_parse_unit_factors(si_unit) or [])
+    scale, offset, dimension = _unit_product_conversion(factors)
+    si_scale, _, si_dimension = _unit_product_conversion(_parse_unit_factors(si_unit) or [])
     if dimension != si_dimension:
         raise QuantityError(*_wrong_dimension_error(unit_text, si_unit, example))
     return Unit(_format_unit(factors), scale / si_scale, offset / si_scale)
@@ -517,7 +517,7 @@ def root_unit_conversion_by_pint(
     return Fraction(one.magnitude) - offset, offset, tuple(sorted(dimension.items()))
 
 
-def _multiply_unit_factors(
+def _unit_product_conversion(
     factors: list[tuple[str, Fraction]],
 ) -> tuple[Fraction, Fraction, dict[str, Fraction]]:
     """Return the conversion of a product of known units to pint's root units.

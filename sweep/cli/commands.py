@@ -23,6 +23,7 @@ from sweep.cli.terminal import (
     WORKERS_OPTION,
     LocalPathType,
     StoreLocationType,
+    add_run_options,
     at_option,
     confirm_large_study,
     echo_wrapped,
@@ -36,7 +37,6 @@ from sweep.cli.terminal import (
     print_inconsistency_warnings,
     print_outcome_and_exit,
     print_spec_warnings,
-    run_options,
     shorten_path,
     study_effects_table,
     wrap_text,
@@ -245,7 +245,7 @@ def main() -> None:
     "however often it is started.",
 )
 @click.option("--yes", is_flag=True, help="Start a very large study without asking.")
-@run_options
+@add_run_options
 def run(
     spec: Path, store: Location | None, overwrite: bool, resuming: bool, yes: bool, **options: Any
 ) -> None:
@@ -290,7 +290,7 @@ def _default_store_path(spec: Path) -> Path:
     help="Resume only if the store holds this study.",
 )
 @click.option("--retry-failed", is_flag=True, help="Compute again the blocks that failed before.")
-@run_options
+@add_run_options
 def resume(store: Location, spec: Path | None, retry_failed: bool, **options: Any) -> None:
     """Compute the missing and damaged blocks of STORE.
 
@@ -603,7 +603,7 @@ def schema() -> None:
     is_flag=True,
     help="Discard an unfinished extension; with --store, replace an existing store.",
 )
-@run_options
+@add_run_options
 def extend(
     store: Location,
     spec: Path | None,

@@ -233,7 +233,7 @@ ALLOW_CODE_OPTION = click.option(
 )
 
 
-def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def add_run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of all computing commands to a command, and return the command.
 
     The command receives the options as keyword arguments.

@@ -488,13 +488,13 @@ def beam_axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> n
 _UNTRUNCATED_FILL_RATIO_MAX = 0.25
 """Largest ratio of beam radius to aperture radius at which truncation by the aperture is neglected.
 At this ratio truncation takes 5e-7 of the echo."""
-_RIM_PHASE_MAX = 60.0
+_RIM_DEFOCUS_PHASE_MAX = 60.0
 """Largest defocus phase at the aperture's rim [rad] in the truncation table. For larger phases the
 efficiency differs by less than 2 % from that at this phase."""
-_FILL_RATIO_STEPS, _RIM_PHASE_STEPS = 16, 100
+_N_FILL_RATIO_STEPS, _N_RIM_PHASE_STEPS = 16, 100
 """Numbers of steps of the truncation table over the angle of the fill ratio, and over the root of
 the defocus phase."""
-_ROOT_PHASE_STEP = math.sqrt(_RIM_PHASE_MAX) / _RIM_PHASE_STEPS
+_SQRT_RIM_PHASE_STEP = math.sqrt(_RIM_DEFOCUS_PHASE_MAX) / _N_RIM_PHASE_STEPS
 """Step, in the square root of the defocus phase, between columns of the truncation table
 [sqrt(rad)]."""
 
@@ -541,8 +541,8 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
     fill_fraction = np.clip(
         (fill_ratio - _UNTRUNCATED_FILL_RATIO_MAX) / (1 - _UNTRUNCATED_FILL_RATIO_MAX), 0.0, 1.0
     )
-    fill_step = np.arccos(1 - 2 * fill_fraction) * (_FILL_RATIO_STEPS / np.pi)
-    phase_step = np.sqrt(np.minimum(rim_phase, _RIM_PHASE_MAX)) / _ROOT_PHASE_STEP
+    fill_step = np.arccos(1 - 2 * fill_fraction) * (_N_FILL_RATIO_STEPS / np.pi)
+    phase_step = np.sqrt(np.minimum(rim_phase, _RIM_DEFOCUS_PHASE_MAX)) / _SQRT_RIM_PHASE_STEP
     table_position = np.stack([fill_step.ravel(), phase_step.ravel()])
     efficiency = map_coordinates(
         _truncation_table(), table_position, mode="mirror", prefilter=False
@@ -572,16 +572,18 @@ def _truncation_table() -> np.ndarray:
     radii, radius_weights = np.polynomial.legendre.leggauss(64)
     radii, radius_weights = (radii + 1) / 2, radius_weights / 2
     gauss_nodes, gauss_weights = np.polynomial.legendre.leggauss(12)
-    q = (np.arange(0.0, 60 + 2 * _RIM_PHASE_MAX, 4.0)[:, None] + 2 * (gauss_nodes + 1)).ravel()
+    q = (
+        np.arange(0.0, 60 + 2 * _RIM_DEFOCUS_PHASE_MAX, 4.0)[:, None] + 2 * (gauss_nodes + 1)
+    ).ravel()
     q_weights = np.tile(2 * gauss_weights, q.size // gauss_weights.size)
     kernel = j0(q[:, None] * radii) * (radius_weights * radii)
     fill_ratios = (
         _UNTRUNCATED_FILL_RATIO_MAX
         + (1 - _UNTRUNCATED_FILL_RATIO_MAX)
-        * (1 - np.cos(np.linspace(0, np.pi, _FILL_RATIO_STEPS + 1)))
+        * (1 - np.cos(np.linspace(0, np.pi, _N_FILL_RATIO_STEPS + 1)))
         / 2
     )
-    rim_phases = np.square(_ROOT_PHASE_STEP * np.arange(_RIM_PHASE_STEPS + 5))
+    rim_phases = np.square(_SQRT_RIM_PHASE_STEP * np.arange(_N_RIM_PHASE_STEPS + 5))
     defocus_cosine, defocus_sine = (
         circular_function(rim_phases[:, None] * radii**2) for circular_function in (np.cos, np.sin)
     )

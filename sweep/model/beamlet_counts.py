@@ -27,11 +27,11 @@ pi s. Gauss-Hermite quadrature is best for narrow spreads. Evenly spaced nodes a
 spreads, as they are almost exact up to the frequency where they alias.
 
 To second order the range rises with the square of the distance from the axis, across the slope as
-along it. So f = s y + c (x^2 + y^2), where E exp(i t c x^2) = 1 / sqrt(1 - 2 i t c). A line of
-nodes at x = 1 has the mean of x^2, and errs by (t c)^2 at most. More lines lie at the positive
+along it. So f = s y + c (x^2 + y^2), where E exp(i t c x^2) = 1 / sqrt(1 - 2 i t c). A row of
+nodes at x = 1 has the mean of x^2, and errs by (t c)^2 at most. More rows lie at the positive
 nodes of a rule of twice as many:
 
-    x ^      .  .  .  .  .      3 lines of 5 nodes, weighted by the Gaussians of x and y;
+    x ^      .  .  .  .  .      3 rows of 5 nodes, weighted by the Gaussians of x and y;
       |      .  .  .  .  .      as f is even in x, their mirror images are not needed
       |      .  .  .  .  .
       +-----------------------> y, along the slope
@@ -336,11 +336,11 @@ def required_beamlet_count_and_pattern(
     power_tolerance = error_budget.allowed_beamlets_error / pd_change_per_power
     window_name = budget.record.window.name
     spread = _line_spread_coefficients(budget, n_points, error_budget.beamlets_max)
-    n_lines, n_nodes, error = required_node_counts(
+    n_rows, n_nodes, error = required_node_counts(
         window_name, spread, power_tolerance, error_budget
     )
-    pattern = np.where(n_lines == 1, "line", np.char.add(n_lines.astype(str), " lines"))
-    return n_lines * n_nodes, pattern, np.minimum(error * pd_change_per_power, 1.0)
+    pattern = np.where(n_rows == 1, "line", np.char.add(n_rows.astype(str), " lines"))
+    return n_rows * n_nodes, pattern, np.minimum(error * pd_change_per_power, 1.0)
 
 
 def _pd_change_per_relative_power(budget: LinkBudget) -> np.ndarray:
@@ -504,7 +504,7 @@ def required_node_counts(
 
     Returns
     -------
-    n_lines : ndarray (n,)
+    n_rows : ndarray (n,)
         Number of parallel rows of nodes, 1 for most points.
     n_nodes : ndarray (n,)
         Number of nodes of each row, at least 2. If no number meets the tolerance, it is that of
@@ -516,33 +516,31 @@ def required_node_counts(
         window_name
     )
     table_index = np.searchsorted(tabulated_spreads, spread.line_deviation)  # of the next wider
-    single_line_error = (
-        _single_line_quadrature_error(window_name, spread) / largest_bin_powers[table_index]
-    )
+    single_row_error = _single_node_row_error(window_name, spread) / largest_bin_powers[table_index]
     counts = NODE_COUNTS_ALONG_SLOPE[
         : np.searchsorted(NODE_COUNTS_ALONG_SLOPE, error_budget.beamlets_max, "right")
     ]
-    total_error = tabulated_errors[: counts.size, table_index] + single_line_error
+    total_error = tabulated_errors[: counts.size, table_index] + single_row_error
     count_index, error = _choose_cheapest_within_tolerance(total_error, counts[:, None], tolerance)
-    n_lines = np.ones(count_index.shape, np.int64)
-    needs_lines = (error > tolerance) & (
-        single_line_error > error_budget.single_line_error_fraction * tolerance
+    n_rows = np.ones(count_index.shape, np.int64)
+    needs_rows = (error > tolerance) & (
+        single_row_error > error_budget.single_row_error_fraction * tolerance
     )
-    if needs_lines.any():
+    if needs_rows.any():
         spread_subset = LineSpreadCoefficients(
-            *(np.asarray(values)[..., needs_lines] for values in spread)
+            *(np.asarray(values)[..., needs_rows] for values in spread)
         )
-        line_count_index, line_counts, line_errors = _choose_node_lines(
-            window_name, spread_subset, tolerance[needs_lines], error_budget.beamlets_max
+        rows_count_index, row_counts, row_errors = _choose_node_rows(
+            window_name, spread_subset, tolerance[needs_rows], error_budget.beamlets_max
         )
-        is_better = line_errors < np.minimum(error[needs_lines], 1.0)
-        improved = np.flatnonzero(needs_lines)[is_better]
-        count_index[improved], n_lines[improved], error[improved] = (
-            line_count_index[is_better],
-            line_counts[is_better],
-            line_errors[is_better],
+        is_better = row_errors < np.minimum(error[needs_rows], 1.0)
+        improved = np.flatnonzero(needs_rows)[is_better]
+        count_index[improved], n_rows[improved], error[improved] = (
+            rows_count_index[is_better],
+            row_counts[is_better],
+            row_errors[is_better],
         )
-    return n_lines, NODE_COUNTS_ALONG_SLOPE[count_index], np.minimum(error, 1.0)
+    return n_rows, NODE_COUNTS_ALONG_SLOPE[count_index], np.minimum(error, 1.0)
 
 
 def _choose_cheapest_within_tolerance(
@@ -571,7 +569,7 @@ def _choose_cheapest_within_tolerance(
     return row, np.take_along_axis(error, row[None], axis=0)[0]
 
 
-def _choose_node_lines(
+def _choose_node_rows(
     window_name: str, spread: LineSpreadCoefficients, tolerance: np.ndarray, beamlets_max: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose numbers of rows and nodes for points at which one row of nodes is too inaccurate.
@@ -583,7 +581,7 @@ def _choose_node_lines(
     -------
     count_index : ndarray (n,)
         Index in NODE_COUNTS_ALONG_SLOPE of the number of nodes of each row.
-    n_lines : ndarray (n,)
+    n_rows : ndarray (n,)
         Number of parallel rows of nodes.
     error : ndarray (n,)
         Upper bound on the relative error of the largest bin's power.
@@ -630,7 +628,7 @@ def _choose_node_lines(
     )
 
 
-def _single_line_quadrature_error(window_name: str, spread: LineSpreadCoefficients) -> np.ndarray:
+def _single_node_row_error(window_name: str, spread: LineSpreadCoefficients) -> np.ndarray:
     """Return a bound on the error of a single row of nodes along the slope due to curvature, (n,).
 
     The error is in units of the power of a bin on which a spectral line is centred. The bound is

@@ -35,7 +35,7 @@ PATTERN_RADIUS_SIGMA = 3.0
 """Radius of a beamlet pattern [standard deviations of the beam], before the pattern is scaled to
 the beam's covariance. 98.9 % of the beam's power lies within this radius."""
 
-SQUARED_RADIUS_GROWTH = 2.9
+SQUARED_RADIUS_PER_LOG_COUNT = 2.9
 """Increase of a hexagonal lattice's squared radius [variances of the beam] when the number of
 beamlets grows by the factor e. It applies from 19 beamlets on.
 
@@ -151,7 +151,7 @@ def lattice_radius(n_beamlets: int) -> float:
     The radius is that before the lattice is scaled to the beam's covariance.
     """
     return math.sqrt(
-        PATTERN_RADIUS_SIGMA**2 + SQUARED_RADIUS_GROWTH * math.log(max(n_beamlets, 19) / 19)
+        PATTERN_RADIUS_SIGMA**2 + SQUARED_RADIUS_PER_LOG_COUNT * math.log(max(n_beamlets, 19) / 19)
     )
 
 

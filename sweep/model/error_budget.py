@@ -92,13 +92,13 @@ class ErrorBudget:
 
     line_error: ArrayLike = SET_BY_TOLERANCE
     """Tolerated error of a bin's magnitude, relative to the noise sigma, when few spectral lines
-    represent all beamlets. By default it is `lines_fraction` times the tolerance. A smaller error
-    slowly increases the number of lines of a segment."""
+    represent all beamlets. By default it is `line_error_fraction` times the tolerance. A smaller
+    error slowly increases the number of lines of a segment."""
 
     leakage_error: ArrayLike = SET_BY_TOLERANCE
     """Tolerated probability of a false peak due to the echo's signal in bins that are far from its
-    lines and not evaluated. By default it is `leakage_fraction` times the tolerance. With a smaller
-    value more bins are evaluated."""
+    lines and not evaluated. By default it is `leakage_error_fraction` times the tolerance. With a
+    smaller value more bins are evaluated."""
 
     leakage_floor: ArrayLike = SET_BY_TOLERANCE
     """Magnitude of leaked signal in a bin, relative to the noise sigma, below which the bin counts
@@ -124,14 +124,14 @@ class ErrorBudget:
     tolerance. The fraction is part of `effects_fraction`. Half of it costs most points one more
     step of `NODE_COUNTS_ALONG_SLOPE`."""
 
-    lines_fraction: float = 1.0
+    line_error_fraction: float = 1.0
     """Default of `line_error`, as a fraction of the tolerance. It is 1, because bounds on this
     error are worst cases over lines and bins."""
 
-    leakage_fraction: float = 0.5
+    leakage_error_fraction: float = 0.5
     """Default of `leakage_error`, as a fraction of the tolerance."""
 
-    single_line_error_fraction: float = 0.1
+    single_row_error_fraction: float = 0.1
     """Fraction of the beamlets' tolerance up to which one row of beamlets along the slope is
     accepted. The error compared with it is that across the slope. If this error is larger, several
     parallel rows are tried. The fraction does not affect the accuracy."""
@@ -197,12 +197,12 @@ class ErrorBudget:
 
         A few spectral lines are computed in place of the lines of all beamlets.
         """
-        return self._stated_or_tolerance_fraction(self.line_error, self.lines_fraction)
+        return self._stated_or_tolerance_fraction(self.line_error, self.line_error_fraction)
 
     @property
     def allowed_leakage(self) -> np.ndarray:
         """Tolerated probability of a false peak due to leaked signal that is not evaluated."""
-        return self._stated_or_tolerance_fraction(self.leakage_error, self.leakage_fraction)
+        return self._stated_or_tolerance_fraction(self.leakage_error, self.leakage_error_fraction)
 
     @property
     def allowed_beamlets_error(self) -> np.ndarray:

@@ -244,7 +244,7 @@ class FlatGround:
         )
         return BeamGradients(*(np.broadcast_to(column, self._n_points) for column in columns))
 
-    def axis_beamlet(self, n_points: int) -> BeamletTable:
+    def axis_beamlet_table(self, n_points: int) -> BeamletTable:
         """Return a table with one beamlet per footprint, on the beam's axis.
 
         The table has a row for each distinct grazing angle, which the `n_points` points share.
@@ -305,7 +305,7 @@ class RayTracedGround:
     ) -> None:
         self.beamlets, self.is_on_other_surface = beamlet_table, is_on_other_surface
 
-    def axis_beamlet(self, n_points: int) -> BeamletTable:
+    def axis_beamlet_table(self, n_points: int) -> BeamletTable:
         """Return a table with one beamlet per footprint, on the beam's axis, for `n_points` points.
 
         The beamlet has the summed echo of all beamlets of the footprint.

@@ -324,7 +324,7 @@ SPECTRA_STUDY_OUTPUTS: dict[str, OutputVariable] = {
 Such studies also store ACCURACY_OUTPUTS and DRAW_COUNT_OUTPUTS."""
 
 
-def _with_dims(
+def _with_leading_dims(
     dims: tuple[str, ...], variables: dict[str, OutputVariable]
 ) -> dict[str, OutputVariable]:
     """Return copies of output variables with the dimensions `dims` placed before their own."""
@@ -336,7 +336,7 @@ def _with_dims(
 
 _VECTOR_DIMS = (XYZ_DIM,)
 
-SHOT_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(
+SHOT_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_leading_dims(
     ("shot",),
     {
         "time": OutputVariable(
@@ -385,7 +385,7 @@ SHOT_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(
 """Output variables, by name, of the true geometry of each shot of a flight, which all draws share.
 """
 
-CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
+CYCLE_VARIABLES: dict[str, OutputVariable] = _with_leading_dims(("cycle",), {
     "cycle_time": OutputVariable("s", "start of the measurement cycle"),
     "true_velocity": OutputVariable(
         "m s-1", "velocity of the instrument, mean over the cycle's shots", dims=_VECTOR_DIMS
@@ -397,7 +397,7 @@ CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
 })  # fmt: skip
 """Output variables, by name, of the instrument's true motion in each measurement cycle."""
 
-BEAMLET_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
+BEAMLET_GEOMETRY_VARIABLES: dict[str, OutputVariable] = _with_leading_dims(("shot", "beamlet"), {
     "offset": OutputVariable("m", "range less that of the reference beamlet"),
     "velocity_offset": OutputVariable(
         "m s-1", "radial velocity less that of the reference beamlet", CLOSING_SIGN_NOTE
@@ -413,7 +413,7 @@ BEAMLET_WEIGHT_VARIABLE = OutputVariable("1", "power fraction of the beamlet", d
 """Output variable of each beamlet's power fraction. It is stored in an eyepoint store, the
 ray-traced geometry of a flight's shots."""
 
-SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
+SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_leading_dims(
     ("shot",),
     {
         "pd_up": OutputVariable("1", "probability of detection, up-chirp, strongest surface"),
@@ -453,7 +453,7 @@ They are nan with a detector other than the fixed threshold, or if only the stro
 segment is reported. If a shot's rays hit nothing, false-alarm probabilities are those of noise
 alone, and the other variables are nan. ``pd_doppler`` is nan without a Doppler segment."""
 
-EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
+EFFECT_VARIABLES: dict[str, OutputVariable] = _with_leading_dims(("shot",), {
     "effects": OutputVariable("1", "effects that were simulated", dtype="uint32"),
     "effects_error": OutputVariable(
         "1", "largest change by effects that were left out",
@@ -467,7 +467,7 @@ rays hit nothing has no effects."""
 
 _NAN_FOR_FALSE_POINT_NOTE = "nan: a false one"
 
-POINT_CLOUD_VARIABLES: dict[str, OutputVariable] = _with_dims(
+POINT_CLOUD_VARIABLES: dict[str, OutputVariable] = _with_leading_dims(
     ("shot", "draw", "return_number"),
     {
         "position": OutputVariable(
@@ -525,7 +525,7 @@ POINT_CLOUD_VARIABLES: dict[str, OutputVariable] = _with_dims(
 """Output variables, by name, of the points of a point cloud. Each shot and draw has at most as many
 points as the study's number of returns."""
 
-NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), {
+NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_leading_dims(("cycle", "draw"), {
     "velocity": OutputVariable("m s-1", "velocity vector of the instrument", dims=_VECTOR_DIMS),
     "velocity_covariance": OutputVariable(
         "m2 s-2", "covariance of the velocity's error", dims=(XYZ_DIM, SECOND_XYZ_DIM)

@@ -909,8 +909,8 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
         Ground that the beams meet.
     """
     budget = LinkBudget(parameters)
-    row_of_point, relative_range_offset, doppler_ratio_offset, relative_echo = ground.axis_beamlet(
-        n_points
+    row_of_point, relative_range_offset, doppler_ratio_offset, relative_echo = (
+        ground.axis_beamlet_table(n_points)
     )
     zeros, architecture = np.zeros(n_points), budget.waveform.architecture
     sample_rate = budget.record.sample_rate + zeros
