@@ -251,10 +251,11 @@ def run(
 ) -> None:
     """Compute the study SPEC into a Zarr store.
 
-    Studies of more than 1e9 points, 1 TB of results or 30 days of one core ask before they start.
+    The command asks for confirmation before a study of more than 1e9 points, 1 TB of results or 30
+    days of one core.
 
-    A table at the end has the probability of detection. For a study with draws, a second table has
-    the number of points within accuracy.tolerance, and the draws that the worst point needs.
+    At the end a table shows the probability of detection. For a study with draws, a second table
+    shows the number of points within accuracy.tolerance, and the draws that the worst point needs.
 
     \b
       sweep run experiments/quickstart.yaml
@@ -317,10 +318,11 @@ def resume(store: Location, spec: Path | None, retry_failed: bool, **options: An
 def plan(spec: Path, workers: int | None) -> None:
     """Print the size and time of SPEC, and the effects it simulates. No store is written.
 
-    The time is measured on points of the study, in about a second, and its parts are printed. Shots
-    of a flight are counted, and a few spread over it are timed. For each effect a table gives the
-    points at which it is simulated, and a bound on its change of pd, log10 pfa or magnitude. For
-    grids it also gives the effect's share of a point's time, where that repeats to 10 %.
+    The time, with its parts, is estimated from some points of the study, which takes about a
+    second. For a flight, all shots are counted, and a few that are spread over it are timed. A
+    table lists the effects: the points at which an effect is simulated, and a bound on its change
+    of pd, log10 pfa or magnitude. For grids the table also has the effect's share of a point's
+    time, if repeated measurements of it agree to 10 %.
     """
     from sweep.tasks.engine.progress import show_activity
 
@@ -407,20 +409,21 @@ def _print_paths(files: Sequence[Location]) -> None:
 def accuracy(
     spec: Path, store: Location | None, points: int, time_limit: float, overwrite: bool
 ) -> None:
-    """Measure what accuracy costs in SPEC: error against time of a ladder of settings.
+    """Measure the time and the error of SPEC with several settings of accuracy.
 
     The command computes a fixed sample of the study's points with each of these settings: the spec
     as written; effects left out by tolerances from 0.1 to 1e-6; all effects everywhere; fixed
     numbers of beamlets or draws; and the algorithm of the thesis, which transforms whole records.
 
-    Errors are differences from the finest setting, which is compared with the time domain. All
-    settings take turns on parts of the sample, round after round, so that a slow machine slows
-    them alike; the best round counts. Planning is counted, storing is not.
+    The error of a setting is its difference from the finest setting, which is itself compared with
+    the time domain. Every setting is timed in several rounds, and its fastest round is reported.
+    Settings take turns within a round, so that a slow machine slows all of them. The time includes
+    planning, but not storing.
 
-    The table has the time a point on one core and the errors. A star marks settings that no other
-    setting beats in both time and error. The store holds errors by setting and point, and opens
-    with xarray. The figure is next to the store, and `sweep figures` draws it again. Ctrl-C keeps
-    the results so far.
+    The table has each setting's time for one point on one core, and its errors. A star marks
+    settings that no other setting beats in both time and error. The store holds errors by setting
+    and point, and opens with xarray. The figure is next to the store, and `sweep figures` draws it
+    again. Ctrl-C keeps the results so far.
 
     \b
       sweep accuracy experiments/quickstart.yaml
@@ -485,9 +488,11 @@ def export(
 ) -> None:  # fmt: skip
     """Write the point cloud in STORE to FILE: .ply, .las, .laz or .csv.
 
-    Reports are the points as a unit's interface passes them on: values in whole quanta and within
-    limits, at its own rate, with a flag of validity and a latency. The spec's section `interface`
-    states these. No point is computed again, so one store serves to try any interface.
+    With --as reports the file has what the lidar's interface would report of the points.
+    Reported values are clipped to limits and rounded to multiples of a quantum. Reports come at the
+    interface's rate and latency, and each has a flag of validity. The spec's section `interface`
+    states rate, latency, quanta and limits. No point is computed again, so one store serves to try
+    any interface.
 
     \b
       sweep export results/forest_scan.zarr forest.las
@@ -520,9 +525,10 @@ def export(
 def certificates(directory: Path) -> None:
     """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.
 
-    Put the output into the cluster's file. Scheduler, workers and client then use TLS, and refuse
-    connections without such a certificate. All machines of the cluster must see the directory, and
-    nobody else may read it. The certificates are valid for a year.
+    The command prints lines for the cluster's file, the one that --cluster names. With these lines
+    scheduler, workers and client use TLS, and refuse connections without such a certificate. All
+    machines of the cluster must see the directory, and nobody else may read it. The certificates
+    are valid for a year.
     """
     from sweep.tasks.engine.deploy.local_ssh import make_certificates
 
@@ -545,7 +551,8 @@ def instruments(name: str | None) -> None:
         laser: {power: 1 mW}
 
     A store holds all fields of the instrument. The study is the same as with all fields in the
-    spec. The description of NAME is a file to begin one's own with, `instrument: {file: own.yaml}`.
+    spec. The description of NAME is YAML: saved as own.yaml and changed, it is an instrument of
+    your own, `instrument: {file: own.yaml}`.
 
     \b
       sweep instruments
@@ -666,9 +673,9 @@ def spectra(
 ) -> None:
     """Write spectra of a shot of STUDY, a spec or a store, with noise in every bin.
 
-    Use the spectra to try your own detectors and estimators. They are complex, draw by draw, with
-    frequencies, noise level, threshold and window. The true lines, range and velocity are there
-    too. A study with draws.method: spectra has the same draws.
+    Use the spectra to try your own detectors and estimators. The file holds a complex spectrum for
+    each draw and segment, the frequencies, the noise level, the threshold and the window. It also
+    holds the true lines, range and velocity. A study with draws.method: spectra has the same draws.
 
     \b
       sweep spectra experiments/cfar.yaml --at range=2km --draws 100 -o spectra.npz

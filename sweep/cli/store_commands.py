@@ -166,10 +166,11 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
 def finalize(store: Location, output: Location | None) -> None:
     """Copy the complete STORE into OUTPUT as few large files [NAME_final.zarr next to NAME.zarr].
 
-    A store has a file for every array and block, so that any number of processes can write it. The
-    copy has the same values, attributes and names in files (shards) of up to 64 MB. These are quick
-    to move, to list, and to open over a network. Every value is read back and compared. All
-    commands that read stores, and sweep verify, accept the copy. It cannot be resumed.
+    A store has a file for every array and block, so that any number of processes can write to it.
+    The copy has the same values, attributes and names in files (shards) of up to 64 MB, which are
+    quick to move, to list, and to open over a network. Every copied value is read back and compared
+    with the original. All commands that read stores, including sweep verify, accept the copy. The
+    copy cannot be resumed.
 
     \b
       sweep finalize results/range_angle.zarr
@@ -272,10 +273,10 @@ def report(store: Location, output: Path | None) -> None:
 def compare(a: Location, b: Location, figure: Path | None) -> None:
     """Show the differences between the studies in two stores: B less A.
 
-    Points of grids are matched by the values of their parameters, shots of flights by scanner,
-    time, beam, position and direction. Probabilities of detection agree if their difference is
-    within the uncertainty of both: the half-widths of draws, and the errors of skipped effects and
-    few beamlets.
+    Points of two grids are matched by the values of their parameters. Shots of two flights are
+    matched by scanner, time, beam, position and direction. Probabilities of detection agree if
+    their difference is within the uncertainty of both studies: the half-widths over draws, and the
+    errors due to skipped effects and the number of beamlets.
 
     Exit codes: 0 both agree wherever both are computed, 2 a mistake in the command, 3 nothing to
     compare is computed yet, 4 they differ.

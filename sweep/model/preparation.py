@@ -451,22 +451,25 @@ class Shots:
 
     @property
     def detects_by_any_two_segments(self) -> bool:
-        """True if any two segments that detect are enough; False if both chirps have to detect."""
+        """True if any two segments can detect a shot; False if both chirps must detect the echo."""
         return (
             self.detection_settings.shot_detection_rule == waveform.ANY_TWO
             and len(self.waveform.segment_order) == 3
         )
 
     def _bin_noise_sigma_from_variance(self, variance: np.ndarray) -> np.ndarray:
-        """Return the noise standard deviation per quadrature of a bin [V].
+        """Return the noise standard deviation per quadrature of a bin of the unscaled FFT [V].
 
-        ``variance`` is the noise variance of a sample at the ADC [V^2].
+        ``variance`` is the noise variance of a sample at the ADC [V^2]; the result has its shape.
         """
         return self.record.bin_noise_sigma(variance, self.looks)
 
     @cached_property
     def beamlet_arrays(self) -> "BeamletArrays":
-        """Ranges, Doppler ratios, amplitudes and phases of all beamlets, relative to the axis."""
+        """Ranges, Doppler ratios, amplitudes and phases of all beamlets, relative to the axis.
+
+        The result is a record of arrays for kernels.
+        """
         from sweep.model.spectrum.lines import BeamletArrays
 
         range_offset, doppler_offset, amplitude = (
@@ -748,7 +751,7 @@ class Shots:
 
     @cached_property
     def speckle_table(self) -> "SpeckleTable":
-        """Speckle parameters of the bins of each segment."""
+        """Speckle parameters of the bins of each segment, as a record for kernels."""
         from sweep.model.detection.echo_detection import SpeckleTable
         from sweep.model.detection.pseudo_variance import signal_pseudo_variance
 

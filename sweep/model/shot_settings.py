@@ -46,7 +46,7 @@ class TargetState:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, np.ndarray]) -> "TargetState":
-        """Return the target's state from parameters by dotted path."""
+        """Return the target's range, velocity and acceleration from parameters by dotted path."""
         return cls(
             range=parameters["target.range"],
             radial_velocity=parameters["target.radial_velocity"],

@@ -65,8 +65,8 @@ class WindowResponse(NamedTuple):
     """(cells,): distance from a line [FFT bins] beyond which all magnitudes are smaller than a
     tabulated magnitude. The tabulated magnitudes fall in equal steps of octaves."""
     scalloping_gain_min: float
-    """Smallest magnitude, relative to the peak, that the FFT bin nearest to a line can have: that
-    at half a bin."""
+    """Smallest magnitude, relative to the peak, that the FFT bin nearest to a line can have. The
+    bin is at most half a bin away from the line."""
 
     def scalloping_gain(self, distance: np.ndarray) -> np.ndarray:
         """Return the magnitude, relative to the peak, of a bin at ``distance`` from a line.
