@@ -189,7 +189,11 @@ def finalize(store: Location, output: Location | None) -> None:
 
 
 def _print_verify_report(report: VerificationReport) -> None:
-    """Print a store's restored, damaged and foreign objects, and its number of undamaged blocks."""
+    """Print what `sweep verify` has found in a store: restored, damaged and foreign objects.
+
+    Foreign objects are files and arrays that do not belong to the store. The number of undamaged
+    blocks is printed as well.
+    """
     store = shorten_path(report.store)
     for name in report.restored_objects:
         click.echo(f"{store}: {name} put back")

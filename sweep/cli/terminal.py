@@ -847,7 +847,7 @@ def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
 
 
 def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
-    """Print warnings about echoes that arrive after their record, and about ambiguous echoes."""
+    """Print warnings about echoes that arrive after the end of their record, or are ambiguous."""
     from sweep.tasks.studies.echo_warnings import echo_warnings
     from sweep.tasks.studies.study_loading import make_study
 

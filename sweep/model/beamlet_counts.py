@@ -195,7 +195,7 @@ def split_by_category_and_beamlet_count(
 
 
 def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[int, str]:
-    """Return the largest number of beamlets among the points, and the name of their pattern.
+    """Return the largest number of beamlets that a point has, and the name of its pattern.
 
     All points share text parameters and array sizes.
     """
@@ -749,12 +749,12 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
 
 @lru_cache(maxsize=1)
 def _smoothed_quadrature_errors() -> np.ndarray:
-    """Tabulate the quadrature error across the slope that remains after smoothing, (rows, m + 1).
+    """Tabulate the quadrature error across the slope where line frequencies also spread linearly.
 
-    Array rows belong to NODE_COUNTS_ACROSS_SLOPE, the numbers of node rows. Columns belong to
-    _TABULATED_SPREAD_RATIOS, the quadratic over the linear spread of line frequencies; the last
-    column, for larger ratios, is inf. Each error is the integral over phases t of the Gaussian
-    exp(-t^2 / 2), which the linear spread causes, times the error at t.
+    The linear spread along the slope reduces (smooths) the error. Array rows belong to
+    NODE_COUNTS_ACROSS_SLOPE. Columns belong to _TABULATED_SPREAD_RATIOS, the quadratic over the
+    linear spread; the last column, for larger ratios, is inf. Each value is the integral over
+    t > 0 of exp(-t^2 / 2) times the error at the quadratic phase t times the ratio.
     """
     phase = np.linspace(0.0, 8.0, 801)[1:]
     weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])

@@ -281,9 +281,9 @@ class OffsetMoments(NamedTuple):
         return OffsetMoments(*(np.minimum(value, 1e200) * factor for value in self))
 
     def bound_on_summed_offsets(self, other: "OffsetMoments") -> "OffsetMoments":
-        """Return upper bounds on the moments of the sum of two kinds of offset.
+        """Return upper bounds on the moments of the sums of two kinds of offset.
 
-        The moments of the first kind are these, those of the second kind are ``other``.
+        This record holds the moments of the first kind, ``other`` those of the second kind.
         """
         return OffsetMoments(
             *(value + other_value for value, other_value in zip(self, other, strict=True))

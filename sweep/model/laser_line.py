@@ -65,8 +65,8 @@ _DECAY_PER_SAMPLE_MIN = 0.1
 single lags. After 400 lags the remaining terms are negligible."""
 
 _N_PHASE_NODES = 256
-"""Number of positions in the record at which phases are evaluated for the pedestal that |X| shows.
-"""
+"""Number of positions in the record at which the covariance of the phase is evaluated by
+:func:`apparent_line_and_pedestal`."""
 
 _LINE_POWER_FRACTION_MIN = 1e-100
 """Lower limit of the fraction of power in the pure line, so that divisions by the fraction stay

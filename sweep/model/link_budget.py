@@ -213,17 +213,19 @@ class NoiseBudget:
 
 
 class EchoScales(NamedTuple):
-    """Echo power [W] and beat amplitude [V] of a target whose relative echo is 1/sr.
+    """Echo power [W] and beat amplitude [V] of a target with a relative echo of 1 [1/sr].
 
     The relative echo [1/sr] is the sum over beamlets of power fraction times backscatter. Effects
     multiply the fields by factors.
     """
 
     echo_power_scale: np.ndarray
-    """Echo power on the detector [W] if the relative echo is 1/sr."""
+    """Echo power on the detector [W] for a relative echo of 1 [1/sr], the sum over beamlets of
+    power fraction times backscatter."""
     beat_amplitude_scale: np.ndarray
-    """Amplitude of the beat at the ADC [V] if the relative amplitude is 1, before the low-pass
-    poles of the receiver."""
+    """Amplitude of the beat at the ADC [V] for a relative amplitude of 1, without the receiver's
+    low-pass poles. The relative amplitude is the root of the relative echo [1/sr], or this echo
+    with direct detection."""
     ground_light_transmission: np.ndarray | float = 1.0
     """Fraction, 0..1, of light from the ground other than the echo, such as sunlight, that reaches
     the receiver."""
@@ -291,7 +293,10 @@ class LinkBudget:
 
     @cached_property
     def echo_scales(self) -> EchoScales:
-        """Echo power [W] and beat amplitude [V] of a target whose relative echo is 1/sr."""
+        """Echo power [W] and beat amplitude [V] of a target with a relative echo of 1 [1/sr].
+
+        The relative echo is the sum over beamlets of power fraction times backscatter.
+        """
         echo_power, current = echo_power_and_beat_current(
             self.waveform.architecture, self.parameters
         )
@@ -377,7 +382,7 @@ def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarr
 def echo_power_and_beat_current(
     architecture: str, parameters: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the echo power [W] and the beat photocurrent [A] for a backscatter of 1/sr.
+    """Return the echo power [W] and the beat photocurrent [A] for a backscatter of 1 [1/sr].
 
     Parameters
     ----------

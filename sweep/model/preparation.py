@@ -133,8 +133,8 @@ class Shots:
     """Range and velocity of the target on the beam's axis at the shot's start, (n,) each. Spectral
     lines use the Doppler ratio of :attr:`motion` instead of this velocity."""
     echo_scales: EchoScales
-    """Echo power on the detector [W] and beat amplitude at the ADC [V] of a target whose relative
-    echo is 1/sr, (n,) or scalars."""
+    """Echo power on the detector [W] and beat amplitude at the ADC [V] of a target with a relative
+    echo of 1 [1/sr], (n,) or scalars."""
     receiver_noise: ReceiverNoise
     """Noise variances at the ADC: of the receiver's own sources [V^2], per square of a noise
     current in the detector [V^2/A^2], and per power of light [V^2/W]."""

@@ -160,7 +160,8 @@ class PhaseError(NamedTuple):
 
     phase_function: Callable[..., np.ndarray]
     """Function that returns the phase error (n, m) [cycles] at positions x (m,) in the record, -1
-    .. 1. It is called with x, ``sign`` and `arguments`."""
+    .. 1. It is called with x, `arguments`, and ``sign``, the segment's chirp rate relative to the
+    up-chirp's."""
     arguments: dict[str, Any]
     """Arguments of ``phase_function`` by name, (n,) or scalars; a tuple has one value per segment.
     """
