@@ -108,9 +108,8 @@ def _print_pending_replacement(store: Location) -> None:
     try:
         if staging_store := find_pending_replacement(resolve_links(store)):
             action = "extended" if EXTENDED_STORE_KEY in read_recipe(staging_store) else "replaced"
-            click.echo(
-                f"being {action}: {shell_command('status', staging_store)}  says how far that is."
-            )
+            status_command = shell_command("status", staging_store)
+            click.echo(f"being {action}: {status_command}  says how far that is.")
     except StoreError as error:
         click.echo(str(error))
 
