@@ -42,12 +42,12 @@ from sweep.storage.store_format import ACCURACY_STORE_KIND, OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
 
 TABULATED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-"""Tolerances for which a table names the fastest setting whose error does not exceed them."""
+"""Limits of the error for which a table names the fastest accuracy setting within the limit."""
 
 NEGLIGIBLE_ERROR = 1e-9
-"""Error below which two settings count as equally accurate.
+"""Error of pd, log10 pfa or |X| up to which accuracy settings count as equally accurate.
 
-The reference setting, from which errors are measured, has errors of this size itself.
+The reference setting, from whose results errors are measured, has errors of this size itself.
 """
 
 FIXED_SETTING_KINDS = (
@@ -60,7 +60,7 @@ FIXED_SETTING_KINDS = (
     COUNTED_DETECTIONS_KIND,
     COUNTED_DETECTIONS_IN_NOISE_KIND,
 )
-"""Kinds of settings with the same effects, beamlets and draws at every point of a study."""
+"""Kinds of accuracy settings with the same effects, beamlets and draws at all points of a study."""
 
 REQUIRED_SPEEDUP_OVER_FIXED, REQUIRED_SPEEDUP_OVER_THESIS = 1 / 1.1, 5.0
 """Least speed-ups of adaptive settings that are required at equal accuracy.
@@ -76,9 +76,10 @@ With fewer rounds it is the ratio of the times of the fastest rounds.
 """
 
 RANDOM_ERROR_QUANTILE_LEVEL = 0.95
-"""Level, 0..1, of the quantile over the points that is the error of a setting with random draws.
+"""Level, 0..1, of the quantile that serves as the error of accuracy settings with random draws.
 
-Without draws the error of a setting is the largest over the points.
+The quantile is that of the errors of pd at all points. Where no setting draws, the error of a
+setting is the largest one at any point.
 """
 
 
@@ -92,29 +93,29 @@ class MeasuredSetting:
     name: str
     """Name of the setting."""
     kind: str
-    """Kind of the setting (:mod:`sweep.storage.accuracy_setting_kinds`)."""
+    """Kind of the setting: a constant of :mod:`sweep.storage.accuracy_setting_kinds`."""
     tolerance: float
-    """Tolerance of an adaptive setting."""
+    """Tolerance for which an adaptive setting chooses effects; meaningless for other settings."""
     seconds_per_point_by_round: np.ndarray
     """Computing time per point of the study in each round of measurement (rounds,) [s]."""
     planning_seconds_per_point: float
-    """Part of the time per point that choosing effects takes, in the fastest round [s]."""
+    """Time per point that the choice of effects takes, in the fastest round of measurement [s]."""
     pd_error_by_point: np.ndarray
-    """Largest error of a probability of detection at each point (points,)."""
+    """Largest error among the probabilities of detection of each point (points,)."""
     log10_pfa_error: float
-    """Largest error of log10 of a false-alarm probability at any point; nan if there is none."""
+    """Largest error of log10 of a false-alarm probability at any point; nan if not measured."""
     magnitude_error: float
-    """Largest relative error of the magnitude |X| of a bin at any point; nan if there is none."""
+    """Largest relative error of the magnitude |X| of a bin at any point; nan if not measured."""
     leakage_error: float
     """Largest error, over all points, of the probability of a false peak due to window sidelobes.
 
-    It is nan if there is none. The tolerance does not limit it, because it jumps where a bin
-    reaches the threshold.
+    The error is nan if not measured. The tolerance does not limit the error, because the
+    probability jumps where a bin reaches the threshold.
     """
     error_quantile_level: float
-    """Level, 0..1, of the quantile of pd's errors over the points that is the `largest_error`.
+    """Level, 0..1, of the quantile of pd's errors over the points that `largest_error` returns.
 
-    Without draws it is 1, which stands for the largest error.
+    Level 1 is the largest error. It applies where no setting has random draws.
     """
 
     @property
@@ -124,9 +125,9 @@ class MeasuredSetting:
 
     @property
     def largest_error(self) -> float:
-        """Largest error that the tolerance limits: of pd, log10 pfa or magnitude.
+        """Largest error that the tolerance limits: of pd, log10 pfa or magnitude |X|, at any point.
 
-        With draws it is a quantile of pd's errors over the points.
+        If settings have random draws, it is the quantile of pd's errors at `error_quantile_level`.
         """
         if self.error_quantile_level < 1.0:
             return self.pd_error_quantile(self.error_quantile_level)
@@ -145,14 +146,15 @@ class MeasuredSetting:
         )
 
     def pd_error_quantile(self, fraction: float) -> float:
-        """Return a quantile of pd's errors over the points; `fraction` is 0..1."""
+        """Return the quantile of the points' errors of pd at the level `fraction`, 0..1."""
         return float(np.nanquantile(self.pd_error_by_point, fraction))
 
     def speedup_over(self, other: MeasuredSetting, extra_seconds: float = 0.0) -> float:
-        """Return the time of another setting over the time of this one.
+        """Return the computing time of another setting divided by the time of this one.
 
-        The ratio is the median over the rounds of measurement, or that of the fastest rounds if
-        there are few rounds. ``extra_seconds`` is a time per point that is added to both [s].
+        The ratio is the median over the rounds of measurement. With fewer than
+        `ROUNDS_FOR_MEDIAN_MIN` rounds it is the ratio of the times of the fastest rounds.
+        ``extra_seconds`` [s] is added to the time per point of both settings.
         """
         if self.seconds_per_point_by_round.size < ROUNDS_FOR_MEDIAN_MIN:
             return (other.fastest_seconds_per_point + extra_seconds) / (
@@ -167,7 +169,7 @@ class MeasuredSetting:
 
 
 def read_measured_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
-    """Return the settings in the dataset of a store of `sweep accuracy`, in their order.
+    """Return the settings in the dataset of a store of `sweep accuracy`, in the order of the store.
 
     Stores of earlier versions call the dimension of settings `rung`.
     """
@@ -237,13 +239,13 @@ class SettingComparison(NamedTuple):
     adaptive_setting: MeasuredSetting
     """Setting that chooses the effects point by point."""
     other_setting: MeasuredSetting | None
-    """Setting with fixed effects, or of the thesis's method; None if none is accurate enough."""
+    """Setting with which the adaptive one is compared; None if none is accurate enough."""
 
     def speedup(self, extra_seconds: float = 0.0) -> float:
-        """Return the time of the other setting over the time of the adaptive one.
+        """Return the computing time of the other setting divided by the time of the adaptive one.
 
-        Without another setting it is infinite. ``extra_seconds`` is a time per point that is added
-        to both [s].
+        Without another setting the ratio is infinite. ``extra_seconds`` [s] is added to the time
+        per point of both settings.
         """
         return (
             self.adaptive_setting.speedup_over(self.other_setting, extra_seconds)
@@ -255,8 +257,8 @@ class SettingComparison(NamedTuple):
 def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
     """Compare the fastest adaptive with the fastest fixed setting, at several limits of the error.
 
-    The limits are the errors of the adaptive settings. Neither of two compared settings exceeds the
-    limit.
+    The limits are the errors of the adaptive settings, from the largest to the smallest. Each limit
+    gives one comparison, in which neither setting exceeds the limit.
     """
     adaptive_settings = select_settings_of_kinds(settings, ADAPTIVE_KIND)
     fixed_settings = [
@@ -281,9 +283,11 @@ def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[Set
 def compare_adaptive_with_thesis(
     settings: Sequence[MeasuredSetting], kind: str = THESIS_METHOD_KIND
 ) -> list[SettingComparison]:
-    """Compare each setting of the thesis's way with the fastest equally accurate adaptive setting.
+    """Compare each setting by the thesis's method with an equally accurate adaptive setting.
 
-    `kind` is the kind of the thesis's settings.
+    The method is that of the thesis [T] (:mod:`sweep.model`). The adaptive setting is the fastest
+    one whose error is at most that of the thesis's setting. `kind` is the kind of the thesis's
+    settings.
     """
     adaptive_settings = select_settings_of_kinds(settings, ADAPTIVE_KIND)
     cheapest_by_thesis = (
@@ -301,27 +305,27 @@ SETTING_TABLE_COLUMNS = (
     "setting", "us a point", "planning", "median", "90 %", "largest", "log10 pfa",
     "magnitude", "leakage", "front",
 )  # fmt: skip
-"""Columns of the table of settings: times, quantiles of pd's error, and other largest errors.
+"""Column names of the table of accuracy settings: times, quantiles of pd's error, other errors.
 
-The last column marks settings that no other setting beats in both time and error.
+The last column, `front`, marks settings that no other setting beats in both time and error.
 """
 
 
 SHORT_SETTING_TABLE_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
-"""Columns of the shorter table of settings in the terminal."""
+"""Column names of the shorter table of accuracy settings that is printed in the terminal."""
 
 CHEAPEST_SETTING_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
 """Column names of the table that lists the fastest setting for each tolerance."""
 
 STORING_SECONDS_ATTRIBUTE = "storing_seconds"
-"""Name of the attribute with the time that storing the study takes [s].
+"""Name of the attribute of an accuracy store with the time that storing the study takes [s].
 
-Stores of earlier versions lack it.
+Stores of earlier versions lack the attribute.
 """
 
 
 def setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return a table row for each setting, in the columns of `SETTING_TABLE_COLUMNS`."""
+    """Return a table row of texts for each setting, in the columns of `SETTING_TABLE_COLUMNS`."""
     front_settings = pareto_front(drop_reference_setting(settings))
     return [
         [
@@ -339,7 +343,7 @@ def setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
 
 
 def short_setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return a row for each setting, in the columns of `SHORT_SETTING_TABLE_COLUMNS`.
+    """Return a row of texts for each setting, in the columns of `SHORT_SETTING_TABLE_COLUMNS`.
 
     A star marks the settings of the Pareto front.
     """
@@ -350,7 +354,10 @@ def short_setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[s
 
 
 def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return a row for each tolerance with the fastest setting, in `CHEAPEST_SETTING_COLUMNS`."""
+    """Return a row for each of the `TABULATED_TOLERANCES`, in `CHEAPEST_SETTING_COLUMNS`.
+
+    A row names the fastest setting whose error does not exceed the tolerance.
+    """
     table_rows = []
     for tolerance in TABULATED_TOLERANCES:
         cheapest_setting = fastest_setting_within_error(drop_reference_setting(settings), tolerance)
@@ -364,7 +371,7 @@ def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]
 
 
 def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> list[str]:
-    """Return sentences with the conclusions from a measurement of accuracy."""
+    """Return the conclusions from an accuracy measurement, as sentences for its page."""
     attributes = dataset.attrs
     conclusions = [_as_written_setting_sentences(dataset, settings)]
     conclusions += _fixed_setting_sentences(compare_adaptive_with_fixed(settings), attributes)
@@ -400,7 +407,7 @@ def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> T
 
 
 def _as_written_setting_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
-    """Return the sentences on the spec as written: its time and error, and a faster setting."""
+    """Return sentences on the setting that the spec states: time, error, and a faster setting."""
     (as_written,) = select_settings_of_kinds(settings, AS_WRITTEN_KIND)
     n_points, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
     cheapest_setting = fastest_setting_within_error(
@@ -487,9 +494,9 @@ def _slowdown_text(
 
 
 def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> list[str]:
-    """Return the sentences that compare adaptive settings with the thesis's way.
+    """Return the sentences that compare adaptive settings with the thesis's method.
 
-    Improved versions of the thesis's way are compared too. `beamlets` is the study's number of
+    Improved versions of the thesis's method are compared too. `beamlets` is the study's number of
     beamlets.
     """
     comparisons = compare_adaptive_with_thesis(settings)
@@ -517,7 +524,7 @@ def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> lis
 
 
 def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
-    """Return sentences with the speed-ups of comparisons, by adaptive setting and error."""
+    """Return a text with a sentence on the speed-ups for each adaptive setting and error."""
     speedups_by_case: dict[str, list[str]] = {}
     for comparison in comparisons:
         if comparison.other_setting:
@@ -534,9 +541,9 @@ def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
 
 
 def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
-    """Return the sentences that compare the closed form with the thesis's way.
+    """Return the sentences that compare the closed form of pd with the thesis's method.
 
-    Beamlets and effects of both are the same.
+    Both have the same beamlets and effects. The list is empty without a setting of each kind.
     """
     described_text, improved_text = (
         "; ".join(
@@ -581,7 +588,7 @@ def _format_duration(seconds: float) -> str:
 
 
 def format_microseconds(seconds: float) -> str:
-    """Return a time [s] as text in microseconds with three digits."""
+    """Return a time [s] as text in microseconds with at least three digits."""
     value = 1e6 * seconds
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
@@ -607,9 +614,9 @@ SETTING_KINDS_NAMED_BY_NUMBER = (
 """Kinds of accuracy settings whose names begin with a number of beamlets or draws."""
 
 SETTING_KINDS_JOINED_BY_LINE = (ADAPTIVE_KIND, *SETTING_KINDS_NAMED_BY_NUMBER)
-"""Kinds of accuracy settings that differ only in tolerance or number.
+"""Kinds of accuracy settings that differ only in tolerance, or in a number of beamlets or draws.
 
-A line connects their marks.
+In the figure a line connects the marks of all settings of such a kind.
 """
 
 MARK_BY_SETTING_KIND = {
@@ -630,7 +637,7 @@ MARK_BY_SETTING_KIND = {
 
 
 def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> Sheet:
-    """Return the sheet of a measurement of accuracy: errors of all settings over their times."""
+    """Return the sheet of an accuracy measurement: the error of every setting over its time."""
     plotted_settings = drop_reference_setting(settings)
     sheet, (axes,) = canvas.sheet_with_axes(10.0, 6.2, 1, 1)
     axes.step(
@@ -672,7 +679,7 @@ def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]
 def _draw_setting_mark(
     axes: Axes, setting: MeasuredSetting, marker: str, colour: str, label: str
 ) -> None:
-    """Draw a setting as a mark at its largest error, with smaller quantiles of pd's error below it.
+    """Draw a setting as a mark at its largest error, and quantiles of pd's error below the mark.
 
     A bar reaches down to the 90 % quantile, and a dot marks the median.
     """
@@ -705,7 +712,7 @@ def _setting_plot_position(setting: MeasuredSetting) -> tuple[float, float]:
 
 
 def _short_setting_name(setting: MeasuredSetting) -> str:
-    """Return a short name that distinguishes a setting within its kind."""
+    """Return a short name that distinguishes a setting within its kind; '' if no name is needed."""
     if setting.kind == ADAPTIVE_KIND:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
     if setting.kind == THESIS_METHOD_KIND:
@@ -765,7 +772,7 @@ class AccuracyResults(NamedTuple):
     dataset: xr.Dataset
     """Dataset of the store, in memory."""
     settings: list[MeasuredSetting]
-    """Errors and times of each accuracy setting."""
+    """Measured errors and times of each accuracy setting."""
 
 
 def open_accuracy_store(store: Location) -> AccuracyResults:

@@ -36,7 +36,7 @@ PNG_DPI = 150
 """Resolution of PNG files [dots per inch]."""
 
 COLOUR_MAP_NAME = "viridis"
-"""Name of matplotlib's colour map for all continuous quantities."""
+"""Name of the colour map of matplotlib for all continuous quantities."""
 MISSING_VALUE_COLOUR = "0.75"
 """Grey of missing values: nan, or a point that is not computed yet."""
 
@@ -75,17 +75,17 @@ MATPLOTLIB_RC_PARAMS: dict[Any, Any] = {
 """Settings of matplotlib for all pictures."""
 
 PNG_SOURCE_FIELD = "Source"
-"""Name of the PNG metadata field that states from what a picture was made."""
+"""Name of the PNG metadata field that names the data from which a picture was made."""
 
 _SOURCE_FIELD_BY_FORMAT = {"png": PNG_SOURCE_FIELD, "pdf": "Subject", "svg": "Description"}
-"""Names of the metadata fields that state from what a picture was made, by file format."""
+"""Names, by file format, of the metadata field that names the data of a picture."""
 
 _OMITTED_METADATA_BY_FORMAT: dict[str, dict[str, str | None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Creator": None, "Date": None},
 }
-"""Metadata fields that pictures lack, because they differ between runs or machines, by format."""
+"""Metadata fields set to None by file format, because they differ between runs or machines."""
 
 
 @contextmanager
@@ -110,7 +110,7 @@ class SheetWithAxes(NamedTuple):
     sheet: Sheet
     """The sheet."""
     axes: list[Axes]
-    """Axes, row by row."""
+    """Axes of the panels, row by row."""
 
 
 def sheet_with_axes(
@@ -145,9 +145,10 @@ def set_caption(target_sheet: Sheet, text: str) -> None:
 
 
 def save_sheet(finished_sheet: Sheet, file_path: Path, *, source: str = "") -> Path:
-    """Write a sheet to a file in the format of its suffix; equal sheets give equal bytes.
+    """Write a sheet to a file in the format of its suffix; return the path of the file.
 
-    ``source`` names what the sheet was drawn from, and is written to the file's metadata.
+    Equal sheets give equal bytes. ``source`` names the data from which the sheet was drawn, and is
+    written to the file's metadata.
     """
     file_path.parent.mkdir(parents=True, exist_ok=True)
     picture_format = file_path.suffix.removeprefix(".")
@@ -161,13 +162,13 @@ def save_sheet(finished_sheet: Sheet, file_path: Path, *, source: str = "") -> P
 
 
 LINES_PER_SHARED_PANEL_MAX = 4
-"""Largest number of lines that share a panel. If there are more, each line has its own panel."""
+"""Largest number of lines that share a panel. With more lines, each line has its own panel."""
 
 MARKED_POINTS_MAX = 40
-"""Largest number of points of a line whose points are drawn with markers."""
+"""Largest number of points that a line may have for its points to be drawn with markers."""
 
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-"""Markers of the points of lines, by style index."""
+"""Markers of matplotlib for the points of lines, by style index."""
 
 MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INCHES = (
     (9.5, 4.4),
@@ -175,11 +176,15 @@ MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INC
     (10.0, 1.75),
     (4.3, 3.0),
 )
-"""Widths and heights of panels [inches]: heat map, several lines, single line, and one of a row."""
+"""Widths and heights of panels [inches].
+
+In order: panel with a heat map, panel with several lines, panel with a single line, and panel in a
+row of panels.
+"""
 
 
 def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
-    """Draw a chart on a new sheet, with a heading above it and a caption below it.
+    """Draw a chart on a new sheet, with a heading above and a caption below; return the sheet.
 
     ``footnote`` is the last sentence of the caption.
     """
@@ -262,7 +267,7 @@ def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
 
 
 def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
-    """Draw the heat map of a panel, with contours and axes."""
+    """Draw the heat map of a panel on axes with contours; set scales and limits of the axes."""
     heat_map, mesh_edges = panel.heat_map, []
     assert heat_map is not None
     for axis_name, values, axis in (
@@ -320,7 +325,7 @@ def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> 
 
 
 def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None:
-    """Set the scale and the limits of an axis."""
+    """Set the scale and the limits of one of matplotlib's axes, x or y, from a chart's axis."""
     if axis.scale != CATEGORY_SCALE:
         axes.set(**{f"{axis_name}scale": axis.scale})
     if axis.limits is not None:
@@ -328,7 +333,10 @@ def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None
 
 
 def _draw_line_panels(chart: Chart) -> Sheet:
-    """Draw the line panels of a chart on a new sheet, one per row or in the rows of the chart."""
+    """Draw the line panels of a chart on a new sheet; return the sheet.
+
+    Panels are one below the other, unless the chart states numbers of panels per row.
+    """
     drawn_panels, is_split = (
         (chart.panels, False) if chart.panels_per_row else _split_crowded_panels(chart.panels)
     )
@@ -419,7 +427,7 @@ def _draw_line_panel(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
-    """Draw one line with its band or error bars.
+    """Draw one line on axes, with its band or error bars if it has them.
 
     With `solid` the line is not dashed, whatever its style index is.
     """

@@ -65,21 +65,21 @@ class ChartLine:
     name: str = ""
     """Name of the line in the legend."""
     style_index: int = 0
-    """Number that selects the line's colour, dash and marker from the common lists."""
+    """Index of the line's colour, dash and marker in the common lists of styles."""
     low: np.ndarray | None = None
-    """Lower end of a band about the line at each position (n,), such as a confidence interval."""
+    """Lower end of a band about the line at each position (n,); None for a line without a band."""
     high: np.ndarray | None = None
-    """Upper end of a band about the line at each position (n,), such as a confidence interval."""
+    """Upper end of a band about the line at each position (n,); None for a line without a band."""
     style: str = "line"
     """Style of the line.
 
-    It is ``line``, ``stated`` (dashed), ``dots``, ``bars`` (error bars), ``level`` (horizontal
-    line) or ``area`` (stacked on the areas before it).
+    The style is ``line``, ``stated`` (dashed), ``dots``, ``bars`` (error bars), ``level``
+    (horizontal line) or ``area`` (stacked on the areas that precede it in the panel).
     """
     n_averaged_points: int = 1
-    """Number of points of the study that are averaged for each value of the line."""
+    """Number of points of the study whose mean is one value of the line; 1 for no averaging."""
     hover_texts: Sequence[str] = ()
-    """Texts that a page shows when the reader points at a value of the line, one per value."""
+    """Texts that a page shows when the mouse is over a value of the line, one text per value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class Panel:
     """
 
     facet_choices: Mapping[str, str]
-    """Choices at which a page shows the panel, by the name of the facet.
+    """Choice for each facet at which a page shows the panel, by the name of the facet.
 
     A facet is a property by which panels differ, such as the part of the study.
     """
@@ -130,11 +130,11 @@ class Panel:
     lines: Sequence[ChartLine] = ()
     """Lines of the panel."""
     heat_map: HeatMap | None = None
-    """Heat map of the panel."""
+    """Heat map of the panel; None for a panel of lines."""
 
     @property
     def title(self) -> str:
-        """Title of the panel: its choices of facets, with commas.
+        """Title of the panel: its choices for all facets, joined by commas.
 
         A facet is a property by which panels differ, such as the part of the study.
         """
@@ -150,7 +150,7 @@ class Chart:
     alt: str
     """Text for readers who can't see the figure."""
     caption: Sequence[str]
-    """Phrases of the caption."""
+    """Phrases of the caption, which become sentences."""
     panels: Sequence[Panel]
     """Panels in the order in which they are drawn."""
     facet_labels: Mapping[str, str] = field(default_factory=dict)
@@ -162,7 +162,7 @@ class Chart:
     colour_scale: ColourScale | None = None
     """Colour scale of all heat maps; None for charts of lines."""
     panels_per_row: Sequence[int] = ()
-    """Numbers of panels in the rows of a sheet; empty for one per row."""
+    """Number of panels in each row of a sheet; empty for one panel per row."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class ChartSizeLimits:
     """Limits of the size of a chart."""
 
     parts_max: int
-    """Largest number of parts of the study that are shown. Each part has a panel."""
+    """Largest number of parts of the study that a chart shows. Each part has a panel."""
     columns_max: int
     """Largest number of columns of cells in a row of heat maps."""
     rows_max: int
@@ -190,16 +190,16 @@ A heat map has no more cells than pixels, so that no cell is lost.
 """
 
 LINES_PER_PANEL_MAX = 8
-"""Largest number of lines in a panel; further lines are omitted."""
+"""Largest number of lines in a panel. Lines beyond this number are omitted."""
 
 REDUCED_LINE_CELLS_MAX = 500
-"""Number of cells along the horizontal axis to which the points of a long line are reduced.
+"""Largest number of cells along the horizontal axis for a line whose points are averaged by cells.
 
-Lines with at most twice as many points are not reduced.
+A line with at most twice as many points shows all of its points.
 """
 
 _LOG_SCALE_DECADES_MIN = 3
-"""Number of decades between median and largest value, above which a colour scale is logarithmic."""
+"""Decades between median and largest value above which a colour scale is logarithmic."""
 
 _LARGEST_IS_WORST_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
 """Prefixes of the names of variables whose largest value is the worst one."""
@@ -210,9 +210,9 @@ class CoordinateAxis:
     """Axis along which a coordinate of a study is shown, in display units."""
 
     chart_axis: ChartAxis
-    """Label, scale and limits."""
+    """Label, scale and limits of the axis in a chart."""
     unit_factor: float
-    """Factor from the units of the coordinate to those of the axis."""
+    """Factor by which values in the coordinate's units are multiplied to give the axis's units."""
     units: str
     """Units of the axis; empty for categories."""
 
@@ -229,7 +229,7 @@ class CoordinateAxis:
         )
 
     def to_axis_units(self, values: np.ndarray) -> np.ndarray:
-        """Convert values of the coordinate to the units of the axis; categories become text."""
+        """Return values of the coordinate in the units of the axis; categories become text."""
         if self.chart_axis.scale == CATEGORY_SCALE:
             return np.array([str(value) for value in values])
         return values * self.unit_factor
@@ -267,8 +267,9 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
     -------
     ColourScale
         Scale from the lowest to the highest finite value. It is logarithmic if all values are at
-        least 0, and the largest exceeds 1000 times the median of the positive ones. It then starts
-        at the first percentile of the positive values, but not below 1e-12 of the largest.
+        least 0, and the largest exceeds 1000 times the median of the positive ones. A logarithmic
+        scale starts at the first percentile of the positive values, but not below 1e-12 of the
+        largest.
     """
     values = np.concatenate([layer.ravel() for layer in layers])
     finite_values = values[np.isfinite(values)]
@@ -288,10 +289,10 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
 
 
 def worst_statistic(variable: str) -> str:
-    """Return the name of the statistic that gives the worst value of a variable in a cell.
+    """Return the name of the statistic of a cell of points that shows a variable's worst value.
 
-    It is the lowest value for detection and SNR, and the highest one for misses and false alarms.
-    For other variables the name is ''.
+    The statistic is the lowest value for detection and SNR, and the highest one for misses and
+    false alarms. For other variables the name is ''.
     """
     if variable.startswith(("pd_", "snr_")):
         return CELL_LOWEST
@@ -301,9 +302,9 @@ def worst_statistic(variable: str) -> str:
 def split_into_parts(
     points: PointSelection, shown_names: Sequence[str], parts_max: int
 ) -> ShownParts:
-    """Split a selection of points into at most ``parts_max`` parts, which panels show.
+    """Split a selection of points into at most ``parts_max`` parts, each for one panel.
 
-    In a part only the coordinates with ``shown_names`` vary.
+    Within a part only the coordinates with ``shown_names`` vary.
     """
     if not points.n_points:
         return ShownParts([], 0)
@@ -424,9 +425,9 @@ def _map_cells_max(
     size_limits: ChartSizeLimits,
     n_layers: int,
 ) -> tuple[int, int]:
-    """Return the largest numbers of columns and of rows that a heat map may have.
+    """Return the largest number of columns and of rows that each heat map may have.
 
-    `planes` are the maps before reduction, `n_layers` is the number of all maps.
+    `planes` are the maps before reduction. `n_layers` is the total number of maps in the chart.
     """
     columns_max = size_limits.columns_max // (size_limits.maps_per_row if len(planes) > 1 else 1)
     n_columns = min(columns_max, max(x_coordinate.values.size for _, x_coordinate, _ in planes))
@@ -471,7 +472,7 @@ def _arrange_on_plane(
 def _reduction_remark(
     points_per_cell: int, coordinates: Sequence[SortedCoordinate], cell_statistics: Sequence[str]
 ) -> str:
-    """Return a caption phrase on the number of points in a cell; '' for a single point."""
+    """Return a caption phrase on how many points a cell combines; '' for one point per cell."""
     if points_per_cell == 1:
         return ""
     n_points = math.prod(coordinate.values.size for coordinate in coordinates)
@@ -541,7 +542,7 @@ def slice_chart(
 
 
 def _horizontal_level_lines(panel: Panel, levels: Sequence[float]) -> list[ChartLine]:
-    """Return horizontal lines at the given levels, as long as the first line of a panel."""
+    """Return a horizontal line for each level, as long as the first line of a panel."""
     x = panel.lines[0].x
     return [ChartLine(x, np.full(x.size, level), f"{level:g}", style="level") for level in levels]
 
@@ -550,7 +551,7 @@ class LabelledLinePoints(NamedTuple):
     """Points of a line of a chart, with the names of the line and of its panel."""
 
     part: str
-    """Name of the part of the study; the line belongs to the panel of this part."""
+    """Name of the part of the study, and of the panel, to which the line belongs."""
     name: str
     """Name of the line."""
     points: PointSelection
@@ -561,7 +562,7 @@ class ShownLines(NamedTuple):
     """Lines that the panels of a chart have room for."""
 
     labelled_lines: list[LabelledLinePoints]
-    """Part, name and points of each line."""
+    """Part, name and points of each line that is shown."""
     n_omitted: int
     """Number of omitted lines."""
 
@@ -570,13 +571,16 @@ class LinesWithRemarks(NamedTuple):
     """Lines of a chart that were read from a store."""
 
     lines: list[ChartLine]
-    """Lines, with x in the units of the dataset."""
+    """Lines of a chart, with x in the units of the dataset."""
     remarks: list[str]
-    """Caption phrases on reduction and bands."""
+    """Caption phrases on how the lines were reduced, and on what their bands show."""
 
 
 def split_into_lines(parts: Sequence[NamedPart], line_coordinates: Sequence[str]) -> ShownLines:
-    """Split every part of a chart into lines by the values of coordinates."""
+    """Split each part of a chart into lines, one for each value of the named coordinates.
+
+    Lines beyond `LINES_PER_PANEL_MAX` of a part are omitted and counted.
+    """
     labelled_lines: list[LabelledLinePoints] = []
     n_omitted = 0
     for part_label, part_points in parts:
@@ -598,7 +602,7 @@ def make_line_panels(
     y_axis: ChartAxis,
     **further_choices: str,
 ) -> list[Panel]:
-    """Return a panel of lines for each part of a chart.
+    """Return the panels of a chart of lines, one for each part of the study.
 
     Parameters
     ----------
@@ -610,7 +614,8 @@ def make_line_panels(
     x_axis, y_axis
         Axes of all panels.
     further_choices
-        Choices of further facets, equal for all panels.
+        Choice for each additional facet, a property by which panels differ; equal for all these
+        panels.
     """
     style_by_name = {
         name: k
@@ -653,9 +658,9 @@ def read_lines_along(
     Returns
     -------
     LinesWithRemarks
-        Lines in the order of the argument. If a line has many points, it shows the means of
-        adjacent points, with a band from the lowest to the highest of them. Otherwise the band is
-        the confidence interval of each point, if there is one.
+        Lines in the order of `points_and_variables`. A line with many points shows the means of
+        adjacent points, with a band from the lowest to the highest of them. The band of any other
+        line is the confidence interval of each point, if there is one.
     """
     lazy_arrays: list[list[Any]] = []
     reductions: list[tuple[SortedCoordinate, int, float, bool]] = []
@@ -698,10 +703,10 @@ def read_lines_along(
 
 
 def _value_and_interval_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
-    """Return a variable with the ends of its confidence interval, and the confidence level.
+    """Return a dataset with a variable and the ends of its confidence interval, and the level.
 
-    The dataset has the variables `mean`, and `lowest` and `highest` if there is an interval.
-    Otherwise the level is 0.
+    The dataset has the variable as `mean`, and `lowest` and `highest` if there is an interval. The
+    level is that of confidence, 0..1; it is 0 if there is no interval or no single level.
     """
     segment = variable.removeprefix("pd_")
     if f"{variable}_low" in dataset:
@@ -724,7 +729,7 @@ def _value_and_interval_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dat
 
 
 def _band_remark(n_averaged_points: int, confidence: float, has_ends: bool) -> str:
-    """Return a caption phrase on the reduction and band of a line; '' for a line without them."""
+    """Return a caption phrase on what the band of a line shows; '' for a line without a band."""
     interval_text = f"{100 * confidence:g} % confidence interval" if confidence else "interval"
     if n_averaged_points > 1:
         ends_note = f", their {interval_text}s included" if confidence else ""

@@ -43,15 +43,15 @@ from sweep.storage.verified_store import open_verified_store
 READ_CHUNK_VALUES_MAX = 2**20
 """Largest number of array values in a Dask chunk.
 
-A chunk of floats has at most 8 MB. Much smaller chunks would make a large task graph, which takes
-about 7 kB per chunk.
+A chunk of floats has at most 8 MB. Much smaller chunks would make a large task graph, because each
+chunk takes about 7 kB in the graph.
 """
 
 READ_SHOTS_MAX = 8192
-"""Largest number of shots that are read at once, unless a stored chunk has more."""
+"""Largest number of shots that are read at once, unless a single stored chunk has more shots."""
 
 COUNT_FILL_VALUE = -1
-"""Value in a store of counts that are not computed yet."""
+"""Value that a store has in place of counts that are not computed yet."""
 
 _DESCRIPTION_BY_STORE_KIND = {
     GRID_STORE_KIND: "a grid of points: sweep.open() opens it",
@@ -131,7 +131,10 @@ def open(
 
 
 def _datasets_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
-    """Return datasets by the titles of their studies; the study id distinguishes equal titles."""
+    """Return a mapping of datasets by the titles of their studies.
+
+    Where several studies have the same title, the study id is part of the key.
+    """
     titles = [str(dataset.attrs["title"]) for dataset in datasets]
     dataset_by_name = {
         comparison.study_title_with_id(dataset) if titles.count(title) > 1 else title: dataset
@@ -155,7 +158,7 @@ def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _add_study_id(dataset: xr.Dataset, study_id: str) -> xr.Dataset:
-    """Return a dataset with two more coordinates: the id of its study, and the study's marker.
+    """Return a dataset with the id of its study and the study's marker as two more coordinates.
 
     Attributes that are mappings of versions become text.
     """
@@ -236,7 +239,7 @@ def open_scene_tree(store_path: Location, chunks: dict[str, int] | None = None) 
 
 
 _NAME_BY_OLD_MAP_VARIABLE = {"map_x": "x", "map_y": "y", "map_height": "height"}
-"""Present names of map variables, by their names in the root of stores of earlier versions."""
+"""Present name of each map variable that stores of earlier versions have in their root."""
 
 
 def _count_chunks(array: xr.DataArray) -> int:
@@ -245,7 +248,7 @@ def _count_chunks(array: xr.DataArray) -> int:
 
 
 def stored_chunk_length(array: xr.DataArray, dim: str) -> int:
-    """Return the length of an array's stored chunks along a dimension."""
+    """Return the length of an array's stored chunks along a dimension, in elements."""
     return int(array.encoding.get("preferred_chunks", {}).get(dim, array.sizes[dim]))
 
 
@@ -303,8 +306,8 @@ def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, A
 def rechunk_for_reading(dataset: xr.Dataset) -> xr.Dataset:
     """Return a dataset of Dask arrays in chunks of at most `READ_CHUNK_VALUES_MAX` values.
 
-    A chunk consists of whole stored chunks. It grows first along the last dimension, along which
-    values are adjacent in the files.
+    A chunk consists of complete stored chunks. Stored chunks are joined along the last dimension
+    first, along which values are adjacent in the files.
     """
     largest_array = max(dataset.data_vars.values(), key=lambda array: array.ndim)
     chunk_sizes = dict(zip(largest_array.dims, largest_array.encoding["chunks"], strict=True))
@@ -315,7 +318,7 @@ def rechunk_for_reading(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def sum_draw_batches(dataset: xr.Dataset) -> xr.Dataset:
-    """Sum the counts of a dataset over batches of draws; a sum is -1 if a batch is not computed."""
+    """Return a dataset with counts summed over batches of draws; -1 if a batch is not computed."""
     batched_counts = {
         name: array for name, array in dataset.data_vars.items() if DRAW_BATCH_DIM in array.dims
     }
@@ -329,7 +332,7 @@ def sum_draw_batches(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> dict[str, Any]:
-    """Return the times and the progress of a study, as attributes of a dataset.
+    """Return the times and the progress of a study as a dict of attributes of a dataset.
 
     ``n_points`` and ``n_blocks`` are the numbers of points and blocks of the complete study.
     """
@@ -359,10 +362,10 @@ def _format_utc(time: float) -> str:
 def _as_accessor_method(
     answer: Callable[..., Any], *, require_axes: bool = False
 ) -> Callable[..., Any]:
-    """Turn a function of a dataset into a method of `ds.sweep` with the same docstring.
+    """Return a method of `ds.sweep` that calls a function of a dataset, with its docstring.
 
-    The method checks that the dataset comes from one study. For a join of studies it answers for
-    each design. With ``require_axes`` it checks that the coordinates of all axes exist.
+    The method checks that the dataset comes from one study. For a join of studies it returns an
+    answer for each design. With ``require_axes`` it checks that the coordinates of all axes exist.
     """
 
     @wraps(answer)
@@ -395,7 +398,7 @@ class SweepAccessor:
         )
 
     def sel(self, *, method: str | None = None, **coordinates: Any) -> xr.Dataset:
-        """Select points by physical value: ``ds.sweep.sel(range="2 km", grazing_angle="20 deg")``.
+        """Return the points at given values: ``ds.sweep.sel(range="2 km", grazing_angle="9 deg")``.
 
         Accepted values, and errors, are described in :func:`.dataset_lookup.select_points`.
         """
@@ -436,5 +439,5 @@ class FlightAccessor:
 
     @wraps(comparison.compare_flights)
     def compare(self, other: xr.DataTree) -> xr.DataTree:
-        """Compare two flights as :func:`.comparison.compare_flights` does."""
+        """Compare this flight with another one by :func:`.comparison.compare_flights`."""
         return comparison.compare_flights(self._tree, other)

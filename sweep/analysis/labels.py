@@ -11,10 +11,10 @@ import numpy as np
 from sweep.messages import number_with_noun as number_with_noun
 
 KILOMETRE_DISPLAY_MIN = 1000.0
-"""Median of the distances on an axis above which they are shown in km [m]."""
+"""Least median of the distances on an axis for which the axis is in km [m]."""
 
 _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW": "µW", "m s-1": "m/s"}
-"""Symbols of units in labels, by the units' names in stores, if they differ."""
+"""Symbol in labels of each unit that stores write in another way."""
 
 _DIMENSIONLESS_UNITS = ("", "1")
 """Values of the attribute `units` for pure numbers and for words."""
@@ -40,13 +40,13 @@ class DisplayUnits(NamedTuple):
     """Units in which values are shown."""
 
     factor: float
-    """Factor from the units of the values to those that are shown."""
+    """Factor by which values in stored units are multiplied to give values in displayed units."""
     units: str
-    """Units that are shown."""
+    """Name of the displayed units."""
 
 
 def display_factor_and_units(values: np.ndarray, units: str) -> DisplayUnits:
-    """Return the factor that converts values to display units, and the display units.
+    """Return the display units for values, and the factor that converts the values to these units.
 
     Long distances are shown in km, and angles in degrees.
     """
@@ -104,7 +104,7 @@ def coordinate_label(name: str) -> str:
 
 
 def join_sentences(phrases: list[str]) -> str:
-    """Turn each phrase into a sentence, and join the sentences; empty phrases are skipped."""
+    """Return a text in which each phrase has become a sentence; empty phrases are skipped."""
     return " ".join(part[0].upper() + part[1:].rstrip(".") + "." for part in phrases if part)
 
 
@@ -114,7 +114,10 @@ def is_categorical(values: np.ndarray) -> bool:
 
 
 def describe_value_extent(values: np.ndarray) -> str:
-    """Return a text with the lowest, the median and the highest finite value of an array."""
+    """Return a text with the lowest, the median and the highest finite value of an array.
+
+    Without finite values the text says that no value is known.
+    """
     finite_values = values[np.isfinite(values)]
     if not finite_values.size:
         return "no value is known"
@@ -123,7 +126,7 @@ def describe_value_extent(values: np.ndarray) -> str:
 
 
 def source_note(attributes: Mapping[Any, Any], counted_unit: str) -> str:
-    """Return a text that names a picture's study, the model version, and what is not computed yet.
+    """Return a text on a picture's origin: study, model version, and progress if not complete.
 
     `attributes` are those of the store. `counted_unit` is the unit of progress: ``points`` or
     ``blocks``.

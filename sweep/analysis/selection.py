@@ -27,7 +27,7 @@ CELL_MEAN, CELL_LOWEST, CELL_HIGHEST = "mean", "lowest", "highest"
 """Names of the statistics of the points in a cell of a figure."""
 
 PARTIAL_SUM_VALUES_MAX = 2**20
-"""Largest number of values that one partial sum adds up. The partial sums are then added."""
+"""Largest number of values in one partial sum. The sum of an array adds its partial sums."""
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,23 @@ class SortedCoordinate:
     dim: str
     """Dimension of the dataset along which the coordinate lies."""
     indices: np.ndarray
-    """Index of each value along the dimension of the dataset."""
+    """Index of each of the `values` along the dimension of the dataset."""
     values: np.ndarray
-    """Values of the coordinate, without duplicates."""
+    """Distinct values of the coordinate, in order."""
 
     def points_per_cell(self, cells_max: int) -> int:
         """Return the number of adjacent values that share a cell of a figure.
 
-        It is the smallest number for which at most ``cells_max`` cells are needed.
+        It is the smallest number for which at most ``cells_max`` cells are needed. For words it is
+        1.
         """
         return 1 if labels.is_categorical(self.values) else -(-self.values.size // cells_max)
 
     def cell_means(self, cells_max: int) -> np.ndarray:
         """Return the mean of the coordinate's values in each cell of a figure.
 
-        Cells hold adjacent values, and there are at most ``cells_max``.
+        Cells hold adjacent values. There are at most ``cells_max`` cells; each word has its own
+        cell.
         """
         cell_size = self.points_per_cell(cells_max)
         if cell_size == 1:
@@ -62,7 +64,7 @@ class SortedCoordinate:
 
 
 def to_float_with_nan(array: xr.DataArray) -> xr.DataArray:
-    """Return an array as floats; negative integers, which stand for missing counts, become nan."""
+    """Return an array as floats; negative integers, which mark missing counts, become nan."""
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
 
@@ -73,7 +75,7 @@ class PointSelection:
     dataset: xr.Dataset
     """Dataset whose points are selected."""
     table_by_dim: Mapping[str, pandas.DataFrame]
-    """Table of each dimension; rows are selected indices, columns are coordinates along it."""
+    """Table of each dimension. Its rows are the selected indices, its columns the coordinates."""
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> PointSelection:
@@ -97,7 +99,7 @@ class PointSelection:
         return math.prod(map(len, self.table_by_dim.values()))
 
     def dim_of_coordinate(self, name: str) -> str:
-        """Return the dimension of the named coordinate, or the name if it is a dimension."""
+        """Return the dimension of the named coordinate, or the name itself if it is a dimension."""
         return next((dim for dim, table in self.table_by_dim.items() if name in table), name)
 
     def coordinate_values(self, name: str) -> np.ndarray:
@@ -106,12 +108,12 @@ class PointSelection:
         return np.asarray(table.get(name, table.index))
 
     def coordinate_units(self, name: str) -> str:
-        """Return the units of a coordinate."""
+        """Return the units of the named coordinate; '' if it has none."""
         coordinate = self.dataset.coords.get(name)
         return "" if coordinate is None else str(coordinate.attrs.get("units", ""))
 
     def isel(self, dim: str, indices: np.ndarray) -> PointSelection:
-        """Restrict the selection along a dimension to row numbers, or to a mask of rows."""
+        """Return the selection restricted along a dimension to row numbers, or to a row mask."""
         return replace(
             self, table_by_dim={**self.table_by_dim, dim: self.table_by_dim[dim].iloc[indices]}
         )
@@ -123,7 +125,10 @@ class PointSelection:
         )
 
     def drop_duplicates(self) -> PointSelection:
-        """Return the selection without points that repeat all coordinates along a dimension."""
+        """Return the selection without points that repeat an earlier point along a dimension.
+
+        A point repeats another one if all coordinates along the dimension are equal.
+        """
         tables = {dim: table.drop_duplicates() if len(table.columns) else table
                   for dim, table in self.table_by_dim.items()}  # fmt: skip
         return replace(self, table_by_dim=tables)
@@ -133,7 +138,7 @@ class PointSelection:
         return list(pandas.unique(self.coordinate_values(name)))
 
     def varying_coordinates(self) -> list[str]:
-        """Return the names of coordinates with more than one value."""
+        """Return the names of coordinates with more than one value among the selected points."""
         return [
             n
             for table in self.table_by_dim.values()
@@ -142,7 +147,7 @@ class PointSelection:
         ]
 
     def distinguishing_coordinates(self, names: Sequence[str]) -> list[str]:
-        """Return coordinates that distinguish points with equal values of the named coordinates.
+        """Return the names of coordinates that distinguish points with equal values of `names`.
 
         As few coordinates as possible are returned.
         """
@@ -153,7 +158,7 @@ class PointSelection:
         ]
 
     def distinguishing_coordinates_along(self, dim: str, names: Sequence[str]) -> list[str]:
-        """Return the `distinguishing_coordinates` that lie along one dimension."""
+        """Return those of the `distinguishing_coordinates` that lie along one dimension."""
         table = self.table_by_dim[dim]
         given_names = [name for name in names if name in table]
         distinguishing: list[str] = []
@@ -166,7 +171,7 @@ class PointSelection:
         return distinguishing
 
     def group_by(self, name: str) -> list[tuple[object, PointSelection]]:
-        """Return each value of a coordinate with the selection of its points.
+        """Return pairs of a coordinate's value and the selection of the points with this value.
 
         Values are in the order of their first appearance.
         """
@@ -192,7 +197,7 @@ class PointSelection:
         return SortedCoordinate(dim, np.asarray(self.table_by_dim[dim].index)[first_rows], values)
 
     def first_indices(self, *coordinates: SortedCoordinate) -> dict[str, int]:
-        """Return the first selected index of each dimension, except those of given coordinates."""
+        """Return the first selected index by dimension, without dimensions of given coordinates."""
         shown_dims = {coordinate.dim for coordinate in coordinates}
         return {
             dim: int(table.index[0])
@@ -242,7 +247,7 @@ class PointSelection:
 
 
 def matches_any_value(values: np.ndarray, wanted_values: list[object]) -> np.ndarray:
-    """Return a mask of the values that equal a wanted value, numbers to a relative 1e-9."""
+    """Return a mask of the values that equal any wanted value; numbers match to a relative 1e-9."""
     if values.dtype.kind not in "fiu":
         return np.isin([str(v) for v in values], [str(w) for w in wanted_values])
     matches = [np.isclose(values, float(w), rtol=1e-9, atol=0.0) for w in wanted_values]  # type: ignore[arg-type]
@@ -254,7 +259,7 @@ def select_where(
 ) -> PointSelection:
     """Return the selection of the points at which coordinates have given values.
 
-    `where` are one or several values by coordinate, written as in a spec.
+    `where` has one or several values for each coordinate, written as in a spec.
     """
     for name, raw_value in where.items():
         wanted_values = list(raw_value) if isinstance(raw_value, tuple | list) else [raw_value]
@@ -285,7 +290,10 @@ class ShownParts(NamedTuple):
 def split_by_coordinates(
     points: PointSelection, names: Sequence[str], parts_max: int
 ) -> ShownParts:
-    """Split a selection by the values of coordinates, into at most ``parts_max`` parts."""
+    """Split a selection by the values of named coordinates, into at most ``parts_max`` parts.
+
+    Without names the selection is the only part.
+    """
     parts = [NamedPart("", points)]
     for name in names:
         units = points.coordinate_units(name)
@@ -303,7 +311,7 @@ def split_by_coordinates(
 
 
 def thin_parts_evenly(parts: list[NamedPart], parts_max: int) -> ShownParts:
-    """Return at most ``parts_max`` evenly spread parts, and the number of omitted parts."""
+    """Return at most ``parts_max`` evenly spread parts, with the number of omitted parts."""
     if len(parts) <= parts_max:
         return ShownParts(parts, 0)
     shown_parts = [parts[round(i * (len(parts) - 1) / (parts_max - 1))] for i in range(parts_max)]
@@ -311,12 +319,12 @@ def thin_parts_evenly(parts: list[NamedPart], parts_max: int) -> ShownParts:
 
 
 def find_axis_parameter(spec: GridSpec, path: str) -> AxisParameter | None:
-    """Return the parameter with a path, if it is on an axis of the study, or None."""
+    """Return the parameter with a dotted path if it is on an axis of the study, otherwise None."""
     return next((m for axis in spec.axes for m in axis.parameters if m.path == path), None)
 
 
 def parameters_at(spec: GridSpec | SceneSpec, axis_indices: Mapping[str, int]) -> dict[str, Any]:
-    """Return the SI values of all parameters by dotted path, at given indices along the axes."""
+    """Return the SI values of all parameters by dotted path, at an index along each axis."""
     return dict(spec.parameters()) | {
         axis_parameter.path: np.asarray(axis_parameter.values)[axis_indices[axis.name]].item()
         for axis in spec.axes
@@ -325,7 +333,7 @@ def parameters_at(spec: GridSpec | SceneSpec, axis_indices: Mapping[str, int]) -
 
 
 RANGE_PATH, GRAZING_ANGLE_PATH = "target.range", "target.grazing_angle"
-"""Dotted paths of range and grazing angle."""
+"""Dotted paths of the parameters range and grazing angle."""
 PUBLISHED_CUTS = (
     (GRAZING_ANGLE_PATH, "15 deg"),
     (GRAZING_ANGLE_PATH, "85 deg"),
@@ -419,10 +427,10 @@ def study_cuts(spec: GridSpec) -> list[StudyCut]:
 
 
 def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
-    """Divide a zipped axis, along which range and grazing angle vary together, into runs.
+    """Divide a zipped axis, along which range and grazing angle vary, into runs.
 
-    Along a run one of them is constant. The result is this parameter and its value for each run, in
-    order.
+    In each run one of the two parameters is constant. The result has this parameter and its
+    constant value for each run, in order.
     """
     axis_parameters = [m for m in axis.parameters if m.path in (RANGE_PATH, GRAZING_ANGLE_PATH)]
     runs: list[tuple[AxisParameter, object]] = []
@@ -449,8 +457,8 @@ def select_beyond_range(
 ) -> PointSelection:
     """Return the selection of the points beyond a range, such as "5 m".
 
-    With ``inclusive`` the points at that range count too. All points are returned if range is on no
-    axis.
+    With ``inclusive`` the points at that range belong to the selection too. If range is on no axis,
+    all points are returned.
     """
     range_parameter = find_axis_parameter(spec, RANGE_PATH)
     if range_parameter is None:
@@ -496,7 +504,7 @@ class Statistics:
 
 
 def compute_statistics(groups: Sequence[PointSelection], variable: str) -> list[Statistics]:
-    """Return the statistics of a variable over each group of points. The data are read once."""
+    """Return the statistics of a variable for each group of points, in order, in one pass."""
     indices_by_group = [
         {dim: np.asarray(table.index) for dim, table in g.table_by_dim.items()} for g in groups
     ]

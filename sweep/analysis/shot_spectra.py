@@ -47,7 +47,7 @@ class BinGroup:
     last_index: int
     """Index of the last bin."""
     peak_index: int
-    """Index of the strongest bin."""
+    """Index of the strongest bin of the group."""
 
 
 @dataclass(frozen=True)
@@ -59,27 +59,27 @@ class DisplayedSegment:
     chirp_rate_ratio: float
     """Frequency slope over the chirp rate: 1 for the up-chirp, 0 for constant frequency."""
     bin_numbers: np.ndarray
-    """Numbers of the bins (n,), rising; a complex record has negative ones too."""
+    """Numbers of the bins (n,), rising. A complex record has negative bin numbers too."""
     frequency: np.ndarray
     """Frequencies of the bins (n,) [Hz]."""
     signal_magnitude: np.ndarray
-    """Magnitude |X| of the signal without noise in each bin (n,) [V]."""
+    """Magnitude |X| of each bin (n,) without noise [V]."""
     magnitude: np.ndarray
-    """Magnitude |X| of each bin with noise, if noise was drawn (n,) [V]."""
+    """Magnitude |X| of each bin (n,), with noise if noise was drawn [V]."""
     beat_frequency: float
-    """Beat frequency, before it is folded at the Nyquist frequency [Hz]."""
+    """Signed beat frequency, before it is folded at the Nyquist frequency [Hz]."""
     carrier_frequency: float
     """Carrier frequency of the segment [Hz]."""
     bin_groups: tuple[BinGroup, ...]
     """Groups of adjacent bins above the threshold. Each group is one detection."""
     snr: float
-    """Signal-to-noise ratio of the signal's strongest bin."""
+    """Signal-to-noise power ratio in the strongest bin of the signal."""
     pd: float
     """Probability of detection in the segment."""
 
     @property
     def peak_index(self) -> int:
-        """Index of the strongest bin."""
+        """Index of the strongest bin of the segment, with noise if noise was drawn."""
         return int(np.argmax(self.magnitude))
 
 
@@ -90,7 +90,7 @@ class SimulatedShot:
     label: str
     """Label of the shot in figures and tables."""
     parameters: ParameterValues
-    """Parameters of the shot."""
+    """SI values of the shot's parameters, by dotted path."""
     prepared_shot: shot_model.Shots
     """All that the shot's spectra depend on (lines, noise, threshold), as arrays of one shot."""
     outputs: dict[str, float]
@@ -98,9 +98,9 @@ class SimulatedShot:
     segments: tuple[DisplayedSegment, ...]
     """Spectra of the segments that the shot has."""
     reported_range: float
-    """Range that the strongest bins give [m]."""
+    """Range that follows from the strongest bins of the segments [m]."""
     reported_radial_velocity: float
-    """Radial velocity that the strongest bins give [m/s]."""
+    """Radial velocity that follows from the strongest bins of the segments [m/s]."""
 
     @property
     def noise_sigma(self) -> float:
@@ -118,13 +118,16 @@ class SimulatedShot:
         return float(np.sqrt(2)) * self.noise_sigma
 
     def magnitude_to_dbv(self, magnitude: np.ndarray | float) -> np.ndarray:
-        """Convert a magnitude |X| [V] to the amplitude of a tone with this magnitude [dBV]."""
+        """Return the amplitude [dBV] of a tone whose magnitude |X| in its bin is given [V]."""
         with np.errstate(divide="ignore"):
             return 20 * np.log10(2 * np.asarray(magnitude) / self.prepared_shot.window.sum)
 
     @property
     def is_detected(self) -> bool:
-        """True if the shot is detected: both chirps, or any two segments, exceed the threshold."""
+        """True if the segments that a detection requires exceed the threshold.
+
+        They are the up- and the down-chirp, or any two segments, as the spec's detection rule says.
+        """
         if self.prepared_shot.detects_by_any_two_segments:
             return sum(bool(segment.bin_groups) for segment in self.segments) >= 2
         return all(
@@ -288,7 +291,7 @@ def simulate_noise_spectrum(
 
 
 def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, ...]:
-    """Return the groups of adjacent bins whose magnitudes are at or above the threshold."""
+    """Return the groups of adjacent bins with magnitudes at or above the threshold, in order."""
     bins_above = np.flatnonzero(magnitude >= threshold)
     runs = (
         np.split(bins_above, np.flatnonzero(np.diff(bins_above) > 1) + 1) if bins_above.size else []
@@ -353,14 +356,14 @@ SPECTRUM_COLOUR, THRESHOLD_COLOUR, NOISE_COLOUR, DETECTION_COLOUR = (
 LEVEL_AXIS_MARGIN_BELOW_DB, LEVEL_AXIS_MARGIN_ABOVE_DB = 25.0, 12.0
 """Margins of the vertical axis of a spectrum [dB].
 
-The first is below the noise, the second above the strongest bin or the threshold.
+The first is the margin below the noise, the second that above the strongest bin or the threshold.
 """
 
 PEAK_VIEW_HALF_WIDTH_MIN_BINS = 12
-"""Least distance from a peak to the edges of its close-up [bins]."""
+"""Least distance from a peak to the edges of a close-up of the peak [bins]."""
 
 DETECTION_VIEW_MARGIN_MIN_BINS = 8
-"""Least distance from the outermost detections in a close-up of a peak to its edges [bins]."""
+"""Least distance from the outermost detections in a close-up to the close-up's edges [bins]."""
 
 NEARBY_DETECTION_BAND_FRACTION_MAX = 0.05
 """Largest distance from a peak at which a detection is shown in the peak's close-up.
@@ -374,8 +377,8 @@ def draw_spectra_sheet(
 ) -> Sheet:
     """Return a sheet of spectra, with a row for each segment and two columns for each shot.
 
-    The columns show the full band, and a close-up of the peak. With ``shows_detections`` the
-    close-up includes all detections near the peak.
+    The first column of a shot shows the full band, the second a close-up of the peak. With
+    ``shows_detections`` the close-up includes all detections near the peak.
     """
     n_rows, n_columns = len(shots[0].segments), 2 * len(shots)
     width = 5.4 if len(shots) == 1 else 4.2
@@ -417,7 +420,7 @@ def draw_spectra_sheet(
 
 
 def _level_axis_limits_db(shots: Sequence[SimulatedShot]) -> tuple[float, float]:
-    """Return the limits of a vertical axis that shows noise and peaks of all shots [dBV]."""
+    """Return the limits of a vertical axis [dBV] that shows the noise and peaks of all shots."""
     low = (
         min(float(shot.magnitude_to_dbv(shot.noise_rms)) for shot in shots)
         - LEVEL_AXIS_MARGIN_BELOW_DB
@@ -500,7 +503,10 @@ def _annotate_snr_and_pd(axes: Axes, shot: SimulatedShot, segment: DisplayedSegm
 
 
 def peak_bin_slice(magnitude: np.ndarray) -> slice:
-    """Return the slice of bins around the largest magnitude, down to a tenth of it."""
+    """Return the slice of bins that a close-up of the largest magnitude shows.
+
+    It contains the bins near the peak with at least a tenth of the largest magnitude, and a margin.
+    """
     peak = int(np.argmax(magnitude))
     strong_bins = np.flatnonzero(magnitude >= 0.1 * magnitude[peak])
     nearby_bins = strong_bins[np.abs(strong_bins - peak) < magnitude.size // 8]
@@ -511,7 +517,7 @@ def peak_bin_slice(magnitude: np.ndarray) -> slice:
 
 
 def detection_bin_slice(segment: DisplayedSegment) -> slice:
-    """Return the slice of bins around a segment's peak that contains all detections near it."""
+    """Return the slice of bins that a close-up of a segment's peak and nearby detections shows."""
     view, n_bins = peak_bin_slice(segment.signal_magnitude), segment.signal_magnitude.size
     peak = int(np.argmax(segment.signal_magnitude))
     near_groups = [
@@ -540,7 +546,7 @@ def draw_scene_shot_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """Return a sheet of the spectra of a scene's shot, with marks at the lines of its beamlets."""
+    """Return a sheet of the spectra of a scene's shot, with marks at its beamlets' lines."""
     notes = [*remarks, "marks at the foot: where the beamlets' own lines are, by surface"]
     sheet = draw_spectra_sheet(
         [shot], title=title, footnote=labels.join_sentences(notes), shows_detections=True
@@ -573,7 +579,7 @@ def draw_scene_shot_sheet(
 
 
 def _noise_table(shot: SimulatedShot) -> PageTable:
-    """Return a table of the noise at the ADC by source: volts, and shares of the noise variance."""
+    """Return a table of the noise at the ADC: volts and share of the noise variance, by source."""
     variance_by_source = {
         n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise.variances.items()
     }
@@ -592,7 +598,7 @@ def _noise_table(shot: SimulatedShot) -> PageTable:
 
 
 def _segment_table(shot: SimulatedShot) -> PageTable:
-    """Return a table of the segments: beat frequency, peak, level, SNR, pd, number of groups."""
+    """Return a table with beat frequency, peak, level, SNR, pd and bin groups of each segment."""
     columns = (
         "segment", "beat (MHz)", "seen (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
         "groups",
@@ -618,7 +624,7 @@ def _segment_table(shot: SimulatedShot) -> PageTable:
 
 
 def _measurement_table(shot: SimulatedShot) -> PageTable:
-    """Return a table of range and radial velocity: true, reported, and error."""
+    """Return a table of range and radial velocity: true value, reported value, and error."""
     prepared_shot = shot.prepared_shot
     rows = [
         (
@@ -654,7 +660,7 @@ def _false_alarm_table(shot: SimulatedShot) -> PageTable:
 
 
 REPORTED_AXIS_VALUES_MAX = 3
-"""Largest number of values of a study's only axis for which a report shows one shot per value."""
+"""Largest number of values of an only axis for which a report shows a shot at every value."""
 
 _REPORTED_PARAMETER_PATHS = (
     "target.range",
@@ -677,9 +683,9 @@ class ShotReport(NamedTuple):
     """Report of the spectra of shots, as text and in files."""
 
     text: str
-    """Tables as text."""
+    """Tables of the shots as text."""
     files: list[Path]
-    """Paths of the written files."""
+    """Paths of the written files: pictures and text."""
 
 
 def write_shot_report(
@@ -746,7 +752,7 @@ class LabelledParameters(NamedTuple):
     """Parameters of a shot that is drawn."""
 
     label: str
-    """Values along the axis; '' for the only shot."""
+    """Coordinate value of the shot along the study's only axis; '' for a report of one shot."""
     parameters: ParameterValues
     """SI values of all parameters by dotted path."""
 
@@ -754,7 +760,11 @@ class LabelledParameters(NamedTuple):
 def select_shot_parameters(
     spec: GridSpec, coordinate_values: Mapping[str, str]
 ) -> list[LabelledParameters]:
-    """Return the label and the parameters of each shot that :func:`write_shot_report` draws."""
+    """Return the label and the parameters of each shot that :func:`write_shot_report` draws.
+
+    ``coordinate_values`` are values with units, by name or path of a coordinate. Raise SpecError if
+    a value can't be read, or is given twice.
+    """
     axis_parameters = [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
     path_by_name, rule_by_path = (
         {m.coordinate_name: m.path for m in axis_parameters},
@@ -794,7 +804,7 @@ def select_shot_parameters(
 
 
 def _format_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Return the name and the formatted value of each parameter of a shot at the given paths."""
+    """Return pairs of the name and the formatted value of a shot's parameters at given paths."""
     rule_by_path = parameter_rules()
     descriptions = []
     for path in paths:
@@ -816,7 +826,7 @@ def _format_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tupl
 
 
 def _describe_shared_parameters(shots: list[SimulatedShot]) -> str:
-    """Return a line of text with the parameters that are equal in all shots."""
+    """Return a line of text with the reported parameters that are equal in all shots."""
     descriptions = [_format_parameters(shot, _REPORTED_PARAMETER_PATHS) for shot in shots]
     return ", ".join(
         f"{name} {value_text}"

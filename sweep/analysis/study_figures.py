@@ -65,10 +65,10 @@ from sweep.storage.locations import Location, derived_files_dir, parse_location
 from sweep.storage.store_format import ACCURACY_STORE_KIND, SCENE_STORE_KIND
 
 SURFACE_AXIS_VALUES_MIN = 8
-"""Least number of values of an axis for a default figure to be a surface over this axis."""
+"""Least number of values that an axis needs for a default surface figure over it."""
 
 DEFAULT_FIGURE_VARIABLES = ("pd_shot", "pd_doppler")
-"""Variables of the default figures of a grid."""
+"""Names of the variables that the default figures of a grid show."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class GridResults:
     def make_table_page(
         self, figure_spec: TableFigure | FalseAlarmTable | ThresholdTable
     ) -> tables.TablePage:
-        """Return the page of a table that the spec defines."""
+        """Return the page of a table that the spec of the study defines."""
         title = figure_spec.title or self.spec.title
         if isinstance(figure_spec, TableFigure):
             units = str(self.dataset[figure_spec.variable].attrs.get("units", ""))
@@ -140,7 +140,7 @@ class GridResults:
         )
 
     def render_figure(self, figure_spec: GridFigure) -> canvas.Sheet | tables.TablePage | str:
-        """Return the sheet of a figure or the page of a table; a message if it would be empty."""
+        """Return a figure as a sheet, or a table as a page; a message text if it would be empty."""
         if not isinstance(figure_spec, SurfaceFigure | SlicesFigure):
             return self.make_table_page(figure_spec)
         chart = self.make_chart(figure_spec, charts.SHEET_CHART_SIZE_LIMITS)
@@ -154,7 +154,7 @@ class GridResults:
 
 
 def describe_selection(figure_spec: SurfaceFigure | SlicesFigure) -> str:
-    """Return a text with the coordinate values that a figure selects."""
+    """Return a text with the single coordinate values that a figure selects; '' if none."""
     return ", ".join(
         f"{labels.coordinate_label(name)} {value}"
         for name, value in figure_spec.where.items()
@@ -229,7 +229,7 @@ def draw_figures(
 
 
 def picture_source_text(study_id: str, figure_spec: GridFigure | SceneFigure) -> str:
-    """Return the text in a picture's metadata that identifies its study and its figure.
+    """Return the text in a picture's metadata that identifies the study and the figure.
 
     The study id depends on everything that determines the results, including the model version.
     """
@@ -288,14 +288,14 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
 
 
 DEFAULT_CLOUD_COLOUR_QUANTITIES = ("range", "radial_velocity")
-"""Quantities by which the default figures colour a point cloud."""
+"""Names of the quantities by which the default figures colour a point cloud."""
 
 
 def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
     """Return the specs of a flight's default figures.
 
-    The figures show the point cloud of each scanner by range, with the flight path, and by radial
-    velocity, and the navigation errors.
+    For each scanner there is a point cloud by range, with the flight path, and one by radial
+    velocity. Figures of navigation errors follow if navigation was computed.
     """
     scanners = [str(name) for name in tree.attrs["scanners"]]
     figure_specs: list[SceneFigure] = [
@@ -318,7 +318,7 @@ class SceneResults:
     store_path: Location
     """Path of the store."""
     tree: xr.DataTree
-    """Tree of the store, with NumPy arrays that are read when they are sliced."""
+    """Tree of the store, whose arrays are read as NumPy arrays when they are sliced."""
     spec: SceneSpec
     """Spec of the study."""
 
@@ -349,7 +349,7 @@ class SceneResults:
         return list(self.spec.figures) or default_scene_figures(self.tree)
 
     def render_figure(self, figure_spec: SceneFigure) -> canvas.Sheet | TablePage | str:
-        """Return the sheet of a figure or the page of a table; a message if it would be empty."""
+        """Return a figure as a sheet, or a table as a page; a message text if it would be empty."""
         draw_by_type: dict[
             type, Callable[[SceneResults, Any, AxisPosition], canvas.Sheet | TablePage | str]
         ] = {
@@ -369,10 +369,10 @@ class SceneResults:
 
 
 SCATTER_POINTS_MAX = 200_000
-"""Largest number of points in a scatter plot; a larger number is thinned."""
+"""Largest number of points in a scatter plot. If there are more, only some are shown."""
 
 NO_POINT_MESSAGE = "there is no point within the figure's limits"
-"""Message of a figure without points."""
+"""Message in place of a figure without points."""
 
 
 def _recording_of_figure(
@@ -404,7 +404,7 @@ def _picture_remarks(
 def _render_cloud_figure(
     results: SceneResults, figure_spec: CloudFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
-    """Return the sheet of a point cloud; a message if there are no points."""
+    """Return the sheet of a point cloud; a message text if there are no points."""
     recording = _recording_of_figure(results, figure_spec, axis_position)
     crop_by_name = {name: getattr(figure_spec, name) for name in (*WORLD_AXES, "time")}
     cloud = gather_point_cloud(
@@ -439,7 +439,7 @@ def _render_cloud_figure(
 def _render_scatter_figure(
     results: SceneResults, figure_spec: ScatterFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
-    """Return the sheet of a scatter plot; a message if there are no points."""
+    """Return the sheet of a scatter plot; a message text if there are no points."""
     recording = _recording_of_figure(results, figure_spec, axis_position)
     thinned_rows = recording.read_thinned_rows(
         [figure_spec.x, figure_spec.y, figure_spec.colour],
@@ -468,7 +468,7 @@ def _render_scatter_figure(
 def _render_shot_spectra_figure(
     results: SceneResults, figure_spec: ShotSpectraFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
-    """Return the sheet of a shot's spectra; a message if there is no such shot, or no target."""
+    """Return the sheet of a shot's spectra; a message text if the shot or its target is missing."""
     recording = _recording_of_figure(results, figure_spec, axis_position)
     shot_choice = figure_spec.shot
     shot_number = (
@@ -508,9 +508,9 @@ def _render_navigation_figure(
     figure_spec: NavigationFigure | NavigationTable,
     axis_position: AxisPosition,
 ) -> canvas.Sheet | TablePage | str:
-    """Return a chart of navigation errors as a sheet, or their table as a page.
+    """Return navigation errors as the sheet of a chart, or as the page of a table.
 
-    The result is a message if nothing was navigated.
+    If no scanner navigated, return a message text.
     """
     scanners = figure_spec.scanners or results.scanners
     named_recordings = [

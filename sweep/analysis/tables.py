@@ -64,7 +64,7 @@ class TablePage:
     notes: Sequence[str]
     """Lines of text below the tables."""
     records: Sequence[dict[str, TableCell]]
-    """Rows of the CSV file, by column name."""
+    """Rows of the CSV file, each as a mapping by column name."""
 
     def to_text(self) -> str:
         """Return the page as plain text."""
@@ -193,7 +193,7 @@ def mean_table_page(
 
 
 def _published_value(printed_rows: Any, row: int, column: int) -> float:
-    """Return the published value at a row and column of a table; nan if none is given.
+    """Return the published value at a row and column of a table; nan if the spec has none.
 
     `printed_rows` are the published values in the spec: for each row a list, or a number if the row
     has a single column.
@@ -213,9 +213,10 @@ def _pivot_table(
     records: list[dict[str, TableCell]],
     column_names: list[str],
 ) -> PageTable:
-    """Return a table of one value of each record, by the record's entries `row` and `column`.
+    """Return a table with the value under one key of each record.
 
-    `corner` is the heading of the row names, `record_key` the key of the value.
+    The records' entries `row` and `column` state the place in the table. `corner` is the heading of
+    the row names, `record_key` the key of the value.
     """
     rows: dict[str, list[TableCell]] = {}
     for record in records:
@@ -246,7 +247,7 @@ TABLE_ROWS_MAX = 100
 
 
 def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, TableCell]]:
-    """Return statistics of the leakage probabilities of each group of points, as part of a record.
+    """Return statistics of the leakage probabilities of each group of points, as parts of records.
 
     The statistics are mean and median of the probability of a false alarm due to leakage in the
     up-chirp, due to leakage in the down-chirp, and due to noise or leakage in both chirps.
@@ -322,7 +323,7 @@ class PointsOfSetting(NamedTuple):
     name: str
     """Name of the setting."""
     parameters: dict[str, Any]
-    """SI values of the parameters of the setting by dotted path."""
+    """SI values of the parameters that define the setting, by dotted path."""
     points: PointSelection
     """Points with this setting."""
 
@@ -424,7 +425,7 @@ _PUBLISHED_VALUE_COLUMNS = {
     "printed": ("printed", ".3e"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".4f%"),
 }  # fmt: skip
-"""Record key and number format of the columns for published values in the table of false alarms."""
+"""Record key and number format of the false-alarm table's columns with published values."""
 _LEAKAGE_COLUMNS = {
     "setting": ("setting", ""), "cut": ("cut", ""),
     "up: mean": ("p_leakage_up_mean", ".3e"), "up: median": ("p_leakage_up_median", ".3e"),
@@ -545,7 +546,7 @@ def _record_table(
 
 
 def _format_record_value(value: TableCell, number_format: str) -> TableCell:
-    """Format a value of a record; an empty format leaves it as it is, and nan becomes '-'."""
+    """Return a record's value in a number format; '-' for nan. An empty format changes nothing."""
     if not number_format:
         return value
     if number_format.endswith("%"):

@@ -48,25 +48,25 @@ from sweep.report.html_page import HtmlTable
 from sweep.units import percent_text
 
 CHART_PARTS_MAX = 6
-"""Largest number of parts of a study among which the reader of a chart can choose."""
+"""Largest number of parts of a study that the reader of a chart can choose from."""
 
 NOISE_BUDGET_POINTS_MAX = 24
-"""Number of points at which a chart of noise sources is computed.
+"""Largest number of points at which a chart of noise sources is computed.
 
-They are points along a coordinate of a grid, or shots along a flight.
+The points lie along a coordinate of a grid, or are shots along a flight.
 """
 
 ROC_POINT_SELECTION_PDS = (0.999, 0.9, 0.5, 0.1, 0.01)
-"""Values of pd. For each of them, the ROC curve of the point with the closest pd is drawn."""
+"""Values of pd; for each value a ROC curve is drawn, that of the point with the closest pd."""
 
 ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
-"""Probabilities of a false alarm in a bin at which ROC curves are computed."""
+"""Probabilities of a false alarm in one bin at which ROC curves are computed."""
 
 N_ROC_DRAWS = 400
 """Number of draws with which the ROC curve of a point with random effects is simulated."""
 
 PFA_WITH_LEAKAGE_VARIABLE = "pfa_both_chirps_with_leakage"
-"""Name of the variable for false alarms in both chirps, by noise or by leakage.
+"""Name of the variable with the probability of false alarms in both chirps, by noise or leakage.
 
 Leakage is signal in the window's sidelobes.
 """
@@ -80,10 +80,10 @@ _LABEL_BY_ALARM_VARIABLE = {
     "p_leakage_down": "leakage, down",
     PFA_WITH_LEAKAGE_VARIABLE: "either, both",
 }
-"""Short legend labels of the false-alarm variables."""
+"""Short legend label of each false-alarm variable."""
 
 _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
-"""Names of the effects that are drawn at random."""
+"""Names of the effects that are simulated by random draws."""
 
 
 @dataclass(frozen=True)
@@ -91,28 +91,32 @@ class GridProfile:
     """Points of one part of a study along the coordinate that charts show, or the only point."""
 
     label: str
-    """Name of the part."""
+    """Name of the part of the study; '' for the complete study."""
     points: PointSelection
     """Points of the part."""
     coordinate_name: str
-    """Name of the main coordinate; empty for a single point."""
+    """Name of the coordinate along the profile; empty for a single point."""
     coordinate: SortedCoordinate | None
-    """Main coordinate; None for a single point."""
+    """Coordinate along the profile; None for a single point."""
 
     @property
     def coordinate_axis(self) -> CoordinateAxis:
-        """Axis along which a chart shows the main coordinate."""
+        """Axis along which a chart shows the profile's coordinate."""
         return CoordinateAxis.from_points(self.points, self.coordinate_name)
 
     def evenly_spread_indices(self, n_max: int) -> np.ndarray:
-        """Return at most ``n_max`` evenly spread indices of points along the profile."""
+        """Return at most ``n_max`` evenly spread indices of points along the profile, rising."""
         if self.coordinate is None:
             return np.zeros(1, int)
         size = self.coordinate.values.size
         return np.unique(np.linspace(0, size - 1, min(n_max, size)).round().astype(int))
 
     def axis_indices(self, index: Any) -> dict[str, Any]:
-        """Return the index along each axis of the study, by name, for indices along the profile."""
+        """Return the index along each axis of the study, by the axis's name.
+
+        `index` is the index along the profile, or an array of such indices. Along all other axes
+        the index is that of the profile.
+        """
         if self.coordinate is None:
             return self.points.first_indices()
         return self.points.first_indices(self.coordinate) | {
@@ -120,7 +124,7 @@ class GridProfile:
         }
 
     def variable_values(self, variable: str, indices: np.ndarray) -> np.ndarray:
-        """Return the values of a variable at indices along the profile, (n,)."""
+        """Return the values (n,) of a variable at n indices along the profile."""
         return np.ravel(self.points.dataset[variable].isel(self.axis_indices(indices)).values)
 
 
@@ -136,7 +140,8 @@ class GridProfiles(NamedTuple):
 def grid_profiles(results: GridResults) -> GridProfiles:
     """Return the profiles of a grid along its main coordinate, and the number of omitted profiles.
 
-    The main coordinate is range if it varies, or else the numeric coordinate with most values.
+    The main coordinate is range if it varies, otherwise the numeric coordinate with the most
+    values.
     """
     axis_parameters = [
         axis_parameter for axis in results.spec.axes for axis_parameter in axis.parameters
@@ -164,7 +169,8 @@ def grid_profiles(results: GridResults) -> GridProfiles:
 def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: int) -> Chart:
     """Return the chart of ROC curves: pd over the probability of a false alarm.
 
-    Curves are those of a few points of each profile. `n_omitted` is the number of omitted profiles.
+    The curves are those of a few points of each profile. `n_omitted` is the number of omitted
+    profiles.
     """
     panels = [panel for profile in profiles for panel in _roc_panels(results, profile)]
     line_names = [line.name for line in panels[0].lines if line.name]
@@ -195,14 +201,14 @@ _PFA_FUNCTION_BY_ALARM_KIND = {
     "in a bin": lambda bin_probability, bins: bin_probability,
     "in both chirps": lambda p, bins: noise_false_alarms.segment_pfa(p, bins) ** 2,
 }
-"""Functions that give the probability of each kind of false alarm, by the name of the kind.
+"""Function that returns the probability of each kind of false alarm, by the kind's name.
 
-Their arguments are the false-alarm probability of one bin, and the number of independent bins.
+The arguments are the false-alarm probability of one bin, and the number of independent bins.
 """
 
 
 def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
-    """Return a panel for each kind of false alarm with the ROC curves of a profile's points.
+    """Return a panel for each kind of false alarm, with the ROC curves of a profile's points.
 
     Dots mark the threshold of the study.
     """
@@ -252,9 +258,9 @@ def _point_label(profile: GridProfile, index: int) -> str:
 
 
 def _roc_point_indices(profile: GridProfile) -> np.ndarray:
-    """Return the indices of those points of a profile for which ROC curves are drawn.
+    """Return the indices along a profile of the points whose ROC curves are drawn.
 
-    Their pd is closest to a value of `ROC_POINT_SELECTION_PDS`.
+    Their pd is closest to one of `ROC_POINT_SELECTION_PDS`.
     """
     indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_CELLS_MAX)
     pd = profile.variable_values("pd_shot", indices)
@@ -345,7 +351,7 @@ def noise_budget_panel(
 
 
 def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
-    """Return the chart with panels of the shares of noise sources."""
+    """Return the chart of the shares of noise sources from its panels and the caption's phrases."""
     share_texts = ", ".join(
         f"{line.name} {percent_text(line.y[0] / 100)} at first" for line in panels[0].lines
     )
@@ -415,25 +421,19 @@ def false_alarm_chart(
 
 
 REPORTED_PD_LEVEL = 0.9
-"""Probability of detection that a report requires within the maximum range.
-
-The report also counts the points that reach it.
-"""
+"""Level of pd that a report requires up to the maximum range, and at points that it counts."""
 
 UNBROKEN_RANGE_LABEL = "kept all the way"
-"""Label, in charts and tables, of one kind of maximum range.
-
-Up to this range pd is at least the chosen level without interruption.
-"""
+"""Label of the maximum range up to which pd is at the level without interruption."""
 
 LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_RANGE_LABEL: "unbroken", "reached at all": "farthest"}
-"""Variables of :func:`.detection_limits.limit` with the two kinds of maximum range, by label."""
+"""Variable of :func:`.detection_limits.limit` for each of two kinds of maximum range, by label."""
 
 INTERVAL_END_LABELS = {"low": "lower end", "high": "upper end"}
-"""Column names for the lower and the upper end of the confidence interval of the maximum range."""
+"""Column name for each end of the maximum range's confidence interval, by the variable's suffix."""
 
 MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {REPORTED_PD_LEVEL:g}"
-"""Heading of the chart or table of the maximum range."""
+"""Heading of the chart and of the table of the maximum range."""
 
 MAXIMUM_RANGE_CAPTION = [
     "Kept all the way: up to here the probability of detection of a shot is "
@@ -444,13 +444,13 @@ MAXIMUM_RANGE_CAPTION = [
     "not below it at the last, or "
     "not computed.",
 ]
-"""Caption of the chart or table of the maximum range."""
+"""Caption of the chart and of the table of the maximum range."""
 
 
 def maximum_range_chart_or_table(results: GridResults) -> Chart | HtmlTable | None:
-    """Return the maximum range of a grid as a chart over another coordinate.
+    """Return the maximum range of a grid as a chart over a coordinate other than range.
 
-    If nothing but range varies, the result is a table; if range does not vary, it is None.
+    If only range varies, the result is a table. If range does not vary, the result is None.
     """
     range_parameter = find_axis_parameter(results.spec, RANGE_PATH)
     if range_parameter is None:
@@ -487,14 +487,14 @@ def maximum_range_chart_or_table(results: GridResults) -> Chart | HtmlTable | No
 
 
 def is_chart_without_values(item: Chart | HtmlTable | None) -> bool:
-    """Return True for a chart of lines without any finite value."""
+    """Return True for a chart of lines without any finite value, False for everything else."""
     if not isinstance(item, Chart):
         return False
     return not any(np.isfinite(line.y).any() for panel in item.panels for line in panel.lines)
 
 
 def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
-    """Return sentences on the result of :func:`maximum_range_chart_or_table`."""
+    """Return sentences on the maximum range, given as :func:`maximum_range_chart_or_table`."""
     unbroken_label = next(iter(LIMIT_VARIABLE_BY_LABEL))
     if isinstance(item, Chart):
         range_label, unbroken_panels = (
@@ -536,7 +536,7 @@ def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
 
 
 def _compute_maximum_range(points: PointSelection, name: str, unit_factor: float) -> PointSelection:
-    """Compute the maximum range over all coordinates except range, as lazy variables of points.
+    """Return the maximum range over all coordinates except range, as lazy variables of points.
 
     `name` is the name of the range coordinate. The result is in display units, to which
     `unit_factor` converts the units of that coordinate.
@@ -558,7 +558,7 @@ def _compute_maximum_range(points: PointSelection, name: str, unit_factor: float
 def _choose_x_coordinate(results: GridResults, points: PointSelection) -> str:
     """Return the name of the coordinate over which the maximum range is drawn; '' if none varies.
 
-    It is the grazing angle if it varies, or else the numeric coordinate with most values.
+    It is the grazing angle if it varies, otherwise the numeric coordinate with the most values.
     """
     varying_names = points.varying_coordinates()
     angle_parameter = find_axis_parameter(results.spec, GRAZING_ANGLE_PATH)
@@ -575,7 +575,7 @@ def _choose_x_coordinate(results: GridResults, points: PointSelection) -> str:
 def _maximum_range_chart(
     max_ranges: Sequence[NamedPart], x: str, range_label: str, n_omitted: int
 ) -> Chart:
-    """Return the chart of the maximum range: panels for each part and kind of maximum range.
+    """Return the chart of the maximum range, with panels by part and kind of maximum range.
 
     Parameters
     ----------
@@ -644,7 +644,7 @@ def _maximum_range_chart(
 def _maximum_range_table(max_ranges: Sequence[NamedPart], range_label: str) -> HtmlTable:
     """Return the table of the maximum range, with a row for each part and kind of maximum range.
 
-    Further columns are the interval, if pd is drawn, and the reason why there is no value.
+    If pd is drawn, columns show the confidence interval. A column shows why a value is missing.
     """
     rows = []
     for part, range_points in max_ranges:

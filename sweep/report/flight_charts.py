@@ -66,7 +66,7 @@ from sweep.report.html_page import (
 from sweep.spec import SceneSpec
 
 CLOUD_COLOUR_QUANTITIES = ("range", "radial_velocity", "snr")
-"""Quantities by which the reader can colour the points of a cloud."""
+"""Names of the quantities by which the reader can colour the points of a cloud."""
 
 PAGE_POINTS_MAX = 36_000
 """Largest number of points of all clouds on a page."""
@@ -75,12 +75,12 @@ PAGE_CLOUDS_MAX = 8
 """Largest number of clouds on a page: scanners times positions along the study's axes."""
 
 TERRAIN_SIDE_NODES_MAX = 90
-"""Largest number of nodes of the drawn terrain along each of its sides."""
+"""Largest number of nodes of the drawn terrain along its longer side."""
 
 TERRAIN_LOWERING_FRACTION = 0.012
-"""Depth by which the drawn terrain is lowered, as a fraction of its horizontal size.
+"""Depth by which terrain is drawn too low, as a fraction of its horizontal size.
 
-Points on the terrain are then visible.
+Points on the terrain are thus visible.
 """
 
 CAMERA_FIELD_OF_VIEW = math.radians(45)
@@ -89,8 +89,8 @@ CAMERA_FIELD_OF_VIEW = math.radians(45)
 VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
 """Framing of the points of a cloud in plotly's view.
 
-The first is the fraction of the field of view that the points' box fills; the rest is for labels.
-The second is the least width-to-height ratio of the plot, which a phone has.
+The first number is the fraction of the field of view that the points' box fills; the rest is for
+labels. The second is the least width-to-height ratio of the plot, which is that on a phone.
 """
 
 CAMERA_POSITION_BY_VIEW = {
@@ -99,7 +99,7 @@ CAMERA_POSITION_BY_VIEW = {
     "from the south": {"x": 0.0, "y": -1.8, "z": 0.1},
     "from the east": {"x": 1.8, "y": 0.0, "z": 0.1},
 }
-"""Camera positions by view, in plotly's units of length."""
+"""Position of the camera for each view, in plotly's units of length."""
 
 CAMERA_TARGET = {"x": 0.0, "y": 0.0, "z": -0.1}
 """Point at which the camera looks, in plotly's units of length."""
@@ -110,7 +110,7 @@ class LabelledRecording:
     """Recording of a scanner at one position along the study's axes, with a label."""
 
     label: str
-    """Label on the page: scanner and coordinates of the position, if there are several."""
+    """Label on the page: scanner and axis values, each if there are several."""
     recording: Recording
     """Shots and points."""
     axis_position: AxisPosition
@@ -121,7 +121,7 @@ class ShownRecordings(NamedTuple):
     """Recordings that a report has room for."""
 
     recordings: list[LabelledRecording]
-    """Recordings, evenly spread over all of them."""
+    """Shown recordings, evenly spread over all of them."""
     n_omitted: int
     """Number of omitted recordings."""
 
@@ -152,9 +152,9 @@ def select_recordings(results: SceneResults) -> ShownRecordings:
 def cloud_plot(
     results: SceneResults, labelled_recordings: Sequence[LabelledRecording], n_omitted: int
 ) -> InteractivePlot | None:
-    """Return the plot of the point clouds of all recordings, or None if there are no points.
+    """Return the plot of the point clouds of all recordings; None if there are no points.
 
-    It shows one cloud at a time. `n_omitted` is the number of omitted recordings.
+    The plot shows one cloud at a time. `n_omitted` is the number of omitted recordings.
     """
     points_max = PAGE_POINTS_MAX // len(labelled_recordings)
     cloud_by_label = {
@@ -241,14 +241,14 @@ def cloud_plot(
 
 
 def _colour_option_label(quantity: str) -> str:
-    """Return the text of the option that colours points by a quantity."""
+    """Return the text of the option by which the reader colours points by a quantity."""
     return {"snr": "signal-to-noise ratio"}.get(quantity, labels.coordinate_label(quantity))
 
 
 def _xyz_columns(
     column_arrays: dict[str, np.ndarray], row_selection: np.ndarray | slice
 ) -> dict[str, np.ndarray]:
-    """Return the columns x, y and z of selected rows of a table, in single precision."""
+    """Return the columns x, y and z of selected rows of a table by name, in single precision."""
     return {axis: column_arrays[axis][row_selection].astype(np.float32) for axis in WORLD_AXES}
 
 
@@ -304,7 +304,7 @@ def _cloud_traces(
 def _terrain_traces(
     cloud_label: str, cloud: PointCloud, height_map: HeightMap
 ) -> Iterator[go.Surface]:
-    """Yield plotly's trace of the shaded terrain around the points; none outside the height map."""
+    """Yield plotly's trace of the shaded terrain around a cloud; nothing outside the height map."""
     map_limits = {}
     for axis in ("x", "y"):
         values = np.concatenate([cloud.points[axis], cloud.flight_path[axis]])
@@ -324,7 +324,7 @@ def _terrain_traces(
 
 
 def _camera_layout(view: str) -> dict[str, dict[str, float]]:
-    """Return plotly's camera for a view."""
+    """Return plotly's layout of the camera for a named view."""
     return {
         "eye": CAMERA_POSITION_BY_VIEW[view],
         "up": {"x": 0.0, "y": 0.0, "z": 1.0},
@@ -333,9 +333,9 @@ def _camera_layout(view: str) -> dict[str, dict[str, float]]:
 
 
 def _hidden_axis_layout(view: str) -> dict[str, bool]:
-    """Return the change of plotly's layout that hides the axis along the direction of a view.
+    """Return the change of plotly's layout that hides the axis along which a view looks.
 
-    The labels of that axis would overlap.
+    The labels of that axis would overlap. A view at an angle hides no axis: the change is empty.
     """
     low, _, high = sorted(WORLD_AXES, key=lambda axis: abs(CAMERA_POSITION_BY_VIEW[view][axis]))
     return {f"scene.{high}axis.visible": False} if CAMERA_POSITION_BY_VIEW[view][low] == 0 else {}
@@ -344,8 +344,8 @@ def _hidden_axis_layout(view: str) -> dict[str, bool]:
 def _largest_fitting_side(side_ratios: np.ndarray) -> float:
     """Return the largest size at which the box around the points fits into every view.
 
-    The size is the length of the longest side, in plotly's units. `side_ratios` (3,) are the sides
-    relative to the longest one.
+    The size is the length of the box's longest side, in plotly's units. `side_ratios` (3,) are the
+    sides relative to the longest one.
     """
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * side_ratios
     eye_positions = [
@@ -361,7 +361,7 @@ def _largest_fitting_side(side_ratios: np.ndarray) -> float:
 
 
 def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
-    """Return True if points (n, 3) are within the field of view of a camera at `eye` (3,)."""
+    """Return True if all points (n, 3) are in the field of view of a camera at `eye` (3,)."""
     view_direction = np.array([CAMERA_TARGET[axis] for axis in WORLD_AXES]) - eye
     view_direction /= np.linalg.norm(view_direction)
     right_direction = np.cross(view_direction, [0.0, 0.0, 1.0])
@@ -376,7 +376,7 @@ def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
 
 
 def _framing_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> dict[str, Any]:
-    """Return the changes of plotly's layout that make the true points of all clouds fill the view.
+    """Return the changes of plotly's layout by which the true points of all clouds fill the view.
 
     With ``with_path`` the flight paths are in the view too. All axes have the same scale.
     """
@@ -417,10 +417,10 @@ def _scene_layout() -> dict[str, Any]:
 
 
 SHOT_CHART_QUANTITIES = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
-"""Quantities of shots that a report draws over time."""
+"""Names of the quantities of shots that a report draws over time."""
 
 ERROR_CHART_QUANTITIES = ("range", "radial_velocity")
-"""Quantities of a point whose errors a report draws over time."""
+"""Names of the quantities of a point whose errors a report draws over time."""
 
 PAGE_SHOTS_MAX = 12_000
 """Largest number of shots of all charts over time on a page."""
@@ -430,7 +430,7 @@ N_NAVIGATION_ALTITUDE_BINS = 20
 
 
 def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
-    """Return the chart of the `SHOT_CHART_QUANTITIES` over time, or None if no shot is computed."""
+    """Return the chart of the `SHOT_CHART_QUANTITIES` over time; None if no shot is computed."""
     quantities = [
         name for name in SHOT_CHART_QUANTITIES if name in labelled_recordings[0].recording.dataset
     ]
@@ -455,7 +455,7 @@ def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> C
 
 
 def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
-    """Return the chart of errors of range and velocity over time, or None without true points."""
+    """Return the chart of errors of range and velocity over time; None if no point is true."""
 
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
         is_true = (column_arrays["flags"].astype(int) & TRUE_RETURN_FLAG) > 0
@@ -531,13 +531,13 @@ def _time_panels(
 
 
 def _time_chart(heading: str, alt: str, caption: list[str], panels: list[Panel]) -> Chart | None:
-    """Return a chart with panels of quantities over time, or None if there are no panels."""
+    """Return a chart with panels of quantities over time; None without panels."""
     facets = {"cloud": "Shown for", "quantity": "Quantity"}
     return Chart(heading, alt, caption, panels, facets) if panels else None
 
 
 def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[ChartLine]:
-    """Return a line of dots for each beam: a quantity over time.
+    """Return a line of dots for each beam: the named quantity over time.
 
     If there are more beams than colours, all beams share one line.
     """
@@ -585,7 +585,7 @@ def point_count_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlT
 def point_count_sentences(
     returns_frame: pandas.DataFrame, groups: Sequence[xr.Dataset], n_omitted: int = 0
 ) -> list[str]:
-    """Return sentences on the numbers of points and of velocities that navigation solved.
+    """Return sentences on the numbers of points and of velocities that navigation computed.
 
     Parameters
     ----------
@@ -622,9 +622,9 @@ def point_count_sentences(
 def flight_navigation_error_chart(
     spec: SceneSpec, labelled_recordings: Sequence[LabelledRecording]
 ) -> Chart | None:
-    """Return the chart of navigation errors over altitude, or None if no scanner navigates.
+    """Return the chart of the errors of navigated velocity and altitude over altitude.
 
-    The errors are those of velocity and altitude.
+    The result is None if no scanner navigates.
     """
     named_recordings = [
         (labelled_recording.label, labelled_recording.recording)
@@ -660,7 +660,7 @@ def flight_noise_budget_chart(
 ) -> Chart | None:
     """Return the chart of the shares of noise sources along a flight.
 
-    It is None if the eyepoints are missing, or no shot hits a target.
+    The result is None if the eyepoints are missing, or if no shot hits a target.
     """
     try:
         panels = [

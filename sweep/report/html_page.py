@@ -34,17 +34,17 @@ PAGE_LINE_COLOURS = {
 }  # fmt: skip
 """Colours of lines on a light and on a dark page, derived from those of Okabe and Ito (2008).
 
-The contrast of each colour to the page is 4.5 or more. The CIEDE2000 distance between two colours
-is 10 or more (12 among the first four), for normal and colour-blind vision.
+The contrast of each colour to the page is 4.5 or more. For normal and colour-blind vision, the
+CIEDE2000 distance between two colours is 10 or more, and 12 or more among the first four.
 """
 
 PLOTLY_DASH_STYLES = (
     "solid", "dash", "dashdot", "dot", "longdash", "longdashdot", "5px 2px 1px 2px", "2px 6px",
 )  # fmt: skip
-"""Dash styles of lines in plotly's notation. Lines then differ not only by colour."""
+"""Dash styles of lines in plotly's notation, by which lines differ in addition to colour."""
 
 _COLOUR_MAP_SPANS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
-"""Parts of the colour map, within 0..1, that contrast with a light page and with a dark page."""
+"""Part of the colour map, within 0..1, that contrasts with a light and with a dark page."""
 
 _GROUND_COLOURS = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
 """Colours of the darkest and the brightest terrain, on a light and on a dark page."""
@@ -61,19 +61,19 @@ class PlotControl:
     """Control of a plot by which the reader selects one of several options."""
 
     name: str
-    """Name of the control in the `meta` of traces (see :func:`trace_meta`)."""
+    """Name of the control, by which the `meta` of traces refers to it (:func:`trace_meta`)."""
     label: str
     """Label on the page."""
     options: Sequence[str]
-    """Options in order."""
+    """Texts of the options, in order."""
     relayout_by_option: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Changes of plotly's layout that are made when an option is chosen, by option."""
+    """Changes of plotly's layout that choosing an option makes, by option."""
 
     @property
     def initial_option_index(self) -> int:
         """Index of the option that a page shows first.
 
-        It is the middle one for parts of a study, and otherwise the first one.
+        It is the middle option if the control selects a part of the study, otherwise the first.
         """
         return (len(self.options) - 1) // 2 if self.name == "part" else 0
 
@@ -89,13 +89,13 @@ class InteractivePlot:
     caption: Sequence[str]
     """Sentences of the caption."""
     figure: go.Figure
-    """Plotly's figure. The `meta` of its traces say when they are shown (:func:`trace_meta`)."""
+    """Figure of plotly. The `meta` of its traces state when they are shown (:func:`trace_meta`)."""
     controls: Sequence[PlotControl] = ()
-    """Controls of the plot; those with one option are hidden."""
+    """Controls of the plot. Controls with a single option are hidden."""
     offers_cuts: bool = False
-    """True if the page offers cuts through the first heat map."""
+    """True if the reader can show cuts (rows and columns) of the plot's first heat map."""
     is_tall: bool = False
-    """True if the plot needs more height, for views in three dimensions."""
+    """True if the plot is given more height, as views in three dimensions need."""
 
 
 def trace_meta(palette_index: int | None = None, **choices: str) -> dict[str, Any]:
@@ -149,10 +149,11 @@ def make_interactive_plot(chart: Chart) -> InteractivePlot:
 
 
 def _make_control(panels: Sequence[Panel], name: str, label: str) -> PlotControl:
-    """Return the control by which the reader chooses a panel of a chart.
+    """Return the control by which the reader chooses among the panels of a chart.
 
-    It changes one facet, a property by which panels differ. If the panels differ in their vertical
-    axes, the options change that axis.
+    The control changes one facet, a property by which panels differ. `name` is the name of the
+    facet, `label` its label. If the panels differ in their vertical axes, the options change that
+    axis.
     """
     axes_by_option: dict[str, set[ChartAxis]] = {}
     for panel in panels:
@@ -219,12 +220,12 @@ def _panel_traces(panel: Panel, colour_scale: ColourScale | None) -> Iterator[An
 
 
 def _to_float32(values: np.ndarray) -> np.ndarray:
-    """Return an array in single precision, which is enough for a screen; other types unchanged."""
+    """Return an array in single precision, enough for a screen; arrays without floats unchanged."""
     return values.astype(np.float32) if values.dtype.kind == "f" else values
 
 
 def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]:
-    """Yield plotly's traces of a line: its band, if it has one, and then the line."""
+    """Yield plotly's traces of a line: one of its band, if it has a band, and one of the line."""
     meta = trace_meta(line.style_index, **panel.facet_choices)
     if panel.y_axis.scale == LOG_SCALE:
         line = _mask_nonpositive(line)
@@ -271,7 +272,7 @@ def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]
 
 
 def _mask_nonpositive(line: ChartLine) -> ChartLine:
-    """Return a line with nan in place of values that are not positive."""
+    """Return a line whose values that are not positive are nan, for a logarithmic axis."""
     masked_values: dict[str, Any] = {
         name: np.where(values > 0, values, np.nan)
         for name, values in (("y", line.y), ("low", line.low), ("high", line.high))
@@ -283,7 +284,7 @@ def _mask_nonpositive(line: ChartLine) -> ChartLine:
 def _band_trace(
     line: ChartLine, x: np.ndarray, low: np.ndarray, high: np.ndarray, meta: dict[str, Any]
 ) -> go.Scatter:
-    """Return plotly's trace of the band about a line, the area between its lower and upper ends."""
+    """Return plotly's trace of the band about a line: the area from its lower to its upper ends."""
     finite_indices = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     reversed_indices = finite_indices[::-1]
     return go.Scatter(
@@ -314,7 +315,7 @@ def colour_themes() -> dict[str, Any]:
 
 
 def plot_layout(**options_set: Any) -> dict[str, Any]:
-    """Return plotly's layout of a plot, with the legend above it; options replace the defaults."""
+    """Return plotly's layout of a plot with the legend above; `options_set` replace defaults."""
     default_options: dict[str, Any] = {
         "margin": {"l": 10, "r": 16, "t": 30, "b": 55},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -329,12 +330,12 @@ def plot_layout(**options_set: Any) -> dict[str, Any]:
 
 
 def wrap_with_html_breaks(text: str, width: int = 44) -> str:
-    """Break a text into lines of at most `width` characters, by HTML line breaks."""
+    """Return a text with HTML line breaks, in lines of at most `width` characters."""
     return "<br>".join(textwrap.wrap(text, width, break_on_hyphens=False))
 
 
 def _axis_layout(axis: ChartAxis, **options_set: Any) -> dict[str, Any]:
-    """Return plotly's layout of an axis: title, scale and limits; options replace the defaults."""
+    """Return plotly's layout of an axis: title, scale, limits; `options_set` replace defaults."""
     label = wrap_with_html_breaks(axis.label) if options_set else axis.label
     axis_options = {"title": {"text": label, "standoff": 12}, "zeroline": False, "type": axis.scale}
     if axis.limits is not None:
@@ -381,7 +382,7 @@ class TextItem:
     caption: Sequence[str]
     """Sentences of the caption."""
     text: str
-    """Text."""
+    """Text itself."""
     download_name: str = ""
     """Name of the file to download; empty for no download."""
 
@@ -395,7 +396,7 @@ class PageSection:
     """Section of a page."""
 
     anchor: str
-    """Name of the section in links."""
+    """Name of the section in links to it."""
     title: str
     """Title of the section."""
     paragraphs: Sequence[str] = ()
@@ -415,17 +416,17 @@ class ReportPage:
     key_facts: Sequence[tuple[str, str]]
     """Name and value of each key fact."""
     remarks: Sequence[str]
-    """Sentences that the reader must not miss."""
+    """Sentences above the sections that the reader must not miss."""
     sections: Sequence[PageSection]
     """Sections in order."""
 
 
 N_TABLE_ROWS_SHOWN = 10
-"""Number of rows of a table that a page shows at once."""
+"""Number of rows of a table that a page shows at a time."""
 
 
 UNWRAPPED_CELL_CHARACTERS_MAX = 40
-"""Largest number of characters of a cell whose text is not wrapped like a sentence."""
+"""Largest number of characters in the cells of a column for which its text is not wrapped."""
 
 
 def render_html(page: ReportPage) -> str:
@@ -454,7 +455,7 @@ def render_html(page: ReportPage) -> str:
 
 
 def _compress_base64(text: str) -> str:
-    """Compress a text by gzip, and return it in base64; that takes about a third of its size."""
+    """Return a text compressed by gzip, in base64. That has about a third of the text's size."""
     return b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
@@ -493,5 +494,5 @@ def _table_json(table: HtmlTable) -> str:
 
 
 def _data_url(text_item: TextItem) -> str:
-    """Return the text of an item as a data URL, which a browser can save as a file."""
+    """Return the text of an item as a data URL, from which a browser can save a file."""
     return f"data:text/plain;charset=utf-8;base64,{b64encode(text_item.text.encode()).decode()}"

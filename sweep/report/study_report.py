@@ -65,7 +65,7 @@ The limit of cells applies to all heat maps together, and keeps the page to a fe
 """
 
 TABLE_POINTS_MAX = 1000
-"""Largest number of points in a table of a report."""
+"""Largest number of points in the table of points of a report."""
 
 GRID_TABLE_VARIABLES = (
     "pd_shot", "pd_shot_half_width", "pd_up", "pd_doppler", "pd_down", "pfa_segment", "pfa_shot",
@@ -74,13 +74,13 @@ GRID_TABLE_VARIABLES = (
     "radial_velocity_error", "range_rmse", "range_bound", "radial_velocity_rmse",
     "radial_velocity_bound", "beamlets", "n_draws", "effects_error",
 )  # fmt: skip
-"""Variables in the table of points of a grid's report."""
+"""Names of the variables in the table of points of a grid's report."""
 
 CLOUD_TABLE_QUANTITIES = (
     "time", "beam", "x", "y", "z", "range", "radial_velocity", "snr", "pd", "true_range",
     "true_radial_velocity", "flags",
 )  # fmt: skip
-"""Quantities in the table of points of a flight's report."""
+"""Names of the quantities in the table of points of a flight's report."""
 
 
 def write_report(store: str | Location, file: str | Path) -> Path:
@@ -119,7 +119,10 @@ def write_report(store: str | Location, file: str | Path) -> Path:
 
 
 SectionItem = Chart | PageItem | None
-"""Item of a section of a report. Charts become interactive plots; None is left out."""
+"""Item that a section of a report is made from.
+
+Charts become interactive plots. None is left out.
+"""
 
 AnySpec = GridSpec | SceneSpec
 """Spec of a grid or of a scene."""
@@ -228,9 +231,9 @@ def _main_results_section(
 def _spec_and_effects_section(
     spec: AnySpec, effect_flags: Sequence[xr.DataArray], dataset: xr.Dataset
 ) -> PageSection:
-    """Return the section on the axes and fields of the spec, the simulated effects, and accuracy.
+    """Return the section on the spec's axes and fields, the simulated effects, and the accuracy.
 
-    `effect_flags` are the flags of simulated effects at all points, `dataset` has the error bounds.
+    `effect_flags` are the flags of simulated effects at all points. `dataset` has the error bounds.
     """
     items = [
         _axis_table(spec),
@@ -305,7 +308,7 @@ def _iter_spec_tables(results: GridResults) -> Iterator[HtmlTable]:
 
 
 def _iter_html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
-    """Yield the tables of a text page as tables of an HTML page.
+    """Yield the tables of a page of text tables as HTML tables.
 
     `stem` is the beginning of the names of their CSV files.
     """
@@ -384,7 +387,7 @@ def consistency_sentences(tree: xr.DataTree) -> list[str]:
 def _page_section(
     anchor: str, title: str, items: Sequence[SectionItem], paragraphs: Sequence[str] = ()
 ) -> PageSection:
-    """Return a section of a page; charts become interactive plots, and None is left out."""
+    """Return a section of a page. Charts become interactive plots, and None is left out."""
     page_items = [
         make_interactive_plot(item) if isinstance(item, Chart) else item for item in items
     ]
@@ -392,7 +395,7 @@ def _page_section(
 
 
 def _grid_point_table(results: GridResults) -> HtmlTable | None:
-    """Return a table of a grid's points, thinned to `TABLE_POINTS_MAX`; None for a single point."""
+    """Return a table of a grid's points, at most `TABLE_POINTS_MAX`; None for a single point."""
     dataset = results.dataset
     if not results.spec.axes:
         return None
@@ -423,7 +426,7 @@ def _grid_point_table(results: GridResults) -> HtmlTable | None:
 
 
 def _table_share_caption(n_rows: int, n_total: int) -> list[str]:
-    """Return the caption of a table that says how many of all points it contains."""
+    """Return the caption of a table of points that states how many of all points it contains."""
     if n_rows == n_total:
         return [f"All {n_total:,} points."]
     return [
@@ -433,7 +436,10 @@ def _table_share_caption(n_rows: int, n_total: int) -> list[str]:
 
 
 def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTable:
-    """Return a table of points of all recordings in the first draw, thinned for the page."""
+    """Return a table of points of all recordings in the first draw.
+
+    The points are thinned to at most `TABLE_POINTS_MAX`.
+    """
     frames, n_total = [], 0
     for labelled_recording in labelled_recordings:
         thinned_rows = labelled_recording.recording.read_thinned_rows(
@@ -475,7 +481,7 @@ def _field_table(spec: AnySpec) -> HtmlTable:
 def _iter_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted path and the value of every field of a nested mapping.
 
-    `prefix` is put in front of each path.
+    `prefix` is the beginning of every path.
     """
     for name, value in mapping.items():
         path = f"{prefix}{name}"
@@ -512,7 +518,7 @@ def _axis_table(spec: AnySpec) -> HtmlTable | None:
 
 
 def _format_values(values: np.ndarray, units: str) -> str:
-    """Return the values of an axis as text; of many values the first two and the last."""
+    """Return the values of an axis as text; of many values only the first two and the last."""
     value_texts = [labels.format_quantity(v, units) for v in values[:4]]
     if len(values) > 5:
         return ", ".join([*value_texts[:2], "...", labels.format_quantity(values[-1], units)])
@@ -520,9 +526,9 @@ def _format_values(values: np.ndarray, units: str) -> str:
 
 
 def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> HtmlTable:
-    """Return a table of the effects: the share of points at which each is simulated, and where.
+    """Return a table of the effects: the share of points that simulate each effect, and where.
 
-    `flag_arrays` hold the effects simulated at each point, `modes` the modes that the spec states.
+    `flag_arrays` hold the effects simulated at each point. `modes` are the spec's modes by effect.
     """
     lazy_counts = []
     for k in range(len(EFFECTS)):
@@ -574,9 +580,10 @@ def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str])
 
 
 def _describe_effect_extent(presence: xr.DataArray) -> str:
-    """Return a text that says where along a dimension points simulate an effect.
+    """Return a text that states where along a dimension points simulate an effect.
 
-    `presence` is a mask along the dimension. The text is empty if all points or none do.
+    `presence` is a mask along the dimension. The text is empty if all points or none are in the
+    mask.
     """
     is_present, extent_texts = presence.values, []
     for name, coordinate in presence.coords.items():
@@ -596,7 +603,7 @@ def _describe_effect_extent(presence: xr.DataArray) -> str:
 
 
 def accuracy_sentences(dataset: xr.Dataset, spec: AnySpec) -> list[str]:
-    """Return sentences on the accuracy that the spec asks for, and on the errors of the results."""
+    """Return sentences on the accuracy that the spec requires, and on the errors of the results."""
     tolerance = spec.accuracy.tolerance
     sentences = [
         f"Asked for: no probability of detection off by more than {tolerance:g}"

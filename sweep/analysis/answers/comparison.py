@@ -31,7 +31,7 @@ from sweep.model.outputs import (
 from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
 PD_ROUNDING_ERROR_MAX = 1e-12
-"""Largest difference of a probability of detection that rounding on another processor explains."""
+"""Largest difference of pd between two processors that counts as a rounding error."""
 
 _MATCHED_SIGNIFICANT_DIGITS = 12
 """Number of significant digits to which coordinates must agree if two points are to match."""
@@ -39,7 +39,7 @@ _MATCHED_SIGNIFICANT_DIGITS = 12
 GRID_FLIGHT_COMPARISON_MESSAGE = (
     "a grid of points and a flight have nothing to match: compare two of a kind"
 )
-"""Error message for a comparison of a grid with a flight."""
+"""Error message that refuses to compare a grid with a flight."""
 
 
 def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
@@ -82,7 +82,7 @@ def compute_differences(
     *,
     bounded_variables: Sequence[str],
 ) -> xr.Dataset:
-    """Return the differences of variables, other minus ours, at the points of both datasets.
+    """Return a dataset of the differences of variables, other minus ours, at common points.
 
     For ``bounded_variables`` the result also has the largest allowed difference, `NAME_allowed`,
     and whether the difference is no larger, `NAME_agrees`.
@@ -119,10 +119,10 @@ def study_title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
 
 
 def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """Return an upper bound of the error of a probability of detection.
+    """Return an upper bound of the error of the probability of detection in a variable.
 
     The bound is the sum of the half-width of random draws and the errors due to skipped effects and
-    few beamlets.
+    few beamlets. `name` is the name of the variable in the dataset.
     """
     error_bounds = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
              if n in dataset]  # fmt: skip
@@ -233,7 +233,7 @@ COMPARED_SHOT_STATISTICS = tuple(
     for name, output in SHOT_STATISTIC_VARIABLES.items()
     if output.dtype == "float64" and name not in ERROR_BOUND_VARIABLES
 )
-"""Names of the shot statistics that a comparison of flights includes."""
+"""Names of the variables of a shot that a comparison of flights includes."""
 
 
 def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
@@ -285,7 +285,7 @@ def scanner_names(tree: xr.DataTree) -> list[str]:
 
 
 def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
-    """Return the differences, other minus ours, at the common shots of a scanner."""
+    """Return a dataset of the differences, other minus ours, at the common shots of a scanner."""
     our_group, other_group = (
         provenance.check_single_study(
             tree.children[scanner].to_dataset(inherit=False).assign_attrs(tree.attrs),
@@ -427,7 +427,8 @@ DIFFERENCE_TABLE_VARIABLES = (
 def compute_tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
     """Compute the differences, other minus ours, that the table of a comparison shows.
 
-    The result is a dataset for each scanner; for grids it is a single one with the name ''.
+    The result has a dataset in memory for each scanner, by the scanner's name. For grids it is a
+    single dataset under the name ''.
     """
     result = ours.sweep.compare(other)
     is_grid = isinstance(result, xr.Dataset)
@@ -446,7 +447,7 @@ def compute_tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict
 
 
 def difference_table_rows(differences: xr.Dataset) -> list[list[str]]:
-    """Return the table rows of all variables that have values (`DIFFERENCE_TABLE_COLUMNS`)."""
+    """Return a row for each tabulated variable that has values, in `DIFFERENCE_TABLE_COLUMNS`."""
     return [
         _difference_table_row(differences, name)
         for name in DIFFERENCE_TABLE_VARIABLES
@@ -479,13 +480,13 @@ def _difference_table_row(differences: xr.Dataset, name: str) -> list[str]:
 
 
 def _describe_point(array: xr.DataArray, index: tuple[np.intp, ...]) -> str:
-    """Return a text with the coordinates of the point at an index of an array."""
+    """Return a text with the coordinates of the point at a given index of an array."""
     point = array.isel(dict(zip(array.dims, map(int, index), strict=True)))
     return ", ".join(_describe_coordinate(c) for c in point.coords.values())
 
 
 def _describe_coordinate(coordinate: xr.DataArray) -> str:
-    """Return a text with the value of a coordinate, and its name if it has no unit."""
+    """Return a text with the value of a scalar coordinate, after its name if it has no unit."""
     units = str(coordinate.attrs.get("units", ""))
     value = labels.format_quantity(coordinate.values.item(), units)
     return (
@@ -520,7 +521,10 @@ class AgreementVerdict(NamedTuple):
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> AgreementVerdict:
-    """Return whether the probabilities of detection of two stores agree."""
+    """Return whether the probabilities of detection of two stores agree.
+
+    ``compared_groups`` are datasets of differences, as of :func:`compute_tabulated_differences`.
+    """
     n_points, n_different, noun, count_note = 0, 0, "point", ""
     for differences in compared_groups:
         if "shot" in differences.dims:
@@ -545,7 +549,7 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> AgreementVerdict
 
 
 PLOTTED_DIFFERENCE_MIN = 1e-16
-"""Smallest difference of pd on the axis of the figure. Smaller ones are drawn at its left edge."""
+"""Smallest difference of pd on the axis of the figure; smaller differences are drawn there."""
 
 
 def save_difference_figure(
@@ -553,8 +557,9 @@ def save_difference_figure(
 ) -> Path:
     """Save a figure of the differences of pd; return the path of the picture.
 
-    It shows the share of points whose pd differs by more than an amount, over that amount. Each
-    scanner has its own colour.
+    The figure shows the share of points whose pd differs by more than d, over d. Each scanner has
+    its own colour. ``differences_by_scanner`` is the result of
+    :func:`compute_tabulated_differences`.
     """
     from sweep.analysis import canvas
 
@@ -599,9 +604,9 @@ def pd_difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Cha
 def _exceedance_lines(
     differences: xr.Dataset, name: str, scanner: str, style_index: int
 ) -> list[ChartLine]:
-    """Return two lines of shares of points [%] over a difference d of pd; none without values.
+    """Return two lines of shares of points [%] over a difference d of pd; [] without values.
 
-    The first is the share of points whose difference exceeds d, the second the share of points
+    The first is the share of points whose difference exceeds d. The second is the share of points
     whose allowed difference exceeds d.
     """
     is_finite = np.isfinite(differences[name].values)

@@ -18,7 +18,7 @@ from sweep.spec.sections import parameter_rules
 from sweep.units import QuantityError, read_number, read_quantity
 
 RELATIVE_VALUE_TOLERANCE = 1e-9
-"""Largest relative difference at which a wanted value counts as a coordinate's value."""
+"""Largest relative difference between a wanted value and a coordinate's value that match."""
 
 STUDY_ID_NAME = "study_id"
 """Name of the coordinate and of the attribute that hold the id of the study."""
@@ -26,7 +26,7 @@ STUDY_ID_NAME = "study_id"
 JOIN_REMEDY = (
     "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
 )
-"""Advice in error messages on how to join the stores of several studies."""
+"""Advice in error messages: how to join the stores of several studies into one dataset."""
 
 JOINED_SPECS_ATTRIBUTE = "specs"
 """Name of the attribute in which a join of studies keeps their specs and variable names.
@@ -111,7 +111,7 @@ def _check_study_marker(dataset: xr.Dataset | xr.DataTree) -> None:
 
 @lru_cache(maxsize=8)
 def _parse_stored_spec(spec_text: str) -> GridSpec | SceneSpec:
-    """Parse the text of a stored spec; the last eight results are cached."""
+    """Parse the JSON text of a stored spec; the last eight results are cached."""
     return from_stored(spec_text)
 
 
@@ -165,7 +165,7 @@ def parse_pd_level(pd: object) -> float:
 
 
 def find_coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """Return a dataset's coordinate by its name, or by the dotted path of its parameter.
+    """Return a dataset's coordinate, given its name or the dotted path of its parameter.
 
     Raise ValueError if there is none.
     """
@@ -190,7 +190,7 @@ def convert_to_coordinate_units(coord: xr.DataArray, raw_value: object) -> float
 
 
 def coordinate_in_si(coord: xr.DataArray) -> xr.DataArray:
-    """Return a coordinate with its values in SI units; words become strings."""
+    """Return a coordinate with its values in SI units, or as strings for a text parameter."""
     rule = parameter_rules().get(coord.attrs.get("path", ""))
     units = coord.attrs.get("units", "")
     if coord.dtype.kind not in "fiu":
@@ -208,7 +208,11 @@ def coordinate_in_si(coord: xr.DataArray) -> xr.DataArray:
 def parameter_in_si(
     dataset: xr.Dataset, path: str, spec: GridSpec | SceneSpec | None = None
 ) -> xr.DataArray:
-    """Return the SI values of a parameter along its axis, or one value if it is on no axis."""
+    """Return the SI values of a parameter as an array along its axis.
+
+    A parameter on no axis gives an array without dimensions. ``path`` is the parameter's dotted
+    path.
+    """
     coord = parameter_coordinate(dataset, path)
     if coord is not None:
         return coordinate_in_si(coord).drop_vars(list(coord.coords), errors="ignore").assign_coords(
@@ -224,7 +228,7 @@ def parameter_in_si(
 
 
 def parameter_coordinate(dataset: xr.Dataset, path: str) -> xr.DataArray | None:
-    """Return the coordinate of the parameter with a dotted path; None if there is none."""
+    """Return the coordinate of the parameter with a given dotted path; None if there is none."""
     matches = (coord for coord in dataset.coords.values() if coord.attrs.get("path") == path)
     return next(matches, None)
 

@@ -22,12 +22,12 @@ from sweep.analysis.answers.probability import (
 )
 
 LIMIT_FOUND, LEVEL_NEVER_REACHED, LEVEL_NEVER_LOST, LIMIT_NOT_COMPUTED = range(4)
-"""Flags of the outcome of a search for the coordinate at which pd falls below a level."""
+"""Flags for the outcome of a search for the limit, the coordinate where pd falls below a level."""
 LIMIT_REASON_MEANINGS = "found never_reached never_lost not_computed"
 """Names of the outcomes of a limit search, for the CF attribute `flag_meanings`."""
 
 _PD_PLUS_MISS_ERROR_MAX = 1e-6
-"""Largest deviation of pd plus the probability of a miss from 1, due to rounding and averaging."""
+"""Largest accepted deviation of pd plus the probability of a miss from 1, by rounding."""
 
 _NORMAL_DEVIATE_MAX = 38.0
 """Largest magnitude of a normal deviate z; it stands for a pd of 0 or 1.
@@ -257,15 +257,15 @@ def _limits_along_dimension(
 
 
 def _smallest_step_where(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
-    """Return the smallest step along a dimension where a mask is true; infinity if it never is.
+    """Return the smallest of the steps at which a mask is true; infinity if it is true nowhere.
 
-    A step is an index along the dimension, which may lie between two integers.
+    Steps are indices along the dimension `dim`, and may lie between two integers.
     """
     return xr.where(is_chosen, steps, np.inf).min(dim, skipna=False)
 
 
 def _coordinate_at_step(step: xr.DataArray, coord: xr.DataArray) -> xr.DataArray:
-    """Interpolate the value of a coordinate at a step, a fractional index; nan stays nan."""
+    """Interpolate the values of a coordinate at fractional indices; a nan index gives nan."""
     all_steps = np.arange(coord.size, dtype=float)
     return xr.apply_ufunc(
         lambda p: np.interp(p, all_steps, coord.values),
@@ -282,7 +282,7 @@ def _set_limit_attributes(
     level: float,
     confidence_attributes: dict[str, float],
 ) -> xr.Dataset:
-    """Set the units and long names of the variables of :func:`limit`."""
+    """Set units and long names of the variables of :func:`limit`, in place; return the dataset."""
     long_names = {
         "unbroken": (
             f"farthest {coord.name} up to which pd of the {segment} stays {level:g} or more"
@@ -346,7 +346,7 @@ def contour(
     Raises
     ------
     ValueError
-        A coordinate does not exist, or there are further dimensions.
+        A coordinate does not exist, or the dataset has more than two dimensions.
     """
     level = parse_pd_level(pd)
     x_coord, y_coord = find_coordinate(dataset, x), find_coordinate(dataset, y)

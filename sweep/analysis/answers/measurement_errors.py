@@ -77,11 +77,11 @@ class _LineEffects(NamedTuple):
     """
 
     range_walk: np.ndarray
-    """True if beats drift within the record."""
+    """Mask (n,) of points whose beats drift within the record."""
     segment_motion: np.ndarray
-    """True if the target moves between segments."""
+    """Mask (n,) of points whose target moves between segments."""
     overlap: np.ndarray
-    """True if echoes lack the samples that precede their arrival."""
+    """Mask (n,) of points whose echoes lack the samples that precede their arrival."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -128,7 +128,7 @@ def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
-    """Return the dataset of :func:`range_error` or :func:`velocity_error`.
+    """Return the dataset of :func:`range_error` or :func:`velocity_error`, as `quantity` says.
 
     `quantity` is ``range`` or ``radial_velocity``.
     """
@@ -242,7 +242,7 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
 
 
 def _is_simulated(effect: str, effect_flags: _Flags) -> _Flags:
-    """Return whether an effect is simulated at points with the given flags of effects."""
+    """Return a mask of the points at which an effect is simulated, from their flags of effects."""
     return (effect_flags & (1 << EFFECT_NAMES.index(effect))) > 0
 
 
@@ -435,10 +435,10 @@ def window_tail_sums_and_widths(taper: Window) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def main_lobe_spline(window_name: str, length: int) -> CubicSpline:
-    """Return a spline of a window's main lobe, relative to its peak, accurate to 1e-8.
+    """Return a spline of the main lobe of a window's spectrum, accurate to 1e-8.
 
-    The main lobe is the magnitude of the window's Fourier transform near its peak. The argument is
-    the distance from the peak, 0 to 1/2, in bins of sample rate over window length.
+    The spline gives the magnitude of the window's Fourier transform, relative to its peak. The
+    argument is the distance from the peak, 0 to 1/2, in bins of sample rate over window length.
     """
     taper, bin_offsets = get_window(window_name, length), np.linspace(0.0, 0.5, 33)
     return CubicSpline(bin_offsets, np.abs(direct_transform(taper, bin_offsets)) / taper.sum)

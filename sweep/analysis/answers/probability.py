@@ -32,7 +32,7 @@ from sweep.model.threshold import THRESHOLD_PATHS, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec
 
 SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
-"""Names of the segments (chirps) and of the shot, each of which has a probability of detection."""
+"""Names of the segments (chirps), and of the shot. Each has a probability of detection."""
 
 
 def segment_variable_name(quantity: str, segment: str) -> str:
@@ -48,7 +48,7 @@ def segment_variable_name(quantity: str, segment: str) -> str:
 
 
 def pd_half_width(dataset: xr.Dataset, segment: str) -> xr.DataArray | None:
-    """Return the half-width of pd's confidence interval; None if pd was computed without draws."""
+    """Return the half-width of pd's confidence interval as an array; None if pd has no draws."""
     return dataset.get(f"{segment_variable_name('pd', segment)}_half_width")
 
 
@@ -89,7 +89,7 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
 def confidence_level_attributes(
     dataset: xr.Dataset, interval_half_width: xr.DataArray | None
 ) -> dict[str, float]:
-    """Return the confidence level of pd's intervals as a dict of attributes.
+    """Return the confidence level of pd's intervals as the attribute `confidence` in a dict.
 
     The dict is empty if the level differs between points. Without draws the level is 1.
     """
@@ -197,10 +197,10 @@ def false_alarms_per_flight_kilometre(
 
 
 def false_alarms_per_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
-    """Return the probability that both chirps of a shot have a false alarm.
+    """Return the probability that both chirps of a shot have a false alarm, as an array.
 
-    With ``leakage`` the alarms of leaked signal count too. For a study that draws whole spectra,
-    the result is the mean number of false alarms of a shot.
+    With ``leakage``, false alarms due to leaked signal count in addition to those due to noise. For
+    a study that draws whole spectra, the result is the mean number of false alarms of a shot.
     """
     if "pfa_both_chirps" not in dataset:
         # Drawn spectra: false alarms were counted in all segments, including those of leakage.
@@ -310,19 +310,19 @@ def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
 ROC_POINTS_MAX = 20_000
 """Largest number of points of a study for which :func:`roc` computes curves."""
 ROC_SIMULATED_POINTS_MAX = 200
-"""Largest number of points that :func:`roc` simulates again, for want of a closed form of pd."""
+"""Largest number of points without an exact closed form of pd that :func:`roc` simulates again."""
 
 PD_MATCH_TOLERANCE = 1e-9
-"""Largest difference of the closed form of pd from the stored pd at which it counts as exact."""
+"""Largest difference from the stored pd up to which the closed form of pd counts as exact."""
 
 CURVE_TNR_VARIABLE = "curve_tnr"
 """Name of the variable with the threshold-to-noise ratio along a ROC curve.
 
-It is not `tnr`, which may be a coordinate of the study.
+The name is not `tnr`, because a coordinate of the study may have that name.
 """
 
 ROC_RANDOM_KEY_DOMAIN = "sweep.analysis.roc"
-"""Text from which the random numbers of ROC curves follow, so that they differ from all others."""
+"""Text in the key of the random numbers of ROC curves, which no other simulation has."""
 
 _RANDOM_EFFECTS_MASK = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
 """Bit mask of the random effects in the variable `effects`."""
@@ -333,7 +333,7 @@ _SEGMENTS_THAT_MUST_DETECT = {
     "down": ("down",),
     "shot": ("up", "down"),
 }
-"""Segments (chirps) that must all exceed the threshold for a detection, by segment or shot."""
+"""Segments (chirps) that must all exceed the threshold for a detection in a segment or shot."""
 
 
 def roc(
@@ -359,7 +359,7 @@ def roc(
     xarray.Dataset
         Computed dataset with:
 
-        - `pd`, with a further dimension `pfa_bin`;
+        - `pd`, over the dimensions of the points and `pfa_bin`;
         - `curve_tnr`: threshold-to-noise ratio for each pfa_bin at each point;
         - `simulated`: true if the point was simulated again;
         - `half_width`: half-width of pd's interval with the study's confidence; 0 if pd is exact.
@@ -424,7 +424,7 @@ def roc(
 
 
 def _looks_of_study(spec: GridSpec) -> Looks:
-    """Return the settings of a study's looks; raise ValueError if they vary between points."""
+    """Return the settings of a study's looks; raise ValueError if they differ between points."""
     axis_paths = (axis_parameter.path for axis in spec.axes for axis_parameter in axis.parameters)
     if varying_paths := sorted(
         {LOOKS_NUMBER_PATH, LOOKS_COMBINE_PATH, LOOKS_VOTES_PATH} & set(axis_paths)
@@ -519,7 +519,7 @@ def _threshold_crossing_probability(
 def _replace_curves_by_simulation(
     dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int
 ) -> None:
-    """Simulate the curves of points without a closed form, and write them into `result`."""
+    """Simulate the points without a closed form; write pd and half-width into `result`."""
     spec = grid_spec_of_dataset(dataset)
     point_indices = np.argwhere(np.asarray(result["simulated"].values))
     if len(point_indices) > ROC_SIMULATED_POINTS_MAX:
@@ -545,7 +545,7 @@ def _replace_curves_by_simulation(
 def _simulate_roc_curve(
     spec: GridSpec, point: xr.Dataset, tnr: np.ndarray, segment: str, draws: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate a point at several threshold-to-noise ratios; return pd and its half-widths."""
+    """Simulate one point at n threshold-to-noise ratios; return pd and half-widths, (n,) each."""
     parameters = _point_parameters(point.coords, spec)
     is_finite = np.isfinite(tnr)
     if not is_finite.all():
@@ -574,7 +574,7 @@ def _simulate_roc_curve(
 
 
 def _set_roc_attributes(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Dataset:
-    """Set the units and long names of the variables of a ROC dataset."""
+    """Return a ROC dataset with units and long names set, and with `dataset`'s attributes."""
     long_names = {
         "pd": f"probability of detection, {segment}",
         CURVE_TNR_VARIABLE: "threshold to noise ratio",

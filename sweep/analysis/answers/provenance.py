@@ -34,7 +34,7 @@ from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
 RELATIVE_VALUE_TOLERANCE = 1e-9
-"""Largest relative difference at which a coordinate's value counts as a value of a study's axis."""
+"""Largest relative difference up to which a coordinate's value equals one of the study's axis."""
 
 
 def compute_answer_per_study(
@@ -134,7 +134,8 @@ def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> N
 def _joined_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
     """Return the dimension along which a dataset joins several studies, or '' for a single study.
 
-    Raise ValueError if the dataset proves neither. With ``refuse_join`` a join is an error too.
+    Raise ValueError if the dataset proves neither of both. With ``refuse_join`` a join is an error
+    too.
     """
     if STUDY_ID_NAME not in dataset.coords:
         raise ValueError(
@@ -170,9 +171,9 @@ def _axis_parameters(spec: GridSpec | SceneSpec) -> list[AxisParameter]:
 
 
 def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
-    """Return a dataset whose axis coordinates have the attributes `path` and `units` again.
+    """Return a dataset in which the attributes `path` and `units` of axis coordinates are restored.
 
-    Only coordinates that lack both are changed.
+    Only coordinates that lack both attributes are changed.
     """
     restored_coords = {}
     for axis_parameter in _axis_parameters(spec):
@@ -185,7 +186,7 @@ def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSp
 
 
 def _study_value_mask(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
-    """Return a mask of the values of a coordinate that occur in the study's spec."""
+    """Return a mask of the values of a coordinate that the study's spec contains."""
     path = coord.attrs["path"]
     axis_values = [
         np.asarray(axis_parameter.values)
@@ -237,7 +238,7 @@ def _check_coordinate_values(dataset: xr.Dataset, spec: GridSpec | SceneSpec) ->
 
 
 def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Raise ValueError if a dimension of a dataset is no axis of its study and has no parameter."""
+    """Raise ValueError if a dimension is neither an axis of the study nor has a parameter."""
     known_dims = {axis.name for axis in spec.axes} | {"shot", "draw", "return_number", "statistic"}
     known_dims |= {
         str(dim) for array in _parameter_coordinates(dataset, spec) for dim in array.dims
@@ -256,9 +257,9 @@ def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
 
 
 def _restrict_to_design(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
-    """Return the data of one of several joined studies, without those of the others.
+    """Return the data of one of several joined studies.
 
-    Points and variables that only the others have are dropped.
+    Points and variables that only other studies of the join have are dropped.
     """
     design_record = json.loads(dataset.attrs[JOINED_SPECS_ATTRIBUTE])[
         str(dataset[STUDY_ID_NAME].item())
@@ -311,11 +312,11 @@ def join_designs(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
 
 
 _SUMMED_ATTRIBUTES = ("points", "points_committed", "blocks", "blocks_committed")
-"""Attributes of datasets that are summed when studies are joined."""
+"""Names of the attributes of datasets that are summed when studies are joined."""
 
 
 def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
-    """Return the attributes of a join: those that all datasets share, summed counts, all specs."""
+    """Return the attributes of a join: equal ones of all datasets, sums of counts, all specs."""
     first_attributes, *other_attributes = (dataset.attrs for dataset in datasets.values())
     common_attributes = {
         key: value
@@ -351,7 +352,7 @@ def _check_join_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
 
 
 def _reference_coordinate_by_path(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.DataArray]:
-    """Return a coordinate for each parameter path, taken from the first dataset that has one."""
+    """Return a coordinate for each parameter path, from the first dataset that has one for it."""
     coord_by_path: dict[str, xr.DataArray] = {}
     for dataset in datasets.values():
         for coord in dataset.coords.values():
@@ -363,7 +364,7 @@ def _reference_coordinate_by_path(datasets: Mapping[str, xr.Dataset]) -> dict[st
 def _align_coordinates(
     dataset: xr.Dataset, spec: GridSpec | SceneSpec, reference_coords: Mapping[str, xr.DataArray]
 ) -> xr.Dataset:
-    """Return a dataset with the coordinates of ``reference_coords``, with their names and units.
+    """Return a dataset with the same coordinates as ``reference_coords``, in name and units.
 
     A parameter that the study does not vary becomes a dimension with one value.
     """
@@ -405,7 +406,7 @@ def _align_coordinates(
 
 
 def _convert_to_display_units(si_values: np.ndarray, path: str, units: str) -> np.ndarray:
-    """Convert SI values of the parameter at a path to display units; return words unchanged."""
+    """Convert SI values of the parameter at a path to given units; return words unchanged."""
     rule = parameter_rules()[path]
     if not isinstance(rule, NumericRule) or not units:
         return si_values
@@ -413,7 +414,7 @@ def _convert_to_display_units(si_values: np.ndarray, path: str, units: str) -> n
 
 
 def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence[str]) -> Any:
-    """Concatenate the datasets or arrays of designs along a new dimension.
+    """Concatenate the datasets or arrays of designs along a new dimension; return the result.
 
     Points that a design lacks get the fill values of `_FILL_VALUE_BY_DTYPE_KIND`, or nan.
     """
@@ -444,7 +445,7 @@ def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence
 
 
 _FILL_VALUE_BY_DTYPE_KIND = {"i": -1, "u": 0, "b": False}
-"""Values for points that one of the joined studies lacks, by NumPy's kind of data type.
+"""Values at points that one of the joined studies lacks, by NumPy's kind of data type.
 
-For other kinds the value is nan.
+For kinds that are not listed the value is nan.
 """

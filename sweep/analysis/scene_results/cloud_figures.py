@@ -61,7 +61,7 @@ class HeightMap:
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree) -> HeightMap | None:
-        """Return the height map of a flight's tree; None if it has no known height."""
+        """Return the height map of a flight's tree; None if no height is known."""
         if TERRAIN_MAP_GROUP not in tree.children:
             return None
         x, y, height = (
@@ -72,7 +72,7 @@ class HeightMap:
     def crop(
         self, x: tuple[float, float], y: tuple[float, float], nodes_max: int = 120
     ) -> HeightMap | None:
-        """Return the part of the map between limits of x and y [m], interpolated on a new grid.
+        """Return the part of the map within limits of x and y [m], interpolated on a new grid.
 
         The longer side of the new grid has ``nodes_max`` nodes. The result is None if the limits
         lie outside the map.
@@ -97,9 +97,9 @@ class HeightMap:
         return HeightMap(self.x, self.y, np.where(is_steep, np.nan, self.height))
 
     def hillshade(self) -> np.ndarray:
-        """Return the brightness of the ground in the light of a low sun (rows, columns), 0..1.
+        """Return the brightness (rows, columns), 0..1, of the ground in the light of a low sun.
 
-        Slopes are exaggerated.
+        Slopes are exaggerated. Ground of unknown height has the brightness 1.
         """
         slope_y, slope_x = np.gradient(self.height, self.y, self.x)
         slope = np.hypot(slope_y, slope_x)
@@ -135,7 +135,7 @@ class ObliqueView:
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {"depthshade": False}
-    """Options of matplotlib's `scatter` for this kind of view."""
+    """Options of matplotlib's `scatter` for points of an oblique view."""
 
     def __init__(
         self, cloud: PointCloud, azimuth: float, elevation: float, *, title: str, caption: str
@@ -188,7 +188,7 @@ class ObliqueView:
         return sides / sides.max()
 
     def _set_box_axes(self, axes: Any, azimuth: float, elevation: float) -> None:
-        """Set the projection, the limits and the background of three-dimensional axes."""
+        """Set the projection, limits and background of three-dimensional axes, in place."""
         axes.patch.set_visible(False)
         axes.set_proj_type("ortho")
         axes.view_init(elev=elevation, azim=azimuth)
@@ -200,9 +200,9 @@ class ObliqueView:
             axis.pane.set_edgecolor("0.8")
 
     def _projected_box(self, azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower left and upper right corner of the projected box.
+        """Return the lower left and the upper right corner (2,) of the cloud's box, as projected.
 
-        The corners are fractions of matplotlib's square axes, (2,) each.
+        Corners are fractions of matplotlib's square axes.
         """
         trial_sheet = SheetWithLegends(
             _TRIAL_SHEET_SIDE_INCHES, _TRIAL_SHEET_SIDE_INCHES, title="", caption=""
@@ -217,7 +217,7 @@ class ObliqueView:
 
     @staticmethod
     def _project(axes: Any, positions: np.ndarray) -> np.ndarray:
-        """Project world positions (3, n) to fractions of the square axes, (2, n)."""
+        """Return world positions (3, n) as positions (2, n) in fractions of the square axes."""
         x, y, _ = proj3d.proj_transform(*positions, axes.get_proj())
         view_limits = axes.viewLim
         return np.array(
@@ -225,7 +225,7 @@ class ObliqueView:
         )
 
     def to_axes_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """Convert world positions (3, n) to the coordinates that axes plot: x, y and z, (n,)."""
+        """Return world positions (3, n) as the coordinates (n,) that the axes plot: x, y and z."""
         return list(positions)
 
     def to_picture_inches(self, positions: np.ndarray) -> np.ndarray:
@@ -233,7 +233,7 @@ class ObliqueView:
         return self.inches_per_unit * self._project(self.axes, positions)
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Draw a shaded relief within the box, without steep ground.
+        """Draw a shaded relief of the ground within the cloud's box, without steep ground.
 
         Return False, because the legend needs no entry for the relief.
         """
@@ -260,10 +260,10 @@ class ObliqueView:
 
 
 AXIS_MARGINS_INCHES = 0.8, 0.55
-"""Margins of a picture for ticks and labels, at the left and at the bottom [inches]."""
+"""Margins of a picture for ticks and labels: left and bottom [inches]."""
 
 AXIS_VIEW_WIDTH_MAX_INCHES, AXIS_VIEW_HEIGHT_MAX_INCHES, AXIS_VIEW_SIDE_MIN_INCHES = 7.4, 7.0, 1.5
-"""Largest width and height of a picture along a world axis, and its smallest side [inches]."""
+"""Largest width, largest height and smallest side of a picture along a world axis [inches]."""
 
 
 class AxisAlignedView:
@@ -274,7 +274,7 @@ class AxisAlignedView:
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {}
-    """Options of matplotlib's `scatter` for this kind of view."""
+    """Options of matplotlib's `scatter` for points of a view along an axis."""
 
     def __init__(
         self,
@@ -323,7 +323,7 @@ class AxisAlignedView:
         )
 
     def to_axes_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """Convert world positions (3, n) to the two coordinates that the axes plot, (n,) each."""
+        """Return world positions (3, n) as the two coordinates (n,) that the axes plot."""
         return [positions[WORLD_AXES.index(axis)] for axis in self.axis_names[:2]]
 
     def to_picture_inches(self, positions: np.ndarray) -> np.ndarray:
@@ -331,7 +331,7 @@ class AxisAlignedView:
         return self.inches_per_unit * np.array(self.to_axes_coordinates(positions))
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Draw the ground: from above as relief with contours, from the side as an area.
+        """Draw the ground: as relief with contours if seen from above, as an area if from the side.
 
         Return True if the legend needs an entry for the ground.
         """
@@ -394,7 +394,7 @@ class AxisAlignedView:
 
 
 def _draw_cloud_marks(picture: AxisAlignedView | ObliqueView, point_colours: np.ndarray) -> None:
-    """Draw the true points, the false points, the shots without a point, and the flight path."""
+    """Draw true points, false points, shots without a point, and the flight path on a picture."""
     axes: Any = picture.axes
     cloud, to_columns = picture.cloud, picture.to_axes_coordinates
     positions = np.array([cloud.points[axis] for axis in WORLD_AXES])
@@ -436,7 +436,7 @@ def _draw_cloud_marks(picture: AxisAlignedView | ObliqueView, point_colours: np.
 
 
 def _positions_in_box(cloud: PointCloud, column_arrays: ColumnArrays) -> np.ndarray:
-    """Return the x, y and z columns of a table as positions (3, n), with nan outside the box."""
+    """Return positions (3, n) from a table's columns x, y, z, with nan outside the cloud's box."""
     positions = np.array([column_arrays[axis] for axis in WORLD_AXES])
     return np.where(within_limits_mask(column_arrays, cloud.box), positions, np.nan)
 
@@ -453,7 +453,10 @@ AXIS_ALIGNED_VIEWS = {
     "side": (("x", "z", "y"), -1),
     "front": (("y", "z", "x"), 1),
 }
-"""Axes and sign of the views along a world axis, by name, for :class:`AxisAlignedView`."""
+"""Views along a world axis, by name.
+
+Each has the arguments `axis_names` and `nearest_sign` of :class:`AxisAlignedView`.
+"""
 
 OBLIQUE_ANGLES_DEG = -60.0, 28.0
 """Azimuth and elevation of the default oblique view [deg]."""
@@ -486,7 +489,7 @@ def draw_cloud_sheet(
     title
         Title of the sheet.
     remarks
-        Further sentences of the caption.
+        Sentences that follow in the caption.
     """
     values = to_displayed_values(quantity, cloud.points[quantity])
     colouring = point_styles.choose_colours(
@@ -538,7 +541,7 @@ def draw_scatter_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """Return the sheet of a scatter plot of one quantity over another, coloured by a third."""
+    """Return the sheet of a scatter plot of quantity y over quantity x, coloured by a third."""
     column_arrays = thinned_rows.to_columns()
     is_true = (
         (column_arrays["flags"] & TRUE_RETURN_FLAG) > 0
@@ -598,7 +601,8 @@ def _scatter_axis_limits(
 ) -> tuple[float, float]:
     """Return the limits of an axis that contain all finite values of true points, with a margin.
 
-    If true points have none, all finite values count.
+    If no true point has a finite value, those of all points count. On a logarithmic axis only
+    positive values count. Without values the limits are 0 and 1.
     """
     finite_values = values[is_true & np.isfinite(values)]
     finite_values = finite_values if finite_values.size else values[np.isfinite(values)]
@@ -617,7 +621,7 @@ def _scatter_axis_limits(
 def _set_scatter_axes(
     axes: Axes, limits: dict[str, tuple[float, float]], quantities: tuple[str, str]
 ) -> None:
-    """Set the limits, scales, labels and grid of a scatter plot of two quantities."""
+    """Set the limits, scales, labels and grid of a scatter plot of two quantities, in place."""
     axis_names: tuple[Literal["x", "y"], ...] = ("x", "y")
     for axis_name, quantity in zip(axis_names, quantities, strict=True):
         axes.set(**{f"{axis_name}scale": "log" if quantity in LOG_QUANTITIES else "linear"})

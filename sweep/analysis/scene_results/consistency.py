@@ -19,16 +19,16 @@ from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 from sweep.storage.locations import Location
 
 CONSISTENT_ERROR_RATIO_MAX = 2.0
-"""Largest ratio of actual errors to stated standard errors that counts as consistent."""
+"""Largest ratio of actual errors to stated standard errors at which they count as consistent."""
 
 _JUDGED_ERRORS_MIN = 20
-"""Least number of errors that suffices to judge whether they are consistent."""
+"""Least number of errors from which their consistency with standard errors is judged."""
 
 _SAMPLED_SHOTS_MAX, _SAMPLED_DRAWS_MAX, _SAMPLED_VALUES_PER_AXIS_MAX = 1 << 15, 16, 6
-"""Largest numbers of shots, of draws, and of values per axis whose errors are read."""
+"""Largest numbers of shots, of draws, and of values per axis from which errors are read."""
 
 _N_SAMPLED_FLIGHT_INTERVALS = 16
-"""Number of evenly spaced parts of a long flight whose errors are read."""
+"""Number of evenly spaced intervals of a long flight from which errors are read."""
 
 _COMPARED_QUANTILE_LEVELS = 0.6827, 0.9545
 """Levels (0..1) at which quantiles of actual errors are compared with those of normal errors."""
@@ -47,7 +47,7 @@ _LIKELY_CAUSE_BY_QUANTITY = {
     "target_acceleration state may be the cause.",
     "altitude": "Relief other than navigation.relief states may be the cause.",
 }
-"""Sentences on the likely cause of errors far larger than stated, by quantity."""
+"""Sentence on the likely cause of errors far larger than stated, by the quantity's name."""
 
 
 class ConsistencyResult(NamedTuple):
@@ -71,7 +71,7 @@ class ConsistencyResult(NamedTuple):
 
     @property
     def message(self) -> str:
-        """Sentence that says how much larger the errors are than stated, and why."""
+        """Sentence that states the ratio of actual to stated errors, and the likely cause."""
         return (
             f"{self.scanner}: {self.quantity} is inconsistent: residuals are "
             f"{self.error_ratio:.3g} "
@@ -145,9 +145,9 @@ def understated_error_messages(store: str | Location, scanner: str | None = None
 
 
 def _iter_flight_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Yield parts of a scanner's arrays, loaded into memory.
+    """Yield parts of a scanner's arrays as datasets in memory.
 
-    A short flight is one part. Of a long flight the parts are evenly spaced intervals.
+    A short flight is one part. The parts of a long flight are evenly spaced intervals.
     """
     n_shots, shots_per_cycle = group.sizes["shot"], int(group.attrs["shots_a_cycle"])
     axis_indices = {
@@ -177,9 +177,9 @@ def _iter_flight_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
 
 
 _VELOCITY_QUANTITY = "velocity"
-"""Name in messages of the velocity vector that navigation computes."""
+"""Name, in messages, of the velocity vector that navigation computes."""
 _VARIABLE_BY_QUANTITY = {"range": "range", "radial velocity": "radial_velocity"}
-"""Stored variables of the quantities of a point, by the quantity's name in messages."""
+"""Stored variable of each measured quantity, by the quantity's name in messages."""
 
 _NEEDED_VARIABLES = (
     "flags",
@@ -202,7 +202,7 @@ _NEEDED_VARIABLES = (
 
 
 def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Return the sizes of all finite errors, relative to their standard errors, by quantity."""
+    """Return finite errors over their standard errors, as magnitudes (n,) by quantity."""
     is_true = (sample["flags"] & TRUE_RETURN_FLAG).values > 0
     errors_by_quantity: dict[str, np.ndarray] = {}
     for quantity, variable in _VARIABLE_BY_QUANTITY.items():
@@ -231,7 +231,7 @@ def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
 
 
 def _solved_mask(status: xr.DataArray) -> np.ndarray:
-    """Return a mask of the navigation solutions that exist, by their status.
+    """Return a mask of the navigation attempts that gave a solution, from their status.
 
     A negative status means that the solution is not computed yet.
     """

@@ -51,21 +51,21 @@ REPORT_COLUMNS = {
     "true_range": ("m", "true range of the beam's axis at the time stamp"),
     "true_radial_velocity": ("m s-1", "true radial velocity of the beam's axis at the time stamp"),
 }  # fmt: skip
-"""Units and description of each column of reports."""
+"""Unit and description of each column of a table of reports, by the column's name."""
 
 _TRUTH_VARIABLE_BY_COLUMN = {
     "true_range": "beam_range",
     "true_radial_velocity": "beam_radial_velocity",
 }
-"""Stored variables with the true values along the beam, by column of the reports."""
+"""Stored variable with the true value along the beam, for each column of reports with a truth."""
 
 _PERIOD_END_TOLERANCE_FRACTION = 1e-6
-"""Fraction of a report's period before its end in which shots count to the next period.
+"""Length of the interval at the end of a report's period whose shots count to the next period.
 
-It allows for rounding errors of times.
+The length is a fraction of the period. The interval allows for rounding errors of times.
 """
 _REPORTS_PER_SHOT_MAX = 10
-"""Largest number of reports per shot. A higher rate of reports is refused: most would be empty."""
+"""Largest number of reports per shot. A higher rate is refused: most reports would be empty."""
 
 
 def reports(
@@ -78,7 +78,7 @@ def reports(
     where: Mapping[str, object] | None = None,
     interface: Mapping[str, object] | None = None,
 ) -> xr.Dataset:
-    """Return the reports that a unit with the stated interface makes of a flight.
+    """Return the reports that a lidar unit sends over its data interface during a flight.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def reports(
 
 
 def _read_shot_columns(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
-    """Return the columns over computed shots that :func:`make_reports` needs, for one draw."""
+    """Return the columns of computed shots that :func:`make_reports` needs, for one draw."""
     stored_by_name = {
         name: quantity_array_name(name, ranges)
         for name in (*MEASURED_QUANTITIES, *map(_standard_error_name, MEASURED_QUANTITIES))
@@ -167,7 +167,7 @@ def _read_shot_columns(recording: Recording, draw: int, ranges: str) -> ColumnAr
 
 
 def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArrays:
-    """Return the reports of a unit's interface made from its shots.
+    """Return the reports that a lidar unit sends over its data interface, made from its shots.
 
     Parameters
     ----------
@@ -176,7 +176,8 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
         errors of the first return, and the truth along the beam's axis, ``beam_range`` and
         ``beam_radial_velocity``.
     interface
-        Rate, quanta, limits, latency and rule of validity.
+        Rate, quantisation steps, limits and latency of reports; whether a report is the mean or
+        the last of its valid shots; and the least number of valid shots of a valid report.
 
     Returns
     -------
@@ -185,8 +186,8 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
 
     Notes
     -----
-    The variance of a report is that of the weighted mean of its shots, plus q^2 / 12 for a quantum
-    q.
+    The variance of a report is that of the weighted mean of its shots, plus q^2 / 12 for a
+    quantisation step q.
     """
     is_valid_shot = (shot_columns["flags"] > 0) & (shot_columns["flags"] & UNCONFIRMED_FLAG == 0)
     report_index, report_periods = _assign_shots_to_reports(shot_columns, interface.rate)
@@ -228,10 +229,10 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
 def quantise_and_clip(
     values: np.ndarray, quantisation_step: float | None, low: float | None, high: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Round values to quantisation steps and clip them; also return a mask of values out of limits.
+    """Return values rounded to quantisation steps and clipped, and a mask of those out of limits.
 
     ``quantisation_step`` and the limits ``low`` and ``high`` are optional (None). Limits are
-    rounded to the nearest step, so that a value within them changes by at most half a step.
+    rounded to the nearest step, so that a value within limits changes by at most half a step.
 
     >>> values, beyond = quantise_and_clip(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
     >>> values.tolist(), beyond.tolist()
@@ -250,7 +251,7 @@ def quantise_and_clip(
 
 
 def _standard_error_name(quantity: str) -> str:
-    """Return the name of the column with the standard error of a quantity."""
+    """Return the name of the column that holds the standard error of a quantity."""
     return f"{quantity}_standard_error"
 
 
@@ -296,10 +297,10 @@ def _assign_shots_to_reports(
 def _shot_weights(
     report_index: np.ndarray, is_valid_shot: np.ndarray, n_valid: np.ndarray, reported_value: str
 ) -> np.ndarray:
-    """Return the weight of each shot (n,) in the value of its report.
+    """Return the weight (n,) of each of n shots in the value of its report.
 
-    The valid shots of a report have equal weights if `reported_value` is ``mean``. Otherwise the
-    last of them has the weight 1, and all others 0.
+    If `reported_value` is ``mean``, the valid shots of a report have equal weights with the sum 1.
+    Otherwise the last valid shot of a report has the weight 1, and all others 0.
     """
     if reported_value == "mean":
         return np.where(is_valid_shot, 1 / np.maximum(n_valid[report_index], 1), 0.0)
@@ -311,9 +312,10 @@ def _shot_weights(
 def _interpolate_truth(
     time: np.ndarray, beam: np.ndarray, shot_columns: ColumnArrays, name: str
 ) -> np.ndarray:
-    """Interpolate a true value between the shots of each beam, at the times and beams of reports.
+    """Return a true value at the times and beams of n reports, (n,).
 
-    The result is nan before the first and after the last shot of the beam.
+    The value is interpolated between the shots of the report's beam. It is nan before the first and
+    after the last shot of the beam. `name` is the column of shots with the true value.
     """
     truth_at_times = np.full(time.size, np.nan)
     truth = np.where(np.isfinite(shot_columns[name]), shot_columns[name], np.nan)

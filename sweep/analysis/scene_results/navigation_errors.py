@@ -88,12 +88,12 @@ class ErrorTally:
 
     @property
     def variance(self) -> np.ndarray:
-        """Unbiased variance of the errors (bins, m); nan with fewer than two solutions."""
+        """Unbiased variance of each component's errors (bins, m); nan below two solutions."""
         return _quotient_or_nan(self.sum_of_squared_deviations, self.n_solutions[..., None] - 1)
 
     @property
     def stated_variance(self) -> np.ndarray:
-        """Mean of the variances that the solutions state (bins, m); nan without solutions."""
+        """Mean of the error variances that solutions state (bins, m); nan without solutions."""
         return np.where(self.n_solutions[..., None] > 0, self.mean_stated_variance, np.nan)
 
 
@@ -104,7 +104,7 @@ class ErrorCurve:
     scanner: str
     """Name of the scanner, or label of its recording."""
     quantity: str
-    """``velocity`` or ``altitude``."""
+    """Name of the quantity: ``velocity`` or ``altitude``."""
     altitude_edges: np.ndarray
     """Edges of the altitude bins (bins + 1,) [m]."""
     tally: ErrorTally
@@ -112,7 +112,7 @@ class ErrorCurve:
 
     @property
     def label(self) -> str:
-        """Display name of the scanner."""
+        """Display name of the scanner; 'measured' for a recording without a name."""
         return labels.coordinate_label(self.scanner) or "measured"
 
     @property
@@ -127,7 +127,7 @@ class ErrorCurve:
 
     @property
     def rmse(self) -> np.ndarray:
-        """RMS error of each component, and of the whole vector if there are several.
+        """RMS error of each component, and for velocity that of the vector as the last column.
 
         The shape is (bins, 1) for altitude and (bins, 4) for velocity.
         """
@@ -135,12 +135,16 @@ class ErrorCurve:
 
     @property
     def stated_deviation(self) -> np.ndarray:
-        """Root of the mean variance that the solutions state, in the shape of `rmse`."""
+        """Root of the mean error variance that solutions state, by component.
+
+        For velocity the last column is that of the vector. The shape is (bins, 1) for altitude and
+        (bins, 4) for velocity.
+        """
         return _append_vector_length(np.sqrt(self.tally.stated_variance))
 
 
 def _append_vector_length(components: np.ndarray) -> np.ndarray:
-    """Return vectors (..., m) with their lengths as a further component (..., m + 1).
+    """Return vectors (..., m) with their lengths as an additional component, (..., m + 1).
 
     Vectors with a single component are returned unchanged.
     """
@@ -183,7 +187,7 @@ def navigation_error_curves(
 
 
 def _altitude_bin_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray | None:
-    """Return the edges of equal altitude bins [m] that contain all true altitudes of all datasets.
+    """Return the edges of equal altitude bins [m] that contain the true altitudes of all datasets.
 
     The result is None if no altitude is known.
     """
@@ -283,7 +287,10 @@ def tally_errors(
 
 
 def merge_tallies(tallies: Sequence[ErrorTally]) -> ErrorTally:
-    """Return the sum of tallies. They are added in pairs, so that rounding is always the same."""
+    """Return the sum of tallies as one tally.
+
+    Tallies are added in pairs in a fixed order, so that rounding is always the same.
+    """
     if not tallies:
         raise ValueError("there is no tally to merge")
     remaining_tallies = list(tallies)
@@ -316,10 +323,13 @@ COMPONENT_NAMES_BY_QUANTITY = {VELOCITY_QUANTITY: ("x", "y", "z"), ALTITUDE_QUAN
 UNIT_BY_QUANTITY = {VELOCITY_QUANTITY: "m/s", ALTITUDE_QUANTITY: "m"}
 """Units of the errors of each quantity."""
 VECTOR_LENGTH_LABEL = "vector"
-"""Label of the error of a whole vector, which follows the components x, y and z."""
+"""Label for the error of a complete vector, the length of the error vector."""
 
 ComponentStatistic = tuple[str, int]
-"""Name of a statistic, and index of a component; an index after the last stands for the vector."""
+"""Name of a statistic, and index of a component of the quantity.
+
+The index that follows the last component stands for the length of the vector.
+"""
 
 
 def navigation_error_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
@@ -350,9 +360,9 @@ def navigation_error_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
 
 
 def _statistics_of_panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
-    """Return the statistics that the panels of each row show.
+    """Return the statistics that panels show, as a list for each row of panels.
 
-    Availability and the error of the whole vector come first, and then the components.
+    Availability and the error of the complete vector precede the components.
     """
     n_components = len(COMPONENT_NAMES_BY_QUANTITY[quantity])
     component_indices = list(range(n_components))
@@ -374,7 +384,7 @@ def _statistics_of_panel_rows(quantity: str, show: str) -> list[list[ComponentSt
 def _statistic_panel(
     curves: Sequence[ErrorCurve], quantity: str, statistic: str, component_index: int
 ) -> Panel:
-    """Return the panel with one statistic of a component over altitude, with a line per curve."""
+    """Return the panel of one statistic of a component over altitude, with a line per curve."""
     component_names = COMPONENT_NAMES_BY_QUANTITY[quantity]
     component = (
         component_names[component_index]
@@ -459,7 +469,7 @@ def navigation_error_page(
 def _altitude_bin_record(
     curve: ErrorCurve, bin_index: int, statistics: Sequence[str]
 ) -> dict[str, TableCell]:
-    """Return the statistics of an altitude bin, by column name of the CSV file."""
+    """Return the row of an altitude bin in the CSV file: its statistics by column name."""
     record: dict[str, TableCell] = {
         "scanner": curve.scanner,
         "from": float(curve.altitude_edges[bin_index]),

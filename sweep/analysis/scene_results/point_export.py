@@ -39,11 +39,12 @@ POINT_DTYPE = np.dtype(
         ("return_number", "|u1"), ("number_of_returns", "|u1"), ("scan_angle", "<f8"),
     ]
 )  # fmt: skip
-"""NumPy type of a point in a file: its columns in order.
+"""NumPy structured type of a point in a file: its columns in order.
 
-The returns of a shot and draw are numbered from 1 in stored order, with confirmed and strong ones
-first. The scan angle is the angle between beam and nadir [deg]. It is negative to the left of the
-ground track, or of the x axis if the platform has no horizontal velocity.
+The returns of a shot and draw are numbered from 1 in stored order: confirmed before unconfirmed
+ones, strong before weak ones. The scan angle is the angle between beam and nadir [deg]. It is
+negative to the left of the ground track, or of the x axis if the platform has no horizontal
+velocity.
 """
 
 POINT_COLUMNS: tuple[str, ...] = POINT_DTYPE.names or ()
@@ -54,17 +55,17 @@ UNIT_BY_COLUMN = {
     for n in POINT_COLUMNS
     if n in QUANTITY_BY_NAME and QUANTITY_BY_NAME[n].units != "1"
 }
-"""Units of those columns of points that have a unit."""
+"""Unit of each column of points that has a unit."""
 UNIT_BY_COLUMN["scan_angle"] = "deg"
 
 REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING_SIGN_NOTE)
-"""Remark on the sign of the values, for each column with a velocity."""
+"""Remark on the sign of the values, for each column with a radial velocity."""
 
 DESCRIPTION_BY_COLUMN = {
     name: "; ".join(filter(None, [UNIT_BY_COLUMN.get(name), REMARK_BY_COLUMN.get(name)]))
     for name in POINT_COLUMNS
 }
-"""Units and remark of each column; empty for a pure number."""
+"""Unit and remark of each column of points; an empty text for a pure number."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,11 @@ class PointTable:
     draw_number: int
     """Number of the draw."""
     range_kind: str
-    """Kind of ranges: ``interpolated`` or ``quantised``."""
+    """Kind of the ranges that are written: ``interpolated`` or ``quantised``."""
     origin: np.ndarray
-    """Offset that is added to the stored coordinates (3,) [m]."""
+    """Offset (3,) from the stored coordinates to those of the scene's files [m]."""
     time_origin: float = 0.0
-    """Offset that is added to the stored times [s]."""
+    """Offset from the stored times to those of the scene's files [s]."""
     projection_wkt: str = ""
     """WKT of the map projection of the coordinates; empty if unknown."""
 
@@ -132,9 +133,9 @@ class PointTable:
         )
 
     def coordinate_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest x, y and z of all points, (3,) each [m].
+        """Return the lowest and the highest x, y and z of all points, as two arrays (3,) [m].
 
-        Without points the limits are infinite.
+        Without points all limits are infinite.
         """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for shot_slice in self.recording.iter_shot_slices():
@@ -148,12 +149,12 @@ class PointTable:
 
 
 Remarks = Sequence[str]
-"""Remarks on the contents of a file; they are written to it if its format allows."""
+"""Remarks on the contents of a file. Writers put them into the file if its format allows."""
 
 _PLY_TYPE_BY_DTYPE = {
     "<f8": "double", "<i2": "short", "|u1": "uchar", "<i4": "int", "<u4": "uint",
 }  # fmt: skip
-"""PLY types of columns, by their NumPy types."""
+"""Name of the PLY type of a column, by the column's NumPy type."""
 
 
 def write_ply(table: PointTable, file_path: Path, remarks: Remarks) -> int:
@@ -202,12 +203,12 @@ A large cloud needs a larger step.
 """
 
 LAS_COORDINATE_STEPS_MAX = 2.0**31 - 1
-"""Largest distance of a coordinate from the offset of a LAS file, in steps of coordinates."""
+"""Largest distance of a coordinate from the offset of a LAS file, in quantisation steps."""
 LAS_RETURN_NUMBER_MAX = 15
 """Largest return number in a LAS file."""
 
 _LAS_STANDARD_COLUMNS = {"x", "y", "z", "time", "return_number", "number_of_returns", "scan_angle"}
-"""Columns with a field in LAS point format 6. All other columns become extra bytes."""
+"""Names of the columns with a field in LAS point format 6. All others become extra bytes."""
 
 _LAS_SCAN_ANGLE_STEP_DEG = 0.006
 """Step in which scan angles are stored in a LAS file [deg]."""
@@ -278,9 +279,9 @@ def _las_coordinate_step(extent: float) -> float:
 
 
 def _to_las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type: ignore[no-untyped-def]
-    """Convert points of `POINT_DTYPE` to points of a LAS file with the given header.
+    """Return points of `POINT_DTYPE` as points of a LAS file with the given header.
 
-    `extra_columns` are the columns that become extra bytes.
+    `extra_columns` are the names of the columns that become extra bytes.
     """
     import laspy
 
@@ -335,7 +336,7 @@ WRITER_BY_SUFFIX: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
     ".laz": partial(write_las, compressed=True),
     ".csv": write_csv,
 }
-"""Functions that write the points to a file and return their number, by suffix of the file."""
+"""Function that writes points to a file and returns their number, by the file's suffix."""
 
 
 def export(
@@ -418,7 +419,7 @@ class RequestedRecording(NamedTuple):
     """Recording that a user requests."""
 
     recording: Recording
-    """Points and shots of the scanner and the draw."""
+    """Shots and points of the requested scanner at the requested axis values."""
     axis_position: AxisPosition
     """Position of the recording along the study's axes."""
 
@@ -446,7 +447,7 @@ def resolve_recording(
     where
         Values of coordinates, written as in a spec.
     mistakes
-        Further mistakes of the request, which the error also lists.
+        Mistakes of the request that are known already, which the error also lists.
 
     Raises
     ------
@@ -466,7 +467,7 @@ def resolve_recording(
 def _find_request_mistakes(
     results: SceneResults, scanner: str | None, draw: int, ranges: str, axis_position: AxisPosition
 ) -> list[Mistake]:
-    """Return the mistakes in a user's request for the points of a scanner and draw."""
+    """Return the mistakes in a user's request for points of a scanner and draw; [] if none."""
     mistakes = []
     scanner_list = ", ".join(results.scanners)
     if scanner is None and len(results.scanners) > 1:

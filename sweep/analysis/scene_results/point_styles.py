@@ -38,12 +38,12 @@ their sign; larger ones are paler.
 """
 
 MISSING_POINT_COLOUR = "0.6"
-"""Colour of points whose value is not known, or whose category has no colour of its own."""
+"""Colour of points whose value is not known, or whose category has no colour assigned."""
 
 OUTLIER_MARGIN_FRACTION = 0.25
 """Distance from the 0.5 % or 99.5 % quantile beyond which colour scales leave out values.
 
-It is a fraction of the difference between both quantiles.
+The distance is a fraction of the difference between the two quantiles.
 """
 
 
@@ -54,11 +54,11 @@ class ContinuousColourScale:
     cmap: Colormap
     """Colour map."""
     norm: Normalize
-    """Normalisation of values to 0..1."""
+    """Normalisation of matplotlib that maps values to 0..1."""
     label: str
     """Label of the colour bar, with units."""
     colour_bar_extend: str = "neither"
-    """Ends of the colour bar beyond which there are values: neither, min, max or both."""
+    """Ends of the colour bar beyond which values lie: neither, min, max or both."""
 
     def to_rgba_colours(self, values: np.ndarray) -> np.ndarray:
         """Return the colours (n, 4) of values (n,), as red, green, blue and opacity, 0..1."""
@@ -79,12 +79,12 @@ class CategoryColours:
 
     @property
     def colour_by_number(self) -> dict[int, str]:
-        """Colour of each category by its number, for as many categories as there are colours."""
+        """Colours of categories by number; categories beyond the available colours are missing."""
         named_numbers = [number for number in self.label_by_number if number >= 0]
         return dict(zip(named_numbers, canvas.LINE_COLOURS, strict=False))
 
     def to_rgba_colours(self, values: np.ndarray) -> np.ndarray:
-        """Return the colours (n, 4) of category numbers, as red, green, blue and opacity, 0..1."""
+        """Return the colours (n, 4) of category numbers (n,): red, green, blue, opacity, 0..1."""
         rgba = np.tile(to_rgba(MISSING_POINT_COLOUR), (np.size(values), 1))
         for number, colour in self.colour_by_number.items():
             rgba[np.asarray(values) == number] = to_rgba(colour)
@@ -114,7 +114,7 @@ def choose_colours(
     """Return the colours for the values of a quantity: a continuous scale, or one per category.
 
     ``is_trusted`` is a mask of the values that determine the ends of a continuous scale.
-    ``surfaces`` are the names of the surfaces.
+    ``surfaces`` are the display names of the surfaces, by number.
     """
     if quantity in CATEGORICAL_QUANTITIES:
         numbers = [int(n) for n in np.unique(values[np.isfinite(values)])]
@@ -132,7 +132,7 @@ def choose_colours(
 
 
 def _colour_scale_ends(values: np.ndarray) -> tuple[float, float]:
-    """Return the lowest and highest value of a colour scale, without far outliers."""
+    """Return the lowest and the highest value of a colour scale that leaves out far outliers."""
     if not values.size:
         return 1.0, 1.0
     low, low_quantile, high_quantile, high = (
@@ -147,7 +147,10 @@ def _colour_scale_ends(values: np.ndarray) -> tuple[float, float]:
 def _continuous_colour_scale(
     quantity: str, values: np.ndarray, is_trusted: np.ndarray
 ) -> ContinuousColourScale:
-    """Return a colour scale that spans the values of trusted points, without far outliers."""
+    """Return a colour scale from the lowest to the highest trusted value, without far outliers.
+
+    If no trusted value is finite, all finite values count.
+    """
     finite_values = values[np.isfinite(values)]
     trusted_values = values[is_trusted & np.isfinite(values)]
     trusted_values = trusted_values if trusted_values.size else finite_values
@@ -171,7 +174,7 @@ LEGEND_WIDTH_INCHES = 1.75
 """Width of the space for legends at the right of a picture [inches]."""
 
 TITLE_HEIGHT_INCHES, CAPTION_HEIGHT_INCHES, CAPTION_LINE_HEIGHT_INCHES = 0.75, 0.55, 0.17
-"""Heights of the title, of the caption's first line, and of each further line [inches]."""
+"""Heights of the title, of a one-line caption, and of each additional line [inches]."""
 
 
 class SheetWithLegends:
@@ -192,7 +195,7 @@ class SheetWithLegends:
     def to_sheet_fractions(
         self, left: float, bottom: float, width: float, height: float
     ) -> tuple[float, float, float, float]:
-        """Convert a rectangle [inches] from the picture's lower left corner to sheet fractions.
+        """Return a rectangle [inches] from the picture's lower left corner in sheet fractions.
 
         The result is left, bottom, width and height.
         """
@@ -205,13 +208,16 @@ class SheetWithLegends:
         )
 
     def add_axes(self, *rectangle_inches: float, **options: Any) -> Axes:
-        """Add axes at left, bottom, width, height [inches] from the picture's lower left corner."""
+        """Add axes to the sheet, and return them.
+
+        Left, bottom, width and height [inches] are measured from the picture's lower left corner.
+        """
         return self.sheet.add_axes(self.to_sheet_fractions(*rectangle_inches), **options)
 
     def draw_legends(
         self, colouring: ContinuousColourScale | CategoryColours, handles: Sequence[Artist]
     ) -> None:
-        """Draw the colour bar or the legend of categories, and the legend of further markers."""
+        """Draw the colour bar or the legend of categories, and the legend of the given handles."""
         if isinstance(colouring, ContinuousColourScale):
             bar_height = min(0.72 * self.height, 4.2)
             axes = self.add_axes(
@@ -234,7 +240,11 @@ class SheetWithLegends:
             self._draw_legend(handles, 0.0, "", "lower left")
 
     def _draw_legend(self, handles: Sequence[Artist], bottom: float, title: str, loc: Any) -> None:
-        """Draw a legend at the right of the picture, at a height [inches]."""
+        """Draw one legend at the right of the picture.
+
+        `bottom` is the height of the legend's anchor above the picture's foot [inches], `loc` the
+        corner of the legend at that anchor.
+        """
         x, y, *_ = self.to_sheet_fractions(self.width + 0.02, bottom, 0, 0)
         self.sheet.legend(
             handles=list(handles), title=title or None, loc=loc, bbox_to_anchor=(x, y),
@@ -243,20 +253,20 @@ class SheetWithLegends:
 
 
 MARKER_AREA_MAX = 24.0
-"""Largest area of the marker of a point of the cloud [(1/72 inch)^2]."""
+"""Largest area of the marker of a point of a cloud [(1/72 inch)^2]."""
 
 MARKER_AREA_MIN_BY_POINT_COUNT = ((2000, 9.0), (8000, 5.0), (30_000, 2.0), (math.inf, 0.7))
-"""Pairs of a number of points, and the least area of markers [(1/72 inch)^2] up to this number."""
+"""Pairs (n, area): least area of markers [(1/72 inch)^2] in pictures with up to n points."""
 
 TICK_SPACING_MIN_X_INCHES, TICK_SPACING_MIN_Y_INCHES = 0.42, 0.25
-"""Least spacing of legible ticks on horizontal and vertical axes [inches]."""
+"""Least spacing of ticks at which labels are legible, on x and on y axes [inches]."""
 
 OFFSET_LABEL_COORDINATE_MIN = 1e5
-"""Magnitude of coordinates above which axis labels are differences from a round number [m]."""
+"""Magnitude of coordinates above which ticks show differences from a round number [m]."""
 
 
 def marker_area(positions: np.ndarray, width: float, height: float) -> float:
-    """Return the area of markers [(1/72 inch)^2] at which most points of a picture stay apart.
+    """Return the area of markers [(1/72 inch)^2] at which most markers of a picture do not touch.
 
     `positions` (2, n), `width` and `height` of the picture are in inches.
     """
@@ -275,7 +285,10 @@ def marker_area(positions: np.ndarray, width: float, height: float) -> float:
 
 
 def false_point_marker_style(area: float) -> dict[str, Any]:
-    """Return the style of markers of false points, given the area of those of true points."""
+    """Return the options of matplotlib's `scatter` for false points.
+
+    `area` is the area of the markers of true points [(1/72 inch)^2].
+    """
     return {"marker": "x", "s": max(1.2 * area, 9.0), "linewidths": 0.7}
 
 
@@ -286,7 +299,7 @@ def set_length_axis(
     axis_inches: float,
     tick_spacing: float = TICK_SPACING_MIN_X_INCHES,
 ) -> None:
-    """Set label and ticks of an axis in metres.
+    """Set label and ticks of one of matplotlib's axes that shows a coordinate in metres.
 
     Parameters
     ----------

@@ -47,18 +47,18 @@ WORLD_AXES = ("x", "y", "z")
 """Axes of world coordinates."""
 
 QUANTISED_RANGES, INTERPOLATED_RANGES = "quantised", "interpolated"
-"""Names of the two kinds of ranges and velocities: of whole bins, or interpolated between bins."""
+"""Names of the two kinds of ranges and velocities: from whole bins, or interpolated."""
 
 _INTERPOLATED_ARRAY_BY_QUANTITY = {
     f"{name}{error}": f"{name}_interpolated{error}"
     for name in ("range", "radial_velocity")
     for error in ("", "_standard_error")
 }
-"""Names of the stored arrays with interpolated values, by quantity."""
+"""Name of the stored array with interpolated values, for each quantity with such an array."""
 
 
 def quantity_array_name(name: str, ranges: str) -> str:
-    """Return the name of the stored array of a quantity, for a kind of ranges.
+    """Return the name of the stored array of a quantity; `ranges` is quantised or interpolated.
 
     With interpolated ranges it is the array of interpolated values, if the quantity has one.
     """
@@ -68,16 +68,16 @@ def quantity_array_name(name: str, ranges: str) -> str:
 
 
 CATEGORICAL_QUANTITIES = ("beam", "surface", "flags")
-"""Quantities whose values are categories, not amounts."""
+"""Names of quantities whose values are categories, not amounts."""
 
 SIGNED_QUANTITIES = ("radial_velocity", "beam_radial_velocity", "true_radial_velocity")
-"""Quantities with a colour scale that distinguishes both signs: velocities."""
+"""Names of quantities with a colour scale that distinguishes both signs: velocities."""
 
 DECIBEL_QUANTITIES = ("snr", "snr_up")
-"""Quantities that are shown in decibels: power ratios."""
+"""Names of quantities that figures show in decibels: power ratios."""
 
 LOG_QUANTITIES = ("pfa_up", "pfa_down")
-"""Quantities that are shown on a logarithmic scale: probabilities of false alarms."""
+"""Names of quantities that figures show on a logarithmic scale: false-alarm probabilities."""
 
 POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
 """Bit of a point's flags for each kind of point, by the name of the kind.
@@ -95,11 +95,11 @@ class Quantity:
     units: str
     """Units of the stored values."""
     is_per_point: bool
-    """True if each point has a value, false if each shot has one."""
+    """True if each point has a value, False if each shot has a value."""
 
 
 def _list_quantities() -> dict[str, Quantity]:
-    """Return all quantities of shots and points, with their descriptions and units."""
+    """Return the descriptions of all quantities of shots and points, by the quantity's name."""
     quantities = {}
     for table, is_per_point in (
         (SHOT_GEOMETRY_VARIABLES, False),
@@ -122,11 +122,11 @@ def _list_quantities() -> dict[str, Quantity]:
 
 
 QUANTITY_BY_NAME = _list_quantities()
-"""All quantities of shots and points, by name."""
+"""Descriptions of all quantities of shots and points, by the quantity's name."""
 
 
 def quantity_label(name: str) -> str:
-    """Return the label of a quantity, with the units in which figures show it."""
+    """Return the label of the named quantity, with the units in which figures show it."""
     quantity = QUANTITY_BY_NAME[name]
     return labels.axis_label(
         quantity.long_name, "dB" if name in DECIBEL_QUANTITIES else quantity.units
@@ -134,9 +134,9 @@ def quantity_label(name: str) -> str:
 
 
 def to_displayed_values(name: str, values: np.ndarray) -> np.ndarray:
-    """Convert the values of a quantity to those that figures show.
+    """Return the values of the named quantity as figures show them, as floats.
 
-    Power ratios become decibels, flags become indices in `POINT_KIND_BITS`.
+    Power ratios become decibels, and flags become indices in `POINT_KIND_BITS`.
     """
     values = np.asarray(values)
     if name == "flags":
@@ -148,7 +148,7 @@ def to_displayed_values(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def point_kind_indices(flags: np.ndarray) -> np.ndarray:
-    """Return the kind of each point as an index in `POINT_KIND_BITS`; -1 if there is no point."""
+    """Return the index in `POINT_KIND_BITS` of the kind in each point's flags; -1 for no point."""
     kind_indices = np.full(np.shape(flags), -1)
     for i, bit in enumerate(POINT_KIND_BITS.values()):
         kind_indices[(flags & bit) > 0] = i
@@ -156,11 +156,11 @@ def point_kind_indices(flags: np.ndarray) -> np.ndarray:
 
 
 ColumnArrays = dict[str, np.ndarray]
-"""Columns of a table by name, all of equal length."""
+"""Columns (n,) of a table with n rows, by the column's name."""
 
 
 ValueLimits = tuple[float, ...]
-"""Lowest and highest value of a quantity."""
+"""Lowest and highest value of a quantity that are within limits."""
 
 INFINITE_VALUE_LIMITS: ValueLimits = (-np.inf, np.inf)
 """Limits that exclude no finite value."""
@@ -169,7 +169,7 @@ INFINITE_VALUE_LIMITS: ValueLimits = (-np.inf, np.inf)
 def within_limits_mask(
     column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]
 ) -> np.ndarray:
-    """Return a mask of the rows of a table whose values are all within the limits, by column.
+    """Return a mask of the rows of a table whose values are within limits in every limited column.
 
     A nan is not within limits.
     """
@@ -186,7 +186,7 @@ class Recording:
     scanner: str
     """Name of the scanner."""
     dataset: xr.Dataset
-    """Arrays of the scanner at this position."""
+    """Arrays of the scanner at one position along the study's axes."""
     flags_chunk_folder: Location | None = None
     """Folder with the stored chunks of the array `flags` for this scanner and position.
 
@@ -213,9 +213,9 @@ class Recording:
     def computed_shot_mask(self, shot_slice: slice, draw: int = 0) -> np.ndarray:
         """Return a mask (k,) of the k shots of a slice whose points are computed for a draw.
 
-        A shot that is not computed has no points, like one that detects nothing; only the existence
-        of its stored chunk tells them apart. Its geometry proves nothing, as it is stored with the
-        first draw at any axis position.
+        A shot that is not computed has no points, like a shot that detects nothing. Only the
+        existence of its stored chunk tells the two apart. The shot's geometry does not, because it
+        is stored with the first draw that is computed at any axis position.
         """
         has_geometry = np.isfinite(self.read_array("time", shot_slice))
         if self.flags_chunk_folder is None:
@@ -315,8 +315,8 @@ class Recording:
     ) -> np.ndarray:
         """Return the world positions of points (m, 3) [m], for quantised or interpolated ranges.
 
-        `has_point` is the mask of the stored points of the slice. `shot_index` (m,) is the shot of
-        each point, from the beginning of the slice.
+        `has_point` is the mask of the stored points of the slice. `shot_index` (m,) is the index
+        within the slice of each point's shot.
         """
         position = self.read_array("position", shot_slice, draw)[has_point]
         if ranges == QUANTISED_RANGES:
@@ -331,7 +331,7 @@ class Recording:
         return position
 
     def shot_values(self, name: str, shot_slice: slice) -> np.ndarray:
-        """Return a quantity of the k shots of a slice, (k,)."""
+        """Return the named quantity of the k shots of a slice, (k,)."""
         if name == "shot":
             return np.arange(shot_slice.start, shot_slice.stop)
         if name == "altitude":
@@ -343,7 +343,10 @@ class Recording:
         return self.read_array(name, shot_slice)
 
     def beam_axis_hit_points(self, shot_slice: slice) -> np.ndarray:
-        """Return the points (k, 3) [m] where the beam axes of k shots meet the scene, or nan."""
+        """Return the points (k, 3) [m] where the beam axes of k shots meet the scene, or nan.
+
+        `shot_slice` is the slice of the k shots.
+        """
         beam_range = self.read_array("beam_range", shot_slice)
         beam_range = np.where(np.isfinite(beam_range), beam_range, np.nan)[:, None]
         return self.read_array("platform_position", shot_slice) + beam_range * self.read_array(
@@ -354,8 +357,8 @@ class Recording:
 def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
     """Return the number of the first shot that has true points on two surfaces in a draw.
 
-    If there is none, it is the first shot whose spectrum without noise has two groups of adjacent
-    bins above the threshold. If there is none either, the result is None.
+    Without one, return the number of the first shot whose spectrum without noise has two groups of
+    adjacent bins above the threshold. Without either kind of shot, return None.
     """
     fallback_shot = None
     for shot_slice in recording.iter_shot_slices():
@@ -381,7 +384,7 @@ def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
 def select_rows_within(
     column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]
 ) -> ColumnArrays:
-    """Return the rows of a table whose values are all within the limits, by column."""
+    """Return the rows of a table that are within limits in every limited column, as columns."""
     if not limits:
         return column_arrays
     is_inside = within_limits_mask(column_arrays, limits)
@@ -399,7 +402,7 @@ class ThinnedRows:
         self._tables: list[ColumnArrays] = []
 
     def append(self, column_arrays: ColumnArrays) -> None:
-        """Append the rows of a table, and thin all rows if they are too many."""
+        """Append the rows of a table in place, and thin all rows if they are too many."""
         start = -self.n_total % self.step
         self.n_total += len(next(iter(column_arrays.values())))
         self._tables.append(
@@ -410,7 +413,10 @@ class ThinnedRows:
             self._tables = [{n: values[::2].copy() for n, values in self.to_columns().items()}]
 
     def describe_count(self, noun: str, qualifier: str = "") -> str:
-        """Return a text with the number of all appended rows, and with the share that is kept."""
+        """Return a text with the number of all appended rows, and with the share that is kept.
+
+        `noun` names a row, and `qualifier` is put behind it.
+        """
         kept_note = f", one in {self.step} of them shown" if self.step > 1 else ""
         return labels.number_with_noun(self.n_total, noun) + qualifier + kept_note
 
@@ -430,7 +436,7 @@ class AxisPosition:
     label: str
     """Coordinates of the position, as text."""
     undetermined_axes: tuple[str, ...]
-    """Names of the axes along which the request leaves several values to choose from."""
+    """Names of the axes along which the request matches several values."""
 
     def open_recording(self, tree: xr.DataTree, scanner: str) -> Recording:
         """Return the recording of a scanner at this position."""
@@ -482,7 +488,7 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
 
 
 def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:
-    """Return the position along a study's axes with the given index along each axis."""
+    """Return the position along a study's axes with a given index along each axis, in order."""
     axis_indices = {
         axis.name: number for axis, number in zip(spec.axes, value_numbers, strict=True)
     }
@@ -539,7 +545,7 @@ def _match_axis_values(
 
 
 def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> str:
-    """Return a text with the coordinates of a position, along axes with several values."""
+    """Return a text with the coordinates of a position; axes with a single value are left out."""
     return ", ".join(
         labels.format_coordinate_value(
             axis_parameter.coordinate_name,
@@ -553,13 +559,13 @@ def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> st
 
 
 CLOUD_POINTS_MAX, CLOUD_DROPOUTS_MAX, CLOUD_PATH_POINTS_MAX = 120_000, 20_000, 2000
-"""Largest numbers of points, shots without a point, and path positions in a picture."""
+"""Largest numbers of points, of shots without a point, and of path positions in a picture."""
 
 BOX_MARGIN_FRACTION = 0.04
-"""Margin around the points of a picture, relative to the longest side of their box."""
+"""Margin around the points of a picture, as a fraction of the longest side of their box."""
 
 CoordinateBox = dict[str, tuple[float, float]]
-"""Lowest and highest value of each of x, y and z [m], the bounds of a picture."""
+"""Box that bounds a picture: lowest and highest value [m] by axis, x, y and z."""
 
 
 @dataclass(frozen=True)
@@ -571,7 +577,7 @@ class PointCloud:
     flight_path: ColumnArrays
     """Columns x, y and z of the flight path [m]; empty if it was not requested."""
     thinned_points: ThinnedRows
-    """Points including those outside the box, with the number of points before thinning."""
+    """Points inside and outside the box, with the number of points before thinning."""
     thinned_dropouts: ThinnedRows
     """Positions of the dropouts, with their number before thinning."""
     n_false_points_outside: int
@@ -589,7 +595,7 @@ class PointCloud:
 
     @property
     def true_point_mask(self) -> np.ndarray:
-        """Mask of the true points among the points."""
+        """Mask of the true points among the rows of `points`."""
         return np.asarray((self.points["flags"] & TRUE_RETURN_FLAG) > 0)
 
     @property
@@ -696,9 +702,10 @@ def _bounding_box(
     path_columns: ColumnArrays,
     coordinate_crops: Mapping[str, ValueLimits],
 ) -> CoordinateBox:
-    """Return the box of a picture: around true points, dropouts and flight path, with a margin.
+    """Return the box of a picture around true points, dropouts and flight path, with a margin.
 
-    `coordinate_crops` are the limits of x, y and z [m].
+    `coordinate_crops` are limits of x, y and z [m]; only the margin exceeds them. Without true
+    points all points count.
     """
     is_true = (point_columns["flags"] & TRUE_RETURN_FLAG) > 0
     box: CoordinateBox = {}
@@ -716,7 +723,7 @@ def _bounding_box(
 def read_eyepoints(
     store_path: Location, scanner_dataset: xr.Dataset, shot_indices: np.ndarray
 ) -> Eyepoints:
-    """Read the eyepoints (geometry) of some shots of a scanner from the store of eyepoints.
+    """Read the eyepoints (geometry) of shots of a scanner, given by index, from their own store.
 
     Raise NotAStoreError if the store of eyepoints is missing.
     """
