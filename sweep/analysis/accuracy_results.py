@@ -20,7 +20,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.datasets import read_attributes_of_kind
-from sweep.analysis.tables import PageTable, TablePage
+from sweep.analysis.tables import TablePage, TextTable
 from sweep.model.error_budget import THESIS_BEAMLET_COUNT
 from sweep.storage.accuracy_setting_kinds import (
     ADAPTIVE_KIND,
@@ -373,7 +373,7 @@ def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]
 def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> list[str]:
     """Return the conclusions from an accuracy measurement, as sentences for its page."""
     attributes = dataset.attrs
-    conclusions = [_as_written_setting_sentences(dataset, settings)]
+    conclusions = [_spec_as_written_sentences(dataset, settings)]
     conclusions += _fixed_setting_sentences(compare_adaptive_with_fixed(settings), attributes)
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
@@ -391,8 +391,8 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
 def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> TablePage:
     """Return a page with the tables and conclusions of a measurement of accuracy."""
     page_tables = [
-        PageTable("Settings", SETTING_TABLE_COLUMNS, setting_table_rows(settings)),
-        PageTable(
+        TextTable("Settings", SETTING_TABLE_COLUMNS, setting_table_rows(settings)),
+        TextTable(
             "Cheapest setting for each error",
             CHEAPEST_SETTING_COLUMNS,
             cheapest_setting_rows(settings),
@@ -406,7 +406,7 @@ def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> T
     )
 
 
-def _as_written_setting_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
+def _spec_as_written_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
     """Return sentences on the setting that the spec states: time, error, and a faster setting."""
     (as_written,) = select_settings_of_kinds(settings, AS_WRITTEN_KIND)
     n_points, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
@@ -619,7 +619,7 @@ SETTING_KINDS_JOINED_BY_LINE = (ADAPTIVE_KIND, *SETTING_KINDS_NAMED_BY_NUMBER)
 In the figure a line connects the marks of all settings of such a kind.
 """
 
-MARK_BY_SETTING_KIND = {
+PLOT_STYLE_BY_SETTING_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
     FIXED_EFFECTS_KIND: ("s", canvas.LINE_COLOURS[2], "the same effects everywhere"),
     BEAMLET_LATTICE_KIND: ("^", canvas.LINE_COLOURS[1], "number of beamlets in a lattice"),
@@ -649,7 +649,7 @@ def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]
         zorder=1,
         label="Pareto front of time and error",
     )
-    for kind, (marker, colour, label) in MARK_BY_SETTING_KIND.items():
+    for kind, (marker, colour, label) in PLOT_STYLE_BY_SETTING_KIND.items():
         kind_settings = select_settings_of_kinds(plotted_settings, kind)
         for i, setting in enumerate(kind_settings):
             _draw_setting_mark(axes, setting, marker, colour, label if i == 0 else "")

@@ -170,7 +170,7 @@ MARKED_POINTS_MAX = 40
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Markers of matplotlib for the points of lines, by style index."""
 
-MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INCHES = (
+HEAT_MAP_PANEL_INCHES, MULTI_LINE_PANEL_INCHES, SINGLE_LINE_PANEL_INCHES, ROW_PANEL_INCHES = (
     (9.5, 4.4),
     (10.0, 3.6),
     (10.0, 1.75),
@@ -189,7 +189,7 @@ def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
     ``footnote`` is the last sentence of the caption.
     """
     drawn_sheet = (
-        _draw_map_panels(chart, chart.colour_scale)
+        _draw_heat_map_panels(chart, chart.colour_scale)
         if chart.colour_scale
         else _draw_line_panels(chart)
     )
@@ -198,13 +198,13 @@ def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
     return drawn_sheet
 
 
-def _draw_map_panels(chart: Chart, colour_scale: ColourScale) -> Sheet:
+def _draw_heat_map_panels(chart: Chart, colour_scale: ColourScale) -> Sheet:
     """Draw the heat maps of a chart on a new sheet, in two columns if it has several parts."""
     n_columns = min(2, len({panel.facet_choices["part"] for panel in chart.panels}))
     n_rows = -(-len(chart.panels) // n_columns)
     maps_sheet, axes_list = sheet_with_axes(
-        MAP_PANEL_INCHES[0] * (1 + 0.4 * (n_columns - 1)),
-        MAP_PANEL_INCHES[1] * n_rows + 0.8,
+        HEAT_MAP_PANEL_INCHES[0] * (1 + 0.4 * (n_columns - 1)),
+        HEAT_MAP_PANEL_INCHES[1] * n_rows + 0.8,
         n_rows,
         n_columns,
         sharex=True,
@@ -214,7 +214,7 @@ def _draw_map_panels(chart: Chart, colour_scale: ColourScale) -> Sheet:
     for panel_axes in axes_list[len(chart.panels) :]:
         panel_axes.set_visible(False)
     for i, (panel_axes, panel) in enumerate(zip(axes_list, chart.panels, strict=False)):
-        _draw_map(panel_axes, norm, panel)
+        _draw_heat_map(panel_axes, norm, panel)
         panel_axes.set_title(panel.title, size=10)
         if i + n_columns >= len(chart.panels):
             panel_axes.set_xlabel(panel.x_axis.label)
@@ -266,7 +266,7 @@ def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
     return np.exp(edge_positions) if logarithmic else edge_positions
 
 
-def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
+def _draw_heat_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
     """Draw the heat map of a panel on axes with contours; set scales and limits of the axes."""
     heat_map, mesh_edges = panel.heat_map, []
     assert heat_map is not None
@@ -284,8 +284,8 @@ def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
     axes.pcolormesh(*mesh_edges, values, norm=norm, cmap=colour_map(), rasterized=True)
     if len(heat_map.contour_levels) and min(values.shape) > 1 and values.count():
         _draw_contours(axes, heat_map, values)
-    _set_axis(axes, "x", panel.x_axis)
-    _set_axis(axes, "y", panel.y_axis)
+    _set_scale_and_limits(axes, "x", panel.x_axis)
+    _set_scale_and_limits(axes, "y", panel.y_axis)
     axes.set_facecolor(MISSING_VALUE_COLOUR)
 
 
@@ -324,7 +324,7 @@ def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> 
         label.set_path_effects(outline)
 
 
-def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None:
+def _set_scale_and_limits(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None:
     """Set the scale and the limits of one of matplotlib's axes, x or y, from a chart's axis."""
     if axis.scale != CATEGORY_SCALE:
         axes.set(**{f"{axis_name}scale": axis.scale})
@@ -342,11 +342,11 @@ def _draw_line_panels(chart: Chart) -> Sheet:
     )
     panels_per_row = chart.panels_per_row or [1] * len(drawn_panels)
     width, height = (
-        SMALL_PANEL_INCHES
+        ROW_PANEL_INCHES
         if chart.panels_per_row
-        else LOW_LINE_PANEL_INCHES
+        else SINGLE_LINE_PANEL_INCHES
         if is_split
-        else HIGH_LINE_PANEL_INCHES
+        else MULTI_LINE_PANEL_INCHES
     )
     share_y_axis = len({panel.y_axis for panel in drawn_panels}) == 1
     n_columns = max(panels_per_row)
@@ -415,8 +415,8 @@ def _draw_line_panel(axes: Axes, panel: Panel) -> None:
     has_stated = any(line.style == "stated" for line in panel.lines)
     for line in panel.lines:
         _draw_line(axes, line, solid=has_stated or line.n_averaged_points > 1)
-    _set_axis(axes, "x", panel.x_axis)
-    _set_axis(axes, "y", panel.y_axis)
+    _set_scale_and_limits(axes, "x", panel.x_axis)
+    _set_scale_and_limits(axes, "y", panel.y_axis)
     if panel.x_axis.scale != CATEGORY_SCALE:
         axes.margins(x=0.0 if max(line.x.size for line in panel.lines) > 1 else 0.05)
     if panel.y_axis.scale != LOG_SCALE:

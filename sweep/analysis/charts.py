@@ -288,7 +288,7 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
     return ColourScale(low, high if high > low else low + 1.0, False, label)
 
 
-def worst_statistic(variable: str) -> str:
+def worst_value_statistic(variable: str) -> str:
     """Return the name of the statistic of a cell of points that shows a variable's worst value.
 
     The statistic is the lowest value for detection and SNR, and the highest one for misses and
@@ -358,7 +358,9 @@ def surface_chart(
     parts, n_omitted = split_into_parts(points, [x, y], size_limits.parts_max)
     planes = [_arrange_on_plane(part.points, variable, x, y) for part in parts]
     cell_statistics = (
-        [CELL_MEAN, worst_statistic(variable)] if worst_statistic(variable) else [CELL_MEAN]
+        [CELL_MEAN, worst_value_statistic(variable)]
+        if worst_value_statistic(variable)
+        else [CELL_MEAN]
     )
     cells_max = _map_cells_max(planes, size_limits, len(cell_statistics) * len(parts))
     points_per_cell = [
@@ -550,9 +552,9 @@ def _horizontal_level_lines(panel: Panel, levels: Sequence[float]) -> list[Chart
 class LabelledLinePoints(NamedTuple):
     """Points of a line of a chart, with the names of the line and of its panel."""
 
-    part: str
+    part_name: str
     """Name of the part of the study, and of the panel, to which the line belongs."""
-    name: str
+    line_name: str
     """Name of the line."""
     points: PointSelection
     """Points of the line."""
@@ -620,7 +622,7 @@ def make_line_panels(
     style_by_name = {
         name: k
         for k, name in enumerate(
-            dict.fromkeys(labelled_line.name for labelled_line in labelled_lines)
+            dict.fromkeys(labelled_line.line_name for labelled_line in labelled_lines)
         )
     }
     lines_by_part: dict[str, list[ChartLine]] = {}

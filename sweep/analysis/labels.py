@@ -10,7 +10,7 @@ import numpy as np
 
 from sweep.messages import number_with_noun as number_with_noun
 
-KILOMETRE_DISPLAY_MIN = 1000.0
+KILOMETRE_DISPLAY_MEDIAN_MIN = 1000.0
 """Least median of the distances on an axis for which the axis is in km [m]."""
 
 _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW": "µW", "m s-1": "m/s"}
@@ -50,7 +50,7 @@ def display_factor_and_units(values: np.ndarray, units: str) -> DisplayUnits:
 
     Long distances are shown in km, and angles in degrees.
     """
-    if units == "m" and values.size and np.median(np.abs(values)) > KILOMETRE_DISPLAY_MIN:
+    if units == "m" and values.size and np.median(np.abs(values)) > KILOMETRE_DISPLAY_MEDIAN_MIN:
         return DisplayUnits(1e-3, "km")
     if units == "rad":
         return DisplayUnits(math.degrees(1.0), "deg")

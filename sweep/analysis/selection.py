@@ -403,7 +403,7 @@ def study_cuts(spec: GridSpec) -> list[StudyCut]:
         None,
     )
     if zipped_axis is not None:
-        fixed_values = _constant_runs(zipped_axis)
+        fixed_values = _split_axis_into_constant_runs(zipped_axis)
     else:
         published_values = [
             (parameter_by_path[p], spec.read_coordinate_value(p, text))
@@ -426,7 +426,7 @@ def study_cuts(spec: GridSpec) -> list[StudyCut]:
     return cut_list or uncut
 
 
-def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
+def _split_axis_into_constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
     """Divide a zipped axis, along which range and grazing angle vary, into runs.
 
     In each run one of the two parameters is constant. The result has this parameter and its

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.selection import GRAZING_ANGLE_PATH
-from sweep.analysis.tables import PageTable, TablePage
+from sweep.analysis.tables import TablePage, TextTable
 from sweep.model import evaluation as shot_model
 from sweep.model import waveform, window
 from sweep.model.beam import DIVERGENCE_PATH, WAIST_PATH
@@ -578,7 +578,7 @@ def draw_scene_shot_sheet(
     return sheet
 
 
-def _noise_table(shot: SimulatedShot) -> PageTable:
+def _noise_table(shot: SimulatedShot) -> TextTable:
     """Return a table of the noise at the ADC: volts and share of the noise variance, by source."""
     variance_by_source = {
         n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise.variances.items()
@@ -594,10 +594,10 @@ def _noise_table(shot: SimulatedShot) -> PageTable:
         if variance > 0
     ]
     rows.append(("total", f"{math.sqrt(total_variance):.4e}", percent_text(1.0, ".4g")))
-    return PageTable("Noise at the ADC", ("source", "V rms", "share"), rows)
+    return TextTable("Noise at the ADC", ("source", "V rms", "share"), rows)
 
 
-def _segment_table(shot: SimulatedShot) -> PageTable:
+def _segment_table(shot: SimulatedShot) -> TextTable:
     """Return a table with beat frequency, peak, level, SNR, pd and bin groups of each segment."""
     columns = (
         "segment", "beat (MHz)", "seen (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
@@ -620,10 +620,10 @@ def _segment_table(shot: SimulatedShot) -> PageTable:
         )
         for segment in shot.segments
     ]
-    return PageTable(heading, columns, rows)
+    return TextTable(heading, columns, rows)
 
 
-def _measurement_table(shot: SimulatedShot) -> PageTable:
+def _measurement_table(shot: SimulatedShot) -> TextTable:
     """Return a table of range and radial velocity: true value, reported value, and error."""
     prepared_shot = shot.prepared_shot
     rows = [
@@ -644,10 +644,10 @@ def _measurement_table(shot: SimulatedShot) -> PageTable:
         )
     ]
     verdict = "detected" if shot.is_detected else "NOT detected: read off the strongest bins"
-    return PageTable(f"Report ({verdict})", ("", "true", "reported", "error"), rows)
+    return TextTable(f"Report ({verdict})", ("", "true", "reported", "error"), rows)
 
 
-def _false_alarm_table(shot: SimulatedShot) -> PageTable:
+def _false_alarm_table(shot: SimulatedShot) -> TextTable:
     """Return a table of the false-alarm and leakage probabilities of a shot."""
     label_by_variable = {
         "pfa_bin": "one bin, noise", "pfa_segment": "up-chirp segment, noise",
@@ -656,7 +656,7 @@ def _false_alarm_table(shot: SimulatedShot) -> PageTable:
         "p_leakage_down": "down-chirp segment, leakage",
     }  # fmt: skip
     rows = [(label, f"{shot.outputs[name]:.4e}") for name, label in label_by_variable.items()]
-    return PageTable("False alarms", ("", "probability"), rows)
+    return TextTable("False alarms", ("", "probability"), rows)
 
 
 REPORTED_AXIS_VALUES_MAX = 3
@@ -835,12 +835,12 @@ def _describe_shared_parameters(shots: list[SimulatedShot]) -> str:
     )
 
 
-def _shot_tables(shots: list[SimulatedShot]) -> list[PageTable]:
+def _shot_tables(shots: list[SimulatedShot]) -> list[TextTable]:
     """Return the tables of all shots; their headings begin with the label of the shot."""
     tables = []
     for shot in shots:
         prefix = f"{shot.label}: " if shot.label else ""
-        parameter_table = PageTable(
+        parameter_table = TextTable(
             f"{prefix}Shot",
             ("parameter", "value"),
             _format_parameters(shot, _REPORTED_PARAMETER_PATHS),
@@ -853,6 +853,6 @@ def _shot_tables(shots: list[SimulatedShot]) -> list[PageTable]:
         ]
         tables += [
             parameter_table,
-            *(PageTable(prefix + b.heading, b.columns, b.rows) for b in further_tables),
+            *(TextTable(prefix + b.heading, b.columns, b.rows) for b in further_tables),
         ]
     return tables

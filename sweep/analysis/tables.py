@@ -42,7 +42,7 @@ TableCell = str | float | int
 
 
 @dataclass(frozen=True)
-class PageTable:
+class TextTable:
     """Heading, column names and rows of a table on a page."""
 
     heading: str
@@ -59,7 +59,7 @@ class TablePage:
 
     title: str
     """Title of the page."""
-    page_tables: Sequence[PageTable]
+    page_tables: Sequence[TextTable]
     """Tables of the page, from top to bottom."""
     notes: Sequence[str]
     """Lines of text below the tables."""
@@ -69,7 +69,9 @@ class TablePage:
     def to_text(self) -> str:
         """Return the page as plain text."""
         parts = [f"{self.title}\n{'=' * len(self.title)}"]
-        parts += [f"{b.heading}\n\n{align_columns(b.columns, b.rows)}" for b in self.page_tables]
+        parts += [
+            f"{b.heading}\n\n{format_aligned_table(b.columns, b.rows)}" for b in self.page_tables
+        ]
         parts += ["\n".join(self.notes)] if self.notes else []
         return "\n\n".join(parts) + "\n"
 
@@ -90,7 +92,7 @@ def format_cell(cell: TableCell) -> str:
     return str(cell)
 
 
-def align_columns(columns: Sequence[str], rows: Sequence[Sequence[TableCell]]) -> str:
+def format_aligned_table(columns: Sequence[str], rows: Sequence[Sequence[TableCell]]) -> str:
     """Return a table as text with aligned columns: words to the left, numbers to the right."""
     cells = [list(columns), *([format_cell(cell) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
@@ -212,7 +214,7 @@ def _pivot_table(
     record_key: str,
     records: list[dict[str, TableCell]],
     column_names: list[str],
-) -> PageTable:
+) -> TextTable:
     """Return a table with the value under one key of each record.
 
     The records' entries `row` and `column` state the place in the table. `corner` is the heading of
@@ -221,7 +223,7 @@ def _pivot_table(
     rows: dict[str, list[TableCell]] = {}
     for record in records:
         rows.setdefault(str(record["row"]), []).append(record[record_key])
-    return PageTable(
+    return TextTable(
         heading, (corner, *column_names), [(name, *cells) for name, cells in rows.items()]
     )
 
@@ -238,7 +240,7 @@ def single_point_page(dataset: xr.Dataset) -> TablePage:
         for name, array in sorted(dataset.data_vars.items())
     ]
     columns = ("variable", "value", "units", "meaning")
-    outputs_table = PageTable("Outputs of the point", columns, [tuple(r.values()) for r in records])
+    outputs_table = TextTable("Outputs of the point", columns, [tuple(r.values()) for r in records])
     return TablePage(str(dataset.attrs.get("title", "")), [outputs_table], [], records)
 
 
@@ -530,7 +532,7 @@ _FALSE_ALARM_NOTES = (
 
 def _record_table(
     heading: str, columns: Mapping[str, tuple[str, str]], records: Sequence[dict[str, TableCell]]
-) -> PageTable:
+) -> TextTable:
     """Return a table with a row for each record.
 
     `columns` are the record key and the number format of each column, by column name.
@@ -542,7 +544,7 @@ def _record_table(
         ]
         for record in records
     ]
-    return PageTable(heading, tuple(columns), rows)
+    return TextTable(heading, tuple(columns), rows)
 
 
 def _format_record_value(value: TableCell, number_format: str) -> TableCell:

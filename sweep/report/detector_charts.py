@@ -429,7 +429,7 @@ UNBROKEN_RANGE_LABEL = "kept all the way"
 LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_RANGE_LABEL: "unbroken", "reached at all": "farthest"}
 """Variable of :func:`.detection_limits.limit` for each of two kinds of maximum range, by label."""
 
-INTERVAL_END_LABELS = {"low": "lower end", "high": "upper end"}
+INTERVAL_END_LABEL_BY_SUFFIX = {"low": "lower end", "high": "upper end"}
 """Column name for each end of the maximum range's confidence interval, by the variable's suffix."""
 
 MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {REPORTED_PD_LEVEL:g}"
@@ -653,7 +653,7 @@ def _maximum_range_table(max_ranges: Sequence[NamedPart], range_label: str) -> H
         for answer_label, answer in LIMIT_VARIABLE_BY_LABEL.items():
             label_by_end = {
                 f"{answer}_{end_name}": end_label
-                for end_name, end_label in INTERVAL_END_LABELS.items()
+                for end_name, end_label in INTERVAL_END_LABEL_BY_SUFFIX.items()
             }
             rows.append(
                 {

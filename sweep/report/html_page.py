@@ -443,7 +443,7 @@ def render_html(page: ReportPage) -> str:
         "table_json": _table_json,
         "download": _data_url,
     }
-    environment.globals |= {"chart_json": _chart_json}
+    environment.globals |= {"chart_json": _plot_json}
     script_path = Path(options.dt_bundle)
     return environment.get_template("report.html").render(
         page=page,
@@ -459,7 +459,7 @@ def _compress_base64(text: str) -> str:
     return b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
-def _chart_json(plot: InteractivePlot) -> str:
+def _plot_json(plot: InteractivePlot) -> str:
     """Return a plot as JSON for the page's script."""
     relayouts: dict[str, Any] = {
         c.name: dict(c.relayout_by_option) for c in plot.controls if c.relayout_by_option

@@ -238,7 +238,7 @@ def _spec_and_effects_section(
     items = [
         _axis_table(spec),
         _effect_table(effect_flags, spec.effect_modes()),
-        _field_table(spec),
+        _spec_field_table(spec),
     ]
     return _page_section(
         "asked", "What was asked and simulated", items, accuracy_sentences(dataset, spec)
@@ -356,7 +356,7 @@ def _scene_report(store: Location) -> ReportPage:
                 *flight_charts.point_count_sentences(
                     point_count_table.frame, scanner_datasets, n_omitted
                 ),
-                *consistency_sentences(results.tree),
+                *error_consistency_sentences(results.tree),
             ],
         ),
         _page_section(
@@ -374,7 +374,7 @@ def _scene_report(store: Location) -> ReportPage:
     return _report_page(spec, attributes, "blocks", key_facts, sections, store)
 
 
-def consistency_sentences(tree: xr.DataTree) -> list[str]:
+def error_consistency_sentences(tree: xr.DataTree) -> list[str]:
     """Return sentences on how a flight's errors compare with their stated standard errors."""
     results = check_error_consistency(tree)
     if messages := [result.message for result in results if not result.is_consistent]:
@@ -465,20 +465,24 @@ def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTabl
     return HtmlTable("Points", _table_share_caption(len(frame), n_total), frame, "points")
 
 
-def _field_table(spec: AnySpec) -> HtmlTable:
+def _spec_field_table(spec: AnySpec) -> HtmlTable:
     """Return a table of the spec's fields, with their values and descriptions."""
     rule_by_path = parameter_rules()
     spec_mapping = spec.to_yaml_mapping()
     rows = [
-        (path, _format_field(value), rule_by_path[path].description if path in rule_by_path else "")
-        for path, value in _iter_fields(spec_mapping)
+        (
+            path,
+            _format_field_value(value),
+            rule_by_path[path].description if path in rule_by_path else "",
+        )
+        for path, value in _iter_spec_fields(spec_mapping)
         if path.split(".")[0] not in ("title", "question", "figures", "axes", "effects")
     ]
     frame = pandas.DataFrame(rows, columns=["field", "value", "meaning"])
     return HtmlTable("Every field", ["Defaults included."], frame, "fields")
 
 
-def _iter_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _iter_spec_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted path and the value of every field of a nested mapping.
 
     `prefix` is the beginning of every path.
@@ -486,12 +490,12 @@ def _iter_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple
     for name, value in mapping.items():
         path = f"{prefix}{name}"
         if isinstance(value, Mapping) and value:
-            yield from _iter_fields(value, f"{path}.")
+            yield from _iter_spec_fields(value, f"{path}.")
         else:
             yield path, value
 
 
-def _format_field(value: object) -> str:
+def _format_field_value(value: object) -> str:
     """Return the value of a field as text of at most 120 characters."""
     value_text = (
         value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)

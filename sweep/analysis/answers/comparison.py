@@ -186,7 +186,7 @@ def _pandas_index_of_dimension(dataset: xr.Dataset, dim: str) -> pandas.Index:
     coords = [c for c in dataset.coords.values() if c.dims == (dim,)]
     if not coords:
         return pandas.RangeIndex(dataset.sizes[dim])
-    columns = [_round_significant(np.asarray(coordinate_in_si(c).values)) for c in
+    columns = [_round_to_12_digits(np.asarray(coordinate_in_si(c).values)) for c in
                sorted(coords, key=lambda c: str(c.attrs.get("path", c.name)))]  # fmt: skip
     index = columns[0] if len(columns) == 1 else pandas.MultiIndex.from_arrays(columns)
     index = pandas.Index(index)
@@ -199,7 +199,7 @@ def _pandas_index_of_dimension(dataset: xr.Dataset, dim: str) -> pandas.Index:
     return index
 
 
-def _round_significant(values: np.ndarray) -> np.ndarray:
+def _round_to_12_digits(values: np.ndarray) -> np.ndarray:
     """Round numbers to 12 significant digits; leave other types unchanged."""
     if values.dtype.kind not in "fiu":
         return values

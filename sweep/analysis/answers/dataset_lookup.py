@@ -164,7 +164,7 @@ def parse_pd_level(pd: object) -> float:
     return level
 
 
-def find_coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
+def coordinate_by_name_or_path(dataset: xr.Dataset, name: str) -> xr.DataArray:
     """Return a dataset's coordinate, given its name or the dotted path of its parameter.
 
     Raise ValueError if there is none.
@@ -257,7 +257,7 @@ def select_points(
     if method not in (None, "nearest"):
         raise ValueError(f"method '{method}' is unknown: take 'nearest', or none")
     for name, selected in selection.items():
-        coord = find_coordinate(dataset, name)
+        coord = coordinate_by_name_or_path(dataset, name)
         indices = _indices_of_selection(coord, selected, method)
         if not coord.dims:
             continue

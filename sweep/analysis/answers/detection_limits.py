@@ -14,7 +14,11 @@ import xarray as xr
 from contourpy import contour_generator
 from scipy.special import ndtri
 
-from sweep.analysis.answers.dataset_lookup import find_coordinate, parse_pd_level, require_variables
+from sweep.analysis.answers.dataset_lookup import (
+    coordinate_by_name_or_path,
+    parse_pd_level,
+    require_variables,
+)
 from sweep.analysis.answers.probability import (
     confidence_level_attributes,
     pd_half_width,
@@ -131,7 +135,7 @@ def limit(
     interpolated linearly. It is defined by pd = Phi(z), with the normal distribution function Phi.
     """
     level = parse_pd_level(pd)
-    coord = find_coordinate(dataset, along)
+    coord = coordinate_by_name_or_path(dataset, along)
     pd_name = segment_variable_name("pd", segment)
     require_variables(dataset, pd_name)
     sorted_dataset, dim = _sort_by_coordinate(dataset, coord, from_highest)
@@ -349,7 +353,10 @@ def contour(
         A coordinate does not exist, or the dataset has more than two dimensions.
     """
     level = parse_pd_level(pd)
-    x_coord, y_coord = find_coordinate(dataset, x), find_coordinate(dataset, y)
+    x_coord, y_coord = (
+        coordinate_by_name_or_path(dataset, x),
+        coordinate_by_name_or_path(dataset, y),
+    )
     pd_name = segment_variable_name("pd", segment)
     require_variables(dataset, pd_name)
     array = dataset[pd_name]

@@ -41,9 +41,9 @@ from sweep.model.waveform import SEGMENT_NAMES
 from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
 
-_Flags = TypeVar("_Flags", np.ndarray, xr.DataArray)
+_FlagArray = TypeVar("_FlagArray", np.ndarray, xr.DataArray)
 
-_PARAMETER_PATHS = (
+_CRAMER_RAO_PARAMETER_PATHS = (
     RECEIVER_PREFIX + "architecture",
     LASER_PREFIX + "wavelength",
     LASER_PREFIX + "line_width",
@@ -70,7 +70,7 @@ _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
 """Names of the effects that are simulated by random draws."""
 
 
-class _LineEffects(NamedTuple):
+class _LineEffectMasks(NamedTuple):
     """Flags (n,) of simulated effects on which the bound for a given SNR depends.
 
     Fields have the names of the effects.
@@ -138,7 +138,9 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     spec = grid_spec_of_dataset(dataset)
     snr_names = [f"snr_{name}" for name in SEGMENT_NAMES]
     require_variables(dataset, *snr_names, "effects", f"{quantity}_error")
-    parameters = {path: parameter_in_si(dataset, path, spec) for path in _PARAMETER_PATHS}
+    parameters = {
+        path: parameter_in_si(dataset, path, spec) for path in _CRAMER_RAO_PARAMETER_PATHS
+    }
     snr = [dataset[name] for name in snr_names]
 
     def point_bounds(
@@ -241,7 +243,7 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
     )
 
 
-def _is_simulated(effect: str, effect_flags: _Flags) -> _Flags:
+def _is_simulated(effect: str, effect_flags: _FlagArray) -> _FlagArray:
     """Return a mask of the points at which an effect is simulated, from their flags of effects."""
     return (effect_flags & (1 << EFFECT_NAMES.index(effect))) > 0
 
@@ -267,7 +269,7 @@ def _point_deviations(
     effects
         Flags of the simulated effects that change lines.
     parameters
-        SI values at each point of the parameters in `_PARAMETER_PATHS`.
+        SI values at each point of the parameters in `_CRAMER_RAO_PARAMETER_PATHS`.
     """
     shape = np.broadcast_shapes(
         *(np.shape(values) for values in (*snr, *effects, *parameters.values()))
@@ -285,7 +287,7 @@ def _point_deviations(
     for rows, category_parameters in categories:
         deviations[:, :, rows] = _deviations_of_category(
             [values[rows] for values in flat_snr],
-            _LineEffects(*(flags[rows] for flags in flat_effects)),
+            _LineEffectMasks(*(flags[rows] for flags in flat_effects)),
             category_parameters,
         )
     return _PointDeviations(

@@ -21,7 +21,7 @@ from sweep.storage.locations import Location
 CONSISTENT_ERROR_RATIO_MAX = 2.0
 """Largest ratio of actual errors to stated standard errors at which they count as consistent."""
 
-_JUDGED_ERRORS_MIN = 20
+_ERRORS_FOR_JUDGEMENT_MIN = 20
 """Least number of errors from which their consistency with standard errors is judged."""
 
 _SAMPLED_SHOTS_MAX, _SAMPLED_DRAWS_MAX, _SAMPLED_VALUES_PER_AXIS_MAX = 1 << 15, 16, 6
@@ -33,7 +33,7 @@ _N_SAMPLED_FLIGHT_INTERVALS = 16
 _COMPARED_QUANTILE_LEVELS = 0.6827, 0.9545
 """Levels (0..1) at which quantiles of actual errors are compared with those of normal errors."""
 
-_SCALAR_NORMAL_QUANTILES, _VECTOR_NORMAL_QUANTILES = (1.0, 2.0), (1.8780, 2.8328)
+_SCALAR_NORMAL_ERROR_QUANTILES, _VECTOR_NORMAL_ERROR_QUANTILES = (1.0, 2.0), (1.8780, 2.8328)
 """Quantiles at 68.27 % and 95.45 % of the length of a normal error, in standard errors.
 
 The first pair is for a number, the second for a vector of three components.
@@ -66,7 +66,8 @@ class ConsistencyResult(NamedTuple):
     def is_consistent(self) -> bool:
         """True if errors are about as large as stated, or too few for a judgement."""
         return (
-            self.n_errors < _JUDGED_ERRORS_MIN or not self.error_ratio > CONSISTENT_ERROR_RATIO_MAX
+            self.n_errors < _ERRORS_FOR_JUDGEMENT_MIN
+            or not self.error_ratio > CONSISTENT_ERROR_RATIO_MAX
         )
 
     @property
@@ -112,9 +113,9 @@ def check_error_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
             error_ratio = float("nan")
             if normalised_errors.size:
                 reference_quantiles = (
-                    _VECTOR_NORMAL_QUANTILES
+                    _VECTOR_NORMAL_ERROR_QUANTILES
                     if quantity == _VELOCITY_QUANTITY
-                    else _SCALAR_NORMAL_QUANTILES
+                    else _SCALAR_NORMAL_ERROR_QUANTILES
                 )
                 error_ratio = np.max(
                     np.quantile(normalised_errors, _COMPARED_QUANTILE_LEVELS) / reference_quantiles

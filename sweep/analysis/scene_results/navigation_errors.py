@@ -14,7 +14,7 @@ from sweep.analysis import labels
 from sweep.analysis.charts import LINEAR_SCALE, LOG_SCALE, Chart, ChartAxis, ChartLine, Panel
 from sweep.analysis.datasets import chunk_aligned_slices, stored_chunk_length
 from sweep.analysis.scene_results.recordings import Recording
-from sweep.analysis.tables import PageTable, TableCell, TablePage
+from sweep.analysis.tables import TableCell, TablePage, TextTable
 from sweep.model.pointcloud.navigation import STATUS_EXCLUDED, STATUS_SOLVED
 
 VELOCITY_QUANTITY, ALTITUDE_QUANTITY = "velocity", "altitude"
@@ -454,7 +454,7 @@ def navigation_error_page(
         ]
         columns = [name for name in curve_records[0] if name != "scanner"]
         rows = [[record[name] for name in columns] for record in curve_records]
-        page_tables.append(PageTable(f"{curve.label}: {curve.quantity}", columns, rows))
+        page_tables.append(TextTable(f"{curve.label}: {curve.quantity}", columns, rows))
         records += curve_records
     units = ", ".join(dict.fromkeys(UNIT_BY_QUANTITY[curve.quantity] for curve in curves))
     notes = [

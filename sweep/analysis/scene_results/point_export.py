@@ -148,7 +148,7 @@ class PointTable:
         return low, high
 
 
-Remarks = Sequence[str]
+FileRemarks = Sequence[str]
 """Remarks on the contents of a file. Writers put them into the file if its format allows."""
 
 _PLY_TYPE_BY_DTYPE = {
@@ -157,7 +157,7 @@ _PLY_TYPE_BY_DTYPE = {
 """Name of the PLY type of a column, by the column's NumPy type."""
 
 
-def write_ply(table: PointTable, file_path: Path, remarks: Remarks) -> int:
+def write_ply(table: PointTable, file_path: Path, remarks: FileRemarks) -> int:
     """Write a binary PLY file with the columns as properties; return the number of points."""
     n_points = table.count_points()
     comments = [*remarks, *(f"{name}: {remark}" for name, remark in REMARK_BY_COLUMN.items())]
@@ -181,7 +181,7 @@ def write_ply(table: PointTable, file_path: Path, remarks: Remarks) -> int:
     return n_points
 
 
-def write_csv(table: PointTable, file_path: Path, remarks: Remarks) -> int:
+def write_csv(table: PointTable, file_path: Path, remarks: FileRemarks) -> int:
     """Write a CSV file with names and units in the first line, in full precision.
 
     Return the number of points.
@@ -224,7 +224,7 @@ LAS_UNCLASSIFIED_CLASS, LAS_NOISE_CLASS = 1, 7
 
 
 def write_las(
-    table: PointTable, file_path: Path, remarks: Remarks, *, compressed: bool = False
+    table: PointTable, file_path: Path, remarks: FileRemarks, *, compressed: bool = False
 ) -> int:
     """Write a LAS 1.4 file of point format 6; return the number of points.
 
@@ -330,7 +330,7 @@ def _assign_return_numbers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return return_numbers, return_counts
 
 
-WRITER_BY_SUFFIX: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
+WRITER_BY_SUFFIX: dict[str, Callable[[PointTable, Path, FileRemarks], int]] = {
     ".ply": write_ply,
     ".las": write_las,
     ".laz": partial(write_las, compressed=True),
