@@ -120,7 +120,7 @@ class MeasuredSetting:
 
     @property
     def fastest_seconds_per_point(self) -> float:
-        """Time per point in the fastest round of measurement [s]."""
+        """Computing time per point in the fastest round of measurement [s]."""
         return float(np.min(self.seconds_per_point_by_round))
 
     @property
@@ -138,8 +138,8 @@ class MeasuredSetting:
     def is_leakage_error_acceptable(self) -> bool:
         """False if the setting is a closed form whose leakage error exceeds its other errors.
 
-        Closed forms omit leakage, the probability of false peaks due to window sidelobes. Other
-        settings include it, and for them the result is True.
+        Closed forms of pd omit leakage, the probability of false peaks due to window sidelobes. For
+        settings of any other kind, which include leakage, the result is True.
         """
         return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
             self.largest_error, NEGLIGIBLE_ERROR
@@ -201,17 +201,17 @@ def read_measured_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
 def select_settings_of_kinds(
     settings: Iterable[MeasuredSetting], *kinds: str
 ) -> list[MeasuredSetting]:
-    """Return the settings of the given kinds."""
+    """Return a list of the settings whose kind is one of the given ones."""
     return [setting for setting in settings if setting.kind in kinds]
 
 
 def drop_reference_setting(settings: Iterable[MeasuredSetting]) -> list[MeasuredSetting]:
-    """Return all settings except the reference, which has no error by definition."""
+    """Return a list of the settings without the reference, which has no error by definition."""
     return [setting for setting in settings if setting.kind != REFERENCE_KIND]
 
 
 def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
-    """Return the settings that no other beats in both time and error, fastest first."""
+    """Return the settings that no other setting beats in both time and error, fastest first."""
     front_settings: list[MeasuredSetting] = []
     for setting in sorted(settings, key=lambda s: (s.fastest_seconds_per_point, s.largest_error)):
         if not front_settings or max(setting.largest_error, NEGLIGIBLE_ERROR) < max(
@@ -224,7 +224,7 @@ def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
 def fastest_setting_within_error(
     settings: Sequence[MeasuredSetting], error_max: float
 ) -> MeasuredSetting | None:
-    """Return the fastest setting whose error is at most ``error_max``, or None."""
+    """Return the fastest setting whose error is at most ``error_max``; None if there is none."""
     error_limit = max(error_max, NEGLIGIBLE_ERROR)
     accurate_settings = [setting for setting in settings if setting.largest_error <= error_limit]
     return min(accurate_settings, key=lambda s: s.fastest_seconds_per_point, default=None)
@@ -389,7 +389,7 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
 
 
 def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> TablePage:
-    """Return a page with the tables and conclusions of a measurement of accuracy."""
+    """Return a page with the tables and the conclusions of an accuracy measurement."""
     page_tables = [
         TextTable("Settings", SETTING_TABLE_COLUMNS, setting_table_rows(settings)),
         TextTable(
@@ -440,7 +440,7 @@ def _spec_as_written_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredS
 def _fixed_setting_sentences(
     comparisons: Sequence[SettingComparison], attributes: dict
 ) -> list[str]:
-    """Return the sentences that compare adaptive with fixed settings."""
+    """Return a list of sentences that compare adaptive settings with fixed settings."""
     if not comparisons:
         return []
     worst_comparison = min(comparisons, key=SettingComparison.speedup)
@@ -467,9 +467,9 @@ def _fixed_setting_sentences(
 def _slowdown_text(
     worst_comparison: SettingComparison, comparisons: Sequence[SettingComparison], attributes: dict
 ) -> str:
-    """Return a text that says by how much adaptive settings miss the speed of fixed settings.
+    """Return a text on how much slower adaptive settings are than fixed settings.
 
-    The text gives the extra time for the whole study, the time of planning, and the smallest
+    The text gives the extra time for the complete study, the time of planning, and the smallest
     speed-up with the time to store results included. `worst_comparison` is the comparison with the
     smallest speed-up among `comparisons`.
     """
@@ -563,7 +563,7 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
 
 
 def _reference_setting_sentences(attributes: dict) -> str:
-    """Return sentences that name the reference setting and its error against the time domain."""
+    """Return a text that names the reference setting and its error against the time domain."""
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
         return text + ". It is not compared with the time domain."
@@ -581,7 +581,7 @@ def _reference_setting_sentences(attributes: dict) -> str:
 
 
 def _format_duration(seconds: float) -> str:
-    """Return a duration [s] as text in seconds, minutes or hours."""
+    """Return a duration, given in seconds, as text in seconds, minutes or hours."""
     if seconds < 100:
         return f"{seconds:.2g} s"
     return f"{seconds / 60:,.0f} min" if seconds < 6000 else f"{seconds / 3600:,.0f} h"
@@ -707,7 +707,7 @@ def _draw_setting_mark(
 
 
 def _setting_plot_position(setting: MeasuredSetting) -> tuple[float, float]:
-    """Return the time [us] and the error at which a setting is drawn."""
+    """Return the time [us] and the error at which the figure shows a setting."""
     return 1e6 * setting.fastest_seconds_per_point, max(setting.largest_error, NEGLIGIBLE_ERROR)
 
 
@@ -723,7 +723,7 @@ def _short_setting_name(setting: MeasuredSetting) -> str:
 
 
 def _set_time_and_error_axes(axes: Axes, error_min: float, error_max: float) -> None:
-    """Set logarithmic axes of time and error, with limits, labels and legend."""
+    """Set limits, labels and legend of logarithmic axes of time and error, in place."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(max(NEGLIGIBLE_ERROR, error_min) / 2, max(2.5, 2 * error_max))
@@ -740,7 +740,7 @@ def _set_time_and_error_axes(axes: Axes, error_min: float, error_max: float) -> 
 
 
 def _sheet_caption(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
-    """Return the caption of the figure: the marks, the reference and the study."""
+    """Return the caption of the figure, on the meaning of marks, the reference and the study."""
     attributes = dataset.attrs
     error_quantile_level = settings[0].error_quantile_level
     mark_meaning = (
@@ -789,10 +789,10 @@ def open_accuracy_store(store: Location) -> AccuracyResults:
 def write_figure_and_tables(
     store: Location, directory: Path | None = None, picture_format: str = "png"
 ) -> list[Path]:
-    """Write the figure and the tables of a store NAME.zarr of `sweep accuracy`.
+    """Write the figure and the tables of a store of `sweep accuracy`; return the written files.
 
-    The files are NAME.png (or pdf, svg) and NAME.txt in the directory, or next to the store. Their
-    paths are returned.
+    For a store NAME.zarr the files are NAME.png (or pdf, svg) and NAME.txt in the directory.
+    Without a directory they lie next to the store.
     """
     dataset, settings = open_accuracy_store(store)
     stem = store.name.removesuffix(".zarr")

@@ -38,7 +38,7 @@ PNG_DPI = 150
 COLOUR_MAP_NAME = "viridis"
 """Name of the colour map of matplotlib for all continuous quantities."""
 MISSING_VALUE_COLOUR = "0.75"
-"""Grey of missing values: nan, or a point that is not computed yet."""
+"""Grey for missing values, which are nan or belong to points that are not computed yet."""
 
 LINE_COLOURS = (
     "#0072B2",
@@ -50,10 +50,13 @@ LINE_COLOURS = (
     "#000000",
     "#785A2D",
 )
-"""Colours of lines by Okabe and Ito (2008), and a brown that red-blind readers distinguish."""
+"""Colours of lines by style index: those of Okabe and Ito (2008), and a brown.
+
+Red-blind readers distinguish the brown from the other colours.
+"""
 
 DASH_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
-"""Dash styles of lines, in matplotlib's notation."""
+"""Dash styles of lines in matplotlib's notation, by style index."""
 
 
 PICTURE_FORMATS = ("png", "pdf", "svg")
@@ -90,7 +93,7 @@ _OMITTED_METADATA_BY_FORMAT: dict[str, dict[str, str | None]] = {
 
 @contextmanager
 def uniform_style() -> Iterator[None]:
-    """Context manager: apply the common style of all pictures in place of the user's settings."""
+    """Context manager that applies the common style of all pictures, not the user's settings."""
     with rc_context():
         rcdefaults()
         rcParams.update(MATPLOTLIB_RC_PARAMS)
@@ -108,7 +111,7 @@ class SheetWithAxes(NamedTuple):
     """Sheet with a grid of axes."""
 
     sheet: Sheet
-    """The sheet."""
+    """Sheet that holds the axes."""
     axes: list[Axes]
     """Axes of the panels, row by row."""
 
@@ -116,21 +119,21 @@ class SheetWithAxes(NamedTuple):
 def sheet_with_axes(
     width: float, height: float, rows: int, columns: int, **options: Any
 ) -> SheetWithAxes:
-    """Return a sheet of the given size [inches] with a grid of axes, listed row by row."""
+    """Return a sheet of the given size [inches] with a grid of axes, and the axes row by row."""
     new_sheet = blank_sheet(width, height)
     axes = new_sheet.subplots(rows, columns, squeeze=False, **options)
     return SheetWithAxes(new_sheet, list(axes.ravel()))
 
 
 def message_sheet(message: str) -> Sheet:
-    """Return a sheet that shows only a message, for figures without data."""
+    """Return a sheet that shows only a message, in place of a figure without data."""
     new_sheet = blank_sheet(8.0, 2.0)
     new_sheet.text(0.5, 0.5, message, ha="center", va="center", color="0.3", parse_math=False)
     return new_sheet
 
 
 def set_title(target_sheet: Sheet, text: str) -> None:
-    """Set the title of a sheet as plain text: a dollar sign does not start a formula."""
+    """Set the title of a sheet as plain text, in which a dollar sign does not start a formula."""
     target_sheet.suptitle(text, fontsize=11, fontweight="bold", parse_math=False)
 
 
@@ -290,7 +293,10 @@ def _draw_heat_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
 
 
 def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> None:
-    """Draw labelled contours in black with a pale outline, which is visible on every colour."""
+    """Draw labelled contours of a heat map on axes, in black with a pale outline.
+
+    Such contours are visible on every colour.
+    """
     levels_in_range = [
         level for level in heat_map.contour_levels if values.min() < level < values.max()
     ]
@@ -382,7 +388,7 @@ def _draw_line_panels(chart: Chart) -> Sheet:
 
 
 def _split_crowded_panels(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]:
-    """Split panels with too many lines into one panel per line.
+    """Return panels with one line each in place of panels with too many lines.
 
     Returns
     -------

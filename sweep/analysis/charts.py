@@ -39,7 +39,7 @@ LINEAR_SCALE, LOG_SCALE, CATEGORY_SCALE = "linear", "log", "category"
 """Scales of axes: linear, logarithmic, or categories."""
 
 PROBABILITY_AXIS_LIMITS = (-0.03, 1.03)
-"""Limits of an axis that shows probabilities."""
+"""Lower and upper limit of an axis that shows probabilities."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class ChartAxis:
     """Axis of a panel."""
 
     label: str = ""
-    """Label with units."""
+    """Label of the axis, with units."""
     scale: str = LINEAR_SCALE
-    """Scale: ``linear``, ``log`` or ``category``."""
+    """Scale of the axis: ``linear``, ``log`` or ``category``."""
     limits: tuple[float | None, float | None] | None = None
-    """Lowest and highest value; None for the extent of the data."""
+    """Lowest and highest value of the axis; None for the extent of the data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class ChartLine:
     x: np.ndarray
     """Positions of the values along the horizontal axis (n,)."""
     y: np.ndarray
-    """Values (n,); nan where missing."""
+    """Values of the line (n,); nan where missing."""
     name: str = ""
     """Name of the line in the legend."""
     style_index: int = 0
@@ -91,9 +91,9 @@ class HeatMap:
     y: np.ndarray
     """Positions of the rows of cells along the vertical axis."""
     values: np.ndarray
-    """Values (rows, columns); nan where missing."""
+    """Values of the cells (rows, columns); nan where missing."""
     contour_levels: Sequence[float] = ()
-    """Values at which contours are drawn."""
+    """Values of the map at which contours are drawn."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Chart:
     heading: str
     """Heading above the figure."""
     alt: str
-    """Text for readers who can't see the figure."""
+    """Text of the figure for readers who can't see it."""
     caption: Sequence[str]
     """Phrases of the caption, which become sentences."""
     panels: Sequence[Panel]
@@ -172,9 +172,9 @@ class ChartSizeLimits:
     parts_max: int
     """Largest number of parts of the study that a chart shows. Each part has a panel."""
     columns_max: int
-    """Largest number of columns of cells in a row of heat maps."""
+    """Largest total number of columns of cells in heat maps that are side by side."""
     rows_max: int
-    """Largest number of rows of cells in a heat map."""
+    """Largest number of rows of cells in one heat map."""
     cells_max: float
     """Largest number of cells of all heat maps together."""
     maps_per_row: int
@@ -184,9 +184,9 @@ class ChartSizeLimits:
 SHEET_CHART_SIZE_LIMITS = ChartSizeLimits(
     parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_per_row=2
 )
-"""Limits of charts on sheets (matplotlib figures).
+"""Limits of the size of charts on sheets (matplotlib figures).
 
-A heat map has no more cells than pixels, so that no cell is lost.
+A heat map has no more cells than the sheet has pixels for it, so that no cell is lost.
 """
 
 LINES_PER_PANEL_MAX = 8
@@ -202,7 +202,7 @@ _LOG_SCALE_DECADES_MIN = 3
 """Decades between median and largest value above which a colour scale is logarithmic."""
 
 _LARGEST_IS_WORST_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
-"""Prefixes of the names of variables whose largest value is the worst one."""
+"""Beginnings of the names of variables whose largest value is the worst one."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ class CoordinateAxis:
 
     @classmethod
     def from_points(cls, points: PointSelection, name: str) -> CoordinateAxis:
-        """Return the axis for a coordinate of a selection of points."""
+        """Return the axis for the named coordinate of a selection of points."""
         values, units = np.unique(points.coordinate_values(name)), points.coordinate_units(name)
         if labels.is_categorical(values):
             return cls(ChartAxis(labels.coordinate_label(name), CATEGORY_SCALE), 1.0, "")
@@ -235,7 +235,7 @@ class CoordinateAxis:
         return values * self.unit_factor
 
     def describe_span(self, values: np.ndarray) -> str:
-        """Return a text with the label of the axis, and the first and last value."""
+        """Return a text with the axis's label, and the first and the last of the given values."""
         axis_values = self.to_axis_units(values)
         end_texts = [
             labels.format_quantity(v, self.units) for v in (axis_values[0], axis_values[-1])
@@ -244,7 +244,7 @@ class CoordinateAxis:
 
 
 def is_log_spaced(values: np.ndarray) -> bool:
-    """Return True if values have about equal ratios and span at least a decade."""
+    """Return True if values span at least a decade, with about equal ratios of neighbours."""
     if values.size < 3 or values.min() <= 0 or values.max() < 10 * values.min():
         return False
     steps = np.diff(np.log(values))
@@ -443,7 +443,7 @@ def _map_cells_max(
 def _arrange_on_plane(
     points: PointSelection, variable: str, x: str, y: str
 ) -> tuple[PointSelection, SortedCoordinate, SortedCoordinate]:
-    """Arrange the points of a heat map on a plane of two dimensions.
+    """Return the points of a heat map on a plane of two dimensions, and their two coordinates.
 
     If x and y lie along one zipped axis, the points are rearranged on a grid of both.
 
@@ -555,9 +555,9 @@ class LabelledLinePoints(NamedTuple):
     part_name: str
     """Name of the part of the study, and of the panel, to which the line belongs."""
     line_name: str
-    """Name of the line."""
+    """Name of the line in the legend."""
     points: PointSelection
-    """Points of the line."""
+    """Points of the study that the line shows."""
 
 
 class ShownLines(NamedTuple):
@@ -638,7 +638,7 @@ def make_line_panels(
 
 
 def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
-    """Return the alternative text of a chart of lines: the extent of each line of a panel."""
+    """Return a chart's text for readers who can't see it: the extent of each line of a panel."""
     line_texts = [
         f"{line.name or 'the line'}: {labels.describe_value_extent(line.y)}" for line in panel.lines
     ]

@@ -61,7 +61,7 @@ _DESCRIPTION_BY_STORE_KIND = {
         "the eyepoints of a flight, which point clouds are made of: open one of those"
     ),
 }
-"""Descriptions of the kinds of stores, with the function that opens each."""
+"""Description of each kind of store, with the function that opens it, for error messages."""
 
 
 def open(
@@ -148,7 +148,7 @@ def _datasets_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
 
 
 def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset with its coordinates in memory, and text coordinates as NumPy strings."""
+    """Return a dataset with all coordinates in memory, and text coordinates as NumPy strings."""
     loaded = {name: array.compute() for name, array in dataset.coords.items()}
     return dataset.assign_coords({
         name: array.copy(data=np.array(array.values.tolist(), str))
@@ -210,9 +210,10 @@ def open_scene(path: str | Location) -> xr.DataTree:
 
 
 def open_scene_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
-    """Open a scene's store as :func:`open_scene` does, with given sizes of Dask chunks.
+    """Return the tree of a scene's store as :func:`open_scene` does, with given Dask chunks.
 
-    With ``chunks=None`` no Dask array is made: values are read when an array is sliced.
+    `chunks` has the length of chunks by dimension; {} stands for the stored chunks. With
+    ``chunks=None`` no Dask array is made: values are read when an array is sliced.
     """
     attributes = read_attributes_of_kind(store_path, SCENE_STORE_KIND)
     require_intact_coordinates(store_path)
@@ -243,7 +244,7 @@ _NAME_BY_OLD_MAP_VARIABLE = {"map_x": "x", "map_y": "y", "map_height": "height"}
 
 
 def _count_chunks(array: xr.DataArray) -> int:
-    """Return the number of chunks in which an array is stored."""
+    """Return the number of chunks of an array in its store."""
     return math.prod(map(math.ceil, np.divide(array.shape, array.encoding["chunks"])))
 
 
@@ -257,8 +258,8 @@ def chunk_aligned_slices(
 ) -> list[slice]:
     """Return consecutive slices that cover a dimension of an array.
 
-    Each slice consists of complete stored chunks. It has at most `slice_length_max` elements, or
-    one chunk if chunks are longer.
+    Each slice consists of complete stored chunks. A slice has at most `slice_length_max` elements,
+    or one chunk if a chunk is longer.
     """
     length, stored_chunk = array.sizes[dim], stored_chunk_length(array, dim)
     step = stored_chunk * max(1, slice_length_max // stored_chunk)
@@ -295,7 +296,8 @@ def require_intact_coordinates(store_path: Location) -> None:
 def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, Any]:
     """Return the attributes of a store; raise NotAStoreError if the store is of another kind.
 
-    ``kind`` is ``grid``, ``scene``, ``accuracy`` or ``eyepoints``, or empty for any kind.
+    ``kind`` is the required kind: ``grid``, ``scene``, ``accuracy`` or ``eyepoints``. Empty stands
+    for any kind.
     """
     attributes = store_format.read_attributes(store_path)
     if kind and attributes["kind"] != kind:
@@ -355,7 +357,7 @@ def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> d
 
 
 def _format_utc(time: float) -> str:
-    """Return a time [s since 1970] as ISO 8601 text in UTC."""
+    """Return a time [s since 1970-01-01 UTC] as ISO 8601 text in UTC."""
     return datetime.fromtimestamp(time, UTC).isoformat(timespec="seconds")
 
 

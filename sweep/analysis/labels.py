@@ -17,7 +17,7 @@ _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW":
 """Symbol in labels of each unit that stores write in another way."""
 
 _DIMENSIONLESS_UNITS = ("", "1")
-"""Values of the attribute `units` for pure numbers and for words."""
+"""Values of the attribute `units` that stand for pure numbers or for words."""
 
 _SI_PREFIX_BY_EXPONENT = {
     -12: "p",
@@ -30,10 +30,10 @@ _SI_PREFIX_BY_EXPONENT = {
     9: "G",
     12: "T",
 }
-"""SI prefixes by exponent of ten."""
+"""SI prefix for each exponent of ten."""
 
 _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
-"""Units that may be written with an SI prefix, such as mm."""
+"""Units before which an SI prefix may stand, as in mm."""
 
 
 class DisplayUnits(NamedTuple):
@@ -70,7 +70,7 @@ def column_label(name: str, units: str) -> str:
 
 
 def format_quantity(value: object, units: str = "") -> str:
-    """Return a value with its unit: ``3.5 km``, ``15°``, ``2^17``."""
+    """Return the text of a value with its unit: ``3.5 km``, ``15°``, ``2^17``."""
     text = str(value) if isinstance(value, str | np.str_) else format_number(float(value))  # type: ignore[arg-type]
     symbol = _SYMBOL_BY_UNIT.get(units, units)
     if units in _DIMENSIONLESS_UNITS:
@@ -79,7 +79,7 @@ def format_quantity(value: object, units: str = "") -> str:
 
 
 def format_coordinate_value(name: str, value: object, units: str = "") -> str:
-    """Return the name of a coordinate with a value: ``grazing angle 15°``."""
+    """Return a text with the name and the value of a coordinate: ``grazing angle 15°``."""
     return f"{coordinate_label(name)} {format_quantity(value, units)}"
 
 

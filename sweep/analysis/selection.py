@@ -185,7 +185,7 @@ class PointSelection:
         ]
 
     def sorted_coordinate(self, name: str) -> SortedCoordinate:
-        """Return a coordinate's distinct values, each with an index along the dimension.
+        """Return a coordinate's distinct values, each with one index along the dimension.
 
         Numbers are in rising order, words in the order of their first appearance.
         """
@@ -282,7 +282,7 @@ class ShownParts(NamedTuple):
     """Parts of a selection that a figure or table has room for."""
 
     parts: list[NamedPart]
-    """Parts, evenly spread over all parts."""
+    """Shown parts, evenly spread over all parts."""
     n_omitted: int
     """Number of omitted parts."""
 
@@ -341,11 +341,11 @@ PUBLISHED_CUTS = (
 )
 """Cuts of the published figures through range and grazing angle.
 
-Each has the dotted path and the value of the parameter that is fixed.
+Each cut has the dotted path and the value of the parameter that is fixed.
 """
 
 FALSE_ALARM_AVERAGING_RANGE_MIN = "5 m"
-"""Smallest range of the points over which false alarms are averaged, with its unit.
+"""Smallest range of the points over which false alarms are averaged, as text with a unit.
 
 At shorter ranges the shot noise of the echo matters ([T] 4.2).
 """
@@ -365,7 +365,7 @@ class StudyCut:
     """Name of the varying coordinate."""
 
     def select_from(self, points: PointSelection) -> PointSelection:
-        """Return the points of a selection that are on the cut, without duplicates."""
+        """Return those points of a selection that are on the cut, without duplicates."""
         return (
             points.sel(self.fixed_coordinate, [self.fixed_value]).drop_duplicates()
             if self.fixed_coordinate
@@ -376,8 +376,8 @@ class StudyCut:
 def study_cuts(spec: GridSpec) -> list[StudyCut]:
     """Return the cuts of a study along which either range or grazing angle is fixed.
 
-    If both are on one zipped axis, that axis defines the cuts. Otherwise they are the published
-    cuts whose fixed value the study has, or the complete study.
+    If both lie on one zipped axis, that axis defines the cuts. Otherwise the cuts are the published
+    ones whose fixed value the study has. If it has none, the complete study is the only cut.
     """
     range_parameter, angle_parameter = (
         find_axis_parameter(spec, RANGE_PATH),
@@ -488,7 +488,10 @@ class Statistics:
 
     @classmethod
     def from_values(cls, values: np.ndarray) -> Statistics:
-        """Return the statistics of finite values; nan is ignored, and the array sorted in place."""
+        """Return the statistics of the finite values of an array; nan does not count.
+
+        The array is sorted in place.
+        """
         total = sum(
             np.nansum(part)
             for part in np.array_split(values, values.size // PARTIAL_SUM_VALUES_MAX + 1)

@@ -32,10 +32,10 @@ from sweep.spec.sections import parameter_rules
 from sweep.units import percent_text
 
 ParameterValues = Mapping[str, float | int | str]
-"""SI values of parameters by dotted path."""
+"""SI values of parameters, by dotted path."""
 
 SEGMENT_DISPLAY_NAMES = ("up-chirp", "Doppler", "down-chirp")
-"""Display names of the segments of a shot, in the order of their indices."""
+"""Display name of each segment of a shot, by the segment's index."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class BinGroup:
     """Group of adjacent bins above the threshold, by their indices in a spectrum."""
 
     first_index: int
-    """Index of the first bin."""
+    """Index of the first bin of the group."""
     last_index: int
-    """Index of the last bin."""
+    """Index of the last bin of the group."""
     peak_index: int
     """Index of the strongest bin of the group."""
 
@@ -57,7 +57,7 @@ class DisplayedSegment:
     name: str
     """Display name of the segment."""
     chirp_rate_ratio: float
-    """Frequency slope over the chirp rate: 1 for the up-chirp, 0 for constant frequency."""
+    """Frequency slope divided by the chirp rate: 1 for the up-chirp, 0 for constant frequency."""
     bin_numbers: np.ndarray
     """Numbers of the bins (n,), rising. A complex record has negative bin numbers too."""
     frequency: np.ndarray
@@ -92,7 +92,7 @@ class SimulatedShot:
     parameters: ParameterValues
     """SI values of the shot's parameters, by dotted path."""
     prepared_shot: shot_model.Shots
-    """All that the shot's spectra depend on (lines, noise, threshold), as arrays of one shot."""
+    """Lines, noise and threshold on which the shot's spectra depend, as arrays of one shot."""
     outputs: dict[str, float]
     """Results of the model for the shot, by the name of the output variable."""
     segments: tuple[DisplayedSegment, ...]
@@ -144,7 +144,7 @@ def simulate_shot(
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """Simulate one shot at a flat target.
+    """Simulate one shot at a flat target; return its spectra, detections and measurement.
 
     Parameters
     ----------
@@ -168,9 +168,10 @@ def simulate_prepared_shot(
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """Simulate one shot of a grid or a scene, given all that its spectra depend on.
+    """Simulate one shot of a grid or a scene from all that its spectra depend on.
 
-    Parameters and result are those of :func:`simulate_shot`.
+    `prepared_shot` holds lines, noise and threshold. Other arguments and the result are those of
+    :func:`simulate_shot`.
     """
     segment_results = shot_model.evaluate_segments(prepared_shot)
     segments = tuple(
@@ -259,7 +260,7 @@ def _segment_spectrum(
 def simulate_noise_spectrum(
     prepared_shot: shot_model.Shots, *, seed: int, segment: int, look: int = 0
 ) -> np.ndarray:
-    """Simulate the noise spectrum of the windowed record of one look, with random numbers.
+    """Return a random noise spectrum of the windowed record of one look.
 
     Parameters
     ----------
@@ -304,7 +305,7 @@ def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, 
 def range_or_velocity_from_frequency(
     shot: SimulatedShot, segment: DisplayedSegment, frequency: np.ndarray
 ) -> np.ndarray:
-    """Convert frequencies in a segment's spectrum to range or radial velocity.
+    """Return the range or radial velocity for frequencies in a segment's spectrum.
 
     Parameters
     ----------
@@ -366,9 +367,9 @@ DETECTION_VIEW_MARGIN_MIN_BINS = 8
 """Least distance from the outermost detections in a close-up to the close-up's edges [bins]."""
 
 NEARBY_DETECTION_BAND_FRACTION_MAX = 0.05
-"""Largest distance from a peak at which a detection is shown in the peak's close-up.
+"""Largest distance from a peak at which the peak's close-up still shows a detection.
 
-It is a fraction of the width of the spectrum.
+The distance is a fraction of the width of the spectrum.
 """
 
 
@@ -436,7 +437,7 @@ def _level_axis_limits_db(shots: Sequence[SimulatedShot]) -> tuple[float, float]
 def _draw_spectrum(
     axes: Axes, shot: SimulatedShot, segment: DisplayedSegment, view: slice, line_width: float
 ) -> None:
-    """Draw a slice of a segment's spectrum, with threshold, noise level and detections."""
+    """Draw a slice of a segment's spectrum on axes, with threshold, noise level and detections."""
     frequency_mhz = segment.frequency[view] / 1e6
     level_db = np.maximum(shot.magnitude_to_dbv(segment.magnitude[view]), -500.0)
     marker = "." if frequency_mhz.size <= 200 else ""

@@ -82,13 +82,13 @@ class GridResults:
 
     @classmethod
     def from_store(cls, store_path: str | Location) -> GridResults:
-        """Open the store of a grid."""
+        """Open the store of a grid; return its dataset and spec."""
         dataset = open_store(store_path)
         return cls(dataset, GridSpec.from_stored(dataset.attrs["spec"]))
 
     @property
     def points(self) -> PointSelection:
-        """Selection of all points."""
+        """Selection of all points of the grid."""
         return PointSelection.from_dataset(self.dataset)
 
     @property
@@ -99,7 +99,7 @@ class GridResults:
     def make_chart(
         self, figure_spec: SurfaceFigure | SlicesFigure, size_limits: charts.ChartSizeLimits
     ) -> charts.Chart | None:
-        """Return the chart of a surface or of slices; None if the figure selects no points."""
+        """Return the chart of a surface or slices figure; None if the figure selects no points."""
         points = select_where(self.points, self.spec, figure_spec.where)
         if not points.n_points:
             return None
@@ -240,8 +240,9 @@ def picture_source_text(study_id: str, figure_spec: GridFigure | SceneFigure) ->
 def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
     """Return the specs of a grid's default figures.
 
-    The figures are surfaces over two long axes, or otherwise slices along a zipped axis or the
-    longest one. A study whose axes have no numbers gets slices over categories, and tables.
+    The figures are surfaces over two long axes. Without two long axes they are slices along a
+    zipped axis or the longest axis. A study whose axes have no numbers gets slices over categories,
+    and tables.
     """
     zipped_axes = [axis for axis in spec.axes if axis.is_zipped][:1]
     axes = zipped_axes or sorted(spec.axes, key=lambda axis: -axis.size)
@@ -324,7 +325,7 @@ class SceneResults:
 
     @classmethod
     def from_store(cls, store_path: str | Location) -> SceneResults:
-        """Open the store of a scene."""
+        """Open the store of a scene; return its tree and spec."""
         tree = open_scene_tree(parse_location(store_path))
         return cls(parse_location(store_path), tree, SceneSpec.from_stored(str(tree.attrs["spec"])))
 
@@ -364,7 +365,7 @@ class SceneResults:
         )
 
     def figure_title(self, figure_spec: SceneFigure, default_title: str) -> str:
-        """Return the title of a figure, with the title of the study in a line above."""
+        """Return the title of a figure, below the title of the study in a line of its own."""
         return "\n".join([self.spec.title, figure_spec.title or default_title])
 
 

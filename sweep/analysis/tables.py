@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sweep.spec import TableFigure as TableSpec
 
 TableCell = str | float | int
-"""Value of a table cell."""
+"""Type of a value in a table cell."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class TablePage:
     """Rows of the CSV file, each as a mapping by column name."""
 
     def to_text(self) -> str:
-        """Return the page as plain text."""
+        """Return the page as plain text: title, tables and notes."""
         parts = [f"{self.title}\n{'=' * len(self.title)}"]
         parts += [
             f"{b.heading}\n\n{format_aligned_table(b.columns, b.rows)}" for b in self.page_tables
@@ -245,7 +245,7 @@ def single_point_page(dataset: xr.Dataset) -> TablePage:
 
 
 TABLE_ROWS_MAX = 100
-"""Largest number of rows of a table."""
+"""Largest number of settings, and so of rows, in a table."""
 
 
 def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, TableCell]]:
@@ -273,8 +273,11 @@ class NoiseAlarmReference(NamedTuple):
     """Probabilities of false alarms due to noise alone, at one setting of the instrument."""
 
     record: dict[str, TableCell]
-    """Part of a record: `tnr`, `bins` (independent bins of a chirp), and the probability of a false
-    alarm in both chirps, as `closed_form` and as `noise_only`, by the model."""
+    """Part of a record, by key.
+
+    It has `tnr`, `bins` (independent bins of a chirp), and the probability of a false alarm in both
+    chirps: `closed_form`, and `noise_only` by the model.
+    """
     pfa_bin: float
     """Probability of a false alarm in a bin, by the model."""
 
@@ -437,7 +440,7 @@ _LEAKAGE_COLUMNS = {
 }  # fmt: skip
 """Record key and number format of each column of the table of leakage, by column name.
 
-Leakage is a false alarm due to the window's sidelobes.
+Leakage is the probability of a false alarm due to the window's sidelobes.
 """
 _THRESHOLD_COLUMNS = {
     "setting": ("setting", ""), "closed form": ("closed_form", ".6e"),
@@ -453,8 +456,8 @@ def false_alarm_page(
 ) -> TablePage:
     """Return a page with the false-alarm probabilities of a shot for each value of a coordinate.
 
-    The page has the form of tables 4.3 to 4.5 of [T]. ``by`` is the name of the coordinate,
-    ``printed`` are published values for comparison.
+    The page has the form of tables 4.3 to 4.5 of the thesis [T]. ``by`` is the name of the
+    coordinate. ``printed`` are published values for comparison.
     """
     records = false_alarm_records(points, spec, by=by, printed=printed)
     has_printed = any(record["printed"] == record["printed"] for record in records)
@@ -484,8 +487,8 @@ def threshold_page(
 ) -> TablePage:
     """Return a page with the probability of a false alarm in a bin, for each threshold.
 
-    The page has the form of table 4.2 of [T]. ``by`` is the name of the threshold's coordinate,
-    ``printed`` are published values for comparison.
+    The page has the form of table 4.2 of the thesis [T]. ``by`` is the name of the threshold's
+    coordinate. ``printed`` are published values for comparison.
     """
     records: list[dict[str, TableCell]] = []
     setting_parts = split_by_setting(points, spec, by)
@@ -533,7 +536,7 @@ _FALSE_ALARM_NOTES = (
 def _record_table(
     heading: str, columns: Mapping[str, tuple[str, str]], records: Sequence[dict[str, TableCell]]
 ) -> TextTable:
-    """Return a table with a row for each record.
+    """Return a text table with a row for each record.
 
     `columns` are the record key and the number format of each column, by column name.
     """

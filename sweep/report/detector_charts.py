@@ -132,7 +132,7 @@ class GridProfiles(NamedTuple):
     """Profiles of a grid that charts have room for."""
 
     profiles: list[GridProfile]
-    """Profiles, evenly spread over all profiles."""
+    """Shown profiles, evenly spread over all profiles."""
     n_omitted: int
     """Number of omitted profiles."""
 
@@ -275,9 +275,10 @@ def _roc_point_indices(profile: GridProfile) -> np.ndarray:
 def grid_noise_budget_chart(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart:
-    """Return the chart of the noise at the ADC, along each part (profile) of a grid.
+    """Return the chart of noise sources' shares of the noise at the ADC, along parts of a grid.
 
-    It shows the share of each noise source. `n_omitted` is the number of omitted profiles.
+    A profile is a part of the grid along its main coordinate. `n_omitted` is the number of omitted
+    profiles.
     """
     panels = []
     for profile in profiles:
@@ -362,10 +363,10 @@ def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart
 def false_alarm_chart(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart | None:
-    """Return the chart of false alarms by noise and by leakage, along each part of a grid.
+    """Return the chart of false alarms by noise and by leakage, along each profile of a grid.
 
     Leakage is signal in the window's sidelobes. The result is None for a grid with a single point.
-    `n_omitted` is the number of omitted parts (profiles).
+    `n_omitted` is the number of omitted profiles.
     """
     if profiles[0].coordinate is None:
         return None

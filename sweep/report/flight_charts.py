@@ -72,7 +72,7 @@ PAGE_POINTS_MAX = 36_000
 """Largest number of points of all clouds on a page."""
 
 PAGE_CLOUDS_MAX = 8
-"""Largest number of clouds on a page: scanners times positions along the study's axes."""
+"""Largest number of clouds on a page. Each scanner has one per position along the study's axes."""
 
 TERRAIN_SIDE_NODES_MAX = 90
 """Largest number of nodes of the drawn terrain along its longer side."""
@@ -102,7 +102,7 @@ CAMERA_POSITION_BY_VIEW = {
 """Position of the camera for each view, in plotly's units of length."""
 
 CAMERA_TARGET = {"x": 0.0, "y": 0.0, "z": -0.1}
-"""Point at which the camera looks, in plotly's units of length."""
+"""Point at which plotly's camera looks, in plotly's units of length."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class LabelledRecording:
     label: str
     """Label on the page: scanner and axis values, each if there are several."""
     recording: Recording
-    """Shots and points."""
+    """Shots and points of the scanner at the axis position."""
     axis_position: AxisPosition
     """Position along the study's axes."""
 
@@ -498,7 +498,7 @@ def _time_panels(
     labelled_recordings: Sequence[LabelledRecording], noun: str, names: Sequence[str],
     quantity_lines: Callable[[dict[str, np.ndarray]], Iterator[QuantityLines]],
 ) -> tuple[list[Panel], str]:  # fmt: skip
-    """Return panels of quantities over time, and a caption phrase if shots or points were thinned.
+    """Return panels of quantities over time, and a caption phrase on thinning; '' if not thinned.
 
     Parameters
     ----------
@@ -559,7 +559,7 @@ def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[Char
 
 
 def point_count_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable:
-    """Return a table with the numbers of shots and of points by kind, for each recording.
+    """Return a table of the numbers of shots, and of points by kind, for each recording.
 
     Shots and points are counted over all draws.
     """

@@ -47,7 +47,7 @@ _COLOUR_MAP_SPANS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
 """Part of the colour map, within 0..1, that contrasts with a light and with a dark page."""
 
 _GROUND_COLOURS = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
-"""Colours of the darkest and the brightest terrain, on a light and on a dark page."""
+"""Colours of the darkest and the brightest terrain, for a light and for a dark page."""
 
 COLOUR_BAR_LAYOUT: dict[str, Any] = {
     "orientation": "h", "x": 0.5, "yref": "container", "y": 0.91, "yanchor": "top", "len": 1.0,
@@ -63,7 +63,7 @@ class PlotControl:
     name: str
     """Name of the control, by which the `meta` of traces refers to it (:func:`trace_meta`)."""
     label: str
-    """Label on the page."""
+    """Label of the control on the page."""
     options: Sequence[str]
     """Texts of the options, in order."""
     relayout_by_option: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -99,7 +99,7 @@ class InteractivePlot:
 
 
 def trace_meta(palette_index: int | None = None, **choices: str) -> dict[str, Any]:
-    """Return the `meta` of a trace of plotly, by which the page's script shows and colours it.
+    """Return the `meta` of a trace of plotly, from which the page's script shows and colours it.
 
     Parameters
     ----------
@@ -112,12 +112,12 @@ def trace_meta(palette_index: int | None = None, **choices: str) -> dict[str, An
 
 
 def to_sentences(parts: Sequence[str]) -> list[str]:
-    """Return each phrase as a sentence; empty phrases are left out."""
+    """Return a list with each phrase as a sentence; empty phrases are left out."""
     return [labels.join_sentences([part]) for part in parts if part]
 
 
 def make_interactive_plot(chart: Chart) -> InteractivePlot:
-    """Convert a chart to an interactive plot."""
+    """Return a chart as an interactive plot of a page."""
     first_panel = chart.panels[0]
     layout_options: dict[str, Any] = {}
     area_lines = [line for line in first_panel.lines if line.style == "area"]
@@ -300,7 +300,7 @@ def _band_trace(
 
 
 def colour_themes() -> dict[str, Any]:
-    """Return the colours and the plotly template of the light and the dark scheme of a page."""
+    """Return the colours and plotly's template for a light and a dark page, by scheme."""
     fractions, colours = np.linspace(0, 1, 11), colormaps[canvas.COLOUR_MAP_NAME]
     return {
         scheme: {
@@ -370,7 +370,7 @@ class HtmlTable:
     frame: pandas.DataFrame
     """Cells of the table, with its column names."""
     csv_stem: str
-    """Name of the CSV file to download, without its suffix."""
+    """Name, without suffix, of the CSV file that the reader can download."""
 
 
 @dataclass(frozen=True)
@@ -384,11 +384,11 @@ class TextItem:
     text: str
     """Text itself."""
     download_name: str = ""
-    """Name of the file to download; empty for no download."""
+    """Name of the file that the reader can download; empty for no download."""
 
 
 PageItem = InteractivePlot | HtmlTable | TextItem
-"""Item of a section of a page: plot, table or text."""
+"""Type of an item of a section of a page: plot, table or text."""
 
 
 @dataclass(frozen=True)
@@ -400,9 +400,9 @@ class PageSection:
     title: str
     """Title of the section."""
     paragraphs: Sequence[str] = ()
-    """Paragraphs of text."""
+    """Paragraphs of text at the beginning of the section."""
     items: Sequence[PageItem] = ()
-    """Plots, tables and texts after the paragraphs."""
+    """Plots, tables and texts that follow the paragraphs."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ PAGE_CHART_SIZE_LIMITS = ChartSizeLimits(
     cells_max=400_000,
     maps_per_row=1,
 )
-"""Limits of the charts on a page: parts of the study that are shown, and size of heat maps.
+"""Limits of the charts on a page: number of parts of the study, and size of heat maps.
 
 The limit of cells applies to all heat maps together, and keeps the page to a few megabytes.
 """
@@ -125,7 +125,7 @@ Charts become interactive plots. None is left out.
 """
 
 AnySpec = GridSpec | SceneSpec
-"""Spec of a grid or of a scene."""
+"""Type of the spec of a grid or of a scene."""
 
 
 def _grid_report(store: Location) -> ReportPage:

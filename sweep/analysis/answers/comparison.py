@@ -34,7 +34,7 @@ PD_ROUNDING_ERROR_MAX = 1e-12
 """Largest difference of pd between two processors that counts as a rounding error."""
 
 _MATCHED_SIGNIFICANT_DIGITS = 12
-"""Number of significant digits to which coordinates must agree if two points are to match."""
+"""Number of significant digits to which the coordinates of matching points agree."""
 
 GRID_FLIGHT_COMPARISON_MESSAGE = (
     "a grid of points and a flight have nothing to match: compare two of a kind"
@@ -134,7 +134,7 @@ def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
 def _restrict_to_common_points(
     ours: xr.Dataset, other: xr.Dataset
 ) -> tuple[xr.Dataset, xr.Dataset]:
-    """Reduce two datasets to their common points; return them with equal coordinates."""
+    """Return two datasets restricted to their common points, with equal coordinates."""
     other = _select_points_at_fixed_values(other, ours)
     ours = _select_points_at_fixed_values(ours, other)
     for dim in [d for d in ours.dims if d in other.dims]:
@@ -156,9 +156,9 @@ def _restrict_to_common_points(
 
 
 def _select_points_at_fixed_values(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
-    """Select the points at which parameters have the values that are fixed in a reference dataset.
+    """Return the points of a dataset at the parameter values that a reference dataset has fixed.
 
-    An axis on which the fixed value of its parameter does not occur is kept.
+    An axis without the fixed value of its parameter is kept.
     """
     varying_paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
     spec = spec_of_dataset(reference)
@@ -200,7 +200,7 @@ def _pandas_index_of_dimension(dataset: xr.Dataset, dim: str) -> pandas.Index:
 
 
 def _round_to_12_digits(values: np.ndarray) -> np.ndarray:
-    """Round numbers to 12 significant digits; leave other types unchanged."""
+    """Return numbers rounded to 12 significant digits; arrays of other types are unchanged."""
     if values.dtype.kind not in "fiu":
         return values
     values = values.astype(float)
@@ -223,10 +223,10 @@ BEAM_DIRECTION_TOLERANCE = 1e-9
 """Largest angle between the beam directions of matching shots [rad]."""
 
 DETECTED_FRACTION_VARIABLE = "detected"
-"""Name of the variable with the share of draws in which a shot has a true point, 0..1."""
+"""Name of the variable with the share, 0..1, of draws in which a shot has a true point."""
 
 ERROR_BOUND_VARIABLES = ("effects_error", "beamlets_error")
-"""Names of the variables that bound the errors of a shot's probabilities."""
+"""Names of the variables with bounds on the errors of a shot's probabilities."""
 
 COMPARED_SHOT_STATISTICS = tuple(
     name
@@ -327,7 +327,7 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
 def _common_shot_indices(
     ours: xr.Dataset, other: xr.Dataset, scanner: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the shots that two flights have in common.
+    """Return the indices of the shots that two flights have in common.
 
     Returns
     -------
@@ -410,7 +410,7 @@ def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: boo
 
 
 DIFFERENCE_TABLE_COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
-"""Column names of the table of differences."""
+"""Column names of the table of differences between two stores."""
 
 OpenedStore = xr.Dataset | xr.DataTree
 """Dataset of a grid, or tree of a flight, as `sweep.open` and `sweep.open_scene` return them."""
@@ -421,7 +421,7 @@ DIFFERENCE_TABLE_VARIABLES = (
     "noise_variance", "range_error", "radial_velocity_error", "false_alarms", "range_rmse",
     "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED_FRACTION_VARIABLE,
 )  # fmt: skip
-"""Variables in the table of differences, in the order of its rows."""
+"""Names of the variables in the table of differences, in the order of its rows."""
 
 
 def compute_tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
@@ -456,7 +456,7 @@ def difference_table_rows(differences: xr.Dataset) -> list[list[str]]:
 
 
 def _difference_table_row(differences: xr.Dataset, name: str) -> list[str]:
-    """Return the table row of a variable: its differences, their agreement, and the worst point."""
+    """Return the row of a variable in the table of differences, in `DIFFERENCE_TABLE_COLUMNS`."""
     array = differences[name]
     is_finite = np.isfinite(array.values)
     abs_difference = np.where(is_finite, np.abs(array.values), -1.0)
@@ -514,10 +514,13 @@ class AgreementVerdict(NamedTuple):
     """Verdict on whether the probabilities of detection of two stores agree."""
 
     verdict: Literal["same", "different", "nothing"]
-    """``same`` if they agree at all common points, ``different`` if they differ at one, and
-    ``nothing`` if no common point is computed."""
+    """Verdict: ``same``, ``different`` or ``nothing``.
+
+    It is ``same`` if the probabilities agree at all common points, ``different`` if they differ at
+    any, and ``nothing`` if no common point is computed.
+    """
     sentence: str
-    """The verdict as a sentence for the user."""
+    """Verdict as a sentence for the user."""
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> AgreementVerdict:
@@ -573,7 +576,7 @@ def save_difference_figure(
 
 
 def pd_difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart | None:
-    """Return the chart of the differences of pd, or None if no common point is computed."""
+    """Return the chart of the differences of pd; None if no common point is computed."""
     compared_groups = list(differences_by_scanner.values())
     variables = [
         n

@@ -21,7 +21,7 @@ RELATIVE_VALUE_TOLERANCE = 1e-9
 """Largest relative difference between a wanted value and a coordinate's value that match."""
 
 STUDY_ID_NAME = "study_id"
-"""Name of the coordinate and of the attribute that hold the id of the study."""
+"""Name of both the coordinate and the attribute that hold the id of the study."""
 
 JOIN_REMEDY = (
     "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
@@ -38,9 +38,10 @@ Its value is the JSON text of a mapping by study id.
 def study_marker_name(study_ids: Iterable[str]) -> str:
     """Return the name of the coordinate that marks the data of a study, or of joined studies.
 
-    When xarray merges datasets, it drops a coordinate that differs between them, or keeps that of
-    the first dataset. It always keeps a coordinate that only one dataset has. The study id is
-    therefore part of the marker's name: a merge of two studies has two markers.
+    The ids of the studies are part of the name. When xarray merges datasets, it always keeps a
+    coordinate that only one dataset has. A merge of two studies therefore has two markers. By
+    contrast, xarray drops a coordinate that differs between datasets, or keeps that of the first
+    dataset.
     """
     study_ids = list(study_ids)
     if len(study_ids) == 1:
@@ -56,7 +57,7 @@ def study_marker_names(dataset: xr.Dataset | xr.DataTree) -> list[str]:
 def spec_of_dataset(dataset: xr.Dataset | xr.DataTree) -> GridSpec | SceneSpec:
     """Return the spec of the study from which a dataset or tree comes.
 
-    Raise ValueError if the data combine several studies, or lack the spec or the marker.
+    Raise ValueError if the data combine several studies, or lack the spec or the study's marker.
     """
     spec_text = dataset.attrs.get("spec")
     _check_study_marker(dataset)
@@ -136,9 +137,9 @@ def require_variables(dataset: xr.Dataset, *names: str) -> None:
 
 
 def parse_to_si(raw_value: object, *, si_unit: str, name: str) -> float:
-    """Convert a quantity such as ``"20 Hz"`` to its SI value; return a plain number unchanged.
+    """Return the SI value of a quantity such as ``"20 Hz"``; a plain number is returned unchanged.
 
-    `name` names the quantity in errors.
+    `si_unit` is the unit of the result. `name` names the quantity in error messages.
     """
     if isinstance(raw_value, int | float) and not isinstance(raw_value, bool):
         return float(raw_value)
@@ -177,7 +178,7 @@ def coordinate_by_name_or_path(dataset: xr.Dataset, name: str) -> xr.DataArray:
 
 
 def convert_to_coordinate_units(coord: xr.DataArray, raw_value: object) -> float | str:
-    """Convert a value such as ``"2 km"`` to a coordinate's units; leave a plain number as it is."""
+    """Return a value such as ``"2 km"`` in a coordinate's units; a plain number stays as it is."""
     rule = parameter_rules().get(coord.attrs.get("path", ""))
     if isinstance(raw_value, int | float | np.number) and not isinstance(raw_value, bool):
         return float(raw_value)
@@ -236,7 +237,7 @@ def parameter_coordinate(dataset: xr.Dataset, path: str) -> xr.DataArray | None:
 def select_points(
     dataset: xr.Dataset, selection: Mapping[str, Any], *, method: str | None = None
 ) -> xr.Dataset:
-    """Select the points at which coordinates have given values.
+    """Return the points of a dataset at which coordinates have given values.
 
     Parameters
     ----------
@@ -301,9 +302,10 @@ def _indices_of_selection(coord: xr.DataArray, selected: Any, method: str | None
 def _indices_of_value(
     coord: xr.DataArray, coord_values: np.ndarray, value: float | str, method: str | None
 ) -> np.ndarray:
-    """Return the indices at which a coordinate has a value, or with ``nearest`` the nearest value.
+    """Return the indices at which a coordinate has a given value.
 
-    Raise ValueError if the value is not on the grid.
+    With the method ``nearest`` they are those of the nearest value. Raise ValueError if the value
+    is not on the grid, or outside the coordinate's range.
     """
     units = coord.attrs.get("units", "")
     if coord_values.dtype.kind not in "fiu":

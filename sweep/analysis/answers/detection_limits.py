@@ -28,7 +28,10 @@ from sweep.analysis.answers.probability import (
 LIMIT_FOUND, LEVEL_NEVER_REACHED, LEVEL_NEVER_LOST, LIMIT_NOT_COMPUTED = range(4)
 """Flags for the outcome of a search for the limit, the coordinate where pd falls below a level."""
 LIMIT_REASON_MEANINGS = "found never_reached never_lost not_computed"
-"""Names of the outcomes of a limit search, for the CF attribute `flag_meanings`."""
+"""Names of the outcomes of a limit search in the order of their flags, separated by spaces.
+
+They are the value of the CF attribute `flag_meanings`.
+"""
 
 _PD_PLUS_MISS_ERROR_MAX = 1e-6
 """Largest accepted deviation of pd plus the probability of a miss from 1, by rounding."""
@@ -183,9 +186,9 @@ def minimum_grazing_angle(
 def _sort_by_coordinate(
     dataset: xr.Dataset, coord: xr.DataArray, from_highest: bool
 ) -> tuple[xr.Dataset, str]:
-    """Sort a dataset by a coordinate; return the sorted dataset and the coordinate's dimension.
+    """Return a dataset sorted by a coordinate, and the name of the coordinate's dimension.
 
-    Values rise, or fall with ``from_highest``. Raise ValueError for a single or repeated value.
+    The values rise, or fall with ``from_highest``. Raise ValueError for a single or repeated value.
     """
     if coord.ndim != 1 or coord.size < 2:
         raise ValueError(f"{coord.name} has a single value: there is nothing to go along")
@@ -205,7 +208,7 @@ def _sort_by_coordinate(
 def _limits_along_dimension(
     pd: xr.DataArray, miss: xr.DataArray | None, coord: xr.DataArray, dim: str, level: float
 ) -> dict[str, xr.DataArray]:
-    """Return the two limits of :func:`limit` along a dimension, with their reasons, by name.
+    """Return the two limits of :func:`limit` along a dimension, and their reasons, by name.
 
     Parameters
     ----------

@@ -64,14 +64,14 @@ _CRAMER_RAO_PARAMETER_PATHS = (
     "target.range",
     "target.radial_velocity",
 )
-"""Dotted paths of the parameters on which Cramer-Rao bounds depend."""
+"""Dotted paths of the parameters on which the Cramer-Rao bounds depend."""
 
 _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
 """Names of the effects that are simulated by random draws."""
 
 
 class _LineEffectMasks(NamedTuple):
-    """Flags (n,) of simulated effects on which the bound for a given SNR depends.
+    """Masks (n,) of points at which effects are simulated that change the bound for a given SNR.
 
     Fields have the names of the effects.
     """
@@ -121,8 +121,8 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
 def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
     """Return the error of the reported radial velocity, and the Cramer-Rao bound.
 
-    Result and notes are those of :func:`range_error`, in m/s. The velocity is half the difference
-    of two peaks.
+    Result and notes are those of :func:`range_error`, with m/s in place of m. The velocity is half
+    the difference of two peaks.
     """
     return _error_dataset(dataset, "radial_velocity")
 
@@ -187,9 +187,9 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
 
 
 def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr.DataArray:
-    """Return the standard deviation that speckle adds to an estimate [m or m/s]; 0 without fading.
+    """Return the standard deviation [m or m/s] that speckle adds to estimates of a quantity.
 
-    `quantity` is ``range`` or ``radial_velocity``.
+    `quantity` is ``range`` or ``radial_velocity``. The result is 0 at points without fading.
     """
     is_fading = _is_simulated("fading", dataset["effects"])
     if (
@@ -409,7 +409,7 @@ def _deviations_of_category(
 
 @lru_cache(maxsize=8)
 def window_tail_sums_and_widths(taper: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sum and the width of the last n samples of a window, for every n.
+    """Return the sum and the width of the last n samples of a window, for every n from 0.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
 
 
 def segment_variable_name(quantity: str, segment: str) -> str:
-    """Return the name of a quantity's variable for a segment or the shot, such as 'pd_up'.
+    """Return the name of a segment's or shot's variable for a quantity, such as 'pd_up'.
 
     Raise ValueError for an unknown segment.
     """
@@ -267,7 +267,7 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _lazy_statistics(array: xr.DataArray) -> dask.array.Array:
-    """Return the `SUMMARY_STATISTICS` (4,) of an array, as a lazy array."""
+    """Return the `SUMMARY_STATISTICS` of an array, as a lazy Dask array (4,)."""
     delayed_chunks = dask.array.asarray(array.chunk().data).to_delayed().ravel()
     delayed_statistics = [
         dask.delayed(_chunk_statistics)(delayed_chunk) for delayed_chunk in delayed_chunks
@@ -278,7 +278,7 @@ def _lazy_statistics(array: xr.DataArray) -> dask.array.Array:
 
 
 def _chunk_statistics(chunk: np.ndarray) -> np.ndarray:
-    """Return the sum, minimum, maximum and number (4,) of the finite values of a chunk."""
+    """Return sum, minimum, maximum and number of the finite values of a chunk, as an array (4,)."""
     finite_values = chunk[np.isfinite(chunk)]
     minimum, maximum = (
         (finite_values.min(), finite_values.max()) if finite_values.size else (np.inf, -np.inf)
@@ -287,7 +287,7 @@ def _chunk_statistics(chunk: np.ndarray) -> np.ndarray:
 
 
 def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
-    """Combine the results of `_chunk_statistics` to the `SUMMARY_STATISTICS` (4,)."""
+    """Return the `SUMMARY_STATISTICS` (4,) of an array from `_chunk_statistics` of its chunks."""
     sums, minima, maxima, counts = np.array(chunk_statistics).T
     if not counts.sum():
         return np.array([np.nan, np.nan, np.nan, 0.0])
@@ -308,7 +308,7 @@ def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
 # tolerance.
 
 ROC_POINTS_MAX = 20_000
-"""Largest number of points of a study for which :func:`roc` computes curves."""
+"""Largest number of points that a study may have for :func:`roc` to compute curves."""
 ROC_SIMULATED_POINTS_MAX = 200
 """Largest number of points without an exact closed form of pd that :func:`roc` simulates again."""
 
@@ -440,7 +440,7 @@ def _looks_of_study(spec: GridSpec) -> Looks:
 def _closed_form_pd(
     dataset: xr.Dataset, segment: str, threshold_ratio: xr.DataArray, looks: Looks
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Compute pd in closed form at each threshold.
+    """Return pd in closed form at each threshold, and where it is exact.
 
     Returns
     -------
@@ -468,7 +468,7 @@ def _closed_form_pd(
 
 
 def _study_threshold_ratio(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
-    """Return the study's threshold over the noise per quadrature, at each point."""
+    """Return the study's threshold divided by the noise per quadrature, at each point."""
     if looks.is_noncoherent:
         return xr.apply_ufunc(
             looks.threshold_ratio_from_log_pfa, np.log(10) * dataset["log10_pfa_bin"]
@@ -493,7 +493,11 @@ def _study_tnr(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def _point_parameters(coordinates: Mapping[Any, xr.DataArray], spec: GridSpec) -> dict[str, Any]:
-    """Return the SI values of all parameters at a point, by path, from the point's coordinates."""
+    """Return the SI values of all parameters at one point by dotted path.
+
+    `coordinates` are the coordinates of the point. Parameters without a coordinate have the value
+    in the spec.
+    """
     values = {str(c.attrs["path"]): c for c in coordinates.values() if "path" in c.attrs}
     return spec.parameters() | {
         path: coordinate_in_si(value).values.item() for path, value in values.items()
@@ -505,9 +509,8 @@ def _threshold_crossing_probability(
 ) -> np.ndarray:
     """Return the probability that a bin with a steady signal exceeds the threshold.
 
-    The probability is the Marcum function Q_1, or its equivalent for several looks. Signal and
-    threshold are relative to the noise per quadrature. The result is nan if one of them is not
-    finite.
+    It is the Marcum function Q_1, or its equivalent for several looks. The magnitudes of signal and
+    threshold are divided by the noise per quadrature. The result is nan where either is not finite.
     """
     is_finite = np.isfinite(signal_ratio) & np.isfinite(threshold_ratio)
     probability = looks.pd_and_miss_steady(

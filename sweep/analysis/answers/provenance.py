@@ -40,7 +40,7 @@ RELATIVE_VALUE_TOLERANCE = 1e-9
 def compute_answer_per_study(
     dataset: xr.Dataset, answer: Callable[[xr.Dataset], Any], *, require_axes: bool
 ) -> Any:
-    """Compute an answer from a dataset of one study, or for each study of a joined dataset.
+    """Return an answer from a dataset of one study, or the answers for all studies of a join.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def _joined_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
 
 
 def _axis_parameters(spec: GridSpec | SceneSpec) -> list[AxisParameter]:
-    """Return the parameters on the axes of a study."""
+    """Return the parameters on the axes of a study, axis by axis."""
     return [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
 
 
@@ -214,7 +214,7 @@ def _study_value_mask(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.nda
 
 
 def _parameter_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> list[xr.DataArray]:
-    """Return the coordinates that are parameters of a study."""
+    """Return the coordinates of a dataset that are parameters of a study."""
     fixed_parameters = spec.parameters()
     axis_paths = {axis_parameter.path for axis_parameter in _axis_parameters(spec)}
     return [coord for coord in dataset.coords.values()
@@ -222,7 +222,7 @@ def _parameter_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> l
 
 
 def _check_coordinate_values(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Raise ValueError if a coordinate has values that the study does not have."""
+    """Raise ValueError if a coordinate of a dataset has a value that the study does not have."""
     for coord in _parameter_coordinates(dataset, spec):
         is_value_known = _study_value_mask(coord, spec)
         if JOINED_SPECS_ATTRIBUTE in dataset.attrs and not coord.dims:

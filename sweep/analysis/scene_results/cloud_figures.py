@@ -42,9 +42,9 @@ The azimuth is measured from north towards east.
 """
 
 DRAWN_GROUND_SLOPE_MAX = 1.5
-"""Slope of the ground (rise over run) above which it is not drawn.
+"""Slope of the ground (rise over run) above which the ground is not drawn.
 
-Walls and the edges of tree crowns would hide points.
+Walls and the edges of tree crowns, if drawn, would hide points.
 """
 
 
@@ -53,11 +53,11 @@ class HeightMap:
     """Heights of the ground on a regular grid."""
 
     x: np.ndarray
-    """World x of the columns [m], rising."""
+    """World x of the map's columns [m], rising."""
     y: np.ndarray
-    """World y of the rows [m], rising."""
+    """World y of the map's rows [m], rising."""
     height: np.ndarray
-    """Heights (rows, columns) [m]; nan where unknown."""
+    """World z of the ground (rows, columns) [m]; nan where unknown."""
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree) -> HeightMap | None:
@@ -92,7 +92,7 @@ class HeightMap:
         return HeightMap(x_nodes, y_nodes, height.values)
 
     def mask_steep_ground(self) -> HeightMap:
-        """Return the map with nan where the slope exceeds `DRAWN_GROUND_SLOPE_MAX`."""
+        """Return a copy of the map with nan where the slope exceeds `DRAWN_GROUND_SLOPE_MAX`."""
         is_steep = np.hypot(*np.gradient(self.height, self.y, self.x)) > DRAWN_GROUND_SLOPE_MAX
         return HeightMap(self.x, self.y, np.where(is_steep, np.nan, self.height))
 
@@ -124,7 +124,7 @@ OBLIQUE_MARGINS_INCHES = (0.55, 0.75, 0.85, 0.1)
 """Margins of an oblique picture for ticks and labels: left, below, right and above [inches]."""
 
 _TRIAL_SHEET_SIDE_INCHES = 10.0
-"""Side of a square trial figure on which the projection of the points' box is measured [inches]."""
+"""Side of the square trial sheet on which the points' box is projected and measured [inches]."""
 
 
 class ObliqueView:
@@ -183,7 +183,7 @@ class ObliqueView:
             axis.set_tick_params(pad=2 + 4 * (name == "z") * side_ratio)
 
     def _side_ratios(self) -> np.ndarray:
-        """Return the sides of the cloud's box (3,), relative to the longest side."""
+        """Return the sides (3,) of the cloud's box, divided by the longest side."""
         sides = np.array([self.cloud.box[axis][1] - self.cloud.box[axis][0] for axis in WORLD_AXES])
         return sides / sides.max()
 
@@ -442,7 +442,7 @@ def _positions_in_box(cloud: PointCloud, column_arrays: ColumnArrays) -> np.ndar
 
 
 def _shaded_ground_colours(height_map: HeightMap) -> np.ndarray:
-    """Return the shaded colours of the ground (rows, columns, 4); transparent where unknown."""
+    """Return the shaded RGBA colours of the ground, (rows, columns, 4); transparent if unknown."""
     rgba = np.array(colormaps["gray"](0.62 + 0.36 * height_map.hillshade()))
     rgba[~np.isfinite(height_map.height)] = 0.0
     return rgba

@@ -31,7 +31,7 @@ _N_SAMPLED_FLIGHT_INTERVALS = 16
 """Number of evenly spaced intervals of a long flight from which errors are read."""
 
 _COMPARED_QUANTILE_LEVELS = 0.6827, 0.9545
-"""Levels (0..1) at which quantiles of actual errors are compared with those of normal errors."""
+"""Levels, 0..1, of the quantiles in which actual and normally distributed errors are compared."""
 
 _SCALAR_NORMAL_ERROR_QUANTILES, _VECTOR_NORMAL_ERROR_QUANTILES = (1.0, 2.0), (1.8780, 2.8328)
 """Quantiles at 68.27 % and 95.45 % of the length of a normal error, in standard errors.
@@ -56,15 +56,15 @@ class ConsistencyResult(NamedTuple):
     scanner: str
     """Name of the scanner."""
     quantity: str
-    """Name of the quantity in messages."""
+    """Name of the quantity, as in messages."""
     error_ratio: float
-    """Size of the errors over their stated standard errors; ideally 1."""
+    """Ratio of the actual errors to their stated standard errors; ideally 1."""
     n_errors: int
     """Number of errors that were read."""
 
     @property
     def is_consistent(self) -> bool:
-        """True if errors are about as large as stated, or too few for a judgement."""
+        """True if errors are about as large as stated, or too few to judge."""
         return (
             self.n_errors < _ERRORS_FOR_JUDGEMENT_MIN
             or not self.error_ratio > CONSISTENT_ERROR_RATIO_MAX
@@ -81,7 +81,7 @@ class ConsistencyResult(NamedTuple):
 
 
 def check_error_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
-    """Compare errors with stated standard errors, for each scanner and quantity of a flight.
+    """Return the ratios of actual to stated errors for each scanner and quantity of a flight.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ _NEEDED_VARIABLES = (
     ),
     *(f"true_{q}" for q in _VARIABLE_BY_QUANTITY.values()),
 )
-"""Variables that the comparison reads from a store."""
+"""Names of the stored variables that are read to compare actual with stated errors."""
 
 
 def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:

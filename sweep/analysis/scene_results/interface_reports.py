@@ -258,9 +258,10 @@ def _standard_error_name(quantity: str) -> str:
 def _assign_shots_to_reports(
     shot_columns: ColumnArrays, rate: float | None
 ) -> tuple[np.ndarray, ColumnArrays]:
-    """Assign n shots to m reports, one for each beam and period of the rate.
+    """Return the report to which each of n shots belongs, and beam and time of m reports.
 
-    Without a rate each shot has its own report.
+    There is a report for each beam and period of the rate. Without a rate each shot has its own
+    report.
 
     Returns
     -------

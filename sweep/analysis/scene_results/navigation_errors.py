@@ -36,17 +36,11 @@ class ErrorTally:
     n_solutions: np.ndarray
     """Number of attempts that gave a navigation solution, in each altitude bin (bins,)."""
     mean_error: np.ndarray
-    """Mean error of the solutions in each altitude bin, by component (bins, m)."""
+    """Mean error of the solutions (bins, m), by altitude bin and component."""
     sum_of_squared_deviations: np.ndarray
-    """Sum of squared deviations of errors from their mean, by altitude bin (bins, m).
-
-    The second dimension is the component of the solution.
-    """
+    """Sum of squared deviations of errors from their mean (bins, m), by bin and component."""
     mean_stated_variance: np.ndarray
-    """Mean of the error variances that solutions state, by altitude bin (bins, m).
-
-    The second dimension is the component of the solution.
-    """
+    """Mean of the error variances that solutions state (bins, m), by altitude bin and component."""
 
     def __add__(self, other: ErrorTally) -> ErrorTally:
         """Return the tally of both, by the method of Chan, Golub and LeVeque (1983).
@@ -70,17 +64,17 @@ class ErrorTally:
 
     @property
     def availability(self) -> np.ndarray:
-        """Share of attempts that gave a solution (bins,), 0..1; nan without attempts."""
+        """Share of attempts that gave a solution (bins,), 0..1, by bin; nan without attempts."""
         return _quotient_or_nan(self.n_solutions, self.n_attempts)
 
     @property
     def bias(self) -> np.ndarray:
-        """Mean error of each component (bins, m); nan without solutions."""
+        """Mean error (bins, m), by altitude bin and component; nan without solutions."""
         return np.where(self.n_solutions[..., None] > 0, self.mean_error, np.nan)
 
     @property
     def rmse(self) -> np.ndarray:
-        """RMS error of each component (bins, m), including the bias; nan without solutions."""
+        """RMS error including the bias (bins, m), by bin and component; nan without solutions."""
         return np.sqrt(
             _quotient_or_nan(self.sum_of_squared_deviations, self.n_solutions[..., None])
             + self.mean_error**2
@@ -122,7 +116,7 @@ class ErrorCurve:
 
     @property
     def bias_standard_error(self) -> np.ndarray:
-        """Standard error of the bias (bins, m); nan with fewer than two solutions."""
+        """Standard error of each component's bias (bins, m); nan with fewer than two solutions."""
         return np.sqrt(self.tally.variance / np.maximum(self.tally.n_solutions, 1)[:, None])
 
     @property
@@ -207,7 +201,7 @@ def _altitude_bin_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarr
 def _iter_error_tallies(
     dataset: xr.Dataset, quantity: str, altitude_edges: np.ndarray
 ) -> Iterator[ErrorTally]:
-    """Yield the error tallies of consecutive parts of a scanner's navigation solutions."""
+    """Yield an error tally for each of consecutive parts of a scanner's navigation solutions."""
     status = dataset[f"{quantity}_status"]
     draws_per_chunk = stored_chunk_length(status, "draw")
     draw_slices = chunk_aligned_slices(status, "draw", draws_per_chunk)
@@ -303,7 +297,7 @@ def merge_tallies(tallies: Sequence[ErrorTally]) -> ErrorTally:
 
 
 def _sum_by_bin(values: np.ndarray, bin_index: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the sums (n_bins, m) of the values (n, m) in each bin.
+    """Return the sums (n_bins, m) of the rows of `values` (n, m) that fall in each bin.
 
     `bin_index` (n,) is the bin of each row.
     """
@@ -318,7 +312,7 @@ def _quotient_or_nan(total: np.ndarray, count: np.ndarray) -> np.ndarray:
 AVAILABILITY, BIAS, RMSE = "availability", "bias", "rmse"
 """Names of the statistics: share of attempts that gave a solution, mean error, and RMS error."""
 COMPONENT_NAMES_BY_QUANTITY = {VELOCITY_QUANTITY: ("x", "y", "z"), ALTITUDE_QUANTITY: ("",)}
-"""Names of the components of each quantity; altitude has a single one without a name."""
+"""Names of the components of each quantity; the only component of altitude has the name ''."""
 
 UNIT_BY_QUANTITY = {VELOCITY_QUANTITY: "m/s", ALTITUDE_QUANTITY: "m"}
 """Units of the errors of each quantity."""
@@ -333,9 +327,10 @@ The index that follows the last component stands for the length of the vector.
 
 
 def navigation_error_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
-    """Return the chart of navigation errors over altitude: a panel per statistic, a line per curve.
+    """Return a chart of navigation errors over altitude, with a panel for each statistic.
 
-    ``show`` is ``availability``, ``bias``, ``rmse``, or ``all``.
+    Each panel has a line for each curve. ``show`` names the statistic: ``availability``, ``bias``,
+    ``rmse``, or ``all``.
     """
     panels, panels_per_row = [], []
     for quantity in dict.fromkeys(curve.quantity for curve in curves):
@@ -444,7 +439,7 @@ def navigation_error_page(
 ) -> TablePage:
     """Return a page of navigation errors with a table for each curve, and a row per altitude bin.
 
-    ``show`` is ``availability``, ``bias``, ``rmse``, or ``all``.
+    ``show`` names the statistic: ``availability``, ``bias``, ``rmse``, or ``all``.
     """
     statistics = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
     page_tables, records = [], []

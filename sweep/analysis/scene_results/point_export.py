@@ -48,7 +48,7 @@ velocity.
 """
 
 POINT_COLUMNS: tuple[str, ...] = POINT_DTYPE.names or ()
-"""Names of the columns of points, in the order of files."""
+"""Names of the columns of points, in the order in which files have them."""
 
 UNIT_BY_COLUMN = {
     n: QUANTITY_BY_NAME[n].units
@@ -197,24 +197,21 @@ def write_csv(table: PointTable, file_path: Path, remarks: FileRemarks) -> int:
 
 
 LAS_COORDINATE_STEP_MIN = 1e-4
-"""Least step in which coordinates are stored in a LAS file [m].
-
-A large cloud needs a larger step.
-"""
+"""Least quantisation step of coordinates in a LAS file [m]. A large cloud needs a larger step."""
 
 LAS_COORDINATE_STEPS_MAX = 2.0**31 - 1
 """Largest distance of a coordinate from the offset of a LAS file, in quantisation steps."""
 LAS_RETURN_NUMBER_MAX = 15
-"""Largest return number in a LAS file."""
+"""Largest number that a return can have in a LAS file."""
 
 _LAS_STANDARD_COLUMNS = {"x", "y", "z", "time", "return_number", "number_of_returns", "scan_angle"}
 """Names of the columns with a field in LAS point format 6. All others become extra bytes."""
 
 _LAS_SCAN_ANGLE_STEP_DEG = 0.006
-"""Step in which scan angles are stored in a LAS file [deg]."""
+"""Quantisation step of scan angles in a LAS file [deg]."""
 
 _STORED_RETURN_NUMBER_FIELD = "stored_return"
-"""Name of the extra field of a LAS point with the number of the return in the store, from 1."""
+"""Name of the extra field of a LAS point that holds the return's number in the store, from 1."""
 
 _LAS_BEAM_NUMBER_MAX = 255
 """Largest beam number that the user data of a LAS point can hold."""
@@ -269,7 +266,7 @@ def write_las(
 
 
 def _las_coordinate_step(extent: float) -> float:
-    """Return the quantisation step [m] for coordinates of a given extent [m]: a power of ten."""
+    """Return the quantisation step [m], a power of ten, for coordinates of a given extent [m]."""
     return LAS_COORDINATE_STEP_MIN * 10.0 ** max(
         0,
         math.ceil(
@@ -307,7 +304,7 @@ def _to_las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # t
 
 
 def _assign_return_numbers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Assign return numbers to the points of each shot, from 1 by rising range.
+    """Return the numbers of the points among the returns of their shots, from 1 by rising range.
 
     True and false points are numbered separately. ``rows`` are points of `POINT_DTYPE`, and contain
     all points of each shot.
@@ -506,7 +503,7 @@ def _find_request_mistakes(
 def _file_remarks(
     results: SceneResults, table: PointTable, axis_position: AxisPosition
 ) -> list[str]:
-    """Return the remarks that are written into a file of points: source, selection and numbers."""
+    """Return the remarks to write into a file of points: source, selection, meaning of codes."""
     surface_remarks = [f"surface {i}: {name}" for i, name in enumerate(results.surface_labels)]
     flag_remarks = [
         f"flag {bit}: {labels.coordinate_label(name)}" for name, bit in FLAG_BITS.items()

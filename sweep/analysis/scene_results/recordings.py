@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 WORLD_AXES = ("x", "y", "z")
-"""Axes of world coordinates."""
+"""Names of the axes of world coordinates."""
 
 QUANTISED_RANGES, INTERPOLATED_RANGES = "quantised", "interpolated"
 """Names of the two kinds of ranges and velocities: from whole bins, or interpolated."""
@@ -80,9 +80,9 @@ LOG_QUANTITIES = ("pfa_up", "pfa_down")
 """Names of quantities that figures show on a logarithmic scale: false-alarm probabilities."""
 
 POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Bit of a point's flags for each kind of point, by the name of the kind.
+"""Bit for each kind of point, by the name of the kind.
 
-Each point has exactly one of these bits.
+The flags of each point have exactly one of these bits.
 """
 
 
@@ -163,7 +163,7 @@ ValueLimits = tuple[float, ...]
 """Lowest and highest value of a quantity that are within limits."""
 
 INFINITE_VALUE_LIMITS: ValueLimits = (-np.inf, np.inf)
-"""Limits that exclude no finite value."""
+"""Lowest and highest value that exclude no finite value."""
 
 
 def within_limits_mask(
@@ -190,7 +190,7 @@ class Recording:
     flags_chunk_folder: Location | None = None
     """Folder with the stored chunks of the array `flags` for this scanner and position.
 
-    Chunks in it show which shots are computed. It is None for a packed store.
+    Chunks in the folder show which shots are computed. The folder is None for a packed store.
     """
 
     @property
@@ -199,7 +199,7 @@ class Recording:
         return int(self.dataset.sizes["shot"])
 
     def iter_shot_slices(self, time_limits: ValueLimits = INFINITE_VALUE_LIMITS) -> Iterator[slice]:
-        """Yield slices of shots that are read together, in the order of shots.
+        """Yield consecutive slices of shots, each of which is read at once.
 
         Slices without a computed shot within `time_limits`, the earliest and the latest time [s],
         are skipped.
@@ -284,7 +284,7 @@ class Recording:
         ranges: str = QUANTISED_RANGES,
         time_limits: ValueLimits | None = None,
     ) -> ThinnedRows:
-        """Read the named quantities of all points, thinned to at most ``rows_max`` rows.
+        """Return at most ``rows_max`` evenly spaced rows of the named quantities of all points.
 
         If all quantities belong to shots, the rows are the computed shots. ``time_limits`` are the
         earliest and the latest time [s].
@@ -434,7 +434,7 @@ class AxisPosition:
     axis_indices: dict[str, int]
     """Index along each axis, by the axis's name."""
     label: str
-    """Coordinates of the position, as text."""
+    """Text with the coordinates of the position."""
     undetermined_axes: tuple[str, ...]
     """Names of the axes along which the request matches several values."""
 
@@ -498,7 +498,7 @@ def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosit
 def _match_axis_values(
     spec: SceneSpec, name: str, wanted_values: list[object]
 ) -> tuple[str, np.ndarray, str]:
-    """Find requested values of a coordinate along the axes of a study.
+    """Return the axis of a coordinate and a mask of the requested values along the axis.
 
     Raise QuantityError if no axis has the coordinate.
 
@@ -583,11 +583,11 @@ class PointCloud:
     n_false_points_outside: int
     """Number of false points that are left out because they lie outside the box."""
     box: CoordinateBox
-    """Box of the picture."""
+    """Bounds of the picture along x, y and z."""
 
     @property
     def dropouts(self) -> ColumnArrays:
-        """Columns x, y and z of the dropouts: where their beam axes meet the scene [m].
+        """Columns x, y and z [m] of the points where the beam axes of dropouts meet the scene.
 
         The columns are empty if dropouts were not requested.
         """
@@ -623,7 +623,7 @@ def gather_point_cloud(
     with_path: bool = False,
     points_max: int = CLOUD_POINTS_MAX,
 ) -> PointCloud | None:
-    """Read the points of a recording within limits, for a picture.
+    """Return the points of a recording within limits, with flight path and dropouts, for a picture.
 
     Parameters
     ----------
