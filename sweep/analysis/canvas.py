@@ -257,7 +257,7 @@ def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        Edges, (n + 1,). The outer edges are as far from their centres as the inner ones.
+        Edges, (n + 1,). The first and the last centre lie in the middle of their cells.
     """
     if centres.size == 1:
         return centres[0] * np.array([0.9, 1.1]) if centres[0] else np.array([-0.5, 0.5])

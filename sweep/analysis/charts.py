@@ -336,7 +336,7 @@ def surface_chart(
 ) -> Chart:
     """Return a chart of heat maps of a variable over two coordinates.
 
-    Each combination of values of the other coordinates has a panel.
+    Each combination of values of the remaining coordinates has a panel.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ def open(
     Returns
     -------
     xarray.Dataset
-        Dataset with the scalar coordinate `study_id`, the id of the study. A further coordinate,
+        Dataset with the scalar coordinate `study_id`, the id of the study. A second coordinate,
         with the id in its name, proves to `ds.sweep` that the dataset comes from one study. The
         attributes are those of the store, and `started` and `finished` (UTC; empty if not known),
         `points`, `points_committed`, `blocks` and `blocks_committed`.

@@ -705,9 +705,9 @@ def write_shot_report(
     spec
         Spec of the grid.
     coordinate_values
-        Values of coordinates, written with units, by name or path. Coordinates without a value take
-        their first one. If nothing is given and the only axis has few values, each of them makes a
-        shot.
+        Values of coordinates, written with units, by name or path. A coordinate without a value
+        has the first value of its axis. Without any values, a study with a single axis of few
+        values has a shot for each of them.
     directory
         Output directory.
     draws_noise

@@ -368,7 +368,7 @@ def false_alarm_records(
     spec
         Spec of the study.
     by
-        Name of the coordinate by which settings are named first.
+        Name of the coordinate that comes first in the names of settings.
     printed
         Published values: for each setting a list with a value for each cut.
     """

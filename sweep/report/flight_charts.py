@@ -507,7 +507,7 @@ def _time_panels(
     noun
         Name of what is drawn: ``shot`` or ``point``.
     names
-        Quantities that are read.
+        Names of the quantities that are read.
     quantity_lines
         Function that yields the label, axis and lines of each drawn quantity, from the columns that
         were read.
@@ -590,7 +590,7 @@ def point_count_sentences(
     Parameters
     ----------
     returns_frame
-        Frame of :func:`point_count_table`.
+        Data frame of the table that :func:`point_count_table` returns.
     groups
         Datasets of the scanners.
     n_omitted

@@ -178,7 +178,7 @@ def _main_results_section(
     counted_unit
         Name of what the datasets count: ``points`` or ``shots``.
     further_sentences
-        Sentences that follow the first one.
+        Sentences that follow the first sentence of the section.
     """
     tolerance, pd_level = spec.accuracy.tolerance, detector_charts.REPORTED_PD_LEVEL
     limits = {"effects_error": tolerance, "beamlets_error": tolerance, "accuracy_missed": 0.0}
@@ -297,7 +297,10 @@ def _iter_figure_charts(results: GridResults) -> Iterator[SectionItem]:
 
 
 def _iter_spec_tables(results: GridResults) -> Iterator[HtmlTable]:
-    """Yield the tables that a grid's spec defines; for a single point also all its outputs."""
+    """Yield the tables that a grid's spec defines.
+
+    For a grid with a single point, yield a table of all outputs first.
+    """
     if not results.spec.axes:
         yield from _iter_html_tables(single_point_page(results.dataset), "outputs")
     for figure_spec in results.figure_specs:

@@ -50,16 +50,16 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     ours, other
         Datasets of `sweep.open`, or selections of them. Points are matched by the values of their
         coordinates, in any units. If a parameter is on an axis of only one study, that axis is
-        reduced to the fixed value of the other study. If it lacks this value, the axis stays.
+        reduced to the fixed value of the other study. An axis without this value stays.
 
     Returns
     -------
     xarray.Dataset
         Lazy dataset over the axes of `ours` and the remaining axes of `other`. It has the
         difference of every output under the name of the output. For each probability of detection
-        it also has `pd_.._allowed` and `pd_.._agrees`. The first is the largest difference
-        explained by the half-widths of draws and the errors of skipped effects and few beamlets.
-        The second is true if the difference is no larger, and false if either study has no value.
+        it also has two variables. `pd_.._allowed` is the largest difference explained by the
+        half-widths of draws and the errors of skipped effects and few beamlets. `pd_.._agrees` is
+        true if the difference is no larger, and false if either study has no value.
 
     Raises
     ------
@@ -250,12 +250,13 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
     Returns
     -------
     xarray.DataTree
-        Group for each common scanner, over the axes and `shot`. It has the differences of the
-        probabilities and SNRs of a shot. If both stores are complete, it also has the difference of
-        `detected`, the share of draws in which the shot has a true point. Probabilities of
-        detection and `detected` also have `.._allowed` and `.._agrees`, as in :func:`compare`. The
-        intervals of `detected` are Clopper-Pearson intervals with the confidence of each study. The
-        attributes `shots` and `other_shots` are the numbers of shots of both flights.
+        Tree with a group for each common scanner, over the axes and `shot`. A group has the
+        differences of the probabilities and SNRs of a shot. If both stores are complete, a group
+        also has the difference of `detected`, the share of draws in which the shot has a true
+        point. Probabilities of detection and `detected` also have `.._allowed` and `.._agrees`, as
+        in :func:`compare`. The intervals of `detected` are Clopper-Pearson intervals with the
+        confidence of each study. The attributes `shots` and `other_shots` are the numbers of shots
+        of both flights.
 
     Raises
     ------

@@ -98,8 +98,8 @@ def limit(
 ) -> xr.Dataset:
     """Return the farthest value of a coordinate at which pd still reaches a level.
 
-    pd need not fall monotonically: scalloping and interference make dips. There are therefore two
-    answers, with and without dips before the limit.
+    pd need not fall monotonically: scalloping and interference make dips. The result therefore has
+    two answers, one up to the first dip below the level, and one beyond the last dip.
 
     Parameters
     ----------

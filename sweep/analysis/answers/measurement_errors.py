@@ -267,7 +267,7 @@ def _point_deviations(
     snr
         Signal-to-noise ratios of the three segments.
     effects
-        Flags of the simulated effects that change lines.
+        Masks of the points at which effects that change lines are simulated.
     parameters
         SI values at each point of the parameters in `_CRAMER_RAO_PARAMETER_PATHS`.
     """

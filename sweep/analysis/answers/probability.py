@@ -64,9 +64,10 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
     -------
     xarray.Dataset
         `pd`, `low` and `high`, from 0 to 1, lazy if the arrays of the store are. The interval is pd
-        plus and minus the stored half-width, clipped to 0..1. Its attribute `confidence` is the
-        confidence level. Without draws pd is a closed form, and the interval has no width. The
-        possible error of skipped effects is not included: it is the variable `effects_error`.
+        plus and minus the stored half-width, clipped to 0..1. The attribute `confidence` of `low`
+        and `high` is the confidence level. Without draws pd is a closed form, and the interval has
+        no width. The interval does not include the possible error of skipped effects, which is the
+        variable `effects_error` of the store.
     """
     require_variables(dataset, segment_variable_name("pd", segment))
     pd = dataset[segment_variable_name("pd", segment)]
@@ -254,8 +255,9 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Every floating-point variable over `statistic`, lazy; nan if no point is finite. Each chunk
-        of the store is read once, chunk by chunk.
+        Every floating-point variable, lazy, with `statistic` (`SUMMARY_STATISTICS`) as its only
+        dimension. Statistics are nan if no value is finite. Each chunk of the store is read once,
+        chunk by chunk.
     """
     result = xr.Dataset(coords={"statistic": list(SUMMARY_STATISTICS)}, attrs=dataset.attrs)
     for name, array in dataset.data_vars.items():
@@ -374,7 +376,7 @@ def roc(
     -----
     Without random effects, pd = Q_1(sqrt(2 SNR), b) and pfa = exp(-b^2 / 2), where SNR is that of
     the strongest bin, b the threshold over the noise per quadrature, and Q_1 the Marcum function.
-    Points at which this does not reproduce the stored pd are simulated again at each threshold.
+    Points at which this pd differs from the stored pd are simulated again at each threshold.
     """
     if grid_spec_of_dataset(dataset).draws.draws_whole_spectra:
         raise ValueError(

@@ -312,7 +312,8 @@ def _assign_return_numbers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     tuple of numpy.ndarray
-        Return number of each point, and the number of returns of its shot and kind.
+        Return number (n,) of each of n points, and the number (n,) of true returns, or of false
+        ones, in the point's shot.
     """
     is_false = (rows["flags"] & TRUE_RETURN_FLAG) == 0
     order = np.lexsort((rows["range"], is_false, rows["shot"]))

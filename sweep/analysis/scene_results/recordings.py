@@ -640,7 +640,7 @@ def gather_point_cloud(
     with_dropouts, with_path
         If true, the shots without a point, or the flight path, are read too.
     points_max
-        Largest number of points; a larger number is thinned.
+        Largest number of points. Of more points only some are read, evenly spaced.
 
     Returns
     -------
