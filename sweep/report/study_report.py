@@ -313,7 +313,7 @@ def _iter_spec_tables(results: GridResults) -> Iterator[HtmlTable]:
 def _iter_html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
     """Yield the tables of a page of text tables as HTML tables.
 
-    `stem` is the beginning of the names of their CSV files.
+    `stem` is the beginning of the names of the CSV files that the reader can download.
     """
     for table_number, page_table in enumerate(table_page.page_tables):
         frame = pandas.DataFrame(

@@ -375,10 +375,10 @@ def _computed_shot_table(group: xr.Dataset) -> pandas.DataFrame:
 
 
 def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: bool) -> xr.Dataset:
-    """Return the variables of a scanner's group that a comparison of flights needs.
+    """Return the variables of a scanner's group that a comparison of flights needs, as a dataset.
 
-    With ``all_drawn``, all draws are computed, and the variables include `detected` and its
-    half-width.
+    ``all_drawn`` is true if all draws are computed. The variables include `detected` and its
+    half-width only in this case.
     """
     variables = [
         name for name in (*COMPARED_SHOT_STATISTICS, *ERROR_BOUND_VARIABLES) if name in group
@@ -498,7 +498,7 @@ def _describe_coordinate(coordinate: xr.DataArray) -> str:
 
 
 def describe_common_shots(differences: xr.Dataset) -> str:
-    """Return a text with the number of shots that two flights have in common."""
+    """Return a text with the number of shots common to two flights, and that of each flight."""
     n_common, n_ours, n_other = (
         differences.sizes["shot"],
         differences.attrs["shots"],

@@ -352,7 +352,7 @@ def _check_join_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
 
 
 def _reference_coordinate_by_path(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.DataArray]:
-    """Return a coordinate for each parameter path, from the first dataset that has one for it."""
+    """Return a coordinate by parameter path, from the first dataset with that parameter."""
     coord_by_path: dict[str, xr.DataArray] = {}
     for dataset in datasets.values():
         for coord in dataset.coords.values():
@@ -364,7 +364,7 @@ def _reference_coordinate_by_path(datasets: Mapping[str, xr.Dataset]) -> dict[st
 def _align_coordinates(
     dataset: xr.Dataset, spec: GridSpec | SceneSpec, reference_coords: Mapping[str, xr.DataArray]
 ) -> xr.Dataset:
-    """Return a dataset with the same coordinates as ``reference_coords``, in name and units.
+    """Return a dataset whose coordinates have the names and units of ``reference_coords``.
 
     A parameter that the study does not vary becomes a dimension with one value.
     """

@@ -57,7 +57,7 @@ _TRUTH_VARIABLE_BY_COLUMN = {
     "true_range": "beam_range",
     "true_radial_velocity": "beam_radial_velocity",
 }
-"""Stored variable with the true value along the beam, for each column of reports with a truth."""
+"""Stored variable with true values along the beam, for each column of true values in reports."""
 
 _PERIOD_END_TOLERANCE_FRACTION = 1e-6
 """Length of the interval at the end of a report's period whose shots count to the next period.

@@ -52,9 +52,9 @@ class ContinuousColourScale:
     """Colours of a quantity with continuous values."""
 
     cmap: Colormap
-    """Colour map."""
+    """Colour map of matplotlib."""
     norm: Normalize
-    """Normalisation of matplotlib that maps values to 0..1."""
+    """Mapping of values to 0..1, an object of matplotlib."""
     label: str
     """Label of the colour bar, with units."""
     colour_bar_extend: str = "neither"
@@ -91,7 +91,7 @@ class CategoryColours:
         return rgba
 
     def legend_handles(self) -> list[Line2D]:
-        """Return a legend entry for each category."""
+        """Return a legend entry of matplotlib for each category."""
         return [
             legend_marker("o", name, color=self.colour_by_number.get(number, MISSING_POINT_COLOUR))
             for number, name in self.label_by_number.items()
