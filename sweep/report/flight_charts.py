@@ -202,7 +202,7 @@ def cloud_plot(
                 omission_remark(n_omitted),
             ]
         ),
-        figure=go.Figure(traces, _scene_layout()),
+        figure=go.Figure(traces, _cloud_view_layout()),
         controls=[
             PlotControl("cloud", "Shown for", list(shown_clouds)),
             PlotControl(
@@ -400,7 +400,7 @@ def _framing_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) ->
     }
 
 
-def _scene_layout() -> dict[str, Any]:
+def _cloud_view_layout() -> dict[str, Any]:
     """Return plotly's layout of the three-dimensional view."""
     axis_style = {"showbackground": False, "showspikes": False, "nticks": 5}
     return plot_layout(
@@ -442,7 +442,7 @@ def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> C
             )
             yield quantity_label(name), y_axis, _lines_by_beam(column_arrays, name)
 
-    panels, reduction_remark = _time_panels(
+    panels, reduction_remark = _panels_over_time(
         labelled_recordings, "shot", [*quantities, "beam"], quantity_lines
     )
     extent_texts = [
@@ -451,7 +451,7 @@ def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> C
         for panel in panels[: len(quantities)]
     ]
     alt = f"Marks of a quantity of each shot over time. {'; '.join(extent_texts)}."
-    return _time_chart("Shots over time", alt, [reduction_remark], panels)
+    return _chart_over_time("Shots over time", alt, [reduction_remark], panels)
 
 
 def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
@@ -481,20 +481,22 @@ def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) ->
         *ERROR_CHART_QUANTITIES,
         *(f"true_{name}" for name in ERROR_CHART_QUANTITIES),
     ]
-    panels, reduction_remark = _time_panels(labelled_recordings, "point", names, quantity_lines)
+    panels, reduction_remark = _panels_over_time(
+        labelled_recordings, "point", names, quantity_lines
+    )
     error_texts = "; ".join(
         panel.facet_choices["quantity"] for panel in panels[: len(ERROR_CHART_QUANTITIES)]
     )
     alt = f"Marks of the error of each true point over time. {error_texts}."
     method_remark = "Measured less true, of true points, interpolated between bins"
-    return _time_chart("Errors against truth", alt, [method_remark, reduction_remark], panels)
+    return _chart_over_time("Errors against truth", alt, [method_remark, reduction_remark], panels)
 
 
 QuantityLines = tuple[str, ChartAxis, list[ChartLine]]
 """Label of a quantity of shots or points, its vertical axis, and its lines over time."""
 
 
-def _time_panels(
+def _panels_over_time(
     labelled_recordings: Sequence[LabelledRecording], noun: str, names: Sequence[str],
     quantity_lines: Callable[[dict[str, np.ndarray]], Iterator[QuantityLines]],
 ) -> tuple[list[Panel], str]:  # fmt: skip
@@ -530,7 +532,9 @@ def _time_panels(
     )
 
 
-def _time_chart(heading: str, alt: str, caption: list[str], panels: list[Panel]) -> Chart | None:
+def _chart_over_time(
+    heading: str, alt: str, caption: list[str], panels: list[Panel]
+) -> Chart | None:
     """Return a chart with panels of quantities over time; None without panels."""
     facets = {"cloud": "Shown for", "quantity": "Quantity"}
     return Chart(heading, alt, caption, panels, facets) if panels else None

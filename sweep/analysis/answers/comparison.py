@@ -302,7 +302,7 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
     # computed looks like one without a point.
     all_drawn = all(t.attrs["points_committed"] >= t.attrs["points"] for t in (ours, other))
     quantities_of_both = [
-        _compared_quantities(group.isel(shot=index), tree, all_drawn=all_drawn)
+        _select_compared_variables(group.isel(shot=index), tree, all_drawn=all_drawn)
         for group, tree, index in (
             (our_group, ours, our_shots),
             (other_group, other, matching_shots),
@@ -374,7 +374,9 @@ def _computed_shot_table(group: xr.Dataset) -> pandas.DataFrame:
     return frame.assign(number=frame.index).dropna().sort_values("time")
 
 
-def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: bool) -> xr.Dataset:
+def _select_compared_variables(
+    group: xr.Dataset, tree: xr.DataTree, *, all_drawn: bool
+) -> xr.Dataset:
     """Return the variables of a scanner's group that a comparison of flights needs, as a dataset.
 
     ``all_drawn`` is true if all draws are computed. The variables include `detected` and its

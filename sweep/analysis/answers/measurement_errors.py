@@ -191,7 +191,7 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
 
     `quantity` is ``range`` or ``radial_velocity``. The result is 0 at points without fading.
     """
-    is_fading = _is_simulated("fading", dataset["effects"])
+    is_fading = _simulated_mask("fading", dataset["effects"])
     if (
         spec.effect_modes()["fading"] == "off"
         or spec.parameters()["footprint.speckle"] != "developed"
@@ -243,7 +243,7 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
     )
 
 
-def _is_simulated(effect: str, effect_flags: _FlagArray) -> _FlagArray:
+def _simulated_mask(effect: str, effect_flags: _FlagArray) -> _FlagArray:
     """Return a mask of the points at which an effect is simulated, from their flags of effects."""
     return (effect_flags & (1 << EFFECT_NAMES.index(effect))) > 0
 

@@ -22,7 +22,7 @@ from sweep.analysis.scene_results import point_styles
 from sweep.analysis.scene_results.point_styles import SheetWithLegends
 from sweep.analysis.scene_results.recordings import (
     CATEGORICAL_QUANTITIES,
-    LOG_QUANTITIES,
+    LOG_SCALE_QUANTITIES,
     SIGNED_QUANTITIES,
     WORLD_AXES,
     ColumnArrays,
@@ -607,12 +607,12 @@ def _scatter_axis_limits(
     finite_values = values[is_true & np.isfinite(values)]
     finite_values = finite_values if finite_values.size else values[np.isfinite(values)]
     finite_values = (
-        finite_values[finite_values > 0] if quantity in LOG_QUANTITIES else finite_values
+        finite_values[finite_values > 0] if quantity in LOG_SCALE_QUANTITIES else finite_values
     )
     if not finite_values.size:
         return 0.0, 1.0
     low, high = float(finite_values.min()), float(finite_values.max())
-    if quantity in LOG_QUANTITIES:
+    if quantity in LOG_SCALE_QUANTITIES:
         return low / 1.3, high * 1.3
     margin = 0.04 * (high - low) or 0.05 * abs(high) or 0.5
     return low - margin, high + margin
@@ -624,7 +624,7 @@ def _set_scatter_axes(
     """Set the limits, scales, labels and grid of a scatter plot of two quantities, in place."""
     axis_names: tuple[Literal["x", "y"], ...] = ("x", "y")
     for axis_name, quantity in zip(axis_names, quantities, strict=True):
-        axes.set(**{f"{axis_name}scale": "log" if quantity in LOG_QUANTITIES else "linear"})
+        axes.set(**{f"{axis_name}scale": "log" if quantity in LOG_SCALE_QUANTITIES else "linear"})
         axes.set(
             **{
                 f"{axis_name}label": textwrap.fill(quantity_label(quantity), 52),

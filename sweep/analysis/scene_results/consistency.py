@@ -173,7 +173,7 @@ def _iter_flight_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
         )
         if "cycle" in sample.dims:
             sample = sample.isel(cycle=slice(first_cycle, first_cycle + cycles_per_interval))
-        variables = [name for name in _NEEDED_VARIABLES if name in sample]
+        variables = [name for name in _CONSISTENCY_VARIABLES if name in sample]
         yield sample[variables].load()
 
 
@@ -182,7 +182,7 @@ _VELOCITY_QUANTITY = "velocity"
 _VARIABLE_BY_QUANTITY = {"range": "range", "radial velocity": "radial_velocity"}
 """Stored variable of each measured quantity, by the quantity's name in messages."""
 
-_NEEDED_VARIABLES = (
+_CONSISTENCY_VARIABLES = (
     "flags",
     "velocity",
     "velocity_covariance",

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from sweep.analysis import canvas, labels
 from sweep.analysis.scene_results.recordings import (
     CATEGORICAL_QUANTITIES,
-    LOG_QUANTITIES,
+    LOG_SCALE_QUANTITIES,
     POINT_KIND_BITS,
     SIGNED_QUANTITIES,
     quantity_label,
@@ -154,7 +154,7 @@ def _continuous_colour_scale(
     finite_values = values[np.isfinite(values)]
     trusted_values = values[is_trusted & np.isfinite(values)]
     trusted_values = trusted_values if trusted_values.size else finite_values
-    is_log = quantity in LOG_QUANTITIES
+    is_log = quantity in LOG_SCALE_QUANTITIES
     low, high = _colour_scale_ends(trusted_values[trusted_values > 0] if is_log else trusted_values)
     cmap = colormaps[canvas.COLOUR_MAP_NAME]
     if quantity in SIGNED_QUANTITIES and low < 0 < high:

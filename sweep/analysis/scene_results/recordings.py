@@ -76,7 +76,7 @@ SIGNED_QUANTITIES = ("radial_velocity", "beam_radial_velocity", "true_radial_vel
 DECIBEL_QUANTITIES = ("snr", "snr_up")
 """Names of quantities that figures show in decibels: power ratios."""
 
-LOG_QUANTITIES = ("pfa_up", "pfa_down")
+LOG_SCALE_QUANTITIES = ("pfa_up", "pfa_down")
 """Names of quantities that figures show on a logarithmic scale: false-alarm probabilities."""
 
 POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
