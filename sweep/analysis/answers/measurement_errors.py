@@ -150,8 +150,8 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
         effect_flags: np.ndarray,
         *parameter_values: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        line_effects = _LineEffects(
-            *(_is_simulated(effect, effect_flags) for effect in _LineEffects._fields)
+        line_effects = _LineEffectMasks(
+            *(_simulated_mask(effect, effect_flags) for effect in _LineEffectMasks._fields)
         )
         point_parameters = dict(zip(parameters, parameter_values, strict=True))
         deviations = _point_deviations((up, doppler, down), line_effects, point_parameters)
@@ -258,7 +258,7 @@ class _PointDeviations(NamedTuple):
 
 
 def _point_deviations(
-    snr: tuple[np.ndarray, ...], effects: _LineEffects, parameters: dict[str, np.ndarray]
+    snr: tuple[np.ndarray, ...], effects: _LineEffectMasks, parameters: dict[str, np.ndarray]
 ) -> _PointDeviations:
     """Return the Cramer-Rao bounds and the deviations by whole bins at each point.
 
@@ -299,7 +299,7 @@ def _point_deviations(
 
 
 def _deviations_of_category(
-    snr: list[np.ndarray], effects: _LineEffects, parameters: dict[str, np.ndarray]
+    snr: list[np.ndarray], effects: _LineEffectMasks, parameters: dict[str, np.ndarray]
 ) -> _PointDeviations:
     """Return the deviations of points that share text parameters and sizes.
 
