@@ -115,7 +115,7 @@ class RepeatedPoint:
             )
         return interval_half_width(mean, interval)
 
-    def half_width_excess(self, points: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    def pd_half_width_excess(self, points: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
         """Return by how much the half-widths of trials exceed the tolerance; 0 if they do not."""
         return np.maximum(self.half_widths(points) - error_budget.tolerance, 0.0)
 

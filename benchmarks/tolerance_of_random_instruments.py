@@ -13,7 +13,7 @@ import numpy as np
 from benchmark_helpers import TABLE_4_1, load_mapping, markdown_table
 
 from sweep.model.beamlet_counts import effects_tolerance
-from sweep.model.effects.catalogue import EFFECTS, pack_effect_flags, unpack_effect_flags
+from sweep.model.effects.catalogue import EFFECTS, effect_names_in_flags, pack_effect_flags
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.planning import plan_effects
 from sweep.model.evaluation import PARAMETER_DEFAULTS
@@ -145,7 +145,7 @@ def errors_at_tolerances(
                 spec,
                 select_parameters_of_points(parameters_at_tolerance, index),
                 index.size,
-                unpack_effect_flags(int(flag)),
+                effect_names_in_flags(int(flag)),
             )
             for name in set(part) & set(COMPARED_OUTPUTS):
                 outputs.setdefault(name, np.empty(grid.n_points))[index] = part[name]

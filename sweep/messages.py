@@ -138,7 +138,7 @@ def is_run_as_command() -> bool:
     return _runs_as_command
 
 
-def shell_command(name: str, *arguments: object, **options: object) -> str:
+def sweep_shell_command(name: str, *arguments: object, **options: object) -> str:
     """Return a command of `sweep` as typed into a shell, with words quoted if necessary.
 
     Parameters
@@ -152,7 +152,7 @@ def shell_command(name: str, *arguments: object, **options: object) -> str:
 
     Examples
     --------
-    >>> shell_command("verify", "results/my lidar.zarr", repair=True)
+    >>> sweep_shell_command("verify", "results/my lidar.zarr", repair=True)
     "sweep verify 'results/my lidar.zarr' --repair"
     """
     words = ["sweep", name, *map(_shell_word, arguments)]
@@ -193,7 +193,7 @@ def suggested_call(name: str, *arguments: object, **options: object) -> str:
     "`sweep resume 'a b.zarr' --retry-failed`"
     """
     if _runs_as_command:
-        return f"`{shell_command(name, *arguments, **options)}`"
+        return f"`{sweep_shell_command(name, *arguments, **options)}`"
     parts = [_python_literal(argument) for argument in arguments]
     parts += [f"{option}={_python_literal(value)}" for option, value in options.items()]
     return f"`sweep.{name}({', '.join(parts)})`"

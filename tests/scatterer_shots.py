@@ -105,7 +105,7 @@ def segment_amplitudes(facet: Facet, shots) -> dict[str, float]:
     """Root mean square amplitude of each segment's beat, behind the receiver's poles [V]."""
     amplitude_by_segment = {}
     for segment in facet.segments:
-        gain = receiver_chain.receiver_transfer(
+        gain = receiver_chain.receiver_transfer_function(
             np.array(echo_beat(facet, segment)),
             detector_bandwidth=shots.receiver_filter.detector_bandwidth,
             amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,

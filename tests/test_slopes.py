@@ -11,7 +11,7 @@ from sweep.model import time_domain_truth, waveform
 from sweep.model.detection.echo_detection import (
     RAYLEIGH_DEVIATION,
     SegmentCorrelations,
-    speckle_mixing_at,
+    speckle_mixing_of_point,
 )
 from sweep.model.detection.estimators import range_velocity_deviation
 from sweep.model.detection.looks import pd_and_miss_any_two_in_speckle
@@ -19,7 +19,7 @@ from sweep.model.evaluation import evaluate_segments, prepare_shots, shot_statis
 from sweep.model.outputs import DRAW_COUNT_OUTPUTS
 from sweep.model.sampling import philox
 from sweep.model.sampling.draws import (
-    PD_BOTH_CHIRPS,
+    PD_BOTH_CHIRPS_NAME,
     DrawRanges,
     count_by_probability,
     count_in_noise,
@@ -145,7 +145,7 @@ def test_any_two_of_three_that_fade(snr, near):
     number, level, snr = 200_000, 4.0, np.array(snr)
     over = near**4  # of Gaussian footprints
     fading = SegmentCorrelations(*np.array([[near + 0j], [over + 0j], [near + 0j]]))
-    key, mixing = (np.uint64(3), np.uint64(5)), speckle_mixing_at(fading.speckle_mixing(), 0)
+    key, mixing = (np.uint64(3), np.uint64(5)), speckle_mixing_of_point(fading.speckle_mixing(), 0)
     factors = np.array(
         [speckle_factors(philox.DrawAddress(*key, draw), 0, mixing) for draw in np.arange(number)]
     ).T
@@ -196,12 +196,12 @@ def test_draws_count_the_shots_that_the_closed_form_tells(table_4_1, noisy, spec
         share,
         expected,
     )
-    assert expected[3] > outputs[PD_BOTH_CHIRPS][0] + 0.02
+    assert expected[3] > outputs[PD_BOTH_CHIRPS_NAME][0] + 0.02
     assert outputs["miss_shot"][0] == pytest.approx(1 - expected[3], abs=1e-12)
     statistics = shot_statistics(
         prepared(table_4_1() | rule | {SHOT_DETECTION_PATH: "both_chirps"}, effects)
     )
-    assert outputs[PD_BOTH_CHIRPS] == statistics["pd_shot"]
+    assert outputs[PD_BOTH_CHIRPS_NAME] == statistics["pd_shot"]
 
 
 FLAT = {

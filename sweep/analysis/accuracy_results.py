@@ -314,7 +314,7 @@ The last column, `front`, marks settings that no other setting beats in both tim
 SHORT_SETTING_TABLE_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
 """Column names of the shorter table of accuracy settings that is printed in the terminal."""
 
-CHEAPEST_SETTING_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
+FASTEST_SETTING_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
 """Column names of the table that lists the fastest setting for each tolerance."""
 
 STORING_SECONDS_ATTRIBUTE = "storing_seconds"
@@ -353,8 +353,8 @@ def short_setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[s
     ]
 
 
-def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return a row for each of the `TABULATED_TOLERANCES`, in `CHEAPEST_SETTING_COLUMNS`.
+def fastest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
+    """Return a row for each of the `TABULATED_TOLERANCES`, in `FASTEST_SETTING_COLUMNS`.
 
     A row names the fastest setting whose error does not exceed the tolerance.
     """
@@ -394,8 +394,8 @@ def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> T
         TextTable("Settings", SETTING_TABLE_COLUMNS, setting_table_rows(settings)),
         TextTable(
             "Cheapest setting for each error",
-            CHEAPEST_SETTING_COLUMNS,
-            cheapest_setting_rows(settings),
+            FASTEST_SETTING_COLUMNS,
+            fastest_setting_rows(settings),
         ),
     ]
     return TablePage(

@@ -41,7 +41,7 @@ from sweep.analysis.selection import (
 )
 from sweep.analysis.shot_spectra import draw_scene_shot_sheet, simulate_prepared_shot
 from sweep.analysis.tables import TablePage
-from sweep.model.effects.catalogue import unpack_effect_flags
+from sweep.model.effects.catalogue import effect_names_in_flags
 from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
 from sweep.spec import (
     FalseAlarmTable,
@@ -485,7 +485,7 @@ def _render_shot_spectra_figure(
     if not eyepoints.has_target.all():
         return f"shot {shot_number} sees nothing"
     parameters = parameters_at(results.spec, axis_position.axis_indices)
-    effects = unpack_effect_flags(
+    effects = effect_names_in_flags(
         int(recording.read_array("effects", slice(shot_number, shot_number + 1))[0])
     )
     prepared = prepare_eyepoint_shots(

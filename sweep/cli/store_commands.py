@@ -19,7 +19,7 @@ from sweep.cli.terminal import (
     print_table,
     shorten_path,
 )
-from sweep.messages import escape_to_one_line, number_with_noun, shell_command
+from sweep.messages import escape_to_one_line, number_with_noun, sweep_shell_command
 from sweep.storage.locations import Location, derived_files_dir, file_sizes_below
 
 if TYPE_CHECKING:
@@ -85,14 +85,14 @@ def status(store: Location) -> None:
     elif store_status.blocks - store_status.blocks_done == len(store_status.failures):
         click.echo("not running; all that is left has failed")
     else:
-        click.echo(f"not running; {shell_command('resume', store)}  goes on.")
+        click.echo(f"not running; {sweep_shell_command('resume', store)}  goes on.")
     _print_pending_replacement(store)
     for block, failure in sorted(store_status.failures.items()):
         echo_wrapped(
             f"block {block} failed on {escape_to_one_line(failure['host'])}: {failure['error']}"
         )
     if store_status.failures:
-        retry_command = shell_command("resume", store, retry_failed=True)
+        retry_command = sweep_shell_command("resume", store, retry_failed=True)
         click.echo(f"{retry_command}  tries failed blocks again.")
     if store_status.blocks_done:
         print_accuracy(store, store_status.done_block_numbers)
@@ -101,14 +101,16 @@ def status(store: Location) -> None:
 def _print_pending_replacement(store: Location) -> None:
     """Print that a store is being extended or replaced; print nothing if it is not."""
     from sweep.storage.locations import resolve_links
-    from sweep.tasks.engine.journal import EXTENDED_STORE_KEY, read_recipe
+    from sweep.tasks.engine.journal import EXTENDED_STORE_KEY, read_store_recipe
     from sweep.tasks.engine.progress import StoreError
     from sweep.tasks.engine.study_store import find_pending_replacement
 
     try:
         if staging_store := find_pending_replacement(resolve_links(store)):
-            action = "extended" if EXTENDED_STORE_KEY in read_recipe(staging_store) else "replaced"
-            status_command = shell_command("status", staging_store)
+            action = (
+                "extended" if EXTENDED_STORE_KEY in read_store_recipe(staging_store) else "replaced"
+            )
+            status_command = sweep_shell_command("status", staging_store)
             click.echo(f"being {action}: {status_command}  says how far that is.")
     except StoreError as error:
         click.echo(str(error))
@@ -155,7 +157,7 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
         _print_verify_remedies(store, reports)
         sys.exit(EXIT_DAMAGED)
     if not all(report.complete for report in reports):
-        click.echo(f"{shell_command('resume', store)}  goes on.", err=True)
+        click.echo(f"{sweep_shell_command('resume', store)}  goes on.", err=True)
         sys.exit(EXIT_INCOMPLETE)
 
 
@@ -226,10 +228,10 @@ def _print_verify_remedies(store: Location, reports: list[VerificationReport]) -
             )
     remedies = {damage.repaired_by for report in reports for damage in report.damages}
     if "repair" in remedies:
-        repair_command = shell_command("verify", store, repair=True)
+        repair_command = sweep_shell_command("verify", store, repair=True)
         click.echo(f"{repair_command}  puts back what is not results.", err=True)
     if "resume" in remedies:
-        resume_command = shell_command("resume", store)
+        resume_command = sweep_shell_command("resume", store)
         click.echo(f"{resume_command}  computes what is lost and mends the journal.", err=True)
     if "hand" in remedies:
         click.echo("What is no part of a store is not sweep's to remove: remove it.", err=True)

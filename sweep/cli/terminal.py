@@ -23,7 +23,7 @@ from sweep.messages import (
     escape_to_one_line,
     escape_unprintable,
     number_with_noun,
-    shell_command,
+    sweep_shell_command,
 )
 from sweep.storage.locations import Location, parse_location
 from sweep.tasks.engine.text_streams import is_terminal
@@ -72,7 +72,7 @@ class LocalPathType(click.Path):
                 ctx,
             )
         if self.exists and not self.dir_okay and (path / "zarr.json").is_file():
-            hint = f"{shell_command('resume', value)} goes on with it"
+            hint = f"{sweep_shell_command('resume', value)} goes on with it"
             self.fail(f"'{path}' is a store, and a file is needed: {hint}", param, ctx)
         return super().convert(str(path), param, ctx)
 
@@ -343,14 +343,15 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
     if outcome.complete:
         if not outcome.blocks_computed:
             echo_wrapped(f"{store} was complete already: nothing was left to compute.")
-        click.echo(f"{shell_command('figures', store)}  draws it.")
+        click.echo(f"{sweep_shell_command('figures', store)}  draws it.")
         return
     for failure in outcome.failures[:5]:
         echo_wrapped(f"block {failure.block} failed: {failure.error}", err=True)
     blocks_left = outcome.blocks - outcome.blocks_done
     n_failed = len(outcome.failures) + outcome.blocks_skipped
     reason = (
-        outcome.stop_reason or f"{n_failed:,} failed; {shell_command('status', store)}  tells why"
+        outcome.stop_reason
+        or f"{n_failed:,} failed; {sweep_shell_command('status', store)}  tells why"
     )
     click.echo(
         f"Incomplete, {blocks_left:,} of {number_with_noun(outcome.blocks, 'block')} left: "
@@ -358,9 +359,9 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
         err=True,
     )
     if blocks_left > n_failed:
-        click.echo(f"{shell_command('resume', store)}  goes on.", err=True)
+        click.echo(f"{sweep_shell_command('resume', store)}  goes on.", err=True)
     if n_failed:
-        retry_command = shell_command("resume", store, retry_failed=True)
+        retry_command = sweep_shell_command("resume", store, retry_failed=True)
         click.echo(f"{retry_command}  tries failed blocks again.", err=True)
     sys.exit(EXIT_INCOMPLETE)
 
@@ -428,13 +429,15 @@ def _print_scene_summary(store: Location) -> None:
         [
             [
                 row.label,
-                f"{row.n_shots:,}",
+                f"{row.n_drawn_shots:,}",
                 number_text(row.mean_pd) if row.mean_pd == row.mean_pd else "no hit",
-                percent_text(row.n_shots_with_true_return / row.n_shots, ".1f")
-                if row.n_shots
+                percent_text(row.n_shots_with_true_return / row.n_drawn_shots, ".1f")
+                if row.n_drawn_shots
                 else "-",
                 f"{row.n_false_points:,}",
-                f"{100 * row.n_solved_cycles / row.n_cycles:.1f} %" if row.n_cycles else "-",
+                f"{100 * row.n_solved_cycles / row.n_drawn_cycles:.1f} %"
+                if row.n_drawn_cycles
+                else "-",
             ]
             for row in flight_summary(store)
         ],
@@ -515,7 +518,7 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
                     row.name,
                     f"{row.n_points_within_tolerance:,} of {row.n_points:,}",
                     f"{row.worst_error:.3g}",
-                    f"{row.excess:.2g}",
+                    f"{row.excess_over_tolerance:.2g}",
                     f"{row.n_samples_at_worst_point:,}",
                     f"{row.n_draws_needed:,.0f}" if row.n_draws_needed < float("inf") else "-",
                     row.worst_point_label,
@@ -534,10 +537,10 @@ def print_accuracy(store: Location, done_block_numbers: np.ndarray | None = None
             [
                 [
                     row.name,
-                    f"{row.mean_n_samples:,.0f}, at most {row.n_samples_max:,}",
+                    f"{row.mean_n_samples:,.0f}, at most {row.largest_n_samples:,}",
                     f"{row.n_points_within_tolerance:,} of {row.n_points:,}",
                     f"{row.worst_error:.3g}",
-                    f"{row.excess:.2g}",
+                    f"{row.excess_over_tolerance:.2g}",
                     row.worst_point_label,
                 ]
                 for row in rays
@@ -660,7 +663,7 @@ def plan_rows(
     )
     yield "parts", _time_parts_text(study_plan)
     memory_share = " a worker" if study_plan.has_workers else ""
-    yield "memory", f"about {decimal(study_plan.memory_bytes)}{memory_share}"
+    yield "memory", f"about {decimal(study_plan.process_memory_bytes)}{memory_share}"
     if reason := _excessive_size_text(
         study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds
     ):
@@ -683,7 +686,7 @@ def _time_parts_text(study_plan: StudyPlan) -> str:
         if seconds > 0
     )
     text = f"{duration_text(study_plan.cpu_seconds)} of one core: {parts_text}"
-    if not study_plan.is_compiled:
+    if not study_plan.are_kernels_compiled:
         text += (
             "; the model is not compiled yet, which the first run does, so that the time of shots "
             "is a guess"
@@ -920,8 +923,8 @@ def print_accuracy_measurement(store: Location, *, has_results: bool) -> Printed
     )
     print_table(
         "Cheapest setting for each error",
-        list(accuracy_results.CHEAPEST_SETTING_COLUMNS),
-        accuracy_results.cheapest_setting_rows(settings),
+        list(accuracy_results.FASTEST_SETTING_COLUMNS),
+        accuracy_results.fastest_setting_rows(settings),
         "cheapest setting",
     )
     for sentence in accuracy_results.conclusion_sentences(dataset, settings):

@@ -41,12 +41,12 @@ from scipy.special import j0
 
 from sweep.model.constants import SPEED_OF_LIGHT
 
-SINGLE_MODE_COUPLING = "single_mode"
+SINGLE_MODE_COUPLING_LAW = "single_mode"
 """Name of the coupling law by which the receiver detects only light of one spatial mode, that of
 the local oscillator."""
-APERTURE_COUPLING = "aperture"
+APERTURE_COUPLING_LAW = "aperture"
 """Name of the coupling law by which all light in the aperture mixes with the local oscillator."""
-COUPLING_LAWS = (SINGLE_MODE_COUPLING, APERTURE_COUPLING)
+COUPLING_LAWS = (SINGLE_MODE_COUPLING_LAW, APERTURE_COUPLING_LAW)
 """Names of the laws that determine what fraction of the echo mixes with the local oscillator."""
 
 COUPLING_PATH = "instrument.telescope.coupling"
@@ -74,7 +74,7 @@ SCAN_RATE_PATH, SEPARATION_PATH, MISALIGNMENT_PATH = (
 )
 
 BEAM_DEFAULTS: dict[str, float | str] = {
-    COUPLING_PATH: SINGLE_MODE_COUPLING,
+    COUPLING_PATH: SINGLE_MODE_COUPLING_LAW,
     DIVERGENCE_PATH: 0.0,
     WAIST_PATH: 0.0,
     BEAM_QUALITY_PATH: 1.0,
@@ -174,7 +174,7 @@ def is_single_mode(parameters: Parameters) -> bool:
     `parameters` are those of points that share all text values.
     """
     return (
-        str(parameters[COUPLING_PATH]) == SINGLE_MODE_COUPLING
+        str(parameters[COUPLING_PATH]) == SINGLE_MODE_COUPLING_LAW
         and str(parameters[ARCHITECTURE_PATH]) != "direct"
     )
 

@@ -200,7 +200,7 @@ class ErrorBudget:
         return self._stated_or_tolerance_fraction(self.line_error, self.line_error_fraction)
 
     @property
-    def allowed_leakage(self) -> np.ndarray:
+    def allowed_leakage_error(self) -> np.ndarray:
         """Tolerated probability of a false peak due to leaked signal that is not evaluated."""
         return self._stated_or_tolerance_fraction(self.leakage_error, self.leakage_error_fraction)
 

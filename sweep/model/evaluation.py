@@ -102,7 +102,7 @@ def prepare_shots(
         shots = apply_effects(category_parameters, point_indices.size, ground, effects)
         yield (
             point_indices,
-            replace(shots, echo_record=shots.echo_record._replace(shares_phase_errors=True)),
+            replace(shots, echo_record=shots.echo_record._replace(shots_share_phase_errors=True)),
         )
 
 
@@ -131,7 +131,7 @@ def prepare_ray_traced_shots(
     """
     parameter_arrays = parameters_as_arrays(PARAMETER_DEFAULTS | dict(parameters))
     return apply_effects(
-        parameter_arrays, ground.beamlets.row_of_point.size, ground, effects, effect_flags
+        parameter_arrays, ground.beamlet_table.row_of_point.size, ground, effects, effect_flags
     )
 
 

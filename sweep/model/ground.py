@@ -257,7 +257,7 @@ class FlatGround:
         )
 
     @cached_property
-    def beamlets(self) -> BeamletTable:
+    def beamlet_table(self) -> BeamletTable:
         """Table of all beamlets of the footprints; points of equal geometry share a row."""
         columns = [column for column in self._geometry if column is not None]
         first, geometry_of_point = find_distinct_rows(columns)
@@ -303,16 +303,16 @@ class RayTracedGround:
     def __init__(
         self, beamlet_table: BeamletTable, is_on_other_surface: np.ndarray | None = None
     ) -> None:
-        self.beamlets, self.is_on_other_surface = beamlet_table, is_on_other_surface
+        self.beamlet_table, self.is_on_other_surface = beamlet_table, is_on_other_surface
 
     def axis_beamlet_table(self, n_points: int) -> BeamletTable:
         """Return a table with one beamlet per footprint, on the beam's axis, for `n_points` points.
 
         The beamlet has the summed echo of all beamlets of the footprint.
         """
-        total_echo = self.beamlets.relative_echo.sum(axis=1)[:, None]
+        total_echo = self.beamlet_table.relative_echo.sum(axis=1)[:, None]
         zeros = np.zeros_like(total_echo)
-        return BeamletTable(self.beamlets.row_of_point, zeros, zeros, total_echo)
+        return BeamletTable(self.beamlet_table.row_of_point, zeros, zeros, total_echo)
 
 
 Ground = FlatGround | RayTracedGround
@@ -375,7 +375,7 @@ class FootprintExtent(NamedTuple):
 
 def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:
     """Return the :class:`FootprintExtent` of ray-traced footprints."""
-    _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
+    _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlet_table
     is_on_other_surface = ground.is_on_other_surface
     total_echo = relative_echo.sum(axis=1)
     power_fraction = relative_echo / np.where(total_echo > 0, total_echo, 1.0)[:, None]

@@ -21,7 +21,7 @@ length; there the record's length replaces the delay.
 |X| does not depend on a phase common to the full record, and little on the part of the pedestal in
 quadrature to the line. With the phase less its mean under the window, the mean of exp(i phi) is the
 line that |X| shows. Only the part of the pedestal in phase with it changes |X|
-(:func:`apparent_line_and_pedestal`). Full spectra are drawn with both parts
+(:func:`apparent_line_and_pedestal_power`). Full spectra are drawn with both parts
 (:func:`beat_phase_noise`). An echo that arrives within the record has the line and the pedestal of
 its own samples, in steps of 1/32 of the record.
 
@@ -66,7 +66,7 @@ single lags. After 400 lags the remaining terms are negligible."""
 
 _N_PHASE_NODES = 256
 """Number of positions in the record at which the covariance of the phase is evaluated by
-:func:`apparent_line_and_pedestal`."""
+:func:`apparent_line_and_pedestal_power`."""
 
 _LINE_POWER_FRACTION_MIN = 1e-100
 """Lower limit of the fraction of power in the pure line, so that divisions by the fraction stay
@@ -89,7 +89,7 @@ class LaserLine(NamedTuple):
     """(n,): variance of noise at the ADC [V^2] that equals the phase-noise pedestal in bins that
     contain lines."""
 
-    def scale_pedestal(self, power_factor: np.ndarray) -> "LaserLine":
+    def with_scaled_pedestal(self, power_factor: np.ndarray) -> "LaserLine":
         """Return a copy whose pedestal variances are multiplied by ``power_factor``.
 
         The factor is that on the echo's power.
@@ -301,7 +301,7 @@ def _pedestal_power_by_integral(gamma: np.ndarray, lag: np.ndarray, window: Wind
     )
 
 
-def apparent_line_and_pedestal(
+def apparent_line_and_pedestal_power(
     *,
     line_width: np.ndarray,
     delay: np.ndarray,

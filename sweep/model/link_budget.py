@@ -86,7 +86,7 @@ class ReceiverFilter:
 
         ``frequency`` is that of a signal, with its sign [Hz].
         """
-        return receiver_chain.receiver_transfer(
+        return receiver_chain.receiver_transfer_function(
             frequency,
             detector_bandwidth=self.detector_bandwidth,
             amplifier_bandwidth=self.amplifier_bandwidth,
@@ -230,7 +230,7 @@ class EchoScales(NamedTuple):
     """Fraction, 0..1, of light from the ground other than the echo, such as sunlight, that reaches
     the receiver."""
 
-    def scale_echo(
+    def with_scaled_echo(
         self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
     ) -> "EchoScales":
         """Return a copy with factors on the echo's power and on the beat's amplitude.

@@ -246,16 +246,16 @@ OUTPUT_HAS_SQUARED_DEVIATIONS = OUTPUT_IS_LOGARITHM | np.array(
 """(outputs,) bool, in the order of GRID_OUTPUTS: True for outputs whose squared deviations from the
 mean are summed over draws."""
 
-N_GROUP_SUMS = 3 * len(PD_OUTPUT_NAMES)
+N_GROUP_SUM_COLUMNS = 3 * len(PD_OUTPUT_NAMES)
 """Number of columns of a row of running sums that describe groups of draws. For each of
 PD_OUTPUT_NAMES they are the mean over groups, the sum of squared deviations, and the sum over the
 unfinished group."""
 
-N_RUNNING_SUMS = (
+RUNNING_SUMS_ROW_LENGTH = (
     len(GRID_OUTPUTS)
     + int(OUTPUT_HAS_SQUARED_DEVIATIONS.sum())
     + int(OUTPUT_IS_LOGARITHM.sum())
-    + N_GROUP_SUMS
+    + N_GROUP_SUM_COLUMNS
 )
 """Number of columns of a row of running sums. The row contains numbers of values, sums of squared
 deviations, largest logarithms and sums over groups of draws. With the stored means they are all

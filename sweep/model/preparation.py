@@ -85,7 +85,7 @@ class _PedestalShapes(NamedTuple):
     """
     line_width_bins: np.ndarray
     """(n,): line width of the laser [FFT bins]."""
-    delay_times_bin_width: np.ndarray
+    delay_bin_width_product: np.ndarray
     """(n,): delay of the echo times the width of an FFT bin [cycles]; the delay is at most the
     record's duration."""
 
@@ -357,7 +357,7 @@ class Shots:
         """Thresholds and noise sigmas of each point's bins, as a record of arrays."""
         from sweep.model.detection.echo_detection import BinThresholds
 
-        side_noise_sigma = self._bin_noise_sigma_from_variance(
+        noise_sigma_next_to_lines = self._bin_noise_sigma_from_variance(
             self.noise_variance + self.laser_line.pedestal_variance_beside_line
         )
         shapes = self._pedestal_shapes
@@ -365,10 +365,10 @@ class Shots:
             line_noise_sigma=self.line_noise_sigma,
             threshold=self.threshold,
             noise_sigma_without_pedestal=self.bin_noise_sigma,
-            side_noise_sigma=side_noise_sigma,
+            noise_sigma_next_to_lines=noise_sigma_next_to_lines,
             pedestal_reach_bins=shapes.reach_bins,
             pedestal_line_width_bins=shapes.line_width_bins,
-            pedestal_delay_times_bin_width=shapes.delay_times_bin_width,
+            pedestal_delay_bin_width_product=shapes.delay_bin_width_product,
         )
         return BinThresholds(*broadcast_rows(values, (self.size,)))
 
@@ -646,10 +646,10 @@ class Shots:
             leakage_tolerance=self.tolerances.leakage_probability,
             line_error_tolerance=self.tolerances.line_error,
             image_gain=np.asarray(self.line_images.iq_image_gain),
-            side_noise_sigma=bin_thresholds.side_noise_sigma,
+            noise_sigma_next_to_lines=bin_thresholds.noise_sigma_next_to_lines,
             pedestal_reach_bins=bin_thresholds.pedestal_reach_bins,
             pedestal_line_width_bins=bin_thresholds.pedestal_line_width_bins,
-            pedestal_delay_times_bin_width=bin_thresholds.pedestal_delay_times_bin_width,
+            pedestal_delay_bin_width_product=bin_thresholds.pedestal_delay_bin_width_product,
         )
         return PointParameters(*broadcast_rows(values, (self.size,)))
 
@@ -676,7 +676,7 @@ class Shots:
         return SegmentParameters(*np.stack(rows_by_segment, axis=1))
 
     @property
-    def real_ends_fft_size(self) -> int:
+    def fft_size_if_end_bins_real(self) -> int:
         """FFT size N if the noise in bins 0 and N/2 is real-valued; 0 if it is complex.
 
         The noise is real-valued in a real record, if noise bins are simulated as correlated.
@@ -723,7 +723,7 @@ class Shots:
             self.detection_settings.echo_bin_rule != "peak_bin",
         )
         is_real_record_in_speckle = in_speckle and not self.complex_record
-        has_real_noise_at_ends = self.real_ends_fft_size > 0
+        has_real_noise_at_ends = self.fft_size_if_end_bins_real > 0
         noise_ratio, lobe_half_width, modes = np.empty(0), 0, NO_MODES
         if is_real_record_in_speckle and has_real_noise_at_ends:
             noise_ratio = noise_pseudo_variance_ratio(self.window, self.fft_size)

@@ -220,7 +220,7 @@ def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) ->
     return np.sqrt(window_energy * noise_variance / 2)
 
 
-def receiver_transfer(
+def receiver_transfer_function(
     frequency: np.ndarray,
     *,
     detector_bandwidth: np.ndarray,
@@ -354,7 +354,7 @@ def relative_noise_density(
         density = np.zeros(())
         for alias_number in range(-_N_ALIASES_PER_SIDE, _N_ALIASES_PER_SIDE + 1):
             alias_frequency = folded_frequency + alias_number * sample_rate
-            amplitude = receiver_transfer(alias_frequency, **poles)
+            amplitude = receiver_transfer_function(alias_frequency, **poles)
             density = density + np.abs(amplitude) ** 2 * antialias_power_transmission(
                 alias_frequency, **antialias
             )

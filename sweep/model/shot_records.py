@@ -87,7 +87,7 @@ class DetectionSettings(NamedTuple):
     N bins of the FFT."""
     search_band: SearchBand | None = None
     """Bins of each segment that are searched, (3, n); None if all bins are searched."""
-    includes_leakage: bool = False
+    leakage_raises_false_alarms: bool = False
     """True if leakage, the echo's signal far from its lines, can raise false alarms."""
 
     @classmethod
@@ -150,7 +150,7 @@ class SpectrumTolerances(NamedTuple):
         budget = ErrorBudget.from_parameters(parameters)
         return cls(
             line_error=budget.allowed_line_error / math.sqrt(looks.n_power_averaged),
-            leakage_probability=budget.allowed_leakage,
+            leakage_probability=budget.allowed_leakage_error,
             leakage_floor=np.asarray(budget.leakage_floor, float),
         )
 
@@ -200,7 +200,7 @@ class EchoRecord(NamedTuple):
     echoes fill their records."""
     phase_errors: tuple[PhaseError, ...] = ()
     """Phase errors of the echo over the record; their phases are summed."""
-    shares_phase_errors: bool = False
+    shots_share_phase_errors: bool = False
     """True if many shots have equal phase errors, as on a grid; False for shots of a flight."""
 
 

@@ -310,7 +310,7 @@ class RecordSettings:
             Range of the target at the shot's start [m].
         """
         return waveform.count_samples_before_echo(
-            delay=segment.delay(range),
+            delay=segment.echo_delay(range),
             doppler_ratio=segment.doppler_ratio,
             record_start=self.acquisition_delay,
             sample_rate=self.sample_rate,

@@ -227,7 +227,7 @@ def beamlet_analytic_signal(
     beat = carrier * doppler_ratio - chirp_rate_ratio * chirp_rate * start_delay * (
         1 + doppler_ratio
     )
-    gain = receiver_chain.receiver_transfer(
+    gain = receiver_chain.receiver_transfer_function(
         np.array(beat),
         detector_bandwidth=_value_of_point(shots.receiver_filter.detector_bandwidth, point),
         amplifier_bandwidth=_value_of_point(shots.receiver_filter.amplifier_bandwidth, point),

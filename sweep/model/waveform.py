@@ -121,7 +121,7 @@ class WaveformSegment(NamedTuple):
     """Time [s] from the start of the shot to that of the segment; 0 if motion between segments is
     not simulated."""
 
-    def delay(self, range: np.ndarray | float) -> np.ndarray:
+    def echo_delay(self, range: np.ndarray | float) -> np.ndarray:
         """Return an echo's delay at the segment's start [s], from its range at the shot's start.
 
         Parameters
@@ -139,7 +139,7 @@ class WaveformSegment(NamedTuple):
         f_seg beta - S tau (1 + beta), with the carrier f_seg, the delay tau and the Doppler ratio
         beta at the segment's start, and the segment's signed chirp rate S.
         """
-        beat_of_delay = self.chirp_rate * (self.delay(range) * (1 + self.doppler_ratio))
+        beat_of_delay = self.chirp_rate * (self.echo_delay(range) * (1 + self.doppler_ratio))
         return self.carrier * self.doppler_ratio - beat_of_delay
 
 
@@ -281,7 +281,7 @@ def round_trip_delay(range: _FloatOrArray) -> _FloatOrArray:
 
     Notes
     -----
-    The quotient is rounded once. :meth:`WaveformSegment.delay` and
+    The quotient is rounded once. :meth:`WaveformSegment.echo_delay` and
     :attr:`sweep.model.shot_settings.TargetState.delay` multiply by 2 / c, which is rounded before,
     and may differ in the last bit.
     """

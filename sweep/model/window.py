@@ -96,21 +96,21 @@ class Window:
             weights = np.append(w[n_half:], 0.0) + np.append(0.0, w[n_half - 1 :: -1])
         return tuple(map(float, weights / weights.sum()))
 
-    def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
+    def phase_span_max_table(self, adds_powers: bool) -> np.ndarray:
         """Return the largest half-width of a group of lines that J equivalent lines can represent.
 
         Half-widths are times pi [rad], by tolerance and by J, as in
-        :func:`sweep.model.spectrum.lines.node_phase_limits`. With `adds_powers` the tolerances are
-        those of sums of powers, else those of sums of amplitudes.
+        :func:`sweep.model.spectrum.lines.phase_span_max_table`. With `adds_powers` the tolerances
+        are those of sums of powers, else those of sums of amplitudes.
         """
         from sweep.model.spectrum.lines import (
             AMPLITUDE_TOLERANCES,
             POWER_TOLERANCES,
-            node_phase_limits,
+            phase_span_max_table,
         )
 
         tolerances = POWER_TOLERANCES if adds_powers else AMPLITUDE_TOLERANCES
-        return node_phase_limits(self.weights_by_record_position(adds_powers), tolerances)
+        return phase_span_max_table(self.weights_by_record_position(adds_powers), tolerances)
 
     @property
     def equivalent_noise_bandwidth(self) -> float:

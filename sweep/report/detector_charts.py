@@ -41,7 +41,7 @@ from sweep.model.detection.looks import (
     LOOKS_VOTES_PATH,
     Looks,
 )
-from sweep.model.effects.catalogue import EFFECTS, unpack_effect_flags
+from sweep.model.effects.catalogue import EFFECTS, effect_names_in_flags
 from sweep.model.evaluation import prepare_shots
 from sweep.model.threshold import THRESHOLD_PATHS, tnr_from_parameters
 from sweep.report.html_page import HtmlTable
@@ -287,7 +287,9 @@ def grid_noise_budget_chart(
         for index, flags in zip(indices, profile.variable_values("effects", indices), strict=True):
             parameters = parameters_at(results.spec, profile.axis_indices(index))
             effects = [
-                name for name in unpack_effect_flags(int(flags)) if name not in _RANDOM_EFFECT_NAMES
+                name
+                for name in effect_names_in_flags(int(flags))
+                if name not in _RANDOM_EFFECT_NAMES
             ]
             ((_, shots),) = prepare_shots(parameters, effects)
             budgets.append(shots.noise.variances)

@@ -44,7 +44,7 @@ from sweep.analysis.scene_results.recordings import (
 )
 from sweep.analysis.selection import parameters_at
 from sweep.analysis.study_figures import SceneResults
-from sweep.model.effects.catalogue import unpack_effect_flags
+from sweep.model.effects.catalogue import effect_names_in_flags
 from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
 from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
 from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
@@ -703,7 +703,7 @@ def _flight_noise_panel(results: SceneResults, labelled_recording: LabelledRecor
     )
     budgets = [
         prepare_eyepoint_shots(
-            eyepoints.select(np.array([i])), parameters, surfaces, unpack_effect_flags(int(flag))
+            eyepoints.select(np.array([i])), parameters, surfaces, effect_names_in_flags(int(flag))
         ).noise.variances
         for i, flag in zip(seen_indices, flags, strict=True)
     ]

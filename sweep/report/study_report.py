@@ -28,7 +28,7 @@ from sweep.analysis.selection import to_float_with_nan
 from sweep.analysis.study_figures import GridResults, SceneResults, describe_selection
 from sweep.analysis.tables import TablePage as TablePage
 from sweep.analysis.tables import single_point_page
-from sweep.messages import shell_command
+from sweep.messages import sweep_shell_command
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.report import detector_charts, flight_charts
 from sweep.report.flight_charts import LabelledRecording
@@ -662,9 +662,9 @@ def _reproduction_section(
     )
     commands = "\n".join(
         [
-            shell_command("run", "study.yaml", store=store_path),
-            shell_command("figures", store_path),
-            shell_command("report", store_path),
+            sweep_shell_command("run", "study.yaml", store=store_path),
+            sweep_shell_command("figures", store_path),
+            sweep_shell_command("report", store_path),
         ]
     )
     versions_text = ", ".join(

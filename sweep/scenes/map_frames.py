@@ -583,7 +583,7 @@ def degree_lengths(
     )
 
 
-def require_one_map(map_frames: Sequence[tuple[str, MapFrame]]) -> None:
+def require_same_map(map_frames: Sequence[tuple[str, MapFrame]]) -> None:
     """Raise `SceneError` if rasters do not belong to one map; the error names two of them.
 
     Parameters

@@ -240,7 +240,7 @@ _PLOTTABLE_OUTPUTS = (
     | outputs.SHOT_STATISTIC_VARIABLES
     | outputs.POINT_CLOUD_VARIABLES
 )
-FIGURE_QUANTITIES = (
+SCENE_FIGURE_QUANTITIES = (
     *(name for name, output in _PLOTTABLE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
@@ -296,7 +296,7 @@ def _plotted_quantity_field(description: str, default: Any = ...) -> Any:
     problem = "is no quantity of shots or points"
     return declare.field_with_rule(
         ChoiceRule(
-            description=description, options=FIGURE_QUANTITIES, problem=problem, remedy=remedy
+            description=description, options=SCENE_FIGURE_QUANTITIES, problem=problem, remedy=remedy
         ),
         default,
     )

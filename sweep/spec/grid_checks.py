@@ -434,7 +434,7 @@ def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
 # Beams
 
 _SINGLE_MODE_CONDITIONS = {
-    beam.COUPLING_PATH: condition_equal_to(beam.SINGLE_MODE_COUPLING),
+    beam.COUPLING_PATH: condition_equal_to(beam.SINGLE_MODE_COUPLING_LAW),
     beam.ARCHITECTURE_PATH: condition_different_from("direct"),
 }
 """Conditions on parameters, by dotted path, under which a coherent receiver mixes one spatial
@@ -524,7 +524,7 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
         M^2, wavelength lambda and aperture diameter D.
     """
     for conditions in (
-        {beam.COUPLING_PATH: condition_equal_to(beam.APERTURE_COUPLING)},
+        {beam.COUPLING_PATH: condition_equal_to(beam.APERTURE_COUPLING_LAW)},
         {beam.ARCHITECTURE_PATH: condition_equal_to("direct")},
     ):
         if narrowest := _beam_furthest_below_limit(GridValues(values, axes), conditions):

@@ -641,7 +641,7 @@ def _build_grounds(
     scene: Scene, files: SpecFiles
 ) -> tuple[np.ndarray, dict[str, Terrain], tuple[str, ...]]:
     """Return the scene's origin (3,) [m], terrains in the scene's frame by name, and warnings."""
-    from sweep.scenes.map_frames import require_one_map
+    from sweep.scenes.map_frames import require_same_map
     from sweep.scenes.tiles import extend_tiles_to_neighbours
 
     ground_sections = {
@@ -660,7 +660,7 @@ def _build_grounds(
         for name, terrain in terrains.items()
         if terrain.map_frame is not None
     ]
-    require_one_map(map_frames)
+    require_same_map(map_frames)
     names_without_crs = [name for name, map_frame in map_frames if not map_frame.wkt]
     joined_terrains, warnings = extend_tiles_to_neighbours(
         {name: terrains[name] for name, _ in map_frames}

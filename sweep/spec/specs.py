@@ -786,7 +786,7 @@ class SceneSpec(BaseSpec):
         return shots_per_cycle(self.scan_pattern(name))
 
     @property
-    def has_navigation_solution(self) -> bool:
+    def can_solve_navigation(self) -> bool:
         """True if one scanner or more has enough shots per cycle to estimate a velocity vector."""
         return any(
             self.shots_per_cycle(name) >= NAVIGATION_SHOTS_PER_CYCLE_MIN for name in self.scanners
@@ -825,7 +825,7 @@ class SceneSpec(BaseSpec):
                 "record: the standard errors of points on speckled ground, and of navigation, are "
                 "too small there, by 1.2 at 2.5 bins and by 1.7 at 5; shorter records drift less"
             )
-        if not self.has_navigation_solution:
+        if not self.can_solve_navigation:
             return sentences
         if not any(value for _, value in self.error_floor):
             sentences.append(

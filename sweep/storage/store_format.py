@@ -573,7 +573,7 @@ LOG_OBJECT_INTERVAL_SECONDS = 1.0
 LOG_OBJECTS_MAX = 64
 
 #: Size from which a merged object gets no further lines [bytes].
-MERGED_LOG_OBJECT_BYTES = 16 << 20
+MERGED_LOG_OBJECT_TARGET_BYTES = 16 << 20
 
 #: Errors of opening a path at which there is no log.
 _MISSING_LOG_ERRNOS = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
@@ -768,7 +768,7 @@ class ObjectStoreLog:
             group_bytes += len(content)
             if (
                 not is_merging
-                or group_bytes > MERGED_LOG_OBJECT_BYTES
+                or group_bytes > MERGED_LOG_OBJECT_TARGET_BYTES
                 or object_name == object_names[-1]
             ):
                 self._rewrite_objects(names_in_group, lines, is_sound)

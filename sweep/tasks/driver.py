@@ -36,12 +36,12 @@ from sweep.tasks.engine.journal import (
     USER_MODULE_DIGESTS_KEY,
     StoreLock,
     committed_block_mask,
-    read_recipe,
+    read_store_recipe,
     receipted_block_mask,
     refuse_damaged_recipe,
     remove_predecessors_from_recipe,
     wait_for_stale_lock,
-    write_recipe,
+    write_store_recipe,
 )
 from sweep.tasks.engine.progress import (
     ClusterError,
@@ -69,7 +69,7 @@ from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.memory_limits import (
-    block_peak_bytes,
+    block_peak_memory_bytes,
     refuse_too_large_blocks,
     refuse_too_large_point,
     refuse_too_large_study,
@@ -230,7 +230,7 @@ def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions)
     backend = _make_backend(run_options, study.spec)
     if working_path == final_path:
         return _compute_missing_blocks(working_path, study, backend)
-    source = read_recipe(working_path).get(EXTENDED_STORE_KEY)
+    source = read_store_recipe(working_path).get(EXTENDED_STORE_KEY)
     return _compute_into_path(
         final_path,
         study.spec,
@@ -458,7 +458,7 @@ def _compute_into_path(
             stored_attributes, stored_study = _read_resumable_study(working_path)
             refuse_other_study(working_path, stored_attributes, stored_study.spec, spec)
             _refuse_unresumable_store(working_path, stored_attributes, stored_study)
-            write_recipe(working_path, **read_recipe(working_path) | recipe)
+            write_store_recipe(working_path, **read_store_recipe(working_path) | recipe)
         if isinstance(spec, SceneSpec) and (from_scratch or not already_exists):
             with show_activity("building the scene", backend.progress):
                 scene_reports = get_built_scene(spec).mesh_reports
@@ -561,9 +561,9 @@ def _warn_of_changed_user_code(
     current_digests = {
         name: digest for name, digest in user_code.module_digests(modules).items() if digest
     }
-    recipe = read_recipe(store_path)
+    recipe = read_store_recipe(store_path)
     source_recipe = (
-        read_recipe(parse_location(recipe[EXTENDED_STORE_KEY]))
+        read_store_recipe(parse_location(recipe[EXTENDED_STORE_KEY]))
         if EXTENDED_STORE_KEY in recipe
         else {}
     )
@@ -572,7 +572,7 @@ def _warn_of_changed_user_code(
         | source_recipe.get(USER_MODULE_DIGESTS_KEY, {})
         | recipe.get(USER_MODULE_DIGESTS_KEY, {})
     )
-    write_recipe(store_path, **recipe | {USER_MODULE_DIGESTS_KEY: recorded_digests})
+    write_store_recipe(store_path, **recipe | {USER_MODULE_DIGESTS_KEY: recorded_digests})
     for module_name in current_digests:
         if recorded_digests[module_name] != current_digests[module_name]:
             say(
@@ -595,7 +595,7 @@ def _compute_missing_blocks(
     """
     backend.max_workers = study.n_blocks
     backend.check_memory = partial(refuse_too_large_study, study)
-    backend.bytes_per_thread = block_peak_bytes(study)
+    backend.bytes_per_thread = block_peak_memory_bytes(study)
     refuse_too_large_blocks(study, backend.memory)
     with (
         backend.interrupts,
@@ -609,7 +609,9 @@ def _compute_missing_blocks(
         session = Session(store_path, study, backend, lock)
         if isinstance(study, GridStudy):
             return Outcome.from_session_outcome(session.run())
-        write_recipe(store_path, **read_recipe(store_path) | _spec_folder_entry(study.spec))
+        write_store_recipe(
+            store_path, **read_store_recipe(store_path) | _spec_folder_entry(study.spec)
+        )
         if _is_flight_complete(store_path, study):
             return Outcome.from_session_outcome(session.run())
         rays_by_scanner, stop_reason = _cast_missing_eyepoints(study, backend)
@@ -668,7 +670,7 @@ def _cast_missing_eyepoints(
                 f"casting {eyepoints.n_rays:,} rays through the scanner '{scanner}'"
             )
             spec = eyepoints.spec
-            write_recipe(
+            write_store_recipe(
                 eyepoint_store_path,
                 spec=spec.to_json(),
                 scanner=scanner,
@@ -695,7 +697,7 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
     )
     refuse_damaged_template(eyepoint_store_path)
     refuse_other_blocks(eyepoint_store_path, eyepoints)
-    return bool(read_recipe(eyepoint_store_path)) and bool(
+    return bool(read_store_recipe(eyepoint_store_path)) and bool(
         committed_block_mask(eyepoint_store_path, eyepoints).all()
     )
 

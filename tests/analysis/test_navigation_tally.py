@@ -118,12 +118,12 @@ def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_variance
     measured[rng.random((n, 4)) >= pd] = np.nan
     solution = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
     stated_variance = np.diagonal(solution.covariance, axis1=-2, axis2=-1)
-    result = _of_all(solution.value - moving, stated_variance, solution.is_available)
+    result = _of_all(solution.estimate - moving, stated_variance, solution.is_available)
     expected = pd**4 + 4 * pd**3 * (1 - pd)
     assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)
     assert (np.abs(result.bias) <= 5 * np.sqrt(result.stated_variance / result.n_solutions)).all()
     # draws of three and of four beams mix, so the spread of squares is taken from themselves
-    errors = solution.value[solution.is_available] - moving
+    errors = solution.estimate[solution.is_available] - moving
     spread = np.std(errors**2, axis=0) / np.sqrt(result.n_solutions)
     assert (np.abs(result.variance - result.stated_variance) <= 5 * spread).all()
     assert (5 * spread < 0.07 * result.stated_variance).all()  # a variance 7 % off would show

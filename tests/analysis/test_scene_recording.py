@@ -21,7 +21,7 @@ from sweep.analysis.scene_results.recordings import (
 from sweep.analysis.selection import parameters_at
 from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_RETURN_FLAG
 from sweep.spec import SpecError
-from sweep.spec.figure_sections import FIGURE_QUANTITIES as OF_SPECS
+from sweep.spec.figure_sections import SCENE_FIGURE_QUANTITIES as OF_SPECS
 
 
 @pytest.fixture

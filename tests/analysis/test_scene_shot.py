@@ -14,7 +14,7 @@ from sweep.analysis.scene_results.recordings import (
 from sweep.analysis.selection import parameters_at
 from sweep.analysis.shot_spectra import BinGroup, DisplayedSegment, simulate_prepared_shot
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import unpack_effect_flags
+from sweep.model.effects.catalogue import effect_names_in_flags
 from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
 from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
@@ -34,7 +34,7 @@ def arrays(scene_store):
 def one(scene_store, spec, recording, number, seed=None):
     eyepoints = read_eyepoints(scene_store, recording.dataset, np.array([number]))
     parameters = parameters_at(spec, find_axis_position(spec, {"power": "1 W"}).axis_indices)
-    effects = unpack_effect_flags(
+    effects = effect_names_in_flags(
         int(recording.read_array("effects", slice(number, number + 1))[0])
     )
     prepared = prepare_eyepoint_shots(eyepoints, parameters, spec.surface_materials(), effects)

@@ -74,7 +74,7 @@ def _check_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> None:
         check_point_cloud(
             eyepoint_results,
             cloud,
-            navigates=tiling.has_navigation_solution,
+            navigates=tiling.can_solve_navigation,
             undefined=_undefined_statistics(study, tile),
         )
 

@@ -93,7 +93,7 @@ BEAM_PATHS = (beam.DIVERGENCE_PATH, beam.WAIST_PATH, beam.OSCILLATOR_WAIST_PATH,
 """Parameters of which some alone make a beam, such as an aperture can make."""
 
 WORKING_VALUES = {
-    beam.DIVERGENCE_PATH: "50 urad", beam.COUPLING_PATH: beam.APERTURE_COUPLING,
+    beam.DIVERGENCE_PATH: "50 urad", beam.COUPLING_PATH: beam.APERTURE_COUPLING_LAW,
     FFT_SIZE: "2^10",  # the usual size would cost much
     ACQUISITION_DELAY_PATH: "13.4 us",  # the echo of 2 km is there from 13.34 us on
 }  # fmt: skip

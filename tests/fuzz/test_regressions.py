@@ -220,7 +220,7 @@ def test_a_ground_is_not_blurred_by_more_than_its_own_size():
 
 def test_a_plan_measures_once_however_late_it_is(monkeypatch):
     """As of a process that is held up between two looks at the clock."""
-    monkeypatch.setattr("sweep.tasks.studies.study_plan.POINT_TIMING_SECONDS", 0.0)
+    monkeypatch.setattr("sweep.tasks.studies.study_plan.GRID_TIMING_SECONDS", 0.0)
     plan = plan_study(GridSpec.from_mapping(base_study_mapping({})))
     assert np.isfinite(plan.wall_seconds) and plan.wall_seconds > 0
 

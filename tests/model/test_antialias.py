@@ -170,7 +170,7 @@ def test_a_leaked_line_passes_the_filter_at_its_own_frequency(table_4_1):
     beat = 1e9 / 500e-6 * 3.0 / SPEED_OF_LIGHT
     aliases = beat + RATE * np.arange(-300, 301)
     density = (np.abs(poles(aliases) * butterworth(aliases, 100e6, 6)) ** 2).sum() * RATE / 2e8
-    scale, _ = permanent_line.line_of_point(shots, 0, 0)
+    scale, _ = permanent_line.permanent_line_of_point(shots, 0, 0)
     amplitude = float(np.broadcast_to(shots.permanent_line.amplitude, 1)[0])
     assert scale == pytest.approx(amplitude / 2 / np.sqrt(density), rel=1e-6)
 
@@ -202,7 +202,7 @@ def test_a_leaked_line_stands_by_its_alias_in_noise(table_4_1, at):
     beat = 1e9 / 500e-6 * 3.0 / SPEED_OF_LIGHT
     aliases = (at or beat) + RATE * np.arange(-4000, 4001)
     density = (np.abs(poles(aliases)) ** 2).sum() * RATE / 8e8
-    scale, _ = permanent_line.line_of_point(shots, 0, 0, at)
+    scale, _ = permanent_line.permanent_line_of_point(shots, 0, 0, at)
     amplitude = float(np.broadcast_to(shots.permanent_line.amplitude, 1)[0])
     assert scale == pytest.approx(amplitude / 2 / np.sqrt(density), rel=1e-4)
 

@@ -62,7 +62,7 @@ class Instrument(NamedTuple):
         # enough samples that what a transform's circle brings back is far from the record
         n_samples = OVER * (length + 64)
         high = np.fft.rfftfreq(n_samples, 1 / (OVER * rate))
-        gain = receiver_chain.receiver_transfer(high, **poles)
+        gain = receiver_chain.receiver_transfer_function(high, **poles)
         within = receiver_chain.electrical_bandwidth(poles) / (OVER * rate / 2)
         white = rng.normal(size=(draws, n_samples)) * np.sqrt(shots.noise_variance[0] / within)
         return np.fft.irfft(gain * np.fft.rfft(white, axis=1), axis=1)[:, : OVER * length : OVER]

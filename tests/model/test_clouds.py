@@ -11,8 +11,8 @@ from sweep.model.effects.catalogue import (
     EFFECT_NAMES,
     EFFECTS,
     PARAMETER_DEFAULTS,
+    effect_names_in_flags,
     pack_effect_flags,
-    unpack_effect_flags,
 )
 from sweep.model.effects.scintillation import turbulence_profile, two_way_log_variances
 from sweep.model.evaluation import evaluate
@@ -159,7 +159,7 @@ def test_shots_that_are_computed_together_are_as_alone_whatever_effects_each_has
     parameters["target.solar_irradiance"] = 1e9
     cloud = _cloud(shot_eyepoints, parameters, effects=DEFAULT_EFFECTS, effect_flags=flags, draws=3)
     for shot in range(16):
-        shot_effects = unpack_effect_flags(int(flags[shot]))
+        shot_effects = effect_names_in_flags(int(flags[shot]))
         key, one = _keys([shot]), np.array([shot])
         single = _cloud(
             shot_eyepoints.select(one), parameters, effects=shot_effects, draws=3, keys=key

@@ -96,8 +96,8 @@ def test_a_permanent_line_masks_the_peak_and_pd_is_computed_on_demand(detection,
     assert (results.magnitude[[0, 2], 0] > 0).all() and np.isfinite(results.frequency).all()
     # Nor does it lose to a larger peak what it does not have.
     unmasked = without_pd._replace(peak_is_masked=np.zeros_like(without_pd.peak_is_masked))
-    lost = strongest_peak._span_probabilities(shots, without_pd, results.pd).pd_loss
-    lost_if_unmasked = strongest_peak._span_probabilities(shots, unmasked, results.pd).pd_loss
+    lost = strongest_peak._other_peak_probabilities(shots, without_pd, results.pd).pd_loss
+    lost_if_unmasked = strongest_peak._other_peak_probabilities(shots, unmasked, results.pd).pd_loss
     assert (lost_if_unmasked[spans.peak_is_masked] > 0).any()
     np.testing.assert_array_equal(lost, np.where(spans.peak_is_masked, 0.0, lost_if_unmasked))
 

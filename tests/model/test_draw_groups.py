@@ -19,7 +19,7 @@ from sweep.model.error_budget import (
 )
 from sweep.model.sampling import philox
 from sweep.model.sampling.draw_groups import (
-    GROUP_SIZE,
+    DRAWS_PER_GROUP,
     GROUPED_NUMBERS_MAX,
     GroupMeans,
     grouped_uniforms,
@@ -51,15 +51,15 @@ def halves(uniform_numbers):
 
 @pytest.mark.parametrize("are_polar", [False, True])
 def test_each_pair_of_a_group_visits_every_cell_of_every_shape_once(are_polar):
-    pairs = numbers(5, 3 * GROUP_SIZE, 6, are_polar=are_polar)
-    pairs = pairs.reshape(-1, GROUP_SIZE, 3, 2)
+    pairs = numbers(5, 3 * DRAWS_PER_GROUP, 6, are_polar=are_polar)
+    pairs = pairs.reshape(-1, DRAWS_PER_GROUP, 3, 2)
     if are_polar:
         pairs = halves(pairs)
-    for along in 2 ** np.arange(int(np.log2(GROUP_SIZE)) + 1):
-        across = GROUP_SIZE // along
+    for along in 2 ** np.arange(int(np.log2(DRAWS_PER_GROUP)) + 1):
+        across = DRAWS_PER_GROUP // along
         cell = np.floor(pairs[..., 0] * along) * across + np.floor(pairs[..., 1] * across)
         np.testing.assert_array_equal(
-            np.sort(cell, axis=1), np.arange(GROUP_SIZE)[None, :, None] + 0 * cell
+            np.sort(cell, axis=1), np.arange(DRAWS_PER_GROUP)[None, :, None] + 0 * cell
         )
 
 
@@ -88,10 +88,10 @@ def test_a_draw_alone_is_uniform_and_its_numbers_independent(draw, are_polar):
 
 def test_numbers_beyond_the_first_are_independent_of_groups():
     count = GROUPED_NUMBERS_MAX + 2
-    uniform_numbers = numbers(2, 2 * GROUP_SIZE, count)
+    uniform_numbers = numbers(2, 2 * DRAWS_PER_GROUP, count)
     independent = philox.uniforms(
-        np.repeat(keys(2), 2 * GROUP_SIZE, axis=0), np.tile(np.arange(2 * GROUP_SIZE), 2), STREAM,
-        count,
+        np.repeat(keys(2), 2 * DRAWS_PER_GROUP, axis=0), np.tile(np.arange(2 * DRAWS_PER_GROUP), 2),
+        STREAM, count,
     ).reshape(uniform_numbers.shape)  # fmt: skip
     grouped = uniform_numbers == independent
     assert grouped[..., GROUPED_NUMBERS_MAX:].all()
@@ -100,7 +100,7 @@ def test_numbers_beyond_the_first_are_independent_of_groups():
 
 def test_means_of_groups_are_numpys_however_draws_are_divided():
     random = np.random.default_rng(1)
-    n_points, draws = 3, 5 * GROUP_SIZE + 17
+    n_points, draws = 3, 5 * DRAWS_PER_GROUP + 17
     values = random.random((2, n_points, draws))
     values[1, 2] = np.nan
     all_means, parts = GroupMeans(n_points, ("a", "b")), GroupMeans(n_points, ("a", "b"))
@@ -113,7 +113,9 @@ def test_means_of_groups_are_numpys_however_draws_are_divided():
             restored = GroupMeans(n_points, ("a", "b"))
             restored.restore_state(means.state())
             means = restored  # goes on from what is stored
-        group_means = values[:, :, : 5 * GROUP_SIZE].reshape(2, n_points, 5, GROUP_SIZE).mean(-1)
+        group_means = (
+            values[:, :, : 5 * DRAWS_PER_GROUP].reshape(2, n_points, 5, DRAWS_PER_GROUP).mean(-1)
+        )
         n_values = np.isfinite(values).sum(axis=-1)
         statistics = means.statistics(np.arange(n_points), n_values)
         np.testing.assert_array_equal(statistics.n_groups, np.where(n_values, 5, 0))
@@ -124,14 +126,16 @@ def test_means_of_groups_are_numpys_however_draws_are_divided():
 def half_widths(values):
     """Half-widths of trials (trials, draws), of whole groups and the rest."""
     trials, n = values.shape
-    n_groups = n // GROUP_SIZE
-    group_means = values[:, : n_groups * GROUP_SIZE].reshape(trials, n_groups, -1).mean(axis=-1)
+    n_groups = n // DRAWS_PER_GROUP
+    group_means = (
+        values[:, : n_groups * DRAWS_PER_GROUP].reshape(trials, n_groups, -1).mean(axis=-1)
+    )
     return grouped_mean_half_width(
         variance=values.var(axis=1, ddof=1),
         n_values=n,
         group_variance=group_means.var(axis=1, ddof=1),
         n_groups=n_groups,
-        group_size=GROUP_SIZE,
+        group_size=DRAWS_PER_GROUP,
         confidence=CONFIDENCE,
     )
 
@@ -173,16 +177,16 @@ def test_the_mean_of_a_group_varies_no_more_than_that_of_independent_draws(funct
 
     5 sigma of a variance of 4000 groups are 11 % of normal means, and more of others.
     """
-    uniform_numbers = numbers(1, 4000 * GROUP_SIZE)[0]
+    uniform_numbers = numbers(1, 4000 * DRAWS_PER_GROUP)[0]
     for pd in (0.03, 0.1, 0.3, 0.5):
         values = function(pd)(uniform_numbers)
-        group_means = values.reshape(-1, GROUP_SIZE).mean(axis=1)
-        assert GROUP_SIZE * group_means.var() < 0.5 * values.var()
+        group_means = values.reshape(-1, DRAWS_PER_GROUP).mean(axis=1)
+        assert DRAWS_PER_GROUP * group_means.var() < 0.5 * values.var()
         if function is power:
             exponent = 1 / pd - 1
             mean_squared_slope = exponent**2 / (2 * exponent - 1)
-            in_cells = mean_squared_slope / (12 * GROUP_SIZE**2)
-            assert GROUP_SIZE * group_means.var() == pytest.approx(in_cells, rel=0.3)
+            in_cells = mean_squared_slope / (12 * DRAWS_PER_GROUP**2)
+            assert DRAWS_PER_GROUP * group_means.var() == pytest.approx(in_cells, rel=0.3)
 
 
 def test_half_widths_of_equal_values_are_what_so_many_draws_can_miss():
@@ -196,9 +200,9 @@ def test_half_widths_of_equal_values_are_what_so_many_draws_can_miss():
 
 def test_half_widths_fall_to_students_and_those_of_independent_draws_bound_them():
     variance, n_groups = 0.09, 12
-    n = GROUP_SIZE * n_groups
+    n = DRAWS_PER_GROUP * n_groups
     arguments = {
-        "variance": variance, "n_values": n, "n_groups": n_groups, "group_size": GROUP_SIZE,
+        "variance": variance, "n_values": n, "n_groups": n_groups, "group_size": DRAWS_PER_GROUP,
         "confidence": CONFIDENCE,
     }  # fmt: skip
     spread = 1e-5
@@ -214,11 +218,11 @@ def test_half_widths_fall_to_students_and_those_of_independent_draws_bound_them(
 
 @pytest.mark.parametrize(("batch", "limit"), [(100, 20_000), (7, 3000), (128, 1000), (64, 100)])
 def test_tests_come_after_whole_groups(batch, limit):
-    ends = np.array(list(stopping_check_draws(batch, limit, GROUP_SIZE)))
+    ends = np.array(list(stopping_check_draws(batch, limit, DRAWS_PER_GROUP)))
     assert ends[-1] == limit and (np.diff(ends) > 0).all()
-    late = ends[(ends >= 2 * GROUP_SIZE) & (ends < limit)]
-    assert (late % GROUP_SIZE == 0).all()
-    early = ends[(ends < 2 * GROUP_SIZE) & (ends < limit)]
+    late = ends[(ends >= 2 * DRAWS_PER_GROUP) & (ends < limit)]
+    assert (late % DRAWS_PER_GROUP == 0).all()
+    early = ends[(ends < 2 * DRAWS_PER_GROUP) & (ends < limit)]
     assert (early % batch == 0).all()
 
 
@@ -232,12 +236,12 @@ def test_standard_errors_of_few_groups_are_not_too_small(n_groups, ratio):
     """
     rng = np.random.default_rng([n_groups, int(100 * ratio)])
     variance = 0.04
-    means = rng.normal(0.0, np.sqrt(ratio * variance / GROUP_SIZE), (20_000, n_groups))
+    means = rng.normal(0.0, np.sqrt(ratio * variance / DRAWS_PER_GROUP), (20_000, n_groups))
     counted = variance_of_grouped_draws(
         variance=variance, group_variance=means.var(axis=1, ddof=1), n_groups=n_groups,
-        group_size=GROUP_SIZE, confidence=CONFIDENCE,
+        group_size=DRAWS_PER_GROUP, confidence=CONFIDENCE,
     )  # fmt: skip
-    errors = np.abs(means.mean(axis=1)) / np.sqrt(counted / (n_groups * GROUP_SIZE))
+    errors = np.abs(means.mean(axis=1)) / np.sqrt(counted / (n_groups * DRAWS_PER_GROUP))
     assert (errors > 1.96).mean() < 0.07
     assert (errors > 5).mean() < 0.006
 
@@ -251,17 +255,17 @@ def test_stopping_is_as_sure_as_promised_where_groups_do_not_help(pd, tolerance)
     rng, n_trials, draws_max = np.random.default_rng(int(1000 * tolerance)), 4000, 3200
     values = rng.random((n_trials, draws_max)) < pd
     sums = np.cumsum(values, axis=1, dtype=np.int32)
-    group_means = values.reshape(n_trials, -1, GROUP_SIZE).mean(axis=2)
+    group_means = values.reshape(n_trials, -1, DRAWS_PER_GROUP).mean(axis=2)
     is_open, is_covered = np.ones(n_trials, bool), np.zeros(n_trials, bool)
-    for n in stopping_check_draws(100, draws_max, GROUP_SIZE):
-        n_groups = n // GROUP_SIZE
+    for n in stopping_check_draws(100, draws_max, DRAWS_PER_GROUP):
+        n_groups = n // DRAWS_PER_GROUP
         if n_groups < 2:
             continue
         mean = sums[:, n - 1] / n
         half_width = grouped_mean_half_width(
             variance=mean * (1 - mean) * n / (n - 1), n_values=n,
             group_variance=group_means[:, :n_groups].var(axis=1, ddof=1), n_groups=n_groups,
-            group_size=GROUP_SIZE, confidence=CONFIDENCE,
+            group_size=DRAWS_PER_GROUP, confidence=CONFIDENCE,
         )  # fmt: skip
         stops = is_open & (half_width <= tolerance)
         is_covered[stops] = np.abs(mean - pd)[stops] <= half_width[stops]

@@ -118,7 +118,7 @@ def scatterers_reported(p, draws, seed):
 def fan_of(spread, turn, shape="hann"):
     """Lines of one footprint, and the window, of records as long as their FFT."""
     size = 1024
-    transform = speckle_lines.transform_table(get_window(shape, size))[1]
+    transform = speckle_lines.window_transform_table(get_window(shape, size))[1]
     node, weight = speckle_lines._quadrature_tables()
     rule = np.array([[3, 3]])  # of 15 lines along either coordinate
     return speckle_lines.SpeckleLineGrid(

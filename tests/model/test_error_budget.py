@@ -35,7 +35,7 @@ def test_accuracy_fields_of_a_spec_are_error_budget_fields_with_the_same_default
 def test_errors_follow_from_the_tolerance_unless_they_are_given():
     points = ErrorBudget(np.array([1e-1, 1e-3]), line_error=np.array([SET_BY_TOLERANCE, 1e-5]))
     assert points.allowed_line_error.tolist() == [1e-1, 1e-5]
-    assert points.allowed_leakage.tolist() == [0.05, 5e-4]
+    assert points.allowed_leakage_error.tolist() == [0.05, 5e-4]
     assert points.has_errors_set_by_tolerance.all()
     error_budget = ErrorBudget(
         1e-3, line_error=1e-5, leakage_error=np.array([1e-6, SET_BY_TOLERANCE])

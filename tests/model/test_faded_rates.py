@@ -132,7 +132,7 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     steady[2, 1:] = rng.uniform(-0.6, 0.6, bins - 1)
     bins_given_mode = echo_detection.BinsGivenMode(*steady, np.zeros(bins))
     run = echo_detection.EchoBins(steady[0], echo, 100)
-    expected = echo_detection._mean_over_mode_power(bins_given_mode, run, False, 1024)
+    expected = echo_detection._mean_pd_and_miss_over_mode_power(bins_given_mode, run, False, 1024)
 
     ratio = steady[1] / steady[0]
     first = np.min(np.maximum(steady[1] - echo_detection._IMPOSSIBLE_BELOW_SIGMA, 0.0) / steady[0])

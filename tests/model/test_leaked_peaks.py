@@ -297,7 +297,7 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     groups = list_bin_groups(shots)
     ((_, leaks),) = leaked.iter_leakage_bins(shots, groups, np.zeros(1, np.int64))
     level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
-    scale, line = permanent_line.line_of_point(shots, 0, 0)
+    scale, line = permanent_line.permanent_line_of_point(shots, 0, 0)
     bins = leaks.permanent_line_bins[
         leaks.permanent_line_begin[0, 0] : leaks.permanent_line_end[0, 0]
     ]
@@ -401,7 +401,7 @@ def test_faint_leakage_is_what_the_average_over_all_bins_together_gives(table_4_
 def test_rates_stay_below_their_bounds_at_every_octave_of_speckle(table_4_1):
     shots = _faint_shots(table_4_1, 20.0)
     ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
-    for octave in range(leaked.N_BOUND_SPECKLE_POWERS):
+    for octave in range(leaked.N_RATE_BOUND_SPECKLE_POWERS):
         for j, s in np.ndindex(leaks.crossing_rate_sum_bound_at_mean.shape):
             bins = slice(leaks.bins_begin[j, s], leaks.bins_end[j, s])
             amplitudes = leaks.log_amplitude[bins] + 0.5 * octave * math.log(2.0)

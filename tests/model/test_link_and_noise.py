@@ -10,7 +10,11 @@ from shot_helpers import prepare_single_category
 from sweep.model import constants, evaluation, receiver_chain
 from sweep.model.beamlets import place_beamlets
 from sweep.model.ground import backscatter
-from sweep.model.receiver_chain import bin_noise_sigma, electrical_bandwidth, receiver_transfer
+from sweep.model.receiver_chain import (
+    bin_noise_sigma,
+    electrical_bandwidth,
+    receiver_transfer_function,
+)
 
 ELECTRON, BOLTZMANN = 1.602176634e-19, 1.380649e-23
 GAIN = 7e3
@@ -218,7 +222,7 @@ def test_noise_of_a_bin_is_half_the_windowed_records_in_each_quadrature():
 
 
 def response(frequency, detector=400e6, amplifier=200e6):
-    return 7e3 * receiver_transfer(
+    return 7e3 * receiver_transfer_function(
         frequency, detector_bandwidth=detector, amplifier_bandwidth=amplifier
     )
 
@@ -275,7 +279,7 @@ def test_drawn_noise_that_passes_the_receiver_has_its_density(table_4_1):
     """
     rng, over, n = np.random.default_rng(4), 16, 64
     high = np.fft.rfftfreq(over * n, 1 / (over * 600e6))
-    gain = receiver_chain.receiver_transfer(
+    gain = receiver_chain.receiver_transfer_function(
         high, detector_bandwidth=400e6, amplifier_bandwidth=400e6
     )
     power = np.zeros(n // 2 + 1)

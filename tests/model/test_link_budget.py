@@ -101,13 +101,15 @@ def test_the_planner_has_the_link_budget_of_the_shots(case, table_4_1):
     assert_equal(points.segment_starts, existing(shots, shots.motion.segment_starts), shape)
     beats = existing(shots, shots.beat_frequencies)
     assert_equal(points.beat_frequency, beats, shape)
-    n_missing = 0 if points.missing_samples is None else points.missing_samples.n_missing
+    n_missing = (
+        0 if points.missing_sample_bounds is None else points.missing_sample_bounds.n_missing
+    )
     before_echo = shots.echo_record.n_samples_before_echo
     expected = 0 if before_echo is None else before_echo[shots.has_segment]
     assert np.array_equal(np.broadcast_to(n_missing, shape), np.broadcast_to(expected, shape))
 
     pole_gain = np.abs(
-        receiver_chain.receiver_transfer(
+        receiver_chain.receiver_transfer_function(
             beats,
             detector_bandwidth=shots.receiver_filter.detector_bandwidth,
             amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,
@@ -136,7 +138,7 @@ def test_effects_that_are_off_leave_lines_at_rest(table_4_1):
         shots = prepare_single_category(scene, effects)
         beats = existing(shots, shots.beat_frequencies)
         assert_equal(points.beat_frequency, beats, beats.shape)
-        assert points.missing_samples is None
+        assert points.missing_sample_bounds is None
 
 
 def test_noise_of_the_echo_moves_no_threshold_and_the_adcs_passes_no_filter():

@@ -25,7 +25,7 @@ from sweep.model.detection.looks import (
 )
 from sweep.model.detection.marcum import at_least_one_probability, marcum_q1
 from sweep.model.evaluation import evaluate, evaluate_segments, prepare_shots
-from sweep.model.laser_line import apparent_line_and_pedestal, pure_line_power_fraction
+from sweep.model.laser_line import apparent_line_and_pedestal_power, pure_line_power_fraction
 from sweep.model.sampling.samplers import simulate_draws
 from sweep.model.spectrum.segment_spectra import segment_spectrum
 from sweep.model.threshold import DESIGN_PFA_BIN_PATH, DESIGN_PFA_SEGMENT_PATH, tnr_from_parameters
@@ -352,7 +352,7 @@ def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
     assert without > expected + 0.1
     timing = {"line_width": np.array([1e5]), "delay": np.array([delay])}
     line = {"duration": np.array([2e-6]), "window": shots.window}
-    assert apparent_line_and_pedestal(**timing, **line)[0] > pure_line_power_fraction(
+    assert apparent_line_and_pedestal_power(**timing, **line)[0] > pure_line_power_fraction(
         **timing, duration=line["duration"]
     )
 

@@ -67,7 +67,7 @@ def test_mean_and_covariance_of_drawn_velocities_are_those_propagated(beams):
     solution = solve_velocity(
         direction=beams, radial_velocity=beams @ MOVING + noise, standard_error=error
     )
-    errors, stated_covariance = solution.value - MOVING, solution.covariance[0]
+    errors, stated_covariance = solution.estimate - MOVING, solution.covariance[0]
     variance = np.diag(stated_covariance)
     assert (np.abs(errors.mean(axis=0)) <= 5 * np.sqrt(variance / DRAWS)).all()
     # of a sample covariance of normal numbers: (C_ii C_jj + C_ij^2) / (n - 1)
@@ -86,7 +86,7 @@ def test_a_turned_frame_turns_the_solution():
         turned = solve_velocity(
             direction=SIXTEEN @ turn.T, radial_velocity=measured, standard_error=error
         )
-        np.testing.assert_allclose(turned.value, turn @ unturned.value, atol=1e-11)
+        np.testing.assert_allclose(turned.estimate, turn @ unturned.estimate, atol=1e-11)
         np.testing.assert_allclose(
             turned.covariance, turn @ unturned.covariance @ turn.T, atol=1e-13 * 0.1
         )
@@ -101,14 +101,14 @@ def test_four_beams_can_spare_any_one_and_three_can_not():
         assert (solution.status == status).all()
         assert (solution.is_beam_used == valid).all() and (solution.degrees_of_freedom == 0).all()
         if status == STATUS_SOLVED:
-            np.testing.assert_allclose(solution.value, np.tile(MOVING, (4, 1)), atol=1e-12)
+            np.testing.assert_allclose(solution.estimate, np.tile(MOVING, (4, 1)), atol=1e-12)
             full = solve_velocity(
                 direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01
             )
             lost = np.linalg.eigvalsh(solution.covariance - full.covariance)
             assert (lost > -1e-15).all()  # a beam less never makes anything better known
         else:
-            assert np.isnan(solution.value).all() and np.isnan(solution.covariance).all()
+            assert np.isnan(solution.estimate).all() and np.isnan(solution.covariance).all()
 
 
 def test_no_cycles_make_no_solutions():
@@ -116,7 +116,7 @@ def test_no_cycles_make_no_solutions():
     solution = solve_velocity(
         direction=FOUR, radial_velocity=nothing, standard_error=0.01, test_level=0.01
     )
-    assert solution.value.shape == (0, 5, 3) and solution.is_available.shape == (0, 5)
+    assert solution.estimate.shape == (0, 5, 3) and solution.is_available.shape == (0, 5)
 
 
 @pytest.mark.parametrize("half_angle", [1e-1, 1e-3, 1e-5, 1e-7])
@@ -125,7 +125,7 @@ def test_a_cone_so_narrow_that_rounding_spoils_it_is_refused(half_angle):
     beams = cone_directions(3, half_angle=half_angle)
     solution = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
     assert solution.is_available == (np.sqrt(2) / np.tan(half_angle) < 1e6)
-    assert np.isfinite(solution.value).all() == solution.is_available
+    assert np.isfinite(solution.estimate).all() == solution.is_available
 
 
 def test_beams_in_a_plane_leave_the_velocity_across_undetermined():
@@ -133,7 +133,7 @@ def test_beams_in_a_plane_leave_the_velocity_across_undetermined():
     beams = np.column_stack([np.sin(angle), 0 * angle, -np.cos(angle)])
     beams = beams @ Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix().T
     solution = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
-    assert solution.status == STATUS_UNDETERMINED and np.isnan(solution.value).all()
+    assert solution.status == STATUS_UNDETERMINED and np.isnan(solution.estimate).all()
 
 
 # ---- one false beam ----
@@ -163,7 +163,7 @@ def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     right = (solution.status == STATUS_EXCLUDED) & ~solution.is_beam_used[:, beam]
     assert is_within_5_sigma(right.sum(), 1 - LEVEL)
     assert (solution.status[~right] == STATUS_WITHHELD).all() and np.isnan(
-        solution.value[~right]
+        solution.estimate[~right]
     ).all()
     assert (solution.is_beam_used[right].sum(axis=1) == 15).all() and (
         solution.degrees_of_freedom[right] == 12
@@ -173,7 +173,7 @@ def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     np.testing.assert_allclose(
         solution.covariance[right][0], stated_covariance, rtol=1e-9, atol=1e-16
     )
-    errors = solution.value[right] - MOVING
+    errors = solution.estimate[right] - MOVING
     assert (np.abs(errors.mean(axis=0)) <= 5 * np.sqrt(np.diag(stated_covariance) / DRAWS)).all()
 
 
@@ -221,7 +221,7 @@ def test_a_platform_that_moves_between_beams_is_put_right_by_their_offsets():
     offset = np.linspace(-1.5, 1.5, 4)[:, None] * MOVING / 80
     ranges = _ranges(FOUR, 90.0, normal=NORMAL, offset=offset)
     solution = altitude(direction=FOUR, range=ranges, standard_error=0.1, offset=offset)
-    assert solution.value == pytest.approx(90.0, rel=1e-13)
+    assert solution.estimate == pytest.approx(90.0, rel=1e-13)
 
 
 @PATTERNS
@@ -233,7 +233,7 @@ def test_the_altitudes_variance_is_its_response_to_each_range(beams, slope):
     solution = altitude(direction=beams, range=ranges, standard_error=error, slope=slope)
     step = 1e-3 * np.eye(len(beams))
     high, low = (
-        altitude(direction=beams, range=ranges + s, standard_error=error, slope=slope).value
+        altitude(direction=beams, range=ranges + s, standard_error=error, slope=slope).estimate
         for s in (step, -step)
     )
     response = (high - low) / 2e-3
@@ -248,7 +248,7 @@ def test_the_altitudes_variance_is_its_response_to_each_range(beams, slope):
                 standard_error=error,
                 slope=slope,
             )
-            from_slopes += slope**2 * ((tilted.value - 200.0) / 1e-5) ** 2
+            from_slopes += slope**2 * ((tilted.estimate - 200.0) / 1e-5) ** 2
     expected = np.sum((response * error) ** 2) + from_slopes
     # steps of 1e-5 relative leave that much, squared or not, of curvature
     assert solution.covariance == pytest.approx(expected, rel=2e-5)
@@ -262,7 +262,7 @@ def test_mean_and_variance_of_drawn_altitudes_are_those_propagated(beams):
     heights = rng.normal(0, 0.3, (DRAWS, len(beams)))  # relief lifts a point, the range shrinks
     ranges = (500.0 - heights) / down + rng.normal(0, 1, heights.shape) * error
     solution = altitude(direction=beams, range=ranges, standard_error=error, relief=0.3)
-    errors, variance = solution.value - 500.0, solution.covariance.mean()
+    errors, variance = solution.estimate - 500.0, solution.covariance.mean()
     # the curvature of the problem is of order variance / altitude, far below 5 sigma / sqrt(n)
     assert variance / 500 < 0.2 * np.sqrt(variance / DRAWS)
     assert abs(errors.mean()) <= 5 * np.sqrt(variance / DRAWS)
@@ -277,7 +277,7 @@ def test_on_a_steep_slope_errors_count_by_how_the_beams_meet_it():
     noise = np.random.default_rng(16).normal(0, 0.1, (DRAWS, 4))
     ranges = _ranges(FOUR, 500.0, normal=normal) + noise
     solution = altitude(direction=FOUR, range=ranges, standard_error=0.1)
-    assert abs(solution.value.var(ddof=1) / solution.covariance.mean() - 1) <= 5 * np.sqrt(
+    assert abs(solution.estimate.var(ddof=1) / solution.covariance.mean() - 1) <= 5 * np.sqrt(
         2 / DRAWS
     )
     assert abs(solution.chi_square.mean() - 1) <= 5 * np.sqrt(2 / DRAWS)
@@ -288,7 +288,7 @@ def test_a_slope_known_beforehand_counts_in_the_variance_of_one_beam():
         direction=FOUR[:1], range=[100.0], standard_error=0.1, slope=0.05, relief=0.2
     )
     cosine = -FOUR[0, 2]
-    assert solution.value == pytest.approx(100 * cosine)
+    assert solution.estimate == pytest.approx(100 * cosine)
     expected = (0.1 * cosine) ** 2 + 0.2**2 + 0.05**2 * 100**2 * (1 - cosine**2)
     assert solution.covariance == pytest.approx(expected, rel=1e-12)
 
@@ -299,7 +299,9 @@ def test_two_beams_see_the_slope_along_their_line():
     solution = altitude(
         direction=beams, range=_ranges(beams, height, normal=NORMAL), standard_error=0.1
     )
-    assert solution.value == pytest.approx(height, rel=1e-12) and solution.degrees_of_freedom == 1
+    assert (
+        solution.estimate == pytest.approx(height, rel=1e-12) and solution.degrees_of_freedom == 1
+    )
 
 
 def test_no_beam_gives_no_altitude():
@@ -307,7 +309,7 @@ def test_no_beam_gives_no_altitude():
         direction=FOUR, range=np.full(4, np.nan), standard_error=0.1, test_level=0.01
     )
     assert solution.status == STATUS_UNDETERMINED and not solution.is_available
-    assert np.isnan(solution.value) and np.isnan(solution.covariance)
+    assert np.isnan(solution.estimate) and np.isnan(solution.covariance)
 
 
 def test_a_tiny_slope_is_level_ground():
@@ -327,7 +329,7 @@ def test_ground_of_random_slope_is_off_by_the_stated_variance():
     beams = FOUR[:2]
     ranges = 200.0 / (tilt @ beams[:, :2].T - beams[:, 2]) + rng.normal(0, 0.1, (DRAWS, 2))
     solution = altitude(direction=beams, range=ranges, standard_error=0.1, slope=0.03)
-    ratio = np.mean((solution.value - 200.0) ** 2) / solution.covariance.mean()
+    ratio = np.mean((solution.estimate - 200.0) ** 2) / solution.covariance.mean()
     assert abs(ratio - 1) <= 5 * np.sqrt(2 / DRAWS) + 0.01
     assert solution.covariance.mean() > 100 * 0.1**2  # by far the slope's doing
     assert (
@@ -342,4 +344,4 @@ def test_a_beam_that_grazes_the_fitted_plane_does_not_run_off_with_the_weight():
     ranges[0] = 9000.0
     solution = altitude(direction=SIXTEEN, range=ranges, standard_error=0.1, test_level=1e-3)
     assert solution.status == STATUS_EXCLUDED and not solution.is_beam_used[0]
-    assert solution.value == pytest.approx(100.0, rel=1e-12)
+    assert solution.estimate == pytest.approx(100.0, rel=1e-12)

@@ -103,11 +103,14 @@ def same_detections(shots):
     for every_bin in (False, True):
         spectra = evaluate_segments(
             replace(
-                shots, detection_settings=shots.detection_settings._replace(includes_leakage=False)
+                shots,
+                detection_settings=shots.detection_settings._replace(
+                    leakage_raises_false_alarms=False
+                ),
             ),
             bin_by_bin=every_bin,
         )
-        assert not np.nan_to_num(spectra.leakage).any()
+        assert not np.nan_to_num(spectra.leakage_probability).any()
         np.testing.assert_array_equal(spectra.frequency, with_all_bins.frequency)
         np.testing.assert_array_equal(spectra.n_exempt, with_all_bins.n_exempt)
         with np.errstate(invalid="ignore"):
@@ -265,7 +268,9 @@ def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, 
     shots = prepared(parameters, *effects, without=() if leakage else ("leakage",))
     spectra, listed = evaluate_segments(shots), list_bin_groups(shots)
     slow = evaluate_segments(shots, bin_by_bin=True)
-    np.testing.assert_allclose(spectra.leakage, slow.leakage, rtol=1e-6, atol=1e-20)
+    np.testing.assert_allclose(
+        spectra.leakage_probability, slow.leakage_probability, rtol=1e-6, atol=1e-20
+    )
     above = 0
     for i in range(40):
         for segment in range(3):
@@ -279,7 +284,7 @@ def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, 
             inside = 0 < best < bins[-1]
             if inside:
                 np.testing.assert_allclose(
-                    listed.neighbour_magnitudes[i, segment, 0], neighbours, rtol=1e-7
+                    listed.peak_and_neighbour_magnitudes[i, segment, 0], neighbours, rtol=1e-7
                 )
             crossing = magnitude >= level
             crossing[best] = True

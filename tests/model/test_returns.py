@@ -40,7 +40,7 @@ from sweep.model.pointcloud.returns import (
     draw_returns,
     draw_segment_peaks,
     empty_group_speckle,
-    largest_noise_magnitude,
+    noise_maximum_at_probability,
 )
 from sweep.model.sampling.draws import NoiseFilter, NoiselessSpectra
 from sweep.model.sampling.philox import DrawAddress
@@ -112,7 +112,9 @@ def test_groups_are_runs_of_bins_above_the_threshold_in_the_true_spectrum(table_
             peak = run.start + spectrum[run].argmax()
             assert groups.strongest_bin[0, segment, g] == peak
             np.testing.assert_allclose(
-                groups.neighbour_magnitudes[0, segment, g], spectrum[peak - 1 : peak + 2], rtol=1e-5
+                groups.peak_and_neighbour_magnitudes[0, segment, g],
+                spectrum[peak - 1 : peak + 2],
+                rtol=1e-5,
             )
 
 
@@ -125,8 +127,12 @@ def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
         groups.strongest_bin[:, :, 0].T, np.rint(expected.frequency * 2**17 / 600e6)
     )
     np.testing.assert_array_equal(groups.n_exempt_bins.T, expected.n_exempt)
-    np.testing.assert_array_equal(groups.leakage_probability.T[[0, 2]], expected.leakage[[0, 2]])
-    assert not expected.leakage[1].any()  # of the Doppler segment only draws need to know
+    np.testing.assert_array_equal(
+        groups.leakage_probability.T[[0, 2]], expected.leakage_probability[[0, 2]]
+    )
+    assert not expected.leakage_probability[
+        1
+    ].any()  # of the Doppler segment only draws need to know
 
 
 def test_fewer_groups_listed_are_the_strongest_of_all(table_4_1):
@@ -289,9 +295,9 @@ def test_the_largest_of_many_noise_bins_has_its_order_statistic():
     """P(max > x) = 1 - (1 - exp(-x^2/2))^n, by scipy's Rayleigh distribution; Gamma's in looks."""
     for chance in (1e-9, 0.01, 0.7):
         for n in (1.0, 100.0, 65000.0):
-            x = largest_noise_magnitude(n, chance, 1)
+            x = noise_maximum_at_probability(n, chance, 1)
             assert -np.expm1(n * stats.rayleigh.logcdf(x)) == pytest.approx(chance, rel=1e-9)
-            below = stats.gamma.logcdf(4 * largest_noise_magnitude(n, chance, 8) ** 2, 8)
+            below = stats.gamma.logcdf(4 * noise_maximum_at_probability(n, chance, 8) ** 2, 8)
             assert -np.expm1(n * below) == pytest.approx(chance, rel=1e-9)
 
 
@@ -605,7 +611,8 @@ def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
     )  # fmt: skip
     assert shots.window.length < shots.fft_size
     shots = dataclasses.replace(  # false peaks may pair with the true ones
-        shots, detection_settings=shots.detection_settings._replace(includes_leakage=False)
+        shots,
+        detection_settings=shots.detection_settings._replace(leakage_raises_false_alarms=False),
     )
     returns = _drawn(shots, _certain(list_bin_groups(shots)))
     assert returns.flags[0, 0, 0] == TRUE_RETURN_FLAG

@@ -18,7 +18,7 @@ from sweep.model.outputs import (
     STANDARD_ERROR_OUTPUTS,
 )
 from sweep.model.sampling import philox, realisations, samplers
-from sweep.model.sampling.draw_groups import GROUP_SIZE
+from sweep.model.sampling.draw_groups import DRAWS_PER_GROUP
 from sweep.model.sampling.samplers import draw_until_accurate, simulate_draws, stopping_check_draws
 
 SPECKLED = (*DEFAULT_EFFECTS, "speckle")
@@ -63,7 +63,7 @@ def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
     drawn = {*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
     assert set(results) == (drawn | {RUNNING_SUMS_NAME} if effects is SPECKLED else drawn)
     numbers = results["n_draws"]
-    group_size = GROUP_SIZE if effects is SPECKLED else 1
+    group_size = DRAWS_PER_GROUP if effects is SPECKLED else 1
     assert np.isin(numbers, list(stopping_check_draws(20, 400, group_size))).all()
     assert np.unique(numbers).size > 1 or (method, effects) == ("probabilities", DEFAULT_EFFECTS)
     for point, number in enumerate(numbers.tolist()):
@@ -80,7 +80,7 @@ def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_
     for name in PD_OUTPUT_NAMES:
         assert (results[f"{name}_half_width"] <= 0.06).all()
     for point, number in enumerate(results["n_draws"].tolist()):
-        for before in [n for n in stopping_check_draws(20, 10_000, GROUP_SIZE) if n < number]:
+        for before in [n for n in stopping_check_draws(20, 10_000, DRAWS_PER_GROUP) if n < number]:
             fixed = simulate_draws(parameters, SPECKLED, batch_sizes=[before], **chosen)
             widths = [fixed[f"{name}_half_width"][point] for name in PD_OUTPUT_NAMES]
             assert max(widths) > 0.06
@@ -204,7 +204,7 @@ class Coins:
         interval = COUNT_INTERVAL_FUNCTIONS[self.method](successes=k, trials=n, confidence=0.95)
         return interval_half_width(k / n, interval)[place]
 
-    def half_width_excess(self, points, error_budget):
+    def pd_half_width_excess(self, points, error_budget):
         return np.maximum(self.widths(points) - error_budget.tolerance, 0.0)
 
 

@@ -10,7 +10,7 @@ from shot_helpers import magnitude_error
 from small_scenes import observe_shots, scene_parameters, straight_flight
 
 from sweep.model import time_domain_truth
-from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS, unpack_effect_flags
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS, effect_names_in_flags
 from sweep.model.evaluation import prepare_shots
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.scanner import cone_directions, fixed_beams
@@ -271,7 +271,9 @@ def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
             has_rotating_bodies=False,
         )
         flags = planned.selected_effects(1).effect_flags
-        called.append({"acceleration", "segment_motion"} & set(unpack_effect_flags(int(flags[0]))))
+        called.append(
+            {"acceleration", "segment_motion"} & set(effect_names_in_flags(int(flags[0])))
+        )
     assert called == [{"acceleration", "segment_motion"}, set()]
 
 

@@ -14,7 +14,7 @@ from sweep.model.spectrum.lines import (
     AMPLITUDE_TOLERANCES,
     NODES_MAX,
     n_required_nodes,
-    node_phase_limits,
+    phase_span_max_table,
     replace_lines_by_nodes,
 )
 from sweep.model.spectrum.segment_spectra import bin_tangents
@@ -115,7 +115,10 @@ def few_for(delta, weights, tolerance, limits):
 def test_few_lines_have_the_same_spectrum_for_bundles_of_any_width(centre, tolerance):
     """Sum of C e^{i u delta} for |u| <= pi, to what is allowed of the summed amplitudes."""
     rng = np.random.default_rng(43)
-    limits, u = node_phase_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), np.linspace(-np.pi, np.pi, 41)
+    limits, u = (
+        phase_span_max_table(AT_THE_ENDS, AMPLITUDE_TOLERANCES),
+        np.linspace(-np.pi, np.pi, 41),
+    )
     allowed = max(tolerance, 1e-13) + 109 * 2.3e-16 + np.pi * np.spacing(abs(centre))
     for spread in 10 ** np.linspace(-16, 2, 60):
         delta, weights = bundle(rng, 109, spread)
@@ -128,7 +131,7 @@ def test_few_lines_have_the_same_spectrum_for_bundles_of_any_width(centre, toler
 
 
 def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
-    limits, counts = node_phase_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), []
+    limits, counts = phase_span_max_table(AT_THE_ENDS, AMPLITUDE_TOLERANCES), []
     for spread in (0.0, 0.1, 1.0, 5.0, 200.0):
         delta = np.linspace(-spread, spread, 109)
         few, _ = few_for(delta, np.ones(109), 0.0, limits)
@@ -144,7 +147,7 @@ def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-10])
 def test_few_lines_are_as_good_in_every_bin_as_the_window_lets_them(name, tolerance):
     """Lines in phase at the ends of their bundle, the worst there are: by direct sums."""
-    limits = get_window(name, 256).node_phase_limits(False)
+    limits = get_window(name, 256).phase_span_max_table(False)
     record = window_samples(name, 256) * np.exp(
         2j * np.pi * np.outer(np.arange(-20, 21), np.arange(256)) / 256
     )

@@ -108,7 +108,7 @@ def scores(shape, rule, angle, draws=4000, places=20):
     count = up.shape[1]
     gradients = LineGradients(np.zeros((count, 3, 2)), np.zeros((count, 3, 2)))
     gradients.line_shift[:, [0, 2], 0] = spread, -spread
-    gradients.phase[:, 2, 0] = turn
+    gradients.phase_gradient[:, 2, 0] = turn
     by_segment = np.full((5, count, 3), np.nan)
     by_segment[:, :, 0], by_segment[:, :, 2] = up, down
     error, offset, power, fraction, noise = by_segment

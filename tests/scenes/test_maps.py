@@ -9,7 +9,7 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from sweep.scenes.map_frames import MapFrame, MetresPerUnit, degree_lengths, require_one_map
+from sweep.scenes.map_frames import MapFrame, MetresPerUnit, degree_lengths, require_same_map
 from sweep.scenes.rasters import raster_digest, read_raster_terrain
 from sweep.scenes.scene_files import SceneError
 from sweep.scenes.terrain import Terrain
@@ -171,10 +171,10 @@ def test_heights_above_two_surfaces_are_refused(survey, one, other, message):
 
     pair = [map_frame(one, "a"), map_frame(other, "b")]
     if not message:
-        require_one_map(pair)
+        require_same_map(pair)
         return
     with pytest.raises(SceneError, match=message):
-        require_one_map(pair)
+        require_same_map(pair)
 
 
 def test_a_remedy_near_a_pole_names_no_zone_of_utm(survey):
@@ -243,12 +243,12 @@ def test_rasters_of_two_maps_are_refused(survey):
         map_frame(32632, "b.tif"),
         map_frame(32633, "c.tif"),
     )
-    require_one_map([one, same])
+    require_same_map([one, same])
     with pytest.raises(SceneError, match=r"c\.tif: lies on the map 'WGS 84 / UTM zone 33N', and a"):
-        require_one_map([one, same, other])
+        require_same_map([one, same, other])
     with pytest.raises(SceneError, match="state one size for both"):
-        require_one_map([one, map_frame(32632, "d.tif", metres_per_unit=(1.0005, 1.0))])
-    require_one_map([one, ("none", MapFrame(MetresPerUnit(1.0, 1.0)))])
+        require_same_map([one, map_frame(32632, "d.tif", metres_per_unit=(1.0005, 1.0))])
+    require_same_map([one, ("none", MapFrame(MetresPerUnit(1.0, 1.0)))])
 
 
 HEIGHTS = np.random.default_rng(3).normal(size=(9, 12))

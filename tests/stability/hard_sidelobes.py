@@ -272,7 +272,7 @@ def leakage_error(window_name: str, size: int, range_m: float) -> float:
     """Relative error of the leakage of a shot's up segment."""
     single_shot = prepare_shot(LEAKAGE_EFFECTS, window=window_name, fft_size=size, range=range_m)
     results = evaluate_segments(single_shot)
-    n_exempt, leakage = int(results.n_exempt[0, 0]), results.leakage[0, 0]
+    n_exempt, leakage = int(results.n_exempt[0, 0]), results.leakage_probability[0, 0]
     return abs(leakage / exact_leakage(single_shot, n_exempt) - 1)
 
 

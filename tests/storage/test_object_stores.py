@@ -308,7 +308,7 @@ def test_receipts_are_gathered_in_objects_of_some_seconds(memory, monkeypatch):
 @pytest.mark.parametrize("objects_max", [1, 2, 100])
 def test_many_objects_of_a_log_become_few_and_say_the_same(memory, monkeypatch, objects_max):
     monkeypatch.setattr(store_format, "LOG_OBJECTS_MAX", objects_max)
-    monkeypatch.setattr(store_format, "MERGED_LOG_OBJECT_BYTES", 200)
+    monkeypatch.setattr(store_format, "MERGED_LOG_OBJECT_TARGET_BYTES", 200)
     path = parse_location(memory) / "log"
     log = store_format.ObjectStoreLog(path)
     lines = [encode_log_record({"block": block, "text": "x" * 50}) for block in range(9)]

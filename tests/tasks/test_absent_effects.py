@@ -8,7 +8,7 @@ from small_studies import STUDY_MAPPING, small_spec
 
 from sweep.model import beamlets
 from sweep.model.effects import atmosphere, scintillation
-from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS, unpack_effect_flags
+from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS, effect_names_in_flags
 from sweep.model.evaluation import prepare_shots, select_effects
 from sweep.model.spectrum import line_shape
 from sweep.tasks.studies.grid_study import GridStudy
@@ -51,7 +51,9 @@ def evaluated(spec):
     study = GridStudy(spec)
     flags = [study.evaluate(block)["effects"].ravel() for block in range(study.n_blocks)]
     return {
-        name for flag in np.unique(np.concatenate(flags)) for name in unpack_effect_flags(int(flag))
+        name
+        for flag in np.unique(np.concatenate(flags))
+        for name in effect_names_in_flags(int(flag))
     }
 
 
@@ -139,7 +141,7 @@ def test_bare_shots_hold_nothing_of_any_effect():
     assert bare.echo_record.phase_errors == () and bare.laser_line.gaussian_fwhm is None
     assert (
         not bare.line_images.are_summed
-        and not bare.detection_settings.includes_leakage
+        and not bare.detection_settings.leakage_raises_false_alarms
         and bare.footprint.adds_powers
     )
     assert set(bare.noise.variances) == {"local_oscillator_shot", "detector", "amplifier"}

@@ -206,7 +206,9 @@ class LeavingPlugin:
     "error", [OSError("gone"), TimeoutError(), RuntimeError("IOLoop is closed"), CancelledError()]
 )
 def test_nothing_is_known_of_the_memory_of_workers_that_go(error):
-    assert worker_memory.worker_memory(LeavingPlugin(error), None).bytes_max == float("inf")
+    assert worker_memory.available_worker_memory(LeavingPlugin(error), None).bytes_max == float(
+        "inf"
+    )
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_in_words(serial_store, tmp_path, two_workers):

@@ -149,7 +149,7 @@ def test_a_block_of_several_points_is_stopped_at_any_of_them(
 ):
     ranges = ("100 m", "1 km", "2 km", "6 km")
     expected = undivided_stores(kind, ranges)
-    monkeypatch.setattr("sweep.tasks.studies.grid_study.POINTS_PER_CALL_MAX", 2)
+    monkeypatch.setattr("sweep.tasks.studies.grid_study.POINTS_PER_MODEL_CALL_MAX", 2)
     assert run_serially(drawn_spec(kind, ranges), tmp_path / "pieces.zarr").complete
     assert file_digests(tmp_path / "pieces.zarr") == expected
     assert any(0 < points < 2 for points in saved) and any(2 < points < 4 for points in saved)

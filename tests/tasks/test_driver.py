@@ -26,7 +26,7 @@ from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_COUNT_OUTPUTS
 from sweep.tasks.driver import resume, run
 from sweep.tasks.engine import session, study_store
 from sweep.tasks.engine.progress import Progress
-from sweep.tasks.engine.study_store import BlockDigest, BlockWriter
+from sweep.tasks.engine.study_store import BlockWriter, WrittenBlock
 from sweep.tasks.engine.worker import TaskSettings, run_blocks
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.store_summary import status
@@ -238,7 +238,7 @@ def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
     def forgetful(self, block, results):
         if block == 3 and len(lost) < times:
             lost.append(block)
-            return BlockDigest("0" * 32, 1)
+            return WrittenBlock("0" * 32, 1)
         return write(self, block, results)
 
     monkeypatch.setattr(BlockWriter, "write", forgetful)

@@ -13,8 +13,8 @@ from sweep.model.effects.catalogue import (
     EFFECT_NAMES,
     EFFECTS,
     effect_flag_attributes,
+    effect_names_in_flags,
     pack_effect_flags,
-    unpack_effect_flags,
 )
 from sweep.tasks.studies import study_plan as planned
 from sweep.tasks.studies.flight_study import _find_tile_runs
@@ -75,14 +75,15 @@ def test_every_point_lies_in_one_tile_that_has_its_parameters():
         points = grid.parameters_of_block(block)
         assert place.size == grid.count_block_points(block)
         for group in tiles.group_tiles(numbers):
-            within = np.flatnonzero(np.isin(place, group.requested_indices))
+            within = np.flatnonzero(np.isin(place, group.positions_in_request))
             window = group.parameters["instrument.processing.window"]
             assert set(points["instrument.processing.window"][within]) == {window}
-            for tile, requested in enumerate(group.requested_indices):
+            for tile, requested in enumerate(group.positions_in_request):
                 own_points = within[place[within] == requested]
                 for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
                     values = np.broadcast_to(
-                        group.parameters[path], (len(group.requested_indices), *tiles.block_shape)
+                        group.parameters[path],
+                        (len(group.positions_in_request), *tiles.block_shape),
                     )
                     assert np.isin(points[path][own_points], values[tile]).all()
 
@@ -101,7 +102,7 @@ def test_few_points_tell_what_all_of_a_tile_call_for():
         is_kept[:, chosen] = plan.is_kept
     for group in selection.tiles.group_tiles(tiles):
         full_plan = selection._plan_group(group)
-        assert (is_kept[:, group.requested_indices] == full_plan.is_kept).all()
+        assert (is_kept[:, group.positions_in_request] == full_plan.is_kept).all()
     assert not is_kept.all(axis=1)[is_kept.any(axis=1)].all()
 
 
@@ -113,7 +114,7 @@ def test_few_points_of_a_tile_hold_the_largest_of_each_parameter():
     tile_velocities = few.parameters["target.radial_velocity"]
     assert (
         tile_velocities.max() == 70
-        and tile_velocities.size < len(few.requested_indices) * tiles.block_shape[-1]
+        and tile_velocities.size < len(few.positions_in_request) * tiles.block_shape[-1]
     )
 
 
@@ -139,9 +140,9 @@ def test_flags_and_names_are_each_other():
     is_kept = np.zeros((len(EFFECT_NAMES), 3), bool)
     is_kept[[0, 3], 0] = is_kept[-1, 1] = True
     flags = pack_effect_flags(is_kept)
-    assert unpack_effect_flags(int(flags[0])) == (EFFECT_NAMES[0], EFFECT_NAMES[3])
-    assert unpack_effect_flags(int(flags[1])) == (EFFECT_NAMES[-1],)
-    assert unpack_effect_flags(int(flags[2])) == ()
+    assert effect_names_in_flags(int(flags[0])) == (EFFECT_NAMES[0], EFFECT_NAMES[3])
+    assert effect_names_in_flags(int(flags[1])) == (EFFECT_NAMES[-1],)
+    assert effect_names_in_flags(int(flags[2])) == ()
     meanings = effect_flag_attributes()["flag_meanings"].split()
     assert [m for m, mask in zip(meanings, effect_flag_attributes()["flag_masks"], strict=True)
             if flags[0] & mask] == [EFFECT_NAMES[0], EFFECT_NAMES[3]]  # fmt: skip
@@ -245,7 +246,7 @@ def test_a_plan_plans_the_effects_of_few_points_of_a_large_block(monkeypatch):
         return of_block(block, points)
 
     monkeypatch.setattr(study.effect_planner, "select_for_block", noted)
-    monkeypatch.setattr(planned, "POINT_TIMING_SECONDS", 0.01)
+    monkeypatch.setattr(planned, "GRID_TIMING_SECONDS", 0.01)
     assert study.n_blocks == 1 and planned.measure_seconds_per_point(study) > 0
     assert max(looked) < 1000
 

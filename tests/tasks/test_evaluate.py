@@ -12,8 +12,8 @@ from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_COUNT_OUTPUTS,
     GRID_OUTPUTS,
-    N_RUNNING_SUMS,
     RUNNING_SUMS_NAME,
+    RUNNING_SUMS_ROW_LENGTH,
     STANDARD_ERROR_OUTPUTS,
 )
 from sweep.tasks.studies.grid_study import evaluate_points, select_parameters_of_points
@@ -36,7 +36,7 @@ def points(**draws):
 def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
     spec, parameters, count = points(**much, method=method)
     together = evaluate_points(spec, parameters, count, effects)
-    sums = {RUNNING_SUMS_NAME: (N_RUNNING_SUMS,)} if effects == RANDOM else {}
+    sums = {RUNNING_SUMS_NAME: (RUNNING_SUMS_ROW_LENGTH,)} if effects == RANDOM else {}
     assert set(together) == {
         *GRID_OUTPUTS,
         *STANDARD_ERROR_OUTPUTS,

@@ -14,7 +14,7 @@ from sweep.cli import main
 from sweep.model.pointcloud import navigation, point_cloud
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.engine import worker
-from sweep.tasks.engine.journal import read_recipe
+from sweep.tasks.engine.journal import read_store_recipe
 from sweep.tasks.studies import flight_study
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.store_verification import verify
@@ -295,7 +295,7 @@ def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeyp
     computed.shots = 0
     assert larger(store, None, changes={"draws.number": 2}).complete
     assert computed.shots == shots_of(spec) * 2
-    assert read_recipe(store) == {"base": str(base)}
+    assert read_store_recipe(store) == {"base": str(base)}
     assert resume(store, progress=False, scheduler="none").complete
     assert file_digests(store) == at_once(spec, store)
 

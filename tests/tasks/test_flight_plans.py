@@ -67,7 +67,7 @@ def test_a_plan_times_a_bounded_number_of_draws(tmp_path, monkeypatch):
 @pytest.mark.parametrize("n_cycles", [1, 2, 7, 1000])
 def test_sampled_cycles_are_spread_over_the_flight(n_cycles):
     study = EyepointStudy(small_scene_spec(), "three")
-    shots = study.shot_numbers_of_spread_cycles(n_cycles)
+    shots = study.shot_numbers_of_evenly_spaced_cycles(n_cycles)
     cycles = np.unique(shots // study.shots_per_cycle)
     assert len(cycles) == min(n_cycles, study.n_cycles)
     assert len(shots) == len(cycles) * study.shots_per_cycle
@@ -92,5 +92,5 @@ def test_without_kernels_no_shot_is_simulated_and_the_plan_says_so(tmp_path, mon
     plan = plan_study(small_scene_spec(), store_path=tmp_path / "a.zarr")
     seconds = {part.name: part.cpu_seconds for part in plan.time_parts}
     assert seconds["compiling"] == study_plan.FLIGHT_COMPILE_CPU_SECONDS
-    assert not plan.is_compiled and "not compiled" in terminal._time_parts_text(plan)
+    assert not plan.are_kernels_compiled and "not compiled" in terminal._time_parts_text(plan)
     assert plan.cpu_seconds > study_plan.FLIGHT_COMPILE_CPU_SECONDS

@@ -154,13 +154,13 @@ def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypa
     store = run_serially(spec, tmp_path / "most.zarr").store
     (row,) = accuracy_rows_of_rays(store)
     stated_error, rays = shots(store).beamlets_error, shots(store).beamlets
-    assert (row.name, row.n_samples_max, row.tolerance_at_worst_point) == ("three", 37, 1e-3)
+    assert (row.name, row.largest_n_samples, row.tolerance_at_worst_point) == ("three", 37, 1e-3)
     assert row.mean_n_samples == pytest.approx(float(rays.mean())) == 37
     assert (
         row.n_points == stated_error.size
         and row.n_points_within_tolerance == (stated_error <= 1e-3).sum() < row.n_points
     )
-    assert row.worst_error == stated_error.max() and row.excess == pytest.approx(
+    assert row.worst_error == stated_error.max() and row.excess_over_tolerance == pytest.approx(
         row.worst_error - 1e-3
     )
     shot = int(stated_error.values[0].argmax())

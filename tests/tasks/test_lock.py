@@ -349,7 +349,7 @@ def fails(number):
 def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkeypatch, number):
     """As Lustre without its option, or NFS without lockd."""
     monkeypatch.setattr(fcntl, "flock", fails(number))
-    monkeypatch.setattr(journal, "_issued_warnings", set())
+    monkeypatch.setattr(journal, "_issued_warning_kinds", set())
     messages = []
     held = StoreLock(tmp_path, messages.append)
     assert (
@@ -370,7 +370,7 @@ def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkey
 def test_a_file_system_without_links_is_warned_of_once_and_used(tmp_path, monkeypatch, number):
     """As FUSE and SMB have none, and exFAT."""
     monkeypatch.setattr(os, "link", fails(number))
-    monkeypatch.setattr(journal, "_issued_warnings", set())
+    monkeypatch.setattr(journal, "_issued_warning_kinds", set())
     messages = []
     held = StoreLock(tmp_path, messages.append)
     assert (
@@ -427,7 +427,7 @@ def test_a_lock_that_another_takes_between_is_left_to_it(tmp_path, monkeypatch, 
 def test_a_run_without_flock_or_links_goes_to_its_end(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", fails(errno.ENOLCK))
     monkeypatch.setattr(os, "link", fails(errno.EPERM))
-    monkeypatch.setattr(journal, "_issued_warnings", set())
+    monkeypatch.setattr(journal, "_issued_warning_kinds", set())
     progress = RecordingProgress()
     store = tmp_path / "s.zarr"
     assert run(small_spec(), store=store, progress=progress, scheduler="none").complete
@@ -460,7 +460,7 @@ def test_many_stores_on_one_file_system_are_warned_of_once(tmp_path, monkeypatch
     """A flight has a lock for each of its eyepoints' stores, and an extension has two."""
     monkeypatch.setattr(fcntl, "flock", fails(errno.ENOSYS))
     monkeypatch.setattr(os, "link", fails(errno.EPERM))
-    monkeypatch.setattr(journal, "_issued_warnings", set())
+    monkeypatch.setattr(journal, "_issued_warning_kinds", set())
     messages = []
     for name in ("one.zarr", "two.zarr", "three.zarr"):
         (tmp_path / name).mkdir()
@@ -470,7 +470,7 @@ def test_many_stores_on_one_file_system_are_warned_of_once(tmp_path, monkeypatch
 
 def test_a_heartbeat_that_fails_is_warned_of_once(tmp_path, monkeypatch):
     monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL_SECONDS", 0.02)
-    monkeypatch.setattr(journal, "_issued_warnings", set())
+    monkeypatch.setattr(journal, "_issued_warning_kinds", set())
     beats, beat = [], journal._FileLock.send_heartbeat
 
     def fails_twice(self):
@@ -492,7 +492,7 @@ def test_a_heartbeat_that_fails_is_warned_of_once(tmp_path, monkeypatch):
 
 def test_a_lock_that_a_full_disk_cuts_is_taken_away(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "link", fails(errno.EPERM))
-    monkeypatch.setattr(journal, "_issued_warnings", set())
+    monkeypatch.setattr(journal, "_issued_warning_kinds", set())
     sync, path = os.fsync, tmp_path / JOURNAL_DIR / journal.LOCK_FILE
 
     def full(opened):

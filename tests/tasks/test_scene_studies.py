@@ -293,12 +293,12 @@ def test_the_summary_counts_what_the_arrays_hold(serial_outcome):
     weak = rows["three, power 0.01 W"]
     flags = dataset["three"].flags.values[0]
     assert (
-        weak.n_shots == 222 * 5
+        weak.n_drawn_shots == 222 * 5
         and weak.n_shots_with_true_return == ((flags & 1) > 0).any(axis=-1).sum()
     )
     assert weak.n_false_points == ((flags > 0) & (flags & 1 == 0)).sum()
     assert weak.mean_pd == pytest.approx(float(dataset["three"].pd_shot[0].mean()), rel=1e-12)
-    assert weak.n_cycles == 74 * 5
+    assert weak.n_drawn_cycles == 74 * 5
     assert weak.n_solved_cycles == (dataset["three"].velocity_status.values[0] <= 1).sum()
     strong = rows["three, power 1 W"]
     assert (
@@ -308,9 +308,9 @@ def test_the_summary_counts_what_the_arrays_hold(serial_outcome):
     # In one draw of a hundred a leaked peak pairs with the echo; whole spectra have it too.
     assert (
         weak.n_shots_with_true_return < strong.n_shots_with_true_return
-        and 0.98 * 222 * 5 < strong.n_shots_with_true_return <= strong.n_shots == 222 * 5
+        and 0.98 * 222 * 5 < strong.n_shots_with_true_return <= strong.n_drawn_shots == 222 * 5
     )
-    assert rows["line, power 1 W"].n_cycles == 0
+    assert rows["line, power 1 W"].n_drawn_cycles == 0
 
 
 def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(serial_outcome, tmp_path):
@@ -324,14 +324,14 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(serial
             chunk.unlink()
     rows = {row.label: row for row in flight_summary(store)}
     weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
-    assert (weak.n_shots, weak.n_cycles) == (120 * 3, 40 * 3)
+    assert (weak.n_drawn_shots, weak.n_drawn_cycles) == (120 * 3, 40 * 3)
     status = opened(serial_outcome.store)["three"].velocity_status.values[0, :40, :3]
     assert weak.n_solved_cycles == (status <= 1).sum()
     assert (
-        strong.n_shots
-        == strong.n_cycles
+        strong.n_drawn_shots
+        == strong.n_drawn_cycles
         == strong.n_solved_cycles
-        == rows["line, power 1 W"].n_shots
+        == rows["line, power 1 W"].n_drawn_shots
         == 0
     )
 

@@ -140,7 +140,7 @@ def test_a_store_that_is_moved_away_meanwhile_ends_the_run(tmp_path):
 
 def test_only_as_many_threads_compute_as_memory_suffices_for(tmp_path, monkeypatch):
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 25 * 10**9)
-    monkeypatch.setattr("sweep.tasks.driver.block_peak_bytes", lambda study: 10 * 10**9)
+    monkeypatch.setattr("sweep.tasks.driver.block_peak_memory_bytes", lambda study: 10 * 10**9)
     at_work, most_at_work, lock = [], [], threading.Lock()
 
     def count(study, block):

@@ -20,7 +20,7 @@ HUGE = {"instrument.processing.fft_size": [2**16, 2**30]}
 def set_machine_memory(monkeypatch, limit):
     """Let this machine have so many bytes, and be asked for any number of them."""
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", limit)
-    monkeypatch.setattr(worker_memory, "ALWAYS_AVAILABLE_BYTES", 0)
+    monkeypatch.setattr(worker_memory, "ALWAYS_AVAILABLE_MEMORY_BYTES", 0)
 
 
 def runs(spec, path):
@@ -76,7 +76,7 @@ def test_an_fft_is_held_against_the_memory_of_the_workers(options, message, tmp_
 @pytest.mark.parametrize("limits", [(), (0,), (None, 10**12)])
 def test_workers_without_a_limit_take_any_study(limits):
     memory_limits.refuse_too_large_point(
-        small_spec(axes=HUGE), worker_memory.worker_memory(ClientOf(*limits), None)
+        small_spec(axes=HUGE), worker_memory.available_worker_memory(ClientOf(*limits), None)
     )
 
 
@@ -183,7 +183,7 @@ def test_a_grid_of_too_many_blocks_is_refused_before_any_point_is_looked_at(monk
 
 def test_the_memory_of_a_plan_counts_a_point():
     spec = small_spec()
-    assert plan_study(spec).memory_bytes > memory_limits.point_memory_bytes(spec) > 1e6
+    assert plan_study(spec).process_memory_bytes > memory_limits.point_memory_bytes(spec) > 1e6
 
 
 @pytest.mark.parametrize(

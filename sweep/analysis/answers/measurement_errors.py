@@ -22,7 +22,7 @@ from sweep.model.effects.catalogue import (
     EFFECT_NAMES,
     EFFECTS,
     PARAMETER_DEFAULTS,
-    unpack_effect_flags,
+    effect_names_in_flags,
 )
 from sweep.model.evaluation import prepare_shots
 from sweep.model.preparation import split_by_category
@@ -222,7 +222,7 @@ def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSp
             rows = np.flatnonzero(flags == flag_bits)
             effects = [
                 name
-                for name in unpack_effect_flags(int(flag_bits))
+                for name in effect_names_in_flags(int(flag_bits))
                 if name not in _RANDOM_EFFECT_NAMES
             ]
             if "fading" not in effects:

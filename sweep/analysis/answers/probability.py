@@ -24,7 +24,7 @@ from sweep.model.detection.looks import (
     LOOKS_VOTES_PATH,
     Looks,
 )
-from sweep.model.effects.catalogue import EFFECTS, unpack_effect_flags
+from sweep.model.effects.catalogue import EFFECTS, effect_names_in_flags
 from sweep.model.evaluation import evaluate
 from sweep.model.sampling.philox import point_keys
 from sweep.model.sampling.samplers import simulate_draws
@@ -556,7 +556,7 @@ def _simulate_roc_curve(
     if not is_finite.all():
         return np.full(tnr.size, np.nan), np.full(tnr.size, np.nan)
     flags = int(point["effects"])
-    effects = unpack_effect_flags(flags)
+    effects = effect_names_in_flags(flags)
     pd_name = segment_variable_name("pd", segment)
     parameter_arrays = {
         p: np.full(tnr.size, value) for p, value in parameters.items() if p not in THRESHOLD_PATHS

@@ -236,7 +236,7 @@ def crossing_rate(probability):
 
 
 @njit(cache=True, error_model="numpy")
-def weighted_crossing_rate(probabilities, weights):
+def weighted_crossing_rate_sum(probabilities, weights):
     """Return the weighted sum over bins of -ln(1 - p), where p is a bin's crossing probability.
 
     Parameters

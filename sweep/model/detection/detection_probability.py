@@ -42,9 +42,9 @@ from sweep.model.detection.echo_detection import (
     EchoBins,
     EchoSpans,
     at_least_two_of_three_probability,
-    bin_speckle_at,
-    bin_threshold_at,
-    echo_bounds,
+    bin_speckle_of_point,
+    bin_threshold_of_point,
+    echo_bin_bounds,
     echo_half_width,
     pd_and_miss,
 )
@@ -147,8 +147,8 @@ def _fill_span_pd_and_miss(spans, point_indices, rule, bin_thresholds, speckle_t
                 ),
                 spans.peak_index[s, j],
                 rule,
-                bin_threshold_at(bin_thresholds, point_indices[j]),
-                bin_speckle_at(speckle_table, s, point_indices[j]),
+                bin_threshold_of_point(bin_thresholds, point_indices[j]),
+                bin_speckle_of_point(speckle_table, s, point_indices[j]),
             )
             pd[s, j], miss[s, j] = detection.pd, detection.miss
 
@@ -158,7 +158,7 @@ def pd_of_bin_group(magnitude, strongest, first, last, first_bin, rule, bin_thre
     """Return the probability that a group of adjacent bins is detected in one record.
 
     The group counts as an echo. Bins of its main lobe below the threshold belong to this echo too
-    (:func:`sweep.model.detection.echo_detection.echo_bounds`). The law is
+    (:func:`sweep.model.detection.echo_detection.echo_bin_bounds`). The law is
     :func:`sweep.model.detection.echo_detection.pd_and_miss`.
 
     Parameters
@@ -174,7 +174,7 @@ def pd_of_bin_group(magnitude, strongest, first, last, first_bin, rule, bin_thre
         :class:`~sweep.model.detection.echo_detection.BinThreshold` and
         :class:`~sweep.model.detection.echo_detection.BinSpeckle` of the point and segment.
     """
-    first_index, last_index = echo_bounds(
+    first_index, last_index = echo_bin_bounds(
         magnitude,
         first,
         last,
@@ -271,8 +271,8 @@ def pd_and_miss_in_looks(
             shots, signal_ratio, threshold / noise_sigma, bins, point_indices
         )
     else:
-        is_real_bin = np.isin(bins, (0, shots.real_ends_fft_size // 2)) & (
-            shots.real_ends_fft_size > 0
+        is_real_bin = np.isin(bins, (0, shots.fft_size_if_end_bins_real // 2)) & (
+            shots.fft_size_if_end_bins_real > 0
         )
         detection = shots.looks.pd_and_miss_steady(
             signal_ratio, threshold / noise_sigma, is_real_bin

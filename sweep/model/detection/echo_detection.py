@@ -219,7 +219,7 @@ class PedestalShape(NamedTuple):
     bins belong to the echo. 0 if this distance does not exceed the half-width of the main lobe."""
     line_width_bins: float
     """Width (FWHM) of the laser's line [FFT bins]."""
-    delay_times_bin_width: float
+    delay_bin_width_product: float
     """Delay of the echo, at most the record's duration, in units of one over the bin width."""
 
 
@@ -241,7 +241,7 @@ class BinThreshold(NamedTuple):
     """Threshold on |X| [V]."""
     noise_sigma_without_pedestal: float
     """Noise per quadrature [V] of the receiver alone, without the laser's phase noise."""
-    side_noise_sigma: float
+    noise_sigma_next_to_lines: float
     """Noise per quadrature [V] in bins next to the lines. It includes the whole phase-noise
     pedestal."""
     pedestal: PedestalShape = NO_PEDESTAL
@@ -257,17 +257,17 @@ class BinThresholds(NamedTuple):
     """(n,): threshold on |X| [V], :attr:`BinThreshold.threshold`."""
     noise_sigma_without_pedestal: np.ndarray
     """(n,): receiver noise [V], :attr:`BinThreshold.noise_sigma_without_pedestal`."""
-    side_noise_sigma: np.ndarray
+    noise_sigma_next_to_lines: np.ndarray
     """(n,): noise per quadrature [V] in bins next to lines,
-    :attr:`BinThreshold.side_noise_sigma`."""
+    :attr:`BinThreshold.noise_sigma_next_to_lines`."""
     pedestal_reach_bins: np.ndarray
     """(n,): distance from a line [bins] up to which bins of the phase-noise pedestal belong to the
     echo, :attr:`PedestalShape.reach_bins`."""
     pedestal_line_width_bins: np.ndarray
     """(n,): laser line width [FFT bins], :attr:`PedestalShape.line_width_bins`."""
-    pedestal_delay_times_bin_width: np.ndarray
+    pedestal_delay_bin_width_product: np.ndarray
     """(n,): delay of the echo [one over the bin width],
-    :attr:`PedestalShape.delay_times_bin_width`."""
+    :attr:`PedestalShape.delay_bin_width_product`."""
 
     def select(self, points: np.ndarray) -> "BinThresholds":
         """Return the thresholds and noise of some points, given by their indices."""
@@ -333,7 +333,7 @@ class SpeckleTable(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def bin_threshold_at(bin_thresholds, point):
+def bin_threshold_of_point(bin_thresholds, point):
     """Return the threshold and the noise of one point.
 
     Parameters
@@ -352,11 +352,11 @@ def bin_threshold_at(bin_thresholds, point):
         bin_thresholds.line_noise_sigma[point],
         bin_thresholds.threshold[point],
         bin_thresholds.noise_sigma_without_pedestal[point],
-        bin_thresholds.side_noise_sigma[point],
+        bin_thresholds.noise_sigma_next_to_lines[point],
         PedestalShape(
             bin_thresholds.pedestal_reach_bins[point],
             bin_thresholds.pedestal_line_width_bins[point],
-            bin_thresholds.pedestal_delay_times_bin_width[point],
+            bin_thresholds.pedestal_delay_bin_width_product[point],
         ),
     )
 
@@ -409,7 +409,7 @@ def pedestal_power_ratio(pedestal, distance):
     2070, 1986], divided by its limit at omega = 0. For Gamma tau <= 1e-5 the ratio is set to 1: the
     phase noise of the echo then almost cancels that of the local oscillator.
     """
-    gamma, delay = 2.0 * math.pi * pedestal.line_width_bins, pedestal.delay_times_bin_width
+    gamma, delay = 2.0 * math.pi * pedestal.line_width_bins, pedestal.delay_bin_width_product
     coherence, omega = math.exp(-gamma * delay), 2.0 * math.pi * distance
     if not distance > 0.0 or not gamma * delay > 1e-5:
         return 1.0
@@ -480,7 +480,10 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
         bin_threshold.line_noise_sigma * bin_threshold.line_noise_sigma / noise_power - 1.0
     )
     ratio_beside_lines = (
-        bin_threshold.side_noise_sigma * bin_threshold.side_noise_sigma / noise_power - 1.0
+        bin_threshold.noise_sigma_next_to_lines
+        * bin_threshold.noise_sigma_next_to_lines
+        / noise_power
+        - 1.0
     )
     line_distance = float(magnitude.size)
     for i in range(magnitude.size):
@@ -496,7 +499,7 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
 
 
 @njit(cache=True, error_model="numpy")
-def bin_speckle_at(speckle_table, segment, point):
+def bin_speckle_of_point(speckle_table, segment, point):
     """Return the :class:`BinSpeckle` of one segment of one point.
 
     Parameters
@@ -524,7 +527,7 @@ class SpeckleMixing(NamedTuple):
         A_down    = down_from_up z_0 + down_from_doppler z_1 + down_from_independent z_2
 
     The coefficients are the Cholesky factor of the correlation matrix of the amplitudes. Fields are
-    (n,) for n points. In kernels they are scalars (:func:`speckle_mixing_at`).
+    (n,) for n points. In kernels they are scalars (:func:`speckle_mixing_of_point`).
     Without speckle, fields are (0,) or zero.
     """
 
@@ -551,7 +554,7 @@ class SpeckleMixing(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def speckle_mixing_at(mixing, point):
+def speckle_mixing_of_point(mixing, point):
     """Return the :class:`SpeckleMixing` of one point, of scalars.
 
     Parameters
@@ -1119,7 +1122,7 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
         noise = (
             bin_threshold.line_noise_sigma
             if magnitude[i] >= 0.5 * largest
-            else bin_threshold.side_noise_sigma
+            else bin_threshold.noise_sigma_next_to_lines
         )
         is_real = is_real_bin(echo.first_bin + i, rule.has_real_noise_at_ends, rule.fft_size)
         tails = bin_crossing_tails(magnitude[i] / noise, threshold / noise, is_real)
@@ -1461,7 +1464,7 @@ def _mean_pd_and_miss_over_mode_phase(bins_given_mode, echo, rule, bin_speckle):
     Near DC and Nyquist of a real record it is also the mean over the mode's phase.
     """
     if bin_speckle.pseudo_variance_ratio.size == 0:
-        return _mean_over_mode_power(
+        return _mean_pd_and_miss_over_mode_power(
             bins_given_mode, echo, rule.has_real_noise_at_ends, rule.fft_size
         )
     return _mean_pd_and_miss_over_noncircular_mode_phase(bins_given_mode, echo, rule, bin_speckle)
@@ -1501,7 +1504,7 @@ def _mean_pd_and_miss_over_noncircular_mode_phase(bins_given_mode, echo, rule, b
                 * inverse_noise
                 * inverse_noise
             )
-        at_phase = _mean_over_mode_power(
+        at_phase = _mean_pd_and_miss_over_mode_power(
             given_phase, echo, rule.has_real_noise_at_ends, rule.fft_size
         )
         pd, miss = pd + at_phase.pd / N_PHASE_NODES, miss + at_phase.miss / N_PHASE_NODES
@@ -1509,7 +1512,7 @@ def _mean_pd_and_miss_over_noncircular_mode_phase(bins_given_mode, echo, rule, b
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mean_over_mode_power(bins_given_mode, echo, has_real_noise_at_ends, fft_size):
+def _mean_pd_and_miss_over_mode_power(bins_given_mode, echo, has_real_noise_at_ends, fft_size):
     """Return the mean :class:`PdAndMiss` over the power of the strongest speckle mode.
 
     The mode has the amplitude z in all bins. The signal of a bin is |z| times
@@ -1767,7 +1770,7 @@ def _rough_upper_normal_quantile(tails):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
+def echo_bin_bounds(magnitude, first, last, threshold, lobe_half_width):
     """Return the indices of the first and last bin of the echo around a group of bins.
 
     A group is a run of adjacent bins at or above the threshold.
@@ -1880,7 +1883,7 @@ def detect_in_spectra(
         low = max(-first_bins[i], 0)
         high = min(last_bin + 1 - first_bins[i], magnitude.shape[1])
         searched = magnitude[i, low:high]
-        bin_threshold = bin_threshold_at(bin_thresholds, i)
+        bin_threshold = bin_threshold_of_point(bin_thresholds, i)
         peak, n_exempt = mark_exempt_bins(
             searched,
             searched.size,
@@ -1893,7 +1896,7 @@ def detect_in_spectra(
             peak,
             rule,
             bin_threshold,
-            bin_speckle_at(speckle_table, 0, i),
+            bin_speckle_of_point(speckle_table, 0, i),
         )
         detections.pd[i], detections.miss[i] = detection.pd, detection.miss
         detections.magnitude[i] = searched[peak]

@@ -778,7 +778,9 @@ class Looks(NamedTuple):
             probability = probability + binomial.pmf(k, n, p_first) * p_too_few
         return probability
 
-    def added_crossing_probability(self, signal: np.ndarray, threshold_ratio: float) -> np.ndarray:
+    def crossing_probability_added_by_signal(
+        self, signal: np.ndarray, threshold_ratio: float
+    ) -> np.ndarray:
         """Compute the probability that signal makes a bin cross where noise alone does not.
 
         Parameters
@@ -831,7 +833,7 @@ class Looks(NamedTuple):
         added_per_signal_power = (
             np.array(
                 [
-                    self.added_crossing_probability(np.array([1e-3]), b)[0]
+                    self.crossing_probability_added_by_signal(np.array([1e-3]), b)[0]
                     for b in np.ravel(threshold_ratio)
                 ]
             )
@@ -1179,7 +1181,7 @@ def _gauss_nodes_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np
 
 @lru_cache(maxsize=4096)
 def _added_crossing_table(looks: Looks, threshold_ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the table that :meth:`Looks.added_crossing_probability` interpolates.
+    """Return the table that :meth:`Looks.crossing_probability_added_by_signal` interpolates.
 
     The table holds ln(signal), and ln of the probability that the signal makes a bin cross where
     noise alone does not.

@@ -69,13 +69,13 @@ class LineGradients(NamedTuple):
     line_shift: np.ndarray
     """(n, 3, 2): shift of the line per standard deviation of the beam [FFT bins], by point, segment
     and coordinate. It is positive towards higher beat frequency."""
-    phase: np.ndarray
+    phase_gradient: np.ndarray
     """(n, 3, 2): change of the line's phase per standard deviation of the beam, minus that in the
     up segment [rad]. The axes are point, segment and coordinate."""
 
     def select(self, points: np.ndarray) -> "LineGradients":
         """Return the gradients of the points with the given indices."""
-        return LineGradients(self.line_shift[points], self.phase[points])
+        return LineGradients(self.line_shift[points], self.phase_gradient[points])
 
 
 class LinePairGradients(NamedTuple):
@@ -157,7 +157,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
     )
     is_resolved = np.abs(gradients.phase_difference) * half_interval <= _RESOLVED_PHASE_MAX
     correlation = _gaussian_correlation(window, gradients).astype(complex)
-    _, transform = transform_table(window)
+    _, transform = window_transform_table(window)
     fill_peak_bin_correlation(
         np.flatnonzero(is_resolved),
         half_interval,
@@ -222,7 +222,7 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray
-        G at each distance, by linear interpolation in :func:`transform_table`. G is 0 beyond
+        G at each distance, by linear interpolation in :func:`window_transform_table`. G is 0 beyond
         2 TRANSFORM_REACH_CELLS.
 
     Examples
@@ -231,7 +231,7 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     >>> float(np.round(window_transform(get_window("hann", 1024), np.array([1.0]))[0], 3))
     0.5
     """
-    distances, transform = transform_table(window)
+    distances, transform = window_transform_table(window)
     return np.interp(np.abs(distance), distances, transform, right=0.0)
 
 
@@ -257,7 +257,7 @@ def _half_maximum_distance(window: Window) -> float:
     The distance is in units of the sample rate over the number of samples. It is at most 2
     TRANSFORM_REACH_CELLS.
     """
-    distances, transform = transform_table(window)
+    distances, transform = window_transform_table(window)
     is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as in Hann's of two
     first_below_half = int(np.argmax(is_below_half)) if is_below_half.any() else transform.size - 1
     return float(
@@ -266,7 +266,7 @@ def _half_maximum_distance(window: Window) -> float:
 
 
 @lru_cache(maxsize=16)
-def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
+def window_transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
     """Return distances 0 .. 2 TRANSFORM_REACH_CELLS, and a window's transform at these distances.
 
     The unit of distance is the sample rate over the number of samples. The transform is 1 at 0.

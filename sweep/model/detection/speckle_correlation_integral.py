@@ -40,7 +40,7 @@ def fill_peak_bin_correlation(
         two are stacked to (2, n).
     transform, samples_per_bin
         Tabulated G, the result of
-        :func:`sweep.model.detection.speckle_correlation.transform_table`, and its number of
+        :func:`sweep.model.detection.speckle_correlation.window_transform_table`, and its number of
         samples per bin.
     nodes, weights
         Nodes and weights of a quadrature on -1 .. 1.

@@ -293,7 +293,7 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
         -optical_depth(profile, **_path_geometry(context.parameters, shots.range))
     )
     is_direct = shots.waveform.architecture == "direct"
-    echo_scales = shots.echo_scales.scale_echo(
+    echo_scales = shots.echo_scales.with_scaled_echo(
         power_factor=transmission**2,
         amplitude_factor=transmission**2 if is_direct else transmission,
     )

@@ -109,7 +109,7 @@ def pack_effect_flags(is_kept: np.ndarray) -> np.ndarray:
     return np.bitwise_or.reduce(np.where(is_kept, flag_masks[:, None], np.uint32(0)), axis=0)
 
 
-def unpack_effect_flags(flags: int) -> tuple[str, ...]:
+def effect_names_in_flags(flags: int) -> tuple[str, ...]:
     """Return the names of the effects whose bits are set in a mask of :func:`pack_effect_flags`."""
     return tuple(name for k, name in enumerate(EFFECT_NAMES) if flags >> k & 1)
 

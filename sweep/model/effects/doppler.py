@@ -178,7 +178,7 @@ def apply_doppler_spread(shots: Shots, context: EffectContext) -> Shots:
     velocity of the instrument relative to the ground, d_b the direction of the beamlet, and d_0
     that of the axis.
     """
-    doppler_ratios = context.ground.beamlets.doppler_ratio_offset
+    doppler_ratios = context.ground.beamlet_table.doppler_ratio_offset
     if shots.footprint.doppler_ratio_offset.shape != doppler_ratios.shape:
         return shots
     doppler_ratios = context.select_beamlet_values(

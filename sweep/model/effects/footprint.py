@@ -86,7 +86,7 @@ def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
     of the ground (:mod:`sweep.model.ground`). Its amplitude is the square root of its relative echo
     [1/sr], or with direct detection that echo itself.
     """
-    row, range_offset, _, echo = context.ground.beamlets
+    row, range_offset, _, echo = context.ground.beamlet_table
     if context.ground.is_on_other_surface is not None:
         range_offset = np.where(context.ground.is_on_other_surface, 0.0, range_offset)
     return replace(
@@ -250,7 +250,7 @@ def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
         Shots with relative ranges (rows, beamlets) of all beamlets, or unchanged if all beamlets
         are on the surface that the axis meets.
     """
-    range_offset = context.ground.beamlets.relative_range_offset
+    range_offset = context.ground.beamlet_table.relative_range_offset
     if (
         context.ground.is_on_other_surface is None
         or shots.footprint.relative_range_offset.shape != range_offset.shape

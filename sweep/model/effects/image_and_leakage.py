@@ -157,8 +157,12 @@ def _image_log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     threshold_distance = np.minimum(
         response.reach_of_magnitude(points.threshold_ratio / total_ratio), nyquist_bin
     )
-    if points.missing_samples is not None:  # sidelobes of an echo that begins within the record
-        step_ratio = np.maximum(total_ratio * points.missing_samples.step_sidelobe_factor, 1e-300)
+    if (
+        points.missing_sample_bounds is not None
+    ):  # sidelobes of an echo that begins within the record
+        step_ratio = np.maximum(
+            total_ratio * points.missing_sample_bounds.step_sidelobe_factor, 1e-300
+        )
         rectangular_response = window_response("rectangular", points.window.length, points.fft_size)
         threshold_distance = np.minimum(
             np.maximum(
@@ -261,14 +265,14 @@ def leakage_error_bound(points: PlannerInputs) -> ErrorBound:
     reach_bins = np.where(
         is_near_image, np.inf, points.line_spread.largest_magnitude + points.phase_error_shift_bins
     )
-    if points.missing_samples is None:
+    if points.missing_sample_bounds is None:
         return ErrorBound(
             probability_change=_leakage_probability_bound(
                 points, points.window.name, ratio_to_threshold, reach_bins
             )
         )
     # Sidelobes of the window and of the step; in each bin one of the two is the larger.
-    step_ratio = 2 * ratio_to_threshold * points.missing_samples.step_sidelobe_factor
+    step_ratio = 2 * ratio_to_threshold * points.missing_sample_bounds.step_sidelobe_factor
     probability = _leakage_probability_bound(
         points, points.window.name, 2 * ratio_to_threshold, reach_bins
     )
@@ -432,7 +436,8 @@ def apply_leakage(shots: Shots, context: EffectContext) -> Shots:
     (:mod:`sweep.model.spectrum.leakage`).
     """
     return replace(
-        shots, detection_settings=shots.detection_settings._replace(includes_leakage=True)
+        shots,
+        detection_settings=shots.detection_settings._replace(leakage_raises_false_alarms=True),
     )
 
 

@@ -69,7 +69,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     if not beam.is_single_mode(context.parameters):
         return shots
     kept_fraction = beam.beam_axis_offset_transmission(context.parameters, shots.range)
-    echo_scales = shots.echo_scales.scale_echo(
+    echo_scales = shots.echo_scales.with_scaled_echo(
         power_factor=kept_fraction, amplitude_factor=np.sqrt(kept_fraction)
     )
     return replace(shots, echo_scales=echo_scales)
@@ -83,7 +83,7 @@ _SINGLE_MODE_REQUIREMENTS = tuple(
         "take a coherent receiver of coupling: single_mode",
     )
     for other_path, word in (
-        (beam.COUPLING_PATH, beam.APERTURE_COUPLING),
+        (beam.COUPLING_PATH, beam.APERTURE_COUPLING_LAW),
         (beam.ARCHITECTURE_PATH, "direct"),
     )
 )

@@ -26,7 +26,7 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.laser_line import (
     DEVIATION_PER_FWHM,
     LaserLine,
-    apparent_line_and_pedestal,
+    apparent_line_and_pedestal_power,
     pedestal_density_under_line,
     pedestal_power_under_line,
     pure_line_power_fraction,
@@ -147,14 +147,14 @@ def _lorentzian_error_bound(points: PlannerInputs) -> ErrorBound:
 def _line_fraction_and_pedestal(
     shots: Shots, timing: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two results of :func:`sweep.model.laser_line.apparent_line_and_pedestal`, (n,) each.
+    """Return two results (n,) of apparent_line_and_pedestal_power in :mod:`sweep.model.laser_line`.
 
     The first is the fraction of power that a laser's pure line keeps. The second is the pedestal of
     phase noise. Both are for the samples of the record that hold the echo.
     """
     looks = shots.looks.n_coherent
     if shots.echo_record.n_samples_before_echo is None:
-        return apparent_line_and_pedestal(window=shots.window, looks=looks, **timing)
+        return apparent_line_and_pedestal_power(window=shots.window, looks=looks, **timing)
     n_before_echo = shots.echo_record.n_samples_before_echo[0]
     windows = [zero_first_samples(shots.window, n_missing) for n_missing in n_before_echo.tolist()]
     line_fraction, in_phase_pedestal = np.empty((2, shots.size))
@@ -162,7 +162,7 @@ def _line_fraction_and_pedestal(
     for window in dict.fromkeys(windows):
         has_window = np.array([window is other_window for other_window in windows])
         part_timing = {name: values[has_window] for name, values in timing.items()}
-        line_fraction[has_window], in_phase_pedestal[has_window] = apparent_line_and_pedestal(
+        line_fraction[has_window], in_phase_pedestal[has_window] = apparent_line_and_pedestal_power(
             window=window, looks=looks, **part_timing
         )
         in_phase_pedestal[has_window] *= (
@@ -200,7 +200,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     Gaussian: |X|^2 is averaged over frequencies of the given FWHM. Lorentzian of width dnu: the
     pure line keeps exp(-2 pi dnu tau) of its power, for the delay tau or the record's length if
     that is shorter, and the rest is a pedestal of noise
-    (:func:`sweep.model.laser_line.apparent_line_and_pedestal`).
+    (:func:`sweep.model.laser_line.apparent_line_and_pedestal_power`).
     """
     line_width = np.asarray(context.parameters[_WIDTH_PATH], float)
     if str(context.parameters[_SHAPE_PATH]) == "gaussian":
@@ -229,7 +229,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
         )
     return replace(
         shots,
-        echo_scales=shots.echo_scales.scale_echo(amplitude_factor=np.sqrt(line_fraction)),
+        echo_scales=shots.echo_scales.with_scaled_echo(amplitude_factor=np.sqrt(line_fraction)),
         laser_line=LaserLine(
             lorentzian_fwhm=line_width,
             pedestal_variance_beside_line=line_power * side_pedestal / shots.window.energy,

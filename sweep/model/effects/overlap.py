@@ -59,7 +59,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     A late echo arrives after its record has begun. The result is None if no samples lack the echo.
     """
-    missing = points.missing_samples
+    missing = points.missing_sample_bounds
     if missing is None:
         return None
     phase_bound = (
@@ -123,7 +123,7 @@ def residual_magnitude_bound(points: PlannerInputs) -> np.ndarray:
     ndarray (segments, n)
         Error relative to the magnitude that all lines together have on a bin.
     """
-    missing = points.missing_samples
+    missing = points.missing_sample_bounds
     assert missing is not None
     range_moments = points.footprint_extent.range_offset_moments
     mean_range = np.minimum(

@@ -310,7 +310,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
             sum(other_bounds.coefficients) + other_bounds.non_polynomial_phase
         )
         turned_by_others = mean_phase_bound(own_bound, points.window) * np.minimum(others_far, 2.0)
-    missing = points.missing_samples
+    missing = points.missing_sample_bounds
     # Missing samples have no phase error, and the centroid of the remaining samples moves.
     if missing is not None:
         others_phase = others_phase + missing.lost_fraction
@@ -653,7 +653,9 @@ def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
             shots.looks, acceleration=shots.target.acceleration, carrier=up_carrier,
             look_period=shots.waveform.look_period,
         )  # fmt: skip
-        shots = replace(shots, echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gain))
+        shots = replace(
+            shots, echo_scales=shots.echo_scales.with_scaled_echo(amplitude_factor=gain)
+        )
     drift_time = shots.record.acquisition_delay + shots.record.duration / 2
     shots = replace(shots, motion=shots.motion._replace(velocity_drift_time=drift_time))
     return _add_phase_error(

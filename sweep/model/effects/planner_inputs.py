@@ -296,11 +296,11 @@ class PlannerInputs(LinkBudget):
         return self.stack_segments(*(s.beat_frequency(self.range) for s in self.existing_segments))
 
     @cached_property
-    def missing_samples(self) -> MissingSampleBounds | None:
+    def missing_sample_bounds(self) -> MissingSampleBounds | None:
         """Bounds on the effect of samples that lack the echo; None if echoes fill all records."""
         if "overlap" in self.effects_off:
             return None
-        delay = self.stack_segments(*(s.delay(self.range) for s in self.existing_segments))
+        delay = self.stack_segments(*(s.echo_delay(self.range) for s in self.existing_segments))
         n_missing = self.stack_segments(
             *(
                 self.record.count_samples_before_echo(segment, self.range)
@@ -326,15 +326,15 @@ class PlannerInputs(LinkBudget):
         The magnitude is relative to the line's peak in a record that the echo fills.
         """
         response_max = self.window_response.magnitude_max_beyond(distance)
-        if self.missing_samples is None:
+        if self.missing_sample_bounds is None:
             return response_max
         rectangular_response = window_response("rectangular", self.window.length, self.fft_size)
         step_sidelobe = (
-            self.missing_samples.step_sidelobe_factor
+            self.missing_sample_bounds.step_sidelobe_factor
             * rectangular_response.magnitude_max_beyond(distance - self.padding_factor)
         )
         return np.asarray(
-            response_max + np.minimum(step_sidelobe, self.missing_samples.lost_fraction)
+            response_max + np.minimum(step_sidelobe, self.missing_sample_bounds.lost_fraction)
         )
 
     def peak_power_min_with_missing_samples(self, power: np.ndarray) -> np.ndarray:
@@ -343,9 +343,11 @@ class PlannerInputs(LinkBudget):
         ``power`` is the bound in a record that the echo fills. Both are relative to the power that
         all lines together would have on one bin.
         """
-        if self.missing_samples is None:
+        if self.missing_sample_bounds is None:
             return power
-        return np.asarray(np.maximum(np.sqrt(power) - self.missing_samples.lost_fraction, 0.0) ** 2)
+        return np.asarray(
+            np.maximum(np.sqrt(power) - self.missing_sample_bounds.lost_fraction, 0.0) ** 2
+        )
 
     @cached_property
     def bin_offset(self) -> np.ndarray:

@@ -205,7 +205,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     gains = clipping_gains(amplitude=amplitude, deviation=deviation, full_scale=voltage_limit)
     return replace(
         shots,
-        echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gains.signal_gain),
+        echo_scales=shots.echo_scales.with_scaled_echo(amplitude_factor=gains.signal_gain),
         noise=replace(shots.noise, variance_factor=shots.noise.variance_factor * gains.noise_gain),
     )
 

@@ -438,11 +438,11 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     }
     return replace(
         shots,
-        echo_scales=shots.echo_scales.scale_echo(
+        echo_scales=shots.echo_scales.with_scaled_echo(
             power_factor=power_factor, amplitude_factor=beat_factor
         ),
         noise=shots.noise.with_sources(**echo_variances),
-        laser_line=shots.laser_line.scale_pedestal(beat_factor**2),
+        laser_line=shots.laser_line.with_scaled_pedestal(beat_factor**2),
     )
 
 

@@ -272,7 +272,7 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
             phase_cycles=phase,
             adds_powers=False,
         ),
-        laser_line=shots.laser_line.scale_pedestal(power_ratio),
+        laser_line=shots.laser_line.with_scaled_pedestal(power_ratio),
     )
 
 
@@ -403,7 +403,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
             axis=1
         )
         gain = np.sqrt(np.maximum(n_looks + squared_sum, 0.0)) / n_looks
-        return replace(shots, echo_scales=shots.echo_scales.scale_echo(amplitude_factor=gain))
+        return replace(shots, echo_scales=shots.echo_scales.with_scaled_echo(amplitude_factor=gain))
     look_power = _relative_look_powers(shots, beam_spread.beam_gradients)
     if (
         np.abs(correlation_by_lag - 1).max() < _LOOK_DECORRELATION_MIN
@@ -559,7 +559,7 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
     if isinstance(ground, FlatGround):
         beam_gradients, doppler_across = ground.gradients, np.zeros(shots.size)
     else:
-        row, offset, doppler, echo = ground.beamlets
+        row, offset, doppler, echo = ground.beamlet_table
         moments = _moments_about_surface_means(
             power=echo,
             doppler_ratio=doppler,
@@ -573,7 +573,7 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
     bin_width = shots.record.bin_width
     line_shift = np.zeros((3, 2, shots.size))
     for segment_index, segment in enumerate(shots.waveform_segments):
-        delay = segment.delay(shots.range)
+        delay = segment.echo_delay(shots.range)
         shift_hertz = (
             segment.carrier * beam_gradients.doppler_ratio
             - segment.chirp_rate * delay * beam_gradients.relative_range
@@ -678,7 +678,7 @@ def _line_pair_gradients(
     padding_factor = shots.fft_size / shots.window.length
     distances, line_shifts = [], []
     for segment in (shots.waveform_segments[segment_index] for segment_index in pair):
-        delay = segment.delay(shots.range)
+        delay = segment.echo_delay(shots.range)
         beat = segment.carrier * segment.doppler_ratio - segment.chirp_rate * delay * (
             1 + segment.doppler_ratio
         )
@@ -720,7 +720,7 @@ def _strongest_bins_with_images(
     standard deviation of the lines.
     """
     nearest_bins = np.rint(line_positions)
-    if not shots.real_ends_fft_size or not shots.line_images.are_summed:
+    if not shots.fft_size_if_end_bins_real or not shots.line_images.are_summed:
         return nearest_bins
     nyquist_bin = shots.fft_size // 2
     spectrum_ends = np.rint(line_positions / nyquist_bin) * nyquist_bin

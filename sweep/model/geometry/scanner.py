@@ -155,7 +155,7 @@ class BeamCycle:
     patterns: Sequence[Sequence[int]] | np.ndarray
     """(p, k): indices of the k beams in each of p patterns. Each measurement cycle fires the beams
     of one pattern in their order. The next cycle fires the next pattern."""
-    rate: float
+    cycle_rate: float
     """Number of measurement cycles per second [Hz], > 0."""
     shot_interval: float | None = None
     """Time from one shot to the next within a measurement cycle [s]. With 0 all beams fire at once
@@ -183,15 +183,18 @@ class BeamCycle:
             raise ValueError("the beams' directions must be finite and other than zero")
         if patterns.min() < 0 or patterns.max() >= len(directions):
             raise ValueError(f"patterns name beams 0 to {len(directions) - 1}")
-        if not (self.rate > 0 and math.isfinite(self.rate)):
-            raise ValueError(f"the measurement rate must be positive, not {self.rate}")
+        if not (self.cycle_rate > 0 and math.isfinite(self.cycle_rate)):
+            raise ValueError(f"the measurement rate must be positive, not {self.cycle_rate}")
         shots_per_cycle = patterns.shape[1]
         interval = (
-            1 / (shots_per_cycle * self.rate) if self.shot_interval is None else self.shot_interval
+            1 / (shots_per_cycle * self.cycle_rate)
+            if self.shot_interval is None
+            else self.shot_interval
         )
-        if not 0 <= interval * shots_per_cycle * self.rate <= 1 + 1e-9:
+        if not 0 <= interval * shots_per_cycle * self.cycle_rate <= 1 + 1e-9:
             raise ValueError(
-                f"{shots_per_cycle} beams {interval:g} s apart do not fit in 1/{self.rate:g} s"
+                f"{shots_per_cycle} beams {interval:g} s apart do not fit in "
+                f"1/{self.cycle_rate:g} s"
             )
         object.__setattr__(self, "_unit_directions", directions / length)
         object.__setattr__(self, "_pattern_table", patterns.astype(np.int64))
@@ -210,7 +213,7 @@ class BeamCycle:
     def count_shots(self, duration: float) -> int:
         """Return the number of shots that begin at times 0 .. ``duration`` [s], ends included."""
         return _count_begun_shots(
-            duration, self.rate, self.shots_per_cycle, self._resolved_shot_interval
+            duration, self.cycle_rate, self.shots_per_cycle, self._resolved_shot_interval
         )
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
@@ -222,7 +225,7 @@ class BeamCycle:
         beam_number = patterns[cycle_number % len(patterns), shot_in_cycle]
         zero_rate = np.zeros((beam_number.size, 3))
         return ScanShots(
-            cycle_number / self.rate + shot_in_cycle * self._resolved_shot_interval,
+            cycle_number / self.cycle_rate + shot_in_cycle * self._resolved_shot_interval,
             beam_number,
             cycle_number,
             self._unit_directions[beam_number],
@@ -410,7 +413,7 @@ ScanPattern = BeamCycle | LineScan
 """Pattern of a scanner: times and directions of its shots, as a function of their numbers."""
 
 
-def beamlet_rays(
+def beamlet_directions(
     attitude: np.ndarray,
     axis: np.ndarray,
     tangent_across: np.ndarray,

@@ -11,7 +11,7 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.detection_probability import group_pd_in_all_looks, pd_of_bin_group
-from sweep.model.detection.echo_detection import bin_speckle_at, bin_threshold_at
+from sweep.model.detection.echo_detection import bin_speckle_of_point, bin_threshold_of_point
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
@@ -33,7 +33,7 @@ class BinGroups(NamedTuple):
     """(n, 3, groups) int64: number of the first (lowest) bin of the group; -1 for no group."""
     last_bin: np.ndarray
     """(n, 3, groups) int64: number of the last (highest) bin of the group; -1 for no group."""
-    neighbour_magnitudes: np.ndarray
+    peak_and_neighbour_magnitudes: np.ndarray
     """(n, 3, groups, 3): |X| without noise [V, summed over the record] of three bins: the bin below
     the group's strongest bin, the strongest bin, and the bin above it."""
     pd: np.ndarray
@@ -55,7 +55,7 @@ class BinGroups(NamedTuple):
 
         The result is (n, 3, groups).
         """
-        return self.neighbour_magnitudes[..., 1]
+        return self.peak_and_neighbour_magnitudes[..., 1]
 
     def without_unused_groups(self) -> "BinGroups":
         """Return a copy of the record with a shorter axis of groups.
@@ -71,7 +71,7 @@ class BinGroups(NamedTuple):
                     "strongest_bin",
                     "first_bin",
                     "last_bin",
-                    "neighbour_magnitudes",
+                    "peak_and_neighbour_magnitudes",
                     "pd",
                 )
             }
@@ -135,7 +135,7 @@ def allocate_bin_groups(n_points: int, groups_max: int) -> BinGroups:
         strongest_bin=np.full(shape, -1, np.int64),
         first_bin=np.full(shape, -1, np.int64),
         last_bin=np.full(shape, -1, np.int64),
-        neighbour_magnitudes=np.full((*shape, 3), np.nan),
+        peak_and_neighbour_magnitudes=np.full((*shape, 3), np.nan),
         pd=np.full(shape, np.nan),
         n_exempt_bins=np.full((n_points, 3), np.nan),
         leakage_probability=np.full((n_points, 3), np.nan),
@@ -187,8 +187,8 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
         spans.point_numbers,
     )
     lacks_group = (bin_groups.strongest_bin[spans.point_numbers, :, 0] < 0) & shots.has_segment
-    strongest_magnitudes = bin_groups.neighbour_magnitudes[spans.point_numbers, :, 0, 1]
-    bin_groups.neighbour_magnitudes[spans.point_numbers, :, 0, 1] = np.where(
+    strongest_magnitudes = bin_groups.peak_and_neighbour_magnitudes[spans.point_numbers, :, 0, 1]
+    bin_groups.peak_and_neighbour_magnitudes[spans.point_numbers, :, 0, 1] = np.where(
         lacks_group, spans.peak_magnitude.T, strongest_magnitudes
     )
     n_exempt_or_nan = np.where((spans.n_bins > 0) | ~spans.peak_is_searched, spans.n_exempt, np.nan)
@@ -197,7 +197,7 @@ def find_groups_in_spans(shots: Shots, spans: BinSpans, bin_groups: BinGroups) -
         bin_groups.leakage_probability[spans.point_numbers],
     ) = (
         n_exempt_or_nan.T,
-        spans.leakage.T,
+        spans.leakage_probability.T,
     )
     bin_groups.raised_bin_probability_max[spans.point_numbers] = spans.raised_bin_probability_max.T
 
@@ -263,7 +263,7 @@ def _find_and_write_groups(
     """
     for j in range(point_numbers.size):
         i = point_numbers[j]
-        bin_threshold = bin_threshold_at(bin_thresholds, i)
+        bin_threshold = bin_threshold_of_point(bin_thresholds, i)
         for segment in range(3):
             if n_bins[segment, j] == 0:
                 continue
@@ -289,10 +289,10 @@ def _find_and_write_groups(
                     first_bin[segment, j],
                     rule,
                     bin_threshold,
-                    bin_speckle_at(speckle_table, segment, i),
+                    bin_speckle_of_point(speckle_table, segment, i),
                 )
                 for side in range(3):
-                    bin_groups.neighbour_magnitudes[i, segment, group, side] = (
+                    bin_groups.peak_and_neighbour_magnitudes[i, segment, group, side] = (
                         _magnitude_at_mirrored_index(
                             magnitude,
                             first_bin[segment, j],

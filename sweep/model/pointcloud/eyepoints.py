@@ -20,7 +20,7 @@ from sweep.model.geometry.body_motion import BodyState, MovingBody
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.ray_casting import BundleHits, Pose, RayCaster
-from sweep.model.geometry.scanner import PointingJitter, ScanPattern, beamlet_rays
+from sweep.model.geometry.scanner import PointingJitter, ScanPattern, beamlet_directions
 from sweep.model.ground import BeamletTable, RayTracedGround, backscatter
 from sweep.model.link_budget import BEAM_ELEVATION_PATH
 from sweep.model.preparation import Parameters, Shots
@@ -188,7 +188,7 @@ def compute_eyepoints(
     )
     body_states = [None if body is None else body.state(time) for body in body_motions or ()]
     poses = [None if body is None else Pose(body.position, body.attitude) for body in body_states]
-    make_rays = partial(beamlet_rays, attitude, shots.direction)
+    make_rays = partial(beamlet_directions, attitude, shots.direction)
     if footprint_full_angles is None:
         light_directions = ray_directions = make_rays(across, along, beam_divergence / 4)
     else:  # the range of the axis determines the width of the footprint

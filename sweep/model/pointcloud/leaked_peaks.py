@@ -54,7 +54,7 @@ from sweep.model.pointcloud.bin_groups import BinGroups, allocate_bin_groups, fi
 from sweep.model.preparation import Shots
 from sweep.model.sampling import philox
 from sweep.model.sampling.draws import NoiselessSpectra, iter_noiseless_spectra
-from sweep.model.spectrum.permanent_line import N_PHASES, line_bin_masks, line_of_point
+from sweep.model.spectrum.permanent_line import N_PHASES, line_bin_masks, permanent_line_of_point
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 N_TABLE_AMPLITUDES = 2048
@@ -132,7 +132,7 @@ MEAN_CROSSING_TABLE_STRIDE = 8
 """Number of table steps between signal amplitudes at which a bin's crossing probability is averaged
 over speckle. The average at amplitudes between them is interpolated."""
 
-N_BOUND_SPECKLE_POWERS = 5
+N_RATE_BOUND_SPECKLE_POWERS = 5
 """Number of speckle powers (1, 2, 4 .. times the mean) at which upper bounds of the sum of a
 segment's crossing rates are stored. The rate of a bin is -ln(1 - c), with c the probability that
 signal lifts the bin above the threshold."""
@@ -184,7 +184,7 @@ class LeakageBins(NamedTuple):
     bins. The rate of a bin is -ln(1 - c), with c the probability that signal lifts the bin above
     the threshold."""
     crossing_rate_sum_bounds: np.ndarray
-    """(m, 3, N_BOUND_SPECKLE_POWERS): upper bounds on the sum of crossing rates in a
+    """(m, 3, N_RATE_BOUND_SPECKLE_POWERS): upper bounds on the sum of crossing rates in a
     segment, at speckle powers of 1, 2, 4 .. times the mean. The rate of a bin is -ln(1 - c), with c
     the probability that signal lifts the bin above the threshold."""
     mean_crossing_probability_sum: np.ndarray
@@ -252,7 +252,7 @@ class LeakageBins(NamedTuple):
             exempt_neighbour_magnitude_ratio=np.empty(0),
             side_of_adjacent_echo_bin=no_bins,
             crossing_rate_sum_bound_at_mean=np.zeros(sum_shape),
-            crossing_rate_sum_bounds=np.zeros((*sum_shape, N_BOUND_SPECKLE_POWERS)),
+            crossing_rate_sum_bounds=np.zeros((*sum_shape, N_RATE_BOUND_SPECKLE_POWERS)),
             mean_crossing_probability_sum=np.full(sum_shape, np.nan),
             permanent_line_begin=no_indices,
             permanent_line_end=no_indices,
@@ -569,7 +569,9 @@ def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
     signal.
     """
     return np.broadcast_to(
-        shots.negligible_signal_ratio if shots.detection_settings.includes_leakage else np.inf,
+        shots.negligible_signal_ratio
+        if shots.detection_settings.leakage_raises_false_alarms
+        else np.inf,
         shots.size,
     )
 
@@ -855,7 +857,7 @@ def _remove_bins_masked_by_leaked_light(
         for s in range(3):
             if not shots.has_segment[s]:
                 continue
-            line_scale, line = line_of_point(shots, i, s)
+            line_scale, line = permanent_line_of_point(shots, i, s)
             start, first_bin = spectra.bins_start[j, s], spectra.first_bin[j, s]
             echo_bins = first_bin + np.flatnonzero(
                 spectra.is_echo[start : start + spectra.n_bins[j, s]]
@@ -930,7 +932,7 @@ def _tabulate_log_crossing_rates(looks: Looks, threshold_ratio: float) -> Crossi
             first_log_amplitude + log_amplitude_step * np.arange(N_TABLE_AMPLITUDES)
         )
         added_probability = np.minimum(
-            looks.added_crossing_probability(amplitudes, threshold_ratio), 1 - 1e-16
+            looks.crossing_probability_added_by_signal(amplitudes, threshold_ratio), 1 - 1e-16
         )
         log_crossing_rates[:] = np.log(np.maximum(-np.log1p(-added_probability), 1e-300))
     return CrossingRateTable(log_crossing_rates, first_log_amplitude, log_amplitude_step)
@@ -1024,7 +1026,7 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
                 if table_position < 0.0:  # rate proportional to the amplitude squared
                     power_fraction, table_position = math.exp(2.0 * log_amplitude_above_first), 0.0
                 table_index = min(int(table_position), N_TABLE_AMPLITUDES - 2)
-                for doublings in range(N_BOUND_SPECKLE_POWERS):
+                for doublings in range(N_RATE_BOUND_SPECKLE_POWERS):
                     rate_sums[doublings] += (
                         power_fraction
                         * linear_rates[
@@ -1509,9 +1511,9 @@ def draw_leaked_peaks(
             speckle_power_max,
             fading_factors[group_index, segment] * fading_factors[group_index, segment],
         )
-    while bound_index < N_BOUND_SPECKLE_POWERS and speckle_power_max > float(1 << bound_index):
+    while bound_index < N_RATE_BOUND_SPECKLE_POWERS and speckle_power_max > float(1 << bound_index):
         bound_index += 1
-    if bound_index < N_BOUND_SPECKLE_POWERS:
+    if bound_index < N_RATE_BOUND_SPECKLE_POWERS:
         rate_sum_bound = leakage_bins.crossing_rate_sum_bounds[point, segment, bound_index]
     n_peaks = INTEGER_ZERO
     if rate_sum_bound > 0.0:

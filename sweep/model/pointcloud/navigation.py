@@ -112,7 +112,7 @@ class FittedCycles(NamedTuple):
     The fields are the first fields of :class:`NavigationSolution`.
     """
 
-    value: np.ndarray
+    estimate: np.ndarray
     """(n, 3): velocity of the instrument [m/s]; or (n,): its altitude [m]. The record holds one of
     the two."""
     covariance: np.ndarray
@@ -130,7 +130,7 @@ class NavigationSolution(NamedTuple):
     Vectors have the axes of the beam directions that were passed to the solver.
     """
 
-    value: np.ndarray
+    estimate: np.ndarray
     """(..., 3): velocity of the platform relative to the ground [m/s]; or (...,): height above the
     ground's plane along the vertical [m]."""
     covariance: np.ndarray
@@ -699,7 +699,7 @@ def solve_navigation(
         )
         for quantity, spread_name, solution in solutions:
             n_beams = np.where(solution.is_available, solution.is_beam_used.sum(axis=-1), 0)
-            results[quantity][cycle_slice] = solution.value
+            results[quantity][cycle_slice] = solution.estimate
             results[f"{quantity}_{spread_name}"][cycle_slice] = solution.covariance
             results[f"{quantity}_status"][cycle_slice] = solution.status
             results[f"{quantity}_beams"][cycle_slice] = n_beams
@@ -886,14 +886,14 @@ def _solve_cycles(
     if error_floor.velocity_scale_error > 0:
         common_variance = (
             error_floor.velocity_scale_error**2
-            * velocity_solution.value[..., None]
-            * velocity_solution.value[..., None, :]
+            * velocity_solution.estimate[..., None]
+            * velocity_solution.estimate[..., None, :]
         )
         velocity_solution = velocity_solution._replace(
             covariance=velocity_solution.covariance + common_variance
         )
     if error_floor.clock > 0:
-        common_variance = (error_floor.clock * altitude_solution.value) ** 2
+        common_variance = (error_floor.clock * altitude_solution.estimate) ** 2
         altitude_solution = altitude_solution._replace(
             covariance=altitude_solution.covariance + common_variance
         )
@@ -979,7 +979,7 @@ def _add_pointing_errors(
     closing_speed, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
     first_velocity = solve_velocity(
         direction=direction[:, None], radial_velocity=closing_speed, standard_error=error
-    ).value
+    ).estimate
     along_beam = np.einsum("cbi,cdi->cdb", direction, first_velocity)
     squared_across = np.sum(first_velocity**2, axis=2)[..., None] - along_beam**2
     speed_across = np.sqrt(np.maximum(np.nan_to_num(squared_across), 0.0))

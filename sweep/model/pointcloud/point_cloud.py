@@ -228,7 +228,7 @@ def _prepare_batch(
                 shots, context, DrawAddresses(keys, np.zeros(shots.size, np.int64))
             )
     leaks_in_speckle = shots.speckle.segment_correlations is not None and bool(
-        shots.detection_settings.includes_leakage
+        shots.detection_settings.leakage_raises_false_alarms
     )
     known_leakage_bins: list[tuple[np.ndarray, LeakageBins]] | None = None
     finds_groups_with_leakage = (
@@ -246,7 +246,9 @@ def _prepare_batch(
         without_target = ~has_target
         for bins in (bin_groups.strongest_bin, bin_groups.first_bin, bin_groups.last_bin):
             bins[without_target] = -1
-        bin_groups.neighbour_magnitudes[without_target] = bin_groups.pd[without_target] = np.nan
+        bin_groups.peak_and_neighbour_magnitudes[without_target] = bin_groups.pd[without_target] = (
+            np.nan
+        )
         bin_groups.n_exempt_bins[without_target] = bin_groups.leakage_probability[
             without_target
         ] = 0.0
@@ -260,7 +262,7 @@ def _prepare_batch(
             bin_groups.leakage_probability[indices] = leakage_bins.mean_leakage_probability()
             if known_leakage_bins is not None:
                 known_leakage_bins.append((indices, leakage_bins))
-    return _PreparedBatch(shots, ground.beamlets, bin_groups, known_leakage_bins)
+    return _PreparedBatch(shots, ground.beamlet_table, bin_groups, known_leakage_bins)
 
 
 def _closed_form_statistics(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:

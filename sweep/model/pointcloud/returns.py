@@ -61,14 +61,14 @@ from sweep.model.detection.detection_probability import (
 from sweep.model.detection.echo_detection import (
     BinThresholds,
     SpeckleMixing,
-    bin_threshold_at,
-    echo_bounds,
+    bin_threshold_of_point,
+    echo_bin_bounds,
     fill_pedestal_ratios,
     is_real_bin,
     pd_of_any_independent_bin,
     pd_of_one_independent_bin,
     pd_of_one_independent_bin_kernel,
-    speckle_mixing_at,
+    speckle_mixing_of_point,
 )
 from sweep.model.detection.estimators import RangeVelocityDeviation, range_velocity_deviation
 from sweep.model.detection.hoyt import hoyt_tails, pseudo_variance_ratio_at
@@ -118,9 +118,9 @@ from sweep.model.sampling.draws import (
     draw_bin_noise,
     draw_bin_noise_by_root,
     iter_noiseless_spectra,
-    largest_noise_magnitude,
     make_echo_noise_filter,
     noise_covariance_root,
+    noise_maximum_at_probability,
     speckle_amplitudes,
     threshold_and_line_noise_ratios,
 )
@@ -350,7 +350,7 @@ def draw_returns(
             noise_filter=filter_rule, noise_covariance_root=noise_roots[n_noise_bins]
         )
         if (
-            shots.real_ends_fft_size
+            shots.fft_size_if_end_bins_real
             and shots.speckle.segment_correlations is not None
             and (shots.speckle_table.pseudo_variance_row > 0).any()
         ):
@@ -361,7 +361,7 @@ def draw_returns(
             n_filter_bins = 2 * (n_near_bins + window_bins + int(spectra.n_bins.max(initial=0)))
             end_filter = NoiseFilter(
                 *noise_filter(shots.window, shots.fft_size, n_filter_bins),
-                shots.real_ends_fft_size,
+                shots.fft_size_if_end_bins_real,
             )
             part_config = part_config._replace(
                 spectrum_end_noise_filter=end_filter,
@@ -467,7 +467,7 @@ class DrawConfig(NamedTuple):
     two_beat_reading: int
     """Number of the reading (way to interpret an up and a down beat as range and velocity) that is
     used if no Doppler peak confirms the pair."""
-    real_ends_fft_size: int
+    fft_size_if_end_bins_real: int
     """FFT size N if noise in the bins at frequency 0 and at Nyquist is real; 0 if it counts as
     complex."""
     lobe_half_width: int
@@ -535,7 +535,7 @@ class DrawConfig(NamedTuple):
             shots.fft_size // 2,
             down_beat_sign,
             two_beat_reading,
-            shots.real_ends_fft_size,
+            shots.fft_size_if_end_bins_real,
             shots.detection_rule.lobe_half_width,
             make_echo_noise_filter(shots, NoiselessSpectra.empty(0)),
             np.zeros((0, 0)),
@@ -811,7 +811,7 @@ def make_draw_inputs(
     ).T
     down_pd = down_pd_given_up_result(pd_up, pd_down, pd_both)
     magnitude_below, magnitude, magnitude_above = np.ascontiguousarray(
-        np.moveaxis(bin_groups.neighbour_magnitudes, -1, 0)
+        np.moveaxis(bin_groups.peak_and_neighbour_magnitudes, -1, 0)
     )
     first_searched_bin, last_searched_bin = _searched_bins(shots)
     echo_fraction, n_independent_bins = _speckle_draw_inputs(shots, bin_groups)
@@ -910,7 +910,7 @@ def _speckle_draw_inputs(shots: Shots, bin_groups: BinGroups) -> tuple[np.ndarra
     if shots.speckle.line_gradients is None:
         return np.zeros(bin_groups.pd.shape), np.ones(bin_groups.pd.shape)
     has_noncircular_bins = (shots.speckle_table.pseudo_variance_row.T > 0)[:, :, None] & (
-        shots.real_ends_fft_size > 0
+        shots.fft_size_if_end_bins_real > 0
     )
     n_independent = _n_independent_bins(shots, bin_groups, has_noncircular_bins)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -962,7 +962,7 @@ def _searched_bins(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
     if noise counts as circular in all bins. A search band narrows the range.
     """
     first_searched, nyquist_bin = shots.first_searched_bin, shots.fft_size // 2
-    last_searched = nyquist_bin - first_searched if shots.real_ends_fft_size else nyquist_bin
+    last_searched = nyquist_bin - first_searched if shots.fft_size_if_end_bins_real else nyquist_bin
     first_bins, last_bins = np.empty((2, shots.size, 3), np.int64)
     first_bins[:], last_bins[:] = (
         (0, shots.fft_size - 1) if shots.complex_record else (first_searched, last_searched)
@@ -1760,7 +1760,7 @@ def prepare_group_speckle(point, config, inputs, spectra):
                 lobe_half_width = max(
                     config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[point])
                 )
-                begin, end = echo_bounds(
+                begin, end = echo_bin_bounds(
                     span_ratios,
                     inputs.first_bin[point, s, g] - span_first_bin,
                     inputs.last_bin[point, s, g] - span_first_bin,
@@ -2253,7 +2253,9 @@ def draw_segment_peaks(
     uniform = philox.to_uniform(alarm_word)
     if uniform < inputs.pfa_noise[point, segment]:
         ratio = max(
-            largest_noise_magnitude(spectra.n_noise_bins[point, segment], uniform, config.n_looks),
+            noise_maximum_at_probability(
+                spectra.n_noise_bins[point, segment], uniform, config.n_looks
+            ),
             threshold_ratio,
         )
         no_noise_peak_bins = leakage_bins.no_noise_peak_bins[
@@ -2415,7 +2417,9 @@ def detect_by_peak_bin(
     )
     k = strongest_bin - spectra.first_bin[point, segment]
     re, im = philox.normal_pair(key_0, key_1, draw, stream, k)
-    is_real = is_real_bin(strongest_bin, config.real_ends_fft_size > 0, config.real_ends_fft_size)
+    is_real = is_real_bin(
+        strongest_bin, config.fft_size_if_end_bins_real > 0, config.fft_size_if_end_bins_real
+    )
     if is_real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * line_noise_ratio, im * line_noise_ratio
@@ -2698,7 +2702,7 @@ def is_detected_by_other_bin(address, point, segment, group, inputs, single_bin_
     random_index = _OTHER_BINS_FIRST_RANDOM_INDEX + group * int(DRAWN_INDEPENDENT_BINS_MAX)
     while n_bins_left > 1e-6:
         speckle_amplitude = speckle_amplitudes(
-            address, random_index, speckle_mixing_at(inputs.speckle_mixing, point)
+            address, random_index, speckle_mixing_of_point(inputs.speckle_mixing, point)
         )[segment]
         re, im = philox.normal_pair(key_0, key_1, draw, philox.STREAM_NOISE[segment], random_index)
         noise_weight, echo_weight = math.sqrt(0.5 * (1.0 - echo_fraction)), math.sqrt(echo_fraction)
@@ -2735,8 +2739,8 @@ def draw_adjacent_bin_noise(address, stream, first_index, first_bin, n_bins, con
         :class:`sweep.model.sampling.draws.NoiseScratch`, the result. It has at least as many bins;
         for bins near DC or Nyquist as many as ``config.spectrum_end_noise_filter``.
     """
-    touches_end = config.real_ends_fft_size > 0 and (
-        first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_ends_fft_size
+    touches_end = config.fft_size_if_end_bins_real > 0 and (
+        first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.fft_size_if_end_bins_real
     )
     if is_near_spectrum_end(first_bin, n_bins, config):
         draw_noise_near_spectrum_end(address, stream, first_index, first_bin, n_bins, config, noise)
@@ -2913,7 +2917,7 @@ def detect_by_any_bin(
         inputs.first_bin[point, segment, group] - span_first_bin,
         inputs.last_bin[point, segment, group] - span_first_bin,
     )
-    first_index, last_index = echo_bounds(
+    first_index, last_index = echo_bin_bounds(
         span_ratios,
         first_index,
         last_index,
@@ -2928,7 +2932,7 @@ def detect_by_any_bin(
         magnitudes = workspace.bin_power[:n_bins]
         for k in range(n_bins):
             magnitudes[k] = noise_sigma * span_ratios[first_index + k]
-        bin_threshold = bin_threshold_at(inputs.bin_thresholds, point)
+        bin_threshold = bin_threshold_of_point(inputs.bin_thresholds, point)
         fill_pedestal_ratios(
             magnitudes, workspace.all_bins_are_echo[:n_bins], bin_threshold, pedestal_power
         )

@@ -282,7 +282,7 @@ def list_flagged_peaks(
         rotate_to_centre(shots, values, signal.strongest_bin) for values in (all_power, flags)
     )
     end_index = power.size - 1
-    if shots.real_ends_fft_size and signal.last_bin >= signal.first_bin:
+    if shots.fft_size_if_end_bins_real and signal.last_bin >= signal.first_bin:
         # Groups exclude DC and Nyquist: flag the inner neighbour of an echo's bin flagged there.
         for end, inner_bin in ((0, 1), (end_index, end_index - 1)):
             if flags[end] and end in (signal.first_bin, signal.last_bin):

@@ -1,6 +1,6 @@
 """Groups of draws whose random numbers are spread evenly, so that their means vary little.
 
-Draws of random effects come in groups of :data:`GROUP_SIZE` consecutive numbers. Each draw is
+Draws of random effects come in groups of :data:`DRAWS_PER_GROUP` consecutive numbers. Each draw is
 as random as one that is alone: its numbers are uniform and independent. The draws of a group,
 however, depend on each other. A pair of numbers, such as those of one complex amplitude, visits
 every cell of equal area among 64 once: cells of 1/64 by 1, 1/32 by 1/2, and so on to 1 by 1/64.
@@ -40,7 +40,7 @@ from sweep.model.sampling.philox import (
 )
 
 _DRAW_IN_GROUP_BITS = 6
-GROUP_SIZE = 1 << _DRAW_IN_GROUP_BITS
+DRAWS_PER_GROUP = 1 << _DRAW_IN_GROUP_BITS
 """Number of draws in a group, over which random numbers are spread evenly. The means of larger
 groups vary less, but a confidence interval follows from the variance of several groups' means. A
 tolerance of 0.01 takes at least 384 draws."""
@@ -50,7 +50,7 @@ GROUPED_NUMBERS_MAX = 32
 of draws. All later numbers are independent: as none of so many matters much, spreading them would
 gain little."""
 
-_WORDS_PER_PAIR = 4 + GROUP_SIZE
+_WORDS_PER_PAIR = 4 + DRAWS_PER_GROUP
 """Number of random words of a group of draws for each pair of random numbers: two to scramble the
 cells of the two numbers, two unused, and one for each draw of the group to shuffle the order of the
 cells."""
@@ -80,7 +80,7 @@ def grouped_uniforms(
     """
     uniform_numbers = np.empty((draw_numbers.size, (count + 3) // 4 * 4))
     n_pairs = (min(count, GROUPED_NUMBERS_MAX) + 1) // 2
-    cells = np.empty((2 * n_pairs, GROUP_SIZE), np.uint64)
+    cells = np.empty((2 * n_pairs, DRAWS_PER_GROUP), np.uint64)
     _fill_grouped_uniforms(
         np.ascontiguousarray(keys),
         np.asarray(draw_numbers, np.int64),
@@ -110,7 +110,7 @@ def _fill_grouped_uniforms(keys, draw_numbers, stream, are_polar, cells, uniform
     are_polar : bool
         True if the second number of each pair is an angle in cycles, as in
         :func:`grouped_uniforms`.
-    cells : ndarray (numbers, GROUP_SIZE) uint64
+    cells : ndarray (numbers, DRAWS_PER_GROUP) uint64
         Scratch: cell of each number in each draw of a group. Only the first ``numbers`` of a row
         are spread evenly; the others are independent.
     uniform_numbers : ndarray (m, count)
@@ -128,7 +128,7 @@ def _fill_grouped_uniforms(keys, draw_numbers, stream, are_polar, cells, uniform
             _fill_cells(DrawAddress(keys[i, 0], keys[i, 1], group), stream, cells)
         address = DrawAddress(keys[i, 0], keys[i, 1], draw_numbers[i])
         fill_words(address, stream, FIRST_BLOCK_NUMBER, BLOCK_INCREMENTS, words.shape[1], words)
-        member = draw_numbers[i] & (GROUP_SIZE - 1)
+        member = draw_numbers[i] & (DRAWS_PER_GROUP - 1)
         for number in range(uniform_numbers.shape[1]):
             own_word = word = words[number & 3, number >> 2]
             if number < cells.shape[0]:
@@ -150,7 +150,7 @@ def _fill_cells(group_address, stream, cells):
     stream
         Number of the stream of the random numbers.
     cells
-        (numbers, GROUP_SIZE) uint64: output array of cells, 0 to GROUP_SIZE - 1, by
+        (numbers, DRAWS_PER_GROUP) uint64: output array of cells, 0 to DRAWS_PER_GROUP - 1, by
         number and draw. The two numbers of pair i are in rows 2 i and 2 i + 1.
 
     Notes
@@ -159,20 +159,20 @@ def _fill_cells(group_address, stream, cells):
     order is shuffled by Fisher and Yates.
     """
     words = np.empty((4, _WORDS_PER_PAIR // 4), np.uint64)
-    order = np.empty(GROUP_SIZE, np.int64)
+    order = np.empty(DRAWS_PER_GROUP, np.int64)
     group_stream = stream + GROUP_STREAM_OFFSET
     for pair in range(cells.shape[0] // 2):
         first_block = np.int64(pair * words.shape[1])
         fill_words(
             group_address, group_stream, first_block, BLOCK_INCREMENTS, words.shape[1], words
         )
-        for i in range(GROUP_SIZE):
+        for i in range(DRAWS_PER_GROUP):
             order[i] = i
-        for last in range(GROUP_SIZE - 1, 0, -1):
+        for last in range(DRAWS_PER_GROUP - 1, 0, -1):
             word = words[last & 3, 1 + (last >> 2)]
             other = np.int64(word % np.uint64(last + 1))
             order[last], order[other] = order[other], order[last]
-        for member in range(GROUP_SIZE):
+        for member in range(DRAWS_PER_GROUP):
             index, reversed_index = order[member], 0
             for bit in range(_DRAW_IN_GROUP_BITS):
                 reversed_index = reversed_index << 1 | (index >> bit & 1)
@@ -182,7 +182,7 @@ def _fill_cells(group_address, stream, cells):
 
 @njit(cache=True)
 def _scramble_cell(cell, word):
-    """Return a cell, 0 to GROUP_SIZE - 1, with bits flipped at random (Owen's scrambling).
+    """Return a cell, 0 to DRAWS_PER_GROUP - 1, with bits flipped at random (Owen's scrambling).
 
     A bit of the random ``word`` decides on each flip. The choice of this bit depends on the higher
     bits of the cell, so that every half of the unit interval, every half of a half, and so on is
@@ -263,7 +263,7 @@ class GroupMeans:
         GroupStatistics
             Arrays (names, m).
         """
-        n_groups = n_values // GROUP_SIZE
+        n_groups = n_values // DRAWS_PER_GROUP
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = self.squared_deviations[:, point_indices] / (n_groups - 1.0)
         return GroupStatistics(n_groups, np.where(n_groups > 1, variance, np.nan))
@@ -304,7 +304,7 @@ def _add_to_group_means(
             open_sum[k, i] += x
             n_groups = (draw_numbers[j] + 1) >> _DRAW_IN_GROUP_BITS
             if n_groups << _DRAW_IN_GROUP_BITS == draw_numbers[j] + 1:
-                group_mean = open_sum[k, i] / GROUP_SIZE
+                group_mean = open_sum[k, i] / DRAWS_PER_GROUP
                 deviation = group_mean - mean[k, i]
                 mean[k, i] += deviation / n_groups
                 squared_deviations[k, i] += deviation * (group_mean - mean[k, i])

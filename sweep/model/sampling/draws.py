@@ -31,9 +31,9 @@ from sweep.model.detection.detection_probability import (
 from sweep.model.detection.echo_detection import (
     BinThresholds,
     SpeckleMixing,
-    bin_threshold_at,
+    bin_threshold_of_point,
     fill_pedestal_ratios,
-    speckle_mixing_at,
+    speckle_mixing_of_point,
 )
 from sweep.model.detection.hoyt import pseudo_variance_ratio_at
 from sweep.model.detection.marcum import at_least_one_probability
@@ -59,7 +59,7 @@ from sweep.model.sampling.speckle_lines import (
 from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import iter_spans
 
-PD_BOTH_CHIRPS = "pd_both_chirps"
+PD_BOTH_CHIRPS_NAME = "pd_both_chirps"
 """Name of the output for the probability that both chirps, up and down, detect the echo. The output
 exists only if any two segments suffice to detect a shot. Otherwise ``pd_shot`` is this probability.
 """
@@ -255,7 +255,7 @@ def count_by_probability(
         pd_if_condition_fails=probabilities.pd_if_condition_fails,
         pd_if_condition_holds=probabilities.pd_if_condition_holds,
         detects_by_any_two_segments=np.isfinite(
-            outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))
+            outputs.get(PD_BOTH_CHIRPS_NAME, np.full(n_rows, np.nan))
         ),
         speckle_mixing=SpeckleMixing(*np.empty((6, 0))),
         pseudo_variance_row=np.zeros((3, n_rows), np.int64),
@@ -344,7 +344,7 @@ class NoiseFilter(NamedTuple):
     first_number_index: np.ndarray
     """(bins,) int64: index of the first independent normal number in each bin's weighted sum; 0 for
     the first bin."""
-    real_ends_fft_size: int
+    fft_size_if_end_bins_real: int
     """FFT size N if noise in the bins at frequency 0 and at Nyquist is real; 0 if it counts as
     complex."""
 
@@ -402,7 +402,7 @@ def make_echo_noise_filter(
         weights[:, N_NOISE_FILTER_TAPS // 2] = 1.0
         return NoiseFilter(weights, np.arange(n_filter_bins) - N_NOISE_FILTER_TAPS // 2, 0)
     return NoiseFilter(
-        *noise_filter(shots.window, shots.fft_size, n_filter_bins), shots.real_ends_fft_size
+        *noise_filter(shots.window, shots.fft_size, n_filter_bins), shots.fft_size_if_end_bins_real
     )
 
 
@@ -450,7 +450,7 @@ def _event_probabilities(outputs: Mapping[str, np.ndarray]) -> EventProbabilitie
     pd_up, pd_down, pd_shot = (
         np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot")
     )
-    stated_both = outputs.get(PD_BOTH_CHIRPS, np.full(pd_up.shape, np.nan))
+    stated_both = outputs.get(PD_BOTH_CHIRPS_NAME, np.full(pd_up.shape, np.nan))
     both = np.where(np.isfinite(stated_both), stated_both, pd_shot)
     down_pd = down_pd_given_up_result(pd_up, pd_down, both)
     pd_doppler = np.nan_to_num(outputs["pd_doppler"])
@@ -582,11 +582,11 @@ def iter_noiseless_spectra(
     point_indices
         Points to include; by default all.
     """
-    noise_sigma, has_real_ends = shots.bin_noise_sigma, shots.real_ends_fft_size > 0
+    noise_sigma, has_real_ends = shots.bin_noise_sigma, shots.fft_size_if_end_bins_real > 0
     # Without leakage only the peak is evaluated.
     negligible_ratio = (
         shots.negligible_signal_ratio + np.zeros(shots.size)
-        if shots.detection_settings.includes_leakage
+        if shots.detection_settings.leakage_raises_false_alarms
         else np.full(shots.size, np.inf)
     )
     magnitude_min = np.minimum(shots.threshold, negligible_ratio * noise_sigma)
@@ -620,7 +620,7 @@ def iter_noiseless_spectra(
             first_bin=np.where(exists, spans.first_bin.T, 0),
             peak_index=np.where(exists, spans.peak_index.T, 0),
             peak_has_real_noise=np.isin(
-                (spans.first_bin + spans.peak_index).T, (0, shots.real_ends_fft_size / 2)
+                (spans.first_bin + spans.peak_index).T, (0, shots.fft_size_if_end_bins_real / 2)
             )
             & exists
             & has_real_ends,
@@ -696,7 +696,7 @@ def _draw_and_count_events(draw_ranges, batch_edges, config, inputs, spectra, co
                 amplitudes = speckle_amplitudes(
                     DrawAddress(address.key_0, address.key_1, first + d),
                     INTEGER_ZERO,
-                    speckle_mixing_at(inputs.speckle_mixing, j),
+                    speckle_mixing_of_point(inputs.speckle_mixing, j),
                 )
                 for s in range(3):
                     speckle_factors_in_phase[s, d] = amplitudes[s].real
@@ -734,7 +734,7 @@ def _draw_and_count_events(draw_ranges, batch_edges, config, inputs, spectra, co
                         s,
                         spectra,
                         config.noise_filter,
-                        bin_threshold_at(inputs.bin_thresholds, j),
+                        bin_threshold_of_point(inputs.bin_thresholds, j),
                         echo_amplitudes[s],
                         noise,
                         is_detected[s],
@@ -1217,7 +1217,7 @@ def _mark_any_bin_crossings(
     threshold_ratio = bin_threshold.threshold / bin_threshold.noise_sigma_without_pedestal
     pedestal_power = np.zeros(n_bins)
     if (
-        bin_threshold.side_noise_sigma > bin_threshold.noise_sigma_without_pedestal
+        bin_threshold.noise_sigma_next_to_lines > bin_threshold.noise_sigma_without_pedestal
         or bin_threshold.line_noise_sigma > bin_threshold.noise_sigma_without_pedestal
     ):
         fill_pedestal_ratios(bin_magnitude_ratios, is_echo, bin_threshold, pedestal_power)
@@ -1273,12 +1273,12 @@ def draw_bin_noise(address, stream, first_index, first_bin, n_bins, filter_rule,
     """
     key_0, key_1, draw = address
     weights, start = filter_rule.weights, filter_rule.first_number_index
-    real_ends_fft_size = filter_rule.real_ends_fft_size
+    fft_size_if_end_bins_real = filter_rule.fft_size_if_end_bins_real
     n_taps = weights.shape[1]
     is_from_nyquist = (
-        real_ends_fft_size > 0 and 2 * (first_bin + n_bins - 1) == real_ends_fft_size
+        fft_size_if_end_bins_real > 0 and 2 * (first_bin + n_bins - 1) == fft_size_if_end_bins_real
     )  # counted from Nyquist
-    is_symmetric = is_from_nyquist or (real_ends_fft_size > 0 and first_bin == 0)
+    is_symmetric = is_from_nyquist or (fft_size_if_end_bins_real > 0 and first_bin == 0)
     first_number = 0 if is_symmetric else start[0]
     for j in range(start[n_bins - 1] + n_taps - first_number):
         re, im = philox.normal_pair(key_0, key_1, draw, stream, first_index + j)
@@ -1379,7 +1379,7 @@ def _mark_crossings(address, n_draws, stream, pair_index, bin_in_noise, random_w
 
 
 @njit(cache=True, error_model="numpy")
-def largest_noise_magnitude(n_bins, probability, n_looks):
+def noise_maximum_at_probability(n_bins, probability, n_looks):
     """Return the |X| / sigma that the largest of n noise bins exceeds with a given probability.
 
     X is a bin of the spectrum, and sigma the standard deviation of its noise per quadrature.

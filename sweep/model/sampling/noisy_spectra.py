@@ -69,7 +69,7 @@ from sweep.model.detection.sub_bin_interpolation import (
 )
 from sweep.model.evaluation import fit_range_velocity_to_peaks
 from sweep.model.laser_line import (
-    apparent_line_and_pedestal,
+    apparent_line_and_pedestal_power,
     beat_phase_noise,
     n_beat_phase_noise_steps,
 )
@@ -224,12 +224,14 @@ def noiseless_signal(
             echo_window = zero_first_samples(
                 echo_window, int(shots.echo_record.n_samples_before_echo[0, point])
             )
-        (line_power_fraction, *_), *_ = apparent_line_and_pedestal(
+        (line_power_fraction, *_), *_ = apparent_line_and_pedestal_power(
             window=echo_window, looks=shots.looks.n_coherent, **phase_noise_arguments
         )
         magnitude = magnitude / math.sqrt(line_power_fraction)
     window, last_index = shots.window, magnitude.size - 1
-    margin = 0 if shots.real_ends_fft_size or shots.complex_record else 1  # omits DC and Nyquist
+    margin = (
+        0 if shots.fft_size_if_end_bins_real or shots.complex_record else 1
+    )  # omits DC and Nyquist
     strongest_bin = int(np.clip(np.argmax(magnitude), margin, last_index - margin))
     if not magnitude[strongest_bin] > 0:
         peak_position = float(strongest_bin - zero_frequency_index(shots))
@@ -614,7 +616,7 @@ def draw_bin_speckle(
     n_bins, zero_index = signal.spectrum.size, zero_frequency_index(shots)
     factors = np.empty((draws.size, n_bins), complex)
     is_real_bin = np.zeros(n_bins, bool)  # the real part alone has all of the power
-    is_real_bin[[0, -1]] = shots.real_ends_fft_size > 0
+    is_real_bin[[0, -1]] = shots.fft_size_if_end_bins_real > 0
     echo_bin_ranges = [
         EchoBinRange(
             signal.strongest_bin,
@@ -661,7 +663,10 @@ def draw_bin_speckle(
             has_speckle &= signal.nearest_echo[bins % n_bins] == echo_number
         bins = bins[has_speckle] % n_bins
         factors[:, bins] = amplitudes[:, has_speckle]
-        if shots.real_ends_fft_size and shots.speckle_table.pseudo_variance_row[segment, point] > 0:
+        if (
+            shots.fft_size_if_end_bins_real
+            and shots.speckle_table.pseudo_variance_row[segment, point] > 0
+        ):
             # Refer their phases to the record's middle, as those of the noise are.
             first_sample = (
                 0
@@ -1112,7 +1117,7 @@ def detect_and_estimate_frequency(
     first_detecting, end_detecting = strongest_index, strongest_index + 1
     if shots.detection_settings.echo_bin_rule == "any_bin" and last_index >= first_index:
         first_detecting, end_detecting = first_index, last_index + 1
-        if not shots.real_ends_fft_size:
+        if not shots.fft_size_if_end_bins_real:
             first_detecting, end_detecting = max(first_detecting, 1), min(end_detecting, end_index)
     signed_peak = signal.strongest_bin - zero_frequency_index(shots)
     flags_of_echo = flags[:, first_detecting:end_detecting] & is_searched(

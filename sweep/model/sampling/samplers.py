@@ -45,12 +45,12 @@ from sweep.model.evaluation import evaluate, prepare_shots, shot_statistics
 from sweep.model.outputs import (
     DETECTOR_INDEPENDENT_OUTPUTS,
     DRAW_COUNT_OUTPUTS,
-    N_GROUP_SUMS,
+    N_GROUP_SUM_COLUMNS,
     PD_OUTPUT_NAMES,
     RUNNING_SUMS_NAME,
 )
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.sampling.draw_groups import GROUP_SIZE, GroupMeans
+from sweep.model.sampling.draw_groups import DRAWS_PER_GROUP, GroupMeans
 from sweep.model.sampling.draws import DrawRanges, count_by_probability, count_in_noise
 from sweep.model.sampling.noisy_spectra import (
     AVERAGED_VALUE_NAMES,
@@ -253,7 +253,9 @@ class Sampler(ABC):
         )
         return interval_half_width(counts / n, interval)
 
-    def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    def pd_half_width_excess(
+        self, point_indices: np.ndarray, error_budget: ErrorBudget
+    ) -> np.ndarray:
         """Return each point's largest half-width minus the tolerance, but at least 0.
 
         Half-widths belong to the confidence intervals of detection probabilities.
@@ -285,7 +287,7 @@ class Sampler(ABC):
         return {
             "n_draws": self.n_draws,
             **{f"{name}_half_width": width for name, width in widths},
-            "accuracy_missed": self.half_width_excess(point_indices, error_budget),
+            "accuracy_missed": self.pd_half_width_excess(point_indices, error_budget),
         }
 
 
@@ -398,7 +400,7 @@ def simulate_draws(
         draw_until_accurate(sampler, point_indices, [sum(batch_sizes)], None, should_stop)
         counts = sampler.counts
     else:
-        group_size = GROUP_SIZE if random_effects(effects) and method != SPECTRA_METHOD else 1
+        group_size = DRAWS_PER_GROUP if random_effects(effects) and method != SPECTRA_METHOD else 1
         check_draws = [
             n_draws
             for n_draws in stopping_check_draws(batch, limit, group_size)
@@ -447,7 +449,7 @@ def draw_until_accurate(
             is_checked = n_draws <= check_at
             is_open = ~is_checked
             is_open[is_checked] = (
-                sampler.half_width_excess(point_indices[is_checked], error_budget) > 0
+                sampler.pd_half_width_excess(point_indices[is_checked], error_budget) > 0
             )
             point_indices = point_indices[is_open]
             if not point_indices.size:
@@ -462,7 +464,7 @@ def _can_be_accurate(n_draws: int, error_budget: ErrorBudget) -> bool:
     they are at least half of z^2 / n (:mod:`sweep.model.error_budget`).
     """
     least_width = two_sided_normal_quantile(error_budget.confidence) ** 2 / n_draws
-    if n_draws < 2 * GROUP_SIZE:
+    if n_draws < 2 * DRAWS_PER_GROUP:
         least_width = least_width / 2
     return bool((least_width <= np.asarray(error_budget.tolerance)).any())
 
@@ -488,7 +490,7 @@ class DetectionSampler(Sampler):
         elif prior_draws is not None:
             self._running_means.restore_from_results(prior_draws.means)
             self._group_means.restore_state(
-                prior_draws.means[RUNNING_SUMS_NAME][:, -N_GROUP_SUMS:].T
+                prior_draws.means[RUNNING_SUMS_NAME][:, -N_GROUP_SUM_COLUMNS:].T
             )
 
     def draws_per_step(self, n_points: int) -> int:
@@ -581,7 +583,7 @@ class DetectionSampler(Sampler):
             grouped_width = grouped_mean_half_width(
                 group_variance=groups.group_variance,
                 n_groups=groups.n_groups,
-                group_size=GROUP_SIZE,
+                group_size=DRAWS_PER_GROUP,
                 **common_inputs,
             )
             has_groups = (groups.n_groups > 1) & self.draws_are_grouped
@@ -621,10 +623,10 @@ class DetectionSampler(Sampler):
             variance=variance,
             group_variance=group_variance,
             n_groups=n_groups,
-            group_size=GROUP_SIZE,
+            group_size=DRAWS_PER_GROUP,
             confidence=STANDARD_ERROR_CONFIDENCE,
         )
-        n_grouped = GROUP_SIZE * np.where(n_groups >= STANDARD_ERROR_GROUPS_MIN, n_groups, 0)
+        n_grouped = DRAWS_PER_GROUP * np.where(n_groups >= STANDARD_ERROR_GROUPS_MIN, n_groups, 0)
         squared_sum_error = n_grouped * grouped_variance + (n - n_grouped) * variance
         errors = np.sqrt(squared_sum_error) / np.where(n > 0, n, np.nan)
         return {f"{name}_error": row for name, row in zip(PD_OUTPUT_NAMES, errors, strict=True)}

@@ -52,7 +52,7 @@ from sweep.model.detection.speckle_correlation import (
     TRANSFORM_SAMPLES_PER_CELL,
     LineGradients,
     late_echo_centroid_shift,
-    transform_table,
+    window_transform_table,
 )
 from sweep.model.detection.sub_bin_interpolation import (
     complex_exponentials,
@@ -181,7 +181,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     Without developed speckle the result has no points.
     """
     gradients = shots.speckle.line_gradients
-    _, window_transform = transform_table(shots.window)
+    _, window_transform = window_transform_table(shots.window)
     node, weight = _quadrature_tables()
     n_points = 0 if gradients is None else shots.size
     line_shift, phase = np.zeros((2, n_points, 3, 2)) if gradients is None else gradients
@@ -209,7 +209,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
         window_transform,
         TRANSFORM_SAMPLES_PER_CELL / padding_factor,
         TRANSFORM_REACH_CELLS * padding_factor,
-        shots.real_ends_fft_size // 2,
+        shots.fft_size_if_end_bins_real // 2,
     )
 
 
@@ -257,7 +257,7 @@ def folding_signs(shots: "Shots") -> np.ndarray:
     if shots.complex_record:
         return signs
     for s, segment in enumerate(shots.waveform_segments):
-        delay = segment.delay(shots.range)
+        delay = segment.echo_delay(shots.range)
         beat = segment.carrier * segment.doppler_ratio - segment.chirp_rate * delay * (
             1 + segment.doppler_ratio
         )
@@ -992,7 +992,7 @@ def wander_covariance(
     """
     first, second = pair
     shift_first, shift_second = gradients.line_shift[:, first], gradients.line_shift[:, second]
-    phase_difference = gradients.phase[:, second] - gradients.phase[:, first]
+    phase_difference = gradients.phase_gradient[:, second] - gradients.phase_gradient[:, first]
     squared_phase = (phase_difference * phase_difference).sum(axis=-1)
     fraction_first, fraction_second = echo_fraction
     power_first, power_second = relative_power
@@ -1130,7 +1130,9 @@ def position_error_moments(
             moment = wander_covariance(
                 gradients, (first, second), relative_power[:, pair].T, echo_fraction[:, pair].T
             )
-            phase_difference = gradients.phase[:, second] - gradients.phase[:, first]
+            phase_difference = (
+                gradients.phase_gradient[:, second] - gradients.phase_gradient[:, first]
+            )
             amplitude_correlation = np.exp(
                 -0.5 * (phase_difference * phase_difference).sum(axis=-1)
             )

@@ -125,7 +125,7 @@ class DetectedSpan(NamedTuple):
     """Index of the bin with the largest magnitude, counted from the first bin of the span."""
     n_exempt: int
     """Number of bins of the span that belong to the echo and so cannot raise a false alarm."""
-    leakage: float
+    leakage_probability: float
     """Probability that the echo's signal far from its lines raises at least one false alarm. The
     value is 0 if it is not computed.
     """
@@ -1189,7 +1189,7 @@ def detect_in_span(
     -------
     DetectedSpan
         Bins around the lines, and the detection in them. No leakage is computed:
-        ``raised_bin_probability_max`` is 1, and ``leakage`` 0.
+        ``raised_bin_probability_max`` is 1, and ``leakage_probability`` 0.
     """
     span, weight_sum = workspace.span, bundle.weight_sum
     is_complex = layout.spectrum_type == COMPLEX_RECORD

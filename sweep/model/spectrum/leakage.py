@@ -40,7 +40,7 @@ from sweep.model.detection.added_crossings import (
     exclude_crossings_joining_echo,
     fill_added_crossing_probabilities,
     largest_or_zero,
-    weighted_crossing_rate,
+    weighted_crossing_rate_sum,
 )
 from sweep.model.detection.echo_detection import mark_exempt_bins
 from sweep.model.detection.marcum import marcum_q1_excess
@@ -148,7 +148,7 @@ class LeakageInputs(NamedTuple):
 class FalsePeakProbability(NamedTuple):
     """Probabilities that leaked signal raises bins of a segment above the threshold."""
 
-    leakage: float
+    leakage_probability: float
     """Probability of at least one false peak apart from the echo. In developed speckle it is the
     mean over the speckle."""
     raised_bin_probability_max: float
@@ -162,13 +162,13 @@ class LeakageResult(NamedTuple):
     The result is valid only if enough bins around the lines are computed.
     """
 
-    leakage: float
+    leakage_probability: float
     """Probability that the echo's signal far from its lines raises at least one false alarm."""
     raised_bin_probability_max: float
     """Upper bound on the probability that leaked signal raises any bin above the threshold,
     including bins that join the echo."""
     is_valid: bool
-    """True if enough bins around the lines are computed for a valid ``leakage``."""
+    """True if enough bins around the lines are computed for a valid ``leakage_probability``."""
 
 
 class EnvelopeTail(NamedTuple):
@@ -354,7 +354,7 @@ def detect_with_leakage(
                 probability = _leakage_of_span(
                     n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
                 )
-                leakage = probability.leakage
+                leakage = probability.leakage_probability
                 raised_bin_probability_max += probability.raised_bin_probability_max
             return DetectedSpan(
                 first_bin, n_bins, peak_index, n_exempt, leakage, raised_bin_probability_max
@@ -378,7 +378,7 @@ def detect_with_leakage(
                 n_bins,
                 peak_index,
                 n_exempt,
-                result.leakage,
+                result.leakage_probability,
                 result.raised_bin_probability_max,
             )
         extra_bins *= 2
@@ -995,7 +995,9 @@ def _leakage_of_all_bins(
         probability = _leakage_of_span(
             n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
         )
-        return LeakageResult(probability.leakage, probability.raised_bin_probability_max, True)
+        return LeakageResult(
+            probability.leakage_probability, probability.raised_bin_probability_max, True
+        )
     _fill_crossing_probabilities(n_bins, inputs, span, crossing_series)
     centre_bin = abs(
         math.floor(0.5 * (folded_range.lowest_position + folded_range.highest_position) + 0.5)
@@ -1069,7 +1071,7 @@ def _leakage_of_all_bins(
     fill_added_crossing_probabilities(
         span.half_square, n_points, threshold_ratio, crossing_series, span.crossing_probability
     )
-    far_rate += weighted_crossing_rate(
+    far_rate += weighted_crossing_rate_sum(
         span.crossing_probability[:n_points], integral.weight[:n_points]
     )
     half_square_max = min(

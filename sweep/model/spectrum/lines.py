@@ -203,7 +203,7 @@ class PointParameters(NamedTuple):
     image_gain: np.ndarray
     """Amplitude of the image that I/Q imbalance makes of a line, over that of the line; 0 if there
     is no image."""
-    side_noise_sigma: np.ndarray
+    noise_sigma_next_to_lines: np.ndarray
     """Noise standard deviation per quadrature in bins next to the lines [V, summed over the
     record]. It includes the whole phase-noise pedestal of the laser.
     """
@@ -213,7 +213,7 @@ class PointParameters(NamedTuple):
     """
     pedestal_line_width_bins: np.ndarray
     """Line width of the laser [FFT bins]."""
-    pedestal_delay_times_bin_width: np.ndarray
+    pedestal_delay_bin_width_product: np.ndarray
     """Delay of the echo times the bin width fs/N, with the sample rate fs and the FFT size N.
     Delays longer than the record count as its duration."""
 
@@ -301,7 +301,7 @@ def beat_parameters_at(point_parameters, segment_parameters, segment, point):
 
 
 @lru_cache(maxsize=32)
-def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...]) -> np.ndarray:
+def phase_span_max_table(weights: tuple[float, ...], tolerances: tuple[float, ...]) -> np.ndarray:
     """Tabulate how wide a group of lines may be so that J equivalent lines meet each tolerance.
 
     The width is the half-width h [bins of fs/L] times pi, a phase [rad] at the record's end.
@@ -628,7 +628,7 @@ def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def n_required_nodes(phase_span, tolerance, phase_limits):
+def n_required_nodes(phase_span, tolerance, phase_span_max_table):
     """Return the number of equivalent lines that represent a group of lines to a tolerance.
 
     Parameters
@@ -638,8 +638,8 @@ def n_required_nodes(phase_span, tolerance, phase_limits):
         fs/L, with the sample rate fs and L samples; 2 pi h if powers add.
     tolerance : float
         Error of the sum over lines, relative to the sum of their magnitudes.
-    phase_limits : ndarray (tolerances, NODES_MAX + 1)
-        Table of :func:`node_phase_limits`. The row of the largest tolerance up to ``tolerance``
+    phase_span_max_table : ndarray (tolerances, NODES_MAX + 1)
+        Table of :func:`phase_span_max_table`. The row of the largest tolerance up to ``tolerance``
         is used, or the first row if all tolerances are larger.
 
     Returns
@@ -647,11 +647,14 @@ def n_required_nodes(phase_span, tolerance, phase_limits):
     int
         Number of equivalent lines, 1 .. NODES_MAX, or NODES_MAX + 1 if no number is sufficient.
     """
-    limit_row = phase_limits.shape[0] - 1
-    while limit_row > 0 and phase_limits[limit_row, 0] > tolerance:
+    limit_row = phase_span_max_table.shape[0] - 1
+    while limit_row > 0 and phase_span_max_table[limit_row, 0] > tolerance:
         limit_row -= 1
     n_nodes = 1
-    while n_nodes < phase_limits.shape[1] and phase_limits[limit_row, n_nodes] < phase_span:
+    while (
+        n_nodes < phase_span_max_table.shape[1]
+        and phase_span_max_table[limit_row, n_nodes] < phase_span
+    ):
         n_nodes += 1
     return n_nodes
 

@@ -85,7 +85,7 @@ def _line_transforms(
     )
 
 
-def line_of_point(
+def permanent_line_of_point(
     shots: Shots, i: int, segment: int, noise_frequency: float | None = None
 ) -> tuple[float, LineTransforms]:
     """Return the permanent line in one segment of one point.
@@ -127,7 +127,7 @@ def line_of_point(
         acquisition_delay,
     ) = (float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in shot_columns)
     beat_frequency = -shots.waveform_segments[segment].chirp_rate_ratio * chirp_rate * delay
-    transfer_gain = receiver_chain.receiver_transfer(
+    transfer_gain = receiver_chain.receiver_transfer_function(
         np.array(beat_frequency),
         detector_bandwidth=np.array(detector_bandwidth),
         amplifier_bandwidth=np.array(amplifier_bandwidth),
@@ -181,7 +181,7 @@ def line_alarm_probability(
     log_no_alarm = [
         np.log1p(
             -np.minimum(
-                looks.added_crossing_probability(
+                looks.crossing_probability_added_by_signal(
                     np.abs(line_term * phasor + image_term * phasor.conjugate()),
                     threshold_ratio,
                 ),
@@ -306,7 +306,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
             bin_spans.magnitudes,
             bin_spans.peak_is_masked,
             bin_spans.n_exempt,
-            bin_spans.leakage,
+            bin_spans.leakage_probability,
         )
     )
     noise_sigma, line_noise_sigma, threshold = (
@@ -322,7 +322,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
         bins = bin_spans.first_bin[segment_index, i] + np.arange(bin_spans.n_bins[segment_index, i])
         bins = bins % fft_size if shots.complex_record else bins
         (half_amplitude, line), peak = (
-            line_of_point(shots, int(bin_spans.point_numbers[i]), segment_index),
+            permanent_line_of_point(shots, int(bin_spans.point_numbers[i]), segment_index),
             bin_spans.peak_index[segment_index, i],
         )
         is_echo = bin_spans.is_exempt[bin_slice]
@@ -338,7 +338,7 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
             / fft_size
             * np.broadcast_to(shots.sample_rate, shots.size)[bin_spans.point_numbers[i]]
         )
-        skirt_half_amplitude, _ = line_of_point(
+        skirt_half_amplitude, _ = permanent_line_of_point(
             shots, int(bin_spans.point_numbers[i]), segment_index, peak_frequency
         )
         skirt_rms = np.where(is_masked[bins], 0.0, skirt_half_amplitude * line.magnitude_rms[bins])
@@ -363,5 +363,8 @@ def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
             )
             leakage[segment_index, i] += (1 - leakage[segment_index, i]) * alarm_probability
     return bin_spans._replace(
-        magnitudes=magnitudes, peak_is_masked=peak_is_masked, n_exempt=n_exempt, leakage=leakage
+        magnitudes=magnitudes,
+        peak_is_masked=peak_is_masked,
+        n_exempt=n_exempt,
+        leakage_probability=leakage,
     )

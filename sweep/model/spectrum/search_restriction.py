@@ -17,8 +17,8 @@ from sweep.model.detection.added_crossings import (
 )
 from sweep.model.detection.echo_detection import (
     EchoSpans,
-    bin_threshold_at,
-    echo_bounds,
+    bin_threshold_of_point,
+    echo_bin_bounds,
     echo_half_width,
 )
 from sweep.model.detection.marcum import marcum_q1_excess
@@ -60,7 +60,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
             spans.span_start,
         )
     )
-    leakage = np.array(spans.leakage)
+    leakage = np.array(spans.leakage_probability)
     bands = shots.detection_settings.search_band.select_points(points)
     peak_is_searched = (spans.n_bins == 0) | bands.contains(spans.first_bin + spans.peak_index)
     line_positions = (
@@ -70,7 +70,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     )
     evaluates_leakage = np.array(
         [
-            shots.detection_settings.includes_leakage and segment.evaluates_leakage
+            shots.detection_settings.leakage_raises_false_alarms and segment.evaluates_leakage
             for segment in shots.waveform_segments
         ]
     )
@@ -92,7 +92,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
         peak_index=peak_index,
         n_exempt=n_exempt,
         span_start=span_start,
-        leakage=leakage,
+        leakage_probability=leakage,
         peak_is_searched=peak_is_searched,
     )
 
@@ -270,7 +270,7 @@ def _restrict_spans(
                     first, last, n_searched = min(first, k), k, n_searched + 1
             if n_searched == n_bins[s, j]:
                 continue
-            bin_threshold = bin_threshold_at(bin_thresholds, j)
+            bin_threshold = bin_threshold_of_point(bin_thresholds, j)
             threshold = bin_threshold.threshold
             magnitudes = spans.magnitudes[span_start : span_start + n_bins[s, j]]
             is_exempt = spans.is_exempt[span_start : span_start + n_bins[s, j]]
@@ -358,7 +358,7 @@ def _mark_searched_echoes(
                 distance -= band.period_bins * math.floor(distance / band.period_bins)
             holds_line |= 0.0 <= distance <= index - first + 1
         if holds_line and _is_in_band(first_bin + largest_index, band):
-            begin, end = echo_bounds(magnitudes, first, index - 1, threshold, lobe_half_width)
+            begin, end = echo_bin_bounds(magnitudes, first, index - 1, threshold, lobe_half_width)
             is_exempt[max(min(begin, first - 1), 0) : max(end, index) + 1] = True
 
 

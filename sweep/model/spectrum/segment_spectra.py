@@ -72,7 +72,7 @@ from sweep.model.spectrum.lines import (
     compute_lines,
     fold_lines,
     n_required_nodes,
-    node_phase_limits,
+    phase_span_max_table,
     replace_lines_by_nodes,
     summarise_lines,
 )
@@ -118,7 +118,7 @@ class SegmentResults(NamedTuple):
     """Frequency of the echo's largest bin [Hz]; nan if the search band does not contain it."""
     n_exempt: np.ndarray
     """Number of bins that belong to the echo or are masked, and so cannot raise a false alarm."""
-    leakage: np.ndarray
+    leakage_probability: np.ndarray
     """Probability that leaked signal raises at least one extra false peak, over noise alone."""
 
 
@@ -152,7 +152,7 @@ class BinSpans(NamedTuple):
     """Probability that the echo is missed, 1 - pd, accurate even where it is small."""
     peak_magnitude: np.ndarray
     """Magnitude of the largest bin without noise [V, summed over the record]."""
-    leakage: np.ndarray
+    leakage_probability: np.ndarray
     """Probability that leaked signal raises at least one extra false peak, over noise alone. A
     false peak is a group of adjacent bins above the threshold.
     """
@@ -245,8 +245,8 @@ class EvaluationSettings(NamedTuple):
     """Sum of the window's samples, the peak of its transform."""
     detection_rule: DetectionRule
     """Rule by which bins of an echo decide whether the echo is detected."""
-    node_phase_limits: np.ndarray
-    """Table of :func:`sweep.model.spectrum.lines.node_phase_limits` for the record's window. It
+    phase_span_max_table: np.ndarray
+    """Table of :func:`sweep.model.spectrum.lines.phase_span_max_table` for the record's window. It
     gives the number of equivalent lines that replace all lines.
     """
     bin_tangents: np.ndarray
@@ -283,7 +283,7 @@ def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> SegmentResul
                 spans.peak_is_searched[s], frequency, np.nan
             )
             results.n_exempt[s, spans.point_numbers] = spans.n_exempt[s]
-            results.leakage[s, spans.point_numbers] = spans.leakage[s]
+            results.leakage_probability[s, spans.point_numbers] = spans.leakage_probability[s]
     return results
 
 
@@ -392,7 +392,7 @@ def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
         n_bins=np.where(lacks_echo, 0, spans.n_bins),
         peak_index=np.where(lacks_echo, 0, spans.peak_index),
         n_exempt=np.where(lacks_echo, 0, spans.n_exempt),
-        leakage=np.where(lacks_echo, 0.0, spans.leakage),
+        leakage_probability=np.where(lacks_echo, 0.0, spans.leakage_probability),
         peak_is_searched=spans.peak_is_searched & ~lacks_echo,
     )
 
@@ -406,9 +406,11 @@ def _apply_looks_to_leakage(shots: Shots, spans: BinSpans) -> BinSpans:
         np.broadcast_to(value, shots.size)[spans.point_numbers]
         for value in (shots.negligible_signal_ratio, shots.bin_noise_sigma, shots.threshold)
     )
-    leakage_in_looks, looks = spans.leakage.copy(), shots.looks
+    leakage_in_looks, looks = spans.leakage_probability.copy(), shots.looks
     for s, column in (
-        np.argwhere(spans.n_bins > 0) if shots.detection_settings.includes_leakage else ()
+        np.argwhere(spans.n_bins > 0)
+        if shots.detection_settings.leakage_raises_false_alarms
+        else ()
     ):
         if not shots.waveform_segments[s].evaluates_leakage:
             continue
@@ -429,7 +431,7 @@ def _apply_looks_to_leakage(shots: Shots, spans: BinSpans) -> BinSpans:
         is_counted = ~is_exempt & (signal >= signal_ratio_min)
         root_powers, crossing_probabilities = np.sqrt(powers), np.zeros((powers.size, signal.size))
         crossing_probabilities[:, is_counted] = np.minimum(
-            looks.added_crossing_probability(
+            looks.crossing_probability_added_by_signal(
                 np.outer(root_powers, signal[is_counted]), threshold[column] / noise_sigma[column]
             ),
             1.0,
@@ -457,7 +459,7 @@ def _apply_looks_to_leakage(shots: Shots, spans: BinSpans) -> BinSpans:
             )
             mean_leakage += weight * any_crossing_probability(probabilities, 0, probabilities.size)
         leakage_in_looks[s, column] = mean_leakage
-    return spans._replace(leakage=leakage_in_looks)
+    return spans._replace(leakage_probability=leakage_in_looks)
 
 
 def segment_spectrum(
@@ -536,7 +538,7 @@ def _leakage_method(shots: Shots, group: LineShapeGroup, bin_by_bin: bool) -> in
     ``bin_by_bin`` excludes LEAKAGE_BY_INTEGRAL.
     """
     layout = group.tables.layout
-    if not shots.detection_settings.includes_leakage:
+    if not shots.detection_settings.leakage_raises_false_alarms:
         return NO_LEAKAGE
     is_averaged = shots.laser_line.gaussian_fwhm is not None and not shots.footprint.adds_powers
     is_averaged |= (
@@ -567,7 +569,7 @@ def _iter_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[LineSh
         shots.motion.line_drift_per_look
     )
     has_few_shapes = lines_stand_still and (
-        shots.echo_record.shares_phase_errors or not shots.echo_record.phase_errors
+        shots.echo_record.shots_share_phase_errors or not shots.echo_record.phase_errors
     )
     batch_size = 16 * POINTS_PER_BATCH if has_few_shapes else POINTS_PER_BATCH
     if not shots.echo_record.phase_errors:
@@ -605,7 +607,7 @@ def _iter_line_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[LineSh
                         fft_size,
                         adds_powers,
                         tier,
-                        shared=shots.echo_record.shares_phase_errors,
+                        shared=shots.echo_record.shots_share_phase_errors,
                     ),
                     modes.select(is_resolved),
                 )
@@ -778,7 +780,7 @@ def _find_distinct_line_shapes(shots: Shots, batch: np.ndarray) -> DistinctLineS
     first_varying = next(varying, None)
     if first_varying is None:
         return DistinctLineShapes(batch[:1], np.zeros(batch.size, np.int64))
-    if not shots.echo_record.shares_phase_errors:
+    if not shots.echo_record.shots_share_phase_errors:
         return DistinctLineShapes(batch, np.arange(batch.size))
     first_of_shape, line_shape_index = find_distinct_rows([first_varying, *varying])
     return DistinctLineShapes(batch[first_of_shape], line_shape_index)
@@ -835,7 +837,7 @@ def _evaluate_batch(
         pd=np.full(shape, np.nan),
         miss=np.full(shape, np.nan),
         peak_magnitude=np.full(shape, np.nan),
-        leakage=np.full(shape, np.nan),
+        leakage_probability=np.full(shape, np.nan),
         raised_bin_probability_max=np.repeat(1.0 * shots.has_segment[:, None], n_points, axis=1),
         span_start=np.zeros(shape, np.int64),
         magnitudes=np.empty(n_kept),
@@ -858,7 +860,7 @@ def _evaluate_batch(
             leakage_methods=leakage_methods,
             window_sum=shots.window.sum,
             detection_rule=shots.detection_rule,
-            node_phase_limits=_node_phase_limits_of_group(shots, group),
+            phase_span_max_table=_phase_span_max_table_of_group(shots, group),
             bin_tangents=bin_tangents(shots.fft_size),
         ),
         line_shape.allocate_line_shapes(tables, segments),
@@ -883,16 +885,16 @@ def _evaluate_batch(
     )
 
 
-def _node_phase_limits_of_group(shots: Shots, group: LineShapeGroup) -> np.ndarray:
+def _phase_span_max_table_of_group(shots: Shots, group: LineShapeGroup) -> np.ndarray:
     """Return the table that gives the number of equivalent lines for a group of points.
 
-    The table is that of :func:`sweep.model.spectrum.lines.node_phase_limits`, for the record's
+    The table is that of :func:`sweep.model.spectrum.lines.phase_span_max_table`, for the record's
     window. For late echoes the table is for a window with all its weight at the record's end.
     """
     if not group.has_late_echoes:
-        return shots.window.node_phase_limits(shots.footprint.adds_powers)
+        return shots.window.phase_span_max_table(shots.footprint.adds_powers)
     tolerances = POWER_TOLERANCES if shots.footprint.adds_powers else AMPLITUDE_TOLERANCES
-    return node_phase_limits((0.0, 1.0), tolerances)
+    return phase_span_max_table((0.0, 1.0), tolerances)
 
 
 @lru_cache(maxsize=4)
@@ -979,7 +981,7 @@ def _compute_equivalent_lines(
     window_sum,
     bin_error_allowed,
     threshold,
-    phase_limits,
+    phase_span_max_table,
     layout,
     workspace,
 ):
@@ -1009,8 +1011,8 @@ def _compute_equivalent_lines(
         not to be replaced.
     threshold
         Threshold on |X| [V, summed over the record].
-    phase_limits
-        :func:`sweep.model.spectrum.lines.node_phase_limits`.
+    phase_span_max_table
+        :func:`sweep.model.spectrum.lines.phase_span_max_table`.
     layout
         :class:`sweep.model.spectrum.lines.SpectrumLayout`.
     workspace
@@ -1062,7 +1064,9 @@ def _compute_equivalent_lines(
             phase_per_bin = (
                 np.pi * layout.record_length / layout.fft_size * (2.0 if adds_powers else 1.0)
             )
-            n_nodes = n_required_nodes(phase_per_bin * half_width, error_allowed, phase_limits)
+            n_nodes = n_required_nodes(
+                phase_per_bin * half_width, error_allowed, phase_span_max_table
+            )
             if 4 * n_nodes < 3 * n_lines and n_nodes <= NODES_MAX:
                 middle = 0.5 * (summary.lowest_position + summary.highest_position)
                 n_lines = replace_lines_by_nodes(
@@ -1259,11 +1263,11 @@ def _evaluate_segment(
         parameters.line_noise_sigma[point],
         threshold,
         noise_sigma,
-        parameters.side_noise_sigma[point],
+        parameters.noise_sigma_next_to_lines[point],
         PedestalShape(
             parameters.pedestal_reach_bins[point],
             parameters.pedestal_line_width_bins[point],
-            parameters.pedestal_delay_times_bin_width[point],
+            parameters.pedestal_delay_bin_width_product[point],
         ),
     )
     inputs = LeakageInputs(
@@ -1298,7 +1302,7 @@ def _evaluate_segment(
         settings.window_sum,
         bin_error_allowed,
         threshold,
-        settings.node_phase_limits,
+        settings.phase_span_max_table,
         layout,
         workspace,
     )
@@ -1331,7 +1335,7 @@ def _evaluate_segment(
             workspace,
         )
     first_bin, n_bins = detected.first_bin, detected.n_bins
-    n_exempt, leakage = detected.n_exempt, detected.leakage
+    n_exempt, leakage = detected.n_exempt, detected.leakage_probability
     raised_bin_probability_max = detected.raised_bin_probability_max
     if image_gain > 0.0:
         n_exempt = clear_image_exemptions(
@@ -1358,7 +1362,7 @@ def _evaluate_segment(
             probability = false_peak_probability_of_bins(
                 n_bins, inputs, negligible_signal_ratio, span, crossing_series
             )
-            leakage = probability.leakage
+            leakage = probability.leakage_probability
             raised_bin_probability_max = probability.raised_bin_probability_max
             if image_gain > 0.0 and rule.neighbour_crossing_quadrature.sine.size > 0:
                 leakage = any_crossing_probability_in_chain(
@@ -1369,7 +1373,7 @@ def _evaluate_segment(
     spans.first_bin[s, i], spans.n_bins[s, i] = first_bin, n_bins
     spans.peak_index[s, i], spans.n_exempt[s, i] = detected.peak_index, n_exempt
     spans.peak_magnitude[s, i] = span.magnitude[detected.peak_index]
-    spans.leakage[s, i] = leakage
+    spans.leakage_probability[s, i] = leakage
     spans.raised_bin_probability_max[s, i] = raised_bin_probability_max
     return next_start
 

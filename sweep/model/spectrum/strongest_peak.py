@@ -41,8 +41,8 @@ from sweep.model.detection.echo_detection import (
     BinThreshold,
     EchoBins,
     PdAndMiss,
-    bin_speckle_at,
-    bin_threshold_at,
+    bin_speckle_of_point,
+    bin_threshold_of_point,
     pd_and_miss,
 )
 from sweep.model.detection.marcum import marcum_q1_tails
@@ -140,7 +140,7 @@ def strongest_peak_probabilities(
         np.zeros(shots.size),
     )
     for spans in iter_spans(shots, bin_by_bin=True, computes_pd=False):
-        probabilities = _span_probabilities(shots, spans, pd)
+        probabilities = _other_peak_probabilities(shots, spans, pd)
         pd_loss[:, spans.point_numbers] = probabilities.pd_loss
         p_alarm[:, spans.point_numbers] = probabilities.p_alarm
         shared_speckle_gain[spans.point_numbers] = probabilities.shared_speckle_gain
@@ -163,7 +163,9 @@ def strongest_peak_probabilities(
     )
 
 
-def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> OtherPeakProbabilities:
+def _other_peak_probabilities(
+    shots: Shots, spans: BinSpans, pd: np.ndarray
+) -> OtherPeakProbabilities:
     """Compute the :class:`OtherPeakProbabilities` of the points of some spans.
 
     A span is a set of adjacent bins around a segment's lines. ``pd`` (3, n) is the probability that
@@ -191,7 +193,7 @@ def _span_probabilities(shots: Shots, spans: BinSpans, pd: np.ndarray) -> OtherP
         shots.bin_thresholds.select(points),
         negligible_signal_ratio,
         shots.detection_rule,
-        shots.detection_settings.includes_leakage,
+        shots.detection_settings.leakage_raises_false_alarms,
         shots.speckle_table,
         pd_loss,
         exponents,
@@ -312,7 +314,7 @@ def _evaluate_levels(
     bin_thresholds,
     negligible_signal_ratio,
     rule,
-    includes_leakage,
+    leakage_raises_false_alarms,
     speckle_table,
     pd_loss,
     exponents,
@@ -331,7 +333,7 @@ def _evaluate_levels(
         (m,): |X| over sigma below which a bin counts as noise alone.
     rule
         :class:`sweep.model.detection.echo_detection.DetectionRule`.
-    includes_leakage
+    leakage_raises_false_alarms
         True if leaked signal counts.
     speckle_table
         :class:`sweep.model.detection.echo_detection.SpeckleTable` of all points.
@@ -352,7 +354,7 @@ def _evaluate_levels(
             is_echo = spans.is_exempt[span_begin : span_begin + n_bins]
             at_threshold, bin_threshold = (
                 PdAndMiss(0.0, 1.0),
-                bin_threshold_at(bin_thresholds, j),
+                bin_threshold_of_point(bin_thresholds, j),
             )
             for k in range(levels.shape[2]):
                 level = levels[s, j, k]
@@ -365,15 +367,15 @@ def _evaluate_levels(
                             bin_threshold.line_noise_sigma,
                             level,
                             bin_threshold.noise_sigma_without_pedestal,
-                            bin_threshold.side_noise_sigma,
+                            bin_threshold.noise_sigma_next_to_lines,
                             bin_threshold.pedestal,
                         ),
-                        bin_speckle_at(speckle_table, s, spans.point_numbers[j]),
+                        bin_speckle_of_point(speckle_table, s, spans.point_numbers[j]),
                     )
                     if k == THRESHOLD_LEVEL_INDEX:
                         at_threshold = at_level
                     pd_loss[s, j, k] = pd_decrease_with_threshold(at_threshold, at_level)
-                if includes_leakage:
+                if leakage_raises_false_alarms:
                     p_leak = span_leakage_probability(
                         magnitudes,
                         is_echo,

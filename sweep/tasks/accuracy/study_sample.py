@@ -23,8 +23,8 @@ from sweep.model import evaluation, time_domain_truth
 from sweep.model.effects.catalogue import (
     EFFECT_NAMES,
     EFFECTS,
+    effect_names_in_flags,
     pack_effect_flags,
-    unpack_effect_flags,
 )
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.pointcloud.eyepoints import Eyepoints, parameters_and_ground_of_eyepoints
@@ -241,7 +241,7 @@ class StudySample(ABC):
             np.bitwise_or.reduce(self._plan_effect_flags(setting, indices).effect_flags)
             for indices in parts
         ]
-        return frozenset(unpack_effect_flags(int(np.bitwise_or.reduce(effect_flags))))
+        return frozenset(effect_names_in_flags(int(np.bitwise_or.reduce(effect_flags))))
 
     def compare_with_time_domain(
         self, setting: AccuracySetting, sample_row: int
@@ -643,7 +643,7 @@ class FlightSample(StudySample):
             flight_block,
             find_peaks or evaluation.evaluate_segments,
         )
-        yield from study.iter_simulated_groups(
+        yield from study.iter_simulated_shot_groups(
             flight_block.scanner,
             eyepoints,
             selected_effects,
@@ -728,7 +728,7 @@ def _simulate_shot_statistics(
     """
     hitting_shots, n_rays = eyepoints.has_target.nonzero()[0], eyepoints.weight.size
     shot_parameters, ground = parameters_and_ground_of_eyepoints(
-        eyepoints.select(hitting_shots), study.parameters_at(flight_block), study.surfaces
+        eyepoints.select(hitting_shots), study.parameters_at(flight_block), study.surface_materials
     )
     shots = evaluation.prepare_ray_traced_shots(
         shot_parameters, ground, effect_names, effect_flags[hitting_shots]
@@ -738,7 +738,7 @@ def _simulate_shot_statistics(
     if study.ray_error_budget is not None:
         peak_bins = peaks.frequency.T * (shots.fft_size / shots.sample_rate[:, None])
         outputs["beamlets_error"] = estimate_ray_error(
-            shots, ground.beamlets, peak_bins, peaks.magnitude.T
+            shots, ground.beamlet_table, peak_bins, peaks.magnitude.T
         )
     all_outputs = {name: np.full(shot_numbers.size, np.nan) for name in outputs}
     for name, values in outputs.items():

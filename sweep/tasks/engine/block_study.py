@@ -135,7 +135,7 @@ class BlockStudy(StoreTemplate, ABC):
     * `id`, `model_version`, `store_attributes` and `group_attributes`: identity, and attributes of
       its store. Equal ids have equal results, to the bit.
     * `grids`: how its points are cut into blocks, one grid per group of the store.
-    * `constant_arrays`: layouts of the arrays whose values are known when the store is made.
+    * `constant_array_layouts`: layouts of the arrays whose values are known when the store is made.
     * `output_layouts`: layouts of the arrays that blocks write.
     * `evaluate` and `compile_kernels`: computation of one block.
     * `supports_checkpoints` and `evaluate_until`, if blocks can stop at a deadline and be continued
@@ -154,7 +154,7 @@ class BlockStudy(StoreTemplate, ABC):
         """Grids that cut the study's points into blocks, one grid for each group of the store."""
 
     @abstractmethod
-    def constant_arrays(self) -> list[ArrayLayout]:
+    def constant_array_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of the arrays whose values are known when the store is made.
 
         Each layout holds the values of its array. Coordinates are an example.
@@ -200,7 +200,7 @@ class BlockStudy(StoreTemplate, ABC):
 
     def array_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of all arrays of the store: constant arrays, then results."""
-        return [*self.constant_arrays(), *self.output_layout_by_name.values()]
+        return [*self.constant_array_layouts(), *self.output_layout_by_name.values()]
 
     @cached_property
     def output_layout_by_name(self) -> dict[str, ArrayLayout]:
@@ -220,7 +220,7 @@ class BlockStudy(StoreTemplate, ABC):
         )
 
     @property
-    def block_nbytes_max(self) -> int:
+    def largest_block_nbytes(self) -> int:
         """Size of the results of the largest block, before compression [bytes]."""
         nbytes_by_group = dict.fromkeys(self._grid_by_group, 0)
         for layout in self.output_layout_by_name.values():

@@ -251,7 +251,7 @@ def read_last_run(store_path: Location) -> LastRun:
     )
 
 
-def write_recipe(store_path: Location, **facts: Any) -> None:
+def write_store_recipe(store_path: Location, **facts: Any) -> None:
     """Replace a store's recipe, the file of facts about how the store is made, in one step.
 
     ``facts`` are all entries of the new recipe, such as the folder of the study's files.
@@ -259,7 +259,7 @@ def write_recipe(store_path: Location, **facts: Any) -> None:
     atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_log_record(facts))
 
 
-def read_recipe(store_path: Location) -> dict[str, Any]:
+def read_store_recipe(store_path: Location) -> dict[str, Any]:
     """Return the entries of a store's recipe, by name; {} if the recipe is missing or damaged.
 
     The recipe is the file of facts about how the store is made.
@@ -270,11 +270,11 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
 
 def remove_predecessors_from_recipe(store_path: Path) -> None:
     """Remove, from a store's recipe, the entries that name the store it extends or replaces."""
-    facts = read_recipe(store_path)
+    facts = read_store_recipe(store_path)
     for name in (EXTENDED_STORE_KEY, REPLACED_STUDY_ID_KEY):
         facts.pop(name, None)
     if facts:
-        write_recipe(store_path, **facts)
+        write_store_recipe(store_path, **facts)
     else:
         (store_path / JOURNAL_DIR / RECIPE_FILE).unlink(missing_ok=True)
 
@@ -593,7 +593,7 @@ _released_tokens: set[str] = set()
 A released lock may still be in its store, if the store could not be reached on release.
 """
 
-_issued_warnings: set[str] = set()
+_issued_warning_kinds: set[str] = set()
 """Kinds of lock warnings that this process has issued.
 
 A study may have many locks, but each kind of warning is issued only once.
@@ -879,8 +879,8 @@ def _read_lock_file(lock_path: Path) -> str | None:
 
 def _warn_once(say: Callable[[str], None], kind: str, warning: str) -> None:
     """Pass a warning to `say`, unless this process has already issued one of the same kind."""
-    if kind not in _issued_warnings:
-        _issued_warnings.add(kind)
+    if kind not in _issued_warning_kinds:
+        _issued_warning_kinds.add(kind)
         say(f"warning: {warning}")
 
 

@@ -76,7 +76,11 @@ from sweep.tasks.engine.worker import (
     run_in_threads,
     run_serial,
 )
-from sweep.tasks.engine.worker_memory import WorkerMemory, process_memory, worker_memory
+from sweep.tasks.engine.worker_memory import (
+    WorkerMemory,
+    available_process_memory,
+    available_worker_memory,
+)
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -337,7 +341,9 @@ class ComputeBackend(ExitStack):
         self.interrupts = InterruptHandler(self.progress)
         self._cluster, self._workload = options.resolve_cluster(workload), workload
         self.memory = (
-            process_memory() if self.is_in_process else worker_memory(options.client, self._cluster)
+            available_process_memory()
+            if self.is_in_process
+            else available_worker_memory(options.client, self._cluster)
         )
         self.bytes_per_thread = 0.0
         """Memory that a thread of this process needs to compute a block [bytes].
@@ -405,7 +411,7 @@ class ComputeBackend(ExitStack):
                     )
                 )
                 if self.uses_running_scheduler:  # the memory of its workers is known from here on
-                    self.check_memory(worker_memory(self._connection.client, None))
+                    self.check_memory(available_worker_memory(self._connection.client, None))
             elif client.asynchronous:
                 raise ClusterError("the client is asynchronous: give one of another kind, Client()")
             else:

@@ -77,8 +77,8 @@ from sweep.tasks.engine.journal import (
     REPLACED_STUDY_ID_KEY,
     Receipt,
     StoreLock,
-    read_recipe,
-    write_recipe,
+    read_store_recipe,
+    write_store_recipe,
 )
 from sweep.tasks.engine.progress import StoreBusyError, StoreError
 
@@ -154,7 +154,7 @@ def _build_store(
     """Create a store without results on disk, with its recipe (facts about how it is made)."""
     build_template(store_path, template, template_attributes(template))
     if recipe:
-        write_recipe(store_path, **recipe)
+        write_store_recipe(store_path, **recipe)
 
 
 def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
@@ -332,7 +332,7 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
     return content + google_crc32c.value(content).to_bytes(4, "little")
 
 
-class BlockDigest(NamedTuple):
+class WrittenBlock(NamedTuple):
     """Digest and size [bytes] of a stored block."""
 
     digest: str  # digest of the bytes and their paths, by `contents_digest`
@@ -345,7 +345,7 @@ class BlockWriter:
     def __init__(self, store_path: str | Location, study: BlockStudy) -> None:
         self.store_path, self.study = parse_location(store_path), study
 
-    def write(self, block: int, results: Mapping[str, np.ndarray]) -> BlockDigest:
+    def write(self, block: int, results: Mapping[str, np.ndarray]) -> WrittenBlock:
         """Write all chunks of one block. Return the digest and the size of the block.
 
         `results` has the values of the block's chunk of each array, by array name. ValueError is
@@ -391,7 +391,7 @@ class BlockWriter:
             n_bytes,
             time.monotonic() - started_at,
         )
-        return BlockDigest(contents_digest(chunk_contents), n_bytes)
+        return WrittenBlock(contents_digest(chunk_contents), n_bytes)
 
 
 def chunk_names_of_block(study: BlockStudy, block: int) -> list[str]:
@@ -739,7 +739,7 @@ def find_pending_replacement(store_path: Location) -> Path | None:
         or not (staging_path := staging_path_for(store_path)).exists()
     ):
         return None
-    if read_recipe(staging_path).get(REPLACED_STUDY_ID_KEY) != store_format.read_study_id(
+    if read_store_recipe(staging_path).get(REPLACED_STUDY_ID_KEY) != store_format.read_study_id(
         store_path
     ):
         situation = "holds another study now" if store_path.exists() else "is gone"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 #: Amount of memory that is assumed to be available everywhere [bytes]; the program itself takes as
 #: much. For smaller needs the memory limit is not read, as this imports Dask, which takes longer
 #: than a small study.
-ALWAYS_AVAILABLE_BYTES = 6e8
+ALWAYS_AVAILABLE_MEMORY_BYTES = 6e8
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class WorkerMemory:
 
     def suffices_for(self, bytes_needed: float) -> bool:
         """Return True if the process may use `bytes_needed` of memory [bytes]."""
-        return bytes_needed < ALWAYS_AVAILABLE_BYTES or bytes_needed <= self.bytes_max
+        return bytes_needed < ALWAYS_AVAILABLE_MEMORY_BYTES or bytes_needed <= self.bytes_max
 
 
-def process_memory() -> WorkerMemory:
+def available_process_memory() -> WorkerMemory:
     """Return the memory that this process may use to compute blocks."""
 
     def machine_limit() -> float:
@@ -54,7 +54,9 @@ def process_memory() -> WorkerMemory:
     return WorkerMemory(machine_limit, "this machine")
 
 
-def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
+def available_worker_memory(
+    client: Client | None, cluster: AnyClusterConfig | None
+) -> WorkerMemory:
     """Return the memory of the smallest worker of a Dask client, or of a cluster to be started.
 
     The cluster counts only if `client` is None. The memory limit is read when it is first needed.

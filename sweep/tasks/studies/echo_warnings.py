@@ -634,7 +634,7 @@ def _diagnose_flight_echoes(study: FlightStudy) -> EchoDiagnosis:
             parameters = PARAMETER_DEFAULTS | dict(study.parameters_at(flight_block))
             hitting_eyepoints = eyepoints_of_sample.select(hitting_shots)
             shot_parameters, _ = parameters_and_ground_of_eyepoints(
-                hitting_eyepoints, parameters, study.surfaces
+                hitting_eyepoints, parameters, study.surface_materials
             )
             diagnoses.append(
                 diagnose_echoes(shot_parameters, FootprintSpreads.from_eyepoints(hitting_eyepoints))

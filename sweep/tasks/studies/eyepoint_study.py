@@ -148,7 +148,7 @@ class EyepointStudy(BlockStudy):
             "shots_a_cycle": self.shots_per_cycle,
         }
 
-    def constant_arrays(self) -> list[ArrayLayout]:
+    def constant_array_layouts(self) -> list[ArrayLayout]:
         """Return a list with the layout of the only array known before rays are cast.
 
         The array holds the power fractions of the beamlets.
@@ -241,7 +241,7 @@ class EyepointStudy(BlockStudy):
             np.unique(self.shot_numbers_of_sampled_tiles(n_tiles) // self.shots_per_cycle)
         )
 
-    def shot_numbers_of_spread_cycles(self, n_cycles: int) -> np.ndarray:
+    def shot_numbers_of_evenly_spaced_cycles(self, n_cycles: int) -> np.ndarray:
         """Return the numbers of all shots in `n_cycles` cycles spread evenly over the flight.
 
         A single cycle is the one in the middle of the flight.

@@ -183,7 +183,7 @@ class ScannerBlockGrid(ParameterGrid, BlockGrid):
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
 
     @property
-    def has_navigation_solution(self) -> bool:
+    def can_solve_navigation(self) -> bool:
         """True if a measurement cycle has enough shots to compute a velocity vector."""
         return self.shots_per_cycle >= NAVIGATION_SHOTS_PER_CYCLE_MIN
 
@@ -314,7 +314,7 @@ class FlightStudy(ExtendableStudy):
             "title": self.spec.title,
             "question": self.spec.question,
             "spec": self.spec.to_json(),
-            "surfaces": [surface.name for surface in self.surfaces],
+            "surfaces": [surface.name for surface in self.surface_materials],
             "scanners": list(self.spec.scanners),
             "origin": np.asarray(get_built_scene(self.spec).origin, float).tolist(),
             "projection": scene_projection_wkt(self.spec.scene, self.spec.files),
@@ -339,7 +339,7 @@ class FlightStudy(ExtendableStudy):
             for scanner, scanner_grid in self.scanner_grids.items()
         } | {TERRAIN_MAP_GROUP: {}}
 
-    def constant_arrays(self) -> list[ArrayLayout]:
+    def constant_array_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of the arrays known in advance: map of heights, and axis coordinates.
 
         The axis coordinates are repeated in the group of each scanner.
@@ -366,7 +366,7 @@ class FlightStudy(ExtendableStudy):
                 | POINT_CLOUD_VARIABLES
             )
             outputs = (
-                outputs | NAVIGATION_VARIABLES if scanner_grid.has_navigation_solution else outputs
+                outputs | NAVIGATION_VARIABLES if scanner_grid.can_solve_navigation else outputs
             )
             for name, output in outputs.items():
                 dims = output.dims if name in GEOMETRY_OUTPUTS else axis_names + output.dims
@@ -465,7 +465,7 @@ class FlightStudy(ExtendableStudy):
             eyepoints,
             tile_numbers,
             self.parameters_at(flight_block),
-            self.surfaces,
+            self.surface_materials,
             modes=self.spec.effect_modes(),
             has_rotating_bodies=self.spec.has_rotating_bodies,
             rays_by_tolerance=self.spec.is_ray_number_set_by_tolerance,
@@ -495,7 +495,7 @@ class FlightStudy(ExtendableStudy):
         )
         for rows, draw_slice in _iter_shots_missing_draws(~is_reused):
             simulate_cloud = partial(self._simulate_cloud, flight_block, draw_slice)
-            for shot_rows, part_results in self.iter_simulated_groups(
+            for shot_rows, part_results in self.iter_simulated_shot_groups(
                 flight_block.scanner,
                 eyepoints,
                 selected_effects,
@@ -504,7 +504,7 @@ class FlightStudy(ExtendableStudy):
                 simulate_cloud,
             ):
                 _insert_results(results, shot_rows, draw_slice, part_results)
-        if scanner_grid.has_navigation_solution and solves_navigation:
+        if scanner_grid.can_solve_navigation and solves_navigation:
             is_missing = (~is_reused).reshape(-1, shots_per_cycle, n_draws).any(axis=1)
             for cycles, draw_slice in _iter_shots_missing_draws(np.asarray(is_missing)):
                 rows = (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel()
@@ -521,7 +521,7 @@ class FlightStudy(ExtendableStudy):
         outputs = (
             SHOT_STATISTIC_VARIABLES
             | POINT_CLOUD_VARIABLES
-            | (NAVIGATION_VARIABLES if scanner_grid.has_navigation_solution else {})
+            | (NAVIGATION_VARIABLES if scanner_grid.can_solve_navigation else {})
         )
         sizes = VECTOR_DIM_SIZES | {
             "shot": n_shots, "cycle": n_shots // scanner_grid.shots_per_cycle, "draw": n_draws,
@@ -530,7 +530,7 @@ class FlightStudy(ExtendableStudy):
         results = {name: output.empty_array(sizes) for name, output in outputs.items()}
         return ReusedCloud(np.zeros((n_shots, n_draws), bool), results)
 
-    def iter_simulated_groups(
+    def iter_simulated_shot_groups(
         self,
         scanner: str,
         eyepoints: Eyepoints,
@@ -588,7 +588,7 @@ class FlightStudy(ExtendableStudy):
         results = simulate_cloud(
             eyepoints,
             parameters=self.parameters_at(flight_block),
-            surfaces=self.surfaces,
+            surfaces=self.surface_materials,
             keys=keys,
             first_draw=first_draw,
             draws=draw_slice.stop - draw_slice.start,
@@ -720,7 +720,7 @@ class FlightStudy(ExtendableStudy):
                 for name in POINT_CLOUD_VARIABLES
             }
             _insert_results(results, shot_rows, draw_column, part_results)
-            if scanner_grid.has_navigation_solution:
+            if scanner_grid.can_solve_navigation:
                 part_results = {
                     name: source_results[name][source_cycle, source_draw]
                     for name in NAVIGATION_VARIABLES
@@ -767,7 +767,7 @@ class FlightStudy(ExtendableStudy):
         )
 
     @cached_property
-    def surfaces(self) -> tuple[SurfaceMaterial, ...]:
+    def surface_materials(self) -> tuple[SurfaceMaterial, ...]:
         """Materials of the scene's surfaces; the surface number is the index."""
         return tuple(self.spec.surface_materials())
 

@@ -28,8 +28,8 @@ from sweep.model.effects.catalogue import (
     PARAMETER_DEFAULTS,
     SEPARATE_BATCHES_MASK,
     effect_flag_attributes,
+    effect_names_in_flags,
     pack_effect_flags,
-    unpack_effect_flags,
 )
 from sweep.model.effects.catalogue import EFFECTS as EFFECT_CATALOGUE
 from sweep.model.effects.planner_inputs import PlannerInputs
@@ -40,9 +40,9 @@ from sweep.model.outputs import (
     DRAW_COUNT_OUTPUTS,
     EFFECT_VARIABLES,
     GRID_OUTPUTS,
-    N_RUNNING_SUMS,
     RUNNING_SUM_OUTPUTS,
     RUNNING_SUMS_NAME,
+    RUNNING_SUMS_ROW_LENGTH,
     SPECTRA_STUDY_OUTPUTS,
     STANDARD_ERROR_OUTPUTS,
     STRONGEST_PEAK_OUTPUTS,
@@ -169,7 +169,7 @@ class SelectedEffects(NamedTuple):
         for group_flags in np.unique(self.effect_flags):
             yield PointsWithSameEffects(
                 np.flatnonzero(self.effect_flags == group_flags),
-                unpack_effect_flags(int(group_flags)),
+                effect_names_in_flags(int(group_flags)),
             )
 
     def iter_groups_computed_together(
@@ -184,7 +184,7 @@ class SelectedEffects(NamedTuple):
         for shared_flags in np.unique(separating_flags):
             index = np.flatnonzero(separating_flags == shared_flags)
             group_flags = self.effect_flags[index]
-            effect_names = unpack_effect_flags(int(np.bitwise_or.reduce(group_flags)))
+            effect_names = effect_names_in_flags(int(np.bitwise_or.reduce(group_flags)))
             yield PointsComputedTogether(index, effect_names, group_flags)
 
 
@@ -196,7 +196,7 @@ class TileGroup(NamedTuple):
 
     group_number: int
     """Number that distinguishes the group from other groups of the grid."""
-    requested_indices: np.ndarray
+    positions_in_request: np.ndarray
     """Indices (m,) of the group's tiles in the array of tiles passed to `TileGrid.group_tiles`."""
     parameters: dict[str, ParameterValue]
     """Parameters of the tiles' points by dotted path.
@@ -219,7 +219,7 @@ class BlockTiles(NamedTuple):
 class TilePlans(NamedTuple):
     """Effects that were chosen for a batch of tiles."""
 
-    requested_indices: np.ndarray
+    positions_in_request: np.ndarray
     """Indices (m,) of the batch's tiles in the array of tiles passed to the planner."""
     effect_plan: EffectPlan
     """Choice of effects for the m tiles of the batch."""
@@ -426,15 +426,15 @@ class EffectPlanner:
                 for tile_group in self.tiles.group_tiles(tiles[batch], stride):
                     plan = self._plan_group(tile_group)
                     is_settled = (
-                        np.full(len(tile_group.requested_indices), stride == 1)
+                        np.full(len(tile_group.positions_in_request), stride == 1)
                         | plan.keeps_all_optional_effects
                     )
                     if is_settled.any():
                         yield TilePlans(
-                            batch[tile_group.requested_indices[is_settled]],
+                            batch[tile_group.positions_in_request[is_settled]],
                             plan.select(is_settled),
                         )
-                    unsettled_tiles.append(batch[tile_group.requested_indices[~is_settled]])
+                    unsettled_tiles.append(batch[tile_group.positions_in_request[~is_settled]])
             remaining_tiles = (
                 np.concatenate(unsettled_tiles) if unsettled_tiles else remaining_tiles[:0]
             )
@@ -443,7 +443,7 @@ class EffectPlanner:
         """Return the effects chosen for each tile of a group."""
         from sweep.model.effects.planning import plan_effects
 
-        parameters, n_tiles = tile_group.parameters, len(tile_group.requested_indices)
+        parameters, n_tiles = tile_group.parameters, len(tile_group.positions_in_request)
         point_axes = tuple(range(1, len(self.tiles.shape) + 1))
 
         def max_over_tile(values: np.ndarray) -> np.ndarray:
@@ -524,7 +524,7 @@ class GridStudy(ExtendableStudy):
             "coordinates": " ".join(coordinate_names),
         }
 
-    def constant_arrays(self) -> list[ArrayLayout]:
+    def constant_array_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of arrays known in advance: axis coordinates and batch sizes.
 
         A batch is a run of draws of a point whose detections are counted together.
@@ -544,7 +544,7 @@ class GridStudy(ExtendableStudy):
 
     def output_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of the arrays that blocks write: outputs of the model, and effects."""
-        sizes = {DRAW_BATCH_DIM: len(draw_batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
+        sizes = {DRAW_BATCH_DIM: len(draw_batch_sizes(self.spec)), "sum": RUNNING_SUMS_ROW_LENGTH}
         off_axes = self.spec.parameters_off_axes()
         promised_accuracy = {  # accuracy that the half-widths of intervals are compared with
             name: float(off_axes[f"accuracy.{name}"])
@@ -686,7 +686,7 @@ class GridStudy(ExtendableStudy):
             for effect in EFFECT_CATALOGUE
             if effect_modes[effect.name] != "off" and not effect.is_random
         ]
-        first_point_effects = unpack_effect_flags(
+        first_point_effects = effect_names_in_flags(
             int(self.effect_planner.select_for_block(0, np.zeros(1, np.int64)).effect_flags[0])
         )
         for effects in ({*possible_effects, *first_point_effects}, ()):
@@ -713,7 +713,7 @@ def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
     ]
 
 
-POINTS_PER_CALL_MAX = 1 << 16
+POINTS_PER_MODEL_CALL_MAX = 1 << 16
 """Largest number of points per call of the model.
 
 The number makes the overhead of calls negligible. The limit keeps memory from growing with the
@@ -858,7 +858,7 @@ def _points_per_model_call(spec: GridSpec) -> int:
     return max(
         1,
         min(
-            POINTS_PER_CALL_MAX,
+            POINTS_PER_MODEL_CALL_MAX,
             DRAW_COUNTS_PER_MODEL_CALL_MAX // max(1, len(draw_batch_sizes(spec))),
         ),
     )
@@ -964,7 +964,11 @@ def initial_running_sums(spec: GridSpec, n_points: int) -> Results:
     The result is an empty dict if the study stores no running sums.
     """
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
-    return {RUNNING_SUMS_NAME: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
+    return (
+        {RUNNING_SUMS_NAME: np.zeros((n_points, RUNNING_SUMS_ROW_LENGTH))}
+        if has_running_sums
+        else {}
+    )
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:

@@ -53,9 +53,9 @@ def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
     )
 
 
-def block_peak_bytes(study: GridStudy | FlightStudy) -> int:
+def block_peak_memory_bytes(study: GridStudy | FlightStudy) -> int:
     """Return the peak memory of a thread that computes and writes one block [bytes]."""
-    return point_memory_bytes(study.spec) + 2 * study.block_nbytes_max
+    return point_memory_bytes(study.spec) + 2 * study.largest_block_nbytes
 
 
 def scene_memory_bytes(spec: SceneSpec) -> int:
@@ -105,7 +105,7 @@ def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None
 
 def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if the results of one block need more memory than a process has."""
-    bytes_needed = 2 * study.block_nbytes_max  # the results, and their encoded copy
+    bytes_needed = 2 * study.largest_block_nbytes  # the results, and their encoded copy
     if not worker_memory.suffices_for(bytes_needed):
         rule = (
             f"makes a block take about {_gigabytes_text(bytes_needed)} of memory, "

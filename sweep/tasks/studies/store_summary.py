@@ -267,13 +267,13 @@ class ScannerRow:
 
     label: str
     """Name of the scanner, and values of the axes at the row's point, as text."""
-    n_shots: int = 0
+    n_drawn_shots: int = 0
     """Number of shots times number of draws."""
     n_shots_with_true_return: int = 0
     """Number of shots with at least one true return, summed over draws."""
     n_false_points: int = 0
     """Number of points of the point clouds that are no true returns, summed over draws."""
-    n_cycles: int = 0
+    n_drawn_cycles: int = 0
     """Number of measurement cycles times number of draws; 0 if a cycle has too few shots.
 
     A cycle needs enough shots to compute a velocity vector.
@@ -298,7 +298,7 @@ class ScannerRow:
         from sweep.model.pointcloud.pairing import TRUE_RETURN_FLAG
 
         point_flags = block_arrays["flags"]
-        self.n_shots += point_flags[..., 0].size
+        self.n_drawn_shots += point_flags[..., 0].size
         self.n_shots_with_true_return += int(
             ((point_flags & TRUE_RETURN_FLAG) > 0).any(axis=-1).sum()
         )
@@ -311,7 +311,7 @@ class ScannerRow:
             )
         if "velocity_status" in block_arrays:
             status = block_arrays["velocity_status"]
-            self.n_cycles += status.size
+            self.n_drawn_cycles += status.size
             self.n_solved_cycles += int((status <= STATUS_EXCLUDED).sum())
 
 
@@ -390,7 +390,7 @@ class AccuracyRow:
     """Number of draws, or of rays, at the worst point."""
     n_total_samples: int = 0
     """Number of draws, or of rays, at all points together."""
-    n_samples_max: int = 0
+    largest_n_samples: int = 0
     """Largest number of draws, or of rays, of any point."""
     worst_point_index: tuple[int, ...] = ()
     """Indices of the worst point in the stored array of errors, one per dimension."""
@@ -399,7 +399,7 @@ class AccuracyRow:
     _worst_excess: float = -math.inf
 
     @property
-    def excess(self) -> float:
+    def excess_over_tolerance(self) -> float:
         """Error less tolerance at the worst point; 0 if the error is within the tolerance."""
         return max(0.0, self.worst_error - self.tolerance_at_worst_point)
 
@@ -414,7 +414,7 @@ class AccuracyRow:
 
         It is nan if the tolerance is met already, and inf if the tolerance is 0.
         """
-        if not self.excess:
+        if not self.excess_over_tolerance:
             return math.nan
         if not self.tolerance_at_worst_point:
             return math.inf
@@ -440,7 +440,7 @@ class AccuracyRow:
         self.n_points += int(is_known.sum())
         self.n_points_within_tolerance += int((excess <= 0).sum() - (~is_known).sum())
         self.n_total_samples += int(samples.sum())
-        self.n_samples_max = max(self.n_samples_max, int(samples.max(initial=0)))
+        self.largest_n_samples = max(self.largest_n_samples, int(samples.max(initial=0)))
         worst = np.unravel_index(np.argmax(excess), excess.shape)
         if excess[worst] > self._worst_excess:
             self._worst_excess, self.worst_error = float(excess[worst]), float(errors[worst])
@@ -502,7 +502,7 @@ def accuracy_rows_of_rays(
             "beamlets",
             tolerance_limit,
         )
-        return [row for row in rows if row.excess]
+        return [row for row in rows if row.excess_over_tolerance]
     if not isinstance(study, FlightStudy) or not study.spec.is_ray_number_set_by_tolerance:
         return []
     reported_rows, group = [], open_verified_group(store_path)

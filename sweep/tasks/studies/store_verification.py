@@ -60,7 +60,7 @@ from sweep.tasks.engine.journal import (
     LOG_FILE_NAMES,
     RECIPE_FILE,
     committed_block_mask,
-    read_recipe,
+    read_store_recipe,
 )
 from sweep.tasks.engine.progress import Progress, StoreError, make_progress, raise_as_store_error
 from sweep.tasks.engine.study_store import (
@@ -181,7 +181,10 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
         )
     if (
         attributes["kind"] == store_format.ACCURACY_STORE_KIND
-        or (attributes["kind"] == store_format.EYEPOINTS_STORE_KIND and not read_recipe(store_path))
+        or (
+            attributes["kind"] == store_format.EYEPOINTS_STORE_KIND
+            and not read_store_recipe(store_path)
+        )
         or PACKED_ATTRIBUTE in attributes
     ):
         return None

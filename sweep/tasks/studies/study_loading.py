@@ -21,8 +21,8 @@ from sweep.messages import (
     SPEC_PLACEHOLDER,
     option_name,
     option_text,
-    shell_command,
     suggested_call,
+    sweep_shell_command,
 )
 from sweep.model import MODEL_VERSION
 from sweep.scenes.scene_files import SceneError
@@ -40,7 +40,7 @@ from sweep.tasks.engine.journal import (
     EXTENDED_STORE_KEY,
     committed_block_mask,
     read_committed_digests,
-    read_recipe,
+    read_store_recipe,
 )
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies.extendable_study import CHUNK_READ_ERRORS
@@ -78,7 +78,7 @@ def _find_reuse_source(
             source_path, attributes, MODEL_VERSION, reader="this machine"
         )
         source_spec = _read_spec(
-            source_path, read_recipe(source_path), attributes.get("spec", "{}")
+            source_path, read_store_recipe(source_path), attributes.get("spec", "{}")
         )
         if (
             type(source_spec) is not type(target_study.spec)
@@ -101,7 +101,7 @@ def read_study(store_path: Location) -> StoredStudy[AnyStudy]:
     """Return the attributes of a store, and its study; raise StoreError if it is unreadable."""
     attributes = store_format.read_attributes(store_path)
     if attributes["kind"] == store_format.ACCURACY_STORE_KIND:
-        figures_command = shell_command("figures", store_path)
+        figures_command = sweep_shell_command("figures", store_path)
         raise StoreError(
             f"{store_path} holds what accuracy costs, no study: `{figures_command}` draws it"
         )
@@ -125,7 +125,7 @@ def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
 
     StoreError is raised if the study can't be read.
     """
-    recipe = read_recipe(store_path)
+    recipe = read_store_recipe(store_path)
     if attributes["kind"] == store_format.EYEPOINTS_STORE_KIND:
         if "spec" not in recipe:
             raise StoreError(

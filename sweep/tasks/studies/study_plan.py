@@ -20,7 +20,7 @@ from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.storage.locations import Location, eyepoint_store_location
 from sweep.tasks.engine.session import RunOptions
-from sweep.tasks.engine.worker_memory import process_memory
+from sweep.tasks.engine.worker_memory import available_process_memory
 from sweep.tasks.studies.eyepoint_study import EyepointStudy, get_built_scene, terrain_map_layouts
 from sweep.tasks.studies.flight_coverage import sample_coverage
 from sweep.tasks.studies.flight_study import FlightStudy
@@ -32,7 +32,7 @@ from sweep.tasks.studies.grid_study import (
     select_parameters_of_points,
 )
 from sweep.tasks.studies.memory_limits import (
-    block_peak_bytes,
+    block_peak_memory_bytes,
     refuse_too_large_blocks,
     refuse_too_large_point,
     refuse_too_large_scene,
@@ -44,7 +44,7 @@ from sweep.tasks.studies.workload import SpecWorkload
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
-POINT_TIMING_SECONDS = 1.0
+GRID_TIMING_SECONDS = 1.0
 """Approximate duration of timing the points of a grid study [s]."""
 TIMED_BLOCKS_MAX = 16
 """Largest number of blocks of a grid whose points are timed."""
@@ -160,7 +160,7 @@ class StudyPlan:
     wall_to_cpu_time_ratio: (
         float  # wall time over processor time of this process as it planned, at least 1
     )
-    memory_bytes: (
+    process_memory_bytes: (
         int  # estimated memory of each worker, or of this process with its threads [bytes]
     )
     scanners: tuple[ScannerPlan, ...] = ()
@@ -180,7 +180,7 @@ class StudyPlan:
         )
 
     @property
-    def is_compiled(self) -> bool:
+    def are_kernels_compiled(self) -> bool:
         """True if the kernels of the study are compiled, so that its points could be timed."""
         return all(scanner_plan.n_timed_shots for scanner_plan in self.scanners)
 
@@ -214,9 +214,9 @@ def plan_study(
     start_part = TimePart(
         name="start", cpu_seconds=start_cpu if is_run_as_command() else COMMAND_START_CPU_SECONDS
     )
-    refuse_too_large_point(spec, process_memory())
+    refuse_too_large_point(spec, available_process_memory())
     study = make_study(spec, (store_path or Path("nowhere.zarr")).absolute())
-    refuse_too_large_blocks(study, process_memory())
+    refuse_too_large_blocks(study, available_process_memory())
     options = RunOptions(workers=n_workers)
     has_workers = options.resolve_cluster(SpecWorkload(spec)) is not None
     n_workers = n_workers or spec.execution.workers or options.n_threads(SpecWorkload(spec))
@@ -258,8 +258,8 @@ def plan_study(
             max(wall_seconds / cpu_seconds, 1.0), WALL_TO_CPU_TIME_RATIO_MAX
         ),
         # with the model loaded, and for each block at work its results and their encoded copy
-        memory_bytes=psutil.Process().memory_info().rss
-        + (1 if has_workers else n_parallel) * block_peak_bytes(study),
+        process_memory_bytes=psutil.Process().memory_info().rss
+        + (1 if has_workers else n_parallel) * block_peak_memory_bytes(study),
         scanners=scanners,
         mesh_reports=mesh_reports,
     )
@@ -277,7 +277,7 @@ def _plan_flight(
     terrain_map_layouts(spec)
     times.append(time.process_time())
     scene_seconds, checks_seconds = np.diff(times).tolist()
-    refuse_too_large_scene(spec, process_memory())
+    refuse_too_large_scene(spec, available_process_memory())
     if are_flight_kernels_compiled(spec):
         plan_scanner, compile_seconds = _plan_scanner, 0.0
     else:
@@ -347,7 +347,7 @@ def measure_seconds_per_point(study: GridStudy) -> float:
         points, extrapolated_seconds = (sum(column) for column in zip(*samples, strict=True))
         return TimedRound(points, (measured_seconds + extrapolated_seconds,))
 
-    timed_round = _time_growing_rounds(time_round, study.grid.n_points, POINT_TIMING_SECONDS)
+    timed_round = _time_growing_rounds(time_round, study.grid.n_points, GRID_TIMING_SECONDS)
     return timed_round.seconds_by_part[0] / timed_round.n_points
 
 
@@ -366,7 +366,7 @@ def _choose_timed_blocks(study: GridStudy) -> list[int]:
         if block not in blocks:
             _compute_timed_points(study, block, 1)
             blocks.append(block)
-        if time.process_time() - start > 2 * POINT_TIMING_SECONDS:
+        if time.process_time() - start > 2 * GRID_TIMING_SECONDS:
             break
     return blocks
 
@@ -546,7 +546,7 @@ class _ScannerTimer:
         """
         start = time.process_time()
         if self._takes_cycles:
-            shot_numbers = self._eyepoints.shot_numbers_of_spread_cycles(
+            shot_numbers = self._eyepoints.shot_numbers_of_evenly_spaced_cycles(
                 max(n_shots // self.grid.shots_per_cycle, 1)
             )
         else:

@@ -39,7 +39,7 @@ def test_the_line_is_that_of_simulated_records(leaking, segment, sign, record):
         leaking(path=40.0, further_parameters=further_parameters, range=1500.0, fft_size=2**14),
         WITH,
     )
-    scale, line = permanent_line.line_of_point(shots, 0, segment)
+    scale, line = permanent_line.permanent_line_of_point(shots, 0, segment)
     # By hand: 2 Re sqrt(P_lo P_tx / I) [A] by 7 kohm, two poles of 400 MHz, at S d / c.
     beat = -sign * 1e9 / 500e-6 * 40.0 / LIGHT
     amplitude = 2 * 1.1 * np.sqrt(1e-3 * 1.0 / ISOLATION) * 7e3 / (1 + (beat / 4e8) ** 2)
@@ -142,7 +142,7 @@ def test_skirts_raise_alarms_as_often_as_in_simulated_records(leaking, monkeypat
         reflectance=1e-12, range=2000.0,
     )  # fmt: skip
     shots = prepare_single_category(p, WITH)
-    scale, line = permanent_line.line_of_point(shots, 0, 0)
+    scale, line = permanent_line.permanent_line_of_point(shots, 0, 0)
     level, sigma = float(shots.threshold[0]), float(shots.bin_noise_sigma[0])
     rng, number, size = np.random.default_rng(8), 5_000, 2**12
     (runs,) = iter_spans(shots)

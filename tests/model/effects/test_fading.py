@@ -15,7 +15,7 @@ from sweep.model.detection.echo_detection import (
     SegmentCorrelations,
     joint_pd_in_speckle,
     pd_and_miss,
-    speckle_mixing_at,
+    speckle_mixing_of_point,
 )
 from sweep.model.detection.joint_tail import joint_tail_quadrature
 from sweep.model.detection.marcum import marcum_q1
@@ -224,7 +224,7 @@ def test_drawn_factors_have_the_correlations(near):
     number = 50_000
     far = 0.1 - 0.4j if near != 1.0 else 1.0
     fading = SegmentCorrelations(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
-    key, mixing = (np.uint64(3), np.uint64(4)), speckle_mixing_at(fading.speckle_mixing(), 0)
+    key, mixing = (np.uint64(3), np.uint64(4)), speckle_mixing_of_point(fading.speckle_mixing(), 0)
     factors = [
         speckle_factors(philox.DrawAddress(*key, draw), 0, mixing) for draw in np.arange(number)
     ]

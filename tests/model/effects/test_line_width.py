@@ -106,7 +106,7 @@ def test_the_line_is_seen_without_the_phase_of_all_the_record(name, delays, g):
     expected = line @ (np.cosh(rest) - 1) @ line
     laser = {"line_width": np.array([g / (2 * np.pi * delay)]), "delay": np.array([delay])}
     form = get_window(name, length)
-    share, in_phase = laser_line.apparent_line_and_pedestal(
+    share, in_phase = laser_line.apparent_line_and_pedestal_power(
         duration=np.array([float(length)]), window=form, **laser
     )
     np.testing.assert_allclose(share * form.sum**2, line.sum() ** 2, rtol=1e-4)

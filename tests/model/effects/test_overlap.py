@@ -323,12 +323,14 @@ def test_leakage_of_an_echo_that_begins_with_a_step_is_within_its_size(table_4_1
         plan = plan_points(planner_inputs(scene), {}, 0.0)
         leakage_bound = plan.omission_error[plan.effect_names.index("leakage")]
         spectra = evaluation.evaluate_segments(shots_of(scene))
-        extra = np.nansum(spectra.leakage, axis=0)
+        extra = np.nansum(spectra.leakage_probability, axis=0)
         assert (np.minimum(extra, 1) <= leakage_bound * (1 + 1e-9) + 1e-12).all()
         complete_record = evaluation.evaluate_segments(
             *(s for _, s in evaluation.prepare_shots(scene, DEFAULT_EFFECTS))
         )
-        assert np.nansum(spectra.leakage) > np.nansum(complete_record.leakage)
+        assert np.nansum(spectra.leakage_probability) > np.nansum(
+            complete_record.leakage_probability
+        )
         noticed += ((leakage_bound < 0.5) & (leakage_bound > 1e-9)).sum()
     assert noticed > 10
 

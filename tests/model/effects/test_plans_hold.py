@@ -104,7 +104,7 @@ def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, 
             )
             assert (np.minimum(moved, 1) <= bounds[name] + ROUNDING).all(), (name, other_effects)
             if name == "leakage":
-                extra = np.nansum(on.leakage, axis=0)
+                extra = np.nansum(on.leakage_probability, axis=0)
                 assert (np.minimum(extra, 1) <= bounds[name] * (1 + 1e-9) + 1e-12).all()
             if name == "signal_shot_noise":
                 statistics = [

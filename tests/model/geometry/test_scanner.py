@@ -71,7 +71,7 @@ def test_equal_elements_reach_the_same_angle_twice_and_are_refused():
 
 def test_cycles_take_the_patterns_in_turn_at_the_measurement_rate():
     directions, patterns = scanner.square_patterns([15 * DEGREE, 7.5 * DEGREE])
-    scan = BeamCycle(directions, patterns, rate=20.0)
+    scan = BeamCycle(directions, patterns, cycle_rate=20.0)
     shots = scan.shots(np.arange(40))
     np.testing.assert_array_equal(shots.cycle_number, np.arange(40) // 4)
     np.testing.assert_array_equal(shots.beam_number, np.concatenate([patterns.ravel()] * 3)[:40])
@@ -188,8 +188,8 @@ def test_a_raster_of_one_direction_looks_at_nadir():
         lambda: fixed_beams([[0, 0, 0]], rate=1.0),
         lambda: fixed_beams(scanner.corner_directions(0.1), rate=0.0),
         lambda: fixed_beams(scanner.corner_directions(0.1), rate=100.0, interval=3e-3),
-        lambda: BeamCycle(scanner.corner_directions(0.1), [[0, 4]], rate=1.0),
-        lambda: BeamCycle(scanner.corner_directions(0.1), [[]], rate=1.0),
+        lambda: BeamCycle(scanner.corner_directions(0.1), [[0, 4]], cycle_rate=1.0),
+        lambda: BeamCycle(scanner.corner_directions(0.1), [[]], cycle_rate=1.0),
         lambda: LineScan(2.0, line_rate=1.0, rate=1.0),
         lambda: LineScan(0.1, line_rate=0.0, rate=1.0),
         lambda: LineScan(0.1, line_rate=1.0, rate=1.0, wave="square"),
