@@ -76,10 +76,10 @@ With fewer rounds it is the ratio of the times of the fastest rounds.
 """
 
 RANDOM_ERROR_QUANTILE_LEVEL = 0.95
-"""Level, 0..1, of the quantile that serves as the error of accuracy settings with random draws.
+"""Level, 0..1, of the quantile of pd errors over points that is the error of an accuracy setting.
 
-The quantile is that of the errors of pd at all points. Where no setting draws, the error of a
-setting is the largest one at any point.
+The quantile is used if any setting of the store uses random draws. Otherwise the error of a setting
+is the maximum of its pd errors over points.
 """
 
 

@@ -197,7 +197,10 @@ class PointSelection:
         return SortedCoordinate(dim, np.asarray(self.table_by_dim[dim].index)[first_rows], values)
 
     def first_indices(self, *coordinates: SortedCoordinate) -> dict[str, int]:
-        """Return the first selected index by dimension, without dimensions of given coordinates."""
+        """Return the first selected index by dimension.
+
+        The dimensions of `coordinates` are left out.
+        """
         shown_dims = {coordinate.dim for coordinate in coordinates}
         return {
             dim: int(table.index[0])

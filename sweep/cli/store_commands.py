@@ -134,8 +134,9 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
 
     The command names every object with a flipped, missing or surplus byte: results block by block,
     metadata, coordinates, the spec, the journal, and the eyepoints of a flight. It also names files
-    and arrays that do not belong to the store. It marks damaged blocks, so that sweep resume
-    computes only these, with the same bytes as before.
+    and arrays that do not belong to the store. With or without --repair, it marks damaged
+    blocks, so that sweep resume computes only these, with the same bytes as before. --repair also
+    restores metadata, coordinates and spec.
 
     \b
       sweep verify results/range_angle.zarr

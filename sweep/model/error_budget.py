@@ -146,8 +146,9 @@ class ErrorBudget:
 
     min_rays_by_tolerance: tuple[tuple[float, int], ...] = ((1e-2, 19), (1e-5, 37), (0.0, 109))
     """Pairs (tolerance, smallest number of rays per shot of a flight). A pair applies to tolerances
-    from its own up to that of the previous pair. Estimates of the error cannot include objects that
-    no ray hits, and fewer rays miss more small objects."""
+    at or above its own and below that of the previous pair; the first pair has no upper limit.
+    Estimates of the error cannot include objects that no ray hits, and fewer rays miss more small
+    objects."""
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
     """Possible numbers of rays per shot. They fill whole shells of the lattice, whose symmetry

@@ -356,11 +356,11 @@ class FootprintExtent(NamedTuple):
     total_to_axis_echo_ratio: np.ndarray | float
     """Echo of all beamlets, divided by that of a single line on the beam's axis."""
     range_offset_moments: OffsetMoments
-    """Moments of the beamlets' relative range offsets: the range minus that on the axis, divided by
-    the range on the axis."""
+    """Moments of the beamlets' relative range offsets: range minus the range on the beam's axis,
+    over the range on the beam's axis."""
     axis_surface_range_offset_moments: OffsetMoments
-    """Moments of relative range offsets, as `range_offset_moments`, of only those beamlets that hit
-    the same surface as the axis."""
+    """Moments as in `range_offset_moments`, of only those beamlets that hit the same surface as the
+    beam's axis."""
     velocity_offset_moments: OffsetMoments
     """Moments of the beamlets' radial velocities minus that on the beam's axis [m/s]."""
     amplitude_gain_max: np.ndarray | float = 1.0
@@ -369,8 +369,8 @@ class FootprintExtent(NamedTuple):
     other_surface_echo_fraction: np.ndarray | float = 0.0
     """Fraction of the echo that comes from surfaces which the beam's axis does not hit, 0..1."""
     other_surface_range_offset_max: np.ndarray | float = 0.0
-    """Largest magnitude of the relative range offset of beamlets on surfaces that the axis does not
-    hit."""
+    """Largest magnitude of (range minus axis range, over axis range) of beamlets on surfaces that
+    the beam's axis does not hit."""
 
 
 def ray_traced_footprint_extent(ground: RayTracedGround) -> FootprintExtent:

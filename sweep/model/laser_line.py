@@ -435,7 +435,7 @@ def n_beat_phase_noise_steps(*, delay: float, length: int) -> int:
 def beat_phase_noise(
     steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
 ) -> np.ndarray:
-    """Return a random laser's phase minus its phase one delay earlier [rad], for each sample.
+    """Return a simulated laser's phase, minus its phase one delay earlier [rad], for each sample.
 
     The laser's phase theta(t) is a random walk. The result is theta(t) - theta(t - tau).
 

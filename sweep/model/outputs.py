@@ -12,7 +12,7 @@ NO_ECHO_NOTE = "nan where no light comes back"
 NO_FREE_BIN_NOTE = (
     "-inf where the detection occupies every bin, so that none is left to raise an alarm"
 )
-"""Comment stored with logarithms of false-alarm probabilities: where they are -inf."""
+"""Comment that explains where a stored logarithm of a false-alarm probability is -inf."""
 CLOSING_SIGN_NOTE = "positive when closing"
 """Comment stored with radial velocities that states which sign means closing."""
 

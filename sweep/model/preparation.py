@@ -240,8 +240,8 @@ class Shots:
     def echo_interval_in_record(self) -> dict[str, Any]:
         """``start`` and ``duration`` [s] of the part of the record with the echo, in a dict.
 
-        ``start`` counts from the segment's start. Both are (n,) or scalars. If the echo does not
-        fill the record, both are tuples by segment.
+        ``start`` counts from the segment's start. Each is a scalar or (n,). If the echo does not
+        fill the record, each is a tuple of these, by segment.
         """
         if self.echo_record.n_samples_before_echo is None:
             return {"start": self.record.acquisition_delay, "duration": self.record.duration}
@@ -270,9 +270,9 @@ class Shots:
 
     @cached_property
     def total_relative_echo(self) -> np.ndarray:
-        """Sum of the relative echoes of all beamlets [1/sr], (n,).
+        """Sum over beamlets of the echo power over `EchoScales.echo_power_scale` [1/sr], (n,).
 
-        The echo power on the detector is proportional to the sum.
+        So the echo power on the detector is this sum times `echo_power_scale`.
         """
         relative_echo = (
             self.footprint.relative_amplitude

@@ -385,7 +385,7 @@ def relative_noise_density(
 
 
 def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power transmission of a single-pole low-pass, summed over all aliases.
+    """Return a single-pole low-pass's power transmission, summed over aliases, and a derivative.
 
     Parameters
     ----------

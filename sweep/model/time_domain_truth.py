@@ -40,8 +40,7 @@ def time_domain_spectrum(
     point, segment : int
         Indices of the point and of the segment.
     with_range_walk : bool
-        True to include range walk: the drift of the frequency while the target moves, by the terms
-        of the phase in t^2.
+        True to include range walk: the drift of the frequency while the target moves.
     with_acceleration : bool
         True to include the drift of the frequency while the target's velocity changes.
     laser_phase : ndarray (L,) or float
@@ -52,7 +51,7 @@ def time_domain_spectrum(
     -------
     ndarray (n_bins,)
         |X| [V] in bins k = 0..N/2, or -N/2..N/2 - 1 of a complex record. If beamlets add as powers,
-        it is the root of the mean of |X|^2 over independent uniform phases of the beamlets.
+        it is the root-mean-square of |X| over independent, uniformly random phases of the beamlets.
     """
     w = window.window_samples(shots.window.name, shots.window.length)
     n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record

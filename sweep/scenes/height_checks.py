@@ -123,9 +123,10 @@ def _shortest_decimal_text(value: float) -> str:
 def _undeclared_no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
     """Return warnings about the smallest or largest heights of a file that may mark missing data.
 
-    A height is suspicious in two cases, by its gap to the nearest height over the span of all other
-    heights. A customary no-data value is suspicious above `_CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN`. A
-    value of several cells is suspicious above `_REPEATED_EXTREME_RELATIVE_GAP_MIN`.
+    The relative gap of a height is its distance to the nearest other height, over the span of all
+    other heights. A height is suspicious in two cases: it is a customary no-data value with a
+    relative gap above `_CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN`, or several cells have it, with a
+    relative gap above `_REPEATED_EXTREME_RELATIVE_GAP_MIN`.
     """
     warnings: list[str] = []
     low, high = -np.inf, np.inf

@@ -538,8 +538,8 @@ _GENERATOR_KEYWORD_BY_NUMPY_NAME = {
     "logspace": "log",
     "arange": "step",
 }
-"""Keyword of the generator of axis values that corresponds to a NumPy function, by the name of the
-function."""
+"""Keyword of a generator of axis values (linear, log, step), by the name of the NumPy function that
+it replaces."""
 _NUMBER_OF_VALUES_RULE = NumericRule(
     description="", example="10", at_least="2", at_most=str(AXIS_VALUES_MAX), is_integer=True
 )

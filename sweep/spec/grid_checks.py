@@ -606,7 +606,7 @@ votes."""
 
 
 def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a `Finding` for each invalid setting of several looks, the records of each segment.
+    """Yield a `Finding` for each invalid setting of several looks (records of a segment).
 
     Settings are invalid if they contradict each other, or if their detection probability is
     unknown.

@@ -527,8 +527,9 @@ class AgreementVerdict(NamedTuple):
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> AgreementVerdict:
-    """Return whether the probabilities of detection of two stores agree.
+    """Return the verdict on whether the probabilities of detection of two stores agree.
 
+    It is ``same``, ``different`` or, if no common point is computed, ``nothing``.
     ``compared_groups`` are datasets of differences, as of :func:`compute_tabulated_differences`.
     """
     n_points, n_different, noun, count_note = 0, 0, "point", ""

@@ -60,9 +60,9 @@ _TRUTH_VARIABLE_BY_COLUMN = {
 """Stored variable with true values along the beam, for each column of true values in reports."""
 
 _PERIOD_END_TOLERANCE_FRACTION = 1e-6
-"""Length of the interval at the end of a report's period whose shots count to the next period.
+"""Shots in the last part of a report's period, of this fraction of it, count to the next period.
 
-The length is a fraction of the period. The interval allows for rounding errors of times.
+This allows for rounding errors of times.
 """
 _REPORTS_PER_SHOT_MAX = 10
 """Largest number of reports per shot. A higher rate is refused: most reports would be empty."""

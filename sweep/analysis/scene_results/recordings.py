@@ -488,7 +488,7 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
 
 
 def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:
-    """Return the position along a study's axes with a given index along each axis, in order."""
+    """Return the axis position with the indices `value_numbers`, in the order of `spec.axes`."""
     axis_indices = {
         axis.name: number for axis, number in zip(spec.axes, value_numbers, strict=True)
     }

@@ -224,7 +224,7 @@ class PedestalShape(NamedTuple):
 
 
 NO_PEDESTAL = PedestalShape(0.0, 0.0, 0.0)
-"""Shape of a laser without phase noise, whose lines have no pedestal."""
+"""Pedestal shape of a laser without phase noise: no pedestal."""
 
 
 class BinThreshold(NamedTuple):

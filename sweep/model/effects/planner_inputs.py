@@ -197,7 +197,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def footprint_full_angles(self) -> beam.FootprintAngles:
-        """Full angles of the beam that the footprint covers [rad]."""
+        """Full 1/e^2 angles that the effective footprint subtends at the instrument [rad]."""
         return beam.footprint_full_angles(self.parameters)
 
     @cached_property

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 RESIDUAL_MAX_OVER_SPAN = 1e-3
-"""Largest allowed departure of a Chebyshev series from the table that it fits, over the table's
-largest less its smallest value."""
+"""Largest allowed departure of a Chebyshev series from the table that it fits, as a fraction
+of the table's span (largest minus smallest value)."""
 CHEBYSHEV_DEGREE_MAX = 64
 """Largest degree of the Chebyshev series that is fitted to a table of frequency errors."""
 

@@ -63,7 +63,7 @@ _BUNDLE_TRIANGLE_TESTS_MAX = np.int64(128)
 """Largest number of triangles that are tested against a whole bundle of rays. If more tests are
 needed, each ray of the bundle traverses the tree alone."""
 _UNLIMITED_TRIANGLE_TESTS = np.int64(1 << 62)
-"""Number of triangle tests passed for a traversal without a limit; no traversal reaches it."""
+"""Limit on triangle tests, given to a traversal that has none; no traversal reaches it."""
 
 _X, _Y, _Z = range(3)
 """Indices of the coordinate axes."""

@@ -408,7 +408,7 @@ def fading_group_of_bins(
     shots : Shots
         Prepared shots.
     groups : BinGroups
-        Groups of adjacent bins above the threshold, without noise: the echoes.
+        Groups of adjacent bins whose noiseless magnitude exceeds the threshold: the echoes.
     points : ndarray (m,) int64
         Indices of the points of ``spectra``.
     spectra : NoiselessSpectra
@@ -439,7 +439,7 @@ def bins_without_noise_peaks(
     shots : Shots
         Prepared shots.
     groups : BinGroups
-        Groups of adjacent bins above the threshold, without noise: the echoes.
+        Groups of adjacent bins whose noiseless magnitude exceeds the threshold: the echoes.
     points : ndarray (m,) int64
         Indices of the points of ``spectra``.
     spectra : NoiselessSpectra
@@ -471,7 +471,7 @@ def iter_leakage_bins(
     shots : Shots
         Prepared shots.
     groups : BinGroups
-        Groups of adjacent bins above the threshold, without noise: the echoes.
+        Groups of adjacent bins whose noiseless magnitude exceeds the threshold: the echoes.
     points : ndarray (m,) int64
         Indices of the points that may have such bins (:func:`find_leaking_points`).
     has_raised_bin : ndarray (n, 3) bool, optional
@@ -513,7 +513,7 @@ def iter_leakage_bins(
 def find_groups_and_leakage_bins(
     shots: Shots, groups_max: int
 ) -> tuple[BinGroups, list[tuple[np.ndarray, LeakageBins]]]:
-    """Find groups of bins and bins of leaked signal together, for echoes in developed speckle.
+    """Find both bin groups and leaked-signal bins in one search, for echoes in developed speckle.
 
     Shots with a search band or a line of leaked light need two separate searches instead
     (:func:`sweep.model.pointcloud.bin_groups.list_bin_groups`, :func:`iter_leakage_bins`).
@@ -528,7 +528,7 @@ def find_groups_and_leakage_bins(
     Returns
     -------
     groups : BinGroups
-        Groups of adjacent bins above the threshold, without noise, of all points
+        Groups of adjacent bins whose noiseless magnitude exceeds the threshold, of all points
         (:class:`sweep.model.pointcloud.bin_groups.BinGroups`). The field ``leakage_probability`` is
         a mean over speckle.
     leakage_bins_by_part : list of tuple
@@ -1140,8 +1140,8 @@ def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
     """Add the crossing rates of a bin, at the nodes of speckle power, to ``rate_sums``, in place.
 
     ``log_amplitude`` is ln(|X| / sigma) at mean power, and ``rate_table`` the table from which
-    ``quadrature`` was made. Only the last nodes, as many as ``rate_sums`` has, are evaluated. Rates
-    are interpolated by cubic polynomials.
+    ``quadrature`` was made. Only the nodes of highest speckle power are evaluated, as many as
+    ``rate_sums`` has elements. Rates are interpolated by cubic polynomials.
     """
     log_amplitude_above_first = log_amplitude - rate_table.first_log_amplitude
     power_fraction, table_position = (
@@ -1197,11 +1197,13 @@ def _add_rates_at_nodes(log_amplitude, rate_table, quadrature, rate_sums):
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_probability_from_rates(rate_sums, weights):
-    """Return the mean over speckle of the probability 1 - exp(-R) that any bin is raised.
+    """Return the mean over speckle of the probability of leakage, 1 - exp(-R).
 
-    R is the sum of the bins' crossing rates. ``rate_sums`` holds R at the last nodes of speckle
-    power. Below the first of these nodes, terms of the mean are continued as a geometric series.
-    The terms are proportional to the speckle power if all draws leak, else to its square.
+    This is the probability that leaked signal lifts at least one bin above the threshold. R is the
+    sum of the bins' crossing rates. ``rate_sums`` holds R at the nodes of highest speckle power.
+    Below the lowest of these nodes, terms of the mean are continued as a geometric series. If all
+    draws leak (R is large even there), the terms are proportional to the speckle power. If R is
+    small, it is proportional to the speckle power too, and the terms to its square.
     """
     mean, lowest_term, next_term = 0.0, 0.0, 0.0
     for i in range(rate_sums.size - 1, -1, -1):
@@ -1244,8 +1246,9 @@ def _compute_separate_peak_rates(
     is_evaluated
         (bins,) bool: True for bins that were evaluated before.
     separate_peak_rates
-        Result: rates -ln(1 - p) at the last nodes of speckle power. p is the probability of a peak
-        that does not join the echo, in the bin ``bin_index`` or in bins farther from the echo.
+        Result: rates -ln(1 - p) at the nodes of highest speckle power. p is the probability of
+        a peak that does not join the echo, in the bin ``bin_index`` or in bins farther from the
+        echo.
 
     Returns
     -------

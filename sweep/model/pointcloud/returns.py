@@ -204,7 +204,7 @@ class PeakLists(NamedTuple):
     """Peaks of the three segments in one draw, as they are detected."""
 
     peaks: Peaks
-    """(3, peaks) in each field: peaks of the up, Doppler and down segment."""
+    """Peaks by segment. Each field of :class:`Peaks` is (3, peaks): up, Doppler, down."""
     group: np.ndarray
     """(3, peaks) int64: index of the echo (group of adjacent bins) to which each peak belongs, or
     FALSE_PEAK_GROUP."""
@@ -252,8 +252,8 @@ class Returns(NamedTuple):
     """Measured power of the weaker of the up and down peak, divided by the mean noise power of a
     bin."""
     pd: np.ndarray
-    """Probability that the up and the down segment both detect the echo of the return; nan if one
-    of its peaks is false."""
+    """Probability that the up and the down segment both detect the echo of the return; nan if a
+    peak of the return is a false alarm."""
     flags: np.ndarray
     """uint8: bits that compare the return with the truth
     (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
@@ -1682,18 +1682,18 @@ class GroupSpeckle(NamedTuple):
     """(groups, 3, bins): root mean square over speckle of the echo's |X| in each bin, over sigma,
     the noise of a bin per quadrature."""
     amplitudes: np.ndarray
-    """(groups, looks, 3, bins) complex: speckle, of mean power 1, by which each bin of an echo is
-    multiplied in each look (record of a segment). If all looks have the same speckle, the axis has
-    one look."""
+    """(groups, looks, 3 segments, bins) complex: speckle, of mean power 1, by which each bin of an
+    echo is multiplied in each look (record of a segment). If all looks have the same speckle, the
+    axis has one look."""
     covariance_factor_rank: np.ndarray
     """(groups,) int64: number of rows of ``covariance_factor`` in use; 0 if the speckle of the echo
-    is summed over the lines of the footprint instead."""
+    is not drawn by the factor, but summed over the lines of the footprint."""
     covariance_factor: np.ndarray
     """(groups, rows, 3, bins) complex: factor of the covariance of the bins' speckle. It makes the
     speckle from few random numbers, one for each row."""
     independent_amplitudes: np.ndarray
-    """(sets, 3, bins) complex: independent sets of speckle in one draw, by segment and bin. They
-    are mixed into the partly correlated speckle of the looks (records of a segment)."""
+    """(sets, 3 segments, bins) complex: independent sets of speckle in one draw. They are
+    mixed into the partly correlated speckle of the looks (records of a segment)."""
     detection_amplitude_weights: np.ndarray
     """(groups, 3, bins): weights that sum the bins' speckle to one amplitude of mean power 1. This
     amplitude is compared with the probability of detection."""
@@ -1887,7 +1887,8 @@ def fill_detection_amplitude_weights(
     mean_power : ndarray (groups, 3, bins)
         Mean power of each bin over speckle, for lines of the total power 1.
     covariance_factor_rank : ndarray (groups,) int64
-        Number of rows of ``covariance_factor`` in use; 0 if the speckle is summed over lines.
+        Number of rows of ``covariance_factor`` in use; 0 if speckle is not drawn by the factor, but
+        summed over lines.
     covariance_factor : ndarray (groups, rows, 3, bins) complex
         Factor of the covariance of the bins' speckle.
     weights : ndarray (bins,)
@@ -1987,9 +1988,9 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
     ----------
     covariance_root : ndarray (3, looks, sets) complex
         Coefficients of each independent set in each look, by segment.
-    independent_amplitudes : ndarray (sets, 3, bins) complex
+    independent_amplitudes : ndarray (sets, 3 segments, bins) complex
         Independent sets of speckle, of mean power 1.
-    look_amplitudes : ndarray (looks, 3, bins) complex
+    look_amplitudes : ndarray (looks, 3 segments, bins) complex
         Result: speckle in each look.
     """
     look_amplitudes[:] = 0.0

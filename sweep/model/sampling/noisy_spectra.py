@@ -925,7 +925,7 @@ class PointSpectra(NamedTuple):
         return self.signal_cache[segment, look]
 
     def echo_indices(self, segment: int) -> np.ndarray:
-        """Return the indices of the echoes' strongest bins in a segment.
+        """Return the index of each echo's strongest bin in a segment, if there are several echoes.
 
         The result is empty for a shot with a single echo.
         """

@@ -200,9 +200,11 @@ class LineSpectrumWorkspace(NamedTuple):
     line_scratch: LineScratch
     """Scratch arrays for sums over lines."""
     cell_re: np.ndarray
-    """Real part of the weights in the table cells over which lines are spread."""
+    """Real part of the sum of line weights in each table cell, after the lines are spread over
+    cells."""
     cell_im: np.ndarray
-    """Imaginary part of the weights in the table cells over which lines are spread."""
+    """Imaginary part of the sum of line weights in each table cell, after the lines are spread over
+    cells."""
     record_end_amplitudes: RecordEndAmplitudes
     """Amplitudes of the segment's lines at the record's start and end."""
     far_equivalent_lines: RecordEndAmplitudes

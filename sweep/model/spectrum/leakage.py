@@ -80,9 +80,11 @@ INTEGRAL_END_CORRECTION_BINS = 3
 correction of that end is computed."""
 
 LAST_END_CORRECTION_FRACTION_MAX = 1e-7
-"""Largest accepted value of the last end correction of the integral over bins, relative to the
-whole leakage. Leakage is the probability of false alarms due to the echo's signal far from its
-lines.
+"""Largest accepted size of the last term of the Euler-Maclaurin correction at the integral's near
+end, relative to the whole leakage.
+
+The integral over bins stands for a sum over them. Leakage is the probability of false alarms due to
+the echo's signal far from its lines.
 """
 
 GAUSS_POINTS_MAX = 200
@@ -172,7 +174,7 @@ class LeakageResult(NamedTuple):
 
 
 class EnvelopeTail(NamedTuple):
-    """Bounds on the spectrum of a line of amplitude 1, at a given distance or farther."""
+    """Bounds on a line's spectrum in bins a given distance or more away, for the amplitude 1."""
 
     magnitude: float
     """Largest magnitude of the line's spectrum at the given distance or farther."""
@@ -815,7 +817,7 @@ def _far_leakage_bound(weight_sum, distance_min, image_distance, inputs, envelop
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _envelope_tail(distance_min, envelope):
-    """Return the :class:`EnvelopeTail` of a line at ``distance_min`` [bins] or farther."""
+    """Return bounds on a line's spectrum in bins ``distance_min`` or more [bins] away from it."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
     return EnvelopeTail(magnitude, magnitude * magnitude + envelope.square_integral[index])

@@ -101,8 +101,8 @@ END_DERIVATIVE_ORDER_MAX = 12
 line is computed."""
 
 N_END_POLYNOMIAL_COEFFICIENTS = END_DERIVATIVE_ORDER_MAX + 2
-"""Number of coefficients of an end polynomial. Two end polynomials, one of the record's start and
-one of its end, give a line's spectrum far from the line."""
+"""Number of coefficients of each of two polynomials that give a line's spectrum far from the line.
+One follows from the start of the record, the other from its end (:class:`EndPolynomials`)."""
 
 MODE_COEFFICIENT_MIN = 1e-13
 """Smallest Chebyshev coefficient of a phase error's phasor that counts as a mode. The last modes
@@ -277,22 +277,24 @@ class LineShapeTables(NamedTuple):
     cotangent_at_envelope_distance: np.ndarray
     """(m,): cot(pi d / N) of each ``envelope_distance`` d, with the FFT size N."""
     full_table_re: np.ndarray
-    """(segments, cells * columns): :attr:`LineShape.table_re` of tables that hold all bins;
-    otherwise empty.
+    """(segments, cells * columns): :attr:`LineShape.table_re` of each segment's line shape, if the
+    tables hold all bins; otherwise empty.
     """
     full_table_im: np.ndarray
-    """(segments, cells * columns): :attr:`LineShape.table_im` of tables that hold all bins; else
-    empty.
+    """(segments, cells * columns): :attr:`LineShape.table_im` of each segment's line shape, if the
+    tables hold all bins; otherwise empty.
     """
     full_envelope: LineEnvelope
-    """(segments, m): envelopes of line shapes whose tables hold all bins; else empty."""
+    """(segments, m): envelope of each segment's line shape, if the tables hold all bins; otherwise
+    empty."""
     echo_lengths: np.ndarray
     """(segments, shapes) int64: number of samples of the echo, for late echoes with mode sums. The
     array is empty for other tables. A late echo fills only the last samples of its record.
     """
     taylor_coefficients: np.ndarray
-    """(modes, END_DERIVATIVE_ORDER_MAX + 1): Taylor coefficients of late echoes' modes at the
-    record's end. The array is empty for other tables."""
+    """(modes, END_DERIVATIVE_ORDER_MAX + 1): Taylor coefficients, about the time at which the
+    record ends, of each mode of late echoes times the window. The array is empty for other tables.
+    """
 
 
 _NO_END_POLYNOMIALS = EndPolynomials(*(np.empty((0, 1)) for _ in EndPolynomials._fields))

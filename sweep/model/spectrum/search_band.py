@@ -123,10 +123,11 @@ def search_band_of_points(
 def _bins_of_beat_interval(
     beat_min: np.ndarray, beat_max: np.ndarray, fft_size: int, is_complex: bool
 ) -> SearchBand:
-    """Return the bins nearest to beats in an interval, as whole floating-point numbers.
+    """Return the :class:`SearchBand` of the bins nearest to the beats in an interval.
 
-    The interval is ``beat_min`` to ``beat_max`` [bins]. ``is_complex`` is true for complex records,
-    whose bins have signed frequencies.
+    Its first bin and its number of bins are whole floating-point numbers; its third field is the
+    FFT size of a complex record, or 0. The interval is ``beat_min`` to ``beat_max`` [bins].
+    ``is_complex`` is true for complex records, whose bins have signed frequencies.
     """
     if is_complex:
         first_bin, last_bin = np.floor(beat_min + 0.5), np.floor(beat_max + 0.5)

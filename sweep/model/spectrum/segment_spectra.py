@@ -813,13 +813,13 @@ def _evaluate_batch(
     leakage_methods: np.ndarray,
     batch_begin: int,
 ) -> BinSpans:
-    """Compute the spectra around the lines for the next batch of points of a group.
+    """Compute the spectra around the lines for the next batch of a group. Return `BinSpans`.
 
     The batch begins with the group's point number ``batch_begin``. It has as many points as fit
     into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
-    shapes. ``parameters`` and ``parameters_by_segment`` are those of all n points.
-    ``lowest_levels`` (3, n) are the magnitudes [V] below which bins may be left out, and
-    ``leakage_methods`` (3,) the methods for the leakage of the segments.
+    shapes. ``parameters`` and ``parameters_by_segment`` hold the values of all n points of
+    the shots, not only of the batch. ``lowest_levels`` (3, n) are the magnitudes [V] below which
+    bins may be left out, and ``leakage_methods`` (3,) the methods for the leakage of the segments.
     """
     points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
     segments, n_points = len(shots.waveform_segments), points.size
@@ -1411,9 +1411,9 @@ def _evaluate_points(
     rate_arrays,
     spans,
 ):
-    """Compute the bins around the lines of m points (spans), as many as fit into memory.
+    """Compute the bins around the lines (span) of the first of m points, until memory is full.
 
-    The result is the number of points whose bins fit.
+    The result is the number of points that are done. Memory is the size of the arrays in ``spans``.
 
     Parameters
     ----------

@@ -430,10 +430,10 @@ class ComputeBackend(ExitStack):
         block_queue: BlockQueue,
         verify_receipt: ReceiptVerifier,
     ) -> Iterator[TaskResult]:
-        """Compute the blocks of a queue. Return an iterator over the results of tasks.
+        """Compute the blocks of a queue. Return an iterator over `TaskResult` objects.
 
-        `verify_receipt` returns True if the block of a receipt is in the store as this process sees
-        it.
+        A receipt is the record of a committed block. `verify_receipt` returns True if that block is
+        in the store as this process sees it.
         """
         options = self.options
         settings = TaskSettings(
@@ -755,7 +755,7 @@ class Session:
         gc.set_threshold(*gc_threshold)
 
     def _consume_results(self, task_results: Iterator[TaskResult], block_queue: BlockQueue) -> str:
-        """Commit results of tasks as they arrive. Return the reason for stopping early, or ''."""
+        """Commit each `TaskResult` as it arrives. Return the reason for stopping early, or ''."""
         no_worker_monitor = NoWorkerMonitor()
         for task_result in task_results:
             if not self._lock.is_held_by_this_process():

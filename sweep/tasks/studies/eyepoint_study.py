@@ -126,7 +126,7 @@ class EyepointStudy(BlockStudy):
 
     @property
     def n_rays(self) -> int:
-        """Number of rays of all shots: one per beamlet of a shot, and one down per cycle."""
+        """Number of rays: one per beamlet of each shot, plus one straight down per cycle."""
         return self.count_rays(self.n_points)
 
     def count_rays(self, n_shots: int) -> int:

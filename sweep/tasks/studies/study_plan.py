@@ -383,7 +383,9 @@ class TimedRound(NamedTuple):
 def _time_growing_rounds(
     time_round: Callable[[int], TimedRound], n_points_max: int, seconds_max: float
 ) -> TimedRound:
-    """Call `time_round` with rising numbers, until a round is long enough. Return that round.
+    """Call `time_round` with rising sample counts, until a round is long enough. Return that round.
+
+    The number of samples quadruples each time, except after a round that compiled kernels.
 
     A round is long enough if all rounds took a third of `seconds_max` [s], or if the round has
     `n_points_max` points. Rounds that compile kernels do not count.
