@@ -95,7 +95,7 @@ _N_TABLE_WINDOW_SAMPLES = 1024
 _N_LAGS = 4096
 """Number of lags of a window's autocorrelation in the table of quadrature errors by the spread of
 line frequencies."""
-_N_CURVATURE_LAGS = 512
+_N_LAGS_OF_CURVATURE_TABLE = 512
 """Number of lags of a window's autocorrelation in the table of quadrature errors by curvature."""
 _TABULATED_CURVATURES = np.geomspace(1e-6, 100.0, 97)
 """Curvatures c for which quadrature errors are tabulated [bins of fs/L, sample rate over number of
@@ -717,7 +717,7 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
     across : ndarray (rows, m + 1)
         Errors across the slope of each number in NODE_COUNTS_ACROSS_SLOPE.
     """
-    lag = (np.arange(_N_CURVATURE_LAGS) + 0.5) / _N_CURVATURE_LAGS
+    lag = (np.arange(_N_LAGS_OF_CURVATURE_TABLE) + 0.5) / _N_LAGS_OF_CURVATURE_TABLE
     weight = _normalised_autocorrelation(window_name, lag)
     phase = 2 * np.pi * lag * _TABULATED_CURVATURES[:, None]
 

@@ -198,12 +198,12 @@ class ErrorBudget:
 
         A few spectral lines are computed in place of the lines of all beamlets.
         """
-        return self._stated_or_tolerance_fraction(self.line_error, self.line_error_fraction)
+        return self._stated_or_default_error(self.line_error, self.line_error_fraction)
 
     @property
     def allowed_leakage_error(self) -> np.ndarray:
         """Tolerated probability of a false peak due to leaked signal that is not evaluated."""
-        return self._stated_or_tolerance_fraction(self.leakage_error, self.leakage_error_fraction)
+        return self._stated_or_default_error(self.leakage_error, self.leakage_error_fraction)
 
     @property
     def allowed_beamlets_error(self) -> np.ndarray:
@@ -230,7 +230,7 @@ class ErrorBudget:
         errors = (np.asarray(self.line_error), np.asarray(self.leakage_error))
         return np.logical_or(*(error == SET_BY_TOLERANCE for error in errors))
 
-    def _stated_or_tolerance_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
+    def _stated_or_default_error(self, stated: ArrayLike, fraction: float) -> np.ndarray:
         """Return `stated`; where that is `SET_BY_TOLERANCE`, `fraction` times the tolerance."""
         allowed = fraction * np.asarray(self.tolerance, float)
         return np.where(np.asarray(stated, float) == SET_BY_TOLERANCE, allowed, stated)

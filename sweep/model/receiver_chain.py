@@ -362,11 +362,13 @@ def relative_noise_density(
     bandwidth_1, bandwidth_2 = poles.values()
     cosine = np.cos(2 * np.pi * (np.asarray(frequency) / sample_rate))
     are_equal = np.abs(bandwidth_1 - bandwidth_2) <= 1e-4 * np.minimum(bandwidth_1, bandwidth_2)
-    alias_sum_1, derivative_1 = _single_pole_alias_sum(
+    alias_sum_1, derivative_1 = _single_pole_alias_sum_and_derivative(
         2 * np.pi * np.where(are_equal, (bandwidth_1 + bandwidth_2) / 2, bandwidth_1) / sample_rate,
         cosine,
     )
-    alias_sum_2, _ = _single_pole_alias_sum(2 * np.pi * bandwidth_2 / sample_rate, cosine)
+    alias_sum_2, _ = _single_pole_alias_sum_and_derivative(
+        2 * np.pi * bandwidth_2 / sample_rate, cosine
+    )
     squared_bandwidth_ratio = np.where(are_equal, 0.5, np.square(bandwidth_2 / bandwidth_1))
     with np.errstate(over="ignore", invalid="ignore"):
         partial_fractions = np.where(
@@ -384,7 +386,9 @@ def relative_noise_density(
     )
 
 
-def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _single_pole_alias_sum_and_derivative(
+    a: np.ndarray, cosine: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a single-pole low-pass's power transmission, summed over aliases, and a derivative.
 
     Parameters

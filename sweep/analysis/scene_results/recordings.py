@@ -472,7 +472,7 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
     for name, raw_value in where.items():
         wanted_values = list(raw_value) if isinstance(raw_value, tuple | list) else [raw_value]
         try:
-            axis, is_wanted, available = _match_axis_values(spec, name, wanted_values)
+            axis, is_wanted, available = _axis_and_mask_of_values(spec, name, wanted_values)
             allowed_by_axis[axis] &= is_wanted
             if not allowed_by_axis[axis].any():
                 raise QuantityError("is no value of this study", available)
@@ -495,7 +495,7 @@ def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosit
     return AxisPosition(axis_indices, _axis_position_label(spec, axis_indices), ())
 
 
-def _match_axis_values(
+def _axis_and_mask_of_values(
     spec: SceneSpec, name: str, wanted_values: list[object]
 ) -> tuple[str, np.ndarray, str]:
     """Return the axis of a coordinate and a mask of the requested values along the axis.

@@ -148,7 +148,7 @@ def allocate_rate_table(threshold_ratios: np.ndarray) -> RateTableArrays:
 
     ``threshold_ratios`` (n,) are thresholds over the noise per quadrature; n may be 0.
     """
-    entries_per_power, n_columns = _table_size_max(np.ascontiguousarray(threshold_ratios, float))
+    entries_per_power, n_columns = _table_shape_max(np.ascontiguousarray(threshold_ratios, float))
     n_entries = entries_per_power * n_columns
     return RateTableArrays(
         np.empty(n_entries),
@@ -159,7 +159,7 @@ def allocate_rate_table(threshold_ratios: np.ndarray) -> RateTableArrays:
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _table_size_max(threshold_ratios):
+def _table_shape_max(threshold_ratios):
     """Return the largest number of entries per power, and of columns, over several thresholds."""
     entries_per_power, n_columns = 0, 0
     for threshold_ratio in threshold_ratios:

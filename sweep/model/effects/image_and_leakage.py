@@ -237,7 +237,7 @@ _TABULATED_LIGHT_SHIFTS_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
 _ROWS_PER_OCTAVE, _OCTAVE_MIN, _OCTAVE_MAX = 2, -8, 30
 """Rows of tables of leakage bounds: number per octave, and first and last octave, of the magnitude
 of all lines over the threshold."""
-_THRESHOLD_TABLE_STEP_FACTOR = 1.04
+_RATIO_OF_TABULATED_THRESHOLDS = 1.04
 """Ratio of the thresholds of successive tables of leakage bounds. Each threshold uses the table of
 the next lower tabulated one."""
 _SINGLE_BINS, _FAR_STRETCHES = 48, 24
@@ -316,7 +316,7 @@ def _leakage_probability_bound(
     )
     column = column.astype(np.int64)
     threshold_step = np.floor(
-        np.log(np.clip(threshold_ratio, 1e-3, 1e4)) / math.log(_THRESHOLD_TABLE_STEP_FACTOR)
+        np.log(np.clip(threshold_ratio, 1e-3, 1e4)) / math.log(_RATIO_OF_TABULATED_THRESHOLDS)
     )
     distinct_steps, step_index = np.unique(threshold_step, return_inverse=True)
     length = points.window.length
@@ -326,7 +326,7 @@ def _leakage_probability_bound(
                 window_name,
                 length,
                 points.fft_size,
-                _THRESHOLD_TABLE_STEP_FACTOR ** float(distinct_step),
+                _RATIO_OF_TABULATED_THRESHOLDS ** float(distinct_step),
                 points.looks,
             )
             for distinct_step in distinct_steps

@@ -553,7 +553,7 @@ def _iter_leaking_spans(
     In segments that ``has_raised_bin`` (n, 3) does not mark, spans end at the threshold.
     """
     magnitude_min = np.minimum(
-        shots.threshold, _leaking_signal_ratio_min(shots) * shots.bin_noise_sigma
+        shots.threshold, _leaking_magnitude_ratio_min(shots) * shots.bin_noise_sigma
     )
     if has_raised_bin is not None:
         magnitude_min = np.where(has_raised_bin.T, magnitude_min, shots.threshold)
@@ -562,7 +562,7 @@ def _iter_leaking_spans(
     )
 
 
-def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
+def _leaking_magnitude_ratio_min(shots: Shots) -> np.ndarray:
     """Return the smallest |X| / sigma, (n,), at which leaked signal may raise a false peak.
 
     sigma is the noise of a bin per quadrature. The result is infinite if the settings omit leaked
@@ -595,7 +595,7 @@ def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> 
         spans.magnitudes,
         spans.is_exempt,
         np.array(np.broadcast_to(shots.bin_noise_sigma, shots.size)),
-        np.array(_leaking_signal_ratio_min(shots)),
+        np.array(_leaking_magnitude_ratio_min(shots)),
         np.ascontiguousarray(groups.strongest_bin),
         shots.fft_size if shots.complex_record else 0,
         bins_begin,

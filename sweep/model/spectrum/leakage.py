@@ -281,7 +281,7 @@ def detect_with_leakage(
         ),
         float(clearance),
     )
-    tolerance_left = inputs.tolerance - _far_leakage_bound(
+    tolerance_left = inputs.tolerance - _far_leakage_probability_bound(
         far_weight, distance_min, image_distance, brightest_inputs, envelope
     )
     if tolerance_left < 0.0 or crossing_distance > clearance:
@@ -298,14 +298,14 @@ def detect_with_leakage(
             float(clearance),
         )
         distance_min = min(crossing_distance, float(clearance + nyquist_bin))
-        tolerance_left = inputs.tolerance - _far_leakage_bound(
+        tolerance_left = inputs.tolerance - _far_leakage_probability_bound(
             far_weight, distance_min, image_distance, brightest_inputs, envelope
         )
         while (
             tolerance_left < 0.0 and distance_min < layout.table_half_width_bins
         ):  # bins of the table take less time than an integral
             distance_min = min(1.25 * distance_min, float(layout.table_half_width_bins))
-            tolerance_left = inputs.tolerance - _far_leakage_bound(
+            tolerance_left = inputs.tolerance - _far_leakage_probability_bound(
                 far_weight, distance_min, image_distance, brightest_inputs, envelope
             )
     # Wide enough if the integral may be left out, else a first guess.
@@ -761,7 +761,7 @@ def mean_leakage_from_log_rates(log_rates, powers_per_octave):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _far_leakage_bound(weight_sum, distance_min, image_distance, inputs, envelope):
+def _far_leakage_probability_bound(weight_sum, distance_min, image_distance, inputs, envelope):
     """Return a bound on the probability of false alarms due to leaked signal far from the lines.
 
     The bins are ``distance_min`` or more bins away from the lines.

@@ -1142,7 +1142,7 @@ def _layout_of_late_echo(layout, n_samples):
 
 
 @njit(cache=True, error_model="numpy")
-def _build_line_shapes(line_shape_index, built_index, modes, tables, segment_exists, shapes):
+def _fill_line_shapes(line_shape_index, built_index, modes, tables, segment_exists, shapes):
     """Compute the line shapes of all segments of a point.
 
     Parameters
@@ -1457,7 +1457,7 @@ def _evaluate_points(
     for i in range(spans.point_numbers.size):
         point = spans.point_numbers[i]
         if line_shape_index[i] != built_index:
-            _build_line_shapes(
+            _fill_line_shapes(
                 line_shape_index[i], built_index, modes, tables, settings.segment_exists, shapes
             )
             built_index = line_shape_index[i]

@@ -91,7 +91,7 @@ _TOLERANCE_FIELD, _DRAWS_FIELD, _DRAWS_LIMIT_FIELD = (
     "draws.limit",
 )
 _BEAMLETS_FIELD, _PATTERN_FIELD, _LINE_PATTERN = "footprint.beamlets", "footprint.pattern", "line"
-_REFERENCE_TOLERANCE_OVERRIDES = dict.fromkeys(
+_REFERENCE_ACCURACY_OVERRIDES = dict.fromkeys(
     ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"), REFERENCE_TOLERANCE
 )
 """Value of each accuracy field that reference settings override, by dotted path."""
@@ -188,7 +188,7 @@ def build_setting_ladder(spec: AnySpec) -> SettingLadder:
         AccuracySetting(name="all effects on", kind=ALL_EFFECTS_KIND, overrides=all_effects)
     )
     reference_overrides, reference_text, rays_error_max = (
-        all_effects | _REFERENCE_TOLERANCE_OVERRIDES,
+        all_effects | _REFERENCE_ACCURACY_OVERRIDES,
         "all effects on",
         0.0,
     )

@@ -371,13 +371,13 @@ class ComputeBackend(ExitStack):
         """
         if not self.is_in_process:
             return 0
-        n_threads = self._n_threads_without_memory_limit
+        n_threads = self._n_requested_threads
         if n_threads == 1 or self.memory.suffices_for(n_threads * self.bytes_per_thread):
             return n_threads
         return max(int(self.memory.bytes_max / self.bytes_per_thread), 1)
 
     @property
-    def _n_threads_without_memory_limit(self) -> int:
+    def _n_requested_threads(self) -> int:
         """Number of threads that the options ask for, at most one per block."""
         return max(min(self.options.n_threads(self._workload), self.max_workers), 1)
 
@@ -450,7 +450,7 @@ class ComputeBackend(ExitStack):
                 self.progress.say(
                     "no performance report: a plain loop has no scheduler to tell of it"
                 )
-            n_threads, n_without_limit = self.n_threads, self._n_threads_without_memory_limit
+            n_threads, n_without_limit = self.n_threads, self._n_requested_threads
             if n_threads < n_without_limit:
                 self.progress.say(
                     f"memory suffices for {n_threads} of {n_without_limit} threads: a block takes "

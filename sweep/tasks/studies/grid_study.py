@@ -235,7 +235,7 @@ class TileGrid(BlockGrid):
     def __init__(self, grid: ParameterBlockGrid) -> None:
         self.grid = grid
         self._is_constant_axis = tuple(
-            self._is_constant_in_tile(axis) for axis in range(len(grid.dims))
+            self._must_be_constant_in_tile(axis) for axis in range(len(grid.dims))
         )
         super().__init__(grid.dims, grid.shape, fit_tile_shape(grid.shape, self._is_constant_axis))
 
@@ -277,7 +277,7 @@ class TileGrid(BlockGrid):
                 parameters |= self._values_along_axis(axis, position[members], stride)
             yield TileGroup(int(group_code), members, parameters)
 
-    def _is_constant_in_tile(self, axis: int) -> bool:
+    def _must_be_constant_in_tile(self, axis: int) -> bool:
         """Return True if a tile must have one value along the axis with number `axis`.
 
         Such an axis varies a text parameter or a :data:`PARAMETERS_CONSTANT_IN_TILE`, such as the

@@ -64,7 +64,7 @@ def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
 def load_checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
     """Return a user's function in a wrapper that passes read-only arrays and checks the results."""
     function = _import_user_function(name)
-    definition = f"{name}{_definition_text(function)}"
+    definition = f"{name}{_definition_place_text(function)}"
 
     def detect(power: np.ndarray, setting: SpectrumSettings) -> np.ndarray:
         answer = _call_user_function(name, function, _read_only_view(power), setting)
@@ -93,7 +93,7 @@ def _call_user_function(name: str, function: Callable[..., Any], *arguments: Any
         raise CodeError(f"{name} fails with {type(error).__name__}: {error}{place_text}") from error
 
 
-def _definition_text(function: Callable[..., Any]) -> str:
+def _definition_place_text(function: Callable[..., Any]) -> str:
     """Return the file and line of a function's definition as text; '' if it is not in Python."""
     code_object = getattr(getattr(function, "py_func", function), "__code__", None)
     return f" ({code_object.co_filename}:{code_object.co_firstlineno})" if code_object else ""
