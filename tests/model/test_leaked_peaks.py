@@ -26,6 +26,7 @@ from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
 from sweep.model.sampling.philox import DrawAddress
 from sweep.model.spectrum import permanent_line
+from sweep.model.waveform import SEARCH_BAND_PATHS
 from sweep.model.window import get_window
 
 NUMBER = {"probabilities": 8000, "noise": 8000, "spectra": 1500}
@@ -353,6 +354,31 @@ def test_segments_without_a_raised_bin_need_no_list_of_bins(scene, table_4_1, mo
         with_all_bins, _ = _flown(table_4_1, "probabilities", scene, draws=1, first=n)
         for name, values in cloud.items():
             np.testing.assert_array_equal(values, with_all_bins[name], err_msg=name)
+
+
+@pytest.mark.parametrize("window", ["hann", "hamming", "rectangular"])
+@pytest.mark.parametrize("bins_beyond_echo", [None, 1.0, 3.0])
+@pytest.mark.parametrize("fft_size", [512, SIZE, 2**17])
+@pytest.mark.parametrize("tolerance", [1e-3, 0.1])
+def test_bounds_on_raised_bins_are_probabilities_no_smaller_than_leakage(
+    window, bins_beyond_echo, fft_size, tolerance, table_4_1
+):
+    """Bright and dim echoes, in the searched band or short of it, at fine and coarse tolerances."""
+    ranges = np.array([30.0, 60.0, 100.0, 101.3, 300.0])
+    parameters = table_4_1(
+        fft_size=fft_size, beamlets=1, radial_velocity=0.0, window=window, noise_bins="correlated",
+        power=np.array([1e5, 1e3, 10.0, 1.0, 0.1]), range=ranges, detection="any_bin",
+    )  # fmt: skip
+    parameters = PARAMETER_DEFAULTS | parameters | {"accuracy.tolerance": tolerance}
+    if bins_beyond_echo is not None:
+        nearest = ranges + bins_beyond_echo * RANGE_BIN * SIZE / fft_size
+        band = (nearest, nearest + 10.0 * RANGE_BIN, -1e-3, 1e-3)
+        parameters |= dict(zip(SEARCH_BAND_PATHS, band, strict=True))
+    groups = list_bin_groups(prepare_single_category(parameters))
+    bound = groups.raised_bin_probability_max
+    assert ((bound >= 0) & (bound <= 1)).all()
+    assert (bound >= groups.leakage_probability * (1 - 1e-9)).all()
+    assert (groups.leakage_probability > 1e-3).any()
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])

@@ -980,7 +980,7 @@ def coherent_amplitude_factor(
     numpy.ndarray
         |mean exp(2 pi i f a t^2 / c)|, 0..1, with the looks' times t about their middle. The phase
         of a steady velocity is corrected. A laser's phase noise reduces the amplitude further, by
-        the root of :func:`sweep.model.effects.laser_line.pure_line_power_fraction`.
+        the root of :func:`sweep.model.laser_line.pure_line_power_fraction`.
     """
     look_index = np.arange(looks.n_coherent) - (looks.n_coherent - 1) / 2
     cycles_per_square_index = np.asarray(

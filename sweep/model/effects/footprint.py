@@ -34,7 +34,9 @@ def axis_surface_line_spread(points: PlannerInputs) -> OffsetMoments:
 def footprint_error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return a bound on the change of the largest bin if the echo is one line on the axis.
 
-    Notes ----- The beamlets' ranges spread the lines, and the beamlets' echoes add up to another
+    Notes
+    -----
+    The beamlets' ranges spread the lines, and the beamlets' echoes add up to another
     total power than that of one line on the axis. The bound is for beamlets that add as powers.
     Velocities, other surfaces and optical phases are separate effects. In direct detection the
     beats always add as amplitudes: beamlet b of range R_b has the phase 4 pi f (R_b - R_0) / c at

@@ -119,8 +119,10 @@ def solar_irradiance(
     ndarray
         Spectral irradiance [W/m^3]; 0 for a distance of 0.
 
-    Notes ----- The irradiance is pi B (R / d)^2 sin(elevation), with Planck's radiance B of a black
-    body of the temperature SUN_TEMPERATURE, and the sun's radius R.
+    Notes
+    -----
+    The irradiance is pi B (R / d)^2 sin(elevation), with Planck's radiance B of a black body of the
+    temperature SUN_TEMPERATURE, and the sun's radius R.
     """
     x, d = np.asarray(wavelength, float), np.asarray(distance, float)
     exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)

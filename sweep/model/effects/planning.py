@@ -436,7 +436,9 @@ def signal_ratio_bounds(
     ratio_min, ratio_max : ndarray (segments, ...)
         Bounds >= 0, by segment and point.
 
-    Notes ----- Effect i changes |X| by at most the fraction m_i of |X|, and by the fraction c_i of
+    Notes
+    -----
+    Effect i changes |X| by at most the fraction m_i of |X|, and by the fraction c_i of
     the sum of all amplitudes in phase. Effect i changes the noise variance by the fraction v_i. Let
     x be |X| over the noise per quadrature of the line on the beam's axis, times the gain of
     combining looks. With C = sum_i c_i,

@@ -158,9 +158,11 @@ def speckle_error_bound(points: PlannerInputs) -> ErrorBound | None:
 
     The bound holds in all draws but a fraction of 1e-6.
 
-    Notes ----- A bin of magnitude |X| becomes sqrt(kappa) X + D, with D complex normal of power (1
-    - kappa) |X|^2. Between smooth and rough, 4 pi sigma_h << lambda, the bin's magnitude over |X|
-    lies within 1 +- 5 (4 pi sigma_h / lambda). In incoherent footprints the coherent part has
+    Notes
+    -----
+    A bin of magnitude |X| becomes sqrt(kappa) X + D, with D complex normal of power
+    (1 - kappa) |X|^2. Between smooth and rough, 4 pi sigma_h << lambda, the bin's magnitude over
+    |X| lies within 1 +- 5 (4 pi sigma_h / lambda). In incoherent footprints the coherent part has
     random phases. If a sum of amplitudes may cancel, the bound is relative to the sum of powers.
     """
     if not points.any_nonzero(_ROUGHNESS_PATH):
@@ -803,9 +805,9 @@ def _moments_about_surface_means(
 ) -> BeamletMoments:
     """Return power-weighted moments of beamlets (rows, beamlets), for points with the given rows.
 
-    ``power`` is (rows, beamlets), ``values`` (2, rows, beamlets), and ``row`` (n,) the row of each
-    point's footprint. ``is_on_other_surface`` (rows, beamlets) bool marks beamlets on a surface
-    that the axis does not meet; None if all are on the axis's surface.
+    ``power``, ``doppler_ratio`` and ``relative_range`` are (rows, beamlets), and ``row_of_point``
+    (n,) is the row of each point's footprint. ``is_on_other_surface`` (rows, beamlets) bool marks
+    beamlets on a surface that the axis does not meet; None if all are on the axis's surface.
     """
     values = np.array([doppler_ratio, relative_range])
     power_fraction = power / np.maximum(power.sum(axis=1), _ZERO_DIVISOR_SUBSTITUTE)[:, None]

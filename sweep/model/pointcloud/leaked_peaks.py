@@ -320,10 +320,8 @@ def find_leaking_points(groups: BinGroups) -> np.ndarray:
 
     Parameters
     ----------
-    shots : Shots
-        Prepared shots of n points (:class:`sweep.model.preparation.Shots`); not used.
     groups : BinGroups
-        Groups of bins of the same points, with the probability of leakage in each segment
+        Groups of bins of n points, with the probability of leakage in each segment
         (:class:`sweep.model.pointcloud.bin_groups.BinGroups`).
 
     Returns

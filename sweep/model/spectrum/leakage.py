@@ -155,7 +155,7 @@ class FalsePeakProbability(NamedTuple):
     mean over the speckle."""
     raised_bin_probability_max: float
     """Upper bound on the probability that leaked signal raises any bin above the threshold,
-    including bins that join the echo. It is 1 in developed speckle."""
+    including bins that join the echo. It is 1 if bins are counted in developed speckle."""
 
 
 class LeakageResult(NamedTuple):
@@ -357,7 +357,9 @@ def detect_with_leakage(
                     n_bins, inputs, speckle_power_max, span, crossing_series, speckle_rates
                 )
                 leakage = probability.leakage_probability
-                raised_bin_probability_max += probability.raised_bin_probability_max
+                raised_bin_probability_max += (
+                    1.0 - inputs.tolerance
+                ) * probability.raised_bin_probability_max
             return DetectedSpan(
                 first_bin, n_bins, peak_index, n_exempt, leakage, raised_bin_probability_max
             )

@@ -665,8 +665,8 @@ def replace_lines_by_nodes(lines, n_lines, n_nodes, middle, half_width, scratch,
 
     Parameters
     ----------
-    lines
-        :class:`LineArrays` with ``n_lines`` lines.
+    lines, n_lines
+        :class:`LineArrays`, and the number of lines in it.
     n_nodes
         Number of nodes; with ``n_lines`` or more, or more than NODES_MAX, lines are copied as they
         are.

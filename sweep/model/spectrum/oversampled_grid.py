@@ -104,7 +104,8 @@ def find_peaks_on_grid(
     Returns
     -------
     SegmentResults
-        Arrays (3, n), like those of :func:`sweep.model.evaluation.evaluate_segments`. Leakage is 0.
+        Arrays (3, n), like those of
+        :func:`sweep.model.spectrum.segment_spectra.evaluate_segments`. Leakage is 0.
     """
     results = allocate_segment_results(shots.size)
     parameters, parameters_by_segment = shots.point_parameters(), shots.segment_parameters()

@@ -158,8 +158,9 @@ class BinSpans(NamedTuple):
     """
     raised_bin_probability_max: np.ndarray
     """Upper bound on the probability that leaked signal raises any bin above the threshold, one
-    that joins the echo included. It is 1 where it is not computed: in developed speckle, with
-    several looks, and with a permanent line. It is 0 in segments that do not exist.
+    that joins the echo included. It is 1 where the bins that may be raised are not counted one by
+    one: in developed speckle, with several looks, with a permanent line, and with a search band. It
+    is 0 in segments that do not exist.
     """
     span_start: np.ndarray
     """Index in ``magnitudes`` and ``is_exempt`` of the first bin of each segment and point."""
@@ -365,7 +366,7 @@ def iter_spans(
                 if ignores_band
                 else restrict_to_band(shots, _clear_spans_without_echo(shots, spans))
             )
-            if shots.looks.is_noncoherent or shots.permanent_line is not None:
+            if not bounds_raised_bins(shots):
                 spans = spans._replace(
                     raised_bin_probability_max=np.ones_like(spans.raised_bin_probability_max)
                 )
@@ -374,6 +375,19 @@ def iter_spans(
             if shots.permanent_line is not None:
                 spans = apply_permanent_line(shots, spans)
             yield detect_in_spans(shots, spans) if computes_pd else spans
+
+
+def bounds_raised_bins(shots: Shots) -> bool:
+    """Return True if the kernel's bound on raised bins holds for the bins that are searched.
+
+    Several looks have another law of crossings. A permanent line and a search band change which
+    bins may be raised: bins of an echo outside the band count as leaked signal.
+    """
+    return (
+        not shots.looks.is_noncoherent
+        and shots.permanent_line is None
+        and shots.detection_settings.search_band is None
+    )
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
