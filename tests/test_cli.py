@@ -513,7 +513,9 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(work
     for name, row in rows.items():
         widths = store[f"{name}_half_width"]
         assert (row.n_points, row.n_points_within_tolerance) == (80, int((widths <= 0.1).sum()))
-        assert row.worst_error == widths.max() and row.excess == row.worst_error - 0.1
+        assert (
+            row.worst_error == widths.max() and row.excess_over_tolerance == row.worst_error - 0.1
+        )
         assert row.n_samples_at_worst_point == 60 and row.n_draws_needed == -(
             -60 * (row.worst_error / 0.1) ** 2 // 1
         )
@@ -527,7 +529,7 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(work
                 and f"{row.n_draws_needed:,.0f}" in result.stdout
             )
     assert 0 < rows["pd_shot"].n_points_within_tolerance < 80
-    assert store.accuracy_missed.max() == max(row.excess for row in rows.values())
+    assert store.accuracy_missed.max() == max(row.excess_over_tolerance for row in rows.values())
     promised = store.pd_shot_half_width.attrs
     assert (promised["tolerance"], promised["confidence"]) == (0.1, 0.95)
 

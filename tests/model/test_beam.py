@@ -75,7 +75,7 @@ def test_light_moves_as_the_moving_product_of_both_fields_says():
     places, directions = beam.footprint_full_angles(p)
     assert directions / 4 == pytest.approx(rms, rel=1e-6) and places > 9 * directions
     plane = FlatGround(p | {"target.transverse_velocity": np.array(100.0)}, 1)
-    _, _, doppler, echo = plane.beamlets
+    _, _, doppler, echo = plane.beamlet_table
     share = echo / echo.sum()
     spread = np.sqrt((share * doppler**2).sum()) * SPEED_OF_LIGHT / 2
     assert spread == pytest.approx(100 * rms, rel=1e-3)
@@ -120,7 +120,7 @@ def test_beamlets_on_a_plane_come_to_the_integral_over_it(focus, angle):
     cell = (across[1] - across[0]) * (along[1] - along[0]) * np.sin(grazing)
     received_share = WAVELENGTH**2 * antenna_pattern.sum() * cell * np.sin(grazing) / np.pi
     area = beam.effective_collecting_area(p)
-    _, offset, _, echo = FlatGround(p, 1).beamlets
+    _, offset, _, echo = FlatGround(p, 1).beamlet_table
     assert area / 40.0**2 * echo.sum() == pytest.approx(received_share, rel=2e-5)
     if angle < 90:
         spread = np.sqrt((antenna_pattern * (depth - 40) ** 2).sum() / antenna_pattern.sum()) / 40

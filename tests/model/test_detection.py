@@ -78,7 +78,9 @@ def assess(magnitude, sigma, level, floor, correlation=0.0):
     assert exempted == exempt.sum()
     marked = set(np.flatnonzero(exempt))
     limits = LeakageInputs(sigma, level, 0.0, correlation)
-    return peak, marked, false_peak_probability_of_bins(count, limits, floor, span, series)
+    probability = false_peak_probability_of_bins(count, limits, floor, span, series)
+    assert 1 >= probability.raised_bin_probability_max >= probability.leakage_probability
+    return peak, marked, probability.leakage_probability
 
 
 def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):

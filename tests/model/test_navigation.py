@@ -318,7 +318,7 @@ def test_a_tiny_slope_is_level_ground():
     near, at = (
         altitude(direction=SIXTEEN, range=ranges, standard_error=1.0, slope=s) for s in (1e-9, 0.0)
     )
-    for name in ("value", "covariance", "chi_square"):
+    for name in ("estimate", "covariance", "chi_square"):
         assert getattr(near, name) == pytest.approx(getattr(at, name), rel=1e-9), name
 
 

@@ -1841,7 +1841,7 @@ class SpectrumDetections(NamedTuple):
     """(m,): frequency of the strongest bin [Hz]."""
     n_exempt: np.ndarray
     """(m,): number of bins that belong to the echo and so can raise no false alarm."""
-    leakage: np.ndarray
+    leakage_probability: np.ndarray
     """(m,): zeros. The probability of a false peak due to leaked signal is not evaluated for these
     spectra."""
 

@@ -272,7 +272,7 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
         shots,
         speckle=shots.speckle._replace(
             segment_correlations=SegmentCorrelations(added, added, added),
-            line_gradients=shots.speckle.line_gradients._replace(phase=turn),
+            line_gradients=shots.speckle.line_gradients._replace(phase_gradient=turn),
         ),
     )
     method = "noise" if noisy else "probabilities"
