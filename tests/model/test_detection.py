@@ -79,7 +79,8 @@ def assess(magnitude, sigma, level, floor, correlation=0.0):
     marked = set(np.flatnonzero(exempt))
     limits = LeakageInputs(sigma, level, 0.0, correlation)
     probability = false_peak_probability_of_bins(count, limits, floor, span, series)
-    assert 1 >= probability.raised_bin_probability_max >= probability.leakage_probability
+    least_bound = probability.leakage_probability * (1 - 1e-12)
+    assert 1 >= probability.raised_bin_probability_max >= least_bound
     return peak, marked, probability.leakage_probability
 
 
