@@ -421,8 +421,8 @@ class ReportPage:
     """Sections in order."""
 
 
-N_TABLE_ROWS_SHOWN = 10
-"""Number of rows of a table that a page shows at a time."""
+ROWS_PER_TABLE_PAGE = 10
+"""Number of rows of a long table that are shown at a time in the HTML report."""
 
 
 UNWRAPPED_CELL_CHARACTERS_MAX = 40
@@ -478,7 +478,7 @@ def _table_json(table: HtmlTable) -> str:
             showIndex=False,
             maxBytes=0,
             maxColumns=0,
-            pageLength=N_TABLE_ROWS_SHOWN,
+            pageLength=ROWS_PER_TABLE_PAGE,
             columnDefs=[
                 {
                     "targets": np.flatnonzero(widths > UNWRAPPED_CELL_CHARACTERS_MAX).tolist(),

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 GRID_STEPS_PER_SIDE_MAX = 7000
 """Largest number of grid steps along a side of a square ground."""
 _RANDOM_STREAM_NAMES = ("relief", "hills", "craters", "boulders", "trees")
-"""What random numbers are used for; the index in this tuple selects an independent stream."""
+"""Uses of random numbers; the index in this tuple selects an independent stream."""
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:

@@ -60,8 +60,7 @@ class Mistake:
     """Dotted path of the value in the spec, such as ``instrument.laser.power`` or
     ``axes.target.range[2]``."""
     problem: str
-    """What is wrong, as the end of a sentence that begins with the path: ``must be at least 1
-    m``."""
+    """Broken rule, as the end of a sentence that begins with the path: ``must be at least 1 m``."""
     value: str = ""
     """Wrong value as the user wrote it; empty if it is not to be shown."""
     suggestion: str = ""
@@ -103,8 +102,8 @@ class Finding:
     location: SpecLocation
     """Keys and list indices that lead to the value."""
     problem: str
-    """What is wrong, as the end of a sentence that begins with the location: ``must be at least 1
-    m``."""
+    """Broken rule, as the end of a sentence that begins with the location: ``must be at least
+    1 m``."""
     suggestion: str = ""
     """Advice to the user, such as a similar name or a remedy; may be empty."""
     raw_value: object = MISSING

@@ -449,7 +449,7 @@ class AxisRefusal(NamedTuple):
     """Why no axis may set a parameter; both texts are empty if an axis may."""
 
     problem: str
-    """Why no axis may set the parameter, as the end of a sentence about its path; empty if one
+    """Reason why no axis may set the parameter, as the end of a sentence; empty if one
     may."""
     remedy: str
     """Advice on what to do instead of an axis; empty if an axis may set the parameter."""

@@ -36,7 +36,7 @@ ACCURACY = 1e-6
 """What the module states, relative to the leakage."""
 
 DOPPLER_ACCURACY = 1e-3
-"""Of the Doppler segment, whose lines may all be at DC or Nyquist: draws bound rates to 1e-2."""
+"""Relative accuracy of the Doppler segment's leakage: all lines may be at DC or Nyquist."""
 
 CLOSED_FORMS = ("hamming", "hann", "rectangular", "flattop")
 EVERY_FORM = tuple(COSINE_SUM_COEFFICIENTS)

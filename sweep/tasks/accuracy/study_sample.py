@@ -197,7 +197,7 @@ class StudySample(ABC):
     """Base of the samples of a study's points. Accuracy settings are tried on these points."""
 
     points_noun = "points"
-    """What the points of the sample are called in messages."""
+    """Plural noun for the points of the sample in messages, such as ``points``."""
     spec: AnySpec
     """Spec of the study."""
     study_with_setting: Callable[[AccuracySetting], Any]

@@ -81,5 +81,5 @@ def prepare_single_category(parameters, effects):
 
 
 def find_spectra(parameters, effects):
-    """What the spectra of the points hold, :func:`sweep.model.evaluation.evaluate_segments`."""
+    """Detection and false alarms in the spectra of the points, as SegmentResults."""
     return evaluate_segments(prepare_single_category(parameters, effects))
