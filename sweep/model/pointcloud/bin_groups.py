@@ -13,7 +13,7 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.detection_probability import group_pd_in_all_looks, pd_of_bin_group
 from sweep.model.detection.echo_detection import bin_speckle_of_point, bin_threshold_of_point
 from sweep.model.preparation import Shots
-from sweep.model.spectrum.segment_spectra import BinSpans, bounds_raised_bins, iter_spans
+from sweep.model.spectrum.segment_spectra import BinSpans, is_raised_bin_bound_valid, iter_spans
 
 
 class BinGroups(NamedTuple):
@@ -112,7 +112,7 @@ def list_bin_groups(
         shots,
         bin_by_bin=every_bin,
         leakage=with_leakage,
-        doppler_leakage=bounds_raised_bins(shots),
+        doppler_leakage=is_raised_bin_bound_valid(shots),
         computes_pd=False,
     ):
         find_groups_in_spans(shots, spans, bin_groups)

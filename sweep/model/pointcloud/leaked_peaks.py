@@ -335,10 +335,11 @@ def find_leaking_points(groups: BinGroups) -> np.ndarray:
 def find_segments_with_raised_bins(
     groups: BinGroups, points: np.ndarray, keys: np.ndarray, first_draw: int, draws: int
 ) -> np.ndarray:
-    """Return a mask (n, 3), True for segments in which leaked signal may raise a bin in any draw.
+    """Return in which segments leaked signal may raise a bin in at least one draw, (n, 3) bool.
 
-    In the other segments the first random number of :func:`draw_leaked_peaks` exceeds the sum of
-    the bins' crossing rates in every draw, so no bin needs to be listed.
+    In every draw of any other segment, -ln(1 - u) exceeds RAISED_BIN_RATE_MARGIN times an upper
+    bound on the sum of the bins' crossing rates. u is the first random number of
+    :func:`draw_leaked_peaks`. No bin is raised then, so that the bins need not be listed.
 
     Parameters
     ----------

@@ -366,7 +366,7 @@ def iter_spans(
                 if ignores_band
                 else restrict_to_band(shots, _clear_spans_without_echo(shots, spans))
             )
-            if not bounds_raised_bins(shots):
+            if not is_raised_bin_bound_valid(shots):
                 spans = spans._replace(
                     raised_bin_probability_max=np.ones_like(spans.raised_bin_probability_max)
                 )
@@ -377,11 +377,12 @@ def iter_spans(
             yield detect_in_spans(shots, spans) if computes_pd else spans
 
 
-def bounds_raised_bins(shots: Shots) -> bool:
-    """Return True if the kernel's bound on raised bins holds for the bins that are searched.
+def is_raised_bin_bound_valid(shots: Shots) -> bool:
+    """Return True if the computed ``raised_bin_probability_max`` is an upper bound; if not, 1 is.
 
-    Several looks have another law of crossings. A permanent line and a search band change which
-    bins may be raised: bins of an echo outside the band count as leaked signal.
+    It is none for noncoherent looks, which have another law of crossings, and with a permanent line
+    or a search band, which change the bins that may be raised: bins of an echo outside the band
+    count as leaked signal.
     """
     return (
         not shots.looks.is_noncoherent
